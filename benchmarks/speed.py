@@ -46,11 +46,11 @@ def verdicts(name: str, found: dict[str, Any]) -> Iterator[str]:
                     f"| {name}: {stage['name']} | {stage['median']:.2f} s | {most_s:g} s {_met(quick)} "
                     f"| {stage['ratio']:.1f} | {least:g} {_met(ahead)} | {other} |"
                 )
-    for share in found["beside"]:
+    for share in found["busy"]:
         if share["rule"] != "one per core":
             met = _met(share["times"] <= BUSY_LIMIT)
             yield (
-                f"| {name}: 40k queries beside {share['beside']} busy, {share['threads']} threads "
+                f"| {name}: 40k queries beside {share['processes']} busy, {share['threads']} threads "
                 f"| {share['busy']:.2f} s | {BUSY_LIMIT * share['fair']:.2f} s {met} | | | |"
             )
 

@@ -90,29 +90,29 @@ def share_field() -> ShareField:
 def _nearest_skin(nodes: Float[np.ndarray, "r 3"]) -> Float[np.ndarray, "r j"]:
     """Each joint's share at the nearest eight skin vertices, by inverse squared distance; children's included."""
     vertices = base().vertices
-    own = np.zeros((len(vertices), len(JOINTS)))
+    direct = np.zeros((len(vertices), len(JOINTS)))
     for bone, (rows, shares) in skin_weights().items():
         for column, joint in enumerate(JOINTS):
             starts, end = joint.skin
             if bone.startswith(starts) and bone.endswith(end):
-                own[rows, column] += shares
+                direct[rows, column] += shares
     for column in reversed(range(len(JOINTS))):
         if PARENTS[column] >= 0:
-            own[:, PARENTS[column]] += own[:, column]
+            direct[:, PARENTS[column]] += direct[:, column]
     skin = np.unique(base().faces)
     distance, row = cKDTree(to_scene(vertices[skin])).query(nodes, k=8)
     weight = 1.0 / np.maximum(distance, 1e-3) ** 2
     weight /= weight.sum(axis=1, keepdims=True)
-    return np.einsum("rk,rkj->rj", weight, np.clip(own[skin[row]], 0.0, 1.0))
+    return np.einsum("rk,rkj->rj", weight, np.clip(direct[skin[row]], 0.0, 1.0))
 
 
 def _flow(number: Int[np.ndarray, "x y z"]) -> csr_matrix:
     """Laplacian of the graph of neighbouring nodes that have a number."""
     pairs = []
     for axis in range(3):
-        here, there = np.moveaxis(number, axis, 0)[:-1].ravel(), np.moveaxis(number, axis, 0)[1:].ravel()
-        both = (here >= 0) & (there >= 0)
-        pairs.append(np.stack([here[both], there[both]]))
+        first, second = np.moveaxis(number, axis, 0)[:-1].ravel(), np.moveaxis(number, axis, 0)[1:].ravel()
+        inside = (first >= 0) & (second >= 0)
+        pairs.append(np.stack([first[inside], second[inside]]))
     i, j = np.concatenate(pairs, axis=1)
     size = number.max() + 1
     links = csr_matrix((np.ones(2 * len(i)), (np.concatenate([i, j]), np.concatenate([j, i]))), shape=(size, size))
@@ -181,8 +181,8 @@ class PosedBody:
     def _shaped(self, points: Float[np.ndarray, "n 3"], shares: Float[np.ndarray, "n j"]) -> Float[np.ndarray, "n 3"]:
         """Every part grows away from its axis, each point by its shares in the parts."""
         across, heads = part_axes()
-        grown = (_own_shares() * self.girth) @ across.reshape(-1, 9)
-        shift = (_own_shares() * self.girth) @ np.einsum("jab,jb->ja", across, heads)
+        grown = (_exclusive_shares() * self.girth) @ across.reshape(-1, 9)
+        shift = (_exclusive_shares() * self.girth) @ np.einsum("jab,jb->ja", across, heads)
         growth = np.einsum("nab,nb->na", (shares @ grown).reshape(-1, 3, 3), points) - shares @ shift
         return (points + growth) * self._scale()
 
@@ -200,10 +200,10 @@ def _kept_shares(points: bytes) -> tuple[Float[np.ndarray, "n j"], tuple[Int[np.
 
 
 @cache
-def _own_shares() -> Float[np.ndarray, "j j"]:
+def _exclusive_shares() -> Float[np.ndarray, "j j"]:
     """``shares @ this`` are the shares of the parts alone, without what hangs from them."""
-    own = np.eye(len(JOINTS))
+    direct = np.eye(len(JOINTS))
     for child, parent in enumerate(PARENTS):
         if parent >= 0:
-            own[child, parent] = -1.0
-    return read_only(own)
+            direct[child, parent] = -1.0
+    return read_only(direct)

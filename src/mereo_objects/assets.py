@@ -187,10 +187,10 @@ def _from_mirror(asset: Asset) -> Path | None:
     path = Path(folder) / asset.name
     if not path.is_file():
         return None
-    found = hashlib.sha256(path.read_bytes()).hexdigest()
-    if found != asset.sha256:
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    if digest != asset.sha256:
         raise ValueError(
-            f"{path} has SHA-256 {found}, but {asset.name} must have {asset.sha256}: "
+            f"{path} has SHA-256 {digest}, but {asset.name} must have {asset.sha256}: "
             f"delete it to download the right one, or unset {MIRROR_VARIABLE}"
         )
     return path
@@ -215,7 +215,7 @@ def _from_cache(asset: Asset) -> Path:
     pooch.get_logger().setLevel("WARNING")
     try:
         downloader = pooch.HTTPDownloader(timeout=(ANSWER_SECONDS, STALL_SECONDS))
-        found = pooch.retrieve(asset.url, f"sha256:{asset.sha256}", asset.name, _cache(), downloader=downloader)
+        downloaded = pooch.retrieve(asset.url, f"sha256:{asset.sha256}", asset.name, _cache(), downloader=downloader)
     except ValueError as error:  # pooch: another hash; it has deleted the file
         raise AssetUnavailable(f"what {asset.url} delivers is not {asset.name} (another SHA-256): {cure}") from error
     except OSError as error:
@@ -224,7 +224,7 @@ def _from_cache(asset: Asset) -> Path:
         raise AssetUnavailable(
             f"{asset.name} cannot be stored at {path} ({error.strerror}): free space there, or set XDG_CACHE_HOME"
         ) from error
-    return Path(found)
+    return Path(downloaded)
 
 
 def _answers(url: str) -> bool:

@@ -132,9 +132,9 @@ def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
     chains = []
     for name, shape in SHAPES.items():
         with part(rng, name):
-            own = shape(rng)
+            local = shape(rng)
             carrier = carried[name] if name in carried else [_move_in_cell(rng, name)]
-        chains.append(Compose((*own, *carrier, waves)))
+        chains.append(Compose((*local, *carrier, waves)))
     return tuple(chains)
 
 

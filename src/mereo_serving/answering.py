@@ -59,10 +59,10 @@ class Loaded:
     def of(cls, served: Served, setup: Setup) -> "Loaded":
         """Load an object, and make what every frame needs; raises as ``load_object`` and ``registrar_for`` do."""
         if served.weights is None:
-            found = load_object(served.object)
+            target = load_object(served.object)
         else:
-            found = load_object(ready_weights(served.weights, served.name, setup.inference), served.scene)
-        loaded = cls(served, found, setup.method)
+            target = load_object(ready_weights(served.weights, served.name, setup.inference), served.scene)
+        loaded = cls(served, target, setup.method)
         registrar = loaded.registrar
         if registrar is not None:
             registrar.prepare()
@@ -81,7 +81,7 @@ class Loaded:
     def facts(self) -> dict[str, Any]:
         """What clients may know of the object."""
         model, known = self.model, self.object.segments
-        own = None if model is None else model.calibration
+        calibration = None if model is None else model.calibration
         frame = None if self.registrar is None else self.registrar.model.source_frame
         return {
             "name": self.served.name,
@@ -94,7 +94,7 @@ class Loaded:
             "method": "network" if self.registrar is None else self.registrar.method,
             "scene_unit_m": None if frame is None else frame.unit_m,
             "calibrated": model is not None and model.calibrates,
-            "recognition_calibrated": own is not None and own.recognizing is not None,
+            "recognition_calibrated": calibration is not None and calibration.recognizing is not None,
             "device": None if model is None else model.device_type,
             "precision": None if model is None else model.working_precision,
         }
@@ -123,12 +123,12 @@ class Answerer:
     @classmethod
     def of(cls, setup: Setup) -> "Answerer":
         """Load all weights; raises ``ValueError`` or ``OSError`` where some cannot be served so."""
-        return cls(setup, {one.name: Loaded.of(one, setup) for one in setup.served})
+        return cls(setup, {item.name: Loaded.of(item, setup) for item in setup.served})
 
     def ready(self) -> Ready:
         """What is reported first."""
-        facts = tuple(one.facts() for one in self.loaded.values())
-        settled = [one.model.working_precision for one in self.loaded.values() if one.model is not None]
+        facts = tuple(item.facts() for item in self.loaded.values())
+        settled = [item.model.working_precision for item in self.loaded.values() if item.model is not None]
         return Ready(facts, cast(Precision, settled[0]) if settled else "float32")
 
     def __call__(self, frame: FrameRequest) -> Reply:
@@ -162,9 +162,9 @@ class Answerer:
         return Reply(200, body, frame.media, headers, seconds)
 
 
-def json_of(found: Result, told: list[str]) -> bytes:
+def json_of(result: Result, warned: list[str]) -> bytes:
     """Content of summary.json, and what was warned of."""
-    return encoded_json({**summary_of(found), "warnings": told})
+    return encoded_json({**summary_of(result), "warnings": warned})
 
 
 def encoded_json(value: Mapping[str, Any]) -> bytes:
@@ -172,11 +172,11 @@ def encoded_json(value: Mapping[str, Any]) -> bytes:
     return json.dumps(to_json(value), ensure_ascii=False, allow_nan=False).encode()
 
 
-def glb_of(found: Result, request: FrameRequest) -> bytes:
+def glb_of(result: Result, request: FrameRequest) -> bytes:
     """Content of segments.glb."""
-    frame, path = found.seen.frame, request.folder / "segments.glb"
-    to_viewer, radii = viewer_rotation(frame.axes), radii_of(found.registered)
-    write_segments_glb(path, found.reconstruction.surfaces, to_viewer, frame.metres, radii)
+    frame, path = result.seen.frame, request.folder / "segments.glb"
+    to_viewer, radii = viewer_rotation(frame.axes), radii_of(result.registered)
+    write_segments_glb(path, result.reconstruction.surfaces, to_viewer, frame.metres, radii)
     return path.read_bytes()
 
 
@@ -195,13 +195,13 @@ def shown(text: str, frame: FrameRequest) -> str:
 
 
 @contextmanager
-def taken_warnings(told: list[str], frame: FrameRequest) -> Iterator[None]:
+def taken_warnings(warned: list[str], frame: FrameRequest) -> Iterator[None]:
     """Take mereo's own warnings of the block for the client; others are passed on."""
     with warnings.catch_warnings(record=True) as recorded:
         warnings.simplefilter("always")
         yield
-    for one in recorded:
-        if one.category.__module__.startswith("mereo"):
-            told.append(shown(str(one.message), frame))
+    for warning in recorded:
+        if warning.category.__module__.startswith("mereo"):
+            warned.append(shown(str(warning.message), frame))
         else:
-            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)

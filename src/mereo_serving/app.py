@@ -222,8 +222,8 @@ def _say_errors_in_sentences(app: FastAPI) -> None:
 
     @app.exception_handler(HTTPException)
     async def nowhere(request: Request, error: HTTPException) -> Response:
-        said = f"{request.method} {request.url.path[:100]!a} is not known ({error.detail}); /docs lists what there is"
-        return response_of(failed(error.status_code, said, error.headers))
+        text = f"{request.method} {request.url.path[:100]!a} is not known ({error.detail}); /docs lists what there is"
+        return response_of(failed(error.status_code, text, error.headers))
 
     @app.exception_handler(ClientDisconnect)
     async def left(_: Request, error: ClientDisconnect) -> Response:

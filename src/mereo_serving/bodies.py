@@ -110,7 +110,7 @@ def header_options(text: str) -> tuple[str, dict[str, str]]:
         value, options = parse_options_header(text)
     except (ValueError, LookupError, TypeError):  # what the parser of mail, which is behind it, makes of it
         raise Refused(400, f"the header {text[:60]!a} cannot be read: let a library make it") from None
-    read = {key.decode("latin-1").lower(): found.decode("latin-1") for key, found in options.items()}
+    read = {key.decode("latin-1").lower(): value.decode("latin-1") for key, value in options.items()}
     return value.decode("latin-1").lower(), read
 
 
@@ -167,7 +167,7 @@ class _Parts:
     def __init__(self, folder: Path, stated: str, boundary: bytes, files: ExitStack) -> None:
         self._folder, self._stated, self._files = folder, stated, files
         self._part, self._file, self._ended = _Part(), None, False
-        self._found: dict[str, str] = {}
+        self._parts: dict[str, str] = {}
         self._open: list[BinaryIO] = []
         callbacks: "MultipartCallbacks" = {
             "on_part_begin": self._begin,
@@ -186,11 +186,11 @@ class _Parts:
     def taken(self) -> Taken:
         if not self._ended:
             raise Refused(400, "the form is cut off before its last boundary: send it whole")
-        if "frame" not in self._found:
+        if "frame" not in self._parts:
             raise Refused(422, "the form has no part 'frame'; it holds the depth image or point cloud: add it")
         for file in self._open:
             file.flush()
-        return Taken(self._found["frame"], self._found.get("mask"), self._found.get("intrinsics"))
+        return Taken(self._parts["frame"], self._parts.get("mask"), self._parts.get("intrinsics"))
 
     def _begin(self) -> None:
         self._part = _Part()
@@ -225,12 +225,12 @@ class _Parts:
             raise Refused(
                 422, f"the form has a part {part[:60]!a}; its parts are frame, mask, intrinsics: leave it out"
             )
-        if part in self._found:
+        if part in self._parts:
             raise Refused(422, f"the form has two parts {part!r}; each comes once: leave one out")
         given = options.get("filename", "")
         kind = headers.get("content-type", "").partition(";")[0].strip().lower()
         name = f"{part}{self._suffix(part, given, kind)}"
-        self._found[part] = name
+        self._parts[part] = name
         self._open.append(self._files.enter_context((self._folder / name).open("xb")))
 
     def _suffix(self, part: str, given: str, kind: str) -> str:

@@ -26,7 +26,7 @@ DRAINED_S = 2.0
 """Seconds for which a body is still taken that is refused: a client that sends cannot read why."""
 
 
-OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?", re.IGNORECASE)
+LOCAL_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?", re.IGNORECASE)
 """Names of this machine, with any port: a tunnel (``ssh -L``) may end at another one."""
 
 
@@ -86,7 +86,7 @@ def refusal(hosts: Sequence[str], origins: Sequence[str], entry: Entry | None = 
     if entry is not None and entry.token:
         if len(hosts) != 1 or not any(map(entry.is_token, given)):
             return "the address has no token, or another one: open the address that mereo serve has printed"
-    elif len(hosts) != 1 or not OWN_HOST.fullmatch(hosts[0]):
+    elif len(hosts) != 1 or not LOCAL_HOST.fullmatch(hosts[0]):
         return f"the host is {', '.join(hosts) or 'not given'}; it must be 127.0.0.1 or localhost: open that address"
     if any(origin.lower() != f"http://{hosts[0].lower()}" for origin in origins):
         return f"the page is of {', '.join(origins)}; only pages of http://{hosts[0]} are answered: open that address"
@@ -160,7 +160,7 @@ class _Body:
     def __init__(self, scope: Any, receive: Any) -> None:
         self._receive, self._whole = receive, False
         # who waits for leave to send a body is told the answer instead
-        self._asked = any(name.lower() == b"expect" for name, _ in scope["headers"])
+        self._expects_continue = any(name.lower() == b"expect" for name, _ in scope["headers"])
 
     async def receive(self) -> Any:
         message = await self._receive()
@@ -171,7 +171,7 @@ class _Body:
         """Take what is left of the body, for a while."""
         try:
             async with asyncio.timeout(DRAINED_S):
-                while most > 0 and not self._whole and not self._asked:
+                while most > 0 and not self._whole and not self._expects_continue:
                     most -= len((await self.receive()).get("body", b""))
         except TimeoutError:
             return

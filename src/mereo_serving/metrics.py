@@ -18,22 +18,22 @@ class Metrics:
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
         ProcessCollector(registry=self.registry)  # memory and time of the server's own process, on Linux
-        own = self.registry
-        self._requests = Counter("mereo_requests", "Requests that were answered.", ["endpoint", "code"], registry=own)
+        r = self.registry
+        self._requests = Counter("mereo_requests", "Requests that were answered.", ["endpoint", "code"], registry=r)
         self._request_seconds = Histogram(
             "mereo_request_seconds",
             "Seconds from a request to its answer.",
             ["endpoint"],
             buckets=SECONDS,
-            registry=own,
+            registry=r,
         )
         self._stages = Histogram(
-            "mereo_stage_seconds", "Seconds of each stage of a frame.", ["stage"], buckets=SECONDS, registry=own
+            "mereo_stage_seconds", "Seconds of each stage of a frame.", ["stage"], buckets=SECONDS, registry=r
         )
-        self._dropped = Counter("mereo_dropped_frames", "Frames nobody waited for any more.", ["reason"], registry=own)
-        self._restarts = Counter("mereo_restarts", "Processes that had to be started again.", registry=own)
-        self._waiting = Gauge("mereo_waiting_frames", "Frames that wait, their bodies included.", registry=own)
-        self._alive = Gauge("mereo_processes", "Processes that are ready to answer.", registry=own)
+        self._dropped = Counter("mereo_dropped_frames", "Frames nobody waited for any more.", ["reason"], registry=r)
+        self._restarts = Counter("mereo_restarts", "Processes that had to be started again.", registry=r)
+        self._waiting = Gauge("mereo_waiting_frames", "Frames that wait, their bodies included.", registry=r)
+        self._alive = Gauge("mereo_processes", "Processes that are ready to answer.", registry=r)
 
     def watch(self, waiting: Callable[[], int], alive: Callable[[], int]) -> None:
         """Read these whenever the numbers are asked for."""

@@ -54,8 +54,8 @@ def _operation(method: str, path: str, operation: Mapping[str, Any]) -> Iterator
     yield _table(
         ("answer", "kind", "when"),
         [
-            (code, ", ".join(found.get("content", {})) or "application/json", found.get("description", ""))
-            for code, found in answers.items()
+            (code, ", ".join(response.get("content", {})) or "application/json", response.get("description", ""))
+            for code, response in answers.items()
         ],
     )
 
@@ -73,10 +73,14 @@ def _words(text: str) -> str:
 
 def _kind(schema: Mapping[str, Any]) -> str:
     """Words for a parameter's values, with the default."""
-    choices = [one for one in schema.get("anyOf", (schema,)) if one.get("type") != "null"]
+    choices = [kind for kind in schema.get("anyOf", (schema,)) if kind.get("type") != "null"]
     words = [
-        " or ".join(one["enum"]) if "enum" in one else "numbers" if one.get("type") == "array" else str(one.get("type"))
-        for one in choices
+        " or ".join(kind["enum"])
+        if "enum" in kind
+        else "numbers"
+        if kind.get("type") == "array"
+        else str(kind.get("type"))
+        for kind in choices
     ]
     default = schema.get("default")
     return ", ".join(words) + ("" if default is None else f" (default: {str(default).lower()})")

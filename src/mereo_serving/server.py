@@ -71,7 +71,7 @@ def serve(
         names = ", ".join(service.names)
         address = entry.address(socket.getsockname()[1])
         many = "1 process" if workers == 1 else f"{workers} processes"
-        said = f"serving {names} at {address} ({many}; /docs says how to ask); Ctrl-C ends"
+        greeting = f"serving {names} at {address} ({many}; /docs says how to ask); Ctrl-C ends"
         settings = uvicorn.Config(
             make_app(service),
             http="h11",
@@ -83,15 +83,15 @@ def serve(
             server_header=False,
             limit_concurrency=config.queue + CONNECTIONS,
         )
-        GracefulServer(settings, dispatcher, said).run(sockets=[socket])
+        GracefulServer(settings, dispatcher, greeting).run(sockets=[socket])
 
 
 class GracefulServer(uvicorn.Server):
     """Server that refuses what waits as soon as it is asked to end, and answers what is begun."""
 
-    def __init__(self, config: uvicorn.Config, dispatcher: Dispatcher, said: str) -> None:
+    def __init__(self, config: uvicorn.Config, dispatcher: Dispatcher, greeting: str) -> None:
         super().__init__(config)
-        self._dispatcher, self._said = dispatcher, said
+        self._dispatcher, self._greeting = dispatcher, greeting
         self._loop: asyncio.AbstractEventLoop | None = None
 
     async def serve(self, sockets: Any = None) -> None:
@@ -103,7 +103,7 @@ class GracefulServer(uvicorn.Server):
         """Listen, and only then say so."""
         await super().startup(sockets)
         if not self.should_exit:
-            print(self._said, flush=True)
+            print(self._greeting, flush=True)
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:

@@ -68,12 +68,12 @@ class WorkerProcess:
 
     def wait_until_ready(self) -> None:
         """Wait until the weights are loaded; raises what loading raises, and ``WorkerDied``."""
-        said = self._receive()
-        if isinstance(said, Exception):
+        message = self._receive()
+        if isinstance(message, Exception):
             self.close()
-            raise said
-        self.ready = said
-        self.setup = replace(self.setup, inference=replace(self.setup.inference, precision=said.precision))
+            raise message
+        self.ready = message
+        self.setup = replace(self.setup, inference=replace(self.setup.inference, precision=message.precision))
 
     def ask(self, frame: FrameRequest) -> Reply:
         """Answer to a frame, see ``Worker``."""

@@ -16,7 +16,7 @@ from mereo.models.weights import load_model
 from mereo.training.config import PRESETS
 from mereo_experiments.speed import fitted_model
 from mereo_experiments.speed.baseline import Rival, farthest_points
-from mereo_experiments.speed.beside import LIMIT, Share, busy_processes, fair_share, measure_beside, shares_table
+from mereo_experiments.speed.busy import LIMIT, Share, busy_processes, fair_share, measure_under_load, shares_table
 from mereo_experiments.speed.report import table
 from mereo_experiments.speed.roofline import Machine, Work, count_operations
 from mereo_experiments.speed.stages import Bench, Stage, needed_nodes, random_points
@@ -132,11 +132,11 @@ def test_the_fair_share_is_what_an_even_division_of_the_cores_gives() -> None:
 
 
 def test_work_beside_busy_processes_takes_the_threads_that_are_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mereo_experiments.speed.beside.cores", lambda: 2)
+    monkeypatch.setattr("mereo_experiments.speed.busy.cores", lambda: 2)
     before, used = torch.get_num_threads(), []
-    shares = measure_beside(lambda: used.append(torch.get_num_threads()), beside=1, rounds=2)
+    shares = measure_under_load(lambda: used.append(torch.get_num_threads()), processes=1, rounds=2)
     assert used == 2 * [2, 1, 2] and torch.get_num_threads() == before
-    assert [(one.rule, one.threads, one.beside) for one in shares] == [
+    assert [(one.rule, one.threads, one.processes) for one in shares] == [
         ("as many as are free", 1, 1),
         ("one per core", 2, 1),
     ]

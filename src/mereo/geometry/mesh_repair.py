@@ -74,8 +74,8 @@ def _drop_unusable(vertices: Vertices, faces: Faces) -> Step:
     kept = faces[usable]
     _, first = np.unique(np.sort(kept, axis=1), axis=0, return_index=True)
     kept = kept[np.sort(first)]
-    used, kept = np.unique(kept, return_inverse=True)
     dropped = len(faces) - len(kept)
+    used, kept = np.unique(kept, return_inverse=True)  # flat before numpy 2
     return vertices[used], kept.reshape(-1, 3), f"dropped {dropped} unusable or repeated faces" if dropped else ""
 
 

@@ -3,7 +3,7 @@
 from mereo.evaluation.cases import EvaluatedView
 from mereo.models.config import Loss
 from mereo.synthesis.config import GenerateConfig
-from mereo_experiments.paper.encoders_losses import ENCODERS, OWN_RECIPE, lacks, recipe
+from mereo_experiments.paper.encoders_losses import AUTODECODER_RECIPE, ENCODERS, lacks, recipe
 from mereo_experiments.paper.result import Claim, Result, Row, better, compare, published
 from mereo_experiments.paper.scales import ExperimentScale
 from mereo_experiments.paper.store import Score, Store
@@ -46,6 +46,6 @@ def run(store: Store, scale: ExperimentScale) -> Result:
         scale.name,
         tuple(rows),
         (claim,),
-        (OWN_RECIPE,),
+        (AUTODECODER_RECIPE,),
         comparisons={"encoders.png": compare("segmentation", views, rows)},
     )

@@ -18,7 +18,7 @@ ENCODERS: tuple[Encoder, ...] = ("pointnet2", "point-transformer", "autodecoder"
 LOSSES: tuple[Loss, ...] = ("ce", "l1", "ce+l1", "ce+l1+cd")
 
 
-OWN_RECIPE = "The autodecoder has its own recipe, as in the paper: batch, rates, passes."
+AUTODECODER_RECIPE = "The autodecoder has its own recipe, as in the paper: batch, rates, passes."
 """Note below tables with more than one encoder."""
 
 
@@ -48,16 +48,16 @@ def features(config: TrainConfig) -> tuple[str, ...]:
         "averaged weights": config.ema_decay,
         "class offsets": config.offset_examples,
     }
-    return tuple(name for name, is_there in added.items() if is_there)
+    return tuple(name for name, is_used in added.items() if is_used)
 
 
 def lacks(scale: ExperimentScale, encoder: Encoder, loss: Loss) -> str:
     """Words for what an encoder's recipe lacks of those that another encoder's has; empty where all are alike."""
     each = {name: recipe(scale, name, loss) for name in ENCODERS}
-    own, others = each[encoder], [found for name, found in each.items() if found is not None and name != encoder]
-    assert own is not None, "nothing is asked of encoder and loss that do not go together"
+    chosen, others = each[encoder], [result for name, result in each.items() if result is not None and name != encoder]
+    assert chosen is not None, "nothing is asked of encoder and loss that do not go together"
     everything = dict.fromkeys(name for config in others for name in features(config))
-    return ", ".join(name for name in everything if name not in features(own))
+    return ", ".join(name for name in everything if name not in features(chosen))
 
 
 def run(store: Store, scale: ExperimentScale) -> Result:
@@ -79,7 +79,7 @@ def run(store: Store, scale: ExperimentScale) -> Result:
                 rows.append(Row(scene, f"{encoder}, {loss}", score, paper, lacks(scale, encoder, loss)))
     notes = (
         "L1 alone knows no segments and has no mIoU; cross-entropy alone leaves the autodecoder nothing to search by.",
-        OWN_RECIPE,
+        AUTODECODER_RECIPE,
     )
     return Result("encoders-losses", "Encoders and losses", scale.name, tuple(rows), _claims(objects, scores), notes)
 

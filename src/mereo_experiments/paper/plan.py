@@ -105,26 +105,26 @@ class Listed:
     name: str
     question: str
     costs: dict[ScaleName, Cost]
-    here: tuple[str, ...]
+    scales: tuple[str, ...]
 
 
 def listed(root: Path) -> tuple[list[Listed], int]:
     """All experiments, with those results that are in ``root``, and how many finished trainings are there."""
-    found = []
+    experiments = []
     for name in EXPERIMENTS:
         places = [results_directory(root, name, scale) for scale in SCALES]
         written = [path.parent.name for place in places for path in root.glob(f"results/{place.name}*/results.json")]
-        here = tuple(sorted(folder.removeprefix(f"{name}-") for folder in written))
+        scales = tuple(sorted(folder.removeprefix(f"{name}-") for folder in written))
         costs = {scale.name: cost(name, scale.name) for scale in SCALES.values()}
-        found.append(Listed(name, experiment(name).QUESTION, costs, here))
-    return found, len(list(root.glob(f"runs/*/{FINISHED}")))
+        experiments.append(Listed(name, experiment(name).QUESTION, costs, scales))
+    return experiments, len(list(root.glob(f"runs/*/{FINISHED}")))
 
 
 def list_experiments(root: Path) -> None:
     """Print each experiment with what it answers, its costs and those of its results that a folder holds."""
-    found, finished = listed(root)
-    for one in found:
-        print(f"{one.name}: {one.question}\n    {_costs(one)}\n    results here: {', '.join(one.here) or 'none'}")
+    experiments, finished = listed(root)
+    for item in experiments:
+        print(f"{item.name}: {item.question}\n    {_costs(item)}\n    results here: {', '.join(item.scales) or 'none'}")
     Console(markup=False, emoji=False).print(
         f"\nRun one by: mereo experiment NAME --scale cpu. Results are in {root / 'results'}, each with a table.md. "
         f"{counted(finished, 'finished training')} there: experiments share them and repeat none. Costs are those of "
@@ -134,8 +134,8 @@ def list_experiments(root: Path) -> None:
     )
 
 
-def _costs(one: Listed) -> str:
-    cpu, paper = one.costs["cpu"], one.costs["paper"]
+def _costs(item: Listed) -> str:
+    cpu, paper = item.costs["cpu"], item.costs["paper"]
     hours = cpu.seen / SEEN_PER_S / 3600
     return (
         f"cpu: {counted(cpu.trainings, 'training')}, {hours:.1f} hours; "

@@ -48,9 +48,9 @@ def run_experiment(name: str, scale: str, root: Path, workers: int = 1, objects:
     if scale not in SCALES:
         raise ValueError(f"scale {scale!r} is unknown; it must be one of {', '.join(SCALES)}: correct it")
     known = experiment(name).OBJECTS
-    if odd := [one for one in objects if one not in known]:
+    if odd := [name for name in objects if name not in known]:
         raise ValueError(f"experiment {name!r} has no object {odd[0]!r}; it has {', '.join(known)}: name some of these")
-    budget = replace(SCALES[scale], chosen=tuple(one for one in known if one in objects))
+    budget = replace(SCALES[scale], chosen=tuple(name for name in known if name in objects))
     directory = results_directory(root, name, scale, budget.chosen)
     _check_results(directory)  # before hours of work
     result = experiment(name).run(Store(root, workers), budget)
@@ -66,8 +66,8 @@ def _check_results(directory: Path) -> None:
     try:
         check_new_directory(directory, force=True)
     except FileExistsError as error:
-        found = str(error).rpartition(": ")[0]
+        folder = str(error).rpartition(": ")[0]
         raise FileExistsError(
-            f"{found}: move it away or delete it, and run the same command again, which keeps the datasets, runs and "
+            f"{folder}: move it away or delete it, and run the same command again, which keeps the datasets, runs and "
             "scores and writes these results anew"
         ) from None

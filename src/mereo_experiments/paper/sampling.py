@@ -58,12 +58,12 @@ def _claims(rows: list[Row]) -> tuple[Claim, ...]:
         Claim(
             "SortSample is better than Volume Uniform and Label Uniform.",
             {
-                name: better(found[best], found["volume-uniform"]) and better(found[best], found["label-uniform"])
-                for name, found in scores.items()
+                name: better(iou[best], iou["volume-uniform"]) and better(iou[best], iou["label-uniform"])
+                for name, iou in scores.items()
             },
         ),
         Claim(
             "Volume Uniform is better than Label Uniform (the paper's own table says so of Engine and Human only).",
-            {name: better(found["volume-uniform"], found["label-uniform"]) for name, found in scores.items()},
+            {name: better(iou["volume-uniform"], iou["label-uniform"]) for name, iou in scores.items()},
         ),
     )

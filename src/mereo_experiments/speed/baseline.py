@@ -41,8 +41,8 @@ class Rival:
         chunks = []
         for start in range(0, len(normalized), CHUNK):
             queries = torch.from_numpy(normalized[start : start + CHUNK])[None].to(self.cloud.device)
-            found = self.model.class_logits(self._predict(self.model.network, queries), queries)
-            chunks.append(found[0].cpu())
+            spread = self.model.class_logits(self._predict(self.model.network, queries), queries)
+            chunks.append(spread[0].cpu())
         return torch.cat(chunks).numpy()
 
     def _predict(self, network: Network, queries: Float[Tensor, "1 q 3"]) -> Prediction:
@@ -87,9 +87,9 @@ def decode(decoder: Decoder, code: Code, latent: Float[Tensor, "1 z"], queries: 
             rows += [everywhere, encoded]
             if decoder.lookup is not None:
                 rows.append(decoder.lookup(hidden, placed)[1])
-        layers_here = decoder.summands(number)
-        weight = torch.cat([layer.weight for layer in layers_here], dim=1)
-        hidden = nn.functional.linear(torch.cat(rows, dim=-1), weight, layers_here[0].bias)
+        local_layers = decoder.summands(number)
+        weight = torch.cat([layer.weight for layer in local_layers], dim=1)
+        hidden = nn.functional.linear(torch.cat(rows, dim=-1), weight, local_layers[0].bias)
         hidden = torch.relu(norm(hidden.flatten(0, 1))).unflatten(0, hidden.shape[:2])
     logits, distance, direction = decoder.head(hidden).split([decoder.classes, 1, 3], dim=-1)
     return Prediction(logits, distance[..., 0], direction)

@@ -16,13 +16,13 @@ from mereo.models.config import Precision
 from mereo.models.device import cpu_features
 from mereo.models.model import Model
 from mereo.models.weights import load_model
-from mereo_experiments.speed.beside import measure_beside, shares_table
+from mereo_experiments.speed.busy import measure_under_load, shares_table
 from mereo_experiments.speed.fitted_model import fitted_model
 from mereo_experiments.speed.roofline import Machine, measure_machine
 from mereo_experiments.speed.stages import Bench, Stage, random_points
 
 QUERIES = 40_000
-"""Number of points that precisions are compared at, and that are asked beside busy processes."""
+"""Number of points that precisions are compared at, and that are queried with busy processes."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def benchmark(
     precision: Precision,
     repeats: int,
     rival: bool,
-    beside: int,
+    busy: int,
     output: Path | None,
     force: bool = False,
 ) -> list[Stage]:
@@ -58,7 +58,7 @@ def benchmark(
         precision: precision of the network's products.
         repeats: repetitions of each stage.
         rival: whether to time the straightforward implementation too.
-        beside: processes that never rest, beside which queries are timed again on a CPU; 0 leaves that out.
+        busy: processes that never rest, with which queries are timed again on a CPU; 0 leaves that out.
         output: a JSON file, or None.
         force: replace an existing file, unless it is the weights.
 
@@ -73,7 +73,7 @@ def benchmark(
     machine = measure_machine(device, fast.working_dtype)
     bench = Bench(fast, view, machine, repeats, rival)
     stages = bench.run()
-    shares = measure_beside(bench.ask(QUERIES), beside, repeats) if beside and device.type == "cpu" else []
+    shares = measure_under_load(bench.ask(QUERIES), busy, repeats) if busy and device.type == "cpu" else []
     facts = load | _facts(weights or f"preset {preset}, fitted to one frame", fast, machine)
     cost = _cost(model, fast, view) if fast.working_dtype is not torch.float32 else None
     print(table(stages, facts, cost))
@@ -81,9 +81,9 @@ def benchmark(
         print(shares_table(shares, f"{QUERIES:,} queries"))
     if output is not None:
         rows = [{**asdict(stage), "ratio": stage.ratio} for stage in stages]
-        told = [{**asdict(share), "fair": share.fair, "times": share.times} for share in shares]
-        found = {**facts, "cost": None if cost is None else asdict(cost), "stages": rows, "beside": told}
-        write_json(output, found, force=force)
+        loads = [{**asdict(share), "fair": share.fair, "times": share.times} for share in shares]
+        report = {**facts, "cost": None if cost is None else asdict(cost), "stages": rows, "busy": loads}
+        write_json(output, report, force=force)
         print(f"wrote {output}")
     return stages
 
@@ -128,9 +128,9 @@ def _cost(exact: Model, fast: Model, view: SampleView) -> Cost:
     cloud = view.depth.to_points()
     points = random_points(view, QUERIES, seed=1)
     code = exact.encode(cloud)
-    one, two = exact.query(code, points), fast.query(fast.encode(cloud), points)
-    change = np.abs(one.distance - two.distance).mean() * code.normalizer.scale
-    return Cost(float((one.label != two.label).mean()), float(change))
+    exact_answer, fast_answer = exact.query(code, points), fast.query(fast.encode(cloud), points)
+    change = np.abs(exact_answer.distance - fast_answer.distance).mean() * code.normalizer.scale
+    return Cost(float((exact_answer.label != fast_answer.label).mean()), float(change))
 
 
 def table(stages: list[Stage], facts: dict[str, Any], cost: Cost | None = None) -> str:

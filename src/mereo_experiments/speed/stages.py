@@ -155,8 +155,8 @@ class Bench:
         field, search = partial(model.logits, self._code), self._code.normalizer.invert(SEARCH_BOX)
 
         def ours() -> UInt8[np.ndarray, "x y z"]:
-            found = extract_whole(field, locate(field, search), 128, model.names, model.colors, model.nested)
-            return found.grid.labels
+            output = extract_whole(field, locate(field, search), 128, model.names, model.colors, model.nested)
+            return output.grid.labels
 
         box = locate(field, search)
 
@@ -368,9 +368,9 @@ class StaticFrames:
         largest = self.sizes[-1]
         for start in range(0, max(len(points), 1), largest):
             part = points[start : start + largest]
-            found = self._ask(part, next(size for size in self.sizes if size >= len(part)))
-            labels.append(found[0])
-            distances.append(found[1])
+            output = self._ask(part, next(size for size in self.sizes if size >= len(part)))
+            labels.append(output[0])
+            distances.append(output[1])
         count = int(self._seen.count)
         check_enough(count, f"the object has {count} pixels")
         return np.concatenate(labels), np.concatenate(distances)
@@ -461,5 +461,5 @@ def _farthest(points: Float[Tensor, "n 3"], valid: Bool[Tensor, " n"], count: in
         order: Tensor = kernels.farthest_points(points[None], valid[None], count)[0]
         return order
     rows = np.flatnonzero(valid.numpy())
-    found = rows[farthest_point_order(points.numpy()[rows], count)]
-    return torch.from_numpy(np.resize(found, count) if len(found) else np.zeros(count, np.int64))
+    output = rows[farthest_point_order(points.numpy()[rows], count)]
+    return torch.from_numpy(np.resize(output, count) if len(output) else np.zeros(count, np.int64))

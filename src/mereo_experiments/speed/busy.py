@@ -1,4 +1,4 @@
-"""Queries beside processes that never rest: what an answer costs on a busy machine, against its fair share."""
+"""Queries while other processes never rest: what an answer costs on a busy machine, against its fair share."""
 
 import statistics
 import subprocess
@@ -36,28 +36,28 @@ def busy_processes(count: int) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Share:
-    """Time beside busy processes, and the fair one.
+    """Time while other processes are busy, and the fair one.
 
     Attributes:
         rule: how many threads were taken.
         threads: how many that were.
         alone: median seconds without the processes, in one thread per core.
-        busy: the same beside them, in ``threads``.
-        beside: number of processes that never rested.
-        there: number of cores.
+        busy: the same with them, in ``threads``.
+        processes: number of processes that never rested.
+        core_count: number of cores.
     """
 
     rule: str
     threads: int
     alone: float
     busy: float
-    beside: int
-    there: int
+    processes: int
+    core_count: int
 
     @property
     def fair(self) -> float:
         """Seconds if the processes and one thread per core shared the cores evenly."""
-        return fair_share(self.alone, self.there, self.beside, self.there)
+        return fair_share(self.alone, self.core_count, self.processes, self.core_count)
 
     @property
     def times(self) -> float:
@@ -65,46 +65,46 @@ class Share:
         return self.busy / self.fair
 
 
-def fair_share(alone: float, threads: int, beside: int, there: int) -> float:
+def fair_share(alone: float, threads: int, processes: int, core_count: int) -> float:
     """Seconds of what takes ``alone`` seconds in so many threads, where all that wants to run gets an equal share."""
-    return alone * max(1.0, (threads + beside) / there)
+    return alone * max(1.0, (threads + processes) / core_count)
 
 
-def measure_beside(work: Callable[[], object], beside: int, rounds: int) -> list[Share]:
+def measure_under_load(work: Callable[[], object], processes: int, rounds: int) -> list[Share]:
     """Shares of ``work`` on the CPU, in a thread for each core that busy processes leave free and in one per core.
 
     Both take turns with the work alone, so that what else runs meets all.
     """
-    there, before = cores(), torch.get_num_threads()
+    core_count, before = cores(), torch.get_num_threads()
     alone: list[float] = []
-    rules = {"as many as are free": max(1, there - beside), "one per core": there}
+    rules = {"as many as are free": max(1, core_count - processes), "one per core": core_count}
     busy: dict[str, list[float]] = {rule: [] for rule in rules}
     cpu = torch.device("cpu")
     try:
         for _ in range(rounds):
-            torch.set_num_threads(there)
+            torch.set_num_threads(core_count)
             alone.append(seconds(work, cpu))
             for rule, threads in rules.items():
                 torch.set_num_threads(threads)
-                with busy_processes(beside):
+                with busy_processes(processes):
                     busy[rule].append(seconds(work, cpu))
     finally:
         torch.set_num_threads(before)
     median = statistics.median(alone)
-    return [Share(rule, rules[rule], median, statistics.median(busy[rule]), beside, there) for rule in rules]
+    return [Share(rule, rules[rule], median, statistics.median(busy[rule]), processes, core_count) for rule in rules]
 
 
 def shares_table(shares: list[Share], what: str) -> str:
     """Markdown table of shares, times in milliseconds, and a sentence where the first is above the limit."""
-    count = shares[0].beside
+    count = shares[0].processes
     lines = [
-        f"| {what}, beside {count} busy process{'es' if count > 1 else ''} | threads | alone, ms | fair share, ms "
+        f"| {what}, with {count} busy process{'es' if count > 1 else ''} | threads | alone, ms | fair share, ms "
         "| median, ms | times fair |",
         "|---|---|---|---|---|---|",
     ]
-    for one in shares:
-        times = " | ".join(f"{1e3 * value:.3g}" for value in (one.alone, one.fair, one.busy))
-        lines.append(f"| {one.rule} | {one.threads} | {times} | {one.times:.2f} |")
+    for share in shares:
+        times = " | ".join(f"{1e3 * value:.3g}" for value in (share.alone, share.fair, share.busy))
+        lines.append(f"| {share.rule} | {share.threads} | {times} | {share.times:.2f} |")
     if shares[0].times > LIMIT:
         lines += ["", f"This is {shares[0].times:.2f} times the fair share; it must be at most {LIMIT}."]
     return "\n".join(lines) + "\n"
