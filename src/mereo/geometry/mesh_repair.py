@@ -114,7 +114,7 @@ def _drop_fragments(vertices: Vertices, faces: Faces) -> Step:
     if not stray.any() or stray.all():
         return vertices, faces, ""
     used, kept = np.unique(faces[~stray[piece]], return_inverse=True)
-    lost = len(faces) - len(kept)
+    lost = int(stray[piece].sum())
     return vertices[used], kept.reshape(-1, 3), f"removed {int(stray.sum())} fragments ({lost} faces)"
 
 
