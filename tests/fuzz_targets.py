@@ -54,17 +54,15 @@ from written_results import COLORS, grid, segments
 
 from mereo.evaluation.registration.placement import read_start
 from mereo.evaluation.sample_views import load_view
-from mereo.io.attachments import Positions, write_attachment
+from mereo.io.attachments import Positions, read_pose_table, write_attachment
 from mereo.io.intrinsics import read_intrinsics
-from mereo.io.label_volumes import read_label_volume
 from mereo.io.mesh_formats import read_segmented_mesh
-from mereo.io.pose_tables import read_pose_table
 from mereo.io.readers import read_point_cloud
 from mereo.io.simulation_states import read_states
+from mereo.io.volume_files import read_label_volume
 from mereo.io.writers.glb import write_segments_glb, write_segments_gltf
 from mereo.io.writers.medical import write_labels_seg_nrrd
-from mereo.io.writers.obj import write_segments_obj
-from mereo.io.writers.ply import write_points_ply, write_segments_ply
+from mereo.io.writers.meshes import write_points_ply, write_segments_obj, write_segments_ply
 from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.statistical_model import load_statistical_model, save_statistical_model

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 from shapes import ball, box
 
 from mereo.geometry.subdivision import split_long_edges
-from mereo.io.attachments import Positions, Surfaces, read_attachments, write_attachment
-from mereo.io.pose_tables import PoseTable, read_pose_table
+from mereo.io.attachments import PoseTable, Positions, Surfaces, read_attachments, read_pose_table, write_attachment
 from mereo.io.writers.glb import viewer_rotation
 
 POINTS = np.random.default_rng(0).normal(size=(20, 3))

@@ -10,8 +10,8 @@ from test_reconstruction import scene
 
 from mereo import __main__ as command_line
 from mereo.cli import reconstruct_many as many
+from mereo.io.atomic_files import MARKER
 from mereo.io.config import InputConfig
-from mereo.io.output_folders import MARKER
 from mereo.models.config import InferenceConfig
 
 pytestmark = pytest.mark.usefixtures("small_previews")

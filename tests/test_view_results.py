@@ -25,7 +25,7 @@ from mereo.fitting.registration.state import STATE
 from mereo.geometry.camera import SCANNER_TO_CAMERA, PointCloud
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.geometry.radii import Radii
-from mereo.io.glb_scene import MOST_PARTS, read_glb
+from mereo.io.mesh_formats import MOST_PARTS, read_glb
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION, write_segments_glb
 from mereo.models.model import Model
 from mereo.visualization.reconstruction_report import write_report

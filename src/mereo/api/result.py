@@ -24,10 +24,9 @@ from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud, camera_axes
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.transforms import fit_rigid, transform_points
-from mereo.io.atomic_files import atomic_file
+from mereo.io.atomic_files import atomic_file, new_directory
 from mereo.io.attachments import Attachment, Content, Positions, Surfaces, read_attachments, write_attachment
 from mereo.io.config import DEFAULT_FILES, CarryFrame, FilesConfig, Format
-from mereo.io.output_folders import new_directory
 from mereo.io.point_arrays import points_of
 from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame

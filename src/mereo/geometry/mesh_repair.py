@@ -17,8 +17,7 @@ from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.mesh_check import Faces, Vertices, examine, faces_astray, mesh_of, solid_of
-from mereo.geometry.overlap import overlaps
+from mereo.geometry.mesh_check import Faces, Vertices, examine, faces_astray, mesh_of, overlaps, solid_of
 
 MERGED_WITHIN = (1e-6, 1e-4)
 """Vertices of open edges this near to each other, in diagonals of the box, count as one; the less, where it helps."""

@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mereo.geometry.camera import Camera, DepthImage
-from mereo.io.depth_formats import metres, open_image
 from mereo.io.errors import SizeError, check_count, limited_memory, reason
 from mereo.io.intrinsics import camera_from_fields, warn_of_distortion
+from mereo.io.readers import metres, open_image
 
 IMAGE, CLOUD, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/CameraInfo"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"

@@ -18,9 +18,8 @@ from mereo.geometry.brief import counted
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import CloudAxes
 from mereo.io.config import InputConfig
-from mereo.io.depth_formats import is_depth_image, read_raw_depth
 from mereo.io.intrinsics import read_intrinsics
-from mereo.io.readers import depth_of, read_points, usable_depth, valid_points
+from mereo.io.readers import depth_of, is_depth_image, read_points, read_raw_depth, usable_depth, valid_points
 from mereo.io.ros_recordings import RecordedFrame, is_recording, recorded_frame, recorded_frames
 
 FORMAT_UNITS_M = {".zdf": 0.001}

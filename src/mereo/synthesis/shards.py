@@ -35,8 +35,7 @@ from jaxtyping import Float
 
 from mereo.io.atomic_files import check_place
 from mereo.io.checked_tensors import pack_tensors
-from mereo.io.object_storage import Place
-from mereo.io.places import claim, names_in
+from mereo.io.object_storage import Place, claim, names_in
 from mereo.io.progress import progress
 from mereo.scenes.random_states import scene_model, states_for
 from mereo.scenes.registry import is_yaml, load_scene

@@ -15,8 +15,8 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from mereo.deformation.moving_least_squares import spread
+from mereo.geometry.camera import SightKind, SightLines
 from mereo.geometry.downsampling import means_along_sight
-from mereo.geometry.sight_lines import SightKind, SightLines
 from mereo.geometry.transforms import rotation_along
 
 MOST_POINTS = 6000

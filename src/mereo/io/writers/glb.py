@@ -10,15 +10,12 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mereo.geometry.conventions import CloudAxes
-from mereo.geometry.creases import split_at_creases
 from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
 from mereo.geometry.radii import STOPS, Radii
+from mereo.geometry.subdivision import split_at_creases
 from mereo.io.atomic_files import atomic_file
 from mereo.io.mesh_formats import VIEWER_ROOT
-from mereo.io.writers.segment_table import with_faces
-
-OUTER_OPACITY = 0.35
-"""Opacity of segments with others nested in them, which viewers draw see-through."""
+from mereo.io.writers.meshes import OUTER_OPACITY, with_faces
 
 GLTF_CAMERA_ROTATION = np.diag([1.0, -1.0, -1.0])
 """Rotation by half a turn about x: from the camera frame (y down, z forward) to glTF (y up, z toward the viewer)."""

@@ -1,9 +1,10 @@
-"""Label grids for medical viewers: NIfTI and 3D Slicer's ``.seg.nrrd``, both in millimetres, at the same place.
+"""Label grids and volumes of numbers for medical viewers: NIfTI, NRRD and 3D Slicer's ``.seg.nrrd``, in millimetres.
 
 The rule: **LPS coordinates in millimetres are the input's coordinates**, axis by axis (x to the patient's left, y to
 the back, z to the head). An axial slice, which viewers draw as seen from the feet with left on the right and back
 below, is then what the camera saw: x right, y down, z forward. NIfTI counts in RAS, so there the first two axes change
-sign. Why not another rule: docs/design/0012-files-out.md.
+sign. Why not another rule: docs/design/0012-files-out.md. NRRD is written here and not by pynrrd, which takes ASCII
+only (names may have any letters) and writes the time of day.
 """
 
 import gzip
@@ -19,27 +20,27 @@ from jaxtyping import Float
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import Color
 from mereo.io.atomic_files import atomic_file
-from mereo.io.writers.segment_table import segment_table
+from mereo.io.volume_files import Volume, segment_fields
+from mereo.io.writers.meshes import segment_table
 
 MM_PER_M = 1000.0
 
-COMMENT = 6
-"""Code of NIfTI's header extensions that hold plain text."""
+RAS_FROM_LPS = np.array([-1.0, -1.0, 1.0, 1.0])[:, None]
 
-SLICER_HEADER = """NRRD0004
+LEVEL = 6
+"""Level of compression of volumes: of intensities, 9 takes three times as long and saves a hundredth."""
+
+NRRD_HEADER = """{magic}
 # written by mereo; format: http://teem.sourceforge.net/nrrd/format.html
-type: unsigned char
+type: {type}
 dimension: 3
 space: left-posterior-superior
 sizes: {sizes}
 space directions: {directions}
 kinds: domain domain domain
-encoding: gzip
+{endian}encoding: gzip
 space origin: {origin}
-{segments}Segmentation_ContainedRepresentationNames:=Binary labelmap|Closed surface|
-Segmentation_MasterRepresentation:=Binary labelmap
-Segmentation_ReferenceImageExtentOffset:=0 0 0
-
+{more}
 """
 
 
@@ -59,16 +60,27 @@ def write_labels_nifti(path: str | Path, grid: LabelGrid, colors: Sequence[Color
     """
     nifti: Any = nibabel()
     image = nifti.Nifti1Image(grid.labels, T_ras_index(grid, unit_m))
-    image.header.set_xyzt_units("mm")
+    _place_in_scanner(image)
     image.header.set_intent("label", name="mereo")
+    table = json.dumps({"segments": segment_table(grid.names, colors)})
+    # code 6: a comment of plain text
+    image.header.extensions.append(nifti.nifti1.Nifti1Extension(6, table.encode("ascii")))
+    _write_nifti(Path(path), image, 9)
+
+
+def _place_in_scanner(image: Any) -> None:
+    """State millimetres, and the image's affine in both of NIfTI's ways."""
+    image.header.set_xyzt_units("mm")
     image.set_qform(image.affine, code="scanner")
     image.set_sform(image.affine, code="scanner")
-    table = json.dumps({"segments": segment_table(grid.names, colors)})
-    image.header.extensions.append(nifti.nifti1.Nifti1Extension(COMMENT, table.encode("ascii")))
+
+
+def _write_nifti(path: Path, image: Any, level: int) -> None:
     content = image.to_bytes()
     with atomic_file(path) as partial:
         # mtime: the same result gives the same bytes
-        partial.write_bytes(gzip.compress(content, mtime=0) if Path(path).suffix == ".gz" else content)
+        is_packed = path.suffix.lower() == ".gz"
+        partial.write_bytes(gzip.compress(content, level, mtime=0) if is_packed else content)
 
 
 def nibabel() -> Any:
@@ -84,16 +96,14 @@ def T_ras_index(grid: LabelGrid, unit_m: float) -> Float[np.ndarray, "4 4"]:
     transform = np.eye(4)
     transform[:3, :3] = np.diag(grid.spacing)
     transform[:3, 3] = grid.origin
-    ras_from_input = np.array([-1.0, -1.0, 1.0, 1.0])[:, None]
     transform[:3] *= MM_PER_M * unit_m
-    return ras_from_input * transform + 0.0  # no -0
+    return RAS_FROM_LPS * transform + 0.0  # no -0
 
 
 def write_labels_seg_nrrd(path: str | Path, grid: LabelGrid, colors: Sequence[Color], unit_m: float = 1.0) -> None:
     """Write a segmentation of 3D Slicer: ``LPS = position * 1000 * unit_m``, with names, colours and labels.
 
-    One layer: a voxel has one label, and inside a nested segment it is the inner one's. Written here and not by pynrrd,
-    which takes ASCII only (names may have any letters) and writes the time of day.
+    One layer: a voxel has one label, and inside a nested segment it is the inner one's.
 
     Args:
         path: the file; Slicer knows it as a segmentation by its end, ``.seg.nrrd``.
@@ -102,12 +112,16 @@ def write_labels_seg_nrrd(path: str | Path, grid: LabelGrid, colors: Sequence[Co
         unit_m: metres per unit of the input.
     """
     scale = MM_PER_M * unit_m
-    directions = " ".join(vector(row) for row in np.diag(grid.spacing * scale))
-    header = SLICER_HEADER.format(
+    segments = "".join(_segment_fields(grid, index, color) for index, color in enumerate(colors))
+    header = NRRD_HEADER.format(
+        magic="NRRD0004",
+        type="unsigned char",
         sizes=" ".join(str(n) for n in grid.labels.shape),
-        directions=directions,
-        origin=vector(grid.origin * scale),
-        segments="".join(_segment_fields(grid, index, color) for index, color in enumerate(colors)),
+        directions=" ".join(_vector(row) for row in np.diag(grid.spacing * scale)),
+        endian="",
+        origin=_vector(grid.origin * scale),
+        more=f"{segments}Segmentation_ContainedRepresentationNames:=Binary labelmap|Closed surface|\n"
+        "Segmentation_MasterRepresentation:=Binary labelmap\nSegmentation_ReferenceImageExtentOffset:=0 0 0\n",
     )
     with atomic_file(path) as partial:
         partial.write_bytes(header.encode("utf-8") + gzip.compress(grid.labels.tobytes(order="F"), mtime=0))
@@ -129,6 +143,67 @@ def _segment_fields(grid: LabelGrid, index: int, color: Color) -> str:
     return "".join(f"Segment{index}_{key}:={value}\n" for key, value in values.items())
 
 
-def vector(values: Float[np.ndarray, "3"]) -> str:
+def _vector(values: Float[np.ndarray, "3"]) -> str:
     """A vector as NRRD writes it."""
     return f"({','.join(repr(float(value)) for value in values)})"
+
+
+# --- volumes of numbers -----------------------------------------------------------------------------------------------
+
+
+def write_volume(path: Path, volume: Volume, unit_m: float = 1.0) -> None:
+    """Write NIfTI-1 (``.nii``, ``.nii.gz``) or NRRD (``.nrrd``, ``.nhdr``), by the name, in millimetres.
+
+    LPS coordinates in millimetres are the input's coordinates; NIfTI counts in RAS. A ``.nhdr`` has its values beside
+    it, in ``.raw.gz``.
+
+    Args:
+        path: the file.
+        volume: its ``T_world_index`` leads to the input's frame and unit. What else the header of its file says is kept
+            where it does not depend on the grid.
+        unit_m: metres per unit of the input.
+
+    Raises ``ImportError`` for NIfTI without the extra `medical`.
+    """
+    T_lps_index = volume.T_world_index.copy()
+    T_lps_index[:3] *= MM_PER_M * unit_m
+    if ".nii" in path.name.lower():
+        _write_volume_nifti(path, volume, RAS_FROM_LPS * T_lps_index + 0.0)  # no -0
+    else:
+        _write_nrrd(path, volume, T_lps_index)
+
+
+def _write_volume_nifti(path: Path, volume: Volume, T_ras_index: Float[np.ndarray, "4 4"]) -> None:
+    nifti: Any = nibabel()
+    header = volume.header if isinstance(volume.header, nifti.Nifti1Header) else None
+    image = nifti.Nifti1Image(volume.values, T_ras_index, header, dtype=volume.values.dtype)
+    image.header.set_data_dtype(volume.values.dtype)
+    image.header.set_slope_inter(volume.slope, volume.intercept)  # of values that are stored as they are
+    _place_in_scanner(image)
+    _write_nifti(path, image, LEVEL)
+
+
+def _write_nrrd(path: Path, volume: Volume, T_lps_index: Float[np.ndarray, "4 4"]) -> None:
+    """NRRD of the values as they are stored; extents of 3D Slicer's segments are those of the whole grid."""
+    values = volume.values.astype(volume.values.dtype.newbyteorder("<"), copy=False)
+    detached = path.with_suffix(".raw.gz") if path.suffix.lower() == ".nhdr" else None
+    fields = segment_fields(volume.header)
+    whole = " ".join(f"0 {n - 1}" for n in values.shape)
+    fields |= {key: whole for key in fields if key.endswith("_Extent")}
+    fields |= {key: "0 0 0" for key in fields if key.endswith("Segmentation_ReferenceImageExtentOffset")}
+    more = "".join(f"{key}:={value}\n" for key, value in fields.items())
+    header = NRRD_HEADER.format(
+        magic="NRRD0005",
+        type={"float32": "float", "float64": "double"}.get(values.dtype.name, values.dtype.name),
+        sizes=" ".join(str(n) for n in values.shape),
+        directions=" ".join(_vector(axis) for axis in T_lps_index[:3, :3].T),
+        endian="endian: little\n",
+        origin=_vector(T_lps_index[:3, 3]),
+        more=more if detached is None else f"data file: {detached.name}\n{more}",
+    )
+    content = gzip.compress(values.tobytes(order="F"), LEVEL, mtime=0)
+    if detached is not None:
+        with atomic_file(detached) as partial:
+            partial.write_bytes(content)
+    with atomic_file(path) as partial:
+        partial.write_bytes(header.encode("utf-8") + (content if detached is None else b""))

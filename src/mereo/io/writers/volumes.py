@@ -1,4 +1,4 @@
-"""Label grids for numpy (NPZ) and for ParaView and VTK (VTI), in the grid's frame and unit.
+"""Label grids and observed points for numpy (NPZ), label grids for ParaView and VTK (VTI), in their frame and unit.
 
 The VTI is written by hand: it is a page of XML around one compressed array, and VTK itself is 100 MB.
 Its format: https://docs.vtk.org/en/latest/vtk_file_formats/vtkxml_file_format.html
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from mereo.geometry.labels import LabelGrid
+from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import Color
 from mereo.io.atomic_files import atomic_file
 
@@ -35,9 +35,6 @@ compressor="vtkZLibDataCompressor">
   </ImageData>
 </VTKFile>
 """
-
-RADII = '        <DataArray type="Float32" Name="radius95" format="binary">{}</DataArray>\n'
-"""Second array of the VTI, in the unit of its coordinates."""
 
 
 def write_labels_npz(
@@ -69,6 +66,25 @@ def write_labels_npz(
         np.savez_compressed(partial, **arrays)
 
 
+def write_points_npz(path: str | Path, cloud: SegmentedCloud) -> None:
+    """Write an NPZ file with the arrays of a ``SegmentedCloud``.
+
+    They are ``points``, ``labels``, ``confidence``, ``occupancy``, ``names`` and ``colors``; ``names[k]`` and
+    ``colors[k]`` are of label k + 1. ``confidence`` and ``occupancy`` are a network's, and left out without one.
+    Positions are in the cloud's frame and unit.
+    """
+    chances: dict[str, Any] = dict(cloud.chances)
+    with atomic_file(path) as partial:
+        np.savez_compressed(
+            partial,
+            points=cloud.points,
+            labels=cloud.labels,
+            **chances,
+            names=np.asarray(cloud.names),
+            colors=np.asarray(cloud.colors, dtype=np.uint8),
+        )
+
+
 def write_labels_vti(
     path: str | Path,
     grid: LabelGrid,
@@ -80,6 +96,7 @@ def write_labels_vti(
     ``segment_names[k]`` is the segment of label k + 1; label 0 is empty space. Coordinates are in the grid's frame and
     unit, and so are ``radii``, which become the array ``radius95``.
     """
+    array = '        <DataArray type="Float32" Name="radius95" format="binary">{}</DataArray>\n'
     codes = (str(code) for name in grid.names for code in (*name.encode("utf-8"), 0))
     text = VTI.format(
         extent=" ".join(f"0 {n - 1}" for n in grid.labels.shape),
@@ -89,7 +106,7 @@ def write_labels_vti(
         names=" ".join(codes),
         colors=" ".join(str(value) for color in colors for value in color),
         labels=_compressed(grid.labels),
-        radii="" if radii is None else RADII.format(_compressed(radii.astype("<f4"))),
+        radii="" if radii is None else array.format(_compressed(radii.astype("<f4"))),
     )
     with atomic_file(path) as partial:
         partial.write_text(text, "utf-8")
