@@ -60,7 +60,7 @@ from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.readers import read_point_cloud
 from mereo.io.simulation_states import read_states
 from mereo.io.volume_files import read_label_volume
-from mereo.io.writers.glb import write_segments_glb, write_segments_gltf
+from mereo.io.writers.glb import write_segments_glb
 from mereo.io.writers.medical import write_labels_seg_nrrd
 from mereo.io.writers.meshes import write_points_ply, write_segments_obj, write_segments_ply
 from mereo.models.weights import load_model
@@ -122,10 +122,9 @@ ALL: tuple[Target, ...] = (
     Target("mesh.3mf", exported("3mf"), read_segmented_mesh, library="lxml"),
     Target("text.stl", exported("stl_ascii"), carried),
     Target("own.glb", lambda p: write_segments_glb(p, segments()), carried),
-    Target("own.gltf", lambda p: write_segments_gltf(p, segments()), carried),
     Target("own.obj", lambda p: write_segments_obj(p, segments()), carried),
     Target("own.ply", lambda p: write_segments_ply(p, segments()), carried),
-    Target("carried.pcd", lambda p: write_attachment(p, Positions(POINTS), 1.0, np.eye(3), 1.0), carried),
+    Target("carried.xyz", lambda p: write_attachment(p, Positions(POINTS), 1.0, np.eye(3), 1.0), carried),
     Target("poses.csv", text(TURNS), read_pose_table),
     Target("labels.nii", nifti, read_label_volume, library="nibabel"),
     Target("labels.nii.gz", nifti, read_label_volume, library="nibabel"),

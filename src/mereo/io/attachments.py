@@ -1,7 +1,7 @@
 """Attachments: files of what is defined with an object's rest model (vessels, a resection plane, a grasp).
 
-Meshes (STL, PLY, OBJ, GLB, glTF), point clouds (PLY, PCD, XYZ, NPY), tables of points or poses (CSV), volumes (NIfTI,
-NRRD). They are read whole, moved with the object, and written in their own format again.
+Meshes (STL, PLY, OBJ, GLB), point clouds (PLY, XYZ, NPY), tables of points or poses (CSV), volumes (NIfTI, NRRD). They
+are read whole, moved with the object, and written in their own format again.
 """
 
 import csv
@@ -21,13 +21,15 @@ from mereo.io.errors import readable
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.readers import CLOUD_READERS, ply_counts
 from mereo.io.volume_files import VOLUME_SUFFIXES, Volume, is_volume, read_scalar_volume
-from mereo.io.writers.glb import write_segments_glb, write_segments_gltf
+from mereo.io.writers.glb import write_segments_glb
 from mereo.io.writers.medical import write_volume
 from mereo.io.writers.meshes import write_positions_ply, write_segments_obj, write_segments_ply, write_surface_stl
 
-MESHES = (".stl", ".ply", ".obj", ".glb", ".gltf")
-CLOUDS = (".ply", ".pcd", ".xyz", ".txt", ".pts", ".asc", ".npy")
-TABLE = ".csv"
+MESHES = (".stl", ".ply", ".obj", ".glb")
+CLOUDS = (".ply", ".xyz", ".txt", ".pts", ".asc", ".npy")
+
+POSITION, QUATERNION = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
+"""Names of a table's columns, in any order and case; others are kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +86,10 @@ class PoseTable:
 
     def text(self, factor: float = 1.0) -> str:
         """Content of a file: positions times ``factor``, and orientations; what other columns say stays."""
-        columns = {_key(name): i for i, name in enumerate(self.header)}
-        changed = dict(zip(_position(columns), (factor * self.points).T, strict=True))
-        if self.rotations is not None and QUATERNION[0] in columns:
+        columns = _columns(self.header)
+        changed = dict(zip(POSITION, (factor * self.points).T, strict=True))
+        if self.rotations is not None:
             changed |= dict(zip(QUATERNION, Rotation.from_matrix(self.rotations).as_quat().T, strict=True))
-        elif self.rotations is not None:
-            changed |= dict(zip(TURN, self.rotations.reshape(-1, 9).T, strict=True))
         cells = np.array(self.rows, dtype=object).reshape(-1, len(self.header))
         for name, values in changed.items():
             cells[:, columns[name]] = [f"{value:.10g}" for value in values]
@@ -139,12 +139,12 @@ def _read(path: Path) -> Content:
     if is_volume(path):
         return read_scalar_volume(path)
     suffix = path.suffix.lower()
-    known = dict.fromkeys((*MESHES, *CLOUDS, TABLE, *VOLUME_SUFFIXES))
+    known = dict.fromkeys((*MESHES, *CLOUDS, ".csv", *VOLUME_SUFFIXES))
     if path.exists() and suffix not in known:
         raise ValueError(
             f"{path} has the suffix {path.suffix!r}; what is carried is one of {', '.join(known)}: convert it"
         )
-    if suffix == TABLE:
+    if suffix == ".csv":
         return read_pose_table(path)
     is_mesh = suffix in MESHES
     if suffix == ".ply":
@@ -182,55 +182,26 @@ def write_attachment(
     elif isinstance(content, PoseTable):
         with atomic_file(path) as partial:
             partial.write_text(content.text(factor), encoding="utf-8")
+    elif isinstance(content, Positions) and suffix == ".ply":
+        write_positions_ply(path, factor * content.points)
     elif isinstance(content, Positions):
-        _write_cloud(path, factor * content.points)
-    elif suffix in (".glb", ".gltf"):
-        with_unit = write_segments_glb if suffix == ".glb" else write_segments_gltf
-        with_unit(path, content.mesh, frame_rotation, unit_m)
+        with atomic_file(path) as partial:
+            if suffix == ".npy":
+                np.save(partial, factor * content.points)
+            else:
+                np.savetxt(partial, factor * content.points, fmt="%.10g")
+    elif suffix == ".glb":
+        write_segments_glb(path, content.mesh, frame_rotation, unit_m)
     else:
         plain = {".ply": write_segments_ply, ".obj": write_segments_obj, ".stl": write_surface_stl}[suffix]
         plain(path, content.mesh.transformed(np.diag([factor] * 3 + [1.0])))
 
 
-def _write_cloud(path: Path, points: Float[np.ndarray, "n 3"]) -> None:
-    suffix = path.suffix.lower()
-    if suffix == ".ply":
-        write_positions_ply(path, points)
-        return
-    with atomic_file(path) as partial:
-        if suffix == ".npy":
-            np.save(partial, points)
-        elif suffix == ".pcd":
-            partial.write_bytes(_pcd(points))
-        else:
-            np.savetxt(partial, points, fmt="%.10g")
-
-
-def _pcd(points: Float[np.ndarray, "n 3"]) -> bytes:
-    """Content of a binary PCD file (pointclouds.org/documentation/tutorials/pcd_file_format.html)."""
-    count = len(points)
-    lines = ["VERSION .7", "FIELDS x y z", "SIZE 4 4 4", "TYPE F F F", "COUNT 1 1 1", f"WIDTH {count}", "HEIGHT 1"]
-    lines += ["VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {count}", "DATA binary", ""]
-    return "\n".join(lines).encode("ascii") + points.astype("<f4").tobytes()
-
-
 # --- tables of positions and poses ------------------------------------------------------------------------------------
-
-# Rows with x, y, z, and an orientation where there is one; other columns are kept. Columns are known by their names, in
-# any order and case. A position is ``x, y, z``, an orientation a quaternion ``qx, qy, qz, qw``. Or a row holds a
-# homogeneous matrix, ``m00`` to ``m23``, first the row, then the column: ``m03, m13, m23`` are the position.
-
-POSITION = ("x", "y", "z")
-QUATERNION = ("qx", "qy", "qz", "qw")
-TURN = tuple(f"m{row}{column}" for row in range(3) for column in range(3))
-SHIFT = tuple(f"m{row}3" for row in range(3))
-
-TOLERANCE = 1e-3
-"""Largest difference of a matrix from a rotation, or of a quaternion's length from 1."""
 
 
 def read_pose_table(path: Path) -> PoseTable:
-    """Table of a CSV file, separated by commas, semicolons or tabs.
+    """Table of a CSV file, separated by commas, semicolons or tabs: ``POSITION``, with ``QUATERNION`` where it has any.
 
     Raises ``FileNotFoundError`` and ``ValueError``: columns are missing, a cell is no number, a row is too short or
     its orientation is none.
@@ -242,16 +213,19 @@ def read_pose_table(path: Path) -> PoseTable:
         reader = csv.reader(io.StringIO(text), delimiter=delimiter)
         lines = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
         (_, header), *body = lines
-        columns = {_key(name): i for i, name in enumerate(header)}
-        position = _position(columns)
-        turn = _orientation(columns)
+        columns = _columns(header)
+        if not set(POSITION) <= columns.keys():
+            raise ValueError(f"its columns are {', '.join(columns)}; it needs x, y, z")
+        stated, lacking = ([name for name in QUATERNION if (name in columns) == has] for has in (True, False))
+        if stated and lacking:
+            raise ValueError(f"it has a column {stated[0]!r} but no {lacking[0]!r}")
         if not body:
             raise ValueError("it has a header and no row")
         for line, row in body:
             if len(row) != len(header):
                 raise ValueError(f"line {line} has {len(row)} cells and the header {len(header)}")
-        points = _numbers(body, columns, position)
-        rotations = None if turn is None else _rotations(body, _numbers(body, columns, turn))
+        points = _numbers(body, columns, POSITION)
+        rotations = _rotations(body, _numbers(body, columns, QUATERNION)) if stated else None
     return PoseTable(tuple(header), tuple(tuple(row) for _, row in body), delimiter, points, rotations)
 
 
@@ -259,30 +233,8 @@ Lines = list[tuple[int, list[str]]]
 """Number and cells of each line."""
 
 
-def _key(name: str) -> str:
-    return name.strip().lower()
-
-
-def _position(columns: dict[str, int]) -> tuple[str, ...]:
-    """Names of the columns that hold the position."""
-    by_name, by_matrix = ({*names} <= columns.keys() for names in (POSITION, SHIFT))
-    if by_name == by_matrix:
-        which = "both" if by_name else "neither"
-        raise ValueError(
-            f"its columns are {', '.join(columns)}, with {which} of x, y, z and m03, m13, m23; it needs one of them"
-        )
-    return POSITION if by_name else SHIFT
-
-
-def _orientation(columns: dict[str, int]) -> tuple[str, ...] | None:
-    """Names of the columns that hold the orientation; None where there are none."""
-    for names in (QUATERNION, TURN):
-        missing = [name for name in names if name not in columns]
-        if not missing:
-            return names
-        if len(missing) < len(names):
-            raise ValueError(f"it has a column {next(n for n in names if n in columns)!r} but no {missing[0]!r}")
-    return None
+def _columns(header: Sequence[str]) -> dict[str, int]:
+    return {name.strip().lower(): index for index, name in enumerate(header)}
 
 
 def _numbers(lines: Lines, columns: dict[str, int], names: tuple[str, ...]) -> Float[np.ndarray, "n k"]:
@@ -297,15 +249,9 @@ def _number(line: int, cell: str, name: str) -> float:
     raise ValueError(f"line {line} has {cell!r} in the column {name}, which is no finite number")
 
 
-def _rotations(lines: Lines, values: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n 3 3"]:
-    """Orientations by quaternions (four values) or matrices (nine)."""
-    if values.shape[1] == len(QUATERNION):
-        off = np.abs(np.linalg.norm(values, axis=1) - 1)
-        result = Rotation.from_quat(np.where(off[:, None] < TOLERANCE, values, [0.0, 0.0, 0.0, 1.0])).as_matrix()
-    else:
-        result = values.reshape(-1, 3, 3)
-        off = np.abs(result @ result.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        off = np.where(np.linalg.det(result) > 0, off, np.inf)
-    if (off >= TOLERANCE).any():
-        raise ValueError(f"line {lines[int(np.argmax(off >= TOLERANCE))][0]} has an orientation that is no rotation")
-    return result
+def _rotations(lines: Lines, quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
+    """Orientations of quaternions, whose lengths are 1."""
+    off = np.abs(np.linalg.norm(quaternions, axis=1) - 1) >= 1e-3
+    if off.any():
+        raise ValueError(f"line {lines[int(np.argmax(off))][0]} has an orientation that is no rotation")
+    return Rotation.from_quat(quaternions).as_matrix()

@@ -1,6 +1,6 @@
 """Datasets: shards of 64 examples, each written whole or not at all, the same bits for any number of workers.
 
-Example i comes from (seed, i) alone. A dataset is a directory, or a folder of an object storage (``io.places``), with
+Example i comes from (seed, i) alone. A dataset is a directory, or one in a storage (``io.object_storage``), with
 ``manifest.json``, everything needed to make it again, and ``shard-00000.safetensors`` and so on, whose tensors are (e
 examples, p stored points, q queries):
 

@@ -1,6 +1,5 @@
 """GLB: binary glTF 2.0 (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html), metres and y up."""
 
-import base64
 import json
 import struct
 from pathlib import Path
@@ -37,7 +36,7 @@ def write_segments_glb(
     """Write a GLB file: one named, coloured node per segment, below a root node that turns the frame for viewers.
 
     Vertices stay as they are (rounded to float32, all that glTF holds), each with its normal; where faces meet at a
-    crease (``geometry.creases``), copies follow them, with the same attributes but normals of their own. Segments
+    crease (``geometry.subdivision``), copies follow them, with the same attributes but normals of their own. Segments
     without faces are left out; those around a nested segment that was found are translucent.
 
     Args:
@@ -58,19 +57,6 @@ def write_segments_glb(
         file.write(struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary)))
         file.write(struct.pack("<I4s", len(text), b"JSON") + text)
         file.write(struct.pack("<I4s", len(binary), b"BIN\0") + binary)
-
-
-def write_segments_gltf(
-    path: str | Path,
-    surfaces: SegmentedMesh,
-    frame_rotation: Float[np.ndarray, "3 3"] = GLTF_CAMERA_ROTATION,
-    unit_m: float = 1.0,
-) -> None:
-    """Write what ``write_segments_glb`` does as a text file, with the arrays in it as base64."""
-    document, binary = _gltf_document(surfaces, frame_rotation, unit_m)
-    document["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(binary).decode("ascii")
-    with atomic_file(path) as partial:
-        partial.write_text(json.dumps(document, ensure_ascii=False), encoding="utf-8")
 
 
 def _gltf_document(
