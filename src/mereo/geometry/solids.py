@@ -331,11 +331,9 @@ def _winding_nodes(
 
 # --- winding numbers --------------------------------------------------------------------------------------------------
 
-# Inside tests for all nodes of a grid at once, by winding numbers along its columns.
-#
-# Instead of a test per node, every triangle is projected onto the (x, y) columns it covers; along each column the
-# signed crossings below a node add up to the winding number there. A column through an edge or a vertex counts as one
-# beside it, the same one for all triangles, so a closed mesh has no cracks.
+# For all nodes of a grid at once: every triangle is projected onto the (x, y) columns it covers, and along each column
+# the signed crossings below a node add up to the winding number there. A column through an edge or a vertex counts as
+# one next to it, the same for all triangles, so a closed mesh has no cracks.
 
 
 def winding_grid(
@@ -396,8 +394,6 @@ def _covered_columns(
 
 
 # --- moments ----------------------------------------------------------------------------------------------------------
-
-# Volume and centre of what belongs to each segment of a mesh, and how they change with its vertices.
 
 
 def owned_centroids(mesh: SegmentedMesh) -> Float[np.ndarray, "s 3"]:

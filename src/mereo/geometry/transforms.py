@@ -132,12 +132,7 @@ class Normalizer:
 
 # --- best rotations ---------------------------------------------------------------------------------------------------
 
-# Rigid motions that bring points onto others, in closed form and robustly.
-#
-# A motion is ``y = R x + t``. Notation: n points, s sets of points; ``T_a_b`` maps b-coordinates to a-coordinates.
-
-ROUNDS = 20
-"""Rounds of reweighting in ``robust_rigid``; it has converged by then."""
+# Rigid motions ``y = R x + t`` that bring points onto others. Notation: n points, s sets of points.
 
 
 def best_rotations(covariance: Float[np.ndarray, "*s 3 3"]) -> Float[np.ndarray, "*s 3 3"]:
@@ -157,7 +152,7 @@ def robust_rigid(
 ) -> Float[np.ndarray, "4 4"]:
     """``fit_rigid`` under a Cauchy loss whose scale falls from the residuals' own median to ``sigma``."""
     T = fit_rigid(source, target, weight)
-    for _ in range(ROUNDS):
+    for _ in range(20):  # it has converged by then
         distance = np.linalg.norm(source @ T[:3, :3].T + T[:3, 3] - target, axis=1)
         scale = max(float(np.median(distance)), sigma)
         T = fit_rigid(source, target, weight / (1.0 + (distance / scale) ** 2))

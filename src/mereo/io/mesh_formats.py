@@ -263,9 +263,6 @@ def _distinct(rows: Float[np.ndarray, "v k"]) -> tuple[Int[np.ndarray, " w"], In
 
 # --- GLB files as a viewer shows them ---------------------------------------------------------------------------------
 
-MOST_PARTS = 200
-"""Meshes that are shown one by one; the others become one part, as labels are few."""
-
 
 @dataclass(frozen=True, eq=False)
 class GlbScene:
@@ -322,7 +319,6 @@ def read_glb(path: str | Path) -> GlbScene:
         unit_m = float(abs(np.linalg.det(root)) ** (1 / 3))
         if not unit_m > 0:
             raise ValueError("its root node has a scale of 0")
-        parts = _few(parts)
         mesh = SegmentedMesh(_renamed([part.segment for part in parts]))
         return GlbScene(mesh, tuple(part.colors for part in parts), _radii(parts), root / unit_m, unit_m, is_own)
 
@@ -371,18 +367,6 @@ def _screen(linear: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
     light = np.clip(linear, 0.0, 1.0)
     share = np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)
     return np.rint(255 * share).astype(np.uint8)
-
-
-def _few(parts: list[_GlbPart]) -> list[_GlbPart]:
-    """The first ``MOST_PARTS`` of them, and all others as one."""
-    if len(parts) <= MOST_PARTS:
-        return parts
-    rest = [part.segment for part in parts[MOST_PARTS:]]
-    starts = np.cumsum([0, *(len(segment.vertices) for segment in rest)])
-    vertices = np.concatenate([segment.vertices for segment in rest])
-    faces = np.concatenate([segment.faces + start for segment, start in zip(rest, starts, strict=False)])
-    joined = Segment(f"{len(rest)} more", rest[0].color, vertices, faces, solid=False)
-    return [*parts[:MOST_PARTS], _GlbPart(joined, None, None, False)]
 
 
 def _renamed(segments: list[Segment]) -> tuple[Segment, ...]:

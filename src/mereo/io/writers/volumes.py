@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32
 
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import Color
@@ -37,14 +37,7 @@ compressor="vtkZLibDataCompressor">
 """
 
 
-def write_labels_npz(
-    path: str | Path,
-    labels: UInt8[np.ndarray, "x y z"],
-    origin: Float[np.ndarray, "3"],
-    spacing: Float[np.ndarray, "3"],
-    names: Sequence[str],
-    radii: Float32[np.ndarray, "x y z"] | None = None,
-) -> None:
+def write_labels_npz(path: str | Path, grid: LabelGrid, radii: Float32[np.ndarray, "x y z"] | None = None) -> None:
     """Write a label grid for numpy: the arrays ``labels``, ``origin``, ``spacing`` and ``names``.
 
     Voxel [i, j, k] is centred at ``origin + [i, j, k] * spacing``, in the input's frame and units. ``names[k]`` is the
@@ -52,13 +45,13 @@ def write_labels_npz(
     voxel that holds the true place of what is there with probability 0.95, in the input's unit, NaN in empty space.
     Raises ``ValueError`` for a label without a name.
     """
-    if labels.size and int(labels.max()) > len(names):
-        raise ValueError(f"label {int(labels.max())} has no name among {len(names)}; name every segment")
+    if grid.labels.size and int(grid.labels.max()) > len(grid.names):
+        raise ValueError(f"label {int(grid.labels.max())} has no name among {len(grid.names)}; name every segment")
     arrays: dict[str, Any] = {
-        "labels": labels,
-        "origin": np.asarray(origin, dtype=np.float64),
-        "spacing": np.asarray(spacing, dtype=np.float64),
-        "names": np.asarray(names),
+        "labels": grid.labels,
+        "origin": np.asarray(grid.origin, dtype=np.float64),
+        "spacing": np.asarray(grid.spacing, dtype=np.float64),
+        "names": np.asarray(grid.names),
     }
     if radii is not None:
         arrays["radius95"] = radii
