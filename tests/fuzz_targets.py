@@ -61,8 +61,8 @@ from mereo.io.readers import read_point_cloud
 from mereo.io.simulation_states import read_states
 from mereo.io.volume_files import read_label_volume
 from mereo.io.writers.glb import write_segments_glb
-from mereo.io.writers.medical import write_labels_seg_nrrd
 from mereo.io.writers.meshes import write_points_ply, write_segments_obj, write_segments_ply
+from mereo.io.writers.volumes import write_labels_seg_nrrd
 from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.statistical_model import load_statistical_model, save_statistical_model

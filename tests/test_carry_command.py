@@ -15,7 +15,7 @@ from mereo.fitting.registration.register import Registrar
 from mereo.io.attachments import PoseTable, Surfaces, read_attachments, read_pose_table
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.volume_files import Volume, read_volume
-from mereo.io.writers.medical import write_volume
+from mereo.io.writers.volumes import write_volume
 from mereo.models.model import Model
 from mereo.models.weights import save_model
 from mereo.scenes.registry import load_scene

@@ -27,7 +27,7 @@ from mereo.io.config import CONFIG
 from mereo.io.progress import shown_stages, stage
 from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.io.writers.formats import chosen_formats
-from mereo.io.writers.medical import MM_PER_M
+from mereo.io.writers.volumes import MM_PER_M
 from mereo.models.config import InferenceConfig
 from mereo.models.trained import Trained
 from mereo.reconstruction.observation import find_object

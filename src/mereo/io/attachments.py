@@ -22,8 +22,8 @@ from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.readers import CLOUD_READERS, ply_counts
 from mereo.io.volume_files import VOLUME_SUFFIXES, Volume, is_volume, read_scalar_volume
 from mereo.io.writers.glb import write_segments_glb
-from mereo.io.writers.medical import write_volume
 from mereo.io.writers.meshes import write_positions_ply, write_segments_obj, write_segments_ply, write_surface_stl
+from mereo.io.writers.volumes import write_volume
 
 MESHES = (".stl", ".ply", ".obj", ".glb")
 CLOUDS = (".ply", ".xyz", ".txt", ".pts", ".asc", ".npy")

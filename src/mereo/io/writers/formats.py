@@ -15,9 +15,16 @@ from mereo.geometry.radii import Radii
 from mereo.io.atomic_files import write_json
 from mereo.io.config import Format
 from mereo.io.writers.glb import write_segments_glb
-from mereo.io.writers.medical import MM_PER_M, nibabel, write_labels_nifti, write_labels_seg_nrrd
 from mereo.io.writers.meshes import write_points_ply, write_segments_obj, write_segments_ply, write_segments_stl
-from mereo.io.writers.volumes import write_labels_npz, write_labels_vti, write_points_npz
+from mereo.io.writers.volumes import (
+    MM_PER_M,
+    nibabel,
+    write_labels_nifti,
+    write_labels_npz,
+    write_labels_seg_nrrd,
+    write_labels_vti,
+    write_points_npz,
+)
 
 SURE = "radius95.glb"
 """Name of the file beside the segments' GLB whose colours say how sure each place of the surfaces is."""
