@@ -101,8 +101,7 @@ def _obj_parts(path: Path) -> list[Part]:
     """Parts of an OBJ file, parsed here because trimesh gives them in no stable order. Polygons become fans."""
     positions: list[list[float]] = []
     faces: list[list[int]] = []
-    owners: list[tuple[str, str]] = []
-    dyes: list[str] = []
+    owners: list[tuple[str, str, str]] = []
     name, library = {"o": "", "g": "", "usemtl": ""}, ""
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         kind, *cells = line.split() or [""]
@@ -115,10 +114,8 @@ def _obj_parts(path: Path) -> list[Part]:
         elif kind == "f":
             corners = [_obj_index(cell, len(positions)) for cell in cells]
             faces += [[corners[0], corners[i], corners[i + 1]] for i in range(1, len(corners) - 1)]
-            owners += [(name["o"], name["g"])] * (len(corners) - 2)
-            dyes += [name["usemtl"]] * (len(corners) - 2)
-    known = _material_colors(path, library)
-    colors = [known.get(material) for material in dyes]
+            owners += [(name["o"], name["g"], name["usemtl"])] * (len(corners) - 2)
+    colors = _material_colors(path, library)
     return _split_parts(np.asarray(positions), np.asarray(faces, dtype=np.int64), owners, colors, path.stem)
 
 
@@ -134,13 +131,13 @@ def _obj_index(cell: str, count: int) -> int:
 def _split_parts(
     vertices: Float[np.ndarray, "v 3"],
     faces: Int[np.ndarray, "f 3"],
-    owners: list[tuple[str, str]],
-    colors: list[Color | None],
+    owners: list[tuple[str, str, str]],
+    colors: dict[str, Color],
     stem: str,
 ) -> list[Part]:
-    """Parts of a file: one per object, or per group where there is only one object; unused vertices are left out.
+    """Parts of a file: one per object, or per group where there is only one object, with the colour of all its faces.
 
-    A part has a colour where all its faces have that one.
+    ``owners`` are object, group and material of each face; unused vertices are left out.
     """
     level = 0 if len({key[0] for key in owners}) > 1 else 1
     labels = [key[level] or key[0] for key in owners]
@@ -149,7 +146,7 @@ def _split_parts(
     parts: list[Part] = []
     for i, name in enumerate(names):
         used, local = np.unique(faces[index == i], return_inverse=True)
-        worn = {color for color, label in zip(colors, labels, strict=True) if label == name}
+        worn = {colors.get(owner[2]) for owner, label in zip(owners, labels, strict=True) if label == name}
         color = worn.pop() if len(worn) == 1 else None
         title = name if name and len(names) > 1 else stem
         parts.append((title, color, *merge_positions(vertices[used], local.reshape(-1, 3))))
