@@ -22,7 +22,7 @@ SETTINGS = (("passive", None), ("passive", 1), ("active", None), (None, None))
 def measure(queries: int, rounds: int, beside: int) -> None:
     """Print threads, and seconds alone and beside busy processes: what the process of one row does."""
     import torch  # before mereo, so that OpenMP finds the variable as this row has it
-    from mereo_experiments.speed.beside import busy_processes
+    from mereo_experiments.speed.busy import busy_processes
 
     from mereo.evaluation.sample_views import load_view
     from mereo.models.weights import load_model
@@ -47,7 +47,7 @@ def measure(queries: int, rounds: int, beside: int) -> None:
 
 def row(policy: str | None, threads: int | None, options: argparse.Namespace) -> float:
     """Print one row of the table; returns the times of the fair share."""
-    from mereo_experiments.speed.beside import fair_share
+    from mereo_experiments.speed.busy import fair_share
 
     from mereo.io.cores import cores
 
@@ -70,7 +70,7 @@ def row(policy: str | None, threads: int | None, options: argparse.Namespace) ->
 
 
 def main() -> None:
-    from mereo_experiments.speed.beside import LIMIT
+    from mereo_experiments.speed.busy import LIMIT
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--queries", type=int, default=40_000)

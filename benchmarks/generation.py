@@ -25,9 +25,8 @@ from jaxtyping import Float, UInt8
 
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.normalizer import Normalizer
 from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import inverse_rigid
+from mereo.geometry.transforms import Normalizer, inverse_rigid
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng

@@ -21,8 +21,7 @@ import numpy as np
 
 from mereo.io.atomic_files import json_text
 from mereo.io.checked_tensors import pack_tensors
-from mereo.io.object_storage import Place, place_of
-from mereo.io.places import write_whole
+from mereo.io.object_storage import Place, place_of, write_whole
 from mereo.synthesis.dataset_contents import MANIFEST, dataset_key, shard_name
 from mereo.training.dataset import Dataset
 

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import mereo
-from mereo.io.output_folders import check_new_directory
+from mereo.io.atomic_files import check_new_directory
 
 
 def main(

@@ -27,7 +27,7 @@ from mereo.cli.options import Outcome
 from mereo.cli.view_command import ViewCommand
 from mereo.io.bounds import check_bounds
 from mereo.io.cores import use_threads
-from mereo.io.foreseen import is_foreseen, printable_line, words_of
+from mereo.io.errors import is_foreseen, printable_line, words_of
 from mereo.synthesis.config import SENSORS, GenerateConfig
 from mereo.training.config import PRESETS
 

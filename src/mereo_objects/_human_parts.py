@@ -16,8 +16,8 @@ from jaxtyping import Float, Int
 
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.geometry.mesh_check import mesh_of, solid_of
-from mereo.geometry.normalizer import Normalizer
 from mereo.geometry.read_only import read_only
+from mereo.geometry.transforms import Normalizer
 from mereo_objects import assets
 from mereo_objects._real_meshes import simplified
 from mereo_objects._solids import Vector, segment_of

@@ -17,8 +17,8 @@ from mereo.deformation.warps import Bend, FreeFormLattice, Squash, Twist
 from mereo.geometry.mesh import PALETTE, Segment, vertex_normals
 from mereo.geometry.mesh_check import Faces, Vertices, solid_of
 from mereo.geometry.mesh_repair import close_holes, largest_piece
-from mereo.geometry.normalizer import Normalizer
 from mereo.geometry.read_only import read_only
+from mereo.geometry.transforms import Normalizer
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.scenes.scene import Workspace
 from mereo_objects import assets

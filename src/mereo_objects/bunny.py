@@ -21,8 +21,8 @@ from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, smooth_step, turn
 from mereo.deformation.warps import SmoothField, Squash
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
-from mereo.geometry.normalizer import Normalizer
 from mereo.geometry.read_only import read_only
+from mereo.geometry.transforms import Normalizer
 from mereo.scenes.scene import WHOLE_SPHERE_RAD, Scene, Workspace
 from mereo_objects import assets
 from mereo_objects._solids import Vector

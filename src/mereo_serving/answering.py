@@ -22,8 +22,7 @@ from mereo.api.words import option_words
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.register import Registrar
 from mereo.io.atomic_files import to_json
-from mereo.io.errors import SizeError
-from mereo.io.foreseen import is_foreseen, words_of
+from mereo.io.errors import SizeError, is_foreseen, words_of
 from mereo.io.sensor_frame import read_frame
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.models.config import InferenceConfig, Precision

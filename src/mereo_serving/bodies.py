@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, BinaryIO
 from python_multipart.exceptions import MultipartParseError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
-from mereo.io.depth_formats import DEPTH_READERS
-from mereo.io.point_cloud_formats import CLOUD_READERS
+from mereo.io.readers import CLOUD_READERS, DEPTH_READERS
 from mereo_serving.refusals import Refused
 
 if TYPE_CHECKING:

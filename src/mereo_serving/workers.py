@@ -12,7 +12,7 @@ from multiprocessing.connection import Connection
 from typing import Any, Protocol, runtime_checkable
 
 from mereo.io.errors import LIMIT_VARIABLE
-from mereo.workers.processes import exit_with_parent, one_thread_each, start_resource_tracker
+from mereo.workers.spread import exit_with_parent, one_thread_each, start_resource_tracker
 from mereo_serving.messages import FrameRequest, Ready, Reply, Setup
 
 POINT_BYTES = 2048

@@ -26,7 +26,7 @@ from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.evaluation.cases import Evaluation
 from mereo.fitting.registration.registration import Located
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
-from mereo.io.output_folders import MARKER
+from mereo.io.atomic_files import MARKER
 from mereo.reconstruction.observation import SizeWarning
 from mereo.scenes.registry import load_scene
 from mereo.visualization.units import Unit

@@ -58,12 +58,6 @@ def unmerged_npz(path: Path) -> Path:
     return path / "s.npz"
 
 
-def npz_per_frame(path: Path) -> Path:
-    for frame in range(10):
-        np.savez(path / f"state{frame + 1}.npz", **{k: to_file(v[frame]) for k, v in moved_vertices().items()})
-    return path
-
-
 def meshes(suffix: str, rest: bool) -> Callable[[Path], Path]:
     """One folder for each segment, a mesh for each frame, numbered without leading zeros."""
 
@@ -84,7 +78,6 @@ FORMATS = {
     "displacements": displacements_npz,
     "vertices": vertices_npz,
     "unmerged": unmerged_npz,
-    "npz per frame": npz_per_frame,
     "ply": meshes("ply", rest=False),
     "obj": meshes("obj", rest=False),
     "stl": meshes("stl", rest=True),
@@ -166,7 +159,9 @@ def test_states_that_do_not_fit_are_named(case: str, tmp_path: Path) -> None:
 
 
 def test_directories_that_are_not_states_are_explained(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"one folder of mesh files for each segment \(left, right\), or one NPZ"):
+    with pytest.raises(
+        ValueError, match=r"one folder of mesh files for each segment \(left, right\): arrange it so, or make one NPZ"
+    ):
         load_states(tmp_path, boxes())
     meshes("ply", rest=False)(tmp_path)
     (tmp_path / "right/10.ply").unlink()

@@ -8,9 +8,8 @@ import pytest
 
 from mereo.evaluation.scans import SCANS, bunny_scan, bunny_truth, scan_in_camera
 from mereo.geometry.camera import VIEW_DISTANCE, scanner_to_camera
-from mereo.geometry.normalizer import Normalizer
 from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.geometry.transforms import Normalizer, inverse_rigid, transform_points
 
 Require = Callable[[str], Path]
 

@@ -16,8 +16,7 @@ from mereo.fitting.registration.registration import Registration, nearest_labels
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import transform_points
-from mereo.io.attachments import Attachment, Positions, Surfaces
-from mereo.io.pose_tables import PoseTable
+from mereo.io.attachments import Attachment, PoseTable, Positions, Surfaces
 from mereo.scenes.random_states import scene_model, state_points
 from mereo.scenes.scene import State
 from mereo.scenes.statistical_model import StatisticalModel

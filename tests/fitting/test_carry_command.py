@@ -12,11 +12,10 @@ from mereo import __main__ as command_line
 from mereo.evaluation.sample_views import SampleView, load_view
 from mereo.fitting.registration.fit import CloudToFit, fit_frame
 from mereo.fitting.registration.register import Registrar
-from mereo.io.attachments import Surfaces, read_attachments
+from mereo.io.attachments import PoseTable, Surfaces, read_attachments, read_pose_table
 from mereo.io.mesh_formats import read_segmented_mesh
-from mereo.io.pose_tables import PoseTable, read_pose_table
 from mereo.io.volume_files import Volume, read_volume
-from mereo.io.writers.scalar_volumes import write_volume
+from mereo.io.writers.volumes import write_volume
 from mereo.models.model import Model
 from mereo.models.weights import save_model
 from mereo.scenes.registry import load_scene

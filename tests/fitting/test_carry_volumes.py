@@ -16,8 +16,7 @@ from mereo.fitting.registration.registration import Registration
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import transform_points
 from mereo.io.attachments import Attachment, read_attachments, write_attachment
-from mereo.io.label_volumes import read_label_volume
-from mereo.io.volume_files import Volume, is_labels, read_volume
+from mereo.io.volume_files import Volume, is_labels, read_label_volume, read_volume
 from mereo.scenes.random_states import scene_model, state_points
 from mereo.scenes.statistical_model import StatisticalModel
 

@@ -20,8 +20,7 @@ from mereo.fitting.registration.answer_frame import (
 )
 from mereo.fitting.registration.fit import CloudToFit
 from mereo.fitting.registration.register import Registrar
-from mereo.geometry.camera import PointCloud
-from mereo.geometry.sight_lines import SightLines
+from mereo.geometry.camera import PointCloud, SightLines
 from mereo.models.model import Model
 from mereo.models.weights import load_model
 from mereo.reconstruction.observation import observe

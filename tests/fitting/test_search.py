@@ -14,7 +14,7 @@ from mereo.fitting.registration.answer_frame import search_modes, size_of
 from mereo.fitting.registration.fit import CloudToFit
 from mereo.fitting.search.screening import CELLS, Poses, Screen, SightTable, medoids, tables_of
 from mereo.fitting.search.search import rotations
-from mereo.geometry.sight_lines import SightLines
+from mereo.geometry.camera import SightLines
 from mereo.models.weights import load_model
 from mereo.scenes.statistical_model import StatisticalModel
 

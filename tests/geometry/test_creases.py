@@ -10,9 +10,9 @@ import trimesh
 from reported_scenes import page_data, positions
 
 from mereo.geometry.camera import PointCloud
-from mereo.geometry.creases import split_at_creases
 from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
 from mereo.geometry.radii import Radii
+from mereo.geometry.subdivision import split_at_creases
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.writers.glb import write_segments_glb
 from mereo.visualization.reconstruction_report import write_report

@@ -9,8 +9,7 @@ from overlapping import check_overlap
 
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.io.label_volumes import read_label_volume, segment_surfaces
-from mereo.io.volume_files import is_volume
+from mereo.io.volume_files import is_volume, read_label_volume, segment_surfaces
 from mereo.scenes.registry import load_scene
 
 nrrd = pytest.importorskip("nrrd")

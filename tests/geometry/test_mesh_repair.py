@@ -12,9 +12,8 @@ from scene_files import write_bar, write_mesh
 from shapes import ball, box, knobbly_torus, segment
 
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.mesh_check import examine, likely_unit
+from mereo.geometry.mesh_check import examine, likely_unit, overlaps
 from mereo.geometry.mesh_repair import repaired, without_overlaps
-from mereo.geometry.overlap import overlaps
 from mereo.scenes.files import check
 from mereo.scenes.files.build import MeshWarning
 from mereo.scenes.files.check import check_scene

@@ -5,7 +5,7 @@ import pytest
 from sight_parts import pixels
 
 from mereo.fitting.problem.evidence import Evidence
-from mereo.geometry.sight_lines import SightLines
+from mereo.geometry.camera import SightLines
 from mereo.reconstruction.observation import find_object
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import example_rng

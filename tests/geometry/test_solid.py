@@ -10,7 +10,7 @@ from shapes import ball, box, knobbly_torus, one, segment
 
 from mereo.geometry import solids
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.overlap import overlaps
+from mereo.geometry.mesh_check import overlaps
 from mereo.geometry.solids import Solids, label_grid, signed_distance_and_direction
 
 

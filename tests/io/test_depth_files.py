@@ -7,8 +7,7 @@ import pytest
 from PIL import Image
 
 from mereo.geometry.camera import Camera
-from mereo.io.depth_formats import is_depth_image
-from mereo.io.readers import read_depth_image, read_mask
+from mereo.io.readers import is_depth_image, read_depth_image, read_mask
 
 CAMERA = Camera(8, 6, 10.0, 11.0, 4.0, 3.0)
 
@@ -125,7 +124,7 @@ def test_exr(tmp_path: Path, channels: dict[str, float]) -> None:
 
 
 def test_exr_without_its_library_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mereo.io.depth_formats.find_spec", lambda _: None)
+    monkeypatch.setattr("mereo.io.readers.find_spec", lambda _: None)
     (tmp_path / "d.exr").write_bytes(b"anything")
     with pytest.raises(ImportError, match=r"needs OpenEXR.*: pip install 'mereo\[sensors\]'"):
         read_depth_image(tmp_path / "d.exr", CAMERA)

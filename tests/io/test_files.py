@@ -13,8 +13,7 @@ from point_files import lzf_compress, save_pcd, save_ply
 from mereo.geometry.camera import Camera
 from mereo.io.intrinsics import read_camera
 from mereo.io.mesh_formats import read_segmented_mesh
-from mereo.io.point_cloud_formats import _lzf_decompress
-from mereo.io.readers import read_mask, read_point_cloud
+from mereo.io.readers import _lzf_decompress, read_mask, read_point_cloud
 
 POINTS = np.random.default_rng(0).normal(size=(57, 3)).astype(np.float32) + np.float32(3)
 CAMERA = Camera(8, 6, 10.0, 11.0, 4.0, 3.0)

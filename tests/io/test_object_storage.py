@@ -10,8 +10,7 @@ from fsspec.implementations.memory import MemoryFileSystem
 
 from mereo.io import object_storage
 from mereo.io.atomic_files import check_place
-from mereo.io.object_storage import ObjectPath, StorageError, place_of
-from mereo.io.places import claim, names_in, sha256, write_whole
+from mereo.io.object_storage import ObjectPath, StorageError, claim, names_in, place_of, sha256, write_whole
 
 
 @pytest.fixture

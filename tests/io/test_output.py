@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from folder_contents import contents
 
-from mereo.io.atomic_files import atomic_file, write_json
-from mereo.io.foreseen import words_of
-from mereo.io.output_folders import claim_directory, new_directory
+from mereo.io.atomic_files import atomic_file, claim_directory, new_directory, write_json
+from mereo.io.errors import words_of
 
 INTERRUPTIONS = [ValueError("no"), KeyboardInterrupt(), SystemExit(1)]
 

@@ -15,8 +15,7 @@ from folder_contents import contents
 
 from mereo import __main__ as command_line
 from mereo.io import atomic_files
-from mereo.io.atomic_files import OLD, atomic_file
-from mereo.io.output_folders import MARKER, new_directory
+from mereo.io.atomic_files import MARKER, OLD, atomic_file, new_directory
 
 
 def write(path: Path, text: str, force: bool = False) -> None:
@@ -157,7 +156,7 @@ def test_reconstruct_does_not_delete_the_folder_of_its_input(
 DIES = """
 import os, signal, sys
 from pathlib import Path
-from mereo.io import atomic_files, output_folders
+from mereo.io import atomic_files
 def die(*_): os.kill(os.getpid(), signal.SIGKILL)
 """
 
@@ -170,7 +169,7 @@ def killed(code: str) -> None:
 
 def test_what_a_killed_process_left_is_removed_by_the_next_one(tmp_path: Path) -> None:
     killed(
-        f"with output_folders.new_directory({str(tmp_path / 'out')!r}) as folder:\n"
+        f"with atomic_files.new_directory({str(tmp_path / 'out')!r}) as folder:\n"
         f" with atomic_files.atomic_file({str(tmp_path / 'a.txt')!r}) as file:\n"
         "  (folder / 'half').touch(); file.touch(); die()"
     )
@@ -197,7 +196,7 @@ def test_a_process_killed_while_it_replaces_loses_neither_result(renames: int, t
         " plain(*places)\n"
         " next(left, None) is not None or die()\n"
         "os.rename = rename\n"
-        f"with output_folders.new_directory({str(out)!r}, force=True) as folder:\n (folder / 'b.txt').touch()"
+        f"with atomic_files.new_directory({str(out)!r}, force=True) as folder:\n (folder / 'b.txt').touch()"
     )
     assert any((tmp_path / name / OLD).is_dir() for name in os.listdir(tmp_path))
     with pytest.raises(FileExistsError, match="not overwritten"):  # after it was put back
@@ -219,7 +218,7 @@ def test_a_result_that_was_being_removed_is_not_put_back(unlinked: int, tmp_path
         " next(left, None) is not None or die()\n"
         " plain(*place, **options)\n"
         "os.unlink = unlink\n"
-        f"with output_folders.new_directory({str(out)!r}, force=True) as folder:\n (folder / 'n').touch()"
+        f"with atomic_files.new_directory({str(out)!r}, force=True) as folder:\n (folder / 'n').touch()"
     )
     assert {path.name for path in out.iterdir()} == {"n", MARKER}
     shutil.rmtree(out)
@@ -229,7 +228,7 @@ def test_a_result_that_was_being_removed_is_not_put_back(unlinked: int, tmp_path
 
 
 def test_without_locks_leftovers_stay_and_are_in_nobodys_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    killed(f"with output_folders.new_directory({str(tmp_path / 'out')!r}): die()")
+    killed(f"with atomic_files.new_directory({str(tmp_path / 'out')!r}): die()")
     monkeypatch.setattr(atomic_files, "HAS_LOCKS", False)
     write(tmp_path / "out", "whole")
     write(tmp_path / "out", "again", force=True)

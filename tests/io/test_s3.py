@@ -17,8 +17,7 @@ from toy_scene import toy_scene
 
 from mereo.__main__ import main
 from mereo.api.generate import generate
-from mereo.io.object_storage import ObjectPath, StorageError
-from mereo.io.places import claim, names_in, write_whole
+from mereo.io.object_storage import ObjectPath, StorageError, claim, names_in, write_whole
 from mereo.training.dataset import Dataset
 
 s3fs = pytest.importorskip("s3fs")

@@ -16,10 +16,14 @@ from written_results import CENTER, COLORS, NAMES, SIDES, segments
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.writers.glb import write_segments_glb
-from mereo.io.writers.obj import material_names, write_segments_obj
-from mereo.io.writers.ply import write_segments_ply
-from mereo.io.writers.segment_table import settled
-from mereo.io.writers.stl import stl_name, write_segments_stl
+from mereo.io.writers.meshes import (
+    material_names,
+    settled,
+    stl_name,
+    write_segments_obj,
+    write_segments_ply,
+    write_segments_stl,
+)
 
 BOX = np.stack([CENTER - SIDES / 2, CENTER + SIDES / 2])
 
@@ -199,7 +203,7 @@ def test_half_an_obj_never_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     def full(*_: object) -> str:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("mereo.io.writers.obj._object", full)
+    monkeypatch.setattr("mereo.io.writers.meshes._object", full)
     with pytest.raises(OSError, match="disk is full"):
         write_segments_obj(tmp_path / "s.obj", segments())
     assert list(tmp_path.iterdir()) == [], "its material library neither"

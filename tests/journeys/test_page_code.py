@@ -17,7 +17,7 @@ from toy_frames import MODEL, NAMES, seen
 
 import mereo
 from mereo.io.readers import read_mask
-from mereo.io.writers.ply import write_positions_ply
+from mereo.io.writers.meshes import write_positions_ply
 from mereo.synthesis.config import SensorModel
 from mereo.synthesis.depth_sensor import KINECT_DISPARITY_M, axial_std_m, quantize
 

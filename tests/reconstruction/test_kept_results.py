@@ -13,7 +13,7 @@ from written_results import segments
 
 from mereo import __main__ as command_line
 from mereo.cli.stream import SurfaceFolder
-from mereo.io.output_folders import new_directory
+from mereo.io.atomic_files import new_directory
 from mereo.io.writers.glb import write_segments_glb
 from mereo.reconstruction.stream import Outcome
 

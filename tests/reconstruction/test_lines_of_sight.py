@@ -9,8 +9,7 @@ from camera_files import write_camera
 from PIL import Image
 from sight_parts import CAMERA, SHOWN, pixels, scene
 
-from mereo.geometry.camera import SCANNER_TO_CAMERA, Camera, DepthImage, PointCloud
-from mereo.geometry.sight_lines import SightLines
+from mereo.geometry.camera import SCANNER_TO_CAMERA, Camera, DepthImage, PointCloud, SightLines
 from mereo.geometry.transforms import rigid
 from mereo.io.config import InputConfig
 from mereo.io.sensor_frame import SensorFrame, read_frame

@@ -161,7 +161,7 @@ def test_zdf_is_an_organized_cloud_in_millimetres(tmp_path: Path) -> None:
 
 
 def test_missing_extras_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, module, library in (("a.zdf", "point_cloud_formats", "netCDF4"), ("a.mcap", "ros_recordings", "rosbags")):
+    for name, module, library in (("a.zdf", "readers", "netCDF4"), ("a.mcap", "ros_recordings", "rosbags")):
         (tmp_path / name).write_bytes(b"anything")
         monkeypatch.setattr(f"mereo.io.{module}.find_spec", lambda _: None)
         with pytest.raises(ImportError, match=rf"{name} needs {library}.*: pip install 'mereo\[sensors\]'"):

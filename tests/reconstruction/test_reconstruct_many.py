@@ -6,8 +6,8 @@ import pytest
 from many_frames import content, frames, loads, run
 
 from mereo.cli import reconstruct_many as many
+from mereo.io.atomic_files import MARKER
 from mereo.io.config import InputConfig
-from mereo.io.output_folders import MARKER
 
 __all__ = ["loads"]  # a fixture
 

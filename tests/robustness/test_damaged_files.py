@@ -15,16 +15,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mereo.io.depth_formats import read_raw_depth
 from mereo.io.errors import LIMIT_VARIABLE, PAGES, max_bytes
-from mereo.io.glb_scene import read_glb
 from mereo.io.intrinsics import read_intrinsics
-from mereo.io.label_volumes import read_label_volume
-from mereo.io.mesh_formats import read_segmented_mesh
-from mereo.io.readers import read_mask, read_point_cloud
+from mereo.io.mesh_formats import read_glb, read_segmented_mesh
+from mereo.io.readers import read_mask, read_point_cloud, read_raw_depth
 from mereo.io.ros_recordings import recorded_frames
 from mereo.io.sensor_frame import read_frame
 from mereo.io.simulation_states import read_states
+from mereo.io.volume_files import read_label_volume
 from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
 

@@ -17,8 +17,7 @@ from PIL import Image
 from safetensors import numpy as arrays
 from safetensors.torch import load_file, save_file
 
-from mereo.io.errors import quiet, reason, without_output
-from mereo.io.foreseen import words_of
+from mereo.io.errors import quiet, reason, without_output, words_of
 
 
 def npz(**members: bytes) -> bytes:

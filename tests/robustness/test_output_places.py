@@ -10,8 +10,7 @@ from scene_files import HEAD, write_bar, write_mesh
 from shapes import box
 
 from mereo import __main__ as command_line
-from mereo.io.atomic_files import atomic_file
-from mereo.io.output_folders import check_new_directory, claim_directory, new_directory
+from mereo.io.atomic_files import atomic_file, check_new_directory, claim_directory, new_directory
 
 NO_PLACES = {
     "": "the output '.' has no name of its own",

@@ -16,8 +16,7 @@ from mereo.deformation.samplers import cubic_cells
 from mereo.deformation.warps import Squash
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.mesh_check import mesh_of
-from mereo.geometry.overlap import overlaps
+from mereo.geometry.mesh_check import mesh_of, overlaps
 from mereo.geometry.subdivision import TooManyFaces, split_edges
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.mesh_formats import read_segmented_mesh

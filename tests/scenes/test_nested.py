@@ -13,7 +13,7 @@ from toy_scene import Shear
 
 from mereo.deformation.maps import Deformation
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.overlap import overlaps
+from mereo.geometry.mesh_check import overlaps
 from mereo.geometry.solids import Solids, label_grid, signed_distance_and_direction
 from mereo.geometry.transforms import rigid, transform_points
 from mereo.reconstruction.isosurfaces import extract

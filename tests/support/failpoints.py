@@ -78,7 +78,7 @@ def _serve() -> None:
     from toy_data import make_small_datasets
 
     import mereo.__main__ as command_line
-    from mereo.io import output_folders  # noqa: F401
+    from mereo.io import atomic_files  # noqa: F401
     from mereo.models.export import onnx_export
     from mereo.models.weights import load_model
     from mereo.training import model_card, trainer

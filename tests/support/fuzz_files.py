@@ -26,7 +26,7 @@ from mereo.io.attachments import read_attachments
 from mereo.io.config import InputConfig
 from mereo.io.readers import read_mask, read_point_cloud
 from mereo.io.sensor_frame import read_frame, read_frames
-from mereo.io.writers.medical import write_labels_nifti, write_labels_seg_nrrd
+from mereo.io.writers.volumes import write_labels_nifti, write_labels_seg_nrrd
 from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.models.weights import save_model

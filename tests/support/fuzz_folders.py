@@ -9,8 +9,7 @@ from toy_scene import toy_scene
 from mereo.evaluation.registration.placement import PlacedSegment, Placement
 from mereo.evaluation.registration.truth_file import ScanFile, read_truth, write_truth
 from mereo.evaluation.tables import read_metrics
-from mereo.io.atomic_files import write_json
-from mereo.io.output_folders import check_new_directory, new_directory
+from mereo.io.atomic_files import check_new_directory, new_directory, write_json
 from mereo.synthesis.config import SENSORS
 from mereo.synthesis.recording import read_recording, write_recording
 from mereo.synthesis.sequence_config import SequenceConfig

@@ -16,8 +16,7 @@ from pathlib import Path
 from traceback import extract_tb
 from types import FrameType
 
-from mereo.io.errors import LIMIT_VARIABLE
-from mereo.io.foreseen import PACKAGE, is_foreseen, words_of
+from mereo.io.errors import LIMIT_VARIABLE, PACKAGE, is_foreseen, words_of
 
 MOST_SECONDS, MOST_GB = 60.0, 2.0
 """An input that takes longer hangs: what is taken here takes a second on a slow machine."""

@@ -54,17 +54,15 @@ from written_results import COLORS, grid, segments
 
 from mereo.evaluation.registration.placement import read_start
 from mereo.evaluation.sample_views import load_view
-from mereo.io.attachments import Positions, write_attachment
+from mereo.io.attachments import Positions, read_pose_table, write_attachment
 from mereo.io.intrinsics import read_intrinsics
-from mereo.io.label_volumes import read_label_volume
 from mereo.io.mesh_formats import read_segmented_mesh
-from mereo.io.pose_tables import read_pose_table
 from mereo.io.readers import read_point_cloud
 from mereo.io.simulation_states import read_states
-from mereo.io.writers.glb import write_segments_glb, write_segments_gltf
-from mereo.io.writers.medical import write_labels_seg_nrrd
-from mereo.io.writers.obj import write_segments_obj
-from mereo.io.writers.ply import write_points_ply, write_segments_ply
+from mereo.io.volume_files import read_label_volume
+from mereo.io.writers.glb import write_segments_glb
+from mereo.io.writers.meshes import write_points_ply, write_segments_obj, write_segments_ply
+from mereo.io.writers.volumes import write_labels_seg_nrrd
 from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.statistical_model import load_statistical_model, save_statistical_model
@@ -124,10 +122,9 @@ ALL: tuple[Target, ...] = (
     Target("mesh.3mf", exported("3mf"), read_segmented_mesh, library="lxml"),
     Target("text.stl", exported("stl_ascii"), carried),
     Target("own.glb", lambda p: write_segments_glb(p, segments()), carried),
-    Target("own.gltf", lambda p: write_segments_gltf(p, segments()), carried),
     Target("own.obj", lambda p: write_segments_obj(p, segments()), carried),
     Target("own.ply", lambda p: write_segments_ply(p, segments()), carried),
-    Target("carried.pcd", lambda p: write_attachment(p, Positions(POINTS), 1.0, np.eye(3), 1.0), carried),
+    Target("carried.xyz", lambda p: write_attachment(p, Positions(POINTS), 1.0, np.eye(3), 1.0), carried),
     Target("poses.csv", text(TURNS), read_pose_table),
     Target("labels.nii", nifti, read_label_volume, library="nibabel"),
     Target("labels.nii.gz", nifti, read_label_volume, library="nibabel"),

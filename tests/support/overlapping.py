@@ -1,7 +1,7 @@
 """What tests ask of segments with each other: that none shares volume with another that is not declared nested."""
 
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.overlap import TOLERANCE, overlaps
+from mereo.geometry.mesh_check import TOLERANCE, overlaps
 
 
 def check_overlap(mesh: SegmentedMesh, tolerance: float = TOLERANCE) -> None:

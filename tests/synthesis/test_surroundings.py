@@ -11,8 +11,7 @@ from toy_scene import toy_scene
 from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.raycasting import Hits, first_hits
-from mereo.geometry.solids import Solids
+from mereo.geometry.solids import Hits, Solids, first_hits
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.clutter import BACKGROUND, NOTHING, OBJECT, OCCLUDER, Backdrop, Capsule, Surroundings
 from mereo.synthesis.config import SENSORS, GenerateConfig, SamplingConfig, SensorConfig

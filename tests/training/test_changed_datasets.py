@@ -12,7 +12,7 @@ from toy_data import SMALL, make_small_datasets, read_all
 from toy_scene import toy_scene
 
 from mereo.api.generate import generate
-from mereo.io.places import sha256
+from mereo.io.object_storage import sha256
 from mereo.training.dataset import Dataset
 
 TOY = toy_scene()

@@ -12,8 +12,7 @@ import mereo
 from mereo.__main__ import main, parse
 from mereo.api.generate import generate
 from mereo.cli.training import Generate, Train
-from mereo.io.object_storage import ObjectPath, StorageError
-from mereo.io.places import names_in, write_whole
+from mereo.io.object_storage import ObjectPath, StorageError, names_in, write_whole
 from mereo.training import trainer
 from mereo.training.dataset import Dataset
 

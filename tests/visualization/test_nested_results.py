@@ -22,7 +22,7 @@ from two_balls import front
 from mereo.fitting.registration.answer import Answer
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.solids import Solids
-from mereo.io.writers.glb import OUTER_OPACITY
+from mereo.io.writers.meshes import OUTER_OPACITY
 from mereo.models.weights import load_model, save_model
 from mereo.reconstruction.pipeline import Reconstruction
 from mereo.training.trainer import train

@@ -51,7 +51,8 @@ def found(answer: Answer) -> Reconstruction:
 
 
 def results(found: Reconstruction, files: FilesConfig, unit_m: float = 1.0) -> Results:
-    return Results.of(found.surfaces, found.labels, found.observed, GLTF_CAMERA_ROTATION, files, unit_m)
+    parts = found.surfaces, found.labels, found.observed
+    return Results(*parts, GLTF_CAMERA_ROTATION, unit_m, files.millimetres)
 
 
 def test_every_format_is_written_where_the_table_says(answer: Answer, tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from mereo.fitting.registration.state import STATE
 from mereo.geometry.camera import SCANNER_TO_CAMERA, PointCloud
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.geometry.radii import Radii
-from mereo.io.glb_scene import MOST_PARTS, read_glb
+from mereo.io.mesh_formats import read_glb
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION, write_segments_glb
 from mereo.models.model import Model
 from mereo.visualization.reconstruction_report import write_report
@@ -148,17 +148,6 @@ def test_any_glb_is_read_with_its_places_and_colours(tmp_path: Path) -> None:
     assert colors is not None and {tuple(color) for color in colors.tolist()} == {(255, 0, 0), (0, 0, 255)}
     assert parts["plain"][0].color == (255, 0, 0) and parts["plain"][1] is None
     assert len(parts["plain"][0].vertices) == 8 and parts["round"][0].color == (0, 128, 255)
-
-
-def test_many_parts_become_few_and_names_are_their_own(tmp_path: Path) -> None:
-    scene, box = trimesh.Scene(), trimesh.creation.box((1, 1, 1))
-    for number in range(MOST_PARTS + 3):
-        move = trimesh.transformations.translation_matrix([2.0 * number, 0, 0])
-        scene.add_geometry(box, node_name=f"node {number}", geom_name="box", transform=move)
-    (tmp_path / "many.glb").write_bytes(scene.export(file_type="glb"))
-    mesh = read_glb(tmp_path / "many.glb").mesh
-    assert len(mesh.segments) == MOST_PARTS + 1 and mesh.names[-1] == "3 more"
-    assert sum(segment.volume for segment in mesh.segments) == pytest.approx(MOST_PARTS + 3)
 
 
 # --- contents ---------------------------------------------------------------------------------------------------------

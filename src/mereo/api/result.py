@@ -24,16 +24,15 @@ from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud, camera_axes
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.transforms import fit_rigid, transform_points
-from mereo.io.atomic_files import atomic_file
+from mereo.io.atomic_files import atomic_file, new_directory
 from mereo.io.attachments import Attachment, Content, Positions, Surfaces, read_attachments, write_attachment
 from mereo.io.config import DEFAULT_FILES, CarryFrame, FilesConfig, Format
-from mereo.io.output_folders import new_directory
 from mereo.io.point_arrays import points_of
 from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame
 from mereo.io.writers.formats import chosen_formats
 from mereo.io.writers.glb import viewer_rotation
-from mereo.io.writers.medical import MM_PER_M
+from mereo.io.writers.volumes import MM_PER_M
 from mereo.visualization.result_files import write_answer, write_answer_file
 from mereo.visualization.result_html import result_html
 from mereo.visualization.units import Unit

@@ -51,9 +51,9 @@ class ReconstructCommand:
             explains the frame, if the weights carry one; network leaves the network's answer, search the network out;
             modes and full take the model in any case, full by fitting the draws of the scene as well.
         scene: the scene's name or file, whose draws are fitted, where it is not the built-in one of the weights.
-        carry: file to bring to where the object is, its inside included; once for each: mesh (STL, PLY, OBJ, GLB,
-            glTF), points (PLY, PCD, XYZ, NPY), CSV (x, y, z; qx, qy, qz, qw or m00 to m23 for poses) or volume (NIfTI,
-            NRRD), which is resampled around the object.
+        carry: file to bring to where the object is, its inside included; once for each: mesh (STL, PLY, OBJ, GLB),
+            points (PLY, XYZ, NPY), CSV (x, y, z; qx, qy, qz, qw for poses) or volume (NIfTI, NRRD), which is
+            resampled around the object.
         carry_frame: frame and unit of these files: source is that of the object's own files, scene that of its scene.
         explain: segment, for its centroid, or place x,y,z in the input's frame and unit: print how sure the object's
             point there is and what leaves it unsure, and write the observed points coloured by how much each decides it

@@ -47,9 +47,8 @@ class Demo:
     def run(self) -> Outcome:
         """Reconstruct every input, and print its scores, seconds and where to look."""
         from mereo.api.reconstruct import reconstruct
-        from mereo.io.atomic_files import check_place
+        from mereo.io.atomic_files import check_new_directory, check_place
         from mereo.io.extras import has_network
-        from mereo.io.output_folders import check_new_directory
         from mereo.io.progress import shown_stages
 
         check_place(self.output, may_be_link=True)
@@ -79,9 +78,9 @@ def _inputs(output: Path) -> "Iterator[tuple[str, str, Object, SensorFrame, Trut
     from mereo.evaluation.sample_views import SHIPPED_SCAN, load_view
     from mereo.evaluation.scans import BUNNY_SCAN_POSES
     from mereo.geometry.mesh import SegmentedMesh
+    from mereo.io.atomic_files import new_directory
     from mereo.io.extras import has_network
-    from mereo.io.output_folders import new_directory
-    from mereo.io.writers.stl import write_surface_stl
+    from mereo.io.writers.meshes import write_surface_stl
     from mereo.models.weights_place import statistical_model_in
 
     model = statistical_model_in("bunny")

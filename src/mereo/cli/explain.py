@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.radii import level_told
-from mereo.io.writers.ply import write_explained_ply
+from mereo.io.writers.meshes import write_explained_ply
 from mereo.visualization.sure_colors import UNEXPLAINED, mark_colors, point_marks, shares_told
 from mereo.visualization.units import Unit, rounded
 

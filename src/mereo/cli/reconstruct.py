@@ -21,14 +21,13 @@ from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.carry import Carried, Placed, place
 from mereo.fitting.registration.carry import carry as carry_one
 from mereo.fitting.registration.register import Registrar
-from mereo.io.atomic_files import write_json
+from mereo.io.atomic_files import new_directory, write_json
 from mereo.io.attachments import Attachment, read_attachments
 from mereo.io.config import CONFIG
-from mereo.io.output_folders import new_directory
 from mereo.io.progress import shown_stages, stage
 from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.io.writers.formats import chosen_formats
-from mereo.io.writers.medical import MM_PER_M
+from mereo.io.writers.volumes import MM_PER_M
 from mereo.models.config import InferenceConfig
 from mereo.models.trained import Trained
 from mereo.reconstruction.observation import find_object

@@ -25,9 +25,8 @@ from mereo.cli import options as command
 from mereo.cli.reconstruct import FrameJob, answer_frame, outcome_of, print_segments, reconstruct_file, written
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.recognition import Known
-from mereo.io.atomic_files import check_place
+from mereo.io.atomic_files import MARKER, check_new_directory, check_place, new_directory
 from mereo.io.config import InputConfig
-from mereo.io.output_folders import MARKER, check_new_directory, new_directory
 from mereo.io.progress import duration
 from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame, read_frame

@@ -205,7 +205,7 @@ class SceneExport:
 
         from mereo.io.atomic_files import atomic_file, check_file_place
         from mereo.io.writers.glb import write_segments_glb
-        from mereo.io.writers.ply import write_segments_ply
+        from mereo.io.writers.meshes import write_segments_ply
         from mereo.scenes.registry import files_of, load_scene
 
         check_file_place(self.output, force=self.force)
@@ -247,7 +247,7 @@ class SceneRecord:
 
     def run(self) -> None:
         """Write the folder, and print how it is answered."""
-        from mereo.io.output_folders import new_directory
+        from mereo.io.atomic_files import new_directory
         from mereo.scenes.registry import files_of, load_scene
         from mereo.synthesis.recording import training_seed, write_recording
 

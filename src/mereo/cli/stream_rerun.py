@@ -26,7 +26,7 @@ from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import Segment, vertex_normals
 from mereo.io.atomic_files import atomic_file, check_file_place
-from mereo.io.writers.glb import OUTER_OPACITY
+from mereo.io.writers.meshes import OUTER_OPACITY
 from mereo.reconstruction.stream import Outcome
 
 SUFFIX, SCHEMES, PORT = ".rrd", ("rerun", "rerun+http", "rerun+https"), 9876

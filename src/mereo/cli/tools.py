@@ -60,7 +60,7 @@ class Align:
         from mereo.evaluation.registration.placement import place, read_start, start_from_model
         from mereo.evaluation.registration.truth_file import TRUTH, ScanFile, write_truth
         from mereo.geometry.conventions import UNITS_M
-        from mereo.io.output_folders import new_directory
+        from mereo.io.atomic_files import new_directory
         from mereo.io.readers import read_point_cloud
         from mereo.io.writers.glb import viewer_rotation, write_segments_glb
         from mereo.models.weights import load_model

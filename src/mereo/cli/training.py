@@ -58,7 +58,7 @@ class Generate:
         """Write the folder of labelled examples."""
         from mereo.api.generate import generate
         from mereo.io.atomic_files import json_text
-        from mereo.io.places import write_whole
+        from mereo.io.object_storage import write_whole
 
         generate(
             self.scene,

@@ -1,19 +1,19 @@
-"""Pinhole cameras, depth images and point clouds.
+"""Pinhole cameras, depth images, point clouds, and lines of sight that passed the object.
 
 Notation: the camera frame is OpenCV/ROS optical, x right, y down, z forward. Depth is z, not ray length. The centre of
 pixel (column u, row v) is at (u + 0.5, v + 0.5). ``unproject`` and ``project`` are each other's inverse.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from mereo.geometry.brief import counted, sides
 from mereo.geometry.conventions import CloudAxes
-from mereo.geometry.normalizer import Normalizer
 from mereo.geometry.read_only import read_only
-from mereo.geometry.transforms import rigid
+from mereo.geometry.transforms import Normalizer, rigid
 
 
 @dataclass(frozen=True)
@@ -127,13 +127,50 @@ class DepthImage:
         return PointCloud(points.astype(np.float64))
 
 
+# --- lines of sight ---------------------------------------------------------------------------------------------------
+
+# A line of sight is of one of three kinds (docs/registration.md): it met the *object*; it went *past* it, to something
+# farther away, so that the space before that is empty; or it is *unknown*: something nearer hides what is behind,
+# nothing was measured, or it lies outside the picture.
+
+SightKind = Literal["past", "unknown"]
+"""Kind of a line of sight that did not meet the object."""
+
+
+@dataclass(frozen=True, eq=False)
+class SightLines:
+    """Lines of sight beside the object, in the frame, axes and unit of its points.
+
+    Attributes:
+        past: points that were measured behind the object; the space between the camera and each is empty.
+        unknown: points anywhere on lines of sight along which nothing is known.
+        other_lines: kind of all lines of sight that none of these points, and none of the object's, is near; None where
+            the frame does not say, as a bare cloud does not, and then a fit has to decide.
+    """
+
+    past: Float[np.ndarray, "p 3"]
+    unknown: Float[np.ndarray, "u 3"]
+    other_lines: SightKind | None = None
+
+    @classmethod
+    def of_cloud(cls, other_lines: SightKind | None = None) -> "SightLines":
+        """Lines of sight beside a bare cloud, all of one kind, or of an undecided one."""
+        return cls(np.empty((0, 3)), np.empty((0, 3)), other_lines)
+
+    def transformed(self, T_new_old: Float[np.ndarray, "4 4"]) -> "SightLines":
+        """Lines of sight in another frame, whose origin is the camera as well."""
+        past, unknown = (points @ T_new_old[:3, :3].T + T_new_old[:3, 3] for points in (self.past, self.unknown))
+        return SightLines(past, unknown, self.other_lines)
+
+    def scaled(self, factor: float) -> "SightLines":
+        """Lines of sight in another unit."""
+        return SightLines(self.past * factor, self.unknown * factor, self.other_lines)
+
+
 # --- scanners' axes ---------------------------------------------------------------------------------------------------
 
-# Axes of clouds: from a scanner's or a camera's frame to the camera frame that networks work in.
-
 SCANNER_TO_CAMERA = read_only(np.diag([1.0, -1.0, -1.0]))
-"""Half a turn about x; its own inverse."""
-
+"""Half a turn about x: from a scanner's axes to a camera's, and back."""
 
 VIEW_DISTANCE = 8.5
 """Assumed distance of a scanner, in half longest sides of the visible part: within the range of the training views.

@@ -7,14 +7,8 @@ from scipy.spatial import cKDTree
 MAX_POINTS = 50_000
 """Many times what any network is trained on; comparing neighbours takes a fraction of a second."""
 
-SPACING_SAMPLE = 1000
-"""Points whose nearest neighbour is looked up for the spacing; its median is then good to a few percent."""
-
 STEEPEST = 4.0
 """Gap in range, in widths of a cell there, from which on there are two surfaces: one would be seen at 76 degrees."""
-
-SMALLEST_EXTENT = 1e-6
-"""Extent across lines of sight, as a slope, that counts as none: a tenth of a millimetre in a hundred metres."""
 
 
 def random_subset(rows: Shaped[np.ndarray, "n *r"], limit: int) -> Shaped[np.ndarray, "m *r"]:
@@ -44,10 +38,10 @@ def thin_to_grid(points: Float[np.ndarray, "n 3"], limit: int) -> Int[np.ndarray
         finer = cell / np.sqrt(limit / max(len(rows), 1)) * 1.05
         if len(rows) >= 0.5 * limit or finer < side * 1e-6:
             return rows
-        found = first_in_cell(points - low, finer)
-        if len(found) > limit:
+        more = first_in_cell(points - low, finer)
+        if len(more) > limit:
             return rows
-        cell, rows = finer, found
+        cell, rows = finer, more
 
 
 def means_along_sight(points: Float[np.ndarray, "n 3"], limit: int) -> Float[np.ndarray, "m 3"]:
@@ -69,7 +63,8 @@ def means_along_sight(points: Float[np.ndarray, "n 3"], limit: int) -> Float[np.
     across = np.linalg.svd(ahead[None])[2][1:]
     flat = sight @ across.T * (np.linalg.norm(ahead) / (sight @ ahead))[:, None]
     flat -= flat.min(axis=0)
-    cell = max(float(np.ptp(flat, axis=0).max()), SMALLEST_EXTENT) / np.sqrt(limit)
+    # an extent, as a slope, of a tenth of a millimetre in a hundred metres counts as none
+    cell = max(float(np.ptp(flat, axis=0).max()), 1e-6) / np.sqrt(limit)
     while (count := (group := _surfaces_in_cells(flat, distance, cell)).max() + 1) > limit:
         cell *= np.sqrt(count / limit) * 1.02
     total = np.stack([np.bincount(group, points[:, axis]) for axis in range(3)], axis=1)
@@ -101,7 +96,7 @@ def first_in_cell(offsets: Float[np.ndarray, "n 3"], cell: float) -> Int[np.ndar
 
 def spacing(points: Float[np.ndarray, "n 3"]) -> float:
     """Median distance from a point to its nearest neighbour at another place; 0 where all coincide."""
-    sample = points[:: max(1, len(points) // SPACING_SAMPLE)]
+    sample = points[:: max(1, len(points) // 1000)]  # whose median is good to a few percent
     distance = cKDTree(points).query(sample, k=min(8, len(points)))[0].reshape(len(sample), -1)
     apart = np.where(distance > 0, distance, np.inf).min(axis=1)
     return float(np.median(apart[np.isfinite(apart)])) if np.isfinite(apart).any() else 0.0
@@ -109,10 +104,9 @@ def spacing(points: Float[np.ndarray, "n 3"]) -> float:
 
 # --- farthest points --------------------------------------------------------------------------------------------------
 
-# Farthest-point order (PointNet++, section 3.2), computed once in preprocessing.
-#
-# The order is greedy, so its first m points are the farthest-point sample of size m for every m: each level of the
-# encoder is a prefix, and nothing is sampled while training.
+# The order (PointNet++, section 3.2) is computed once, in preprocessing. It is greedy, so its first m points are the
+# farthest-point sample of size m for every m: each level of the encoder is a prefix, and nothing is sampled while
+# training.
 
 
 def farthest_point_order(
@@ -139,12 +133,8 @@ def farthest_point_order(
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     # about the middle, so that single precision is spent on the shape and not on where it is
     xyz = np.ascontiguousarray((points[rank] - middle).T, dtype=np.float32)
-    first = _farthest_from_origin(xyz) if start is None else int(np.flatnonzero(rank == start)[0])
+    first = int((np.add.reduce(xyz * xyz, axis=0)).argmax() if start is None else np.flatnonzero(rank == start)[0])
     return rank[_greedy(xyz, first, m)]
-
-
-def _farthest_from_origin(xyz: Float[np.ndarray, "3 n"]) -> int:
-    return int(np.add.reduce(xyz * xyz, axis=0).argmax())
 
 
 def _greedy(xyz: Float[np.ndarray, "3 n"], first: int, m: int) -> Int[np.ndarray, " m"]:

@@ -184,7 +184,7 @@ class SegmentedMesh:
         """Raise ``ValueError`` unless every segment is finite, closed, outward oriented and of positive volume.
 
         Of a segment that is marked as no solid, only finite vertices and existing indices are asked.
-        Overlap between segments needs inside tests, see ``mereo.geometry.overlap.overlaps``.
+        Overlap between segments needs inside tests, see ``mereo.geometry.mesh_check.overlaps``.
         """
         for segment in self.segments:
             check_segment(segment)

@@ -4,7 +4,6 @@
 moved by the last resort alone, a new surface from the winding number. Everything is deterministic.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import igl
@@ -17,23 +16,10 @@ from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.mesh_check import Faces, Vertices, examine, faces_astray, mesh_of, solid_of
-from mereo.geometry.overlap import overlaps
+from mereo.geometry.mesh_check import Faces, Vertices, examine, faces_astray, mesh_of, overlaps, solid_of
 
 MERGED_WITHIN = (1e-6, 1e-4)
 """Vertices of open edges this near to each other, in diagonals of the box, count as one; the less, where it helps."""
-
-FRAGMENT = 0.02
-"""A piece whose diagonal is below this share of the segment's is a stray."""
-
-FLECK = 1e-5
-"""Share of the largest piece's volume."""
-
-MOST_SHELLS = 300
-"""More are no object of parts but debris, and their union would take minutes."""
-
-REMESH_CELLS = 128
-"""Cells along the longest side of the grid on which the last resort finds a new surface."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +96,7 @@ def _drop_fragments(vertices: Vertices, faces: Faces) -> Step:
     np.minimum.at(low, piece, corners.min(axis=1))
     np.maximum.at(high, piece, corners.max(axis=1))
     whole = float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    stray = np.linalg.norm(high - low, axis=1) < FRAGMENT * whole
+    stray = np.linalg.norm(high - low, axis=1) < 0.02 * whole
     if not stray.any() or stray.all():
         return vertices, faces, ""
     used, kept = np.unique(faces[~stray[piece]], return_inverse=True)
@@ -153,7 +139,7 @@ def _unite(vertices: Vertices, faces: Faces) -> Step:
     except ValueError:
         return vertices, faces, ""
     shells = solid.decompose()
-    if not 1 < len(shells) <= MOST_SHELLS:
+    if not 1 < len(shells) <= 300:  # more are debris, and their union would take minutes
         return vertices, faces, ""
     filled = [shell for shell in shells if shell.volume() > 0]
     hollow = [solid_of(v, f[:, ::-1]) for v, f in (mesh_of(shell) for shell in shells if shell.volume() < 0)]
@@ -165,16 +151,15 @@ def _unite(vertices: Vertices, faces: Faces) -> Step:
 def _remesh(vertices: Vertices, faces: Faces) -> Step:
     """A new surface where the winding number is one half, smooth because it is found by distances near the old one."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
-    step = float((high - low).max()) / REMESH_CELLS
+    step = float((high - low).max()) / 128
     axes = [np.arange(low[k] - 2.5 * step, high[k] + 2.5 * step, step) for k in range(3)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     inside = igl.fast_winding_number(vertices, faces.astype(np.int64), nodes) > 0.5
     squared = _near_squared(vertices, faces, nodes, inside.reshape([len(axis) for axis in axes]), step)
     field = np.clip(np.sqrt(squared), 1e-3 * step, step) * np.where(inside, 1.0, -1.0)
-    found, triangles, _, _ = marching_cubes(
-        field.reshape([len(axis) for axis in axes]), 0.0, gradient_direction="ascent"
-    )
-    solid = solid_of(found.astype(np.float64) * step + [axis[0] for axis in axes], triangles.astype(np.int64))
+    shape = [len(axis) for axis in axes]
+    corners, triangles, _, _ = marching_cubes(field.reshape(shape), 0.0, gradient_direction="ascent")
+    solid = solid_of(corners.astype(np.float64) * step + [axis[0] for axis in axes], triangles.astype(np.int64))
     solid = solid.simplify(0.2 * step)
     return *mesh_of(solid), f"made a new surface from the winding number; details below {2 * step:.2g} are lost"
 
@@ -229,7 +214,7 @@ def _without_flecks(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
     piece = pieces(faces, len(vertices))
     a, b, c = (vertices[faces[:, k]] - vertices.mean(axis=0) for k in range(3))
     volume = np.abs(np.bincount(piece, weights=np.einsum("ij,ij->i", a, np.cross(b, c))))
-    used, kept = np.unique(faces[(volume > FLECK * volume.max())[piece]], return_inverse=True)
+    used, kept = np.unique(faces[(volume > 1e-5 * volume.max())[piece]], return_inverse=True)
     return vertices[used], kept.reshape(-1, 3)
 
 
@@ -256,8 +241,8 @@ def largest_piece(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
 def open_edges(vertices: Vertices, faces: Faces) -> Int[np.ndarray, "_ 2"]:
     """Directed edges that no face takes the other way, in the order of faces."""
     directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    there, back = directed @ [len(vertices), 1], directed @ [1, len(vertices)]
-    return directed[~np.isin(there, back)]
+    forth, back = directed @ [len(vertices), 1], directed @ [1, len(vertices)]
+    return directed[~np.isin(forth, back)]
 
 
 def close_holes(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
@@ -265,14 +250,9 @@ def close_holes(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
     rim = open_edges(vertices, faces)
     graph = coo_array((np.ones(len(rim)), rim.reshape(-1, 2).T), shape=(len(vertices),) * 2)
     _, group = connected_components(graph, directed=False)
-    for loop in _grouped(rim, group):
+    for index in np.unique(group[rim[:, 0]]):
+        loop = rim[group[rim[:, 0]] == index]
         fan = np.stack([loop[:, 1], loop[:, 0], np.full(len(loop), len(vertices))], axis=1)
         vertices = np.concatenate([vertices, vertices[loop[:, :1]].mean(axis=0)])
         faces = np.concatenate([faces, fan])
     return vertices, faces
-
-
-def _grouped(rim: Int[np.ndarray, "_ 2"], group: Int[np.ndarray, " v"]) -> Iterator[Int[np.ndarray, "_ 2"]]:
-    """The edges of each connected loop."""
-    for index in np.unique(group[rim[:, 0]]):
-        yield rim[group[rim[:, 0]] == index]

@@ -11,12 +11,6 @@ from scipy.spatial import cKDTree
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import Color
 
-FOLLOWED = 4
-"""Points of its segment between which a radius is interpolated; it is smooth."""
-
-DIGITS = 3
-"""Decimal digits that a radius on a grid keeps: it is not known better, and files become a third as large."""
-
 STOPS: tuple[Color, ...] = ((214, 224, 234), (250, 205, 120), (226, 98, 62), (122, 24, 70))
 """Colours from a radius of none to ``Radii.high``: pale is sure, dark red is not."""
 
@@ -66,7 +60,7 @@ class Radii:
     def at(self, places: Float[np.ndarray, "n 3"], label: int) -> Float[np.ndarray, " n"]:
         """Radii at places in or near a segment, between its nearest points by the inverse of the squared distance."""
         tree, values = self._trees[label]
-        distance, near = tree.query(places, k=range(1, min(FOLLOWED, len(values)) + 1))
+        distance, near = tree.query(places, k=range(1, min(4, len(values)) + 1))  # a radius is smooth
         weight = 1.0 / np.maximum(distance, 1e-12 * max(1.0, float(np.abs(self.points).max()))) ** 2
         result: np.ndarray = (weight * values[near]).sum(axis=1) / weight.sum(axis=1)
         return result
@@ -77,7 +71,8 @@ class Radii:
         for label in self._trees:
             index = np.argwhere(grid.labels == label)
             if len(index):
-                result[tuple(index.T)] = rounded_to(self.at(grid.positions(index), label), DIGITS)
+                # a radius is not known better, and files become a third as large
+                result[tuple(index.T)] = rounded_to(self.at(grid.positions(index), label), 3)
         return result
 
 
@@ -94,8 +89,6 @@ def rounded_to(values: Float[np.ndarray, " n"], digits: int) -> Float[np.ndarray
 
 
 # --- color stops ------------------------------------------------------------------------------------------------------
-
-# Colours between stops: the scales by which surfaces and points are coloured, in files as on pages.
 
 
 def between_stops(shares: Float[np.ndarray, " n"], stops: Sequence[Color]) -> Float[np.ndarray, "n 3"]:

@@ -1,10 +1,13 @@
-"""Solid queries on closed meshes: which segment holds a point, how far is its surface, which way.
+"""Solid queries on closed meshes: which segment holds a point, how far is its surface, which way, what a ray hits.
 
 Inside tests cast one ray and ask whether the first face hit is seen from behind. Two rays in unrelated directions are
 compared; where they disagree (a ray through an edge, an imperfect mesh) the generalized winding number decides
 (Jacobson et al., SIGGRAPH 2013; Barill et al., SIGGRAPH 2018). Each segment has a ray scene of its own: in a joint one
 the coincident faces of two neighbours would make the first face hit ambiguous. A segment that is marked as no solid
 (holes, self-intersections) is left to the winding number altogether.
+
+Rays from the camera are ``t * direction``, t > 0, from the origin of the camera frame; Embree finds where they first
+meet a surface. Directions have z = 1, so that t is the depth and a direction's x and y are its slopes.
 """
 
 from functools import cached_property
@@ -12,16 +15,99 @@ from typing import NamedTuple
 
 import igl
 import numpy as np
+from embreex import rtcore
+from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 from scipy.sparse import csr_array
 
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.raycasting import Hits, first_hits, ray_scene, toward
 from mereo.geometry.read_only import read_only
 
 _DIRECTIONS = read_only(np.array([[0.4637, 0.5718, 0.6767], [-0.7301, 0.3469, -0.5887]], dtype=np.float32))
 """Two generic directions: not along any axis, face diagonal or each other."""
+
+
+# --- rays from the camera ---------------------------------------------------------------------------------------------
+
+_DEVICE = rtcore.EmbreeDevice()
+
+
+class Hits(NamedTuple):
+    """First meetings of rays with a surface.
+
+    Attributes:
+        distance: t; infinite where nothing is hit.
+        normal: of the surface there, of any length, on either side; zero where nothing is hit.
+    """
+
+    distance: Float[np.ndarray, " n"]
+    normal: Float[np.ndarray, "n 3"]
+
+    @classmethod
+    def none(cls, count: int) -> "Hits":
+        """Hits of rays that meet nothing (yet)."""
+        return cls(np.full(count, np.inf), np.zeros((count, 3)))
+
+    def nearer(self, rows: Int[np.ndarray, " m"], others: "Hits") -> Int[np.ndarray, " k"]:
+        """Rows of ``rows`` on which the ``others`` meet something nearer, which these hits take over, in place."""
+        better = others.distance < self.distance[rows]
+        kept = rows[better]
+        self.distance[kept], self.normal[kept] = others.distance[better], others.normal[better]
+        return kept
+
+
+def ray_scene(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> EmbreeScene:
+    """Embree scene of one triangle mesh. It works in single precision: keep coordinates near the origin."""
+    scene = EmbreeScene(_DEVICE)
+    TriangleMesh(scene, vertices.astype(np.float32), faces.astype(np.int32))
+    return scene
+
+
+def first_hits(
+    scene: EmbreeScene, center: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]
+) -> tuple[Int[np.ndarray, " m"], Hits]:
+    """Rays that hit a scene whose coordinates are relative to ``center``, and their hits."""
+    hits = scene.run(*_rays(center, directions), output=True)
+    rows = np.flatnonzero(hits["primID"] >= 0)
+    return rows, Hits(hits["tfar"][rows].astype(np.float64), hits["Ng"][rows].astype(np.float64))
+
+
+def first_faces(
+    scene: EmbreeScene, center: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]
+) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+    """Rays that hit a scene whose coordinates are relative to ``center``, and the face that each hits first."""
+    face = scene.run(*_rays(center, directions))
+    rows = np.flatnonzero(face >= 0)
+    return rows, face[rows].astype(np.int64)
+
+
+def _rays(
+    center: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]
+) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
+    """Origins and directions in the single precision that Embree wants."""
+    single = np.ascontiguousarray(directions, dtype=np.float32)
+    return np.broadcast_to(-center.astype(np.float32), single.shape).copy(), single
+
+
+def toward(
+    directions: Float[np.ndarray, "n 3"], low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]
+) -> Int[np.ndarray, " m"]:
+    """Rays that may hit the box from ``low`` to ``high``: all of them where it is not wholly in front of the camera.
+
+    A segment covers a small part of an image, and a ray that misses costs as much as one that hits.
+    """
+    if low[2] <= 0:
+        return np.arange(len(directions))
+    # a hundredth of a pixel of the paper's camera, a thousand times single precision's rounding
+    margin = 1e-4
+    x, y = directions[:, 0], directions[:, 1]
+    least, most = (np.stack([corner[:2] / low[2], corner[:2] / high[2]]) for corner in (low, high))
+    (x0, y0), (x1, y1) = least.min(axis=0) - margin, most.max(axis=0) + margin
+    return np.flatnonzero((x >= x0) & (x <= x1) & (y >= y0) & (y <= y1))
+
+
+# --- segments and objects ---------------------------------------------------------------------------------------------
 
 
 class _Solid:
@@ -76,8 +162,8 @@ class _Solid:
     def first_hit(self, directions: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Hits]:
         """Which rays from the origin hit the segment, and where each of them does first."""
         rows = toward(directions, self.low, self.high)
-        hit, found = first_hits(self.rays, self.center, directions[rows])
-        return rows[hit], found
+        hit, hits = first_hits(self.rays, self.center, directions[rows])
+        return rows[hit], hits
 
     def closest(
         self, points: Float[np.ndarray, "n 3"]
@@ -170,10 +256,10 @@ class Solids:
         for again in (False, True):
             for index, solid in enumerate(self._solids):
                 rows = np.flatnonzero((likely != index) & (bounds[index] < squared) if again else likely == index)
-                found, faces, places = solid.closest(points[rows])
-                nearer = found < squared[rows]
+                distance, faces, places = solid.closest(points[rows])
+                nearer = distance < squared[rows]
                 kept = rows[nearer]
-                squared[kept], place[kept], owner[kept] = found[nearer], places[nearer], index
+                squared[kept], place[kept], owner[kept] = distance[nearer], places[nearer], index
                 face[kept] = first_faces[index] + faces[nearer]
         return Nearest(np.sqrt(squared), place, face, owner)
 
@@ -245,11 +331,9 @@ def _winding_nodes(
 
 # --- winding numbers --------------------------------------------------------------------------------------------------
 
-# Inside tests for all nodes of a grid at once, by winding numbers along its columns.
-#
-# Instead of a test per node, every triangle is projected onto the (x, y) columns it covers; along each column the
-# signed crossings below a node add up to the winding number there. A column through an edge or a vertex counts as one
-# beside it, the same one for all triangles, so a closed mesh has no cracks.
+# For all nodes of a grid at once: every triangle is projected onto the (x, y) columns it covers, and along each column
+# the signed crossings below a node add up to the winding number there. A column through an edge or a vertex counts as
+# one next to it, the same for all triangles, so a closed mesh has no cracks.
 
 
 def winding_grid(
@@ -311,8 +395,6 @@ def _covered_columns(
 
 # --- moments ----------------------------------------------------------------------------------------------------------
 
-# Volume and centre of what belongs to each segment of a mesh, and how they change with its vertices.
-
 
 def owned_centroids(mesh: SegmentedMesh) -> Float[np.ndarray, "s 3"]:
     """Centre of the volume that belongs to each segment: its mesh's without that of the segments nested in it."""
@@ -341,8 +423,7 @@ def owned_gradients(mesh: SegmentedMesh) -> Float[np.ndarray, "s 4 v 3"]:
     centers, volumes = owned_centroids(mesh), mesh.owned_volumes
     result = np.zeros((len(mesh.segments), 4, ends[-1], 3))
     for owner, center in enumerate(centers):
-        inner = _directly_inside(mesh, owner)
-        for index, sign in ((owner, 1.0), *((one, -1.0) for one in inner)):
+        for index, sign in ((owner, 1.0), *((inner, -1.0) for inner in _directly_inside(mesh, owner))):
             rows = slice(ends[index], ends[index + 1])
             result[owner, :, rows] = sign * _gradients(mesh.segments[index], center)
         # about the centroid the first moment is zero, so that the volume's change does not move it
@@ -353,7 +434,7 @@ def owned_gradients(mesh: SegmentedMesh) -> Float[np.ndarray, "s 4 v 3"]:
 def _directly_inside(mesh: SegmentedMesh, outer: int) -> list[int]:
     """Segments whose meshes bound the volume that belongs to a segment from within."""
     within = [inner for inner, other in mesh.nesting if other == outer]
-    return [one for one in within if not any((one, other) in mesh.nesting for other in within)]
+    return [inner for inner in within if not any((inner, other) in mesh.nesting for other in within)]
 
 
 def _gradients(segment: Segment, origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 v 3"]:

@@ -18,7 +18,7 @@ from mereo.geometry.downsampling import MAX_POINTS, thin_to_grid
 NEIGHBORS = 24
 """Neighbours that are looked at: in an image, the 5 x 5 pixels around one."""
 
-BESIDE, AROUND = 1.6, 3.0
+ADJACENT, AROUND = 1.6, 3.0
 """Angles in pitches within which points are beside each other (diagonals are), and within which neighbours count."""
 
 JUMP = 4.0
@@ -85,7 +85,7 @@ def _patches(
     pitch = np.full(len(points), everywhere) if on_grid else around
     step = np.abs(distance[neighbor] - distance[:, None])
     tall = np.maximum(JUMP * pitch * distance, NOISE * float(np.median(step[:, :4])))
-    row, column = np.nonzero((angle <= BESIDE * pitch[:, None]) & (step <= tall[:, None]))
+    row, column = np.nonzero((angle <= ADJACENT * pitch[:, None]) & (step <= tall[:, None]))
     edges = (np.ones(len(row), dtype=np.int8), (row, neighbor[row, column]))
     patch = connected_components(coo_matrix(edges, shape=(len(points),) * 2), directed=False)[1]
     same = (angle <= AROUND * around[:, None]) & (patch[neighbor] == patch[:, None])
@@ -152,7 +152,7 @@ def smoothed(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     radius = RADIUS * float(np.median(angle[:, FEWEST]))
     if radius == 0:
         return points
-    near = (angle <= radius) & _on_one_surface(distance, angle, neighbor)
+    near = (angle <= radius) & _on_same_surface(distance, angle, neighbor)
     weight = near * np.exp(-0.5 * (angle / (WIDTH * radius)) ** 2)
     terms = _quadratic(sight, neighbor, radius)
     normal = np.einsum("nki,nk,nkj->nij", terms, weight, terms) + np.diag(RIDGE)
@@ -162,7 +162,7 @@ def smoothed(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     return sight * moved[:, None]
 
 
-def _on_one_surface(
+def _on_same_surface(
     distance: Float[np.ndarray, " n"], angle: Float[np.ndarray, "n k"], neighbor: Int[np.ndarray, "n k"]
 ) -> Bool[np.ndarray, "n k"]:
     """Whether the step in range to each neighbour is no larger than slant or noise make it."""

@@ -1,4 +1,6 @@
-"""Rigid transforms. Notation: ``T_a_b`` maps b-coordinates to a-coordinates."""
+"""Rigid transforms and the joint normalizer. Notation: ``T_a_b`` maps b-coordinates to a-coordinates."""
+
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -78,14 +80,59 @@ def fit_rigid(
     return rigid(rotation, aim - rotation @ middle)
 
 
+# --- normalized coordinates -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Normalizer:
+    """Joint normalizer (paper, section 3.2): map to normalized coordinates, ``(points - center) * scale``.
+
+    It comes from the observed points only: their box fills [-1, 1]^3, and the hidden part may lie outside. Normalized
+    coordinates carry no suffix.
+
+    Attributes:
+        center: middle of the cloud's bounding box, in the camera frame (the paper's -t).
+        scale: one over half the box's longest side (the paper's s), in 1/unit.
+    """
+
+    center: Float[np.ndarray, "3"]
+    scale: float
+
+    @classmethod
+    def fit(cls, points: Float[np.ndarray, "n 3"]) -> "Normalizer":
+        """Normalizer of a cloud, the paper's t and s. Raises ``ValueError`` when the cloud has no extent."""
+        if len(points) == 0:
+            raise ValueError("the point cloud is empty; it needs points on the object: check the mask and the units")
+        low, high = points.min(axis=0), points.max(axis=0)
+        half = float((high - low).max()) / 2
+        if not half > 0:
+            raise ValueError("all points coincide; the cloud needs an extent: check the file's columns and units")
+        return cls((low + high) / 2, 1.0 / half)
+
+    def apply(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Points in normalized coordinates."""
+        return (points - self.center) * self.scale
+
+    def invert(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Points in the cloud's frame and unit, from normalized coordinates."""
+        return points / self.scale + self.center
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "4 4"]:
+        """Homogeneous transform that ``apply`` is."""
+        result = np.diag([self.scale, self.scale, self.scale, 1.0])
+        result[:3, 3] = -self.scale * self.center
+        return result
+
+    @property
+    def viewpoint(self) -> Float[np.ndarray, "3"]:
+        """Position of the camera (the origin of the camera frame) in normalized coordinates."""
+        return -self.center * self.scale
+
+
 # --- best rotations ---------------------------------------------------------------------------------------------------
 
-# Rigid motions that bring points onto others, in closed form and robustly.
-#
-# A motion is ``y = R x + t``. Notation: n points, s sets of points; ``T_a_b`` maps b-coordinates to a-coordinates.
-
-ROUNDS = 20
-"""Rounds of reweighting in ``robust_rigid``; it has converged by then."""
+# Rigid motions ``y = R x + t`` that bring points onto others. Notation: n points, s sets of points.
 
 
 def best_rotations(covariance: Float[np.ndarray, "*s 3 3"]) -> Float[np.ndarray, "*s 3 3"]:
@@ -105,7 +152,7 @@ def robust_rigid(
 ) -> Float[np.ndarray, "4 4"]:
     """``fit_rigid`` under a Cauchy loss whose scale falls from the residuals' own median to ``sigma``."""
     T = fit_rigid(source, target, weight)
-    for _ in range(ROUNDS):
+    for _ in range(20):  # it has converged by then
         distance = np.linalg.norm(source @ T[:3, :3].T + T[:3, 3] - target, axis=1)
         scale = max(float(np.median(distance)), sigma)
         T = fit_rigid(source, target, weight / (1.0 + (distance / scale) ** 2))

@@ -1,9 +1,12 @@
-"""Files that appear whole or not at all, the scratch folders in which they are made, and values as JSON.
+"""Files and folders of results: they appear whole or not at all, and replace only what mereo itself wrote.
 
 An output is first made in a scratch folder beside its destination and renamed at the end, so that a reader never sees
 half of it and an error, Ctrl-C or a full disk leaves nothing behind. A scratch folder (``.NAME.1a2b3c4d.mereo``) is
 locked by its process; the system frees locks when a process dies, however it does, so the next one that writes there
 can tell what a killed one left from work in progress.
+
+Each folder of results holds ``.mereo.json``, a list of all that is in it with the size and time of each file. A folder
+is replaced where its content is that list's, unchanged: what somebody has put there, or has edited, stays.
 """
 
 import errno
@@ -11,8 +14,9 @@ import json
 import os
 import re
 import shutil
+import stat
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -29,11 +33,13 @@ except ImportError:  # Windows, where what a killed process left stays until its
 OLD = ".mereo-old"
 """Name under which an output that is being replaced waits in the scratch folder of its successor."""
 
-PROTOCOL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")
-"""First part of what a path makes of a URL."""
+MARKER = ".mereo.json"
+"""Name of the list in each folder of results."""
 
-MOST_BYTES = 255 - len("..1a2b3c4d.mereo")
-"""Length of a name in bytes that leaves room for that of its scratch folder on every usual file system."""
+EXISTS = "exists; it is not overwritten: choose another name or pass --force"
+
+SUFFIX_BYTES = len(".1a2b3c4d.mereo")
+"""Length of what a scratch folder's name has behind that of its output."""
 
 
 # --- scratch folders --------------------------------------------------------------------------------------------------
@@ -47,20 +53,23 @@ def check_place(path: Path, may_be_link: bool = False) -> None:
     name = repr(str(path))
     if re.search("[\0\ud800-\udfff]", str(path)):
         raise ValueError(f"the output {name} has a zero byte, or bytes that are no UTF-8 text: choose another name")
-    if len(path.parts) > 1 and PROTOCOL.fullmatch(path.parts[0]) and not Path(path.parts[0]).exists():
+    # a path makes "s3:/bucket" of "s3://bucket"
+    is_url = len(path.parts) > 1 and re.fullmatch(r"[A-Za-z][A-Za-z0-9+.-]+:", path.parts[0])
+    if is_url and not Path(path.parts[0]).exists():
         raise ValueError(
             f"the output {path.parts[0]}//{'/'.join(path.parts[1:])} is a URL, and a local path is needed here; only "
             "datasets go to an object storage: name a folder or file of this machine"
         )
     if path.name in ("", ".."):
         raise ValueError(f"the output {name} has no name of its own, which it needs: name it, as in {path / 'out'}")
-    if max(len(part.encode()) for part in path.parts) > MOST_BYTES:
-        raise ValueError(f"the output {name[:40]}... has a name of over {MOST_BYTES} bytes: choose a shorter one")
+    most = 255 - len(".") - SUFFIX_BYTES  # of usual file systems, which hold the scratch folder too
+    if max(len(part.encode()) for part in path.parts) > most:
+        raise ValueError(f"the output {name[:40]}... has a name of over {most} bytes: choose a shorter one")
     if path.is_symlink() and not (may_be_link and path.is_dir()):
         raise ValueError(f"{path} is a link, which would be lost; an output is written in its own place: name that")
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise ValueError(f"{path} is a device or pipe; an output is a file or folder: choose another --output")
-    above = next((place for place in path.parents if place.exists()), path.parent)
+    above = next((folder for folder in path.parents if folder.exists()), path.parent)
     if above.exists() and not above.is_dir():
         raise ValueError(f"{above} is no folder, so {path.name} cannot be made in it: choose another --output")
 
@@ -76,7 +85,7 @@ def scratch_folder(path: Path) -> Iterator[Path]:
         PermissionError: the place cannot be written to.
     """
     remove_abandoned(path)
-    missing = [place for place in path.parents if not place.exists()]
+    missing = [folder for folder in path.parents if not folder.exists()]
     try:
         scratch, lock = _new_scratch(path)
         try:
@@ -116,16 +125,12 @@ def _new_scratch(path: Path) -> tuple[Path, int | None]:
 
 def remove_abandoned(path: Path) -> None:
     """Remove what killed processes left for ``path``; an output that one of them had taken away is put back."""
-    for scratch, is_dead in _scratches(path.parent, re.escape(path.name)):
-        if is_dead:
-            _clear(scratch, path)
+    _clear_dead(path.parent, re.escape(path.name))
 
 
 def remove_all_abandoned(directory: Path) -> None:
     """Remove what killed processes left for any file of a directory in which work is continued."""
-    for scratch, is_dead in _scratches(directory, ".+"):
-        if is_dead:
-            _clear(scratch, directory / scratch.name[1 : -len(".1a2b3c4d.mereo")])
+    _clear_dead(directory, ".+")
 
 
 def is_being_written(path: Path) -> bool:
@@ -133,12 +138,18 @@ def is_being_written(path: Path) -> bool:
     return any(not is_dead for _, is_dead in _scratches(path.parent, re.escape(path.name)))
 
 
+def _clear_dead(directory: Path, names: str) -> None:
+    for scratch, is_dead in _scratches(directory, names):
+        if is_dead:
+            _clear(scratch, directory / scratch.name[1:-SUFFIX_BYTES])
+
+
 def _scratches(directory: Path, names: str) -> Iterator[tuple[Path, bool]]:
     """Scratch folders for a pattern of names, each with whether its process is dead; none where there are no locks."""
-    pattern, found = re.compile(rf"\.(?:{names})\.[0-9a-z_]{{8}}\.mereo"), list[Path]()
+    pattern, scratches = re.compile(rf"\.(?:{names})\.[0-9a-z_]{{8}}\.mereo"), list[Path]()
     with suppress(OSError):  # it may be missing, or be no one's to list
-        found = [place for place in directory.iterdir() if pattern.fullmatch(place.name) and not place.is_symlink()]
-    for scratch in found:
+        scratches = [item for item in directory.iterdir() if pattern.fullmatch(item.name) and not item.is_symlink()]
+    for scratch in scratches:
         try:
             lock = _lock(scratch)
         except BlockingIOError:
@@ -209,9 +220,6 @@ def atomic_file(path: str | Path, *, force: bool = True, inputs: Iterable[str | 
             _place_new(partial, path)
 
 
-EXISTS = "exists; it is not overwritten: choose another name or pass --force"
-
-
 def check_file_place(path: str | Path | None, *, force: bool = True, inputs: Iterable[str | Path] = ()) -> None:
     """Raise as ``atomic_file`` does for a place where no file can be put: before the work, not after. None is none.
 
@@ -249,6 +257,152 @@ def _place_new(partial: Path, path: Path) -> None:
         if path.exists():
             raise FileExistsError(f"{path} {EXISTS}") from None
         os.rename(partial, path)
+
+
+# --- folders of results ---------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def new_directory(path: str | Path, force: bool = False, inputs: Sequence[str | Path] = ()) -> Iterator[Path]:
+    """Yield an empty temporary directory; rename it to ``path`` when the block succeeds.
+
+    Args:
+        path: the destination. An existing empty directory counts as absent.
+        force: replace an existing directory, once the new one is complete, if mereo wrote all that it holds.
+        inputs: files that are read, which are never replaced.
+
+    Raises:
+        ValueError: ``path`` is a link, a device, a mount point or no usable name.
+        FileExistsError: ``path`` is a file, or a directory with content and ``force`` is false, or it holds what mereo
+            did not write; or one of these came to be while the block ran.
+        OSError: the disk is full, or the place cannot be written to.
+    """
+    path = Path(path)
+    check_new_directory(path, force, inputs)
+    with scratch_folder(path) as scratch:
+        content = scratch / path.name
+        content.mkdir()
+        yield content
+        (content / MARKER).write_text(json_text({"written_by": "mereo", "files": _stamps(content)}), "utf-8")
+        if force and _has_content(path):
+            os.rename(path, scratch / OLD)  # from here on nobody finds it to put something into it
+            _check_ours(scratch / OLD, path)  # where this raises, ``scratch_folder`` puts it back
+        with suppress(OSError):  # Windows renames nothing to an empty folder
+            path.rmdir()
+        try:
+            os.rename(content, path)
+        except OSError:
+            if not path.exists():
+                raise
+            raise FileExistsError(
+                f"{path} was written by another while this ran; it is kept and this result is dropped: run again with "
+                "another --output"
+            ) from None
+
+
+def check_new_directory(path: Path, force: bool, inputs: Sequence[str | Path] = ()) -> None:
+    """Check what ``new_directory`` may do, before the work; raises as it does.
+
+    An output that a killed process was just replacing is put back.
+    """
+    check_place(path)
+    if path.exists() and not path.is_dir():
+        raise FileExistsError(f"{path} is a file; a directory is written there: choose another --output")
+    if os.path.ismount(path):
+        raise ValueError(f"{path} is a mount point, which cannot be renamed: name a folder in it")
+    if is_being_written(path):
+        raise FileExistsError(f"{path} is being written by another process: wait for it, or choose another --output")
+    remove_abandoned(path)
+    if not _has_content(path):
+        return
+    if not force:
+        raise FileExistsError(
+            f"{path} exists and is not empty; it is not overwritten: choose another --output or pass --force"
+        )
+    for place in map(Path, inputs):
+        if place.exists() and place.resolve().is_relative_to(path.resolve()):
+            raise FileExistsError(f"{path} holds {place}, which is read; it is not replaced: choose another --output")
+    _check_ours(path, path)
+
+
+def _has_content(path: Path) -> bool:
+    return path.is_dir() and any(path.iterdir())
+
+
+def _check_ours(folder: Path, path: Path) -> None:
+    """Raise ``FileExistsError`` where ``folder``, which is or was ``path``, holds what its list does not have as it is.
+
+    Links are never in that list.
+    """
+    try:
+        listed = json.loads((folder / MARKER).read_text("utf-8"))["files"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        listed = {}
+    known = listed if isinstance(listed, dict) else {}
+    stamps = {name: stamp for name, stamp in _stamps(folder).items() if name != MARKER}
+    others = [name for name, stamp in stamps.items() if stamp is None or known.get(name) != stamp]
+    if others:
+        more = f" and {len(others) - 1} more" if len(others) > 1 else ""
+        raise FileExistsError(
+            f"{path} holds {others[0]}{more}, not written by this version of mereo or changed since; it is not "
+            "replaced: move that away, or choose another --output"
+        )
+
+
+def _stamps(folder: Path) -> dict[str, list[int] | None]:
+    """Size and time of each file in a folder, by its name there; of a folder nothing, and None for all else."""
+    stamps = dict[str, list[int] | None]()
+    for item in sorted(folder.rglob("*")):
+        facts = item.lstat()
+        stamp = [facts.st_size, facts.st_mtime_ns] if stat.S_ISREG(facts.st_mode) else None
+        stamps[item.relative_to(folder).as_posix()] = [] if stat.S_ISDIR(facts.st_mode) else stamp
+    return stamps
+
+
+# --- folders in which work is continued -------------------------------------------------------------------------------
+
+
+def claim_directory(directory: Path, name: str, settings: dict[str, Any], kind: str) -> dict[str, Any] | None:
+    """Settings that a directory of earlier work holds, or None where it was made with ``settings`` just now.
+
+    Hidden files do not count: a process that was killed while writing leaves them, and they are removed here. It may
+    be a link to a directory, because nothing is put in its place.
+
+    Args:
+        directory: where work is done that may be stopped and continued; made when it is missing.
+        name: of the JSON file in it that says what the work is.
+        settings: what that file says of a new directory.
+        kind: of the directory, for messages: "a dataset".
+
+    Raises:
+        FileExistsError: it is a file, or holds something but no such file.
+        ValueError: its file holds no settings, or it is no place for a directory.
+    """
+    check_place(directory, may_be_link=True)
+    path = directory / name
+    if directory.exists() and not directory.is_dir():
+        raise FileExistsError(f"{directory} is a file; {kind} is a directory: choose another --output")
+    remove_all_abandoned(directory)
+    if path.is_file():
+        return read_settings(path)
+    if directory.is_dir() and any(not file.name.startswith(".") for file in directory.iterdir()):
+        raise FileExistsError(f"{directory} is not empty and holds no {name}; choose another --output")
+    try:
+        write_json(path, settings, force=False)
+    except FileExistsError:  # another process came first
+        return read_settings(path)
+    return None
+
+
+def read_settings(path: Any) -> dict[str, Any]:
+    """Settings in the file of earlier work, a local one or an ``ObjectPath``; ``ValueError`` where it holds none."""
+    try:
+        settings = json.loads(path.read_text("utf-8"))
+    except ValueError:
+        settings = None
+    if not isinstance(settings, dict):
+        raise ValueError(f"{path} holds no settings; what it belongs to cannot be continued: choose another --output")
+    return settings
 
 
 # --- JSON -------------------------------------------------------------------------------------------------------------

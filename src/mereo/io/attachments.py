@@ -1,77 +1,110 @@
-"""Attachments: files of what is defined beside an object's rest model (vessels, a resection plane, a grasp).
+"""Attachments: files of what is defined with an object's rest model (vessels, a resection plane, a grasp).
 
-Meshes (STL, PLY, OBJ, GLB, glTF), point clouds (PLY, PCD, XYZ, NPY), tables of points or poses (CSV), volumes (NIfTI,
-NRRD). They are read whole, moved elsewhere, and written in their own format again.
+Meshes (STL, PLY, OBJ, GLB), point clouds (PLY, XYZ, NPY), tables of points or poses (CSV), volumes (NIfTI, NRRD). They
+are read whole, moved with the object, and written in their own format again.
 """
 
+import csv
+import io
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.atomic_files import atomic_file
 from mereo.io.errors import readable
 from mereo.io.mesh_formats import read_segmented_mesh
-from mereo.io.point_cloud_formats import CLOUD_READERS, ply_counts
-from mereo.io.pose_tables import PoseTable, read_pose_table
+from mereo.io.readers import CLOUD_READERS, ply_counts
 from mereo.io.volume_files import VOLUME_SUFFIXES, Volume, is_volume, read_scalar_volume
-from mereo.io.writers.glb import write_segments_glb, write_segments_gltf
-from mereo.io.writers.obj import write_segments_obj
-from mereo.io.writers.ply import write_positions_ply, write_segments_ply
-from mereo.io.writers.scalar_volumes import write_volume
-from mereo.io.writers.stl import write_surface_stl
+from mereo.io.writers.glb import write_segments_glb
+from mereo.io.writers.meshes import write_positions_ply, write_segments_obj, write_segments_ply, write_surface_stl
+from mereo.io.writers.volumes import write_volume
 
-MESHES = (".stl", ".ply", ".obj", ".glb", ".gltf")
-CLOUDS = (".ply", ".pcd", ".xyz", ".txt", ".pts", ".asc", ".npy")
-TABLES = (".csv",)
+MESHES = (".stl", ".ply", ".obj", ".glb")
+CLOUDS = (".ply", ".xyz", ".txt", ".pts", ".asc", ".npy")
+
+POSITION, QUATERNION = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
+"""Names of a table's columns, in any order and case; others are kept."""
 
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """Surfaces of one or more named parts, closed or not."""
+    """Surfaces of one or more named parts, closed or not; they have no orientations."""
 
     mesh: SegmentedMesh
+    rotations = None
 
     @property
     def points(self) -> Float[np.ndarray, "n 3"]:
         """All vertices."""
         return np.concatenate([part.vertices for part in self.mesh.segments])
 
-    @property
-    def rotations(self) -> None:
-        """A surface has no orientations."""
-        return None
-
     def at(self, points: Float[np.ndarray, "n 3"], rotations: Float[np.ndarray, "n 3 3"] | None) -> "Surfaces":
-        """The surfaces with their vertices elsewhere."""
+        """The surfaces with other vertices."""
         ends = np.cumsum([len(part.vertices) for part in self.mesh.segments])[:-1]
         return Surfaces(self.mesh.with_vertices(np.split(points, ends)))
 
 
 @dataclass(frozen=True, eq=False)
 class Positions:
-    """Points of a cloud, without anything else that its file may say about them."""
+    """Points of a cloud, without anything else that its file may say about them; they have no orientations."""
 
     points: Float[np.ndarray, "n 3"]
-
-    @property
-    def rotations(self) -> None:
-        """A point has no orientation."""
-        return None
+    rotations = None
 
     def at(self, points: Float[np.ndarray, "n 3"], rotations: Float[np.ndarray, "n 3 3"] | None) -> "Positions":
         """Other points."""
         return replace(self, points=points)
 
 
+@dataclass(frozen=True, eq=False)
+class PoseTable:
+    """Table of positions, or of poses.
+
+    Attributes:
+        header: names of all columns.
+        rows: their texts.
+        delimiter: between them.
+        points: position of each row.
+        rotations: orientation of each row, the pose's axes as columns; None where the table has none.
+    """
+
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    delimiter: str
+    points: Float[np.ndarray, "n 3"]
+    rotations: Float[np.ndarray, "n 3 3"] | None
+
+    def at(self, points: Float[np.ndarray, "n 3"], rotations: Float[np.ndarray, "n 3 3"] | None) -> "PoseTable":
+        """The table with other positions and orientations."""
+        return replace(self, points=points, rotations=rotations)
+
+    def text(self, factor: float = 1.0) -> str:
+        """Content of a file: positions times ``factor``, and orientations; what other columns say stays."""
+        columns = _columns(self.header)
+        changed = dict(zip(POSITION, (factor * self.points).T, strict=True))
+        if self.rotations is not None:
+            changed |= dict(zip(QUATERNION, Rotation.from_matrix(self.rotations).as_quat().T, strict=True))
+        cells = np.array(self.rows, dtype=object).reshape(-1, len(self.header))
+        for name, values in changed.items():
+            cells[:, columns[name]] = [f"{value:.10g}" for value in values]
+        file = io.StringIO()
+        writer = csv.writer(file, delimiter=self.delimiter, lineterminator="\n")
+        writer.writerow(self.header)
+        writer.writerows(cells.tolist())
+        return file.getvalue()
+
+
 Placeable = Surfaces | Positions | PoseTable
 """Content that is moved point by point: all have ``points``, ``rotations`` and ``at``."""
 
 Content = Placeable | Volume
-"""Content of an attachment. A volume is not moved but resampled: each voxel elsewhere asks what was there."""
+"""Content of an attachment. A volume is not moved but resampled."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,26 +139,21 @@ def _read(path: Path) -> Content:
     if is_volume(path):
         return read_scalar_volume(path)
     suffix = path.suffix.lower()
-    known = dict.fromkeys((*MESHES, *CLOUDS, *TABLES, *VOLUME_SUFFIXES))
+    known = dict.fromkeys((*MESHES, *CLOUDS, ".csv", *VOLUME_SUFFIXES))
     if path.exists() and suffix not in known:
         raise ValueError(
             f"{path} has the suffix {path.suffix!r}; what is carried is one of {', '.join(known)}: convert it"
         )
-    if suffix in TABLES:
+    if suffix == ".csv":
         return read_pose_table(path)
-    content = _mesh_or_cloud(path)
+    is_mesh = suffix in MESHES
+    if suffix == ".ply":
+        with readable(path, "mesh or point cloud"):
+            is_mesh = ply_counts(path).get("face", 0) > 0
+    content = Surfaces(read_segmented_mesh(path)) if is_mesh else _cloud(path)
     if not np.isfinite(content.points).all():
         raise ValueError(f"{path} has NaN or infinite positions; all must be finite: export it again")
     return content
-
-
-def _mesh_or_cloud(path: Path) -> Surfaces | Positions:
-    suffix = path.suffix.lower()
-    if suffix == ".ply":
-        with readable(path, "mesh or point cloud"):
-            faces = ply_counts(path).get("face", 0)
-        return Surfaces(read_segmented_mesh(path)) if faces else _cloud(path)
-    return Surfaces(read_segmented_mesh(path)) if suffix in MESHES else _cloud(path)
 
 
 def _cloud(path: Path) -> Positions:
@@ -154,33 +182,76 @@ def write_attachment(
     elif isinstance(content, PoseTable):
         with atomic_file(path) as partial:
             partial.write_text(content.text(factor), encoding="utf-8")
+    elif isinstance(content, Positions) and suffix == ".ply":
+        write_positions_ply(path, factor * content.points)
     elif isinstance(content, Positions):
-        _write_cloud(path, factor * content.points)
-    elif suffix in (".glb", ".gltf"):
-        with_unit = write_segments_glb if suffix == ".glb" else write_segments_gltf
-        with_unit(path, content.mesh, frame_rotation, unit_m)
+        with atomic_file(path) as partial:
+            if suffix == ".npy":
+                np.save(partial, factor * content.points)
+            else:
+                np.savetxt(partial, factor * content.points, fmt="%.10g")
+    elif suffix == ".glb":
+        write_segments_glb(path, content.mesh, frame_rotation, unit_m)
     else:
         plain = {".ply": write_segments_ply, ".obj": write_segments_obj, ".stl": write_surface_stl}[suffix]
         plain(path, content.mesh.transformed(np.diag([factor] * 3 + [1.0])))
 
 
-def _write_cloud(path: Path, points: Float[np.ndarray, "n 3"]) -> None:
-    suffix = path.suffix.lower()
-    if suffix == ".ply":
-        write_positions_ply(path, points)
-        return
-    with atomic_file(path) as partial:
-        if suffix == ".npy":
-            np.save(partial, points)
-        elif suffix == ".pcd":
-            partial.write_bytes(_pcd(points))
-        else:
-            np.savetxt(partial, points, fmt="%.10g")
+# --- tables of positions and poses ------------------------------------------------------------------------------------
 
 
-def _pcd(points: Float[np.ndarray, "n 3"]) -> bytes:
-    """Content of a binary PCD file (pointclouds.org/documentation/tutorials/pcd_file_format.html)."""
-    count = len(points)
-    lines = ["VERSION .7", "FIELDS x y z", "SIZE 4 4 4", "TYPE F F F", "COUNT 1 1 1", f"WIDTH {count}", "HEIGHT 1"]
-    lines += ["VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {count}", "DATA binary", ""]
-    return "\n".join(lines).encode("ascii") + points.astype("<f4").tobytes()
+def read_pose_table(path: Path) -> PoseTable:
+    """Table of a CSV file, separated by commas, semicolons or tabs: ``POSITION``, with ``QUATERNION`` where it has any.
+
+    Raises ``FileNotFoundError`` and ``ValueError``: columns are missing, a cell is no number, a row is too short or
+    its orientation is none.
+    """
+    with readable(path, "table of points"):
+        text = path.read_text(encoding="utf-8-sig")
+        first = next((line for line in text.splitlines() if line.strip()), "")
+        delimiter = max(",;\t", key=first.count)
+        reader = csv.reader(io.StringIO(text), delimiter=delimiter)
+        lines = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+        (_, header), *body = lines
+        columns = _columns(header)
+        if not set(POSITION) <= columns.keys():
+            raise ValueError(f"its columns are {', '.join(columns)}; it needs x, y, z")
+        stated, lacking = ([name for name in QUATERNION if (name in columns) == has] for has in (True, False))
+        if stated and lacking:
+            raise ValueError(f"it has a column {stated[0]!r} but no {lacking[0]!r}")
+        if not body:
+            raise ValueError("it has a header and no row")
+        for line, row in body:
+            if len(row) != len(header):
+                raise ValueError(f"line {line} has {len(row)} cells and the header {len(header)}")
+        points = _numbers(body, columns, POSITION)
+        rotations = _rotations(body, _numbers(body, columns, QUATERNION)) if stated else None
+    return PoseTable(tuple(header), tuple(tuple(row) for _, row in body), delimiter, points, rotations)
+
+
+Lines = list[tuple[int, list[str]]]
+"""Number and cells of each line."""
+
+
+def _columns(header: Sequence[str]) -> dict[str, int]:
+    return {name.strip().lower(): index for index, name in enumerate(header)}
+
+
+def _numbers(lines: Lines, columns: dict[str, int], names: tuple[str, ...]) -> Float[np.ndarray, "n k"]:
+    """Values of some columns."""
+    return np.array([[_number(line, row[columns[name]], name) for name in names] for line, row in lines])
+
+
+def _number(line: int, cell: str, name: str) -> float:
+    with suppress(ValueError):
+        if np.isfinite(value := float(cell)):
+            return value
+    raise ValueError(f"line {line} has {cell!r} in the column {name}, which is no finite number")
+
+
+def _rotations(lines: Lines, quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
+    """Orientations of quaternions, whose lengths are 1."""
+    off = np.abs(np.linalg.norm(quaternions, axis=1) - 1) >= 1e-3
+    if off.any():
+        raise ValueError(f"line {lines[int(np.argmax(off))][0]} has an orientation that is no rotation")
+    return Rotation.from_quat(quaternions).as_matrix()

@@ -47,49 +47,41 @@ class Bounds:
         return inside and not (self.above and value == self.least) and not (self.below and value == self.most)
 
 
-def _shown(bounds: Bounds) -> Any:
-    """Option's help with the rule behind the default."""
-    return arg(help_behavior_hint=lambda default: f"(default: {default}; {bounds.rule})")
+def _within(least: float, most: float = math.inf, *, above: bool = False, below: bool = False) -> tuple[Bounds, Any]:
+    """Bounds, and the help of options with their rule behind the default."""
+    bounds = Bounds(least, most, above, below)
+    return bounds, arg(help_behavior_hint=lambda default: f"(default: {default}; {bounds.rule})")
 
 
-_COUNT, _COUNT_OR_NONE = Bounds(1), Bounds(0)
-_POSITIVE, _NOT_NEGATIVE = Bounds(0, above=True), Bounds(0)
-_PROBABILITY, _BELOW_ONE, _SHARE = Bounds(0, 1), Bounds(0, 1, below=True), Bounds(0, 1, above=True)
-_EXPONENT, _DEPTH, _CELLS, _PORT = Bounds(-30, 30), Bounds(1, 1000), Bounds(4, 4096), Bounds(0, 65535)
-_POINTS, _IMAGE = Bounds(MIN_POINTS, 2**20), Bounds(8, 8192)
-# where a slip of a few digits would take all memory before anything could be said: far above all that has been of use
-_WIDTH, _NEIGHBORS, _NEIGHBORS_OR_NONE = Bounds(1, 8192), Bounds(1, 1024), Bounds(0, 1024)
-_BATCH, _QUERIES, _TIMES = Bounds(1, 65536), Bounds(1, 100_000), Bounds(1, 1000)
-_STATES, _WORKERS, _MULTIPLE = Bounds(1, 20_000), Bounds(0, 1024), Bounds(0, 1000)
-_SEED = Bounds(0, 2**63, below=True)  # what torch takes
-
-Threads = Annotated[int, _WORKERS, _shown(_WORKERS)]
-Count = Annotated[int, _COUNT, _shown(_COUNT)]
-CountOrNone = Annotated[int, _COUNT_OR_NONE, _shown(_COUNT_OR_NONE)]
-Points = Annotated[int, _POINTS, _shown(_POINTS)]
-ImageSize = Annotated[int, _IMAGE, _shown(_IMAGE)]
-Width = Annotated[int, _WIDTH, _shown(_WIDTH)]
-Widths = Annotated[tuple[int, ...], _WIDTH, _shown(_WIDTH)]
-Neighbors = Annotated[int, _NEIGHBORS, _shown(_NEIGHBORS)]
-NeighborsOrNone = Annotated[int, _NEIGHBORS_OR_NONE, _shown(_NEIGHBORS_OR_NONE)]
-Batch = Annotated[int, _BATCH, _shown(_BATCH)]
-Queries = Annotated[int, _QUERIES, _shown(_QUERIES)]
-Times = Annotated[int, _TIMES, _shown(_TIMES)]
-States = Annotated[int, _STATES, _shown(_STATES)]
-Workers = Annotated[int, _WORKERS, _shown(_WORKERS)]
-Positive = Annotated[float, _POSITIVE, _shown(_POSITIVE)]
-PositiveOrUnknown = Annotated[float | None, _POSITIVE, _shown(_POSITIVE)]
-NotNegative = Annotated[float, _NOT_NEGATIVE, _shown(_NOT_NEGATIVE)]
-Multiple = Annotated[float, _MULTIPLE, _shown(_MULTIPLE)]
-Probability = Annotated[float, _PROBABILITY, _shown(_PROBABILITY)]
-BelowOne = Annotated[float, _BELOW_ONE, _shown(_BELOW_ONE)]
-Share = Annotated[float, _SHARE, _shown(_SHARE)]
-ShareRange = Annotated[tuple[float, float], _SHARE, _shown(_SHARE)]
-Exponent = Annotated[int, _EXPONENT, _shown(_EXPONENT)]
-Depth = Annotated[int, _DEPTH, _shown(_DEPTH)]
-Cells = Annotated[int, _CELLS, _shown(_CELLS)]
-Port = Annotated[int, _PORT, _shown(_PORT)]
-Seed = Annotated[int, _SEED, _shown(_SEED)]
+# The upper bounds are far above all that has been of use: a slip of a few digits would take all memory before anything
+# could be said.
+Count = Annotated[int, *_within(1)]
+CountOrNone = Annotated[int, *_within(0)]
+Threads = Annotated[int, *_within(0, 1024)]
+Workers = Annotated[int, *_within(0, 1024)]
+Points = Annotated[int, *_within(MIN_POINTS, 2**20)]
+ImageSize = Annotated[int, *_within(8, 8192)]
+Width = Annotated[int, *_within(1, 8192)]
+Widths = Annotated[tuple[int, ...], *_within(1, 8192)]
+Neighbors = Annotated[int, *_within(1, 1024)]
+NeighborsOrNone = Annotated[int, *_within(0, 1024)]
+Batch = Annotated[int, *_within(1, 65536)]
+Queries = Annotated[int, *_within(1, 100_000)]
+Times = Annotated[int, *_within(1, 1000)]
+Depth = Annotated[int, *_within(1, 1000)]
+States = Annotated[int, *_within(1, 20_000)]
+Exponent = Annotated[int, *_within(-30, 30)]
+Cells = Annotated[int, *_within(4, 4096)]
+Port = Annotated[int, *_within(0, 65535)]
+Seed = Annotated[int, *_within(0, 2**63, below=True)]  # what torch takes
+Positive = Annotated[float, *_within(0, above=True)]
+PositiveOrUnknown = Annotated[float | None, *_within(0, above=True)]
+NotNegative = Annotated[float, *_within(0)]
+Multiple = Annotated[float, *_within(0, 1000)]
+Probability = Annotated[float, *_within(0, 1)]
+BelowOne = Annotated[float, *_within(0, 1, below=True)]
+Share = Annotated[float, *_within(0, 1, above=True)]
+ShareRange = Annotated[tuple[float, float], *_within(0, 1, above=True)]
 
 
 def check_bounds(settings: Any, prefix: str = "") -> None:

@@ -100,12 +100,12 @@ def check_tensors(tensors: Tensors, shapes: Mapping[str, str], sizes: Mapping[st
             raise ValueError(f"it has no tensor {name!r}")
         if np.iscomplexobj(tensors[name]):
             raise ValueError(f"its tensor {name!r} has complex numbers")
-        found, wanted = tensors[name].shape, axes.split()
-        if len(found) != len(wanted) or any(
+        shape, wanted = tensors[name].shape, axes.split()
+        if len(shape) != len(wanted) or any(
             length != (int(axis) if axis.isdecimal() else known.setdefault(axis, length))
-            for length, axis in zip(found, wanted, strict=True)
+            for length, axis in zip(shape, wanted, strict=True)
         ):
-            raise ValueError(f"its tensor {name!r} has the shape {list(found)}")
+            raise ValueError(f"its tensor {name!r} has the shape {list(shape)}")
 
 
 def _digest(tensors: Tensors, facts: Mapping[str, Any]) -> str:

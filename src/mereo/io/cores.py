@@ -4,7 +4,8 @@ import math
 import os
 import sys
 import threading
-from contextlib import AbstractContextManager
+from collections.abc import Callable
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "IGL_NUM_THREADS")
@@ -19,8 +20,8 @@ QUOTAS = (
 
 def cores() -> int:
     """Number of cores that this process may use, a container's quota included."""
-    there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, math.ceil(min(there, _quota())))
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, math.ceil(min(count, _quota())))
 
 
 def _quota() -> float:
@@ -52,29 +53,34 @@ def use_threads(count: int) -> None:
         threadpool_limits(count)
 
 
-class _OneBlasThread:
-    """Limit of BLAS to one thread that several threads of a program may hold at once; the last to leave lifts it."""
+class SharedLimit:
+    """Limit of the whole process that several threads may hold at once; the last to leave lifts it."""
 
-    def __init__(self) -> None:
-        self._changing, self._holders = threading.Lock(), 0
-        self._limit: AbstractContextManager[object] | None = None
+    def __init__(self, limit: Callable[[], AbstractContextManager[object]]) -> None:
+        self._limit, self._changing, self._holders = limit, threading.Lock(), 0
+        self._held = ExitStack()
 
     def __enter__(self) -> None:
-        from threadpoolctl import threadpool_limits
-
         with self._changing:
             if self._holders == 0:
-                self._limit = threadpool_limits(1, "blas")
+                self._held.enter_context(self._limit())
             self._holders += 1
 
     def __exit__(self, *_: object) -> None:
         with self._changing:
             self._holders -= 1
-            if self._holders == 0 and self._limit is not None:
-                self._limit.__exit__(None, None, None)
+            if self._holders == 0:
+                self._held.close()
 
 
-_ONE_BLAS_THREAD = _OneBlasThread()
+def _blas_limit() -> AbstractContextManager[object]:
+    from threadpoolctl import threadpool_limits
+
+    limit: AbstractContextManager[object] = threadpool_limits(1, "blas")
+    return limit
+
+
+_BLAS_LIMIT = SharedLimit(_blas_limit)
 
 
 def one_blas_thread() -> AbstractContextManager[object]:
@@ -83,7 +89,7 @@ def one_blas_thread() -> AbstractContextManager[object]:
     And where products are small it is faster than two, on busy cores 20 times. The limit is the whole process's, and
     lasts until the last thread that holds it lets go.
     """
-    return _ONE_BLAS_THREAD
+    return _BLAS_LIMIT
 
 
 def workers_for(workers: int, threads: int) -> int:

@@ -1,7 +1,8 @@
-"""Errors of reading: whatever a parsing library raises becomes one sentence, and what else it says is not shown.
+"""Errors: whatever a library raises becomes one sentence for users, and what else it says is not shown.
 
 A header of a few bytes can promise terabytes, and a megabyte of zip can hold a gigabyte. So while a file is read, the
 process may take only so much more memory: ``DEFAULT_GB``, or what the environment variable ``MEREO_MAX_FILE_GB`` says.
+Light, so that the command line may import it.
 """
 
 import ctypes
@@ -10,14 +11,16 @@ import logging
 import math
 import os
 import sys
-import threading
+import sysconfig
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout
 from pathlib import Path
+from traceback import walk_tb
 from typing import TYPE_CHECKING
 
-import numpy as np
+from mereo.io.cores import SharedLimit
+from mereo.io.extras import NEEDED, is_torch
 
 try:
     import resource
@@ -27,8 +30,13 @@ except ImportError:  # Windows, where a file's own size alone is limited
 if TYPE_CHECKING:
     from pydantic import ValidationError
 
+PACKAGE = Path(__file__).parents[1]
+
+LIBRARIES = tuple(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
+"""Where the code of others is; mereo itself may be installed there."""
+
 MOST_CHARACTERS = 300
-"""Length of a library's text in a sentence, which may quote all that it has read."""
+"""Length of what is quoted of a library's text, which may quote all that it has read."""
 
 LIMIT_VARIABLE = "MEREO_MAX_FILE_GB"
 
@@ -40,6 +48,62 @@ PAGES = Path("/proc/self/statm")
 
 for _name in ("trimesh", "nibabel.global"):  # they log tracebacks and repairs, which Python shows where nobody listens
     logging.getLogger(_name).setLevel(logging.CRITICAL + 1)
+
+
+# --- sentences for users ----------------------------------------------------------------------------------------------
+
+
+def is_foreseen(error: Exception) -> bool:
+    """Whether the text of an error is a sentence for users: not what a library's ``ValueError`` says of its arguments.
+
+    Those of the operating system, and imports that fail, name what is wrong themselves.
+    """
+    if isinstance(error, OSError | ImportError):
+        return True
+    if not isinstance(error, ValueError):
+        return False
+    files = [frame.f_code.co_filename for frame, _ in walk_tb(error.__traceback__)]
+    return not files or not files[-1].startswith(LIBRARIES) or Path(files[-1]).is_relative_to(PACKAGE)
+
+
+def words_of(error: Exception) -> str:
+    """Words of an error in one line: the sentence of a foreseen one, else its type and text.
+
+    An error of the operating system is told by its file and reason, the lack of torch by the extra that brings it.
+    """
+    if is_torch(error):
+        return NEEDED
+    if not is_foreseen(error):
+        text = _shortened(printable_line(str(error)))
+        return f"{type(error).__name__}: {text}" if text else type(error).__name__
+    if isinstance(error, OSError) and error.strerror:
+        what = error.strerror[0].lower() + error.strerror[1:]
+        return printable_line(f"{f'{error.filename}: ' if error.filename else ''}{what}: correct that and try again")
+    return printable_line(str(error)) or type(error).__name__
+
+
+def printable_line(text: str) -> str:
+    """Text in one line, with what a terminal would obey (files may have it in names) as Python spells it."""
+    line = " ".join(text.split())
+    return line if line.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
+
+
+def reason(error: Exception) -> str:
+    """First line of a library's text, which may be several sentences; the error's type where there is none."""
+    return _shortened((str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".;: "))
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= MOST_CHARACTERS else f"{text[:MOST_CHARACTERS]}..."
+
+
+def first_problem(error: "ValidationError") -> str:
+    """What pydantic found wrong first, and where: "its 'iou': Input should be a valid number"."""
+    first = error.errors()[0]
+    return f"its {'.'.join(map(str, first['loc'])) or 'content'!r}: {first['msg']}"
+
+
+# --- limits of memory -------------------------------------------------------------------------------------------------
 
 
 class SizeError(ValueError):
@@ -72,30 +136,19 @@ def _too_large(path: str | Path) -> SizeError:
     )
 
 
-class _MemoryLimit:
-    """Limit of the memory of this process that several threads may set at once; the last to leave lifts it."""
-
-    def __init__(self) -> None:
-        self._changing, self._holders, self._before = threading.Lock(), 0, (-1, -1)
-
-    def __enter__(self) -> None:
-        more = max_bytes()
-        with self._changing:
-            if self._holders == 0:
-                self._before = resource.getrlimit(resource.RLIMIT_AS)
-                now = int(PAGES.read_text().split()[0]) * resource.getpagesize()
-                bounds = [limit for limit in self._before if limit != resource.RLIM_INFINITY]
-                resource.setrlimit(resource.RLIMIT_AS, (min([now + more, *bounds]), self._before[1]))
-            self._holders += 1
-
-    def __exit__(self, *_: object) -> None:
-        with self._changing:
-            self._holders -= 1
-            if self._holders == 0:
-                resource.setrlimit(resource.RLIMIT_AS, self._before)
+@contextmanager
+def _memory_limit() -> Iterator[None]:
+    more, before = max_bytes(), resource.getrlimit(resource.RLIMIT_AS)
+    now = int(PAGES.read_text().split()[0]) * resource.getpagesize()
+    bounds = [limit for limit in before if limit != resource.RLIM_INFINITY]
+    resource.setrlimit(resource.RLIMIT_AS, (min([now + more, *bounds]), before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
 
 
-_MEMORY_LIMIT = _MemoryLimit()
+_MEMORY_LIMIT = SharedLimit(_memory_limit)
 
 
 @contextmanager
@@ -108,12 +161,15 @@ def limited_memory(path: str | Path) -> Iterator[None]:
         raise _too_large(path) from None
 
 
-def check_count(count: int, found: int, what: str) -> None:
-    """Raise ``ValueError`` (its reason only) for a negative count, or one of more than was ``found``."""
+# --- reading ----------------------------------------------------------------------------------------------------------
+
+
+def check_count(count: int, available: int, what: str) -> None:
+    """Raise ``ValueError`` (its reason only) for a negative count, or one of more than is ``available``."""
     if count < 0:
         raise ValueError(f"its header states {count} {what}")
-    if found < count:
-        raise ValueError(f"it is truncated: {found} of {count} {what}")
+    if available < count:
+        raise ValueError(f"it is truncated: {available} of {count} {what}")
 
 
 @contextmanager
@@ -144,18 +200,14 @@ def readable(path: Path, kind: str) -> Iterator[None]:
         raise ValueError(f"{path} cannot be read as a {kind} ({reason(error)}): export or download it again") from error
 
 
-def first_problem(error: "ValidationError") -> str:
-    """What pydantic found wrong first, and where: "its 'iou': Input should be a valid number"."""
-    first = error.errors()[0]
-    return f"its {'.'.join(map(str, first['loc'])) or 'content'!r}: {first['msg']}"
-
-
 @contextmanager
 def quiet() -> Iterator[None]:
     """Let libraries warn of nothing: of damage the sentence is enough, and lost values are checked where they matter.
 
     mereo's own warnings pass.
     """
+    import numpy as np  # not above, as the command line starts without it
+
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.filterwarnings("ignore", category=UserWarning, module=r"(PIL|nibabel|nrrd|trimesh|numpy|tifffile)\b")
         warnings.filterwarnings("ignore", "Reading `.npy` or `.npz` file required additional header parsing")
@@ -169,7 +221,14 @@ def without_output() -> Iterator[None]:
 
     What other threads print at that moment is lost too.
     """
-    _flush()
+
+    def flush() -> None:
+        """Write out what Python and C still hold of the process's streams."""
+        sys.stdout.flush()
+        sys.stderr.flush()
+        ctypes.CDLL(None).fflush(None)
+
+    flush()
     kept = [os.dup(stream) for stream in (1, 2)]
     nowhere = os.open(os.devnull, os.O_WRONLY)
     try:
@@ -178,21 +237,8 @@ def without_output() -> Iterator[None]:
         with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
             yield
     finally:
-        _flush()
-        for stream, place in zip((1, 2), kept, strict=True):
-            os.dup2(place, stream)
-            os.close(place)
+        flush()
+        for stream, copy in zip((1, 2), kept, strict=True):
+            os.dup2(copy, stream)
+            os.close(copy)
         os.close(nowhere)
-
-
-def _flush() -> None:
-    """Write out what Python and C still hold of the process's streams."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    ctypes.CDLL(None).fflush(None)
-
-
-def reason(error: Exception) -> str:
-    """First line of a library's text, which may be several sentences; the error's type where there is none."""
-    text = (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".;: ")
-    return text if len(text) <= MOST_CHARACTERS else f"{text[:MOST_CHARACTERS]}..."

@@ -69,10 +69,15 @@ def read_camera(path: str | Path, size: tuple[int, int] | None = None) -> Camera
 
 def written_intrinsics(camera: Camera) -> dict[str, float]:
     """Content of a JSON file of intrinsics, as ``read_intrinsics`` reads them."""
-    size, focal = (camera.width, camera.height), (camera.focal_x_px, camera.focal_y_px)
-    center = (camera.center_x_px, camera.center_y_px)
-    names = ("width", "height", "fx", "fy", "cx", "cy", "pixel_center")
-    return dict(zip(names, (*size, *focal, *center, 0.5), strict=True))
+    return {
+        "width": camera.width,
+        "height": camera.height,
+        "fx": camera.focal_x_px,
+        "fy": camera.focal_y_px,
+        "cx": camera.center_x_px,
+        "cy": camera.center_y_px,
+        "pixel_center": 0.5,
+    }
 
 
 def read_intrinsics(
@@ -96,15 +101,19 @@ def read_intrinsics(
     path = Path(path)
     with readable(path, "camera intrinsics file"):
         text = path.read_text(encoding="utf-8-sig")
-        fields = json.loads(text) if path.suffix.lower() == ".json" else _yaml(text)
+        if path.suffix.lower() == ".json":
+            fields = json.loads(text)
+        else:  # the first document; OpenCV's header and type tags are not YAML to others
+            plain = re.sub(r"^%YAML.*$|!!opencv-matrix", "", text, flags=re.MULTILINE)
+            fields = next(iter(yaml.safe_load_all(plain.removeprefix("\n---"))), None)
         if not isinstance(fields, dict):
             raise ValueError("it is not an object with named fields")
         fields = _frame(fields, None if image is None else Path(image).stem, index)
         for key in NESTED:
             fields = {**fields, **fields[key]} if isinstance(fields.get(key), dict) else fields
-        found = Intrinsics(camera_from_fields(fields, size), _depth_scale(fields))
-        warn_of_distortion(found.camera, fields, str(path))
-    return found
+        intrinsics = Intrinsics(camera_from_fields(fields, size), _depth_scale(fields))
+        warn_of_distortion(intrinsics.camera, fields, str(path))
+    return intrinsics
 
 
 def camera_from_fields(fields: Fields, size: tuple[int, int] | None = None) -> Camera:
@@ -122,12 +131,6 @@ def camera_from_fields(fields: Fields, size: tuple[int, int] | None = None) -> C
     return Camera(width, height, focal_x, focal_y, center_x + shift, center_y + shift)
 
 
-def _yaml(text: str) -> object:
-    """First document of a YAML file; OpenCV's header and type tags are not YAML to others."""
-    plain = re.sub(r"^%YAML.*$|!!opencv-matrix", "", text, flags=re.MULTILINE)
-    return next(iter(yaml.safe_load_all(plain.removeprefix("\n---"))), None)
-
-
 # --- files of many frames --------------------------------------------------------------------------------------------
 
 
@@ -139,16 +142,16 @@ def _frame(fields: Fields, stem: str | None, index: int | None) -> Fields:
     if isinstance(frames, list) and any(map(_states_a_camera, frames)):
         names = [Path(str(f.get("depth_file_path", f.get("file_path", "")))).stem for f in frames]
         chosen = index if index is not None else names.index(stem) if stem in names else None
-        return {**fields, **frames[_one_of(chosen, len(frames), list(range(len(frames))))]}
+        return {**fields, **frames[_chosen(chosen, len(frames), list(range(len(frames))))]}
     if fields and all(key.isdecimal() for key in fields) and all(map(_states_a_camera, fields.values())):
         numbers = {int(key): value for key, value in fields.items()}
         number = re.search(r"\d+$", stem or "")
         chosen = index if index is not None else int(number.group()) if number else None
-        return dict(numbers[_one_of(chosen, len(numbers), list(numbers))])
+        return dict(numbers[_chosen(chosen, len(numbers), list(numbers))])
     return fields
 
 
-def _one_of(chosen: int | None, count: int, known: list[int]) -> int:
+def _chosen(chosen: int | None, count: int, known: list[int]) -> int:
     if chosen is None and count == 1:
         return known[0]
     if chosen not in known:

@@ -1,22 +1,28 @@
-"""Segmented meshes from files: one file with named parts, several files, or a directory with one file per segment."""
+"""Segmented meshes from files: one file with named parts, several files, or a directory with one file per segment.
+
+``read_segmented_mesh`` reads files for what they enclose; ``read_glb`` reads GLB files as a viewer shows them.
+"""
 
 import re
-from collections.abc import Callable
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
+from mereo.geometry.radii import Radii
 from mereo.io.errors import check_count, readable
-from mereo.io.material_colors import material_colors
-from mereo.io.point_cloud_formats import check_ply
+from mereo.io.readers import check_ply
 
 VIEWER_ROOT = "camera_frame"
 """Name of the root node of our own GLB files; below it, vertices are in the input's camera frame."""
+
+STL_NAME = b"written by mereo: "
+"""What the header of our own STL files says before the name of the segment."""
 
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", ".3mf")
 """Suffixes of mesh files that are read."""
@@ -60,15 +66,18 @@ Part = tuple[str, Color | None, Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]
 
 
 def _parts(path: Path) -> list[Part]:
-    if path.exists() and path.suffix.lower() not in MESH_SUFFIXES:
+    suffix = path.suffix.lower()
+    if path.exists() and suffix not in MESH_SUFFIXES:
         known = ", ".join(MESH_SUFFIXES)
         raise ValueError(f"{path} has the suffix {path.suffix!r}; a mesh is one of {known}: convert or rename it")
-    if path.suffix.lower() == ".3mf" and find_spec("lxml") is None:
+    if suffix == ".3mf" and find_spec("lxml") is None:
         raise ImportError(f"{path} needs lxml, which reads 3MF files and is not installed: pip install 'mereo[cad]'")
     with readable(path, "mesh"):
-        if path.suffix.lower() in CHECKS:
-            CHECKS[path.suffix.lower()](path)
-        parts = _obj_parts(path) if path.suffix.lower() == ".obj" else _scene_parts(path)
+        if suffix == ".ply":
+            check_ply(path)
+        if suffix == ".off":
+            _check_off(path)
+        parts = _obj_parts(path) if suffix == ".obj" else _scene_parts(path)
         if not parts:
             raise ValueError("it has no faces")
     return parts
@@ -88,29 +97,11 @@ def _check_off(path: Path) -> None:
     check_count(faces, len(body) - vertices, "faces")
 
 
-CHECKS: dict[str, Callable[[Path], None]] = {".ply": check_ply, ".off": _check_off}
-"""Check of the formats of which trimesh returns a part where a text file was cut short."""
-
-
-STL_NAME = b"written by mereo: "
-"""What the header of our own STL files says before the name of the segment."""
-
-
-def stl_segment_name(path: Path) -> str | None:
-    """Name of the segment in an STL file that mereo wrote; None for another one."""
-    with path.open("rb") as file:
-        header = file.read(80)
-    if not header.startswith(STL_NAME):
-        return None
-    return header.removeprefix(STL_NAME).decode("utf-8", errors="replace").strip() or None
-
-
 def _obj_parts(path: Path) -> list[Part]:
-    """Parts of an OBJ file, by an own parser because trimesh gives them in no stable order. Polygons become fans."""
+    """Parts of an OBJ file, parsed here because trimesh gives them in no stable order. Polygons become fans."""
     positions: list[list[float]] = []
     faces: list[list[int]] = []
-    owners: list[tuple[str, str]] = []
-    dyes: list[str] = []
+    owners: list[tuple[str, str, str]] = []
     name, library = {"o": "", "g": "", "usemtl": ""}, ""
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         kind, *cells = line.split() or [""]
@@ -123,10 +114,8 @@ def _obj_parts(path: Path) -> list[Part]:
         elif kind == "f":
             corners = [_obj_index(cell, len(positions)) for cell in cells]
             faces += [[corners[0], corners[i], corners[i + 1]] for i in range(1, len(corners) - 1)]
-            owners += [(name["o"], name["g"])] * (len(corners) - 2)
-            dyes += [name["usemtl"]] * (len(corners) - 2)
-    known = material_colors(path, library)
-    colors = [known.get(material) for material in dyes]
+            owners += [(name["o"], name["g"], name["usemtl"])] * (len(corners) - 2)
+    colors = _material_colors(path, library)
     return _split_parts(np.asarray(positions), np.asarray(faces, dtype=np.int64), owners, colors, path.stem)
 
 
@@ -142,13 +131,13 @@ def _obj_index(cell: str, count: int) -> int:
 def _split_parts(
     vertices: Float[np.ndarray, "v 3"],
     faces: Int[np.ndarray, "f 3"],
-    owners: list[tuple[str, str]],
-    colors: list[Color | None],
+    owners: list[tuple[str, str, str]],
+    colors: dict[str, Color],
     stem: str,
 ) -> list[Part]:
-    """Parts of a file: one per object, or per group where there is only one object; unused vertices are left out.
+    """Parts of a file: one per object, or per group where there is only one object, with the colour of all its faces.
 
-    A part has a colour where all its faces have that one.
+    ``owners`` are object, group and material of each face; unused vertices are left out.
     """
     level = 0 if len({key[0] for key in owners}) > 1 else 1
     labels = [key[level] or key[0] for key in owners]
@@ -157,46 +146,92 @@ def _split_parts(
     parts: list[Part] = []
     for i, name in enumerate(names):
         used, local = np.unique(faces[index == i], return_inverse=True)
-        worn = {color for color, label in zip(colors, labels, strict=True) if label == name}
+        worn = {colors.get(owner[2]) for owner, label in zip(owners, labels, strict=True) if label == name}
         color = worn.pop() if len(worn) == 1 else None
         title = name if name and len(names) > 1 else stem
         parts.append((title, color, *merge_positions(vertices[used], local.reshape(-1, 3))))
     return parts
 
 
+def _material_colors(mesh: Path, library: str) -> dict[str, Color]:
+    """Diffuse colour (``Kd``, taken as that on the screen) of each material without a texture in an OBJ file's library.
+
+    A library is no part of the shape: where it is missing or damaged, there are no colours, and no error. Only a file
+    in the same folder is read, because a downloaded mesh should not choose which files are opened.
+    """
+    path = mesh.parent / library
+    if not library or Path(library).name != library or not path.is_file():
+        return {}
+    try:
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    except (OSError, MemoryError):
+        return {}
+    colors: dict[str, Color] = {}
+    textured: set[str] = set()
+    name = ""
+    for line in lines:
+        kind, *cells = line.split() or [""]
+        if kind == "newmtl":
+            name = " ".join(cells)
+        elif kind == "Kd" and (color := _color_of_shares(cells)) is not None:
+            colors[name] = color
+        elif kind == "map_Kd":
+            textured.add(name)
+    return {name: color for name, color in colors.items() if name not in textured}
+
+
+def _color_of_shares(cells: list[str]) -> Color | None:
+    """Colour of three numbers from 0 to 1; None for anything else (a spectral curve, CIE XYZ, damage)."""
+    try:
+        red, green, blue = (round(255 * value) if 0 <= value <= 1 else -1 for value in map(float, cells))
+    except ValueError:
+        return None
+    return (red, green, blue) if min(red, green, blue) >= 0 else None
+
+
 def _scene_parts(path: Path) -> list[Part]:
+    """Parts of a file of any other format, by trimesh."""
     scene: Any = trimesh.load_scene(path, process=False)
-    # the graph's nodes come in no order; the file's order makes the labels
-    order = {key: index for index, key in enumerate(scene.geometry)}
-    nodes = [node for node in scene.graph.nodes_geometry if _has_faces(scene, node)]
-    nodes.sort(key=lambda node: (order[scene.graph[node][1]], node))
-    parts = [_part(scene, node, path.stem if len(nodes) == 1 else "") for node in nodes]
-    own = stl_segment_name(path) if path.suffix.lower() == ".stl" else None
-    return parts if own is None else [(own, color, vertices, faces) for _, color, vertices, faces in parts]
-
-
-def _has_faces(scene: Any, node: str) -> bool:
-    return len(getattr(scene.geometry[scene.graph[node][1]], "faces", ())) > 0
-
-
-def _part(scene: Any, node: str, stem: str) -> Part:
     base = VIEWER_ROOT if VIEWER_ROOT in scene.graph.nodes else scene.graph.base_frame
+    nodes, parts = _nodes_with_faces(scene), list[Part]()
+    for node in nodes:
+        vertices, faces, geometry = _in_frame(scene, node, base)
+        # a file without names gets its own name as the node's
+        is_unnamed = len(nodes) == 1 and (node.startswith("geometry_") or Path(node).stem == path.stem)
+        parts.append((path.stem if is_unnamed else node, _color(geometry), *merge_positions(vertices, faces)))
+    if path.suffix.lower() == ".stl":
+        with path.open("rb") as file:
+            header = file.read(80)
+        name = header.removeprefix(STL_NAME).decode("utf-8", errors="replace").strip()
+        if header.startswith(STL_NAME) and name:
+            return [(name, *rest) for _, *rest in parts]  # type: ignore[misc]
+    return parts
+
+
+def _nodes_with_faces(scene: Any) -> list[str]:
+    """Nodes with faces in the file's order, which makes the labels; the graph has them in none."""
+    order = {key: index for index, key in enumerate(scene.geometry)}
+    keys = {node: scene.graph[node][1] for node in scene.graph.nodes_geometry}
+    nodes = [node for node, key in keys.items() if len(getattr(scene.geometry[key], "faces", ())) > 0]
+    return sorted(nodes, key=lambda node: (order[keys[node]], node))
+
+
+def _in_frame(scene: Any, node: str, base: str) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Any]:
+    """Vertices of a node in the frame of another one, its faces, and trimesh's geometry."""
     transform, key = scene.graph.get(node, frame_from=base)
     geometry = scene.geometry[key]
     vertices = np.asarray(geometry.vertices, dtype=np.float64) @ transform[:3, :3].T + transform[:3, 3]
     faces = np.asarray(geometry.faces, dtype=np.int64)
     if np.linalg.det(transform[:3, :3]) < 0:
         faces = faces[:, ::-1]
-    # a file without names gets its own name as the node's
-    unnamed = node.startswith("geometry_") or Path(node).stem == stem
-    return (stem if stem and unnamed else node, _color(geometry), *merge_positions(vertices, faces))
+    return vertices, faces, geometry
 
 
 def _color(geometry: Any) -> Color | None:
     """Colour of a part: the exact one of our own files, else a material's or uniform vertex colour, else none."""
-    own = geometry.metadata.get("color")
-    if own is not None:
-        return int(own[0]), int(own[1]), int(own[2])
+    stated = geometry.metadata.get("color")
+    if stated is not None:
+        return int(stated[0]), int(stated[1]), int(stated[2])
     if not geometry.visual.defined or geometry.visual.kind == "texture":
         return None
     red, green, blue = (int(value) for value in geometry.visual.main_color[:3])
@@ -207,12 +242,145 @@ def merge_positions(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
     """Merge vertices at exactly the same position, in order of first use, and drop the faces this collapses."""
-    _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    first, index = _distinct(vertices)
     if len(first) == len(vertices):
         return vertices, faces
-    order = np.argsort(first)
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    merged = rank[inverse.reshape(-1)][faces]
+    merged = index[faces]
     proper = (merged != np.roll(merged, 1, axis=1)).all(axis=1)
-    return vertices[first[order]], merged[proper]
+    return vertices[first], merged[proper]
+
+
+def _distinct(rows: Float[np.ndarray, "v k"]) -> tuple[Int[np.ndarray, " w"], Int[np.ndarray, " v"]]:
+    """First of each group of equal rows, in their order, and which of these each row is."""
+    _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), dtype=np.int64)
+    rank[np.argsort(first)] = np.arange(len(first))
+    return np.sort(first), rank[inverse.reshape(-1)]
+
+
+# --- GLB files as a viewer shows them ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class GlbScene:
+    """Content of a GLB file.
+
+    Attributes:
+        mesh: each node with faces as a segment, its vertices merged where they have the same place and colour. Those of
+            our own files are in the input's frame and unit, others in glTF's, metres and y up.
+        colors: of the vertices of each, where it has several; None where it has one.
+        radii: how sure the surfaces are, where our own file says it.
+        rotation: from the vertices' frame to glTF's.
+        unit_m: metres per unit of the vertices.
+        is_own: whether mereo wrote the file.
+    """
+
+    mesh: SegmentedMesh
+    colors: tuple[UInt8[np.ndarray, "_ 3"] | None, ...]
+    radii: Radii | None
+    rotation: Float[np.ndarray, "3 3"]
+    unit_m: float
+    is_own: bool
+
+
+@dataclass(frozen=True, eq=False)
+class _GlbPart:
+    """Node with faces: its segment, colours of its vertices, their radii, and whether these are calibrated."""
+
+    segment: Segment
+    colors: UInt8[np.ndarray, "v 3"] | None
+    radii: Float[np.ndarray, " v"] | None
+    calibrated: bool
+
+
+def is_glb(path: Path) -> bool:
+    """Whether a path names a GLB file."""
+    return path.suffix.lower() == ".glb"
+
+
+def read_glb(path: str | Path) -> GlbScene:
+    """Meshes of any GLB file.
+
+    Raises ``FileNotFoundError`` where there is none, and ``ValueError`` for a damaged file or one without faces.
+    """
+    path = Path(path)
+    with readable(path, "GLB file"):
+        scene: Any = trimesh.load_scene(path, process=False)
+        is_own = VIEWER_ROOT in scene.graph.nodes
+        base = VIEWER_ROOT if is_own else scene.graph.base_frame
+        root = np.asarray(scene.graph.get(VIEWER_ROOT)[0] if is_own else np.eye(4), dtype=np.float64)[:3, :3]
+        nodes = _nodes_with_faces(scene)
+        if not nodes:
+            raise ValueError("it has no faces")
+        parts = [_glb_part(scene, node, base, number, path.stem) for number, node in enumerate(nodes)]
+        unit_m = float(abs(np.linalg.det(root)) ** (1 / 3))
+        if not unit_m > 0:
+            raise ValueError("its root node has a scale of 0")
+        mesh = SegmentedMesh(_renamed([part.segment for part in parts]))
+        return GlbScene(mesh, tuple(part.colors for part in parts), _radii(parts), root / unit_m, unit_m, is_own)
+
+
+def _glb_part(scene: Any, node: str, base: str, number: int, stem: str) -> _GlbPart:
+    vertices, faces, geometry = _in_frame(scene, node, base)
+    if not np.isfinite(vertices).all():
+        raise ValueError(f"its mesh {node!r} has places that are not finite")
+    color, colors = _colors(geometry, PALETTE[number % len(PALETTE)])
+    radii = geometry.vertex_attributes.get("_RADIUS95")
+    facts = geometry.metadata.get("radius95")
+    kept, index = _distinct(vertices if colors is None else np.column_stack([vertices, colors]))
+    return _GlbPart(
+        Segment(stem if node.startswith("geometry_") else node, color, vertices[kept], index[faces], solid=False),
+        None if colors is None else colors[kept],
+        None if radii is None else np.asarray(radii, dtype=np.float64).reshape(-1)[kept],
+        isinstance(facts, dict) and facts.get("calibrated") is True,
+    )
+
+
+def _colors(geometry: Any, plain: Color) -> tuple[Color, UInt8[np.ndarray, "v 3"] | None]:
+    """One colour of a mesh, and those of its vertices where they have several; as a screen shows them."""
+    visual, count = geometry.visual, len(geometry.vertices)
+    material = getattr(visual, "material", None)
+    factor = getattr(material, "baseColorFactor", None)
+    tint = np.ones(3) if factor is None else np.asarray(factor, dtype=np.float64)[:3] / 255.0
+    each = None
+    painted = getattr(visual, "vertex_attributes", {}).get("color")
+    painted = visual.vertex_colors if painted is None and visual.kind == "vertex" else painted
+    if painted is not None and len(painted) == count:
+        share = np.asarray(painted)[:, :3] / (255.0 if np.asarray(painted).dtype == np.uint8 else 1.0)
+        each = _screen(share * tint)
+    elif getattr(material, "baseColorTexture", None) is not None and getattr(visual, "uv", None) is not None:
+        each = np.asarray(visual.to_color().vertex_colors)[:, :3].astype(np.uint8)
+    color = geometry.metadata.get("color")
+    if color is None and each is not None:
+        color = each.mean(axis=0)
+    elif color is None:
+        color = plain if factor is None else _screen(tint[None])[0]
+    varied = each is not None and (each != each[0]).any()
+    return (int(color[0]), int(color[1]), int(color[2])), each if varied else None
+
+
+def _screen(linear: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
+    """Colours of a screen from linear light (glTF 2.0, section 3.9.2)."""
+    light = np.clip(linear, 0.0, 1.0)
+    share = np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)
+    return np.rint(255 * share).astype(np.uint8)
+
+
+def _renamed(segments: list[Segment]) -> tuple[Segment, ...]:
+    """Segments of which no two have the same name: repeated ones are numbered."""
+    names: list[str] = []
+    for segment in segments:
+        tries = (segment.name if n == 1 else f"{segment.name} ({n})" for n in range(1, len(segments) + 1))
+        names.append(next(name for name in tries if name not in names))
+    return tuple(replace(segment, name=name) for segment, name in zip(segments, names, strict=True))
+
+
+def _radii(parts: list[_GlbPart]) -> Radii | None:
+    """Radii of all parts; None where one of them has none."""
+    values = [part.radii for part in parts if part.radii is not None and np.isfinite(part.radii).all()]
+    if len(values) < len(parts):
+        return None
+    counts = tuple(len(value) for value in values)
+    labels = np.repeat(np.arange(1, len(counts) + 1), counts).astype(np.uint8)
+    points = np.concatenate([part.segment.vertices for part in parts])
+    return Radii(points, labels, np.concatenate(values), counts, all(part.calibrated for part in parts))

@@ -1,4 +1,4 @@
-"""Objects of an object storage in the place of files: the few things that a dataset does with them, by fsspec.
+"""Folders of datasets, local or in an object storage (by fsspec), and their files, whole or not at all.
 
     s3://BUCKET/FOLDER   S3, or whatever speaks it at AWS_ENDPOINT_URL: s3fs, the extra `storage`
     gs://BUCKET/FOLDER   Google Cloud Storage: gcsfs, the extra `gcs`
@@ -8,6 +8,8 @@ A put of an object is atomic: others see all of it, or what was there before. Cr
 find by themselves (environment, profile, role of the machine); none is taken from a URL, and none is ever printed.
 """
 
+import hashlib
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,6 +18,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
+
+from mereo.io.atomic_files import atomic_file, claim_directory, json_text, read_settings
 
 LIBRARIES = {"s3": ("s3fs", "storage"), "gs": ("gcsfs", "gcs"), "memory": ("fsspec", "storage")}
 """Library of each protocol, and the extra that has it."""
@@ -65,14 +69,14 @@ class ObjectPath:
 
     def names(self) -> list[str]:
         """Names of the objects in this folder, sorted; none where there is nothing."""
-        own = self.url.partition("://")[2] + "/"
+        folder = self.url.partition("://")[2] + "/"
         try:
             with self._system() as system:
                 system.invalidate_cache()
-                found = [place.strip("/") for place in system.ls(self.url, detail=False)]
+                keys = [key.strip("/") for key in system.ls(self.url, detail=False)]
         except FileNotFoundError:
             return []
-        return sorted({place.removeprefix(own) for place in found if place.startswith(own)})
+        return sorted({key.removeprefix(folder) for key in keys if key.startswith(folder)})
 
     def exists(self) -> bool:
         """Whether there is this object; folders are none."""
@@ -141,10 +145,10 @@ def place_of(given: str | Path | ObjectPath) -> Place:
     """
     if not isinstance(given, str):
         return given
-    found = URL.fullmatch(given)
-    if found is None:
+    match = URL.fullmatch(given)
+    if match is None:
         return Path(given)
-    if found[1].lower() != "file":
+    if match[1].lower() != "file":
         return ObjectPath(given)
     parts = urlsplit(given)
     if parts.netloc not in ("", "localhost"):
@@ -154,8 +158,8 @@ def place_of(given: str | Path | ObjectPath) -> Place:
 
 def _checked(url: str) -> str:
     """URL without slashes at its end; ``ValueError`` for one that cannot be meant."""
-    found = URL.fullmatch(url)
-    protocol, rest = (found[1].lower(), found[2].rstrip("/")) if found else ("", "")
+    match = URL.fullmatch(url)
+    protocol, rest = (match[1].lower(), match[2].rstrip("/")) if match else ("", "")
     bucket, _, name = rest.partition("/")
     shown = f"{protocol or 'a URL'}://...@..." if "@" in bucket else ascii(url)[1:-1][:100]
     if "@" in bucket:
@@ -168,3 +172,58 @@ def _checked(url: str) -> str:
     if not rest.isprintable() or len(rest.encode(errors="replace")) > 900:
         raise ValueError(f"{shown} is no name that a storage takes: choose a shorter one, of letters and digits")
     return f"{protocol}://{rest}"
+
+
+# --- files of a dataset -----------------------------------------------------------------------------------------------
+
+
+def names_in(folder: Place) -> list[str]:
+    """Names of what lies in a folder, sorted, but for hidden files; none where it does not exist.
+
+    Raises as the file system or the storage does.
+    """
+    if isinstance(folder, ObjectPath):
+        return folder.names()
+    return sorted(file.name for file in folder.iterdir() if not file.name.startswith(".")) if folder.is_dir() else []
+
+
+def write_whole(place: Place, content: bytes) -> str:
+    """Write a file, whole or not at all, also where the machine loses its power; its SHA-256 is returned.
+
+    Raises as ``atomic_file`` does, or ``StorageError``.
+    """
+    if isinstance(place, ObjectPath):
+        place.write_bytes(content)
+    else:
+        with atomic_file(place) as partial:
+            partial.write_bytes(content)
+            with partial.open("rb+") as file:
+                os.fsync(file.fileno())  # NFS tells of a full disk here, and a name comes after its content
+    return sha256(content)
+
+
+def sha256(content: bytes) -> str:
+    """Digest of a file, as ``sha256sum`` prints it."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def claim(folder: Place, name: str, settings: dict[str, Any], kind: str) -> dict[str, Any] | None:
+    """Settings that a place of earlier work holds, or None where it was made with ``settings`` just now.
+
+    As ``claim_directory``, for local folders and for those of a storage, where of several that come at a time one puts
+    its file and the others read that.
+    """
+    if isinstance(folder, Path):
+        return claim_directory(folder, name, settings, kind)
+    path, names = folder / name, folder.names()
+    if name in names:
+        return read_settings(path)
+    if any(not file.startswith(".") for file in names):
+        raise FileExistsError(f"{folder} is not empty and holds no {name}; choose another --output")
+    content = json_text(settings).encode()
+    try:
+        path.write_bytes(content, force=False)
+    except FileExistsError:  # another process came first
+        return read_settings(path)
+    stored = read_settings(path)  # a storage without conditional puts took both, and keeps the last
+    return None if json_text(stored).encode() == content else stored

@@ -26,16 +26,6 @@ ACCEPTED = (
 )
 """Forms that ``points_of`` takes, for sentences."""
 
-CLOUD_FIELDS = ("fields", "point_step", "row_step", "data", "is_bigendian", "width", "height")
-"""Fields by which a sensor_msgs/PointCloud2 is recognized."""
-
-MOST_COLUMNS = 16
-"""Columns that a row of a point may have (position, normal, colour, labels); with more it is a row of pixels."""
-
-DROP = "leave them out with drop_invalid=True"
-DROP_ORGANIZED = "organized clouds mark pixels without a measurement so, and drop_invalid=True leaves them out"
-"""Cure of points without a measurement, in a list of points and in a grid of them."""
-
 
 def points_of(source: object, drop_invalid: bool = False) -> tuple[PointCloud | DepthImage, int]:
     """Observed points of whatever holds a frame in memory, and how many points were left out.
@@ -64,7 +54,10 @@ def points_of(source: object, drop_invalid: bool = False) -> tuple[PointCloud | 
         return source, 0
     with np.errstate(over="ignore", invalid="ignore"):  # infinite values are counted below, whoever made them
         points, name, organized = _positions(source)
-        kept = valid_points(points, name, drop_invalid, DROP_ORGANIZED if organized else DROP)
+        cure = "leave them out with drop_invalid=True"
+        if organized:
+            cure = "organized clouds mark pixels without a measurement so, and drop_invalid=True leaves them out"
+        kept = valid_points(points, name, drop_invalid, cure)
     return PointCloud(kept), len(points) - len(kept)
 
 
@@ -106,7 +99,12 @@ def _positions(source: Any) -> tuple[Float[np.ndarray, "n 3"], str, bool]:
     if is_frame_list(source):
         raise ValueError(f"{kind} holds {counted(len(source), 'frame')}; one is needed: give its elements one by one")
     if _is_cloud_message(source):
-        return _message_points(source), "the PointCloud2 message", source.height > 1
+        try:
+            return cloud_points(source), "the PointCloud2 message", source.height > 1
+        except Exception as error:  # whatever a broken message makes of the parser
+            raise ValueError(
+                f"the PointCloud2 message cannot be read ({reason(error)}): take another message"
+            ) from error
     if not isinstance(source, np.ndarray | list | tuple):
         if hasattr(source, "columns"):
             raise ValueError(
@@ -130,14 +128,8 @@ def _positions(source: Any) -> tuple[Float[np.ndarray, "n 3"], str, bool]:
 
 
 def _is_cloud_message(source: object) -> bool:
-    return all(hasattr(source, name) for name in CLOUD_FIELDS)
-
-
-def _message_points(message: Any) -> Float[np.ndarray, "n 3"]:
-    try:
-        return cloud_points(message)
-    except Exception as error:  # whatever a broken message makes of the parser
-        raise ValueError(f"the PointCloud2 message cannot be read ({reason(error)}): take another message") from error
+    fields = ("fields", "point_step", "row_step", "data", "is_bigendian", "width", "height")
+    return all(hasattr(source, name) for name in fields)
 
 
 def _carried(source: Any) -> Any:
@@ -149,8 +141,8 @@ def _carried(source: Any) -> Any:
             return getattr(source, name)["positions"]
         except (AttributeError, LookupError, TypeError, RuntimeError):
             continue
-    found = (getattr(source, name, None) for name in ("points", "vertices"))
-    return next((values for values in found if values is not None and not callable(values)), None)
+    attributes = (getattr(source, name, None) for name in ("points", "vertices"))
+    return next((values for values in attributes if values is not None and not callable(values)), None)
 
 
 def _structured_points(records: np.ndarray, name: str) -> Float[np.ndarray, "n 3"]:
@@ -212,7 +204,7 @@ def _what_it_is(values: np.ndarray) -> str:
     if _is_color_image(values):
         return "is a color image, which shows no positions; a depth image or point cloud is needed: give one of these"
     flat, rows, columns = values.ndim == 2, values.shape[0], values.shape[-1]
-    wide = columns > MOST_COLUMNS
+    wide = columns > 16  # more than a point's position, normal, colour and labels: a row of pixels
     if (wide and rows != 3) if flat else (columns == 1 or (wide and rows == 1)):
         return (
             "is an image of depths, which needs the camera's intrinsics: give intrinsics=, a mereo.Camera or a file of "

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
+from dataclasses import dataclass
 
 from rich.console import Console
 from rich.progress import BarColumn, TextColumn
@@ -24,6 +25,7 @@ WINDOW_S = 60.0
 """Seconds, the latest, of which the rate is: a machine that becomes busy shows in it."""
 
 
+@dataclass
 class Progress:
     """Progress of one stage, which ``progress`` makes.
 
@@ -32,16 +34,24 @@ class Progress:
         total: units of work.
         unit: what these are, in the plural.
         each: examples in a unit, where the rate is not of units but of examples; else 0.
+        quiet: show nothing.
+        bar: of a terminal.
         done: units so far.
     """
 
-    def __init__(self, stage: str, total: int, unit: str, each: int, bar: Bar | None) -> None:
-        self.stage, self.total, self.unit, self.each, self.bar = stage, total, unit, each, bar
-        self.done = 0
-        self.task = None if bar is None else bar.add_task("", total=total, stage=stage)
-        self.started = self.shown = time.monotonic()
-        self.paused_s = 0.0
-        self.past = deque([(0.0, 0)])
+    stage: str
+    total: int
+    unit: str
+    each: int
+    quiet: bool
+    bar: Bar | None = None
+    done: int = 0
+
+    def __post_init__(self) -> None:
+        self._task = None if self.bar is None else self.bar.add_task("", total=self.total, stage=self.stage)
+        self._started = self._shown = time.monotonic()
+        self._paused_s = 0.0
+        self._past = deque([(0.0, 0)])
 
     def advance(self, count: int = 1, note: str = "", tail_s: float = 0.0) -> None:
         """Count ``count`` units as done.
@@ -53,13 +63,23 @@ class Progress:
         """
         now = time.monotonic()
         self.done += count
-        worked_s = now - self.started - self.paused_s
-        while len(self.past) > 1 and worked_s - self.past[1][0] > WINDOW_S:
-            self.past.popleft()
-        then_s, then = self.past[0]
-        self.past.append((worked_s, self.done))
+        worked_s = now - self._started - self._paused_s
+        while len(self._past) > 1 and worked_s - self._past[1][0] > WINDOW_S:
+            self._past.popleft()
+        then_s, then = self._past[0]
+        self._past.append((worked_s, self.done))
         rate = (self.done - then) / max(worked_s - then_s, 1e-9)
-        self._show(self._text(rate, (self.total - self.done) / max(rate, 1e-9) + tail_s, note), now)
+        left_s = (self.total - self.done) / max(rate, 1e-9) + tail_s
+        speed = f"{rate:.{1 if rate >= 0.1 else 3}f} {self.unit}/s"
+        if self.each:
+            speed = f"{rate * self.each:.1f} examples/s"
+        parts = (f"{self.done} of {self.total} {self.unit}", speed, f"{duration(left_s)} left", note)
+        text = ", ".join(part for part in parts if part)
+        if self.bar is not None and self._task is not None:
+            self.bar.update(self._task, completed=self.done, description=text)
+        elif not self.quiet and now - self._shown >= LINE_EVERY_S:
+            _print(f"{self.stage}: {text}")
+            self._shown = now
 
     @contextmanager
     def paused(self) -> Iterator[None]:
@@ -68,36 +88,17 @@ class Progress:
         try:
             yield
         finally:
-            self.paused_s += time.monotonic() - begun
-
-    def _text(self, rate: float, left_s: float, note: str) -> str:
-        speed = (
-            f"{rate * self.each:.1f} examples/s" if self.each else f"{rate:.{1 if rate >= 0.1 else 3}f} {self.unit}/s"
-        )
-        return ", ".join(part for part in (self._count, speed, f"{duration(left_s)} left", note) if part)
+            self._paused_s += time.monotonic() - begun
 
     @property
     def unit_s(self) -> float:
         """Seconds that a unit took, in the mean; 0 before the first."""
-        return (time.monotonic() - self.started - self.paused_s) / self.done if self.done else 0.0
-
-    @property
-    def _count(self) -> str:
-        return f"{self.done} of {self.total} {self.unit}"
-
-    def _show(self, text: str, now: float) -> None:
-        if self.bar is not None and self.task is not None:
-            self.bar.update(self.task, completed=self.done, description=text)
-        elif now - self.shown >= LINE_EVERY_S:
-            print(f"{self.stage}: {text}", file=sys.stderr, flush=True)
-            self.shown = now
+        return (time.monotonic() - self._started - self._paused_s) / self.done if self.done else 0.0
 
     def close(self) -> None:
-        """Say how long it took, where anything was to be done."""
-        if not self.done:
-            return
-        took = duration(time.monotonic() - self.started)
-        print(f"{self.stage}: {self.done} {self.unit} in {took}", file=sys.stderr, flush=True)
+        """Print how long it took, where anything was done."""
+        if self.done and not self.quiet:
+            _print(f"{self.stage}: {self.done} {self.unit} in {duration(time.monotonic() - self._started)}")
 
 
 @contextmanager
@@ -106,24 +107,16 @@ def progress(
 ) -> Iterator[Progress]:
     """Context of a stage, which shows its progress; at its end a line with the time it took, unless it failed.
 
-    Args:
-        stage: its name: the command's.
-        total: units of work.
-        unit: what these are, in the plural.
-        each: examples in a unit, where the rate shall be of these.
-        quiet: show nothing.
+    The arguments are the attributes of ``Progress``.
     """
-    if quiet:
-        yield _Quiet(stage, total, unit, each, None)
-        return
     console = Console(stderr=True, highlight=False)
     bar = None
-    if console.is_terminal:
+    if console.is_terminal and not quiet:
         columns = TextColumn("{task.fields[stage]}"), BarColumn(), TextColumn("{task.description}")
         # text that goes into a file is not drawn on the terminal
         bar = Bar(*columns, console=console, transient=True, redirect_stdout=sys.stdout.isatty())
     with bar or nullcontext():
-        shown = Progress(stage, total, unit, each, bar)
+        shown = Progress(stage, total, unit, each, quiet, bar)
         yield shown
     shown.close()
 
@@ -167,7 +160,7 @@ def stage(text: str) -> Iterator[None]:
     def show() -> None:
         wait_s = STAGE_S
         while not ended.wait(wait_s):
-            print(f"{text}: {duration(time.monotonic() - started)} so far", file=sys.stderr, flush=True)
+            _print(f"{text}: {duration(time.monotonic() - started)} so far")
             wait_s = LINE_EVERY_S
 
     thread = threading.Thread(target=show, daemon=True, name="stage")
@@ -179,12 +172,8 @@ def stage(text: str) -> Iterator[None]:
         thread.join()
 
 
-class _Quiet(Progress):
-    """Progress that nobody sees."""
-
-    def advance(self, count: int = 1, note: str = "", tail_s: float = 0.0) -> None:
-        """Count alone."""
-        self.done += count
+def _print(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
 
 
 def duration(seconds: float) -> str:

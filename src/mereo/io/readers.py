@@ -1,26 +1,45 @@
 """Readers of point clouds, depth images and masks; ``mereo.io.sensor_frame`` reads whichever a file holds.
 
 Every reader raises ``FileNotFoundError`` or a ``ValueError`` of one sentence (value, rule, cure), whatever the parsing
-library raised. Nothing is repaired silently: missing points are refused unless the caller asks to drop them. Depth
-scales and pixel centres are explained in ``mereo.io.intrinsics``.
+library raised: a parser of a format raises any exception whose text completes "cannot be read as a point cloud (...)".
+Nothing is repaired silently: missing points are refused unless the caller asks to drop them. Depth scales and pixel
+centres are explained in ``mereo.io.intrinsics``.
 """
 
+import re
+from collections.abc import Callable
+from contextlib import suppress
+from importlib.util import find_spec
+from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+import trimesh
+from jaxtyping import Bool, Float, Real
+from PIL import Image
 
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import LARGEST
-from mereo.io.depth_formats import DEPTH_READERS, Raw, metres, open_image, read_raw_depth
-from mereo.io.errors import limited_memory, readable
-from mereo.io.point_cloud_formats import CLOUD_READERS
+from mereo.io.errors import check_count, limited_memory, quiet, readable, without_output
 
 PLAUSIBLE_DEPTH_M = (0.05, 20.0)
 """Range of an image's median depth, unless the caller says otherwise; beyond it the unit is wrong."""
 
+MILLIMETRES, METRES = 1000.0, 1.0
+"""Depth scales of integer and of floating images where nothing else is said, in units per metre."""
 
-# --- point clouds ----------------------------------------------------------------------------------------------------
+NOTHING_M = 1e9
+"""Depth from which on nothing was measured: renderers store 1e10 where a ray met nothing."""
+
+NARROWEST = 16
+"""Least number of columns of an image; with fewer an array is a list of points, or of points with something else."""
+
+Raw = Real[np.ndarray, "h w"]
+"""Values of a depth image as they are stored."""
+
+
+# --- point clouds -----------------------------------------------------------------------------------------------------
 
 
 def read_point_cloud(path: str | Path, drop_invalid: bool = False) -> PointCloud:
@@ -90,7 +109,7 @@ def valid_points(
     return points[usable]
 
 
-# --- depth images ----------------------------------------------------------------------------------------------------
+# --- depth images and masks -------------------------------------------------------------------------------------------
 
 
 def read_depth_image(
@@ -122,6 +141,47 @@ def read_depth_image(
             f"{path} has the suffix {path.suffix!r}; a depth image is one of {known}: convert or rename it"
         )
     return usable_depth(depth_of(path, read_raw_depth(path), depth_scale, camera), path, mask_path, plausible_m)
+
+
+def read_raw_depth(path: Path) -> Raw:
+    """Values of a file that ``is_depth_image``, as stored. Raises ``FileNotFoundError`` or ``ValueError``."""
+    with readable(path, "depth image"):
+        return DEPTH_READERS[path.suffix.lower()](path)
+
+
+def is_depth_image(path: Path) -> bool:
+    """Whether a file is read as a depth image and not as a point cloud: by suffix, and NPY files by their shape."""
+    if path.suffix.lower() != ".npy":
+        return path.suffix.lower() in DEPTH_READERS
+    if not path.is_file():  # a pipe would be waited for
+        return False
+    try:
+        with quiet():
+            array = np.lib.format.open_memmap(path, mode="r")
+    except Exception:  # a damaged header raises what Python's own parser does, too
+        return False  # the reader of clouds says what is wrong
+    return array.ndim == 2 and array.shape[1] >= NARROWEST
+
+
+def metres(raw: Raw, depth_scale: float | None) -> Float[np.ndarray, "h w"]:
+    """Depth in metres from stored values, 0 where nothing was measured.
+
+    In floats NaN and infinity say so (ROS REP 118), and values from ``NOTHING_M`` up.
+
+    Args:
+        raw: 0 means no measurement.
+        depth_scale: pixel value of one metre; by default 1000 for integers and 1 for floats.
+    """
+    floating = raw.dtype.kind == "f"
+    if depth_scale is None:
+        depth_scale = METRES if floating else MILLIMETRES
+    if not (np.isfinite(depth_scale) and depth_scale > 0):
+        raise ValueError(
+            f"the depth scale is {depth_scale}; it must be positive, in units per metre: 1000 for millimetres"
+        )
+    with np.errstate(invalid="ignore"):  # a NaN may be of the kind that signals
+        values = raw.astype(np.float64)
+    return np.where(np.isfinite(values) & (values < NOTHING_M), values, 0.0) / depth_scale
 
 
 def depth_of(path: Path, raw: Raw, depth_scale: float | None, camera: Camera) -> DepthImage:
@@ -167,6 +227,303 @@ def read_mask(path: str | Path, size: tuple[int, int] | None = None) -> Bool[np.
             f"{size[0]} x {size[1]}; they must agree: export the mask at the depth image's size"
         )
     return mask
+
+
+# --- parsers of depth images: values as stored, integers or floats ----------------------------------------------------
+
+
+def open_image(source: Path | BytesIO, formats: tuple[str, ...] | None = None) -> Image.Image:
+    """Open an image, which is to be closed by the caller; Pillow does not compare the checksums of a PNG by itself.
+
+    Args:
+        source: the file.
+        formats: those that Pillow may take it for.
+    """
+    with Image.open(source, formats=formats) as image:
+        if image.format == "PNG":
+            image.verify()
+    if isinstance(source, BytesIO):
+        source.seek(0)
+    return Image.open(source, formats=formats)
+
+
+def _png(path: Path) -> Raw:
+    with open_image(path) as image:
+        if image.format != "PNG" or image.mode not in ("I;16", "I;16B", "I"):
+            raise ValueError(f"it is {image.format} of mode {image.mode}, not a 16-bit grey PNG")
+        return np.asarray(image).astype(np.asarray(image).dtype.newbyteorder("="))
+
+
+def _tiff(path: Path) -> Raw:
+    with path.open("rb") as file:
+        is_big_endian = file.read(2) == b"MM"
+    with without_output(), open_image(path) as image:  # libtiff prints what Pillow says again
+        if image.format != "TIFF" or image.mode not in ("I;16", "I;16B", "I", "F"):
+            raise ValueError(f"it is {image.format} of mode {image.mode}, not a grey TIFF of 16-bit or float values")
+        if getattr(image, "n_frames", 1) != 1:
+            raise ValueError(f"it has {image.n_frames} pages instead of one")  # type: ignore[attr-defined]
+        if image.mode == "F" and is_big_endian and image.info.get("compression") != "raw":
+            # Pillow 13 swaps no bytes here and returns noise
+            raise ValueError("it is compressed, floating and big-endian, which is not supported: save it uncompressed")
+        return np.asarray(image).astype(np.asarray(image).dtype.newbyteorder("="))
+
+
+def _exr(path: Path) -> Raw:
+    if find_spec("OpenEXR") is None:
+        raise ImportError(f"{path} needs OpenEXR, which is not installed: pip install 'mereo[sensors]'")
+    import OpenEXR
+
+    with without_output(), OpenEXR.File(str(path), separate_channels=True) as file:
+        channels = {str(name): np.array(channel.pixels) for name, channel in file.channels().items()}
+    known = ("z", "v", "y", "r", "depth", "distance")  # v is Blender's, r that of an image saved as grey colour
+    depths = [name for last in known for name in channels if name.lower().split(".")[-1] == last]
+    if not depths and len(channels) == 1:
+        depths = list(channels)
+    if not depths:
+        raise ValueError(f"its channels are {', '.join(channels)}, none of them a depth such as Z")
+    return channels[depths[0]]
+
+
+def _npy(path: Path) -> Raw:
+    array = np.load(path, allow_pickle=False)
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"its type is {array.dtype}, not a number")
+    return np.asarray(array)
+
+
+DEPTH_READERS: dict[str, Callable[[Path], Raw]] = {
+    ".png": _png,
+    **dict.fromkeys((".tif", ".tiff"), _tiff),
+    ".exr": _exr,
+    ".npy": _npy,
+}
+"""Parser of each suffix of depth images."""
+
+
+# --- parsers of point clouds: positions, NaN rows included ------------------------------------------------------------
+
+
+def _ply_points(path: Path) -> Float[np.ndarray, "n 3"]:
+    """Vertices of a PLY file; trimesh returns those it finds, so a file cut short is only noticed by counting them."""
+    check_ply(path)
+    count = ply_counts(path).get("vertex", 0)
+    if count == 0:
+        raise ValueError("it has 0 vertices")
+    loaded: Any = trimesh.load(path, file_type="ply", process=False)
+    check_count(count, len(loaded.vertices), "points")
+    return np.asarray(loaded.vertices, dtype=np.float64)
+
+
+def ply_counts(path: Path) -> dict[str, int]:
+    """Number of each kind of element (vertex, face) that a PLY file's header states."""
+    with path.open("rb") as file:
+        return {name: count for name, count, _ in _ply_header(file.read(65536))[1]}
+
+
+def check_ply(path: Path) -> None:
+    """Raise ``ValueError`` for a PLY file that trimesh would read in part: with a wrong header, or text cut short."""
+    with path.open("rb") as file:
+        order, elements, start = _ply_header(file.read(65536))
+        file.seek(start)
+        rows = sum(1 for row in file if row.strip()) if order == "ascii" else 0
+    if order == "ascii":
+        check_count(sum(count for _, count, _ in elements), rows, "rows")
+
+
+def _ply_header(content: bytes) -> tuple[str, list[tuple[str, int, list[list[str]]]], int]:
+    """Header of a PLY file: format, name, count and properties (type and name) of each element, start of the data."""
+    match = re.search(rb"^end_header[ \t]*\r?\n?", content[:65536], re.MULTILINE)
+    if not content.startswith(b"ply") or match is None:
+        raise ValueError("it has no PLY header")
+    order, elements = "", []
+    for key, *values in filter(None, map(str.split, content[: match.end()].decode("latin-1").splitlines())):
+        if key == "format":
+            order = values[0]
+        elif key == "element":
+            count = int(values[1])
+            check_count(count, max(count, 0), f"of element {values[0]!r}")
+            elements.append((values[0], count, list[list[str]]()))
+        elif key == "property":
+            elements[-1][2].append(values)
+    orders = ("ascii", "binary_little_endian", "binary_big_endian")
+    if order not in orders:
+        raise ValueError(f"its format is {order!r}, not one of {', '.join(orders)}")
+    return order, elements, match.end()
+
+
+def _text_points(path: Path) -> Float[np.ndarray, "n 3"]:
+    """Rows of a text file; comment lines (# or //) and others before the first row of numbers are skipped."""
+    lines = [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
+    first = next((i for i, line in enumerate(lines[:100]) if _is_row(line)), None)
+    if first is None:
+        raise ValueError("it has no row of three numbers")
+    # an empty cell must not shift its neighbours, so a separator is kept where the file has one
+    delimiter = next((mark for mark in (",", ";") if mark in lines[first]), None)
+    title = lines[first - 1].lstrip("#/ ") if first else ""
+    header = [cell.strip().strip('"').lower() for cell in title.split(delimiter)]
+    columns = [header.index(axis) if set("xyz") <= set(header) else i for i, axis in enumerate("xyz")]
+    rows = [line for line in lines[first:] if not line.lstrip().startswith(("#", "//"))]
+    if path.suffix.lower() == ".pts" and title.strip().isdecimal():
+        check_count(int(title), len(rows), "points")
+    return np.loadtxt(rows, delimiter=delimiter, usecols=columns, ndmin=2)
+
+
+def _is_row(line: str) -> bool:
+    """Whether a line holds at least three numbers; other cells may be words, and comments are never rows."""
+    if line.lstrip().startswith(("#", "//")):
+        return False
+    numbers = 0
+    for cell in re.split(r"[,;\s]+", line.strip()):
+        with suppress(ValueError):
+            float(cell)
+            numbers += 1
+    return numbers >= 3
+
+
+def _array_points(path: Path) -> Float[np.ndarray, "n 3"]:
+    with path.open("rb") as file:  # by its name, numpy would leave a damaged archive open
+        loaded = np.load(file, allow_pickle=False)
+        if isinstance(loaded, np.ndarray):
+            return _check_array(loaded)
+        if "points" in loaded:
+            return _check_array(loaded["points"])
+        arrays = [loaded[key] for key in loaded.files]
+        fitting = [array for array in arrays if array.ndim in (2, 3) and array.shape[-1] == 3]
+    if len(fitting) != 1:
+        raise ValueError(f"it holds {len(fitting)} arrays of shape [n, 3] and none called 'points'")
+    return _check_array(fitting[0])
+
+
+def _check_array(array: np.ndarray) -> Float[np.ndarray, "n 3"]:
+    if array.ndim not in (2, 3) or array.shape[-1] != 3:
+        raise ValueError(f"its shape is {array.shape}, not [n, 3] or [h, w, 3]")
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"its type is {array.dtype}, not a number")
+    return array.reshape(-1, 3).astype(np.float64)
+
+
+# --- PCD (Point Cloud Library, https://pointclouds.org/documentation/tutorials/pcd_file_format.html) -----------------
+
+
+def _pcd_points(path: Path) -> Float[np.ndarray, "n 3"]:
+    """Points of a PCD file: ascii, binary, binary_compressed; organized clouds come row by row, with their NaN rows."""
+    header, body = _pcd_header(path.read_bytes())
+    count, row = int(header["POINTS"][0]), _pcd_row(header)
+    width, height = (int(header.get(key, [str(count)])[0]) for key in ("WIDTH", "HEIGHT"))
+    if count < 0 or ({"WIDTH", "HEIGHT"} <= header.keys() and width * height != count):
+        raise ValueError(f"its header states {count} points and {width} x {height}")
+    if not {"x", "y", "z"} <= set(row.names or ()):
+        raise ValueError(f"its fields are {', '.join(header['FIELDS'])}, without x, y and z")
+    layout = header["DATA"][0]
+    if layout == "ascii":
+        return _pcd_ascii(body, row, count)
+    if layout == "binary_compressed":
+        return _pcd_compressed(body, row, count)
+    if layout != "binary":
+        raise ValueError(f"its DATA is {layout!r}, not ascii, binary or binary_compressed")
+    check_count(count, len(body) // row.itemsize, "points")
+    records = np.frombuffer(body, row, count)
+    return np.stack([records[axis].astype(np.float64).reshape(count) for axis in "xyz"], axis=1)
+
+
+def _pcd_header(content: bytes) -> tuple[dict[str, list[str]], bytes]:
+    match = re.search(rb"^DATA[ \t]+\S+[ \t]*\r?\n?", content[:65536], re.MULTILINE)
+    if match is None:
+        raise ValueError("it has no PCD header")
+    lines = [line.split() for line in content[: match.end()].decode("ascii").splitlines() if not line.startswith("#")]
+    header = {line[0]: line[1:] for line in lines if len(line) > 1}
+    missing = [key for key in ("FIELDS", "SIZE", "TYPE", "POINTS") if key not in header]
+    if missing:
+        raise ValueError(f"its header has no {missing[0]}")
+    return header, content[match.end() :]
+
+
+def _pcd_row(header: dict[str, list[str]]) -> np.dtype:
+    """One point as a packed record; padding fields are all called ``_`` and get distinct names."""
+    kinds = {"F": "f", "I": "i", "U": "u"}
+    counts = header.get("COUNT", ["1"] * len(header["FIELDS"]))
+    columns = zip(header["FIELDS"], header["TYPE"], header["SIZE"], counts, strict=True)
+    fields: list[Any] = []
+    for index, (name, kind, size, count) in enumerate(columns):
+        fields.append((name if name in "xyz" else f"{name}{index}", f"<{kinds[kind]}{size}", (int(count),)))
+    return np.dtype(fields)
+
+
+def _pcd_ascii(body: bytes, row: np.dtype, count: int) -> Float[np.ndarray, "n 3"]:
+    sizes = [int(np.prod(row[name].shape)) for name in row.names or ()]
+    starts = dict(zip(row.names or (), np.cumsum([0, *sizes[:-1]]).tolist(), strict=True))
+    lines = [line for line in body.decode("ascii").splitlines() if line.strip()]
+    check_count(count, len(lines), "points")
+    if count == 0:
+        return np.empty((0, 3))
+    return np.loadtxt(lines[:count], usecols=[starts[axis] for axis in "xyz"], ndmin=2)
+
+
+def _pcd_compressed(body: bytes, row: np.dtype, count: int) -> Float[np.ndarray, "n 3"]:
+    """Points of a compressed body: two sizes, then LZF data with all values of one field together."""
+    if len(body) < 8:
+        raise ValueError("it is truncated after its header")
+    packed, unpacked = (int(size) for size in np.frombuffer(body, "<u4", 2))
+    check_count(count, unpacked // row.itemsize, "points")
+    data = _lzf_decompress(body[8 : 8 + packed], unpacked)
+    axes, start = {}, 0
+    for name in row.names or ():
+        length = row[name].itemsize * count
+        if name in "xyz":
+            axes[name] = np.frombuffer(data[start : start + length], row[name].base).astype(np.float64)
+        start += length
+    return np.stack([axes[axis] for axis in "xyz"], axis=1)
+
+
+def _lzf_decompress(data: bytes, size: int) -> bytes:
+    """Decompress Marc Lehmann's LZF: runs of literals, or copies of ``length`` bytes from ``offset`` back."""
+    output, at = bytearray(), 0
+    while at < len(data):
+        control, at = data[at], at + 1
+        if control < 32:
+            output += data[at : at + control + 1]
+            at += control + 1
+            continue
+        length = control >> 5
+        if length == 7:
+            length, at = length + data[at], at + 1
+        offset, at = ((control & 31) << 8) + data[at] + 1, at + 1
+        start, length = len(output) - offset, length + 2
+        if start < 0:
+            raise ValueError("its compressed data are damaged")
+        # a copy may overlap what it writes: it then repeats the last `offset` bytes
+        chunk = output[start : start + length]
+        output += (chunk * (length // len(chunk) + 1))[:length]
+    if len(output) != size:
+        raise ValueError(f"it is truncated: {len(output)} of {size} bytes")
+    return bytes(output)
+
+
+# --- ZDF (Zivid; NetCDF 4) -------------------------------------------------------------------------------------------
+
+
+def _zdf_points(path: Path) -> Float[np.ndarray, "n 3"]:
+    """Points of a ZDF file: organized, millimetres, NaN where nothing was measured."""
+    if find_spec("netCDF4") is None:
+        raise ImportError(f"{path} needs netCDF4, which is not installed: pip install 'mereo[sensors]'")
+    import netCDF4
+
+    with netCDF4.Dataset(path) as file:
+        cloud = file["data"]["pointcloud"][:]
+    return _check_array(np.ma.filled(np.ma.asarray(cloud, dtype=np.float64), np.nan))
+
+
+CLOUD_READERS: dict[str, Callable[[Path], Float[np.ndarray, "n 3"]]] = {
+    ".ply": _ply_points,
+    ".pcd": _pcd_points,
+    **dict.fromkeys((".xyz", ".txt", ".pts", ".asc", ".csv"), _text_points),
+    **dict.fromkeys((".npy", ".npz"), _array_points),
+    ".zdf": _zdf_points,
+}
+"""Parser of each suffix of point clouds."""
+
+
+# --- arrays -----------------------------------------------------------------------------------------------------------
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from io import BytesIO
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +18,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mereo.geometry.camera import Camera, DepthImage
-from mereo.io.depth_formats import metres, open_image
 from mereo.io.errors import SizeError, check_count, limited_memory, reason
 from mereo.io.intrinsics import camera_from_fields, warn_of_distortion
+from mereo.io.readers import metres, open_image
 
 IMAGE, CLOUD, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/CameraInfo"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
@@ -124,11 +123,11 @@ def recorded_frame(
     if index < 0:
         raise ValueError(f"the frame index is {index}; frames count from 0: give 0 or more with --frame-index")
     with closing(recorded_frames(path, topic, camera, depth_scale)) as frames:  # type: ignore[type-var]
-        found = next(islice(frames, index, None), None)
-    if found is None:
-        count = sum(1 for _ in recorded_frames(path, topic, camera, depth_scale))
-        raise ValueError(f"{path} has {count} frames; frame {index} is asked for: give a lower --frame-index")
-    return found
+        count = 0
+        for count, frame in enumerate(frames, start=1):
+            if count > index:
+                return frame
+    raise ValueError(f"{path} has {count} frames; frame {index} is asked for: give a lower --frame-index")
 
 
 def _open(path: Path) -> Any:
@@ -163,10 +162,10 @@ def _messages(reader: Any, connections: list[Any], source: str | Path) -> Iterat
     messages = reader.messages(connections)
     while True:
         with limited_memory(source):
-            found = next(messages, None)
-        if found is None:
+            message = next(messages, None)
+        if message is None:
             return
-        yield found
+        yield message
 
 
 def _depth_topic(reader: Any, path: Path) -> str:
@@ -288,15 +287,10 @@ def cloud_points(message: Any) -> Float[np.ndarray, "n 3"]:
         raise ValueError(f"its fields are {', '.join(f.name for f in message.fields)}, without x, y and z")
     if strange := [field for field in fields.values() if field.datatype not in FIELD_TYPES]:
         raise ValueError(f"its field {strange[0].name!r} is of datatype {strange[0].datatype}, not 1 to 8")
-    axes = {name: (f"{end}{FIELD_TYPES[field.datatype]}", field.offset) for name, field in fields.items()}
-    point = np.dtype(
-        {
-            "names": list(axes),
-            "formats": [kind for kind, _ in axes.values()],
-            "offsets": [offset for _, offset in axes.values()],
-            "itemsize": message.point_step,
-        }
-    )
+    formats = [f"{end}{FIELD_TYPES[field.datatype]}" for field in fields.values()]
+    offsets = [field.offset for field in fields.values()]
+    layout: Any = {"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": message.point_step}
+    point = np.dtype(layout)
     rows = _rows(message, message.row_step, message.point_step)
     points = np.ascontiguousarray(rows[:, : message.width * message.point_step]).view(point).reshape(-1)
     return np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=1)

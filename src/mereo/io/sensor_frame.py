@@ -18,13 +18,9 @@ from mereo.geometry.brief import counted
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import CloudAxes
 from mereo.io.config import InputConfig
-from mereo.io.depth_formats import is_depth_image, read_raw_depth
 from mereo.io.intrinsics import read_intrinsics
-from mereo.io.readers import depth_of, read_points, usable_depth, valid_points
+from mereo.io.readers import depth_of, is_depth_image, read_points, read_raw_depth, usable_depth, valid_points
 from mereo.io.ros_recordings import RecordedFrame, is_recording, recorded_frame, recorded_frames
-
-FORMAT_UNITS_M = {".zdf": 0.001}
-"""Metres per unit of point clouds whose format says it."""
 
 Kind = Literal["recording", "depth image", "point cloud"]
 """Kinds of files that hold frames."""
@@ -92,7 +88,9 @@ def read_frame(path: str | Path, reading: InputConfig = InputConfig()) -> Sensor
         return _recorded(recorded_frame(path, index, *_recording_options(reading)), path, reading)
     if kind == "depth image":
         return _depth_image(path, reading)
-    unit_m = FORMAT_UNITS_M.get(path.suffix.lower()) if reading.unit_m is None else reading.unit_m
+    unit_m = reading.unit_m
+    if unit_m is None and path.suffix.lower() == ".zdf":  # in millimetres, by its definition
+        unit_m = 0.001
     points = read_points(path)
     cloud = PointCloud(valid_points(points, path, reading.drop_invalid))
     return SensorFrame(path, cloud, unit_m, reading.frame, invalid=len(points) - len(cloud))
@@ -130,19 +128,21 @@ def _depth_image(path: Path, reading: InputConfig) -> SensorFrame:
     if reading.intrinsics is None:
         raise ValueError(f"{path} is a depth image without intrinsics; they are needed: give --intrinsics FILE")
     raw = read_raw_depth(path)
-    found = read_intrinsics(reading.intrinsics, (raw.shape[1], raw.shape[0]), path, reading.frame_index)
-    stated = None if raw.dtype.kind == "f" else found.depth_scale
+    intrinsics = read_intrinsics(reading.intrinsics, (raw.shape[1], raw.shape[0]), path, reading.frame_index)
+    stated = None if raw.dtype.kind == "f" else intrinsics.depth_scale
     scale = stated if reading.depth_scale is None else reading.depth_scale
-    whole = depth_of(path, raw, scale, found.camera)
+    whole = depth_of(path, raw, scale, intrinsics.camera)
     image = usable_depth(whole, path, reading.mask)
     return SensorFrame(path, image.to_points(), 1.0, "camera", image, whole=whole)
 
 
 def _recording_options(reading: InputConfig) -> tuple[str | None, Camera | None, float | None]:
     """Topic, camera and depth scale, as ``recorded_frames`` takes them."""
-    own = None if reading.intrinsics is None else read_intrinsics(reading.intrinsics)
-    scale = own.depth_scale if own is not None and reading.depth_scale is None else reading.depth_scale
-    return reading.topic, own.camera if own else None, scale
+    if reading.intrinsics is None:
+        return reading.topic, None, reading.depth_scale
+    intrinsics = read_intrinsics(reading.intrinsics)
+    scale = intrinsics.depth_scale if reading.depth_scale is None else reading.depth_scale
+    return reading.topic, intrinsics.camera, scale
 
 
 def _recorded(message: RecordedFrame, path: Path, reading: InputConfig) -> SensorFrame:

@@ -15,8 +15,8 @@ from jaxtyping import Float, Int
 from mereo.io.errors import readable
 from mereo.io.readers import read_arrays
 
-FRAME_SUFFIXES = (".npz", ".ply", ".obj", ".stl", ".off")
-"""Suffixes of files that hold a state each."""
+FRAME_SUFFIXES = (".ply", ".obj", ".stl", ".off")
+"""Suffixes of meshes that hold a state each."""
 
 TETRAHEDRAL = ("rest_nodes", "tetrahedra", "nodes", "displacements")
 """Names of the arrays of tetrahedral states."""
@@ -80,13 +80,9 @@ def read_states(path: Path, names: tuple[str, ...]) -> TetrahedralRecord | Surfa
 # --- NPZ --------------------------------------------------------------------------------------------------------------
 
 
-def _arrays(path: Path) -> dict[str, np.ndarray]:
-    with readable(path, "NPZ file"):
-        return read_arrays(path)
-
-
 def _archive(path: Path, names: tuple[str, ...]) -> TetrahedralRecord | SurfaceRecord:
-    arrays = _arrays(path)
+    with readable(path, "NPZ file"):
+        arrays = read_arrays(path)
     if "tetrahedra" in arrays:
         return _tetrahedral(path, arrays)
     _check_names(path, {key.removesuffix(REST) for key in arrays}, names)
@@ -144,13 +140,13 @@ def _floats(path: Path, key: str, array: np.ndarray, axes: int) -> np.ndarray:
     return array
 
 
-def _check_names(path: Path, found: set[str], names: tuple[str, ...]) -> None:
-    if missing := [name for name in names if name not in found]:
+def _check_names(path: Path, stated: set[str], names: tuple[str, ...]) -> None:
+    if missing := [name for name in names if name not in stated]:
         raise ValueError(
-            f"{path} has states of {', '.join(map(repr, sorted(found))) or 'nothing'} but not of segment "
+            f"{path} has states of {', '.join(map(repr, sorted(stated))) or 'nothing'} but not of segment "
             f"{missing[0]!r}; every segment needs its own: name each array or folder after its segment"
         )
-    if unknown := sorted(found - set(names)):
+    if unknown := sorted(stated - set(names)):
         raise ValueError(
             f"{path} has states of {unknown[0]!r}, which is no segment; the segments are {', '.join(names)}: rename or "
             "remove it"
@@ -165,71 +161,50 @@ def _numbered(count: int) -> tuple[str, ...]:
 
 
 def _directory(path: Path, names: tuple[str, ...]) -> SurfaceRecord:
-    """States in a directory: an NPZ file per frame, a folder of meshes per segment, or meshes of the only segment."""
-    folders = sorted(item.name for item in path.iterdir() if item.is_dir() and not item.name.startswith("."))
-    files = _frame_files(path)
-    if folders and not files:
-        _check_names(path, set(folders), names)
-        return _joined(path, {name: _mesh_frames(path / name, name) for name in names})
-    if files and all(file.suffix.lower() == ".npz" for file in files):
-        return _joined(path, _npz_frames(path, files, names))
-    if files and len(names) == 1:
-        return _joined(path, {names[0]: _mesh_frames(path, names[0])})
-    raise ValueError(
-        f"{path} is no directory of states for {len(names)} segments; it must hold one folder of mesh files for each "
-        f"segment ({', '.join(names)}), or one NPZ file for each frame: arrange it so"
-    )
-
-
-def _frame_files(path: Path) -> list[Path]:
-    """Files of a directory without ``rest.*``, in natural order: 2 before 10."""
-    files = [file for file in path.iterdir() if file.suffix.lower() in FRAME_SUFFIXES and file.stem != "rest"]
-    return sorted(files, key=lambda file: [int(t) if t.isdigit() else t for t in re.split(r"(\d+)", file.name)])
-
-
-def _rest_file(path: Path) -> Path | None:
-    return next((file for file in sorted(path.glob("rest.*")) if file.suffix.lower() in FRAME_SUFFIXES), None)
-
-
-Frames = dict[str, np.ndarray]
-"""Positions [vertices, 3] by the name of their frame; "" is the rest pose."""
-
-
-def _mesh_frames(path: Path, name: str) -> Frames:
-    rest = _rest_file(path)
-    files = {"": rest} if rest else {}
-    files |= {f"frame {file.name}": file for file in _frame_files(path)}
-    return {frame: _floats(file, name, mesh_vertices(file), 2) for frame, file in files.items()}
-
-
-def _npz_frames(path: Path, files: list[Path], names: tuple[str, ...]) -> dict[str, Frames]:
-    rest = _rest_file(path)
-    found: dict[str, Frames] = {name: {} for name in names}
-    for file in [rest, *files] if rest else files:
-        arrays = _arrays(file)
-        _check_names(file, set(arrays), names)
-        for name in names:
-            found[name]["" if file == rest else f"frame {file.name}"] = _floats(file, name, arrays[name], 2)
-    return found
-
-
-def _joined(path: Path, found: dict[str, Frames]) -> SurfaceRecord:
-    """Frames as one array for each segment; all must have the same vertices and the same frames."""
-    counts = {name: len(frames) - ("" in frames) for name, frames in found.items()}
+    """States in a directory: a folder of meshes per segment, or the meshes of the only segment."""
+    folders = {item.name: item for item in path.iterdir() if item.is_dir() and not item.name.startswith(".")}
+    if _frame_files(path) and len(names) == 1:
+        folders = {names[0]: path}
+    elif not folders or _frame_files(path):
+        raise ValueError(
+            f"{path} is no directory of states for {len(names)} segments; it must hold one folder of mesh files for "
+            f"each segment ({', '.join(names)}): arrange it so, or make one NPZ file"
+        )
+    _check_names(path, set(folders), names)
+    vertices, rest, counts = dict[str, np.ndarray](), dict[str, np.ndarray](), dict[str, int]()
+    frames: tuple[str, ...] = ()
+    for name in names:
+        files = _frame_files(folders[name])
+        states = {f"frame {file.name}": _floats(file, name, mesh_vertices(file), 2) for file in files}
+        for file in sorted(folders[name].glob("rest.*")):
+            if file.suffix.lower() in FRAME_SUFFIXES:
+                rest[name] = _floats(file, name, mesh_vertices(file), 2)
+                break
+        reference = {"the rest pose": rest[name]} if name in rest else {}
+        _check_topology(path, name, reference | states)
+        vertices[name] = np.stack(list(states.values())) if states else np.empty((0, 0, 3))
+        frames, counts[name] = frames or tuple(states), len(states)
     if len(set(counts.values())) > 1:
         text = ", ".join(f"{count} of {name!r}" for name, count in counts.items())
         raise ValueError(f"{path} has {text} frames; all segments need the same number: export them together")
-    for name, frames in found.items():
-        first = next(iter(frames), "")
-        for frame, vertices in frames.items():
-            if len(vertices) != len(frames[first]):
-                raise ValueError(
-                    f"{path}: {frame} of {name!r} has {len(vertices)} vertices but {first or 'the rest pose'} has "
-                    f"{len(frames[first])}; the topology must stay the same: export without remeshing"
-                )
-    rest = {name: frames.pop("") for name, frames in found.items() if "" in frames}
-    moved = {name: np.stack(list(frames.values())) if frames else np.empty((0, 0, 3)) for name, frames in found.items()}
-    return SurfaceRecord(moved, rest, tuple(next(iter(found.values()))))
+    return SurfaceRecord(vertices, rest, frames)
+
+
+def _check_topology(path: Path, name: str, states: dict[str, np.ndarray]) -> None:
+    """Raise ``ValueError`` where states of a segment have other numbers of vertices than the first of them."""
+    first = next(iter(states), "")
+    for state, vertices in states.items():
+        if len(vertices) != len(states[first]):
+            raise ValueError(
+                f"{path}: {state} of {name!r} has {len(vertices)} vertices but {first} has {len(states[first])}; the "
+                "topology must stay the same: export without remeshing"
+            )
+
+
+def _frame_files(path: Path) -> list[Path]:
+    """Meshes in a directory but ``rest.*``, in natural order: 2 before 10."""
+    files = [file for file in path.iterdir() if file.suffix.lower() in FRAME_SUFFIXES and file.stem != "rest"]
+    return sorted(files, key=lambda file: [int(t) if t.isdigit() else t for t in re.split(r"(\d+)", file.name)])
 
 
 def mesh_vertices(path: Path) -> Float[np.ndarray, "_ 3"]:

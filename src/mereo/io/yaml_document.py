@@ -7,10 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from pydantic import (
-    BaseModel,
-    ValidationError,
-)
+from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from mereo.io.errors import reason
@@ -20,13 +17,8 @@ Model = TypeVar("Model", bound=BaseModel)
 Place = Sequence[int | str]
 """Keys and indices from the top of the document, for example ("deformations", 0, "angle")."""
 
-
 MOST_VALUES = 100_000
 """Values of a document, those of aliases counted where they stand: a few lines of nested aliases are billions."""
-
-
-MOST_CHARACTERS = 120
-"""Length of a quoted value."""
 
 
 class _TooMuch(ValueError):
@@ -184,7 +176,7 @@ class Document:
 
 def _short(value: object) -> str:
     text = str(value)
-    return text if len(text) <= MOST_CHARACTERS else f"{text[:MOST_CHARACTERS]}..."
+    return text if len(text) <= 120 else f"{text[:120]}..."
 
 
 def _key_of(place: Place) -> str:
@@ -203,21 +195,15 @@ def _fields_at(place: Place, model: type[BaseModel]) -> list[str]:
     """Names of the fields of the block at ``place``, from the model's JSON schema."""
     schema = model.model_json_schema()
     block: dict[str, Any] = schema
-    for step in place:
-        block = _inner(schema, block, step)
+    for step in place:  # a key, a list's item, or the item of a named type
+        if "discriminator" in block and isinstance(step, str):
+            block = {"$ref": block["discriminator"]["mapping"][step]}
+        else:
+            block = block["items"] if isinstance(step, int) else block.get("properties", {}).get(step, block)
+        block = next((option for option in block.get("anyOf", ()) if option.get("type") != "null"), block)
+        if "$ref" in block:
+            block = schema["$defs"][block["$ref"].rpartition("/")[2]]
     return list(block.get("properties", {}))
-
-
-def _inner(schema: dict[str, Any], block: dict[str, Any], step: int | str) -> dict[str, Any]:
-    """Schema of one step further in: of a key, a list's item, or the item of a named type."""
-    inner: dict[str, Any] = block["items"] if isinstance(step, int) else block.get("properties", {}).get(step, block)
-    if "discriminator" in block and isinstance(step, str):
-        inner = {"$ref": block["discriminator"]["mapping"][step]}
-    inner = next((option for option in inner.get("anyOf", ()) if option.get("type") != "null"), inner)
-    if "$ref" in inner:
-        found: dict[str, Any] = schema["$defs"][inner["$ref"].rpartition("/")[2]]
-        return found
-    return inner
 
 
 def similar(word: str, known: list[str]) -> str:

@@ -22,9 +22,8 @@ from mereo.evaluation.calibrate import LEAST_VIEWS, VIEWS, calibrate
 from mereo.evaluation.metrics import format_score
 from mereo.evaluation.scoring import EvaluationConfig, evaluate
 from mereo.evaluation.tables import read_metrics
-from mereo.io.atomic_files import atomic_file, scratch_folder, write_json
+from mereo.io.atomic_files import MARKER, atomic_file, claim_directory, scratch_folder, write_json
 from mereo.io.config import CONFIG
-from mereo.io.output_folders import MARKER, claim_directory
 from mereo.io.progress import progress
 from mereo.learning.object_files import (
     FRAME,

@@ -15,7 +15,7 @@ from mereo.geometry.brief import counted
 from mereo.geometry.mesh_check import examine
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.volume_files import is_volume
-from mereo.io.writers.ply import write_positions_ply
+from mereo.io.writers.meshes import write_positions_ply
 from mereo.scenes.files.build import MeshWarning
 from mereo.scenes.files.check import check_scene
 from mereo.scenes.files.joints import SLIDES_ALONG, TURNS_ON

@@ -10,7 +10,7 @@ from typing import Any
 
 from mereo.evaluation.metrics import format_score
 from mereo.io.atomic_files import check_place
-from mereo.io.foreseen import words_of
+from mereo.io.errors import words_of
 from mereo.io.mesh_formats import MESH_SUFFIXES
 from mereo.io.volume_files import is_volume
 from mereo.learning.learn import learn

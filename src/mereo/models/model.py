@@ -22,7 +22,7 @@ from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.downsampling import farthest_point_order, random_subset
 from mereo.geometry.mesh import Color
-from mereo.geometry.normalizer import Normalizer
+from mereo.geometry.transforms import Normalizer
 from mereo.models.calibration import Calibration
 from mereo.models.config import Precision, Supervision
 from mereo.models.decoder import ConditionedMLP, Prediction

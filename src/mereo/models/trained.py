@@ -16,7 +16,7 @@ from mereo.geometry.brief import counted
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import Color
-from mereo.geometry.normalizer import Normalizer
+from mereo.geometry.transforms import Normalizer
 from mereo.models.calibration import Calibration
 from mereo.scenes.statistical_model import StatisticalModel
 

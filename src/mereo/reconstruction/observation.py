@@ -19,10 +19,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mereo.geometry.brief import counted
-from mereo.geometry.camera import DepthImage, PointCloud, into_camera
+from mereo.geometry.camera import DepthImage, PointCloud, SightLines, into_camera
 from mereo.geometry.conventions import MIN_POINTS, CloudAxes
 from mereo.geometry.downsampling import MAX_POINTS, STEEPEST, random_subset
-from mereo.geometry.sight_lines import SightLines
 from mereo.geometry.transforms import transform_points
 from mereo.io.sensor_frame import SensorFrame
 from mereo.reconstruction.config import Extent, IsolationConfig

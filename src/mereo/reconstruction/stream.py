@@ -14,7 +14,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from mereo.io.foreseen import is_foreseen, words_of
+from mereo.io.errors import is_foreseen, words_of
 
 Content = TypeVar("Content")
 Result = TypeVar("Result")

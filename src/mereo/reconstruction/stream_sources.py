@@ -10,8 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from mereo.io.config import InputConfig
-from mereo.io.depth_formats import DEPTH_READERS
-from mereo.io.point_cloud_formats import CLOUD_READERS
+from mereo.io.readers import CLOUD_READERS, DEPTH_READERS
 from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame, read_frame, read_frames
 from mereo.reconstruction.config import IsolationConfig

@@ -22,8 +22,7 @@ from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import fit_rigid
 from mereo.io.checked_tensors import Tensors, held_against, pack_tensors, read_content, unpack_tensors
 from mereo.io.errors import reason
-from mereo.io.object_storage import Place
-from mereo.io.places import write_whole
+from mereo.io.object_storage import Place, write_whole
 from mereo.scenes.rest_pose import rest_frame
 from mereo.scenes.scene import SourceFrame
 

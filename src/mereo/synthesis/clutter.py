@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from mereo.geometry.raycasting import Hits, toward
-from mereo.geometry.solids import Solids
+from mereo.geometry.solids import Hits, Solids, toward
 from mereo.synthesis.config import Occluder, SensorConfig
 
 NOTHING, OBJECT, OCCLUDER, BACKGROUND = range(4)

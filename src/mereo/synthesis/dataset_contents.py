@@ -21,8 +21,7 @@ from pydantic import BaseModel, Field, ValidationError
 from mereo.io.atomic_files import json_text
 from mereo.io.checked_tensors import check_tensors, held_against, read_content, unpack_tensors
 from mereo.io.errors import first_problem, reason
-from mereo.io.object_storage import ObjectPath, Place
-from mereo.io.places import names_in, sha256, write_whole
+from mereo.io.object_storage import ObjectPath, Place, names_in, sha256, write_whole
 from mereo.io.progress import progress
 from mereo.scenes.rest_pose import TEMPLATE_NODES
 from mereo.scenes.seeds import TEST_SEED_START

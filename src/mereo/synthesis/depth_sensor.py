@@ -16,8 +16,7 @@ from scipy import ndimage
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.raycasting import Hits
-from mereo.geometry.solids import Solids
+from mereo.geometry.solids import Hits, Solids
 from mereo.synthesis.clutter import NOTHING, OBJECT, Capsule, Surroundings, sample_surroundings
 from mereo.synthesis.config import SENSOR_TERMS, SensorConfig, SensorModel
 

@@ -18,10 +18,9 @@ from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.downsampling import farthest_point_order
 from mereo.geometry.mesh import SegmentedMesh, barycentric
-from mereo.geometry.normalizer import Normalizer
 from mereo.geometry.solids import Nearest, Solids, signed_distance_and_direction
 from mereo.geometry.surface_patches import without_strays
-from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.geometry.transforms import Normalizer, inverse_rigid, transform_points
 from mereo.scenes.rest_pose import rest_frame
 from mereo.scenes.scene import Scene
 from mereo.synthesis.clutter import OBJECT

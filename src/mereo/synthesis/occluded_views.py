@@ -17,8 +17,7 @@ from jaxtyping import Bool, Float, UInt8
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.raycasting import Hits
-from mereo.geometry.solids import Solids
+from mereo.geometry.solids import Hits, Solids
 from mereo.io.sensor_frame import SensorFrame
 from mereo.synthesis.clutter import OBJECT, Backdrop, Capsule, Screen, Surroundings, farthest, sample_occluder
 from mereo.synthesis.config import GenerateConfig, Occluder

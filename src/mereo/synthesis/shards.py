@@ -1,6 +1,6 @@
 """Datasets: shards of 64 examples, each written whole or not at all, the same bits for any number of workers.
 
-Example i comes from (seed, i) alone. A dataset is a directory, or a folder of an object storage (``io.places``), with
+Example i comes from (seed, i) alone. A dataset is a directory, or one in a storage (``io.object_storage``), with
 ``manifest.json``, everything needed to make it again, and ``shard-00000.safetensors`` and so on, whose tensors are (e
 examples, p stored points, q queries):
 
@@ -35,8 +35,7 @@ from jaxtyping import Float
 
 from mereo.io.atomic_files import check_place
 from mereo.io.checked_tensors import pack_tensors
-from mereo.io.object_storage import Place
-from mereo.io.places import claim, names_in
+from mereo.io.object_storage import Place, claim, names_in
 from mereo.io.progress import progress
 from mereo.scenes.random_states import scene_model, states_for
 from mereo.scenes.registry import is_yaml, load_scene

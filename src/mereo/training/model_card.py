@@ -15,7 +15,7 @@ import torch
 
 from mereo.evaluation.metrics import format_score
 from mereo.evaluation.tables import read_metrics
-from mereo.io.output_folders import new_directory
+from mereo.io.atomic_files import new_directory
 from mereo.models.calibration import calibration_rows
 from mereo.models.model import Model
 from mereo.models.weights import load_model, save_model, weights_bytes

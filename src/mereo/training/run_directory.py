@@ -12,9 +12,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
-from mereo.io.atomic_files import atomic_file
+from mereo.io.atomic_files import atomic_file, claim_directory
 from mereo.io.errors import reason
-from mereo.io.output_folders import claim_directory
 from mereo.models.config import NetworkConfig
 from mereo.models.encoders.encoding import Autodecoder
 from mereo.models.model import Model

@@ -8,9 +8,8 @@ from typing import Any
 from mereo.evaluation.cases import Evaluation
 from mereo.evaluation.scoring import EvaluationConfig, evaluate, trained_scene
 from mereo.evaluation.tables import markdown_table, metrics
-from mereo.io.atomic_files import write_json
+from mereo.io.atomic_files import new_directory, write_json
 from mereo.io.config import CONFIG
-from mereo.io.output_folders import new_directory
 from mereo.models.config import EXACT, InferenceConfig
 from mereo.models.model import Model
 from mereo.models.remote import settings_for

@@ -17,11 +17,12 @@ from jaxtyping import Float, Int, UInt16
 
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import DepthImage, PointCloud
-from mereo.geometry.creases import split_at_creases
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.subdivision import split_at_creases
 from mereo.io.atomic_files import atomic_file
-from mereo.io.writers.glb import GLTF_CAMERA_ROTATION, OUTER_OPACITY
+from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
+from mereo.io.writers.meshes import OUTER_OPACITY
 from mereo.visualization.depth_picture import depth_data
 from mereo.visualization.report_words import page_words
 from mereo.visualization.sure_colors import SureColors, sure_colors

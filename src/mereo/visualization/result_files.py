@@ -161,7 +161,8 @@ def _results(answer: Answer, files: FilesConfig) -> Results:
     """What the writers of all formats are given."""
     result, frame = answer.reconstruction, answer.seen.frame
     radii, to_viewer = radii_of(answer.registered), viewer_rotation(frame.axes)
-    return Results.of(result.surfaces, result.labels, result.observed, to_viewer, files, frame.metres, radii)
+    parts = result.surfaces, result.labels, result.observed
+    return Results(*parts, to_viewer, frame.metres, files.millimetres, radii=radii)
 
 
 def radii_of(registered: Registration | None) -> Radii | None:

@@ -6,18 +6,22 @@ died is done again by another.
 
 import logging
 import math
+import multiprocessing
 import os
 import pickle
 import signal
 import socket
 import sys
+import threading
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from itertools import islice
+from multiprocessing import connection, resource_tracker
+from multiprocessing.connection import Connection
 from tempfile import TemporaryDirectory
 from types import ModuleType
 from typing import Annotated, Any, TypeVar
@@ -25,8 +29,7 @@ from typing import Annotated, Any, TypeVar
 from tyro.conf import arg
 
 from mereo.io.bounds import Count, NotNegative
-from mereo.io.cores import cores, use_threads
-from mereo.workers.processes import pickled, process_pool
+from mereo.io.cores import THREAD_VARIABLES, cores, use_threads
 
 LOCAL = "local"
 """Address of a cluster of this machine alone, started for the run."""
@@ -156,6 +159,103 @@ def _result(future: Future[Result]) -> Result:
         ) from error
 
 
+# --- processes of this machine ----------------------------------------------------------------------------------------
+
+Function = Callable[[Any], Any]
+"""Work on an item."""
+
+
+@contextmanager
+def process_pool(function: Function, workers: int) -> Iterator[Callable[[Any], Future[Any]]]:
+    """Open a pool of processes, each with one thread; yields what submits an item to ``function`` there.
+
+    An exception in the block ends the processes at once. Raises ``ValueError`` where ``function``, which is sent once
+    to every process, cannot be pickled.
+    """
+    pickled(function, pickle.dumps)
+    # spawned, not forked: threads of libraries that this process has used do not survive a fork
+    context = multiprocessing.get_context("spawn")
+    start_resource_tracker()
+    end, parent_end = context.Pipe(duplex=False)
+    executor = ProcessPoolExecutor(workers, context, _start_worker, (function, end))
+    with end, parent_end, one_thread_each(), executor as pool:
+        try:
+            yield lambda item: pool.submit(_apply, item)
+        except BaseException:
+            parent_end.close()  # which every worker sees at the other end
+            raise
+
+
+def start_resource_tracker() -> None:
+    """Start Python's process that frees shared things, once; it ignores INT and TERM by itself, with HUP blocked too.
+
+    A closed terminal would end it before the others, which then complain that what they free is gone.
+    """
+    if not hasattr(signal, "SIGHUP"):
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGHUP])  # what is blocked stays so in a new process
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+_in_worker: Function | None = None
+"""Set once when a worker starts: it need not be sent with every item."""
+
+
+def _start_worker(function: Function, end: Connection) -> None:
+    global _in_worker
+    # Ctrl-C and a closed terminal are the parent's business, which ends its workers; TERM is how the pool ends them
+    for number in (signal.SIGINT, *((signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ())):
+        signal.signal(number, signal.SIG_IGN)
+    threading.Thread(target=exit_with_parent, args=(end,), daemon=True).start()
+    _in_worker = function
+
+
+def exit_with_parent(*ends: Connection) -> None:
+    """End this process when its parent ends, as one that was killed cannot stop its workers, or closes a pipe.
+
+    Blocks, for a thread.
+    """
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel, *ends])
+        os._exit(1)
+
+
+def _apply(item: Any) -> Any:
+    assert _in_worker is not None, "only called in a worker, which sets it first"
+    return _in_worker(item)
+
+
+def pickled(function: Function, dumps: Callable[[Function], bytes]) -> bytes:
+    """Pickle a function, by ``pickle.dumps`` or one like it; ``ValueError`` where it cannot be."""
+    try:
+        return dumps(function)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise ValueError(
+            f"the work cannot be sent to other processes ({' '.join(str(error).split())}); functions in it must be "
+            "defined at the top level of a module, and what they hold must be picklable: change that, or use one "
+            "worker and no --ray"
+        ) from None
+
+
+@contextmanager
+def one_thread_each() -> Iterator[None]:
+    """Let processes that are started in the block compute in one thread: libraries read this when they are loaded."""
+    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
 # --- Ray --------------------------------------------------------------------------------------------------------------
 
 
@@ -255,11 +355,11 @@ def _ray_pool(function: Callable[[Any], Any], cluster: Cluster) -> Iterator[Call
     from ray import cloudpickle
 
     with connect(cluster):
-        path = [os.path.abspath(place) for place in sys.path]
+        path = [os.path.abspath(folder) for folder in sys.path]
         # pickled here, as libraries that the function imports must find the number of threads set
         shared = ray.put((pickled(function, cloudpickle.dumps), cluster, os.getcwd(), path))
         running = set[Any]()
-        task = ray.remote(_apply).options(num_cpus=cluster.cpus, num_gpus=cluster.gpus, max_retries=DEATHS)
+        task = ray.remote(_apply_in_task).options(num_cpus=cluster.cpus, num_gpus=cluster.gpus, max_retries=DEATHS)
 
         def submit(item: Any) -> Future[Any]:
             reference = task.remote([shared], item)
@@ -279,7 +379,7 @@ _loaded: tuple[str, Callable[[Any], Any]] | None = None
 """The function of this worker process, unpickled once: a model takes longer for that than a view to be rendered."""
 
 
-def _apply(shared: list[Any], item: Any) -> Any:
+def _apply_in_task(shared: list[Any], item: Any) -> Any:
     """Task: the result for an item. ``shared`` holds a reference, as Ray would unpickle a value for each task."""
     global _loaded
     (reference,) = shared
@@ -290,6 +390,6 @@ def _apply(shared: list[Any], item: Any) -> Any:
             os.environ["CUDA_VISIBLE_DEVICES"] = ""
         with suppress(OSError):
             os.chdir(folder)
-        sys.path.extend(place for place in path if place not in sys.path)
+        sys.path.extend(item for item in path if item not in sys.path)
         _loaded = reference.hex(), pickle.loads(function)
     return _loaded[1](item)

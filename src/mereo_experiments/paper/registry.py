@@ -6,7 +6,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Protocol, cast, get_args, runtime_checkable
 
-from mereo.io.output_folders import check_new_directory
+from mereo.io.atomic_files import check_new_directory
 from mereo_experiments.paper.result import Result, write_result
 from mereo_experiments.paper.scales import SCALES, ExperimentName, ExperimentScale
 from mereo_experiments.paper.store import Store

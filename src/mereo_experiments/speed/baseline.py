@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from mereo.geometry.normalizer import Normalizer
+from mereo.geometry.transforms import Normalizer
 from mereo.models.decoder import Code, Decoder, Prediction, line_of_sight
 from mereo.models.model import Model
 from mereo.models.network import Network

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from mereo.evaluation.sample_views import SampleView
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import PALETTE
-from mereo.geometry.normalizer import Normalizer
+from mereo.geometry.transforms import Normalizer
 from mereo.models.model import Box, Model
 from mereo.models.network import Network
 from mereo.training.config import PRESETS

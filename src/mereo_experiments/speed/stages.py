@@ -14,7 +14,7 @@ from torch import Tensor
 from mereo.evaluation.sample_views import SampleView
 from mereo.geometry.camera import Camera
 from mereo.geometry.downsampling import farthest_point_order
-from mereo.geometry.normalizer import Normalizer
+from mereo.geometry.transforms import Normalizer
 from mereo.models.config import MOST_ORDERED
 from mereo.models.decoder import Code
 from mereo.models.model import Model

@@ -1,6 +1,6 @@
 """What a frame shows, and what it rules out: observed points, the silhouette, and the free space in front of them.
 
-A frame is a cloud seen from one place, and what is known of the lines of sight beside it (``geometry.sight_lines``). A
+A frame is a cloud seen from one place, and what is known of the lines of sight beside it (``geometry.camera``). A
 vertex of a fitted model may lie neither on a line of sight that went past the object, before what that met (outside the
 silhouette), nor in front of the observed points around its own line of sight (free space). Nothing is ruled out along
 lines of sight on which nothing is known. Lines of sight are compared by their angles, so a depth image and a cloud
@@ -15,8 +15,8 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from mereo.deformation.moving_least_squares import spread
+from mereo.geometry.camera import SightKind, SightLines
 from mereo.geometry.downsampling import means_along_sight
-from mereo.geometry.sight_lines import SightKind, SightLines
 from mereo.geometry.transforms import rotation_along
 
 MOST_POINTS = 6000

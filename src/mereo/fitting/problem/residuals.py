@@ -18,7 +18,7 @@ from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, Rows, along, cross, geman_mcclure, in_space
 from mereo.geometry.mesh import barycentric
-from mereo.geometry.raycasting import first_faces, ray_scene
+from mereo.geometry.solids import first_faces, ray_scene
 from mereo.scenes.statistical_model import StatisticalModel
 
 # --- the surface as samples -------------------------------------------------------------------------------------------

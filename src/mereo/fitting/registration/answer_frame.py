@@ -23,7 +23,7 @@ from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.search.screening import Screen, tables_of
 from mereo.fitting.search.search import WHOLE, rotations, search
-from mereo.geometry.sight_lines import SightLines
+from mereo.geometry.camera import SightLines
 from mereo.geometry.transforms import transform_points
 from mereo.io.cores import one_blas_thread
 from mereo.io.progress import stage

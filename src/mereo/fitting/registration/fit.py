@@ -33,8 +33,7 @@ from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import Surface
 from mereo.fitting.registration.registration import Method, Registration
 from mereo.fitting.uncertainty.uncertainty import DrawsOptimum, ModesOptimum, Optimum
-from mereo.geometry.camera import PointCloud
-from mereo.geometry.sight_lines import SightLines
+from mereo.geometry.camera import PointCloud, SightLines
 from mereo.io.cores import one_blas_thread
 from mereo.models.calibration import Calibration
 from mereo.models.trained import EncodedCloud, Trained

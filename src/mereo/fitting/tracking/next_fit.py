@@ -25,8 +25,8 @@ from mereo.fitting.problem.residuals import NetworkTerm, Prior
 from mereo.fitting.registration.fit import ModesFit
 from mereo.fitting.search.search import WHOLE
 from mereo.fitting.tracking.config import TrackConfig
+from mereo.geometry.camera import SightKind, SightLines
 from mereo.geometry.downsampling import means_along_sight
-from mereo.geometry.sight_lines import SightKind, SightLines
 from mereo.io.cores import one_blas_thread
 from mereo.models.calibration import Calibration
 

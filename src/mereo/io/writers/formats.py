@@ -13,14 +13,18 @@ from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.radii import Radii
 from mereo.io.atomic_files import write_json
-from mereo.io.config import FilesConfig, Format
+from mereo.io.config import Format
 from mereo.io.writers.glb import write_segments_glb
-from mereo.io.writers.medical import MM_PER_M, nibabel, write_labels_nifti, write_labels_seg_nrrd
-from mereo.io.writers.obj import write_segments_obj
-from mereo.io.writers.ply import write_points_ply, write_segments_ply
-from mereo.io.writers.points import write_points_npz
-from mereo.io.writers.stl import write_segments_stl
-from mereo.io.writers.volumes import write_labels_npz, write_labels_vti
+from mereo.io.writers.meshes import write_points_ply, write_segments_obj, write_segments_ply, write_segments_stl
+from mereo.io.writers.volumes import (
+    MM_PER_M,
+    nibabel,
+    write_labels_nifti,
+    write_labels_npz,
+    write_labels_seg_nrrd,
+    write_labels_vti,
+    write_points_npz,
+)
 
 SURE = "radius95.glb"
 """Name of the file beside the segments' GLB whose colours say how sure each place of the surfaces is."""
@@ -35,7 +39,7 @@ class Results:
         observed: the input's points with their segments; needed for the format "points" only.
         frame_rotation: from the input's frame to glTF's (y up).
         unit_m: metres per unit of the input.
-        factor: of positions in files that have no unit of their own.
+        millimetres: write files that have no unit of their own in millimetres, and not in the input's unit.
         summary: what the JSON file holds.
         radii: how sure the surfaces and what is inside them are, in the input's frame and unit; None where not known.
     """
@@ -44,25 +48,15 @@ class Results:
     labels: LabelGrid
     observed: SegmentedCloud | None
     frame_rotation: Float[np.ndarray, "3 3"]
-    unit_m: float
-    factor: float
+    unit_m: float = 1.0
+    millimetres: bool = False
     summary: Mapping[str, Any] = field(default_factory=dict)
     radii: Radii | None = None
 
-    @classmethod
-    def of(
-        cls,
-        surfaces: SegmentedMesh,
-        labels: LabelGrid,
-        observed: SegmentedCloud | None,
-        frame_rotation: Float[np.ndarray, "3 3"],
-        files: FilesConfig,
-        unit_m: float = 1.0,
-        radii: Radii | None = None,
-    ) -> "Results":
-        """Results in the unit that ``files`` asks for; the arguments are the attributes of the same names."""
-        factor = MM_PER_M * unit_m if files.millimetres else 1.0
-        return cls(surfaces, labels, observed, frame_rotation, unit_m, factor, radii=radii)
+    @property
+    def factor(self) -> float:
+        """Factor of positions in files that have no unit of their own."""
+        return MM_PER_M * self.unit_m if self.millimetres else 1.0
 
     @property
     def scaled_surfaces(self) -> SegmentedMesh:
@@ -108,11 +102,6 @@ def _glb(path: Path, results: Results) -> None:
         )
 
 
-def _npz(path: Path, results: Results) -> None:
-    grid = results.labels
-    write_labels_npz(path, grid.labels, grid.origin, grid.spacing, grid.names, results.radii_on_grid)
-
-
 def _vti(path: Path, results: Results) -> None:
     radii = results.radii_on_grid
     scaled = None if radii is None else radii * np.float32(results.factor)
@@ -132,7 +121,7 @@ WRITERS: dict[Format, Writer] = {
     "ply": Writer("segments.ply", lambda path, r: write_segments_ply(path, r.scaled_surfaces, r.scaled_radii)),
     "obj": Writer("segments.obj", lambda path, r: write_segments_obj(path, r.scaled_surfaces)),
     "stl": Writer("stl", lambda path, r: write_segments_stl(path, r.scaled_surfaces)),
-    "npz": Writer("labels.npz", _npz),
+    "npz": Writer("labels.npz", lambda path, r: write_labels_npz(path, r.labels, r.radii_on_grid)),
     "vti": Writer("labels.vti", _vti),
     "nifti": Writer(
         "labels.nii.gz", lambda path, r: write_labels_nifti(path, r.labels, r.surfaces.colors, r.unit_m), nibabel

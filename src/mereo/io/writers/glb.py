@@ -1,24 +1,20 @@
 """GLB: binary glTF 2.0 (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html), metres and y up."""
 
-import base64
 import json
 import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from mereo.geometry.conventions import CloudAxes
-from mereo.geometry.creases import split_at_creases
 from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
 from mereo.geometry.radii import STOPS, Radii
+from mereo.geometry.subdivision import split_at_creases
 from mereo.io.atomic_files import atomic_file
 from mereo.io.mesh_formats import VIEWER_ROOT
-from mereo.io.writers.segment_table import with_faces
-
-OUTER_OPACITY = 0.35
-"""Opacity of segments with others nested in them, which viewers draw see-through."""
+from mereo.io.writers.meshes import OUTER_OPACITY, with_faces
 
 GLTF_CAMERA_ROTATION = np.diag([1.0, -1.0, -1.0])
 """Rotation by half a turn about x: from the camera frame (y down, z forward) to glTF (y up, z toward the viewer)."""
@@ -40,7 +36,7 @@ def write_segments_glb(
     """Write a GLB file: one named, coloured node per segment, below a root node that turns the frame for viewers.
 
     Vertices stay as they are (rounded to float32, all that glTF holds), each with its normal; where faces meet at a
-    crease (``geometry.creases``), copies follow them, with the same attributes but normals of their own. Segments
+    crease (``geometry.subdivision``), copies follow them, with the same attributes but normals of their own. Segments
     without faces are left out; those around a nested segment that was found are translucent.
 
     Args:
@@ -54,7 +50,43 @@ def write_segments_glb(
 
     Raises ``ValueError`` where no segment has faces.
     """
-    document, binary = _gltf_document(surfaces, frame_rotation, unit_m, radii, colored)
+    solid, arrays = with_faces(surfaces), _Arrays()
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.asarray(frame_rotation) * unit_m
+    root = {"name": VIEWER_ROOT, "matrix": matrix.T.ravel().tolist(), "children": list(range(1, len(solid) + 1))}
+    nodes: list[dict[str, Any]] = [root]  # glTF matrices are column-major
+    meshes, materials = [], []
+    for index, (label, segment) in enumerate(solid):
+        creased, source = split_at_creases(segment)
+        attributes = {"POSITION": arrays.add(creased.vertices, "VEC3"), "NORMAL": arrays.add(_normals(creased), "VEC3")}
+        primitive = {"attributes": attributes, "indices": arrays.add_faces(creased.faces), "material": index}
+        # the exact colour, which a material's factors approximate
+        extras: dict[str, Any] = {"label": label, "color": list(segment.color)}
+        material = _material(segment, surfaces.opaque[label - 1])
+        if radii is not None:
+            values = radii.at(segment.vertices, label)[source]
+            attributes["_RADIUS95"] = arrays.add(values[:, None], "SCALAR")
+            extras["radius95"] = {"unit_m": unit_m, "calibrated": radii.calibrated}
+            if colored:
+                attributes["COLOR_0"] = arrays.add(_linear(radii.colors(values)), "VEC3")
+                scale = {"color_0_at": 0.0, "color_1_at": radii.high, "stops": [list(color) for color in STOPS]}
+                extras["radius95"] |= scale
+                material["pbrMetallicRoughness"]["baseColorFactor"][:3] = [1.0, 1.0, 1.0]
+        nodes.append({"name": segment.name, "mesh": index})
+        meshes.append({"name": segment.name, "primitives": [primitive], "extras": extras})
+        materials.append(material)
+    binary = b"".join(arrays.chunks)
+    document = {
+        "asset": {"version": "2.0", "generator": "mereo"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": nodes,
+        "meshes": meshes,
+        "materials": materials,
+        "accessors": arrays.accessors,
+        "bufferViews": arrays.views,
+        "buffers": [{"byteLength": len(binary)}],
+    }
     text = json.dumps(document, ensure_ascii=False).encode()
     text += b" " * (-len(text) % 4)
     with atomic_file(path) as partial, partial.open("wb") as file:
@@ -63,103 +95,36 @@ def write_segments_glb(
         file.write(struct.pack("<I4s", len(binary), b"BIN\0") + binary)
 
 
-def write_segments_gltf(
-    path: str | Path,
-    surfaces: SegmentedMesh,
-    frame_rotation: Float[np.ndarray, "3 3"] = GLTF_CAMERA_ROTATION,
-    unit_m: float = 1.0,
-) -> None:
-    """Write what ``write_segments_glb`` does as a text file, with the arrays in it as base64."""
-    document, binary = _gltf_document(surfaces, frame_rotation, unit_m)
-    document["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(binary).decode("ascii")
-    with atomic_file(path) as partial:
-        partial.write_text(json.dumps(document, ensure_ascii=False), encoding="utf-8")
+class _Arrays:
+    """Arrays of the file's one buffer; all components are four bytes wide, so every view starts aligned."""
+
+    def __init__(self) -> None:
+        self.chunks, self.views, self.accessors = list[bytes](), list[dict[str, Any]](), list[dict[str, Any]]()
+
+    def add(self, values: Float[np.ndarray, "n k"], kind: str) -> int:
+        """Number of the accessor of vertices' attributes, as single floats."""
+        return self._append(values.astype("<f4"), kind, 5126, 34962)
+
+    def add_faces(self, faces: Int[np.ndarray, "f 3"]) -> int:
+        """Number of the accessor of faces' corners."""
+        return self._append(faces.astype("<u4").reshape(-1, 1), "SCALAR", 5125, 34963)
+
+    def _append(self, array: np.ndarray, kind: str, component: int, target: int) -> int:
+        start, number = sum(len(chunk) for chunk in self.chunks), len(self.accessors)
+        self.chunks.append(array.tobytes())
+        self.views.append({"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": target})
+        low, high = array.min(axis=0).tolist(), array.max(axis=0).tolist()
+        head = {"bufferView": number, "componentType": component, "count": len(array), "type": kind}
+        self.accessors.append({**head, "min": low, "max": high})
+        return number
 
 
-def _gltf_document(
-    surfaces: SegmentedMesh,
-    frame_rotation: Float[np.ndarray, "3 3"],
-    unit_m: float,
-    radii: Radii | None = None,
-    colored: bool = False,
-) -> tuple[dict[str, Any], bytes]:
-    """Document and its one buffer."""
-    solid = with_faces(surfaces)
-    chunks: list[bytes] = []
-    document = _gltf_skeleton(solid, surfaces.opaque, np.asarray(frame_rotation) * unit_m)
-    creased = [split_at_creases(segment) for _, segment in solid]
-    for segment, _ in creased:
-        _add_array(document, chunks, segment.vertices.astype("<f4"), "VEC3", 34962)
-        _add_array(document, chunks, _unit_normals(segment).astype("<f4"), "VEC3", 34962)
-        _add_array(document, chunks, segment.faces.astype("<u4").reshape(-1, 1), "SCALAR", 34963)
-    for index, (label, segment) in enumerate(solid if radii is not None else ()):
-        assert radii is not None
-        values = radii.at(segment.vertices, label)[creased[index][1]]
-        _add_radii(document, chunks, index, radii, values, unit_m, colored)
-    binary = b"".join(chunks)
-    document["buffers"] = [{"byteLength": len(binary)}]
-    return document, binary
-
-
-def _gltf_skeleton(
-    solid: list[tuple[int, Segment]], opaque: tuple[bool, ...], linear: Float[np.ndarray, "3 3"]
-) -> dict[str, Any]:
-    matrix = np.eye(4)
-    matrix[:3, :3] = linear
-    children = list(range(1, len(solid) + 1))
-    return {
-        "asset": {"version": "2.0", "generator": "mereo"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        # glTF matrices are column-major
-        "nodes": [{"name": VIEWER_ROOT, "matrix": matrix.T.ravel().tolist(), "children": children}]
-        + [{"name": segment.name, "mesh": index} for index, (_, segment) in enumerate(solid)],
-        "meshes": [_gltf_mesh(index, label, segment) for index, (label, segment) in enumerate(solid)],
-        "materials": [_gltf_material(segment, opaque[label - 1]) for label, segment in solid],
-        "accessors": [],
-        "bufferViews": [],
-    }
-
-
-def _gltf_mesh(index: int, label: int, segment: Segment) -> dict[str, Any]:
-    """Mesh of a segment; ``extras`` keep the label and the exact colour, which a material's factors approximate."""
-    primitive = {
-        "attributes": {"POSITION": 3 * index, "NORMAL": 3 * index + 1},
-        "indices": 3 * index + 2,
-        "material": index,
-    }
-    return {"name": segment.name, "primitives": [primitive], "extras": {"label": label, "color": list(segment.color)}}
-
-
-def _gltf_material(segment: Segment, opaque: bool) -> dict[str, Any]:
+def _material(segment: Segment, opaque: bool) -> dict[str, Any]:
     """Material of a segment's colour; glTF's factors are linear light, ours are sRGB (glTF 2.0, section 3.9.2)."""
     color = [*_linear(np.array(segment.color, dtype=np.uint8)).round(6).tolist(), 1.0 if opaque else OUTER_OPACITY]
     surface = {"baseColorFactor": color, "metallicFactor": 0.0, "roughnessFactor": 0.7}
     material = {"name": segment.name, "doubleSided": True, "pbrMetallicRoughness": surface}
     return material if opaque else {**material, "alphaMode": "BLEND"}
-
-
-def _add_radii(
-    document: dict[str, Any],
-    chunks: list[bytes],
-    index: int,
-    radii: Radii,
-    values: Float[np.ndarray, " v"],
-    unit_m: float,
-    colored: bool,
-) -> None:
-    """Attribute of a mesh's radii, and with ``colored`` their colours in place of the segment's."""
-    mesh = document["meshes"][index]
-    attributes = mesh["primitives"][0]["attributes"]
-    attributes["_RADIUS95"] = len(document["accessors"])
-    _add_array(document, chunks, values.astype("<f4").reshape(-1, 1), "SCALAR", 34962)
-    mesh["extras"]["radius95"] = {"unit_m": unit_m, "calibrated": radii.calibrated}
-    if colored:
-        attributes["COLOR_0"] = len(document["accessors"])
-        _add_array(document, chunks, _linear(radii.colors(values)).astype("<f4"), "VEC3", 34962)
-        mesh["extras"]["radius95"] |= {"color_0_at": 0.0, "color_1_at": radii.high, "stops": [list(c) for c in STOPS]}
-        surface = document["materials"][index]["pbrMetallicRoughness"]
-        surface["baseColorFactor"] = [1.0, 1.0, 1.0, surface["baseColorFactor"][3]]
 
 
 def _linear(srgb: UInt8[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
@@ -169,24 +134,8 @@ def _linear(srgb: UInt8[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     return linear
 
 
-def _unit_normals(segment: Segment) -> Float[np.ndarray, "v 3"]:
+def _normals(segment: Segment) -> Float[np.ndarray, "v 3"]:
     """Normals of the vertices; glTF wants unit length, so those of vertices without a face's area point up."""
     normals = vertex_normals(segment)
     normals[np.linalg.norm(normals, axis=1) < 0.5] = (0.0, 0.0, 1.0)
     return normals
-
-
-def _add_array(document: dict[str, Any], chunks: list[bytes], array: np.ndarray, kind: str, target: int) -> None:
-    """Append an accessor; all components are four bytes wide, so every view starts aligned."""
-    start = sum(len(chunk) for chunk in chunks)
-    chunks.append(array.tobytes())
-    view = len(document["bufferViews"])
-    document["bufferViews"].append({"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": target})
-    accessor = {
-        "bufferView": view,
-        "componentType": 5126 if array.dtype.kind == "f" else 5125,
-        "count": len(array),
-        "type": kind,
-    }
-    low, high = array.min(axis=0).tolist(), array.max(axis=0).tolist()
-    document["accessors"].append({**accessor, "min": low, "max": high})

@@ -27,8 +27,7 @@ from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
 from mereo.geometry.conventions import MIN_POINTS
-from mereo.io.atomic_files import write_json
-from mereo.io.output_folders import new_directory
+from mereo.io.atomic_files import new_directory, write_json
 from mereo.models.decoder import Code
 from mereo.models.encoders.encoding import Level
 from mereo.models.model import DENSE_FACTOR, Model

@@ -19,8 +19,8 @@ from mereo.deformation.maps import Deformation
 from mereo.deformation.samplers import RandomMotion
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.mesh_check import examine, mesh_of, solid_of
-from mereo.geometry.normalizer import Normalizer
 from mereo.geometry.subdivision import TooManyFaces, split_edges
+from mereo.geometry.transforms import Normalizer
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.yaml_document import Document, similar
 from mereo.scenes.files.defaults import default_deformations
@@ -229,7 +229,7 @@ def read_segments(document: Document, file: SceneFile) -> SegmentedMesh:
         if file.parts is None:
             return model
         return _assembled(document, "parts", file.parts, _from_model(document, file.parts, model))
-    from mereo.io.label_volumes import read_label_volume, segment_surfaces
+    from mereo.io.volume_files import read_label_volume, segment_surfaces
 
     assert file.labels is not None and file.names is not None, "the schema asks for both"
     with document.named_at(("labels",)):

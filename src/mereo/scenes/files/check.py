@@ -14,9 +14,8 @@ from mereo.deformation.samplers import JointSampler, RandomMotion
 from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.mesh_check import PLAUSIBLE_M, Health, examine, likely_unit
+from mereo.geometry.mesh_check import PLAUSIBLE_M, Health, Overlap, examine, grid_volume, likely_unit, overlaps
 from mereo.geometry.mesh_repair import repaired, without_overlaps
-from mereo.geometry.overlap import Overlap, grid_volume, overlaps
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid
 from mereo.io.atomic_files import atomic_file, check_file_place, remove_abandoned

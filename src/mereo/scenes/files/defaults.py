@@ -14,8 +14,7 @@ from jaxtyping import Float, Int
 from mereo.deformation.maps import Deformation
 from mereo.deformation.samplers import RandomMotion, distance_from_line
 from mereo.geometry.mesh import SegmentedMesh, surface_points
-from mereo.geometry.normalizer import Normalizer
-from mereo.geometry.transforms import fit_rigid, inverse_rigid, transform_points
+from mereo.geometry.transforms import Normalizer, fit_rigid, inverse_rigid, transform_points
 from mereo.scenes.files.deformation_blocks import BendBlock, DeformationBlock, LatticeBlock, Target
 from mereo.scenes.scene import Workspace
 from mereo.scenes.seeds import example_rng

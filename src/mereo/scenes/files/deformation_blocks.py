@@ -26,7 +26,7 @@ from mereo.deformation import samplers
 from mereo.deformation.samplers import DeformationSampler
 from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.normalizer import Normalizer
+from mereo.geometry.transforms import Normalizer
 from mereo.scenes.scene import Workspace
 
 # --- fields -----------------------------------------------------------------------------------------------------------

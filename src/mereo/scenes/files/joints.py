@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from mereo.deformation.maps import Rigid
 from mereo.geometry.mesh import Segment, SegmentedMesh, surface_points
-from mereo.geometry.overlap import overlaps
+from mereo.geometry.mesh_check import overlaps
 
 # --- contacts ---------------------------------------------------------------------------------------------------------
 

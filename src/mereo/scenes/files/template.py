@@ -13,9 +13,8 @@ from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.mesh_check import likely_unit
 from mereo.io.atomic_files import atomic_file, check_file_place
-from mereo.io.label_volumes import read_label_volume, segment_surfaces
 from mereo.io.mesh_formats import read_segmented_mesh
-from mereo.io.volume_files import is_volume
+from mereo.io.volume_files import is_volume, read_label_volume, segment_surfaces
 from mereo.scenes.files.build import placed
 from mereo.scenes.files.defaults import default_deformations, default_view, random_motion, rounded
 from mereo.scenes.files.deformation_blocks import BendBlock, LatticeBlock

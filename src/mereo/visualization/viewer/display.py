@@ -13,8 +13,8 @@ from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
 from mereo.geometry.camera import PointCloud
-from mereo.geometry.creases import split_at_creases
 from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
+from mereo.geometry.subdivision import split_at_creases
 from mereo.visualization.contact_sheets import Picture, enlarge
 
 CLOUD_COLOR = (244, 246, 250)

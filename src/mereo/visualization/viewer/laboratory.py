@@ -24,7 +24,7 @@ from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid, transform_points
-from mereo.io.foreseen import words_of
+from mereo.io.errors import words_of
 from mereo.models.trained import Trained
 from mereo.reconstruction.observation import observe as observe_cloud
 from mereo.scenes.draw_recorder import Key

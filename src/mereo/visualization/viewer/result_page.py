@@ -22,7 +22,7 @@ from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.radii import Radii
 from mereo.geometry.solids import Solids
-from mereo.io.glb_scene import GlbScene, is_glb, read_glb
+from mereo.io.mesh_formats import GlbScene, is_glb, read_glb
 from mereo.io.writers.formats import WRITERS
 from mereo.io.writers.glb import viewer_rotation
 from mereo.visualization.contact_sheets import Picture

@@ -1,0 +1,279 @@
+"""Surfaces and points as PLY, OBJ and STL, which have no unit: positions are in the frame and unit of what is written.
+
+PLY is binary (Turk, "The PLY Polygon File Format", 1994). Its labels are a property called ``label``, with names in
+the header, as comments that hold JSON. A binary STL file holds one surface, so there is one for each segment; its name
+is in the 80 bytes that STL leaves to the writer, as ``STL_NAME`` and UTF-8, and comes back from there.
+"""
+
+import json
+import re
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float, Int, Integer, UInt8
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from mereo.geometry.labels import SegmentedCloud
+from mereo.geometry.mesh import Color, Segment, SegmentedMesh
+from mereo.geometry.radii import Radii
+from mereo.io.atomic_files import atomic_file, new_directory
+from mereo.io.mesh_formats import STL_NAME
+
+OUTER_OPACITY = 0.35
+"""Opacity of segments with others nested in them, which viewers draw see-through."""
+
+MERGED_WITHIN = 2e-8
+"""Distance, in a file's unit, at which programs that merge vertices on reading take two for one (trimesh: 1e-8)."""
+
+
+# --- segments as all writers put them into files ----------------------------------------------------------------------
+
+
+def with_faces(surfaces: SegmentedMesh) -> list[tuple[int, Segment]]:
+    """Labels and segments that have a surface, without edges that end in one place once they are written (``settled``).
+
+    Raises ``ValueError`` where none has.
+    """
+    segments = enumerate(surfaces.segments, start=1)
+    solid = [(label, settled(segment)) for label, segment in segments if len(segment.faces)]
+    if not solid:
+        raise ValueError("all segments are without faces; at least one surface is needed: check the reconstruction")
+    return solid
+
+
+def settled(segment: Segment) -> Segment:
+    """Segment whose edges of no length are closed up: both ends at one vertex, and the faces along them gone.
+
+    Files hold float32, and readers merge what is near; the two ends become one place there, but the faces between them
+    stay as slivers with open edges. Which is why such edges, shorter than either can tell, go before. No other vertex
+    moves or changes its number of faces; a segment that would not be closed any more stays as it is.
+    """
+    extent = float(np.abs(segment.vertices).max(initial=0.0))
+    edges = np.concatenate([segment.faces[:, pair] for pair in ((0, 1), (1, 2), (2, 0))])
+    away = np.linalg.norm(segment.vertices[edges[:, 0]] - segment.vertices[edges[:, 1]], axis=1)
+    short = edges[away < max(MERGED_WITHIN, 4 * float(np.finfo(np.float32).eps) * extent)]
+    if not len(short):
+        return segment
+    count = len(segment.vertices)
+    graph = coo_array((np.ones(len(short)), (short[:, 0], short[:, 1])), shape=(count, count))
+    place = connected_components(graph, directed=False)[1]
+    first, local = np.unique(place, return_index=True, return_inverse=True)[1:]
+    faces = local.reshape(-1)[segment.faces]
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    if not len(faces) or (_is_closed(segment.faces) and not _is_closed(faces)):
+        return segment
+    return Segment(segment.name, segment.color, segment.vertices[first], faces)
+
+
+def _is_closed(faces: Int[np.ndarray, "f 3"]) -> bool:
+    """Whether each edge has two faces, which run along it in opposite directions."""
+    edges = np.concatenate([faces[:, pair] for pair in ((0, 1), (1, 2), (2, 0))]).astype(np.int64)
+    base = int(edges.max(initial=0)) + 1
+    forth, back = edges[:, 0] * base + edges[:, 1], edges[:, 1] * base + edges[:, 0]
+    unique = np.unique(forth)
+    return len(unique) == len(forth) and np.array_equal(unique, np.unique(back))
+
+
+def segment_table(names: Sequence[str], colors: Sequence[Color]) -> list[dict[str, Any]]:
+    """Label, name and colour of each segment, in label order."""
+    rows = enumerate(zip(names, colors, strict=True), start=1)
+    return [{"label": label, "name": name, "color": list(color)} for label, (name, color) in rows]
+
+
+# --- PLY --------------------------------------------------------------------------------------------------------------
+
+
+def write_segments_ply(path: str | Path, surfaces: SegmentedMesh, radii: Radii | None = None) -> None:
+    """Write all surfaces as one PLY mesh whose vertices and faces have ``label``, ``red``, ``green``, ``blue`` (uchar).
+
+    Segments share no vertices, so each vertex has one label; positions are float32. With ``radii`` of the same unit
+    each vertex has ``radius95``, float32. Raises ``ValueError`` where no segment has faces.
+    """
+    with_faces(surfaces)
+    positions, faces, owner = surfaces.merged()
+    colors = np.array(surfaces.colors, dtype=np.uint8)
+    vertex_owner = np.repeat(np.arange(len(colors)), [len(segment.vertices) for segment in surfaces.segments])
+    corners = {"count": ("u1", np.full(len(faces), 3)), "vertex_indices": ("i4", faces)}
+    sure: Columns = {} if radii is None else {"radius95": ("f4", np.concatenate(radii.vertices))}
+    vertices = _records(_positions(positions) | _colors(colors[vertex_owner]) | _label(vertex_owner + 1) | sure)
+    triangles = _records(corners | _colors(colors[owner]) | _label(owner + 1))
+    comments = _comments(surfaces.names, surfaces.colors)
+    if radii is not None:
+        comments.append(f"radius95 is in the unit of x, y, z{'' if radii.calibrated else '; it is not calibrated'}")
+    _write(path, comments, {"vertex": vertices, "face": triangles})
+
+
+def write_points_ply(path: str | Path, cloud: SegmentedCloud) -> None:
+    """Write the observed points with ``label``, its colour, ``confidence`` and ``occupancy``, see ``SegmentedCloud``.
+
+    The last two are a network's; without one they are left out. Positions are float32.
+    """
+    colors = np.array(cloud.colors, dtype=np.uint8)[cloud.labels - 1]
+    sure = {name: ("f4", values) for name, values in cloud.chances.items()}
+    vertices = _records(_positions(cloud.points) | _colors(colors) | _label(cloud.labels) | sure)
+    _write(path, _comments(cloud.names, cloud.colors), {"vertex": vertices})
+
+
+def write_explained_ply(
+    path: str | Path,
+    points: Float[np.ndarray, "n 3"],
+    colors: UInt8[np.ndarray, "n 3"],
+    unexplained: Bool[np.ndarray, " n"],
+    comment: str,
+) -> None:
+    """Write observed points coloured by how much they decide a place, with ``unexplained`` (uchar, 1 or 0)."""
+    lost: Columns = {"unexplained": ("u1", unexplained)}
+    plain = comment.encode("ascii", "replace").decode("ascii")
+    _write(path, [plain], {"vertex": _records(_positions(points) | _colors(colors) | lost)})
+
+
+def write_positions_ply(path: str | Path, points: Float[np.ndarray, "n 3"], comment: str = "") -> None:
+    """Write a cloud's positions alone, as float32; ``comment`` is for people who open the file."""
+    _write(path, [comment] if comment else [], {"vertex": _records(_positions(points))})
+
+
+Columns = dict[str, tuple[str, np.ndarray]]
+"""Type and values of each property, in the order of the file."""
+
+
+def _positions(points: Float[np.ndarray, "n 3"]) -> Columns:
+    return {axis: ("f4", points[:, k]) for k, axis in enumerate("xyz")}
+
+
+def _colors(colors: UInt8[np.ndarray, "n 3"]) -> Columns:
+    return {channel: ("u1", colors[:, k]) for k, channel in enumerate(("red", "green", "blue"))}
+
+
+def _label(labels: Integer[np.ndarray, " n"]) -> Columns:
+    return {"label": ("u1", labels)}
+
+
+def _comments(names: Sequence[str], colors: Sequence[Color]) -> list[str]:
+    """Table of segments as ASCII lines, so that any name survives."""
+    return [f"segment {json.dumps(row)}" for row in segment_table(names, colors)]
+
+
+def _records(columns: Columns) -> np.ndarray:
+    """Little-endian records without padding."""
+    fields = [(name, f"<{kind}", values.shape[1:]) for name, (kind, values) in columns.items()]
+    records = np.zeros(len(next(iter(columns.values()))[1]), np.dtype(fields))
+    for name, (_, values) in columns.items():
+        records[name] = values
+    return records
+
+
+def _write(path: str | Path, comments: list[str], elements: dict[str, np.ndarray]) -> None:
+    lines = ["ply", "format binary_little_endian 1.0", "comment written by mereo", *(f"comment {c}" for c in comments)]
+    for element, records in elements.items():
+        lines += [f"element {element} {len(records)}", *_properties(records.dtype)]
+    with atomic_file(path) as partial, partial.open("wb") as file:
+        file.write("\n".join([*lines, "end_header\n"]).encode("ascii"))
+        for records in elements.values():
+            file.write(records.tobytes())
+
+
+def _properties(dtype: np.dtype) -> list[str]:
+    """Header lines of an element; ``count`` and ``vertex_indices`` together are what PLY calls a list."""
+    types = {"u1": "uchar", "i4": "int", "f4": "float"}
+    lines = []
+    for name in dtype.names or ():
+        if name == "vertex_indices":
+            lines.append("property list uchar int vertex_indices")
+        elif name != "count":
+            lines.append(f"property {types[dtype[name].str[1:]]} {name}")
+    return lines
+
+
+# --- OBJ --------------------------------------------------------------------------------------------------------------
+
+
+def write_segments_obj(path: str | Path, surfaces: SegmentedMesh) -> None:
+    """Write one OBJ object (``o``) per segment with a material of its colour; the materials go beside it, as STEM.mtl.
+
+    Objects and materials have the segments' names, materials with ``_`` for what is no letter or digit, because many
+    programs name what they read after its material (trimesh, VTK). Segments without faces are left out. Raises
+    ``ValueError`` where no segment has faces.
+    """
+    path = Path(path)
+    library = path.with_suffix(".mtl")
+    solid = with_faces(surfaces)
+    materials = material_names(solid)
+    with atomic_file(library) as partial_library, atomic_file(path) as partial:
+        partial_library.write_text(_materials(solid, materials, surfaces.opaque), "utf-8")
+        with partial.open("w", encoding="utf-8", newline="\n") as file:
+            file.write(f"# written by mereo\nmtllib {library.name}\n")
+            first = 1  # OBJ counts vertices from 1, through all objects
+            for (_, segment), material in zip(solid, materials, strict=True):
+                file.write(_object(material, segment, first))
+                first += len(segment.vertices)
+
+
+def material_names(solid: Sequence[tuple[int, Segment]]) -> list[str]:
+    """Name of each segment's material: one word, and no other's; those that would be alike get their labels."""
+    words = [re.sub(r"\W+", "_", segment.name).strip("_") for _, segment in solid]
+    alike = Counter(words)
+    return [
+        word if word and alike[word] == 1 else f"{word}_label_{label}".lstrip("_")
+        for (label, _), word in zip(solid, words, strict=True)
+    ]
+
+
+def _object(material: str, segment: Segment, first: int) -> str:
+    lines = [f"o {' '.join(segment.name.split())}", f"usemtl {material}"]
+    lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in segment.vertices.tolist()]
+    lines += [f"f {a} {b} {c}" for a, b, c in (segment.faces + first).tolist()]
+    return "\n".join(lines) + "\n"
+
+
+def _materials(solid: list[tuple[int, Segment]], names: list[str], opaque: tuple[bool, ...]) -> str:
+    """Material library: ``Kd`` is the diffuse colour, taken as that on the screen (sRGB), ``d`` the opacity."""
+    blocks = []
+    for (label, segment), name in zip(solid, names, strict=True):
+        color = " ".join(f"{value / 255:.6f}" for value in segment.color)
+        blocks.append(f"newmtl {name}\nKd {color}\nd {1.0 if opaque[label - 1] else OUTER_OPACITY}\n")
+    return "\n".join(blocks)
+
+
+# --- STL --------------------------------------------------------------------------------------------------------------
+
+
+def write_segments_stl(directory: str | Path, surfaces: SegmentedMesh, force: bool = False) -> None:
+    """Write a new directory of ``1-head.stl``, ``2-left-ear.stl``, ...: label and name of each segment with faces.
+
+    Positions are float32. Raises ``ValueError`` where no segment has faces, and ``FileExistsError`` for a directory
+    with content unless ``force``.
+    """
+    solid = with_faces(surfaces)
+    with new_directory(directory, force) as partial:
+        for label, segment in solid:
+            (partial / stl_name(label, segment.name)).write_bytes(_stl(segment))
+
+
+def write_surface_stl(path: str | Path, surfaces: SegmentedMesh) -> None:
+    """Write all segments as one nameless surface; positions are float32."""
+    vertices, faces, _ = surfaces.merged()
+    with atomic_file(path) as partial:
+        partial.write_bytes(_stl(Segment("", surfaces.colors[0], vertices, faces)))
+
+
+def stl_name(label: int, name: str) -> str:
+    """File name of a segment that every system takes: letters and digits of its name; the label keeps it unique."""
+    words = re.sub(r"[^\w]+", "-", name).strip("-")
+    return f"{label}-{words}.stl" if words else f"{label}.stl"
+
+
+def _stl(segment: Segment) -> bytes:
+    """File as trimesh writes it, but for its header, which must not begin with "solid" as text files do.
+
+    A name that is too long for the header is left out, not cut short.
+    """
+    mesh = trimesh.Trimesh(segment.vertices, segment.faces, process=False)
+    content: bytes = trimesh.exchange.stl.export_stl(mesh)
+    text = STL_NAME + segment.name.encode("utf-8")
+    header = text if len(text) <= 80 and segment.name.isprintable() else b"written by mereo"
+    return header.ljust(80) + content[80:]
