@@ -179,12 +179,12 @@ class Scene:
         "own" is ``workspace``. "cone" and "sphere" are that too where it is one, so that scenes can be compared; else
         the cone of the scene, with a level horizon, and the whole sphere at any roll.
         """
-        own = self.workspace
-        if name == "cone" and own.all_around:
-            return self.cone or replace(own, aperture_rad=PAPER_APERTURE_RAD, any_roll=False)
-        if name == "sphere" and not own.all_around:
-            return replace(own, aperture_rad=WHOLE_SPHERE_RAD, any_roll=True)
-        return own
+        workspace = self.workspace
+        if name == "cone" and workspace.all_around:
+            return self.cone or replace(workspace, aperture_rad=PAPER_APERTURE_RAD, any_roll=False)
+        if name == "sphere" and not workspace.all_around:
+            return replace(workspace, aperture_rad=WHOLE_SPHERE_RAD, any_roll=True)
+        return workspace
 
     def for_seed(self, seed: int) -> "Scene":
         """Scene that a seed draws from: its held-out states for testing (``TEST_SEED_START`` up), or itself."""
