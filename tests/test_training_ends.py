@@ -21,7 +21,7 @@ from training_runs import kill_after
 
 from mereo import __main__ as command_line
 from mereo.training import metrics_log, trainer
-from mereo.training.batches import Batch
+from mereo.training.dataset import Batch
 
 BRIEF = replace(SMALL, epochs=0.6)  # five steps
 FILES = ("weights.safetensors", "checkpoint.safetensors", "metrics.csv", "curves.png")

@@ -89,17 +89,15 @@ class DatasetCheck:
 
     Attributes:
         dataset: folder written by `mereo generate`, or its URL in an object storage.
-        write: write the SHA-256 of each file into the manifest of a dataset that has none, if all are good.
     """
 
     dataset: DatasetFolder
-    write: bool = False
 
     def run(self) -> None:
         """Print what is wrong, a line for each file."""
-        from mereo.synthesis.dataset_contents import check_dataset
+        from mereo.synthesis.shards import check_dataset
 
-        check_dataset(self.dataset, self.write)
+        check_dataset(self.dataset)
 
 
 @dataclass(frozen=True)
@@ -115,21 +113,17 @@ class DatasetShow:
     def run(self) -> None:
         """Print a line for each fact."""
         from mereo.scenes.seeds import TEST_SEED_START
-        from mereo.synthesis.dataset_contents import DatasetContents, recorded_files
+        from mereo.synthesis.shards import DatasetContents
 
         contents = DatasetContents.of(self.dataset)
         manifest, files = contents.manifest, contents.expected
-        hashes = (
-            "of each file in the manifest" if recorded_files(manifest) else "not recorded: see dataset check --write"
-        )
         facts = {
             "dataset": contents.folder,
             "scene": f"{manifest['scene']}, of {', '.join(segment['name'] for segment in manifest['segments'])}",
             "seed": f"{manifest['seed']}" + ", which is for testing" * (manifest["seed"] >= TEST_SEED_START),
             "examples": f"{manifest['examples']}"
             + (f", {manifest['bytes'] / 1e6:,.1f} MB" if "bytes" in manifest else ""),
-            "files": f"{sum(name in contents.there for name in files)} of {len(files)} are there",
-            "SHA-256": hashes,
+            "files": f"{sum(name in contents.names for name in files)} of {len(files)} are there",
             "made by": f"mereo {manifest['version']}",
             **dict(flat_options(manifest["settings"])),
         }

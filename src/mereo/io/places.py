@@ -1,6 +1,5 @@
 """Places of datasets: local folders, or folders of an object storage, and the files in them, whole or not at all."""
 
-import hashlib
 import os
 from pathlib import Path
 from typing import Any
@@ -20,8 +19,8 @@ def names_in(folder: Place) -> list[str]:
     return sorted(file.name for file in folder.iterdir() if not file.name.startswith(".")) if folder.is_dir() else []
 
 
-def write_whole(place: Place, content: bytes) -> str:
-    """Write a file, whole or not at all, also where the machine loses its power; its SHA-256 is returned.
+def write_whole(place: Place, content: bytes) -> None:
+    """Write a file, whole or not at all, also where the machine loses its power.
 
     Raises as ``atomic_file`` does, or ``StorageError``.
     """
@@ -32,12 +31,6 @@ def write_whole(place: Place, content: bytes) -> str:
             partial.write_bytes(content)
             with partial.open("rb+") as file:
                 os.fsync(file.fileno())  # NFS tells of a full disk here, and a name comes after its content
-    return sha256(content)
-
-
-def sha256(content: bytes) -> str:
-    """Digest of a file, as ``sha256sum`` prints it."""
-    return hashlib.sha256(content).hexdigest()
 
 
 def claim(folder: Place, name: str, settings: dict[str, Any], kind: str) -> dict[str, Any] | None:
