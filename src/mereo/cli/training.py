@@ -112,18 +112,19 @@ class DatasetShow:
 
     def run(self) -> None:
         """Print a line for each fact."""
+        from mereo.io.places import names_in
         from mereo.scenes.seeds import TEST_SEED_START
-        from mereo.synthesis.shards import DatasetContents
+        from mereo.synthesis.shards import expected_files, read_manifest
 
-        contents = DatasetContents.of(self.dataset)
-        manifest, files = contents.manifest, contents.expected
+        manifest = read_manifest(self.dataset)
+        files, names = expected_files(manifest), names_in(self.dataset)
         facts = {
-            "dataset": contents.folder,
+            "dataset": self.dataset,
             "scene": f"{manifest['scene']}, of {', '.join(segment['name'] for segment in manifest['segments'])}",
             "seed": f"{manifest['seed']}" + ", which is for testing" * (manifest["seed"] >= TEST_SEED_START),
             "examples": f"{manifest['examples']}"
             + (f", {manifest['bytes'] / 1e6:,.1f} MB" if "bytes" in manifest else ""),
-            "files": f"{sum(name in contents.names for name in files)} of {len(files)} are there",
+            "files": f"{sum(name in names for name in files)} of {len(files)} are there",
             "made by": f"mereo {manifest['version']}",
             **dict(flat_options(manifest["settings"])),
         }

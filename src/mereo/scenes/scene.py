@@ -37,11 +37,6 @@ class SourceFrame:
         """Scene units per unit of the files."""
         return float(np.cbrt(np.linalg.det(self.T_scene_source[:3, :3])))
 
-    @property
-    def source_unit_m(self) -> float | None:
-        """Metres per unit of the files; None where the object's true size is not known."""
-        return None if self.unit_m is None else self.unit_m * self.scale
-
     def facts(self) -> dict[str, Any]:
         """Plain values for a file's header."""
         return {"T_scene_source": self.T_scene_source.tolist(), "unit_m": self.unit_m}

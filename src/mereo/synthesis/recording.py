@@ -30,7 +30,6 @@ from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid
 from mereo.io.atomic_files import write_json
 from mereo.io.intrinsics import written_intrinsics
-from mereo.scenes.draw_recorder import Call
 from mereo.scenes.parameters import Played
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
@@ -246,7 +245,7 @@ def write_recording(
     """
     unit_m = sensor[1].metres_per_unit if scene.unit_m is None else scene.unit_m
     (folder / FRAMES).mkdir()
-    truth, frames, scale, camera = _Truth(), [], FINEST, None
+    frames, states, scale, camera = [], [], FINEST, None
     digits = max(4, len(str(settings.frames - 1)))
     for number, moment in enumerate(sequence(scene, settings, sensor[1], seed)):
         image = moment.seen.image
@@ -258,11 +257,23 @@ def write_recording(
         file = f"{number:0{digits}}.png"
         Image.fromarray(steps).save(folder / FRAMES / file)
         frames.append({"file": file, "time_s": moment.time_s, "points": moment.seen.object_points})
-        truth.add(moment)
+        vertices = np.concatenate([segment.vertices for segment in moment.mesh.segments]).astype(np.float32)
+        shares = np.concatenate([np.empty(0), *(call.shares for call in moment.played.calls)])
+        states.append((vertices, moment.T_world_camera, shares))  # the pictures would not fit into memory
+        sizes = [len(call.shares) for call in moment.played.calls]
     assert camera is not None
     write_json(folder / CAMERA, {**written_intrinsics(camera), "depth_scale": scale})
-    truth.write(folder / TRUTH, scene.rest)
     rest = scene.rest
+    vertices, poses, draws = (np.stack(arrays) for arrays in zip(*states, strict=True))
+    np.savez_compressed(
+        folder / TRUTH,
+        vertices=vertices,
+        faces=rest.merged()[1].astype(np.int32),
+        counts=np.array([(len(segment.vertices), len(segment.faces)) for segment in rest.segments]),
+        T_world_camera=poses,
+        draws=draws,
+        sizes=np.array(sizes, dtype=np.int64),
+    )
     index = {
         "format": 1,
         "scene": named or scene.name,
@@ -276,31 +287,6 @@ def write_recording(
         "frames": frames,
     }
     write_json(folder / INDEX, index)
-
-
-class _Truth:
-    """Truth of a sequence, gathered frame by frame: the pictures themselves would not fit into memory."""
-
-    def __init__(self) -> None:
-        self.vertices: list[Float[np.ndarray, "v 3"]] = []
-        self.poses: list[Float[np.ndarray, "4 4"]] = []
-        self.calls: list[tuple[Call, ...]] = []
-
-    def add(self, moment: Moment) -> None:
-        self.vertices.append(np.concatenate([segment.vertices for segment in moment.mesh.segments]).astype(np.float32))
-        self.poses.append(moment.T_world_camera)
-        self.calls.append(moment.played.calls)
-
-    def write(self, path: Path, rest: SegmentedMesh) -> None:
-        np.savez_compressed(
-            path,
-            vertices=np.stack(self.vertices),
-            faces=rest.merged()[1].astype(np.int32),
-            counts=np.array([(len(segment.vertices), len(segment.faces)) for segment in rest.segments]),
-            T_world_camera=np.stack(self.poses),
-            draws=np.stack([np.concatenate([np.empty(0), *(call.shares for call in calls)]) for calls in self.calls]),
-            sizes=np.array([len(call.shares) for call in self.calls[0]], dtype=np.int64),
-        )
 
 
 def is_recording_folder(path: Path) -> bool:

@@ -26,7 +26,7 @@ import json
 import platform
 import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -146,58 +146,35 @@ def dataset_key(manifest: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-@dataclass(frozen=True, eq=False)
-class DatasetContents:
-    """Files of a dataset.
+def expected_files(manifest: Mapping[str, Any]) -> list[str]:
+    """Names of the files that a dataset must have, but for its manifest."""
+    # nothing is trained on a test set
+    models = [] if manifest["seed"] >= TEST_SEED_START else [STATISTICAL_MODEL]
+    return [TEMPLATE, *models, *shard_names(manifest)]
 
-    Attributes:
-        folder: of the dataset.
-        manifest: of the dataset, checked.
-        names: of its files at first.
-    """
 
-    folder: Place
-    manifest: dict[str, Any]
-    names: frozenset[str]
+def check_file(path: Place, manifest: Mapping[str, Any]) -> None:
+    """Read a file of the dataset with this manifest; raises as ``read_shard`` does."""
+    if path.name == TEMPLATE:
+        read_template(path, manifest)
+    elif path.name == STATISTICAL_MODEL:
+        read_statistical_model(read_content(path), dataset_key(manifest))
+    else:
+        read_shard(path, manifest)
 
-    @classmethod
-    def of(cls, folder: Place) -> "DatasetContents":
-        """Contents of a folder. Raises as ``read_manifest`` does."""
-        return cls(folder, read_manifest(folder), frozenset(names_in(folder)))
 
-    @property
-    def expected(self) -> list[str]:
-        """Names of the files that the dataset must have, but for its manifest."""
-        # nothing is trained on a test set
-        models = [] if self.manifest["seed"] >= TEST_SEED_START else [STATISTICAL_MODEL]
-        return [TEMPLATE, *models, *shard_names(self.manifest)]
-
-    def check(self, name: str) -> None:
-        """Read a file of the dataset.
-
-        Raises ``FileNotFoundError``, ``ValueError`` (its reason only) where it is damaged or another dataset's, and
-        ``StorageError`` where nothing is known of it.
-        """
-        path = self.folder / name
-        if name == TEMPLATE:
-            read_template(path, self.manifest)
-        elif name == STATISTICAL_MODEL:
-            read_statistical_model(read_content(path), dataset_key(self.manifest))
-        else:
-            read_shard(path, self.manifest)
-
-    def keeps(self, name: str) -> bool:
-        """Whether a file is there and whole; one that a crash cut off or that was changed since is reported."""
-        if name not in self.names:
-            return False
+def whole_files(folder: Place, manifest: Mapping[str, Any], files: Iterable[str]) -> set[str]:
+    """Those of a dataset's files that are there and whole; damaged ones are reported."""
+    whole = set[str]()
+    for name in sorted({*names_in(folder)}.intersection(files)):
         try:
-            self.check(name)
+            check_file(folder / name, manifest)
+            whole.add(name)
         except FileNotFoundError:
-            return False
+            pass
         except ValueError:
             print(f"{name} is damaged and is made again", flush=True)
-            return False
-        return True
+    return whole
 
 
 def check_dataset(folder: Place) -> None:
@@ -206,18 +183,20 @@ def check_dataset(folder: Place) -> None:
     Raises ``ValueError`` where a file is not good, or the folder holds no dataset, ``FileNotFoundError`` where there is
     none, and ``StorageError`` where the storage refuses.
     """
-    contents = DatasetContents.of(folder)
-    problems, files = dict[str, str](), contents.expected
+    manifest = read_manifest(folder)
+    problems, files = dict[str, str](), expected_files(manifest)
     with progress("check", len(files), "files") as shown:
         for name in files:
             try:
-                contents.check(name)
+                check_file(folder / name, manifest)
             except FileNotFoundError:
                 problems[name] = "it is missing"
             except ValueError as error:
                 problems[name] = str(error)
             shown.advance(1)
-    spare = sorted(name for name in contents.names.difference(files) if re.fullmatch(r"shard-.*\.safetensors", name))
+    spare = sorted(
+        name for name in {*names_in(folder)}.difference(files) if re.fullmatch(r"shard-.*\.safetensors", name)
+    )
     for name, why in problems.items():
         print(f"{name}: {why}")
     for name in spare:
@@ -231,7 +210,7 @@ def check_dataset(folder: Place) -> None:
         raise ValueError(
             f"{folder}: {len(spare)} files are not of this dataset; move {'them' if spare[1:] else 'it'} away"
         )
-    print(f"{folder}: all {len(files)} files are whole, {contents.manifest['examples']} examples")
+    print(f"{folder}: all {len(files)} files are whole, {manifest['examples']} examples")
 
 
 def shard_name(number: int) -> str:
@@ -327,25 +306,6 @@ class DatasetConfig:
             )
 
 
-@dataclass(frozen=True, eq=False)
-class _Work:
-    """Scene and settings of all shards of a dataset; a built-in scene is sent to workers by its name."""
-
-    scene: str | Scene
-    settings: GenerateConfig
-    seed: int
-    dataset: str
-
-
-@dataclass(frozen=True)
-class _Shard:
-    """One file: examples ``first`` up to ``end``, without the end."""
-
-    name: str
-    first: int
-    end: int
-
-
 def generate(
     scene: str | Scene,
     output: Place,
@@ -383,29 +343,36 @@ def generate(
     loaded = load_scene(scene) if isinstance(scene, str) else scene
     manifest = make_manifest(loaded, settings, examples, seed)
     check_space(output, examples, manifest["bytes"] // examples, shard[1])
-    shards = [
-        _Shard(shard_name(n), n * SHARD_SIZE, min(examples, (n + 1) * SHARD_SIZE))
-        for n in range(shard[0], -(-examples // SHARD_SIZE), shard[1])
-    ]
-    contents = _claim(output, manifest, shards, resume, alone=shard[1] == 1)
-    key = dataset_key(contents.manifest)
-    if not contents.keeps(TEMPLATE):
+    numbers = range(shard[0], -(-examples // SHARD_SIZE), shard[1])
+    before = claim(output, MANIFEST, manifest, "a dataset")
+    if before is not None:
+        names = names_in(output)
+        if not resume and (shard[1] == 1 or any(shard_name(number) in names for number in numbers)):
+            raise FileExistsError(f"{output} holds a dataset; continue it with --resume, or choose another --output")
+        _check_same(output, before, manifest)
+        manifest = read_manifest(output)
+    key = dataset_key(manifest)
+    whole = whole_files(output, manifest, [TEMPLATE, STATISTICAL_MODEL, *map(shard_name, numbers)])
+    if TEMPLATE not in whole:
         write_whole(output / TEMPLATE, pack_tensors({"distance": rest_distances(loaded.rest)}, {"dataset": key}))
     # nothing is trained on a test set
-    if not config.test and not contents.keeps(STATISTICAL_MODEL):
+    if not config.test and STATISTICAL_MODEL not in whole:
         states = states_for(examples)
         print(f"modes of {states} random states, for registration", flush=True)
         write_whole(output / STATISTICAL_MODEL, statistical_model_bytes(scene_model(loaded, states, quiet=False), key))
-    missing = [item for item in shards if not contents.keeps(item.name)]
-    total = sum(item.end - item.first for item in missing)
+    missing = [
+        range(number * SHARD_SIZE, min(examples, (number + 1) * SHARD_SIZE))
+        for number in numbers
+        if shard_name(number) not in whole
+    ]
     # what a YAML file says can be sent, and is then the same for all workers even if the file changes meanwhile; other
     # machines have neither file nor assets
     sent = loaded if isinstance(workers, Cluster) or is_yaml(scene) else scene
-    work = partial(_make_shard, _Work(sent, settings, seed, key))
-    with closing(spread(work, missing, workers)) as made, progress("generate", total) as shown:
-        for item, data in made:
-            write_whole(output / item.name, data)
-            shown.advance(item.end - item.first)
+    work = partial(_make_shard, sent, settings, seed, key)
+    with closing(spread(work, missing, workers)) as made, progress("generate", sum(map(len, missing))) as shown:
+        for rows, data in made:
+            write_whole(output / shard_name(rows.start // SHARD_SIZE), data)
+            shown.advance(len(rows))
 
 
 def _check_sharing(workers: int | Cluster, shard: tuple[int, int]) -> None:
@@ -450,17 +417,6 @@ def example_bytes(settings: GenerateConfig, segments: int) -> int:
     return per_point * settings.points + per_query * settings.sampling.total(segments) + once + seen
 
 
-def _claim(output: Place, manifest: dict[str, Any], shards: list[_Shard], resume: bool, alone: bool) -> DatasetContents:
-    """Create the folder with its manifest, or check that it is this very dataset; others may write shards there."""
-    before = claim(output, MANIFEST, manifest, "a dataset")
-    if before is not None:
-        names = names_in(output)
-        if not resume and (alone or any(item.name in names for item in shards)):
-            raise FileExistsError(f"{output} holds a dataset; continue it with --resume, or choose another --output")
-        _check_same(output, before, manifest)
-    return DatasetContents.of(output)
-
-
 def _check_same(output: Place, before: dict[str, Any], manifest: dict[str, Any]) -> None:
     default = {"settings.observations": [], "settings.workspace": "own"}  # manifests do not state these
     earlier = default | _flat(before)
@@ -484,16 +440,12 @@ def _flat(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 # --- the work ---------------------------------------------------------------------------------------------------------
 
 
-def _make_shard(work: _Work, shard: _Shard) -> bytes:
-    """Content of the shard's file."""
-    loaded = load_scene(work.scene) if isinstance(work.scene, str) else work.scene
-    scene = loaded.for_seed(work.seed)
-    rows = [
-        pack(synthesize(scene, work.settings, example_rng(work.seed, index)), work.settings.points)
-        for index in range(shard.first, shard.end)
-    ]
-    tensors = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
-    return pack_tensors(tensors, {"dataset": work.dataset, "first": shard.first})
+def _make_shard(scene: str | Scene, settings: GenerateConfig, seed: int, dataset: str, rows: range) -> bytes:
+    """Content of the file of these examples; a built-in scene goes by its name."""
+    loaded = (load_scene(scene) if isinstance(scene, str) else scene).for_seed(seed)
+    examples = [pack(synthesize(loaded, settings, example_rng(seed, row)), settings.points) for row in rows]
+    tensors = {key: np.stack([example[key] for example in examples]) for key in examples[0]}
+    return pack_tensors(tensors, {"dataset": dataset, "first": rows.start})
 
 
 def pack(example: Example, points: int) -> dict[str, np.ndarray]:

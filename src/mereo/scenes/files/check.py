@@ -250,9 +250,6 @@ STATE_TOLERANCE = 0.02
 WIDTH = 96
 """Of the depth image in pixels, the default of ``synthesis.config.GenerateConfig``."""
 
-NARROWED = (0.75, 0.5, 0.25, 0.1)
-"""Shares of a joint's ranges that are tried where it turns segments into each other."""
-
 
 def report_states(scene: Scene) -> int:
     """Print how far random states move, how they are seen, and each overlap with its cause; returns their number."""
@@ -318,29 +315,4 @@ def _cure(scene: Scene, overlap: Overlap) -> str:
     moves = f"{' and '.join(titles)} {'moves' if len(apart) == 1 else 'move'} one of the two alone"
     if not all(isinstance(draw.steps[index][0], JointSampler) for index in apart):
         return f"{moves}: leave out its `segments`, so that both move by it, or deform less"
-    for share in NARROWED:
-        if _free(scene, _narrowed(draw, apart, share), overlap):
-            return f"{moves}: {share:.0%} of the range keeps them apart; or correct the pivot and the axis"
-    return f"{moves}, and they meet at a tenth of the range already: correct its pivot and axis, or move both"
-
-
-def _narrowed(draw: RandomMotion, which: list[int], share: float) -> RandomMotion:
-    """The same motion with some of its joints narrowed."""
-    steps = list(draw.steps)
-    for index in which:
-        joint, members = steps[index]
-        assert isinstance(joint, JointSampler)
-        steps[index] = (joint.narrowed(share), members)
-    return replace(draw, steps=tuple(steps))
-
-
-def _free(scene: Scene, draw: RandomMotion, overlap: Overlap) -> bool:
-    """Whether the two segments of an overlap keep apart in all of the states."""
-    names = (overlap.small, overlap.large)
-    parts = [scene.rest.names.index(name) for name in sorted(names, key=scene.rest.names.index)]
-    nested = tuple(pair for pair in scene.rest.nested if set(pair) == set(names))
-    for index in range(STATES):
-        mesh = scene.deform(draw(example_rng(0, index))).mesh
-        if overlaps(SegmentedMesh(tuple(mesh.segments[part] for part in parts), nested), STATE_TOLERANCE):
-            return False
-    return True
+    return f"{moves}: narrow its range, correct its pivot and axis, or move both"

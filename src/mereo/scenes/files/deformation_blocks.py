@@ -5,7 +5,6 @@ units and radians.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -18,7 +17,6 @@ from pydantic import (
     ConfigDict,
     Field,
     FiniteFloat,
-    model_serializer,
     model_validator,
 )
 
@@ -142,14 +140,6 @@ class LatticeBlock(DeformationBlock):
         if self.cells is not None and self.spacing is not None:
             raise ValueError("it has both cells and spacing; one of them says where the control points are: drop one")
         return self
-
-    @model_serializer(mode="wrap")
-    def _without_absent_spacing(self, serialize: Callable[["LatticeBlock"], dict[str, object]]) -> dict[str, object]:
-        # datasets keep a digest of what their scene file says, and most are from before there was a spacing
-        written = serialize(self)
-        if self.spacing is None:
-            del written["spacing"]
-        return written
 
     def sampler(self, target: Target) -> DeformationSampler:
         """Sampler of lattices over the box of what is moved; ``Misfit`` where ``spacing`` is too small for it."""
