@@ -170,28 +170,8 @@ def random_motion(mesh: SegmentedMesh, blocks: tuple[DeformationBlock, ...], pla
 # --- the camera -------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class View:
-    """Where the camera is by default.
-
-    Attributes:
-        near, far: its distances from the object's centre, in scene units.
-        field_of_view: angle in whole degrees.
-    """
-
-    near: float
-    far: float
-    field_of_view: int
-
-
-def default_view(rest: SegmentedMesh, draw: Draw, workspace: Workspace) -> View:
-    """Distances and a field of view that random states fill without being cut.
-
-    Args:
-        rest: segments in scene units.
-        draw: their maps in a random state.
-        workspace: directions from which the camera looks.
-    """
+def _default_view(rest: SegmentedMesh, draw: Draw, workspace: Workspace) -> tuple[float, float, int]:
+    """Nearest and farthest distance in scene units, and field of view in degrees, that random states fill uncut."""
     states = _states(rest, draw)
     reach = max(float(np.linalg.norm(points - center, axis=1).max()) for points, center in states)
     near = max(NEAR, float(np.ceil(reach / np.sin(MOST_VIEW_RAD / 2))))
@@ -202,7 +182,7 @@ def default_view(rest: SegmentedMesh, draw: Draw, workspace: Workspace) -> View:
         seen = transform_points(inverse_rigid(pose), points)
         widest = max(widest, float(np.abs(seen[:, :2] / seen[:, 2:]).max()))
     view = int(np.clip(np.ceil(np.rad2deg(2 * np.arctan(MARGIN * widest))), 5, 90))
-    return View(near, float(np.ceil(FARTHER * near)), view)
+    return near, float(np.ceil(FARTHER * near)), view
 
 
 def _states(rest: SegmentedMesh, draw: Draw) -> list[tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "3"]]]:
@@ -236,16 +216,7 @@ LABEL_CELLS = 64
 
 @dataclass(frozen=True, eq=False)
 class _Source:
-    """Segments of files, and facts that their kind tells.
-
-    Attributes:
-        block: the lines of the scene file that name them.
-        mesh: the segments, in the files' unit.
-        unit: the likely one.
-        reason: why.
-        up: the axis that likely points upwards, 1 for y or 2 for z.
-        up_reason: why.
-    """
+    """Segments of files in their unit, the lines that name them, and the likely unit and upward axis, with reasons."""
 
     block: str
     mesh: SegmentedMesh
@@ -371,7 +342,7 @@ def _text(name: str, source: _Source, units: str | None) -> str:
     blocks = default_deformations(source.mesh)
     rest = source.mesh.with_vertices([placement.apply(segment.vertices) for segment in source.mesh.segments])
     x, y, z = np.eye(3)[source.up].tolist()
-    view = default_view(rest, random_motion(rest, blocks, placement), Workspace(axis=(x, y, z)))
+    near, far, view = _default_view(rest, random_motion(rest, blocks, placement), Workspace(axis=(x, y, z)))
     unit, reason = (units, "as you said") if units else (source.unit, source.reason)
     bend, lattice = blocks[0], blocks[-1]
     assert isinstance(bend, BendBlock) and isinstance(lattice, LatticeBlock)
@@ -384,9 +355,9 @@ def _text(name: str, source: _Source, units: str | None) -> str:
         size=f"{size:g}",
         up=[int(k == source.up) for k in range(3)],
         up_reason=source.up_reason,
-        near=f"{view.near:g}",
-        far=f"{view.far:g}",
-        view=view.field_of_view,
+        near=f"{near:g}",
+        far=f"{far:g}",
+        view=view,
         spacing=f"{lattice.spacing:g}",
         strength=f"{lattice.strength:g}",
         end=_numbers(np.array(bend.origin)),
