@@ -22,10 +22,10 @@ SETTINGS = (("passive", None), ("passive", 1), ("active", None), (None, None))
 def measure(queries: int, rounds: int, beside: int) -> None:
     """Print threads, and seconds alone and beside busy processes: what the process of one row does."""
     import torch  # before mereo, so that OpenMP finds the variable as this row has it
-    from mereo_experiments.speed.busy import busy_processes
 
     from mereo.evaluation.sample_views import load_view
     from mereo.models.weights import load_model
+    from mereo_experiments.speed.busy import busy_processes
     from mereo_experiments.speed.stages import random_points
 
     model, view = load_model("bunny"), load_view("bunny")
@@ -47,9 +47,8 @@ def measure(queries: int, rounds: int, beside: int) -> None:
 
 def row(policy: str | None, threads: int | None, options: argparse.Namespace) -> float:
     """Print one row of the table; returns the times of the fair share."""
-    from mereo_experiments.speed.busy import fair_share
-
     from mereo.io.cores import cores
+    from mereo_experiments.speed.busy import fair_share
 
     variables = {
         name: value for name, value in os.environ.items() if name not in ("OMP_WAIT_POLICY", "OMP_NUM_THREADS")

@@ -16,7 +16,7 @@ from collections.abc import Callable
 import torch
 
 from mereo.models.config import Encoder, NetworkConfig
-from mereo.models.encoders.encoding import Autodecoder
+from mereo.models.encoders import Autodecoder
 from mereo.models.network import Network
 from mereo.training.config import PRESETS
 

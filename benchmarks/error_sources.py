@@ -35,9 +35,8 @@ from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
-from mereo.training.batches import Batch, Draws, choose_points
 from mereo.training.config import AugmentConfig
-from mereo.training.dataset import Dataset
+from mereo.training.dataset import Batch, Dataset, Draws, choose_points
 
 NEAR_CELLS = 1.2
 HELD_OUT = 64

@@ -39,10 +39,9 @@ from mereo.models.weights import load_model
 from mereo.reconstruction.observation import observe
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
-from mereo.synthesis.config import SENSORS, Occluder
+from mereo.synthesis.config import SENSORS, Occluder, SequenceConfig
 from mereo.synthesis.depth_sensor import add_depth_noise
 from mereo.synthesis.recording import Moment, sequence
-from mereo.synthesis.sequence_config import SequenceConfig
 
 STILL, SETTLED, BEFORE_JUMP, AFTER_JUMP, CELLS = 60, 30, 10, 12, 50
 CLOSE = 0.02

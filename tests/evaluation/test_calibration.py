@@ -15,8 +15,7 @@ from mereo.evaluation.calibrate import GOOD_ENOUGH, calibrate, ece_of, fit_scali
 from mereo.evaluation.cases import BINS, AskedCells, Reliability
 from mereo.evaluation.ground_truth import truth_grid
 from mereo.models.calibration import Calibration
-from mereo.models.model import Model
-from mereo.models.scaled_logits import scaled_logits
+from mereo.models.model import Model, scaled_logits
 from mereo.models.weights import load_model, save_model, with_calibration
 from mereo.reconstruction.segment_statistics import segment_points
 from mereo.scenes.registry import load_scene

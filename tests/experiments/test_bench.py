@@ -19,7 +19,7 @@ from mereo_experiments.speed.baseline import Rival, farthest_points
 from mereo_experiments.speed.busy import LIMIT, Share, busy_processes, fair_share, measure_under_load, shares_table
 from mereo_experiments.speed.report import table
 from mereo_experiments.speed.roofline import Machine, Work, count_operations
-from mereo_experiments.speed.stages import Bench, Stage, needed_nodes, random_points
+from mereo_experiments.speed.stages import Bench, Stage, needed_nodes
 
 MACHINE = Machine(1e11, 1e10)
 
@@ -84,14 +84,6 @@ def test_a_fitted_network_knows_its_frame(monkeypatch: pytest.MonkeyPatch) -> No
     labels = model.query(model.encode(view.depth.to_points()), grid.positions(cells)).label
     assert (labels > 0).mean() > 0.5
     assert model.network.config == PRESETS["tiny"].network.changed(dropout=0.0)
-
-
-def test_a_frame_by_fixed_shapes_is_what_the_model_answers() -> None:
-    """What CUDA times for a whole frame, step by step on this CPU."""
-    bench = Bench(load_model("rope"), load_view("rope"), MACHINE)
-    points = random_points(bench.view, 500)
-    expected = bench.model.logits(bench._code, points).argmax(axis=1)
-    assert (bench._by_graphs(points[:100], points)() == expected).mean() > 0.99
 
 
 def test_the_table_names_ratio_and_floor() -> None:

@@ -15,8 +15,8 @@ from mereo.evaluation.tables import read_metrics
 from mereo.models.weights import PACKED, _pack, _unpack, load_model, save_model
 from mereo.models.weights_place import find_weights, shipped_names
 from mereo.synthesis.config import SENSORS, SensorConfig
-from mereo.training.examples_seen import seen_by, told
 from mereo.training.model_card import card, release
+from mereo.training.run_directory import describe_seen, seen_by
 
 TEST = {
     "seed": 1_000_000,
@@ -124,7 +124,7 @@ def test_shipped_weights_have_a_true_card(name: str) -> None:
     states = model.statistical_model
     assert states is not None and f"the mesh at rest and {states.count} modes of deformation" in text
     assert states.source_frame is not None
-    assert told(model.provenance) in text and seen_by(name) is not None
+    assert describe_seen(model.provenance) in text and seen_by(name) is not None
     assert '"/' not in json.dumps(model.provenance), "no folders of the machine that trained"
     network = [tensor for key, tensor in load_file(path).items() if not key.startswith("states.")]
     assert {tensor.dtype for tensor in network if tensor.is_floating_point()} == {torch.float16}

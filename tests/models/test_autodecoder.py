@@ -20,7 +20,7 @@ from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.models.config import AutodecoderConfig, NetworkConfig
 from mereo.models.decoder import Code
-from mereo.models.encoders.encoding import Autodecoder, Encoding
+from mereo.models.encoders import Autodecoder, Encoding
 from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.models.weights import load_model

@@ -11,7 +11,7 @@ from toy_data import read_all
 from mereo.api.generate import generate
 from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
 from mereo.models.config import AutodecoderConfig
-from mereo.models.encoders.encoding import Encoding
+from mereo.models.encoders import Encoding
 from mereo.models.network import Network
 from mereo.synthesis.config import GenerateConfig
 from mereo.training.config import PRESETS, AugmentConfig, TrainConfig

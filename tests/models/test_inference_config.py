@@ -11,7 +11,7 @@ from mereo import __main__ as command_line
 from mereo.cli.answers import ReconstructCommand
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.models.config import EXACT, InferenceConfig
-from mereo.models.device import BFLOAT16_PAYS, bfloat16_gain, find_device
+from mereo.models.device import bfloat16_pays, find_device
 from mereo.models.weights import load_for
 
 CPU = InferenceConfig(device="cpu", precision="bfloat16")
@@ -29,7 +29,7 @@ def test_where_and_how_exactly_is_what_was_asked_for() -> None:
     assert (fast.device.type, fast.working_precision) == ("cpu", "bfloat16")
     assert exact.working_precision == "float32"
     on_cpu = load_for("bunny", InferenceConfig(device="cpu"))
-    assert on_cpu.working_precision == ("bfloat16" if bfloat16_gain() >= BFLOAT16_PAYS else "float32")
+    assert on_cpu.working_precision == ("bfloat16" if bfloat16_pays() else "float32")
 
 
 def test_bfloat16_changes_few_labels_and_little_distance(tmp_path: Path) -> None:

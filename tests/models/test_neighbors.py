@@ -6,7 +6,7 @@ import sys
 import pytest
 import torch
 
-from mereo.models.ops.neighbors import _by_rank, ball_query, gather, nearest, squared_distances
+from mereo.models.neighbors import _by_rank, ball_query, gather, nearest, squared_distances
 
 
 def random_points(batch: int, count: int, seed: int = 0) -> torch.Tensor:
@@ -63,7 +63,7 @@ def test_ball_query_finds_the_same_on_every_device() -> None:
 
 COMPILED = """
 import torch
-from mereo.models.ops.neighbors import ball_query, nearest
+from mereo.models.neighbors import ball_query, nearest
 
 points, queries = torch.rand(2, 60, 3), torch.rand(2, 40, 3)
 def both(points, queries):
@@ -83,7 +83,7 @@ def test_compiled_networks_call_the_same_searches() -> None:
 def test_nearest_finds_the_same_in_exported_graphs(monkeypatch: pytest.MonkeyPatch) -> None:
     queries, points = random_points(2, 40, 3), random_points(2, 30, 4)
     by_tree = nearest(queries, points, 40)
-    monkeypatch.setattr("mereo.models.ops.neighbors.is_exporting", lambda: True)
+    monkeypatch.setattr("mereo.models.neighbors.is_exporting", lambda: True)
     assert by_tree.shape == (2, 40, 30)
     assert torch.equal(nearest(queries, points, 40), by_tree)
     assert nearest(queries[..., :2], points[..., :2], 1).shape == (2, 40, 1)

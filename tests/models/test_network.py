@@ -6,7 +6,7 @@ import torch.nn.functional as F
 
 from mereo.models.config import Loss, NetworkConfig, Supervision
 from mereo.models.decoder import FrequencyEncoding, Prediction
-from mereo.models.encoders.encoding import PointNet2
+from mereo.models.encoders import PointNet2
 from mereo.models.network import Network
 from mereo.training.config import PRESETS
 from mereo.training.losses import occupancy_loss

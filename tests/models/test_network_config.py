@@ -1,7 +1,7 @@
 """Settings of networks have parts, and are flat wherever they are written: in weights, in runs, as options."""
 
 import json
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any, get_args
 
 import pytest
@@ -83,10 +83,9 @@ def test_every_setting_is_an_option_without_its_part() -> None:
 def test_a_recipe_is_written_flat() -> None:
     """Runs and weights hold the network's settings as they did before there were parts."""
     written = TrainConfig().to_dict()
-    names = [item.name for item in fields(TrainConfig) if item.name != "accumulate"]  # which older runs do not have
+    names = [item.name for item in fields(TrainConfig)]
     assert list(written) == [name for name in names if name != "code_length"]  # of an autodecoder's codes
     assert list(PRESETS["tiny-autodecoder"].to_dict()) == names
-    assert replace(TrainConfig(), accumulate=2).to_dict()["accumulate"] == 2
     assert list(written["network"])[:6] == ["encoder", "points", "neighbors", "ratio1", "radius1", "mlp1"]
     assert written["augment"]["keep_points"] == (1.0, 1.0)
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from mereo.models.export.onnx_operators import trilinear
+from mereo.models.export.onnx_export import trilinear
 from mereo.models.rigid_alignment import fit_rigid, svd3
 
 

@@ -20,9 +20,9 @@ from mereo.evaluation.scoring import score_cases
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.models.config import NetworkConfig
-from mereo.models.encoders.encoding import PointTransformer, TransitionDown, VectorAttention
+from mereo.models.encoders import PointTransformer, TransitionDown, VectorAttention
+from mereo.models.neighbors import distinct_distances, nearest
 from mereo.models.network import Network
-from mereo.models.ops.neighbors import distinct_distances, nearest
 from mereo.models.weights import load_model
 from mereo.training import trainer
 from mereo.training.config import PRESETS, AugmentConfig

@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from mereo.models.ops import products
-from mereo.models.ops.products import ROWS, linear, onednn_gain
+from mereo.models import device
+from mereo.models.device import ROWS, linear, onednn_pays
 from mereo_experiments.speed.roofline import count_operations
 
 
@@ -13,14 +13,14 @@ from mereo_experiments.speed.roofline import count_operations
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """How many rows oneDNN was asked for, as if it were faster here."""
     rows_of_each: list[int] = []
-    onednn = products._by_onednn
+    onednn = device._by_onednn
 
     def by_onednn(rows: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None) -> torch.Tensor:
         rows_of_each.append(rows.numel() // rows.shape[-1])
         return onednn(rows, weight, bias)
 
-    monkeypatch.setattr(products, "_by_onednn", by_onednn)
-    monkeypatch.setattr(products, "onednn_gain", lambda: 2.0)
+    monkeypatch.setattr(device, "_by_onednn", by_onednn)
+    monkeypatch.setattr(device, "onednn_pays", lambda: True)
     return rows_of_each
 
 
@@ -57,19 +57,20 @@ def test_other_sizes_precisions_and_trainings_are_torchs(asked: list[int]) -> No
     assert weight.grad is not None and not asked
 
 
-def test_a_torch_without_the_operator_does_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    def gone(*_: object) -> torch.Tensor:
-        raise AttributeError("'_OpNamespace' 'mkldnn' object has no attribute '_linear_pointwise'")
-
-    monkeypatch.setattr(products, "_by_onednn", gone)
-    onednn_gain.cache_clear()
+def test_the_processor_decides_and_no_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    onednn_pays.cache_clear()
     try:
-        assert onednn_gain() == 0.0
+        for is_amd, missing, pays in ((True, False, True), (False, False, False), (True, True, False)):
+            onednn_pays.cache_clear()
+            monkeypatch.setattr(device, "is_amd", lambda is_amd=is_amd: is_amd)
+            if missing:  # a private operator of torch, which may go
+                monkeypatch.setattr(torch.ops, "mkldnn", object())
+            assert onednn_pays() is pays
         with torch.inference_mode():
             weight, bias = layer()
             assert torch.equal(linear(rows(ROWS), weight, bias), F.linear(rows(ROWS), weight, bias))
     finally:
-        onednn_gain.cache_clear()
+        onednn_pays.cache_clear()
 
 
 def test_its_operations_are_counted(asked: list[int]) -> None:

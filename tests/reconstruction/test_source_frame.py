@@ -28,7 +28,7 @@ def test_files_in_millimetres_come_to_the_scene(tmp_path: Path) -> None:
         # long faces are divided, which adds vertices after the file's own
         np.testing.assert_allclose(transform_points(scene.T_scene_source, own), part.vertices[: len(own)], atol=1e-9)
     assert scene.source_frame.scale == pytest.approx(2.0)  # 10 mm become 20 units
-    assert scene.source_frame.source_unit_m == pytest.approx(0.001)
+    assert scene.source_frame.unit_m * scene.source_frame.scale == pytest.approx(0.001)
     model = scene_model(scene, 20)
     assert model.source_frame is not None and model.source_frame.unit_m == scene.unit_m
     registrar = Registrar(untrained(scene.rest.names, "bar"), model)
@@ -67,6 +67,6 @@ def test_the_frame_survives_weights_and_older_ones_have_none(tmp_path: Path) -> 
     read = load_model(tmp_path / "w.safetensors").statistical_model
     assert read is not None and read.source_frame is not None and model.source_frame is not None
     np.testing.assert_array_equal(read.source_frame.T_scene_source, model.source_frame.T_scene_source)
-    assert read.source_frame.unit_m == 0.25 and read.source_frame.source_unit_m == pytest.approx(0.5)
+    assert read.source_frame.unit_m == 0.25 and read.source_frame.scale == pytest.approx(2.0)
     tensors, facts = pack_model(model)
     assert unpack_model(tensors, {key: value for key, value in facts.items() if key != "frame"}).source_frame is None

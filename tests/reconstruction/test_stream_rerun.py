@@ -22,9 +22,8 @@ from mereo.reconstruction.isolation import Reading
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.stream import Outcome
 from mereo.scenes.registry import load_scene
-from mereo.synthesis.config import SENSORS
+from mereo.synthesis.config import SENSORS, SequenceConfig
 from mereo.synthesis.recording import CAMERA, FRAMES, write_recording
-from mereo.synthesis.sequence_config import SequenceConfig
 
 RERUN = "rerun-sdk is not installed: pip install 'mereo[rerun]'"
 

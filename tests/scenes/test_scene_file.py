@@ -17,8 +17,8 @@ from mereo.deformation.samplers import RandomMotion
 from mereo.deformation.warps import Bend, FreeFormLattice
 from mereo.geometry.mesh import PALETTE
 from mereo.scenes.files import build
-from mereo.scenes.files.defaults import motion
 from mereo.scenes.files.deformation_blocks import AnyDeformation, SceneFile
+from mereo.scenes.files.template import motion
 from mereo.scenes.parameters import parameters, random_state
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES

@@ -4,15 +4,11 @@ from pathlib import Path
 
 import numpy as np
 from fuzz_files import POINTS, bar, dataset, scene_file, tiny_model
-from toy_scene import toy_scene
 
 from mereo.evaluation.registration.placement import PlacedSegment, Placement
 from mereo.evaluation.registration.truth_file import ScanFile, read_truth, write_truth
 from mereo.evaluation.tables import read_metrics
 from mereo.io.atomic_files import check_new_directory, new_directory, write_json
-from mereo.synthesis.config import SENSORS
-from mereo.synthesis.recording import read_recording, write_recording
-from mereo.synthesis.sequence_config import SequenceConfig
 from mereo.training.config import PRESETS
 from mereo.training.dataset import Dataset
 from mereo.training.model_card import card
@@ -67,14 +63,3 @@ def truth(path: Path) -> None:
 
 def placed(path: Path) -> object:
     return read_truth(path)
-
-
-def recorded(path: Path) -> None:
-    settings = SequenceConfig(seconds=0.2, rate=10, change=20.0, occluder="none", image_size=24)
-    write_recording(path.parent, toy_scene(), settings, ("paper", SENSORS["paper"]), 3)
-
-
-def played(path: Path) -> object:
-    """All that a recording is asked for."""
-    found = read_recording(path.parent)
-    return [(found.cloud(number), found.truth(number), found.times_s[number]) for number in range(len(found))]

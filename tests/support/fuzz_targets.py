@@ -49,7 +49,7 @@ from fuzz_files import (
     weights,
     zdf,
 )
-from fuzz_folders import claimed, placed, played, recorded, replaced, result, run, scored, scores, truth
+from fuzz_folders import claimed, placed, replaced, result, run, scored, scores, truth
 from written_results import COLORS, grid, segments
 
 from mereo.evaluation.registration.placement import read_start
@@ -160,8 +160,6 @@ ALL: tuple[Target, ...] = (
     Target("config.json", run, claimed, folder=True),
     Target("metrics.json", scores, scored),
     Target("truth.json", truth, placed, folder=True),
-    Target("recording.json", recorded, played, folder=True),
-    Target("truth.npz", recorded, played, folder=True),
 )
 TARGETS = {target.name: target for target in ALL if find_spec(target.library) is not None}
 

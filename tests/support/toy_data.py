@@ -66,6 +66,7 @@ def write_toy_dataset(
         "scene": "toy",
         "seed": 5,
         "examples": examples,
+        "shard_size": SHARD,
         "version": "0",
         "any_roll": False,
         "settings": {"sampling": {"per_segment": 0}},

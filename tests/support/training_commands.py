@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mereo.training import trainer
-from mereo.training.batches import Batch
+from mereo.training.dataset import Batch
 
 
 def diverge_at(monkeypatch: pytest.MonkeyPatch, step: int, loss: float, gradient: float) -> None:

@@ -64,9 +64,6 @@ def test_killed_and_resumed_equals_uninterrupted(
         generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3)
     complete = contents(tmp_path / "data")
     assert len(complete) == 3 + calls // 4  # manifest, template and statistical model come first
-    manifest = json.loads((whole / "manifest.json").read_text())
-    del manifest["files"]  # which are written when all are there
-    assert json.loads(complete.pop("manifest.json")) == manifest
     assert complete.items() <= contents(whole).items()
     generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3, resume=True)
     assert contents(tmp_path / "data") == contents(whole)

@@ -83,24 +83,6 @@ def test_the_manifest_states_the_sensor_and_resuming_needs_the_same(tmp_path: Pa
         generate(toy_scene(), tmp_path / "data", SMALL, examples=2, seed=3, resume=True)
 
 
-def test_a_dataset_from_before_there_were_sensors_goes_on_without_one(tmp_path: Path) -> None:
-    generate(toy_scene(), tmp_path / "data", SMALL, examples=2, seed=3)
-    path = tmp_path / "data" / "manifest.json"
-    manifest = json.loads(path.read_text())
-    del manifest["settings"]["sensor"]
-    path.write_text(json.dumps(manifest))
-    generate(toy_scene(), tmp_path / "data", SMALL, examples=2, seed=3, resume=True)
-    with pytest.raises(ValueError, match="was made with settings.sensor.axial = 0.0, not 1.0; resuming needs equal"):
-        generate(
-            toy_scene(),
-            tmp_path / "data",
-            replace(SMALL, sensor=SensorConfig(axial=1.0)),
-            examples=2,
-            seed=3,
-            resume=True,
-        )
-
-
 # --- evaluation -------------------------------------------------------------------------------------------------------
 
 

@@ -9,9 +9,8 @@ from observed_views import observed
 from safetensors.torch import load_file, save_file
 from toy_data import write_toy_dataset
 
-from mereo.training.batches import Draws, augment_batch, choose_points
 from mereo.training.config import AugmentConfig
-from mereo.training.dataset import Dataset, ShuffledOrder
+from mereo.training.dataset import Dataset, Draws, ShuffledOrder, augment_batch, choose_points
 
 NONE = AugmentConfig()
 FULL = AugmentConfig(keep_points=(0.4, 0.9), hole_probability=1.0, jitter_std=0.01, roll=True)

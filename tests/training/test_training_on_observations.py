@@ -15,9 +15,8 @@ from training_runs import assert_resumes_exactly
 
 from mereo.models.weights import load_model
 from mereo.training import trainer
-from mereo.training.batches import Batch, draw_observations
 from mereo.training.config import PRESETS, AugmentConfig
-from mereo.training.dataset import Dataset
+from mereo.training.dataset import Batch, Dataset, draw_observations
 from mereo.training.metrics_log import FIELDS, SENSOR_FIELDS
 from mereo.training.run_directory import fit_config
 from mereo.training.validation import choose_offsets, held_out, validate

@@ -8,8 +8,7 @@ from tyro.conf import arg
 
 from mereo.cli.options import AssetNames, MeshUnits, ObjectFiles, SceneName, SceneNameOrNone
 from mereo.io.bounds import CountOrNone, States
-from mereo.synthesis.config import SENSORS, Sensor
-from mereo.synthesis.sequence_config import SequenceConfig
+from mereo.synthesis.config import SENSORS, Sensor, SequenceConfig
 
 if TYPE_CHECKING:
     from mereo.scenes.statistical_model import StatisticalModel
@@ -254,9 +253,9 @@ class SceneRecord:
         seed = training_seed(self.seed, self.test)
         with new_directory(self.output, self.force, files_of(self.scene)) as folder:
             scene, sensor = load_scene(self.scene), (self.sensor, SENSORS[self.sensor])
-            index = write_recording(folder, scene, self.settings, sensor, seed, named=self.scene)
-        print(f"wrote {self.output}: {len(index.frames)} frames in {self.settings.seconds:g} s; then:")
-        print(f"  mereo stream {self.output} --rate {index.rate_hz:g} --weights WEIGHTS")
+            write_recording(folder, scene, self.settings, sensor, seed, named=self.scene)
+        print(f"wrote {self.output}: {self.settings.frames} frames in {self.settings.seconds:g} s; then:")
+        print(f"  mereo stream {self.output} --rate {self.settings.rate:g} --weights WEIGHTS")
 
 
 @dataclass(frozen=True)

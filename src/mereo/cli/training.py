@@ -89,17 +89,15 @@ class DatasetCheck:
 
     Attributes:
         dataset: folder written by `mereo generate`, or its URL in an object storage.
-        write: write the SHA-256 of each file into the manifest of a dataset that has none, if all are good.
     """
 
     dataset: DatasetFolder
-    write: bool = False
 
     def run(self) -> None:
         """Print what is wrong, a line for each file."""
-        from mereo.synthesis.dataset_contents import check_dataset
+        from mereo.synthesis.shards import check_dataset
 
-        check_dataset(self.dataset, self.write)
+        check_dataset(self.dataset)
 
 
 @dataclass(frozen=True)
@@ -114,22 +112,19 @@ class DatasetShow:
 
     def run(self) -> None:
         """Print a line for each fact."""
+        from mereo.io.object_storage import names_in
         from mereo.scenes.seeds import TEST_SEED_START
-        from mereo.synthesis.dataset_contents import DatasetContents, recorded_files
+        from mereo.synthesis.shards import expected_files, read_manifest
 
-        contents = DatasetContents.of(self.dataset)
-        manifest, files = contents.manifest, contents.expected
-        hashes = (
-            "of each file in the manifest" if recorded_files(manifest) else "not recorded: see dataset check --write"
-        )
+        manifest = read_manifest(self.dataset)
+        files, names = expected_files(manifest), names_in(self.dataset)
         facts = {
-            "dataset": contents.folder,
+            "dataset": self.dataset,
             "scene": f"{manifest['scene']}, of {', '.join(segment['name'] for segment in manifest['segments'])}",
             "seed": f"{manifest['seed']}" + ", which is for testing" * (manifest["seed"] >= TEST_SEED_START),
             "examples": f"{manifest['examples']}"
             + (f", {manifest['bytes'] / 1e6:,.1f} MB" if "bytes" in manifest else ""),
-            "files": f"{sum(name in contents.there for name in files)} of {len(files)} are there",
-            "SHA-256": hashes,
+            "files": f"{sum(name in names for name in files)} of {len(files)} are there",
             "made by": f"mereo {manifest['version']}",
             **dict(flat_options(manifest["settings"])),
         }

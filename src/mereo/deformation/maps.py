@@ -32,7 +32,6 @@ class Deformation(Protocol):
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Images of points, in the points' unit."""
-        ...
 
 
 @runtime_checkable
@@ -43,7 +42,6 @@ class Invertible(Protocol):
         self, points: Float[np.ndarray, "n 3"], guess: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
         """Rest points whose image is ``points``, and which of them were found; arguments as for ``invert``."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -145,11 +145,6 @@ class JointSampler:
         slide = axis * named(rng, "slide").uniform(*self.slide)
         return Rigid(rotation, slide + named(rng, "shift").uniform(-self.shift, self.shift), self.pivot)
 
-    def narrowed(self, share: float) -> "JointSampler":
-        """Joint with ``share`` of each of its ranges."""
-        (a, b), (c, d) = self.angle_rad, self.slide
-        return replace(self, angle_rad=(share * a, share * b), slide=(share * c, share * d), shift=share * self.shift)
-
 
 @dataclass(frozen=True)
 class PushSampler:

@@ -159,13 +159,13 @@ class TetrahedralMap:
         elements = self.rest.elements
         element = _locate(_tree(self.nodes, elements), self.nodes, elements, points)
         inside = element >= 0
-        rest, found = np.empty_like(points, dtype=np.float64), inside.copy()
+        rest, converged = np.empty_like(points, dtype=np.float64), inside.copy()
         first = elements[element[inside], 0]
         back = np.linalg.inv(self._gradients[element[inside]])
         rest[inside] = self.rest.nodes[first] + _apply(back, points[inside] - self.nodes[first])
         if not inside.all():
-            rest[~inside], found[~inside] = newton(self, points[~inside], guess[~inside])
-        return rest, found
+            rest[~inside], converged[~inside] = newton(self, points[~inside], guess[~inside])
+        return rest, converged
 
 
 def _edges(nodes: Float[np.ndarray, "n 3"], elements: Int[np.ndarray, "m 4"]) -> Float[np.ndarray, "m 3 3"]:
@@ -188,8 +188,8 @@ def _locate(
 ) -> Int[np.ndarray, " p"]:
     if len(points) == 0:  # libigl's loop expects some
         return np.empty(0, dtype=np.int64)
-    found: np.ndarray = igl.in_element(nodes, elements, np.ascontiguousarray(points, dtype=np.float64), tree)
-    return found.astype(np.int64)  # C's long long, which numpy tells apart
+    element: np.ndarray = igl.in_element(nodes, elements, np.ascontiguousarray(points, dtype=np.float64), tree)
+    return element.astype(np.int64)  # C's long long, which numpy tells apart
 
 
 def _apply(matrix: Float[np.ndarray, "p 3 3"], vector: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
@@ -237,9 +237,7 @@ class Surface:
 
     @cached_property
     def _tree(self) -> igl.AABB:
-        tree = igl.AABB()
-        tree.init(self.vertices, self.faces)
-        return tree
+        return _tree(self.vertices, self.faces)
 
     @cached_property
     def _solver(self) -> Float[np.ndarray, "k c"]:

@@ -34,8 +34,7 @@ from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.io.progress import progress
 from mereo.models.calibration import Calibration, RadiusFactors, Recognizing, Scaling, SignName, Usual
-from mereo.models.model import Model
-from mereo.models.scaled_logits import scaled_array
+from mereo.models.model import Model, scaled_array
 from mereo.reconstruction.observation import observe
 from mereo.scenes.draw_recorder import with_farther_states
 from mereo.scenes.registry import load_scene

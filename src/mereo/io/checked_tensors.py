@@ -6,8 +6,7 @@ Files of earlier versions have none and are taken as they are.
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -43,15 +42,12 @@ def read_content(path: Place) -> bytes:
         raise ValueError(reason(error)) from None
 
 
-def unpack_tensors(
-    content: bytes, dataset: str | None = None, verified: bool = False
-) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def unpack_tensors(content: bytes, dataset: str | None = None) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Tensors that ``pack_tensors`` has packed, and their facts, none where there is no header entry.
 
     Args:
         content: of the file.
         dataset: key of the dataset that it should be of; None takes any.
-        verified: its bytes are known to be right, so its checksum need not be compared.
 
     Raises ``ValueError`` (its reason only) where the file is damaged, or states another dataset.
     """
@@ -60,23 +56,11 @@ def unpack_tensors(
         expected = facts.pop(CHECKSUM, None)
     except (SafetensorError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(reason(error)) from None
-    if expected is not None and not verified and expected != _digest(tensors, facts):
+    if expected is not None and expected != _digest(tensors, facts):
         raise ValueError("its checksum is another: its bytes have changed")
     if dataset is not None and facts.get("dataset") not in (None, dataset):
         raise ValueError("it is of another dataset")
     return tensors, facts
-
-
-@contextmanager
-def held_against(content: bytes, recorded: str | None) -> Iterator[bool]:
-    """Compare a file's content with its SHA-256 in the dataset's manifest, if that has one; yield whether it is equal.
-
-    What the block has against the file says more: only after it ``ValueError`` (its reason only) is raised.
-    """
-    same = recorded is not None and hashlib.sha256(content).hexdigest() == recorded
-    yield same
-    if recorded is not None and not same:
-        raise ValueError("its SHA-256 is not that in manifest.json: it is another file than was recorded there")
 
 
 def _facts(content: bytes) -> dict[str, Any]:

@@ -11,14 +11,12 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from mereo.geometry.brief import counted
 from mereo.geometry.mesh_check import examine
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.volume_files import is_volume
 from mereo.io.writers.meshes import write_positions_ply
 from mereo.scenes.files.build import MeshWarning
 from mereo.scenes.files.check import check_scene
-from mereo.scenes.files.joints import SLIDES_ALONG, TURNS_ON
 from mereo.scenes.files.template import write_scene_file
 from mereo.scenes.registry import is_yaml, load_scene
 from mereo.scenes.scene import SCENES, Scene
@@ -82,7 +80,10 @@ def scene_for(files: Sequence[Path], folder: Path, units: str | None, quiet: boo
         write_scene_file(files, path, units, name=files[0].name.split(".")[0])
         if quiet:
             return str(path)
-        print(told_of(path))
+        print(
+            f"wrote {path}: the object bends as if it were of rubber; where it has joints or moves in other ways, say "
+            "so in that file (docs/own-object.md), and learn it anew: mereo learn FILE --output ANOTHER"
+        )
     return str(path)
 
 
@@ -109,22 +110,6 @@ def scene_of_meshes(files: Sequence[Path], units: str | None = None) -> Scene:
         text = str(one.message).replace(f"{path}: ", "")
         warnings.warn(text.replace(f"repair it with `mereo scene check {path} --repair`", cure), one.category, 2)
     return replace(scene, file=None)
-
-
-def told_of(path: Path) -> str:
-    """What a user should know of the scene file that was written for their meshes, before minutes go by."""
-    joints = sum(line.startswith((TURNS_ON, SLIDES_ALONG)) for line in path.read_text("utf-8").splitlines())
-    said = f"wrote {path}: the object bends as if it were of rubber"
-    if joints == 0:
-        return (
-            f"{said}; where it has joints or moves in other ways, say so in that file (docs/own-object.md), and learn "
-            "it anew: mereo learn FILE --output ANOTHER"
-        )
-    return (
-        f"{said}. Its parts touch like {counted(joints, 'joint')}, which that file proposes in comments: if it has "
-        "them, stop with Ctrl-C, take the # away from them and the rubber out (docs/own-object.md), and mereo learn "
-        "FILE --output ANOTHER"
-    )
 
 
 def check(files: Sequence[Path], units: str | None) -> None:

@@ -145,21 +145,25 @@ class Calibration(BaseModel, frozen=True):
         return Scaling() if self.temperature is None else Scaling(self.temperature, self.biases)
 
 
-def calibration_rows(found: Calibration | None) -> list[tuple[str, str]]:
+def calibration_rows(calibration: Calibration | None) -> list[tuple[str, str]]:
     """Calibration in words, each with its title."""
-    if found is None:
+    if calibration is None:
         return [("calibration", "none: confidences are not calibrated, recognition has conservative limits")]
-    rows = [("calibration", f"{found.views} views of the training seed {found.seed}")]
-    if found.temperature is not None:
-        kind = "a temperature" if found.biases is None else "a temperature and a bias for each class"
-        error = "" if found.ece is None else f"; calibration error {found.ece[0]:.3f}, with it {found.ece[1]:.3f}"
-        rows.append(("probabilities", f"{kind} ({found.temperature:.2f}){error}"))
+    rows = [("calibration", f"{calibration.views} views of the training seed {calibration.seed}")]
+    if calibration.temperature is not None:
+        kind = "a temperature" if calibration.biases is None else "a temperature and a bias for each class"
+        error = (
+            ""
+            if calibration.ece is None
+            else f"; calibration error {calibration.ece[0]:.3f}, with it {calibration.ece[1]:.3f}"
+        )
+        rows.append(("probabilities", f"{kind} ({calibration.temperature:.2f}){error}"))
     for what, noisy in (("radii", False), ("radii of noisy frames", True)):
-        modes, draws = (found.radii(draws=each, noisy=noisy).scale for each in (False, True))
+        modes, draws = (calibration.radii(draws=each, noisy=noisy).scale for each in (False, True))
         if modes is not None:
             of_draws = "" if draws is None else f", {draws:.2f} of fits of the scene's draws"
             rows.append((what, f"the posterior's times {modes:.2f} of fits of the modes{of_draws}"))
-    if found.recognizing is not None:
-        limits = found.recognizing
+    if calibration.recognizing is not None:
+        limits = calibration.recognizing
         rows.append(("recognition", f"unsure above a strangeness of {limits.unsure:.2g}, no from {limits.refused:.2g}"))
     return rows

@@ -40,9 +40,6 @@ Loss = Literal["ce", "l1", "ce+l1", "ce+l1+cd"]
 HEADS = 4
 """Number of heads of the attention to local features."""
 
-MOST_ORDERED = 16384
-"""Number of points of one cloud that a program of the GPU can keep: 16 in each of 1024 threads."""
-
 
 @dataclass(frozen=True)
 class InferenceConfig:

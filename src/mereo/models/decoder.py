@@ -16,10 +16,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mereo.models.config import HEADS, NetworkConfig
-from mereo.models.device import exact
-from mereo.models.encoders.encoding import Encoding, Level
-from mereo.models.ops.neighbors import gather, nearest
-from mereo.models.ops.products import linear
+from mereo.models.device import exact, linear
+from mereo.models.encoders import Encoding, Level
+from mereo.models.neighbors import gather, nearest
 from mereo.models.rigid_alignment import Alignment
 from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH
 
@@ -75,8 +74,8 @@ class RestLookup(nn.Module):
         """Signed distance to each segment at rest coordinates, trilinear; beyond the grid that of its border."""
         # grid_sample takes coordinates from the last axis to the first, in [-1, 1]
         places = (rest / TEMPLATE_REACH).flip(-1)[None, :, :, None]
-        found = F.grid_sample(self.distance[None], places, padding_mode="border", align_corners=True)
-        return found[0, ..., 0].permute(1, 2, 0)
+        sampled = F.grid_sample(self.distance[None], places, padding_mode="border", align_corners=True)
+        return sampled[0, ..., 0].permute(1, 2, 0)
 
 
 # --- decoder ----------------------------------------------------------------------------------------------------------

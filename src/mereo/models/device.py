@@ -1,19 +1,22 @@
-"""Device, precision, and an allocator setting that matters: what this machine offers."""
+"""Device, precision, products, threads, and an allocator setting that matters: what this machine offers."""
 
 import ctypes
 import os
+import platform
 import shutil
 import sys
-import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
+from pathlib import Path
 from threading import Barrier
 from typing import TypeVar
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional as F
 
 from mereo.models.config import Device, Precision
 
@@ -33,34 +36,28 @@ def find_device(device: Device, rank: int = 0) -> torch.device:
 
 
 @cache
-def bfloat16_gain() -> float:
-    """Ratio of this CPU's rates of matrix products in bfloat16 and in float32, at the network's size.
+def is_amd() -> bool:
+    """Whether this is a processor of AMD, as it says itself."""
+    listed = Path("/proc/cpuinfo")
+    return "AuthenticAMD" in (listed.read_text() if listed.is_file() else platform.processor())
 
-    Measured once, in about 10 ms, because what a CPU says of itself does not tell: AVX-512's bfloat16 instructions
-    double the rate on AMD's Zen 4 and change nothing on Intel's Xeons, where AMX makes it five times.
+
+@cache
+def bfloat16_pays() -> bool:
+    """Whether this CPU multiplies in bfloat16 so much faster that a training step gains by it.
+
+    AVX-512's bfloat16 instructions double the rate on AMD's Zen 4 and change nothing on Intel's Xeons, where AMX makes
+    it five times. Measuring it would give other answers on a busy machine.
     """
-    # not random numbers: drawing them would change the caller's
-    pairs = [(torch.ones(2048, 256, dtype=d), torch.ones(256, 256, dtype=d)) for d in (torch.float32, torch.bfloat16)]
-    rounds = [[_seconds(*pair) for pair in pairs] for _ in range(8)]  # in turn, so that a busy moment meets both
-    single, half = map(min, zip(*rounds, strict=True))
-    return single / half
-
-
-def _seconds(a: Tensor, b: Tensor) -> float:
-    start = time.perf_counter()
-    torch.mm(a, b)
-    return time.perf_counter() - start
-
-
-BFLOAT16_PAYS = 1.5
-"""Gain in products from which on a training step is faster too: the rest of it stays in float32."""
+    features = cpu_features()
+    return bool(features["amx"] or (features["avx512_bf16"] and is_amd()))
 
 
 def pick_precision(precision: Precision, device: torch.device) -> torch.dtype | None:
     """Type of products for autocast, or None for float32; auto takes bfloat16 on CUDA and where a CPU gains by it."""
     if precision == "float32":
         return None
-    if precision == "bfloat16" or device.type == "cuda" or bfloat16_gain() >= BFLOAT16_PAYS:
+    if precision == "bfloat16" or device.type == "cuda" or bfloat16_pays():
         return torch.bfloat16
     return None
 
@@ -108,16 +105,61 @@ def cpu_features() -> dict[str, bool | None]:
         "avx512_bf16": "_is_avx512_bf16_supported",
         "amx": "_is_amx_tile_supported",
     }
-    return {name: _ask_torch(function) for name, function in probes.items()}
+    return {name: _probe(function) for name, function in probes.items()}
 
 
-def _ask_torch(function: str) -> bool | None:
+def _probe(function: str) -> bool | None:
     """Answer of a private function of torch: they come and go, and must never stop the report."""
     probe = getattr(torch.cpu, function, None)
     try:
         return None if probe is None else bool(probe())
     except (RuntimeError, AttributeError):
         return None
+
+
+# --- products ---------------------------------------------------------------------------------------------------------
+
+# Products of layers in float32 on a CPU, by the faster one of torch's two libraries.
+#
+# torch asks Intel's MKL, which takes the slower instructions on AMD's processors; oneDNN, which torch brings as well,
+# makes twice as many operations a second there in the same precision.
+
+ROWS = 1024
+"""Number of rows, or a multiple, of what oneDNN is asked for: it prepares itself for each size, and keeps few."""
+
+
+def linear(
+    rows: Float[Tensor, "*n i"], weight: Float[Tensor, "o i"], bias: Float[Tensor, " o"] | None = None
+) -> Float[Tensor, "*n o"]:
+    """The product ``rows weight^T + bias``, as ``torch.nn.functional.linear`` gives it but for rounding."""
+    if _suits_onednn(rows, weight) and onednn_pays():
+        return _by_onednn(rows, weight, bias)
+    return F.linear(rows, weight, bias)
+
+
+@cache
+def onednn_pays() -> bool:
+    """Whether oneDNN makes float32 products faster than MKL; the same in all processes, which so compute the same."""
+    return is_amd() and hasattr(torch.ops.mkldnn, "_linear_pointwise")  # a private operator: it may go
+
+
+def _suits_onednn(rows: Tensor, weight: Tensor) -> bool:
+    """Whether these are plain numbers of many rows on a CPU: neither a graph nor a training, which need torch's own."""
+    count = rows.numel() // max(rows.shape[-1], 1)
+    return (
+        rows.device.type == "cpu"
+        and rows.dtype == weight.dtype == torch.float32
+        and count > 0
+        and count % ROWS == 0
+        and not torch.is_grad_enabled()
+        and not torch.is_autocast_enabled("cpu")
+        and not torch.compiler.is_compiling()
+    )
+
+
+def _by_onednn(rows: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+    product: Tensor = torch.ops.mkldnn._linear_pointwise(rows, weight, bias, "none", [], "")
+    return product
 
 
 # --- threads ----------------------------------------------------------------------------------------------------------
@@ -128,10 +170,10 @@ MOST = 8
 """Threads that take pieces; beyond, Python itself would be what they wait for, and each piece gets several instead."""
 
 Piece = TypeVar("Piece")
-Found = TypeVar("Found")
+Result = TypeVar("Result")
 
 
-def in_threads(work: Callable[[Piece], Found], pieces: Sequence[Piece], most: int = MOST) -> list[Found]:
+def in_threads(work: Callable[[Piece], Result], pieces: Sequence[Piece], most: int = MOST) -> list[Result]:
     """What ``work`` says of each piece, in their order, by as many threads as torch may take here, ``most`` at most.
 
     Products of a few thousand rows gain little by a second thread: all threads wait after each step. Pieces that know

@@ -8,7 +8,7 @@ import copy
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import TypeVar
 
@@ -23,13 +23,12 @@ from mereo.geometry.camera import PointCloud
 from mereo.geometry.downsampling import farthest_point_order, random_subset
 from mereo.geometry.mesh import Color
 from mereo.geometry.transforms import Normalizer
-from mereo.models.calibration import Calibration
+from mereo.models.calibration import Calibration, Scaling
 from mereo.models.config import Precision, Supervision
 from mereo.models.decoder import ConditionedMLP, Prediction
 from mereo.models.device import MOST, in_threads, pick_precision
-from mereo.models.encoders.encoding import SharedMLP
+from mereo.models.encoders import SharedMLP
 from mereo.models.network import Network
-from mereo.models.scaled_logits import scaled_logits
 from mereo.models.trained import Answer, EncodedCloud, checked_points
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -159,7 +158,7 @@ class Model:
 
     def logits(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n c"]:
         """Class logits at each point, without the rest of the answer: what surface extraction needs."""
-        return self._chunked(code, points, lambda *found: (self.class_logits(*found),))[0]
+        return self._chunked(code, points, lambda *answer: (self.class_logits(*answer),))[0]
 
     @property
     def calibrates(self) -> bool:
@@ -168,8 +167,8 @@ class Model:
 
     def rest(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"] | None:
         """Rest coordinates of each point (``scenes.rest_pose``); None from a model without template."""
-        found = self.correspond(code, points)
-        return None if found is None else found[1]
+        correspondences = self.correspond(code, points)
+        return None if correspondences is None else correspondences[1]
 
     def correspond(
         self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]
@@ -178,11 +177,11 @@ class Model:
         if self.network.decoder.lookup is None:
             return None
 
-        def found(prediction: Prediction, queries: Tensor) -> tuple[Tensor, Tensor]:
+        def answer(prediction: Prediction, queries: Tensor) -> tuple[Tensor, Tensor]:
             assert prediction.rest is not None
             return self.class_logits(prediction, queries).softmax(dim=-1), prediction.rest
 
-        probability, rest = self._chunked(code, points, found)
+        probability, rest = self._chunked(code, points, answer)
         return probability, rest.astype(np.float64)
 
     def respond(
@@ -239,10 +238,32 @@ class Model:
         def part(start: int) -> list[Tensor]:
             with self.answering():
                 queries = torch.from_numpy(normalized[start : start + size])[None].to(self.device)
-                return [found[0].cpu() for found in answer(network.query(code.code, queries), queries)]
+                return [values[0].cpu() for values in answer(network.query(code.code, queries), queries)]
 
         chunks = in_threads(part, range(0, max(len(normalized), 1), size), most)
         return [torch.cat(parts).numpy() for parts in zip(*chunks, strict=True)]
+
+
+# --- calibrated logits ------------------------------------------------------------------------------------------------
+
+
+def scaled_logits(scaling: Scaling, logits: Float[Tensor, "*n c"]) -> Float[Tensor, "*n c"]:
+    """Logits in single precision, divided and with their biases; as they are where neither changes anything."""
+    if scaling == Scaling():
+        return logits
+    divided = logits.float() / scaling.temperature
+    return divided if scaling.biases is None else divided + _on_device(scaling.biases, logits.device)
+
+
+def scaled_array(scaling: Scaling, logits: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
+    """``scaled_logits`` of logits that have left their device."""
+    return scaled_logits(scaling, torch.from_numpy(logits)).numpy()
+
+
+@lru_cache(maxsize=16)
+def _on_device(biases: tuple[float, ...], device: torch.device) -> Float[Tensor, " c"]:
+    """Biases, made once: an upload for every chunk of queries would wait for the device."""
+    return torch.tensor(biases, device=device)
 
 
 # --- batch normalization, fused ---------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from mereo.models.config import NetworkConfig
 from mereo.models.decoder import Code, ConditionedMLP, Decoder, Prediction
-from mereo.models.encoders.encoding import Autodecoder, Encoding, PointNet2, PointTransformer
+from mereo.models.encoders import Autodecoder, Encoding, PointNet2, PointTransformer
 from mereo.models.rigid_alignment import Alignment, fit_rigid
 
 ALIGNED_QUERIES = 128

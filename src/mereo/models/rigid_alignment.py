@@ -38,17 +38,11 @@ def fit_rigid(source: Float[Tensor, "b n 3"], target: Float[Tensor, "b n 3"]) ->
     """Rotation and shift with the least squared distance of moved ``source`` to ``target`` (Kabsch, 1976)."""
     middle, aim = source.mean(dim=1, keepdim=True), target.mean(dim=1, keepdim=True)
     with exact(source):
-        u, _, v = _svd((target - aim).transpose(1, 2) @ (source - middle))
+        u, _, v = torch.linalg.svd((target - aim).transpose(1, 2) @ (source - middle))
         flip = torch.ones_like(source[:, 0])
         flip[:, 2] = _determinant(u @ v).sign()
         rotation = (u * flip[:, None]) @ v
         return Alignment(rotation, (aim - middle @ rotation.transpose(1, 2))[:, 0])
-
-
-def _svd(matrix: Float[Tensor, "b 3 3"]) -> tuple[Tensor, Tensor, Tensor]:
-    """``torch.linalg.svd``, whose solver a CUDA graph cannot hold."""
-    capturing = matrix.is_cuda and not torch.compiler.is_compiling() and torch.cuda.is_current_stream_capturing()
-    return svd3(matrix) if capturing else torch.linalg.svd(matrix)
 
 
 def _determinant(matrix: Float[Tensor, "b 3 3"]) -> Float[Tensor, " b"]:
@@ -59,9 +53,7 @@ def _determinant(matrix: Float[Tensor, "b 3 3"]) -> Float[Tensor, " b"]:
 
 # --- singular values of 3 x 3 matrices --------------------------------------------------------------------------------
 
-# Singular value decomposition of 3 x 3 matrices from plain operations, for graphs that cannot hold a solver's.
-#
-# ONNX has no operator for it, and a CUDA graph cannot hold torch's, which looks at its own result on the host.
+# Singular value decomposition of 3 x 3 matrices from plain operations, as ONNX has no operator for it.
 
 SWEEPS = 5
 """Number of rounds of rotations: convergence is quadratic, four reach double precision, and one is to spare."""
@@ -91,8 +83,7 @@ def svd3(matrix: Tensor, full_matrices: bool = True, driver: str | None = None) 
     # the sign that the cross product has chosen for the third column goes to V, because singular values have none
     sign = torch.where((u[..., 2] * stacked[:, :3, 2]).sum(dim=1, keepdim=True) < 0, -1.0, 1.0)
     v = torch.cat([stacked[:, 3:, :2], (stacked[:, 3:, 2] * sign)[..., None]], dim=2)
-    found = u, values, v.transpose(1, 2)
-    return found[0].to(matrix.dtype), found[1].to(matrix.dtype), found[2].to(matrix.dtype)
+    return u.to(matrix.dtype), values.to(matrix.dtype), v.transpose(1, 2).to(matrix.dtype)
 
 
 def _orthogonal(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,6 +1,6 @@
-"""A trained network as whoever asks it sees it: without torch, which only the asked one needs.
+"""Trained networks as callers see them: without torch, which only their own code needs.
 
-cloud -Trained.encode-> EncodedCloud -query, logits, correspond-> what the network says at points
+cloud -Trained.encode-> EncodedCloud -query, logits, correspond-> answers at points
 
 ``models.model.Model`` is the one that there is. An object without weights has none, and nothing here is loaded for it.
 """
@@ -62,87 +62,73 @@ class Answer:
 
 @runtime_checkable
 class Trained(Protocol):
-    """Trained network: what may be known of it, and asked. ``Model`` says what each attribute is."""
+    """Trained network: its facts and its answers. ``Model`` describes each attribute."""
 
     @property
     def name(self) -> str:
         """How the weights were named when they were loaded."""
-        ...
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the segments."""
-        ...
 
     @property
     def colors(self) -> tuple[Color, ...]:
         """Colours of the segments."""
-        ...
 
     @property
     def nested(self) -> tuple[tuple[str, str], ...]:
         """Pairs of names (inner, outer)."""
-        ...
 
     @property
     def segmented(self) -> bool:
         """Whether it tells segments apart."""
-        ...
 
     @property
     def provenance(self) -> Mapping[str, object]:
         """How it was trained."""
-        ...
 
     @property
     def statistical_model(self) -> StatisticalModel | None:
         """Statistical model of the object's states; None without."""
-        ...
 
     @property
     def calibration(self) -> Calibration | None:
         """How far its answers can be trusted; None where that was not measured."""
-        ...
 
     @property
     def calibrates(self) -> bool:
         """Whether its probabilities are calibrated."""
-        ...
 
     @property
     def device_type(self) -> str:
         """Kind of the device that it computes on."""
-        ...
 
     @property
     def working_precision(self) -> str:
         """Name of the type of its products."""
-        ...
 
     def encode(self, cloud: PointCloud) -> EncodedCloud:
         """Encoded cloud of points in a camera frame; ``ValueError`` for unusable ones."""
-        ...
 
     def query(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Answer:
         """Segment, probabilities, signed distance and direction at each point."""
-        ...
 
     def logits(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n c"]:
         """Class logits at each point."""
-        ...
 
     def correspond(
         self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, "n c"], Float[np.ndarray, "n 3"]] | None:
         """Class probabilities and rest coordinates of points; None from a network without them."""
-        ...
 
 
-def check_enough(count: int, said: str) -> None:
-    """Raise ``ValueError``, beginning with ``said``, where a reconstruction needs more points than ``count``."""
+def check_enough(count: int, message: str) -> None:
+    """Raise ``ValueError``, beginning with ``message``, where a reconstruction needs more points than ``count``."""
     if count < MIN_POINTS:
         raise ValueError(
-            f"{said}; a reconstruction needs at least {MIN_POINTS}: move closer, or check the mask and the depth range"
+            f"{message}; a reconstruction needs at least {MIN_POINTS}: move closer, or check the mask and the depth "
+            "range"
         )
 
 

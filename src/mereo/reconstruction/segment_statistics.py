@@ -80,7 +80,7 @@ def segment_points(
 
 
 def _scaled(calibration: Calibration, logits: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
-    from mereo.models.scaled_logits import scaled_array  # it needs torch, which whoever has logits has
+    from mereo.models.model import scaled_array  # it needs torch, which whoever has logits has
 
     return scaled_array(calibration.scaling, logits)
 

@@ -190,12 +190,12 @@ def _plain(values: Any) -> Any:
 def _trail() -> Trail:
     """The calls from ``parameters.play`` down to the recorder, which are what a draw is known by."""
     frame: FrameType | None = sys._getframe(1)
-    found: list[tuple[CodeType, int]] = []
+    trail: list[tuple[CodeType, int]] = []
     while frame is not None and frame.f_code.co_name != "play":
         if not _is_ours(frame.f_code):
-            found.append((frame.f_code, frame.f_lasti))
+            trail.append((frame.f_code, frame.f_lasti))
         frame = frame.f_back
-    return tuple(found[::-1])
+    return tuple(trail[::-1])
 
 
 def _is_ours(code: CodeType) -> bool:

@@ -181,7 +181,7 @@ def _witness(scene: Scene, deformations: tuple[Deformation, ...]) -> Float[np.nd
 
 def parameters(played: Played) -> tuple[Parameter, ...]:
     """Degrees of freedom of this state, in the order in which they are drawn, with names that differ in a group."""
-    found: list[Parameter] = []
+    sliders: list[Parameter] = []
     titles = [_title(call) for call in played.calls]
     repeated = Counter(titles)
     seen: Counter[tuple[str, tuple[str, ...]]] = Counter()
@@ -190,8 +190,8 @@ def parameters(played: Played) -> tuple[Parameter, ...]:
         group, names = title
         if repeated[title] > 1:
             names = tuple(f"{name} {seen[title]}" for name in names)
-        found += _parameters_of(call, group, names, played.turns.get(call.key, (0.0, call.shares))[0])
-    return tuple(parameter for parameter in found if parameter.high > parameter.low)
+        sliders += _parameters_of(call, group, names, played.turns.get(call.key, (0.0, call.shares))[0])
+    return tuple(parameter for parameter in sliders if parameter.high > parameter.low)
 
 
 def _title(call: Call) -> tuple[str, tuple[str, ...]]:

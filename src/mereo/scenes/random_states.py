@@ -220,12 +220,12 @@ def kept_model(scene: Scene, count: int = OBJECT_STATES) -> StatisticalModel:
     """Statistical model of a scene: read where it was made before, else made, and kept where that can be written."""
     path = cache_folder() / "models" / f"{model_key(scene, count)}.safetensors"
     with suppress(OSError, ValueError):  # not there, or damaged: it is made anew
-        return read_statistical_model(path.read_bytes(), None, None)
+        return read_statistical_model(path.read_bytes())
     with stage("make the object's statistical model, once"):
         made = scene_model(scene, count)
     with suppress(OSError):  # a full disk, or a home that cannot be written to: it is made again next time
         save_statistical_model(made, path)
-    return read_statistical_model(statistical_model_bytes(made), None, None)  # the same bits as from the file
+    return read_statistical_model(statistical_model_bytes(made))  # the same bits as from the file
 
 
 def cache_folder() -> Path:

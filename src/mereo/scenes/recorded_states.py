@@ -30,11 +30,9 @@ class Frames(Protocol):
     @property
     def count(self) -> int:
         """Number of recorded states."""
-        ...
 
     def deformations(self, frame: int) -> tuple[Deformation, ...]:
         """Deformations of the segments in one recorded state."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)

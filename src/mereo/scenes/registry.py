@@ -1,5 +1,7 @@
 """Scenes by name: the built-in ones, and those of files."""
 
+import importlib.util
+import sys
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -44,14 +46,14 @@ def files_of(name: str | Path) -> list[Path]:
 def load_scene(name: str | Path) -> Scene:
     """Scene by its built-in name, or from a file, YAML or Python.
 
-    YAML files are read by ``scenes.files.build``; Python files are run, by ``scenes.files.python``.
+    YAML files are read by ``scenes.files.build``; Python files are run: trust them first.
     Raises ``ValueError`` listing what there is for an unknown name, or saying what is wrong with a file;
     ``FileNotFoundError`` where it, or a mesh that it names, does not exist.
     """
     if is_yaml(name):
         scene: Scene = replace(import_module("mereo.scenes.files.build").load(Path(name)), file=Path(name))
     elif Path(name).suffix == ".py":
-        scene = replace(import_module("mereo.scenes.files.python").load(Path(name)), file=Path(name))
+        scene = replace(_load_python(Path(name)), file=Path(name))
     elif name in SCENES:
         scene = import_module(f"mereo_objects.{str(name).replace('-', '_')}").scene()
     else:
@@ -60,3 +62,38 @@ def load_scene(name: str | Path) -> Scene:
             "`mereo scene new` writes it, or .py with a function scene()): check the spelling"
         )
     return scene
+
+
+def _load_python(path: Path) -> Scene:
+    """Scene of a new name that a Python file's function ``scene`` returns; the meshes must be sound."""
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{path} does not exist; a Python file with a function scene() is needed: check the path"
+        )
+    scene = _run(path)
+    if not isinstance(scene, Scene):
+        raise ValueError(
+            f"scene() in {path} returns a {type(scene).__name__}; it must return a Scene of mereo.scenes.scene"
+        )
+    if scene.name in SCENES:
+        raise ValueError(f"{path} names its scene {scene.name!r}, which is a built-in scene: choose another name")
+    scene.rest.check()
+    return replace(scene, definition=scene.definition + path.read_text("utf-8"))
+
+
+def _run(path: Path) -> object:
+    name = f"mereo_scene_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None and spec.loader is not None, "a .py file always has a loader"
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look their module up
+    try:
+        spec.loader.exec_module(module)
+        return module.scene()
+    except Exception as error:
+        raise ValueError(
+            f"{path} fails with {type(error).__name__}: {error}; it must run and define a function scene(): correct it "
+            "(MEREO_TRACEBACK=1 shows where)"
+        ) from error
+    finally:
+        del sys.modules[name]  # nobody else finds it by its name, and Ray sends the code of what it does not find

@@ -37,11 +37,6 @@ class SourceFrame:
         """Scene units per unit of the files."""
         return float(np.cbrt(np.linalg.det(self.T_scene_source[:3, :3])))
 
-    @property
-    def source_unit_m(self) -> float | None:
-        """Metres per unit of the files; None where the object's true size is not known."""
-        return None if self.unit_m is None else self.unit_m * self.scale
-
     def facts(self) -> dict[str, Any]:
         """Plain values for a file's header."""
         return {"T_scene_source": self.T_scene_source.tolist(), "unit_m": self.unit_m}
@@ -179,12 +174,12 @@ class Scene:
         "own" is ``workspace``. "cone" and "sphere" are that too where it is one, so that scenes can be compared; else
         the cone of the scene, with a level horizon, and the whole sphere at any roll.
         """
-        own = self.workspace
-        if name == "cone" and own.all_around:
-            return self.cone or replace(own, aperture_rad=PAPER_APERTURE_RAD, any_roll=False)
-        if name == "sphere" and not own.all_around:
-            return replace(own, aperture_rad=WHOLE_SPHERE_RAD, any_roll=True)
-        return own
+        workspace = self.workspace
+        if name == "cone" and workspace.all_around:
+            return self.cone or replace(workspace, aperture_rad=PAPER_APERTURE_RAD, any_roll=False)
+        if name == "sphere" and not workspace.all_around:
+            return replace(workspace, aperture_rad=WHOLE_SPHERE_RAD, any_roll=True)
+        return workspace
 
     def for_seed(self, seed: int) -> "Scene":
         """Scene that a seed draws from: its held-out states for testing (``TEST_SEED_START`` up), or itself."""

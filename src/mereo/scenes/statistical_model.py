@@ -20,7 +20,7 @@ from mereo.deformation.moving_least_squares import ANCHORS, Anchors, PointWeight
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import fit_rigid
-from mereo.io.checked_tensors import Tensors, held_against, pack_tensors, read_content, unpack_tensors
+from mereo.io.checked_tensors import Tensors, pack_tensors, read_content, unpack_tensors
 from mereo.io.errors import reason
 from mereo.io.object_storage import Place, write_whole
 from mereo.scenes.rest_pose import rest_frame
@@ -302,8 +302,9 @@ def following(
     weight = np.zeros((len(points), width))
     for label in np.unique(labels):
         rows = np.flatnonzero(labels == label)
-        found = anchors[label - 1].weights(points[rows])
-        index[rows, : found.index.shape[1]], weight[rows, : found.index.shape[1]] = found.index, found.weight
+        followed = anchors[label - 1].weights(points[rows])
+        count = followed.index.shape[1]
+        index[rows, :count], weight[rows, :count] = followed.index, followed.weight
     return PointWeights(index, weight)
 
 
@@ -386,27 +387,26 @@ def statistical_model_bytes(model: StatisticalModel, dataset: str | None = None)
     return pack_tensors(tensors, {**facts, "dataset": dataset})
 
 
-def load_statistical_model(path: Place, dataset: str | None = None, recorded: str | None = None) -> StatisticalModel:
+def load_statistical_model(path: Place, dataset: str | None = None) -> StatisticalModel:
     """Read what ``save_statistical_model`` wrote; ``ValueError`` for another file, or one of another dataset.
 
-    ``recorded`` is its SHA-256 in the dataset's manifest. Raises ``StorageError`` where nothing is known of the file.
+    Raises ``StorageError`` where nothing is known of the file.
     """
     try:
-        return read_statistical_model(read_content(path), dataset, recorded)
+        return read_statistical_model(read_content(path), dataset)
     except (FileNotFoundError, ValueError) as error:
         raise ValueError(
             f"{path} is no statistical model of mereo ({error}); delete it and run `mereo generate ... --resume`"
         ) from None
 
 
-def read_statistical_model(content: bytes, dataset: str | None, recorded: str | None) -> StatisticalModel:
+def read_statistical_model(content: bytes, dataset: str | None = None) -> StatisticalModel:
     """Statistical model that a file's content holds; ``ValueError`` (its reason only) where it holds none."""
-    with held_against(content, recorded) as verified:
-        tensors, facts = unpack_tensors(content, dataset, verified)
-        try:
-            return unpack_model(tensors, facts)
-        except (KeyError, TypeError, IndexError) as error:
-            raise ValueError(reason(error)) from None
+    tensors, facts = unpack_tensors(content, dataset)
+    try:
+        return unpack_model(tensors, facts)
+    except (KeyError, TypeError, IndexError) as error:
+        raise ValueError(reason(error)) from None
 
 
 def with_fewer_modes(model: StatisticalModel, most: int) -> StatisticalModel:
@@ -451,7 +451,7 @@ def _rest(tensors: Tensors, facts: Mapping[str, Any]) -> SegmentedMesh:
     for name, color, solid, points, triangles in zip(
         *(facts[key] for key in ("names", "colors", "solid", "vertices", "faces")), strict=True
     ):
-        own = faces[start : start + triangles] - first
-        segments.append(Segment(name, tuple(color), vertices[first : first + points], own, solid))
+        local = faces[start : start + triangles] - first
+        segments.append(Segment(name, tuple(color), vertices[first : first + points], local, solid))
         first, start = first + points, start + triangles
     return SegmentedMesh(tuple(segments), tuple((inner, outer) for inner, outer in facts["nested"]))

@@ -90,7 +90,7 @@ def process_weights(times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:
 
 def switches(scene: Scene, start: Played) -> set[Key]:
     """Draws on which it depends what else is drawn: a corner that is bent or not."""
-    found = set()
+    keys = set()
     for call in start.calls:
         if call.kind not in SMOOTH or len(call.shares) > 1:
             continue
@@ -100,9 +100,9 @@ def switches(scene: Scene, start: Played) -> set[Key]:
             with suppress(OutOfDraws, ValueError):
                 play(scene, recorder)
                 whole = True
-            if _draws_others(start.keys, tuple(one.key for one in recorder.calls), whole):
-                found.add(call.key)
-    return found
+            if _draws_others(start.keys, tuple(drawn.key for drawn in recorder.calls), whole):
+                keys.add(call.key)
+    return keys
 
 
 def _draws_others(before: tuple[Key, ...], after: tuple[Key, ...], whole: bool) -> bool:
@@ -111,7 +111,7 @@ def _draws_others(before: tuple[Key, ...], after: tuple[Key, ...], whole: bool) 
     A scene that refuses what it has drawn gives up, or draws once more from places where it has drawn already; neither
     says that it wants anything else.
     """
-    differs = (i for i, (one, other) in enumerate(zip(before, after, strict=False)) if one != other)
+    differs = (i for i, (a, b) in enumerate(zip(before, after, strict=False)) if a != b)
     same = next(differs, min(len(before), len(after)))
     if same == len(after):
         return whole and len(after) < len(before)
@@ -161,9 +161,9 @@ class _Path:
         first = int(self.weights[i].argmax())
         before = self.nodes.copy()
         self.nodes[first:] = self.rng.normal(size=self.nodes[first:].shape)
-        own = self.weights[0, first:]
-        if own.any():
-            self.nodes[first:] += np.outer(own / (own @ own), self.first - self.weights[0] @ self.nodes)
+        weights = self.weights[0, first:]
+        if weights.any():
+            self.nodes[first:] += np.outer(weights / (weights @ weights), self.first - self.weights[0] @ self.nodes)
         changed = np.flatnonzero((self.nodes != before).any(axis=1))
         return int(np.flatnonzero((self.weights[:, changed] > 0).any(axis=1))[0]) if len(changed) else 0
 

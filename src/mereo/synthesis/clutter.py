@@ -145,8 +145,8 @@ def sample_surroundings(
     """
     unit = 1 / sensor.metres_per_unit
     probable: tuple[tuple[Occluder, float], ...] = (("tool", sensor.tool), ("hand", sensor.hand))
-    there = [kind for kind, probability in probable if streams[kind].random() < probability]
-    occluders = [part for kind in there for part in sample_occluder(kind, seen, reach, unit, streams[kind])]
+    kinds = [kind for kind, probability in probable if streams[kind].random() < probability]
+    occluders = [part for kind in kinds for part in sample_occluder(kind, seen, reach, unit, streams[kind])]
     plane = None
     if streams["background"].random() < sensor.background:
         plane = sample_plane(solids, unit, streams["background"])

@@ -213,8 +213,8 @@ def mix_edges(
     if probability == 0:
         return depth
     padded = np.pad(depth, 1)
-    beside = np.stack([padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:]])
-    step = np.where((beside > 0) & (depth > 0), beside - depth, 0.0)
+    neighbors = np.stack([padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:]])
+    step = np.where((neighbors > 0) & (depth > 0), neighbors - depth, 0.0)
     largest = np.take_along_axis(step, np.abs(step).argmax(axis=0)[None], axis=0)[0]
     mixed = np.abs(largest) > depth * np.tan(STEEPEST_RAD) / focal_px
     mixed &= rng.random(depth.shape) < probability

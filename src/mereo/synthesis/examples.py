@@ -157,8 +157,8 @@ def rest_coordinates(scene: Scene, view: View, samples: Samples, nearest: Neares
     for deformation in {id(d): d for d in view.deformations}.values():
         members = np.flatnonzero(maps == id(deformation))
         if len(members):
-            found, converged = invert(deformation, world[members], guess[members])
-            rest[inside[members[converged]]] = found[converged]
+            points, converged = invert(deformation, world[members], guess[members])
+            rest[inside[members[converged]]] = points[converged]
     center, half = rest_frame(scene.rest)
     return (rest - center) / half
 

@@ -218,13 +218,13 @@ class _Draws:
     def _check_limit(self, inside: int, outside: int) -> None:
         if len(self.points) < MAX_DRAWS:
             return
-        found, where = inside, "inside it"
+        hits, where = inside, "inside it"
         cure = "check that it is closed and no earlier segment covers it, or split it into shorter parts"
         if inside >= self.need:
-            found, where = outside, "outside it" if self.outside.sum() > 1 else "in the empty space around it"
+            hits, where = outside, "outside it" if self.outside.sum() > 1 else "in the empty space around it"
             cure = "widen box_margin, or use nested-sort-sample for a segment enclosed by others"
         raise ValueError(
-            f"segment {self.index} has {found} of {MAX_DRAWS:,} draws {where}; {self.need} are needed: {cure}"
+            f"segment {self.index} has {hits} of {MAX_DRAWS:,} draws {where}; {self.need} are needed: {cure}"
         )
 
 

@@ -14,7 +14,8 @@ with further observations (``synthesis.examples``), of which each has k,
 and ``template.safetensors``, the segments at rest: distance f16 [segments, n, n, n] (``scenes.rest_pose``), and
 ``statistical_model.safetensors``, the modes of the object's random states (``scenes.statistical_model``).
 
-When all are there the manifest gets the SHA-256 of each (``synthesis.dataset_contents``).
+Each file has a checksum of its bytes and the key of its dataset (``io.checked_tensors``). Generation reads both before
+it keeps a file of an interrupted run, training before it learns from one.
 
 Workers only compute; this process alone writes. So one place meets a full disk, and whatever kills a worker leaves
 nothing half-written.
@@ -23,37 +24,251 @@ nothing half-written.
 import hashlib
 import json
 import platform
+import re
+import shutil
+from collections.abc import Iterable, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float16
+from pydantic import BaseModel, Field, ValidationError
 
 from mereo.io.atomic_files import check_place
-from mereo.io.checked_tensors import pack_tensors
-from mereo.io.object_storage import Place, claim, names_in
+from mereo.io.checked_tensors import check_tensors, pack_tensors, read_content, unpack_tensors
+from mereo.io.errors import first_problem, reason
+from mereo.io.object_storage import ObjectPath, Place, claim, names_in, write_whole
 from mereo.io.progress import progress
 from mereo.scenes.random_states import scene_model, states_for
 from mereo.scenes.registry import is_yaml, load_scene
-from mereo.scenes.rest_pose import rest_digest, rest_distances
+from mereo.scenes.rest_pose import TEMPLATE_NODES, rest_digest, rest_distances
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
-from mereo.scenes.statistical_model import statistical_model_bytes
+from mereo.scenes.statistical_model import read_statistical_model, statistical_model_bytes
 from mereo.synthesis.config import STATISTICAL_MODEL, TEMPLATE, GenerateConfig
-from mereo.synthesis.dataset_contents import FILES, MANIFEST, DatasetContents, check_space, dataset_key, shard_name
 from mereo.synthesis.examples import Clouds, Example, synthesize
 from mereo.workers.spread import Cluster, spread
 
 SHARD_SIZE = 64
+MANIFEST = "manifest.json"
+
 LIBRARIES = ("numpy", "scipy", "embreex", "libigl", "manifold3d", "trimesh")
 """Libraries whose versions are in the manifest: others may move last bits, but make no other dataset."""
 
-NOT_COMPARED = ("libraries", "bytes", FILES)
+NOT_COMPARED = ("libraries", "bytes")
 """Manifest entries that may differ when a dataset is resumed."""
+
+DECISIVE = ("scene", "segments", "nested", "any_roll", "workspace", "settings", "seed", "rest_sha256")
+"""Manifest entries that decide what example i is; a scene file's text, source and unit may change without."""
+
+SHARD = {
+    "cloud": "e p 3",
+    "cloud_count": "e",
+    "center": "e 3",
+    "scale": "e",
+    "positions": "e q 3",
+    "labels": "e q",
+    "distances": "e q",
+    "directions": "e q 3",
+    "rest": "e q 3",
+}
+"""Tensors of a shard by their axes: e examples, p stored points, q queries."""
+
+OBSERVED = {"seen": "e k p 3", "seen_count": "e k"}
+"""Tensors that a dataset with k further observations has besides."""
+
+
+# --- files of a dataset -----------------------------------------------------------------------------------------------
+
+
+class _Segment(BaseModel):
+    """Segment in a manifest."""
+
+    name: str
+    color: tuple[int, int, int]
+
+
+class _Sampling(BaseModel):
+    """Settings of sampling that training reads."""
+
+    per_segment: Annotated[int, Field(ge=0)]
+
+
+class _Settings(BaseModel):
+    """Settings that training reads."""
+
+    sampling: _Sampling
+
+
+class _Manifest(BaseModel):
+    """Entries of a manifest that programs read; the others decide the dataset's key, or are for people."""
+
+    scene: str
+    seed: int
+    examples: Annotated[int, Field(ge=1)]
+    settings: _Settings
+    segments: Annotated[tuple[_Segment, ...], Field(min_length=1, max_length=254)]
+    nested: tuple[tuple[str, str], ...] = ()
+    any_roll: bool
+    version: str
+    shard_size: Annotated[int, Field(ge=1)]
+    unit_m: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    source: str | None = None
+
+
+def read_manifest(directory: Place) -> dict[str, Any]:
+    """Manifest of a dataset; ``FileNotFoundError`` or ``ValueError`` with one sentence on what is wrong otherwise."""
+    path = directory / MANIFEST
+    try:
+        manifest: dict[str, Any] = json.loads(path.read_text("utf-8"))
+        _Manifest.model_validate(manifest)
+    except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
+        raise FileNotFoundError(
+            f"{directory} has no {MANIFEST}; a dataset is a directory made by mereo generate"
+        ) from None
+    except ValidationError as error:
+        raise ValueError(
+            f"{path} is not the manifest of a dataset ({first_problem(error)}); generate the dataset again"
+        ) from None
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is not valid JSON ({reason(error)}); generate the dataset again") from None
+    return manifest
+
+
+def dataset_key(manifest: Mapping[str, Any]) -> str:
+    """Digest of what decides a dataset's examples, by which its files know whose they are."""
+    text = json.dumps({name: manifest.get(name) for name in DECISIVE}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def expected_files(manifest: Mapping[str, Any]) -> list[str]:
+    """Names of the files that a dataset must have, but for its manifest."""
+    # nothing is trained on a test set
+    models = [] if manifest["seed"] >= TEST_SEED_START else [STATISTICAL_MODEL]
+    return [TEMPLATE, *models, *shard_names(manifest)]
+
+
+def check_file(path: Place, manifest: Mapping[str, Any]) -> None:
+    """Read a file of the dataset with this manifest; raises as ``read_shard`` does."""
+    if path.name == TEMPLATE:
+        read_template(path, manifest)
+    elif path.name == STATISTICAL_MODEL:
+        read_statistical_model(read_content(path), dataset_key(manifest))
+    else:
+        read_shard(path, manifest)
+
+
+def whole_files(folder: Place, manifest: Mapping[str, Any], files: Iterable[str]) -> set[str]:
+    """Those of a dataset's files that are there and whole; damaged ones are reported."""
+    whole = set[str]()
+    for name in sorted({*names_in(folder)}.intersection(files)):
+        try:
+            check_file(folder / name, manifest)
+            whole.add(name)
+        except FileNotFoundError:
+            pass
+        except ValueError:
+            print(f"{name} is damaged and is made again", flush=True)
+    return whole
+
+
+def check_dataset(folder: Place) -> None:
+    """Read every file of a dataset and print each that is missing, wrong or too many, with the reason.
+
+    Raises ``ValueError`` where a file is not good, or the folder holds no dataset, ``FileNotFoundError`` where there is
+    none, and ``StorageError`` where the storage refuses.
+    """
+    manifest = read_manifest(folder)
+    problems, files = dict[str, str](), expected_files(manifest)
+    with progress("check", len(files), "files") as shown:
+        for name in files:
+            try:
+                check_file(folder / name, manifest)
+            except FileNotFoundError:
+                problems[name] = "it is missing"
+            except ValueError as error:
+                problems[name] = str(error)
+            shown.advance(1)
+    spare = sorted(
+        name for name in {*names_in(folder)}.difference(files) if re.fullmatch(r"shard-.*\.safetensors", name)
+    )
+    for name, why in problems.items():
+        print(f"{name}: {why}")
+    for name in spare:
+        print(f"{name}: it is no part of this dataset, which ends before it")
+    if problems:
+        raise ValueError(
+            f"{folder}: {len(problems)} of {len(files)} files are not good; the `mereo generate` command that made it, "
+            "with --resume, makes just these again"
+        )
+    if spare:
+        raise ValueError(
+            f"{folder}: {len(spare)} files are not of this dataset; move {'them' if spare[1:] else 'it'} away"
+        )
+    print(f"{folder}: all {len(files)} files are whole, {manifest['examples']} examples")
+
+
+def shard_name(number: int) -> str:
+    """Name of a shard's file."""
+    return f"shard-{number:05d}.safetensors"
+
+
+def shard_names(manifest: Mapping[str, Any]) -> list[str]:
+    """Names of the shards of a whole dataset, in the order of their examples."""
+    return [shard_name(number) for number in range(-(-manifest["examples"] // manifest["shard_size"]))]
+
+
+def read_shard(path: Place, manifest: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Tensors of a shard of the dataset with this manifest, named by ``shard_name``.
+
+    Raises ``FileNotFoundError``, ``ValueError`` (its reason only) where it is damaged or another's, and
+    ``StorageError`` where nothing is known of it.
+    """
+    tensors, facts = unpack_tensors(read_content(path), dataset_key(manifest))
+    first = shard_names(manifest).index(path.name) * manifest["shard_size"]
+    if facts.get("first") not in (None, first):
+        raise ValueError(f"it begins with example {facts['first']} instead of {first}")
+    shapes = SHARD | (OBSERVED if OBSERVED.keys() & tensors.keys() else {})
+    check_tensors(tensors, shapes, {"e": min(manifest["shard_size"], manifest["examples"] - first)})
+    return tensors
+
+
+def read_template(path: Place, manifest: Mapping[str, Any]) -> Float16[np.ndarray, "s n n n"]:
+    """Signed distances of the template of the dataset with this manifest; raises as ``read_shard`` does."""
+    tensors, _ = unpack_tensors(read_content(path), dataset_key(manifest))
+    check_tensors(tensors, {"distance": "s n n n"}, {"s": len(manifest["segments"]), "n": TEMPLATE_NODES})
+    return tensors["distance"]
+
+
+def check_space(output: Place, examples: int, each: int, machines: int) -> None:
+    """Raise ``ValueError`` where examples of ``each`` bytes do not fit on the disk, beside those that are there.
+
+    An object storage tells no free space.
+
+    Args:
+        output: the dataset's folder, which may not exist yet.
+        examples: of the whole dataset.
+        each: bytes of one.
+        machines: that share the work; this one makes its part.
+    """
+    if isinstance(output, ObjectPath):
+        return
+    stored = sum(file.stat().st_size for file in output.glob("shard-*.safetensors")) if output.is_dir() else 0
+    disk = next(folder for folder in (output.absolute(), *output.absolute().parents) if folder.is_dir())
+    free = shutil.disk_usage(disk).free
+    needed = max(0, min(examples * each - stored, -(-examples // machines) * each))
+    if needed > free:
+        raise ValueError(
+            f"--examples {examples} needs {needed / 1e9:,.1f} GB at {each / 1e3:,.1f} kB each and {output} has "
+            f"{free / 1e9:,.1f} GB free; {machines * (free // each)} would fit: ask for fewer, or change --output"
+        )
+
+
+# --- generation -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -88,25 +303,6 @@ class DatasetConfig:
                 f"--seed is {self.seed}; a test set needs one from {TEST_SEED_START} up, which training never uses: "
                 "choose one"
             )
-
-
-@dataclass(frozen=True, eq=False)
-class _Work:
-    """What all shards of a dataset have in common; a scene made by code is sent to workers by its name or file."""
-
-    scene: str | Scene
-    settings: GenerateConfig
-    seed: int
-    dataset: str
-
-
-@dataclass(frozen=True)
-class _Shard:
-    """One file: examples ``first`` up to ``end``, without the end."""
-
-    name: str
-    first: int
-    end: int
 
 
 def generate(
@@ -146,30 +342,36 @@ def generate(
     loaded = load_scene(scene) if isinstance(scene, str) else scene
     manifest = make_manifest(loaded, settings, examples, seed)
     check_space(output, examples, manifest["bytes"] // examples, shard[1])
-    shards = [
-        _Shard(shard_name(n), n * SHARD_SIZE, min(examples, (n + 1) * SHARD_SIZE))
-        for n in range(shard[0], -(-examples // SHARD_SIZE), shard[1])
-    ]
-    contents = _claim(output, manifest, shards, resume, alone=shard[1] == 1)
-    key = dataset_key(contents.manifest)
-    if not contents.keeps(TEMPLATE):
-        contents.write(TEMPLATE, pack_tensors({"distance": rest_distances(loaded.rest)}, {"dataset": key}))
+    numbers = range(shard[0], -(-examples // SHARD_SIZE), shard[1])
+    before = claim(output, MANIFEST, manifest, "a dataset")
+    if before is not None:
+        names = names_in(output)
+        if not resume and (shard[1] == 1 or any(shard_name(number) in names for number in numbers)):
+            raise FileExistsError(f"{output} holds a dataset; continue it with --resume, or choose another --output")
+        _check_same(output, before, manifest)
+        manifest = read_manifest(output)
+    key = dataset_key(manifest)
+    whole = whole_files(output, manifest, [TEMPLATE, STATISTICAL_MODEL, *map(shard_name, numbers)])
+    if TEMPLATE not in whole:
+        write_whole(output / TEMPLATE, pack_tensors({"distance": rest_distances(loaded.rest)}, {"dataset": key}))
     # nothing is trained on a test set
-    if not config.test and not contents.keeps(STATISTICAL_MODEL):
+    if not config.test and STATISTICAL_MODEL not in whole:
         states = states_for(examples)
         print(f"modes of {states} random states, for registration", flush=True)
-        contents.write(STATISTICAL_MODEL, statistical_model_bytes(scene_model(loaded, states, quiet=False), key))
-    missing = [item for item in shards if not contents.keeps(item.name)]
-    total = sum(item.end - item.first for item in missing)
+        write_whole(output / STATISTICAL_MODEL, statistical_model_bytes(scene_model(loaded, states, quiet=False), key))
+    missing = [
+        range(number * SHARD_SIZE, min(examples, (number + 1) * SHARD_SIZE))
+        for number in numbers
+        if shard_name(number) not in whole
+    ]
     # what a YAML file says can be sent, and is then the same for all workers even if the file changes meanwhile; other
     # machines have neither file nor assets
     sent = loaded if isinstance(workers, Cluster) or is_yaml(scene) else scene
-    work = partial(_make_shard, _Work(sent, settings, seed, key))
-    with closing(spread(work, missing, workers)) as made, progress("generate", total) as shown:
-        for item, data in made:
-            contents.write(item.name, data)
-            shown.advance(item.end - item.first)
-    contents.finish()
+    work = partial(_make_shard, sent, settings, seed, key)
+    with closing(spread(work, missing, workers)) as made, progress("generate", sum(map(len, missing))) as shown:
+        for rows, data in made:
+            write_whole(output / shard_name(rows.start // SHARD_SIZE), data)
+            shown.advance(len(rows))
 
 
 def _check_sharing(workers: int | Cluster, shard: tuple[int, int]) -> None:
@@ -179,7 +381,7 @@ def _check_sharing(workers: int | Cluster, shard: tuple[int, int]) -> None:
         raise ValueError(f"the shard is {shard[0]}/{shard[1]}; i/n needs i from 0 to n - 1: pass for example 0/4")
 
 
-# --- the directory ----------------------------------------------------------------------------------------------------
+# --- the manifest -----------------------------------------------------------------------------------------------------
 
 
 def make_manifest(scene: Scene, settings: GenerateConfig, examples: int, seed: int) -> dict[str, Any]:
@@ -214,25 +416,13 @@ def example_bytes(settings: GenerateConfig, segments: int) -> int:
     return per_point * settings.points + per_query * settings.sampling.total(segments) + once + seen
 
 
-def _claim(output: Place, manifest: dict[str, Any], shards: list[_Shard], resume: bool, alone: bool) -> DatasetContents:
-    """Create the folder with its manifest, or check that it is this very dataset; others may write shards there."""
-    before = claim(output, MANIFEST, manifest, "a dataset")
-    if before is not None:
-        there = names_in(output)
-        if not resume and (alone or any(item.name in there for item in shards)):
-            raise FileExistsError(f"{output} holds a dataset; continue it with --resume, or choose another --output")
-        _check_same(output, before, manifest)
-    return DatasetContents.of(output, SHARD_SIZE)
-
-
 def _check_same(output: Place, before: dict[str, Any], manifest: dict[str, Any]) -> None:
-    # a manifest of an older version may not state everything; settings it lacks were as their defaults are
-    default = _flat({"settings": asdict(GenerateConfig()) | {"observations": []}})
-    before = default | _flat(before)
+    default = {"settings.observations": [], "settings.workspace": "own"}  # manifests do not state these
+    earlier = default | _flat(before)
     for key, now in (default | _flat(manifest)).items():
-        if before.get(key, now) != now:
+        if earlier.get(key) != now:
             raise ValueError(
-                f"{output} was made with {key} = {before[key]!r}, not {now!r}; resuming needs equal settings: "
+                f"{output} was made with {key} = {earlier.get(key)!r}, not {now!r}; resuming needs equal settings: "
                 "use them, or choose another --output"
             )
 
@@ -249,16 +439,12 @@ def _flat(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 # --- the work ---------------------------------------------------------------------------------------------------------
 
 
-def _make_shard(work: _Work, shard: _Shard) -> bytes:
-    """Content of the shard's file."""
-    loaded = load_scene(work.scene) if isinstance(work.scene, str) else work.scene
-    scene = loaded.for_seed(work.seed)
-    rows = [
-        pack(synthesize(scene, work.settings, example_rng(work.seed, index)), work.settings.points)
-        for index in range(shard.first, shard.end)
-    ]
-    tensors = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
-    return pack_tensors(tensors, {"dataset": work.dataset, "first": shard.first})
+def _make_shard(scene: str | Scene, settings: GenerateConfig, seed: int, dataset: str, rows: range) -> bytes:
+    """Content of the file of these examples; a built-in scene goes by its name."""
+    loaded = (load_scene(scene) if isinstance(scene, str) else scene).for_seed(seed)
+    examples = [pack(synthesize(loaded, settings, example_rng(seed, row)), settings.points) for row in rows]
+    tensors = {key: np.stack([example[key] for example in examples]) for key in examples[0]}
+    return pack_tensors(tensors, {"dataset": dataset, "first": rows.start})
 
 
 def pack(example: Example, points: int) -> dict[str, np.ndarray]:

@@ -12,7 +12,6 @@ from typing import Any, Literal, get_args
 from mereo.io.bounds import (
     Batch,
     BelowOne,
-    Count,
     CountOrNone,
     NotNegative,
     Positive,
@@ -65,8 +64,6 @@ class TrainConfig:
         loss: which terms: cross-entropy, L1 on the distance, cosine on the direction.
         l1_weight: the paper's lambda.
         batch: examples per step, over all processes together.
-        accumulate: parts in which each process takes its share of a batch, one after another, for batches that do not
-            fit into memory at once; only batch normalization sees the parts (docs/many-machines.md).
         queries: query points per example and step, a random subset; 0 means all of them.
         epochs: passes over the dataset.
         learning_rate: peak rate.
@@ -93,7 +90,6 @@ class TrainConfig:
     loss: Loss = "ce+l1"
     l1_weight: NotNegative = 100.0
     batch: Batch = 40
-    accumulate: Count = 1
     queries: CountOrNone = 0
     epochs: Positive = 300.0
     learning_rate: Positive = 5e-4
@@ -114,14 +110,10 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         check_bounds(self)
-        if self.batch % self.accumulate:
+        if self.batch == self.queries == 1:
             raise ValueError(
-                f"accumulate is {self.accumulate} and batch {self.batch}; a batch is learnt in equal parts: give a "
-                "number that divides it"
+                "batch and queries are both 1; batch normalization needs several values at a time: give more of either"
             )
-        if self.batch * self.queries == self.accumulate:
-            one = "batch and queries are both 1" if self.accumulate == 1 else "a part of a batch has one query"
-            raise ValueError(f"{one}; batch normalization needs several values at a time: give more of either")
 
     @property
     def supervision(self) -> Supervision:
@@ -136,8 +128,6 @@ class TrainConfig:
         settings = asdict(self) | {"network": self.network.to_dict(), "augment": augment}
         if self.network.encoder != "autodecoder":
             del settings["code_length"]
-        if self.accumulate == 1:
-            del settings["accumulate"]
         return settings
 
 

@@ -11,8 +11,8 @@ from torch import Tensor
 from mereo.models.config import Supervision
 from mereo.models.decoder import Prediction
 from mereo.models.network import ALIGNED_QUERIES
-from mereo.training.batches import Batch
 from mereo.training.config import TrainConfig
+from mereo.training.dataset import Batch
 from mereo.training.processes import Process
 
 
@@ -78,17 +78,14 @@ def supervised_loss(
     return loss, terms
 
 
-def with_known(batch: Batch, process: Process, parts: int) -> Batch:
-    """Batch with the numbers of queries by which sums over its parts, of all processes, become means of the whole.
+def with_known(batch: Batch, process: Process) -> Batch:
+    """Share of ``process`` with the numbers of queries by which sums over the shares become means of the whole batch.
 
-    The mean of parts with their own numbers would be another: they have more or fewer queries inside. ``batch`` is the
-    share of ``process``, which takes it in so many ``parts``.
+    The mean of shares with their own numbers would be another: they have more or fewer queries inside.
     """
-    parts *= process.world
-    if parts == 1:
+    if process.world == 1:
         return batch
     inside = ~batch.rest.isnan().any(dim=-1)
     known = torch.stack([inside[:, :ALIGNED_QUERIES].sum(), inside.sum()])
-    if process.world > 1:
-        dist.all_reduce(known)
-    return replace(batch, known=known.clamp(min=1) / parts)
+    dist.all_reduce(known)
+    return replace(batch, known=known.clamp(min=1) / process.world)

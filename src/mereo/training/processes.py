@@ -98,11 +98,11 @@ def meeting(process: Process) -> Iterator[None]:
         raise SystemExit(USER_ERROR)
 
 
-def agreed(process: Process, wish: bool) -> bool:
-    """Wish of process 0, which decides for all: clocks differ, and validation is collective."""
+def agreed(process: Process, decision: bool) -> bool:
+    """Decision of process 0, which holds for all: clocks differ, and validation is collective."""
     if process.world == 1:
-        return wish
-    flag = torch.tensor([float(wish)], device=collective_device(process))
+        return decision
+    flag = torch.tensor([float(decision)], device=collective_device(process))
     dist.broadcast(flag, src=0)
     return bool(flag.item())
 
@@ -141,7 +141,7 @@ def connected(process: Process) -> Iterator[None]:
 
 # --- batch_normalization ----------------------------------------------------------------------------------------------
 
-# Batch normalization of a batch that several processes share, or one process takes in parts.
+# Batch normalization of a batch that several processes share.
 #
 # Notation: n rows, c channels.
 
@@ -159,15 +159,6 @@ def share_statistics(network: nn.Module, process: Process, device: torch.device)
         if isinstance(module, nn.BatchNorm1d):
             module.__class__ = SharedBatchNorm
     return network
-
-
-def adapt_momentum(network: nn.Module, parts: int) -> None:
-    """Let the running statistics move as far in ``parts`` updates of a step as they would in one."""
-    if parts == 1:
-        return
-    for module in network.modules():
-        if isinstance(module, nn.BatchNorm1d | nn.SyncBatchNorm) and module.momentum is not None:
-            module.momentum = 1 - (1 - module.momentum) ** (1 / parts)
 
 
 class SharedBatchNorm(nn.BatchNorm1d):
@@ -202,9 +193,9 @@ class _Normalize(torch.autograd.Function):
     ) -> tuple[Float[Tensor, "n c"], Float[Tensor, " c"], Float[Tensor, " c"]]:
         exact = rows.float()
         variance, mean = torch.var_mean(exact, dim=0, correction=0)
-        own = torch.stack([mean, variance])
-        every = [torch.empty_like(own) for _ in range(dist.get_world_size())]
-        dist.all_gather(every, own)
+        local = torch.stack([mean, variance])
+        every = [torch.empty_like(local) for _ in range(dist.get_world_size())]
+        dist.all_gather(every, local)
         means, variances = torch.stack(every).unbind(1)
         mean = means.mean(dim=0)
         # by differences of means, not of squares: a mean may be hundreds of spreads
@@ -221,9 +212,10 @@ class _Normalize(torch.autograd.Function):
     ) -> tuple[Float[Tensor, "n c"], Float[Tensor, " c"], Float[Tensor, " c"], None]:
         standard, inverse, weight = ctx.saved_tensors
         exact = gradient.float()
-        own = torch.stack([exact.sum(dim=0), (exact * standard).sum(dim=0)])  # of bias and weight, which DDP averages
-        every = own.clone()
+        # of bias and weight, which DDP averages
+        local = torch.stack([exact.sum(dim=0), (exact * standard).sum(dim=0)])
+        every = local.clone()
         dist.all_reduce(every)
         shift, slope = every / (len(standard) * dist.get_world_size())
         rows = (exact - shift - standard * slope) * (inverse * weight)
-        return rows.to(gradient.dtype), own[1], own[0], None
+        return rows.to(gradient.dtype), local[1], local[0], None

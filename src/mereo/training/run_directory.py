@@ -2,6 +2,7 @@
 
 import copy
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,10 @@ from torch import Tensor, nn
 from mereo.io.atomic_files import atomic_file, claim_directory
 from mereo.io.errors import reason
 from mereo.models.config import NetworkConfig
-from mereo.models.encoders.encoding import Autodecoder
+from mereo.models.encoders import Autodecoder
 from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.models.weights import load_model
-from mereo.synthesis.config import TEMPLATE
 from mereo.training.config import AugmentConfig, TrainConfig
 from mereo.training.dataset import Dataset
 from mereo.training.processes import Process, broadcast_result, meeting
@@ -77,11 +77,6 @@ def start_network(config: TrainConfig, data: Dataset) -> Network:
         network.encoder.add_codes(len(data) - config.holdout, config.code_length)
     lookup = network.decoder.lookup
     if lookup is not None:
-        if data.template is None:
-            raise ValueError(
-                f"the dataset has no {TEMPLATE}, which this network reads; an older mereo made it: continue it with "
-                "mereo generate ... --resume, or train with --network.no-rest-template"
-            )
         lookup.distance.copy_(data.template)
     return network
 
@@ -96,7 +91,7 @@ def trained_model(
 ) -> Model:
     """Model of the averaged network after ``step`` steps, class offsets in its last bias, with its weights' header.
 
-    ``before`` is the number of examples that the weights it started from had seen (``examples_seen.seen_by``).
+    ``before`` is the number of examples that the weights it started from had seen (``seen_by``).
     """
     network = average
     if offsets is not None:
@@ -165,48 +160,102 @@ def claim_run(run_dir: Path, config: TrainConfig, data: Dataset, process: Proces
     Process 0 does so alone: another one would find the directory that it is just creating, without its settings yet.
     The others wait, and end where process 0 refuses.
     """
-    if config.batch % (process.world * config.accumulate):
-        parts = f", in {config.accumulate} parts each" if config.accumulate > 1 else ""
+    if config.batch % process.world:
         raise ValueError(
-            f"the batch of {config.batch} cannot be shared by {process.world} processes{parts}; it must be a multiple: "
+            f"the batch of {config.batch} cannot be shared by {process.world} processes; it must be a multiple: "
             "change --batch or the number of processes"
         )
     with meeting(process):
         if process.is_main:
             dataset = {key: data.manifest[key] for key in ("scene", "seed", "examples")}
-            _claim(run_dir, json.loads(json.dumps({"dataset": dataset, "train": config.to_dict()})))
-
-
-NOT_WRITTEN = {"accumulate": 1}
-"""Settings that files do not hold where they are so."""
-
-
-def _claim(run_dir: Path, settings: dict[str, Any]) -> None:
-    found = claim_directory(run_dir, "config.json", settings, "a training run")
-    before = settings if found is None else _with_defaults(run_dir, found)
-    if before != settings:
-        odd = _first_difference(*(item | {"train": NOT_WRITTEN | item["train"]} for item in (before, settings)))
-        raise ValueError(
-            f"{run_dir} holds a run with another {odd}; continuing needs equal settings: use them, or another --output"
-        )
-
-
-def _with_defaults(run_dir: Path, settings: dict[str, Any]) -> dict[str, Any]:
-    """A run's settings; those that an older mereo did not have are as they were then, which is their default."""
-    default = json.loads(json.dumps(TrainConfig().to_dict()))
-    groups = [settings.get("dataset", {}), given := settings.get("train", {})]
-    if not all(isinstance(group, dict) for group in groups) or not isinstance(given.get("network", {}), dict):
-        raise ValueError(f"{run_dir / 'config.json'} holds no settings of a training run: choose another --output")
-    train = default | {"learned_box": True} | given  # every network had one
-    return settings | {"train": train | {"network": default["network"] | train["network"]}}
+            settings = json.loads(json.dumps({"dataset": dataset, "train": config.to_dict()}))
+            before = claim_directory(run_dir, "config.json", settings, "a training run")
+            if before is not None and before != settings:
+                raise ValueError(
+                    f"{run_dir} holds a run with another {_first_difference(before, settings)}; continuing needs equal "
+                    "settings: use them, or another --output"
+                )
 
 
 def _first_difference(before: dict[str, Any], now: dict[str, Any]) -> str:
     for group in now:
+        earlier = before.get(group)
+        earlier = earlier if isinstance(earlier, dict) else {}
         for key, value in now[group].items():
-            if before.get(group, {}).get(key) != value:
-                return f"{group} setting {key} ({before.get(group, {}).get(key)!r:.80} instead of {value!r})"
+            if earlier.get(key) != value:
+                return f"{group} setting {key} ({earlier.get(key)!r:.80} instead of {value!r})"
     return "format"
+
+
+# --- examples seen ----------------------------------------------------------------------------------------------------
+
+# Examples that weights have seen in training, those of the weights that they started from included. A training writes
+# how many their start had seen into its weights (``provenance["examples_before"]``), so chains of any length add up.
+
+_BEFORE: Mapping[tuple[str, str, str], int] = {
+    ("bunny", "3", "6530"): 132_320,
+    ("engine", "11", "6240"): 438_448,
+    ("human", "7", "4872"): 423_730,
+    ("lizard", "10", "3372"): 414_766,
+    ("robot", "8", "10326"): 449_668,
+    ("rope", "5", "10351"): 70_980,
+    ("shapes", "12", "5744"): 407_884,
+    ("sheet", "9", "16860"): 433_984,
+    ("skull", "6", "10326"): 441_922,
+    ("tumor", "4", "4060"): 83_106,
+}
+"""What shipped weights had seen before their last training, by scene, seed and steps of that one.
+
+Their files are older than ``examples_before``. The chains are in docs/experiments.md, entries 6, 13, 14, 16, 17 and 18:
+all but the liver and the rope began with the bunny's 393,520, the tumour with the liver's.
+"""
+
+
+def seen_in_training(provenance: Mapping[str, Any]) -> int | None:
+    """Number of examples that a training has shown, repeated ones each time; None where the weights do not say."""
+    recipe = provenance.get("recipe") or {}
+    steps, batch = provenance.get("steps"), recipe.get("batch")
+    return steps * batch if isinstance(steps, int) and isinstance(batch, int) else None
+
+
+def seen_before(provenance: Mapping[str, Any]) -> int | None:
+    """Number of examples that the weights from which a training started had seen, and those before them.
+
+    0 for a start from random weights; None where a chain cannot be told: an older mereo did not write it.
+    """
+    stated = provenance.get("examples_before")
+    if isinstance(stated, int):
+        return stated
+    recipe = provenance.get("recipe")
+    if recipe and not recipe.get("init"):
+        return 0
+    return _BEFORE.get(
+        (str(provenance.get("scene")), str(provenance.get("training_seed")), str(provenance.get("steps")))
+    )
+
+
+def seen_in_all(provenance: Mapping[str, Any]) -> int | None:
+    """Number of examples of a training and of the chain behind it; None where the weights do not say."""
+    latest, before = seen_in_training(provenance), seen_before(provenance)
+    return None if latest is None or before is None else latest + before
+
+
+def seen_by(init: str) -> int | None:
+    """Number of examples that weights have seen in all, by a shipped name or a file; empty are random ones.
+
+    None where they do not say. Raises as ``load_model`` does.
+    """
+    return seen_in_all(load_model(init).provenance) if init else 0
+
+
+def describe_seen(provenance: Mapping[str, Any]) -> str:
+    """Words for the examples of a training and of the chain behind it; empty where the weights do not say."""
+    latest, before = seen_in_training(provenance), seen_before(provenance)
+    if latest is None or before == 0:
+        return "" if latest is None else f"{latest:,} examples seen"
+    if before is None:
+        return f"{latest:,} examples seen, and those of the weights that it started from, which do not say how many"
+    return f"{latest:,} examples seen, {latest + before:,} with those of the weights that it started from"
 
 
 # --- checkpoint -------------------------------------------------------------------------------------------------------

@@ -22,19 +22,16 @@ from mereo.io.object_storage import Place
 from mereo.io.progress import Progress, progress
 from mereo.models.config import Device
 from mereo.models.device import compiling_pays, find_device, keep_freed_memory, pick_precision
-from mereo.models.encoders.encoding import CODES, Autodecoder
+from mereo.models.encoders import CODES, Autodecoder
 from mereo.models.network import Network
 from mereo.models.weights import save_model, trained_steps
 from mereo.models.weights_place import WEIGHTS
-from mereo.training.batches import Batch, Draws, seed_of
 from mereo.training.config import TrainConfig
-from mereo.training.dataset import Dataset, ShuffledOrder
-from mereo.training.examples_seen import seen_by
+from mereo.training.dataset import Batch, Dataset, Draws, ShuffledOrder, seed_of
 from mereo.training.losses import supervised_loss, with_known
 from mereo.training.metrics_log import MetricsLog
 from mereo.training.processes import (
     Process,
-    adapt_momentum,
     agreed,
     connected,
     join_processes,
@@ -48,6 +45,7 @@ from mereo.training.run_directory import (
     fit_config,
     load_checkpoint,
     save_checkpoint,
+    seen_by,
     start_network,
     trained_model,
 )
@@ -139,7 +137,6 @@ class Trainer:
         self.log = MetricsLog(run_dir, bool(data.further)) if process.is_main else None
         self.unread: list[tuple[int, float, dict[str, Tensor]]] = []
         self.autocast = pick_precision(config.precision, device)
-        adapt_momentum(self.network, config.accumulate)
         self.module: nn.Module = share_statistics(self.network, process, device)
         if process.world > 1:
             self.module = nn.parallel.DistributedDataParallel(self.network)
@@ -182,7 +179,7 @@ class Trainer:
             index = self.order.index(step)[self.rows]
             draws = Draws.of(seed_of(config.seed, step, 0), config.batch, self.rows)
             batch = self.data.batch(index, config.network.points, config.queries, config.augment, draws)
-            yield with_known(batch, self.process, config.accumulate)
+            yield with_known(batch, self.process)
 
     def train_step(self, batch: Batch) -> None:
         """Take one optimizer step."""
@@ -192,27 +189,16 @@ class Trainer:
             group["lr"] = group["peak"] * part
         torch.manual_seed(seed_of(self.config.seed, self.step, self.process.rank))  # for dropout
         self.optimizer.zero_grad(set_to_none=True)
-        terms = self._gradients(batch)
+        loss, terms = self._loss(batch)
+        loss.backward()
         norm = clip_gradients(self.network, self.config.clip_norm)
         self.optimizer.step()
         self.step += 1
         update_average(self.average, self.network, self.step, self.config.ema_decay)
-        values = {"norm": norm, **self._of_all(terms)}
+        values = {"norm": norm, **self._of_all({"loss": loss.detach(), **terms})}
         self.unread.append((self.step, self.config.learning_rate * part, values))
         if self.device.type == "cpu" or self.step % READ_EVERY == 0 or self.step == self.total:
             self._read_losses()  # on a CPU that waits for nothing
-
-    def _gradients(self, batch: Batch) -> dict[str, Tensor]:
-        """Add up the gradients of a batch's parts, with the last one over all processes; returns their mean terms."""
-        parts = batch.parts(self.config.accumulate)
-        found: list[dict[str, Tensor]] = []
-        for part in parts:
-            alone = self.process.world > 1 and len(found) + 1 < len(parts)
-            with self.module.no_sync() if alone else nullcontext():  # type: ignore[operator]
-                loss, terms = self._loss(part)
-                (loss / len(parts) if len(parts) > 1 else loss).backward()
-            found.append({"loss": loss.detach(), **terms})
-        return found[0] if len(found) == 1 else {n: torch.stack([row[n] for row in found]).mean(0) for n in found[0]}
 
     def _of_all(self, terms: dict[str, Tensor]) -> dict[str, Tensor]:
         """Means over all processes, which so stop at the same step, as DDP has made them of the gradients."""
@@ -309,9 +295,9 @@ class Trainer:
 
     def finish(self) -> None:
         """Write all that a run leaves at its end, unless an earlier process has, which may have been killed before."""
-        there = self.log is not None and self.log.is_written(self.step)
-        there = there and self.saved_step == self.step == trained_steps(self.run_dir / WEIGHTS)
-        if not agreed(self.process, there):
+        is_whole = self.log is not None and self.log.is_written(self.step)
+        is_whole = is_whole and self.saved_step == self.step == trained_steps(self.run_dir / WEIGHTS)
+        if not agreed(self.process, is_whole):
             if self.first_step == self.total:  # no step was taken in this process, so none was validated
                 self.validate()
             self.save(finished=True)

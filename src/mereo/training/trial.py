@@ -11,9 +11,8 @@ import torch
 from mereo.io.progress import Progress
 from mereo.models.device import keep_freed_memory, pick_device
 from mereo.models.weights_place import shipped_names
-from mereo.training.batches import Batch, Draws
 from mereo.training.config import TrainConfig
-from mereo.training.dataset import Dataset
+from mereo.training.dataset import Batch, Dataset, Draws
 from mereo.training.processes import Process
 from mereo.training.run_directory import fit_config, start_network
 from mereo.training.trainer import Trainer

@@ -12,9 +12,8 @@ from torch import Tensor
 
 from mereo.evaluation.metrics import Scores, confusion_matrix, intersection_over_union
 from mereo.models.network import Network
-from mereo.training.batches import Batch, Draws
 from mereo.training.config import AugmentConfig, TrainConfig
-from mereo.training.dataset import Dataset
+from mereo.training.dataset import Batch, Dataset, Draws
 
 SEARCHED = 16
 """Held-out examples of an autodecoder's curve: each one's code must be searched for first."""
@@ -50,8 +49,8 @@ def choose_offsets(network: Network, data: Dataset, config: TrainConfig) -> Floa
     if not (count and uniform and config.supervision.labels):
         return None
     answers = _answers(network, data, config, range(count))
-    found = [(logits[:, -uniform:], batch.labels[:, -uniform:]) for batch, logits, _ in answers]
-    return class_offsets(*(torch.cat(part).flatten(0, 1).cpu() for part in zip(*found, strict=True)))
+    pairs = [(logits[:, -uniform:], batch.labels[:, -uniform:]) for batch, logits, _ in answers]
+    return class_offsets(*(torch.cat(part).flatten(0, 1).cpu() for part in zip(*pairs, strict=True)))
 
 
 def _answers(

@@ -20,8 +20,7 @@ from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START
 from mereo.synthesis.config import GenerateConfig
-from mereo.synthesis.dataset_contents import MANIFEST
-from mereo.synthesis.shards import NOT_COMPARED, DatasetConfig, generate, make_manifest
+from mereo.synthesis.shards import MANIFEST, NOT_COMPARED, DatasetConfig, generate, make_manifest
 from mereo.training.config import TrainConfig
 from mereo.training.trainer import train
 from mereo.visualization.evaluation_files import evaluate_weights

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from mereo.models.ops.products import linear
+from mereo.models.device import linear
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def _operations_of_linear(rows: Sequence[int], weight: Sequence[int], *_: object
 
 
 ONEDNN = {torch.ops.mkldnn._linear_pointwise: _operations_of_linear}
-"""Products of ``mereo.models.ops.products`` that torch's counter does not know."""
+"""Products of ``mereo.models.device`` that torch's counter does not know."""
 
 
 def seconds(work: Callable[[], object], device: torch.device) -> float:

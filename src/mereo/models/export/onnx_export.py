@@ -14,10 +14,11 @@ import io
 import logging
 import shutil
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,10 +30,10 @@ from torch.export import Dim, ExportedProgram
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.io.atomic_files import new_directory, write_json
 from mereo.models.decoder import Code
-from mereo.models.encoders.encoding import Level
+from mereo.models.encoders import Level
 from mereo.models.model import DENSE_FACTOR, Model
 from mereo.models.network import Network
-from mereo.models.rigid_alignment import Alignment
+from mereo.models.rigid_alignment import Alignment, svd3
 from mereo.models.weights import load_model
 
 FORMAT_VERSION = 1
@@ -137,10 +138,10 @@ def export_graphs(model: Model) -> Graphs:
             code |= {"cloud": cloud, "viewpoint": torch.tensor([[0.1, -0.2, -8.0]])}
         open_sizes = {name: None if name in FIXED_SIZE else {1: Open} for name in code}
         points = _example_points(EXAMPLE_QUERIES)
-        asked = torch.export.export(query, (points, code), dynamic_shapes=({1: Open}, open_sizes), strict=False)
+        queried = torch.export.export(query, (points, code), dynamic_shapes=({1: Open}, open_sizes), strict=False)
     (bounds,) = traced.range_constraints.values()
     most = None if float(bounds.upper) > UNBOUNDED else int(bounds.upper)
-    return Graphs(traced, asked, tuple(code), outputs, most)
+    return Graphs(traced, queried, tuple(code), outputs, most)
 
 
 def _example_points(count: int) -> Float[Tensor, "1 n 3"]:
@@ -152,8 +153,6 @@ def _example_points(count: int) -> Float[Tensor, "1 n 3"]:
 def write_onnx(graphs: Graphs, directory: Path) -> None:
     """Write ``encoder.onnx`` and ``query.onnx``. Raises ``ImportError`` without the extra `onnx`."""
     _require_onnx()
-    from mereo.models.export.onnx_operators import DECOMPOSITIONS
-
     inputs = {"encoder": ["cloud"], "query": ["points", *graphs.inputs]}
     outputs = {"encoder": graphs.outputs, "query": ANSWERS}
     for name, program in (("encoder", graphs.encoder), ("query", graphs.query)):
@@ -239,3 +238,44 @@ def export_weights(
     print(f"wrote {output}: encoder and query for clouds of {model.network.config.points} points")
     if format == "onnx":
         print(f"try: python {Path(output) / RUNNER.name} frame.npy --points queries.npy -o out.npz")
+
+
+# --- operators --------------------------------------------------------------------------------------------------------
+
+# Operators that ONNX lacks, made of those it has: the SVD of 3 x 3 matrices and 3-D sampling. They have torch's own
+# arguments, and its results to rounding.
+
+
+def trilinear(volume: Tensor, grid: Tensor, interpolation_mode: int, padding_mode: int, align_corners: bool) -> Tensor:
+    """Trilinear ``grid_sample`` of a volume [1, c, d, h, w] at [1, i, j, k, 3] in [-1, 1]: [1, c, i, j, k].
+
+    Only as ``decoder.RestLookup`` asks for it: linear (0), the border's value beyond it (1), corners aligned.
+    """
+    assert (interpolation_mode, padding_mode, align_corners) == (0, 1, True), "another sampling than the template's"
+    channels, sizes = volume.shape[1], volume.shape[2:]
+    # places are x, y, z, the last axis first
+    axes = [_between(grid[..., 2 - axis].reshape(-1), size) for axis, size in enumerate(sizes)]
+    values = volume.reshape(channels, -1)
+    total = torch.zeros_like(axes[0][1])
+    for corner in product((0, 1), repeat=3):
+        index, weight = torch.zeros_like(axes[0][0]), torch.ones_like(total)
+        for (low, part), step, size in zip(axes, corner, sizes, strict=True):
+            index = index * size + low + step
+            weight = weight * (part if step else 1 - part)
+        total = total + weight * values.index_select(1, index)
+    return total.reshape(1, channels, *grid.shape[1:4])
+
+
+def _between(place: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """The lower of the two nodes around a place in [-1, 1], and how far towards the upper one it is, 0 to 1."""
+    position = ((place + 1) / 2 * (size - 1)).clamp(0, size - 1)
+    low = position.floor().clamp(max=size - 2)
+    return low.long(), position - low
+
+
+DECOMPOSITIONS: dict[Any, Callable[..., Any]] = {
+    torch.ops.aten.linalg_svd.default: svd3,
+    torch.ops.aten.grid_sampler.default: trilinear,
+    torch.ops.aten.grid_sampler_3d.default: trilinear,
+}
+"""Replacements of torch's operators, for ``ExportedProgram.run_decompositions``."""

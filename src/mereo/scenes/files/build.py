@@ -23,7 +23,6 @@ from mereo.geometry.subdivision import TooManyFaces, split_edges
 from mereo.geometry.transforms import Normalizer
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.yaml_document import Document, similar
-from mereo.scenes.files.defaults import default_deformations
 from mereo.scenes.files.deformation_blocks import (
     AnyDeformation,
     CameraBlock,
@@ -34,11 +33,12 @@ from mereo.scenes.files.deformation_blocks import (
     SceneFile,
     Target,
 )
+from mereo.scenes.files.template import default_deformations, placed
 from mereo.scenes.recorded_states import load_states
 from mereo.scenes.scene import SCENES, Scene, Workspace
 from mereo.scenes.seeds import example_rng
 
-ELSEWHERE = {"source", "segments", "model", "parts", "labels", "names", "cells"}
+SOURCES = {"source", "segments", "model", "parts", "labels", "names", "cells"}
 """Keys that decide the meshes, which identify themselves, or nothing."""
 
 
@@ -94,7 +94,7 @@ def build(document: Document, file: SceneFile, mesh: SegmentedMesh) -> Scene:
     placement = placed(mesh, file.size)
     rest = mesh.with_vertices([placement.apply(segment.vertices) for segment in mesh.segments])
     workspace = _workspace(document, file.camera, rest.bounds)
-    unit_m, definition = file.units / placement.scale, file.model_dump_json(exclude=ELSEWHERE)
+    unit_m, definition = file.units / placement.scale, file.model_dump_json(exclude=SOURCES)
     if file.states is not None:
         scene = _recorded(document, file, rest, placement, workspace)
         definition += _digest(document.path.parent / file.states)
@@ -163,15 +163,6 @@ def _digest(path: Path) -> str:
         with file.open("rb") as content:
             digest.update(file.name.encode() + hashlib.file_digest(content, "sha256").digest())
     return digest.hexdigest()
-
-
-def placed(mesh: SegmentedMesh, size: float) -> Normalizer:
-    """Map from the file's frame to the scene's: the joint box centred, its shortest side ``size`` long."""
-    low, high = mesh.bounds
-    shortest = float((high - low).min())
-    if not shortest > 0:
-        raise ValueError(f"the object's box has sides {(high - low).tolist()}; all must be above 0: check the meshes")
-    return Normalizer((low + high) / 2, size / shortest)
 
 
 def _workspace(document: Document, camera: CameraBlock, bounds: Float[np.ndarray, "2 3"]) -> Workspace:
@@ -291,8 +282,8 @@ def _assembled(document: Document, key: str, parts: Sequence[PartLook], segments
 
 def _colored(segments: Sequence[Segment], parts: Sequence[PartLook]) -> list[Segment]:
     """The file's colours; without one the mesh's own, where they tell the segments apart, or the palette's."""
-    own = [segment.color for segment in segments]
-    fallback = own if len(set(own)) == len(own) else [PALETTE[i % len(PALETTE)] for i in range(len(own))]
+    colors = [segment.color for segment in segments]
+    fallback = colors if len(set(colors)) == len(colors) else [PALETTE[i % len(PALETTE)] for i in range(len(colors))]
     return [
         Segment(segment.name, part.color or color, segment.vertices, segment.faces)
         for segment, part, color in zip(segments, parts, fallback, strict=True)

@@ -21,7 +21,7 @@ from mereo.geometry.transforms import inverse_rigid
 from mereo.io.atomic_files import atomic_file, check_file_place, remove_abandoned
 from mereo.io.yaml_document import Document
 from mereo.scenes.files.build import build, read, read_segments
-from mereo.scenes.files.defaults import motion
+from mereo.scenes.files.template import motion
 from mereo.scenes.registry import is_yaml, load_scene
 from mereo.scenes.scene import SCENES, Scene, Workspace
 from mereo.scenes.seeds import example_rng
@@ -55,7 +55,7 @@ def check_scene(name: str, repair: bool = False) -> None:
             return
         if repair:
             print("no mesh needs a repair")
-        if any(found.hopeless for found in health):
+        if any(condition.hopeless for condition in health):
             raise _refusal(name, faults)
         scene = build(document, file, _marked(mesh, health))
         _report_refinement(mesh, scene.rest)
@@ -89,13 +89,13 @@ def _examined(mesh: SegmentedMesh) -> list[Health]:
 def _report(mesh: SegmentedMesh, health: list[Health], unit: str) -> int:
     """Print each segment and each overlap; returns the number of faults."""
     faults = 0
-    usable = not any(found.hopeless for found in health)
+    usable = not any(condition.hopeless for condition in health)
     volumes = mesh.owned_volumes if usable else [np.nan] * len(health)
-    for segment, found, volume in zip(mesh.segments, health, volumes, strict=True):
-        inside = volume if found.sound or found.hopeless else grid_volume(replace(segment, solid=False))
+    for segment, condition, volume in zip(mesh.segments, health, volumes, strict=True):
+        inside = volume if condition.sound or condition.hopeless else grid_volume(replace(segment, solid=False))
         amount = f"   volume {inside:.4g} {unit}" if np.isfinite(inside) else ""
         print(f"{segment.name:<20} {len(segment.faces):>7} faces{amount}")
-        for fault in (*found.hopeless, *found.dirty):
+        for fault in (*condition.hopeless, *condition.dirty):
             faults += 1
             print(f"  fault: it {fault}")
     if usable:
@@ -107,7 +107,7 @@ def _report(mesh: SegmentedMesh, health: list[Health], unit: str) -> int:
 
 def _marked(mesh: SegmentedMesh, health: list[Health]) -> SegmentedMesh:
     """Mesh with segments that are no solids marked so."""
-    marked = (replace(s, solid=found.sound) for s, found in zip(mesh.segments, health, strict=True))
+    marked = (replace(s, solid=condition.sound) for s, condition in zip(mesh.segments, health, strict=True))
     return replace(mesh, segments=tuple(marked))
 
 
@@ -182,7 +182,7 @@ def _holds(place: Path, content: bytes) -> bool:
 
 # A scene file written anew with other meshes; its comments stay in the user's own file, which nobody changes.
 
-SOURCES = ("segments", "model", "parts", "labels", "names", "cells")
+KINDS = ("segments", "model", "parts", "labels", "names", "cells")
 """Keys that say where the segments come from."""
 
 HEADER = """\
@@ -211,12 +211,12 @@ def with_segment_files(document: Document, mesh: SegmentedMesh, changed: Collect
     else:
         files = {name: repaired_name(name) for name in mesh.names}
         segments = _segment_blocks(mesh, files)
-    first = next(key for key in document.data if key in SOURCES)
+    first = next(key for key in document.data if key in KINDS)
     data: dict[str, Any] = {}
     for key, value in document.data.items():
         if key == first:
             data["segments"] = segments
-        elif key not in SOURCES:
+        elif key not in KINDS:
             data[key] = value
     body = yaml.safe_dump(data, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
     return HEADER.format(name=document.path.name) + body, files
@@ -249,9 +249,6 @@ STATE_TOLERANCE = 0.02
 WIDTH = 96
 """Of the depth image in pixels, the default of ``synthesis.config.GenerateConfig``."""
 
-NARROWED = (0.75, 0.5, 0.25, 0.1)
-"""Shares of a joint's ranges that are tried where it turns segments into each other."""
-
 
 def report_states(scene: Scene) -> int:
     """Print how far random states move, how they are seen, and each overlap with its cause; returns their number."""
@@ -264,9 +261,9 @@ def report_states(scene: Scene) -> int:
     for index in range(STATES):
         rng = example_rng(0, index)
         mesh = scene.sample_state(rng).mesh
-        for found in overlaps(mesh, STATE_TOLERANCE):
-            pair = frozenset((found.small, found.large))
-            worst[pair] = max(worst.get(pair, found), found, key=lambda overlap: overlap.share)
+        for overlap in overlaps(mesh, STATE_TOLERANCE):
+            pair = frozenset((overlap.small, overlap.large))
+            worst[pair] = max(worst.get(pair, overlap), overlap, key=lambda each: each.share)
         share, count = _view(scene.workspace, mesh, rng)
         seen = min(seen, share)
         pixels.append(count)
@@ -317,29 +314,4 @@ def _cure(scene: Scene, overlap: Overlap) -> str:
     moves = f"{' and '.join(titles)} {'moves' if len(apart) == 1 else 'move'} one of the two alone"
     if not all(isinstance(draw.steps[index][0], JointSampler) for index in apart):
         return f"{moves}: leave out its `segments`, so that both move by it, or deform less"
-    for share in NARROWED:
-        if _free(scene, _narrowed(draw, apart, share), overlap):
-            return f"{moves}: {share:.0%} of the range keeps them apart; or correct the pivot and the axis"
-    return f"{moves}, and they meet at a tenth of the range already: correct its pivot and axis, or move both"
-
-
-def _narrowed(draw: RandomMotion, which: list[int], share: float) -> RandomMotion:
-    """The same motion with some of its joints narrowed."""
-    steps = list(draw.steps)
-    for index in which:
-        joint, members = steps[index]
-        assert isinstance(joint, JointSampler)
-        steps[index] = (joint.narrowed(share), members)
-    return replace(draw, steps=tuple(steps))
-
-
-def _free(scene: Scene, draw: RandomMotion, overlap: Overlap) -> bool:
-    """Whether the two segments of an overlap keep apart in all of the states."""
-    names = (overlap.small, overlap.large)
-    parts = [scene.rest.names.index(name) for name in sorted(names, key=scene.rest.names.index)]
-    nested = tuple(pair for pair in scene.rest.nested if set(pair) == set(names))
-    for index in range(STATES):
-        mesh = scene.deform(draw(example_rng(0, index))).mesh
-        if overlaps(SegmentedMesh(tuple(mesh.segments[part] for part in parts), nested), STATE_TOLERANCE):
-            return False
-    return True
+    return f"{moves}: narrow its range, correct its pivot and axis, or move both"

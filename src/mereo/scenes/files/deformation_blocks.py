@@ -5,7 +5,6 @@ units and radians.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -18,7 +17,6 @@ from pydantic import (
     ConfigDict,
     Field,
     FiniteFloat,
-    model_serializer,
     model_validator,
 )
 
@@ -138,18 +136,10 @@ class LatticeBlock(DeformationBlock):
     strength: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.5
 
     @model_validator(mode="after")
-    def _has_one_grid(self) -> "LatticeBlock":
+    def _has_single_grid(self) -> "LatticeBlock":
         if self.cells is not None and self.spacing is not None:
             raise ValueError("it has both cells and spacing; one of them says where the control points are: drop one")
         return self
-
-    @model_serializer(mode="wrap")
-    def _without_absent_spacing(self, serialize: Callable[["LatticeBlock"], dict[str, object]]) -> dict[str, object]:
-        # datasets keep a digest of what their scene file says, and most are from before there was a spacing
-        written = serialize(self)
-        if self.spacing is None:
-            del written["spacing"]
-        return written
 
     def sampler(self, target: Target) -> DeformationSampler:
         """Sampler of lattices over the box of what is moved; ``Misfit`` where ``spacing`` is too small for it."""
@@ -414,13 +404,13 @@ class SceneFile(Block):
     held_out: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.1
 
     @model_validator(mode="after")
-    def _moves_in_one_way(self) -> "SceneFile":
+    def _moves_in_single_way(self) -> "SceneFile":
         if self.states is not None and self.deformations is not None:
             raise ValueError("it has both states and deformations; recorded states say how the object moves: drop one")
         return self
 
     @model_validator(mode="after")
-    def _has_one_source(self) -> "SceneFile":
+    def _has_single_source(self) -> "SceneFile":
         given = [key for key in ("segments", "model", "labels") if getattr(self, key) is not None]
         if len(given) != 1:
             raise ValueError(

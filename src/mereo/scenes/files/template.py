@@ -1,25 +1,208 @@
-"""``mereo scene new``: a scene file for given meshes, with defaults that fit their size and comments on each."""
+"""First draft of a scene file, for an object of which only the meshes are known: ``mereo scene new``.
+
+The object is taken for rubber that deforms about as much as those of the built-in scenes. A lattice alone is too stiff
+for that: the bound that keeps space from folding over limits it. So the object bends along its longest side, and two
+lattices of cubes follow, one after the other, all scaled until the surface moves by ``MOTION``.
+"""
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from mereo.deformation.maps import Deformation
+from mereo.deformation.samplers import RandomMotion, distance_from_line
 from mereo.geometry.conventions import UNITS_M
-from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, surface_points
 from mereo.geometry.mesh_check import likely_unit
+from mereo.geometry.transforms import Normalizer, fit_rigid, inverse_rigid, transform_points
 from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.volume_files import is_volume, read_label_volume, segment_surfaces
-from mereo.scenes.files.build import placed
-from mereo.scenes.files.defaults import default_deformations, default_view, random_motion, rounded
-from mereo.scenes.files.deformation_blocks import BendBlock, LatticeBlock
-from mereo.scenes.files.joints import SLIDES_ALONG, TURNS_ON, proposed_joints
+from mereo.scenes.files.deformation_blocks import BendBlock, DeformationBlock, LatticeBlock, Target
 from mereo.scenes.scene import SCENES, Workspace
+from mereo.scenes.seeds import example_rng
+
+# --- how far states move ----------------------------------------------------------------------------------------------
+
+# How far an object moves in its random states: what its shape changes by, beyond turns and shifts of the whole.
+
+STATES = 24
+
+POINTS = 800
+"""Places of the surface at which motion is measured."""
+
+Draw = Callable[[np.random.Generator], tuple[Deformation, ...]]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Motion of the surface in a typical (median) state, in shares of the object's longest side.
+
+    Attributes:
+        mean: root mean square over the surface, after the best rigid motion of the whole.
+        largest: that of the place which moves farthest, likewise.
+    """
+
+    mean: float
+    largest: float
+
+
+def motion(rest: SegmentedMesh, draw: Draw, states: int = STATES) -> Motion:
+    """Motion of an object in ``states`` random states, which are the same in every call."""
+    points, owner = material_points(rest, POINTS)
+    length = float((rest.bounds[1] - rest.bounds[0]).max())
+    means, most = [], []
+    for index in range(states):
+        moved = move(points, owner, draw(example_rng(0, index)))
+        way = np.linalg.norm(moved - transform_points(fit_rigid(points, moved), points), axis=1) / length
+        means.append(np.sqrt(np.mean(way**2)))
+        most.append(way.max())
+    return Motion(float(np.median(means)), float(np.median(most)))
+
+
+def move(
+    points: Float[np.ndarray, "n 3"], owner: Int[np.ndarray, " n"], deformations: tuple[Deformation, ...]
+) -> Float[np.ndarray, "n 3"]:
+    """Points of segments (indices ``owner``), each moved by its segment's map."""
+    result = np.empty_like(points)
+    for index in np.unique(owner):
+        rows = owner == index
+        result[rows] = deformations[index](points[rows])
+    return result
+
+
+def material_points(mesh: SegmentedMesh, count: int) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
+    """Points evenly spread over the surface of all segments, and the index of the segment of each."""
+    vertices, faces, owner = mesh.merged()
+    points, face = surface_points(vertices, faces, count)
+    return points, owner[face]
+
+
+# --- defaults ---------------------------------------------------------------------------------------------------------
+
+MOTION = 0.05
+"""Motion of the surface in a typical state, in longest sides: that of the bunny and of the liver."""
+
+LATTICES = 2
+
+MOST_STRENGTH = 0.9
+
+MOST_BEND_DEG = 120.0
+
+BEND_SHARE = 0.8
+"""Largest bend, as a share of that at which space folds over; ``samplers.FOLD_SHARE`` is the bound."""
+
+NEAR = 100.0
+"""Nearest distance of the camera, as in the paper, in scene units; farther for what would fill a wider view."""
+
+FARTHER = 1.25
+"""Farthest distance, in nearest ones. Twice, as in the paper, leaves a quarter of the picture's pixels."""
+
+MOST_VIEW_RAD = float(np.deg2rad(40.0))
+
+VIEWS = 64
+
+FRAMED = 1000
+"""Places of the surface that a view must show, and at most so many vertices of each segment."""
+
+MARGIN = 1.03
+"""Width of the picture, in widths of the widest of ``VIEWS`` views from the nearest distance."""
+
+
+UNPLACED = Normalizer(np.zeros(3), 1.0)
+
+
+def default_deformations(mesh: SegmentedMesh) -> tuple[BendBlock | LatticeBlock, ...]:
+    """Deformations under which the surface moves by about ``MOTION``, or by as much as does not fold space over.
+
+    Args:
+        mesh: segments in the file's frame and unit.
+    """
+    strength = 1.0
+    for _ in range(4):  # motion is nearly proportional to the strength
+        blocks = _blocks(mesh, strength)
+        moved = motion(mesh, random_motion(mesh, blocks, UNPLACED)).mean
+        if abs(moved / MOTION - 1) < 0.02 or (moved < MOTION and strength == 1.0):
+            break
+        strength = min(strength * MOTION / moved, 1.0)
+    return _blocks(mesh, strength)
+
+
+def _blocks(mesh: SegmentedMesh, strength: float) -> tuple[BendBlock | LatticeBlock, ...]:
+    """A bend along the longest side and ``LATTICES`` lattices, numbers rounded as they are written."""
+    low, high = mesh.bounds
+    longest = int((high - low).argmax())
+    origin, axis, length = (low + high) / 2, np.eye(3)[longest], float((high - low)[longest])
+    origin[longest] = low[longest]
+    radius = distance_from_line(mesh.merged()[0], origin, axis)
+    most = min(BEND_SHARE * np.rad2deg(length / radius), MOST_BEND_DEG)
+    x, y, z = (rounded(value) for value in origin)
+    angle, size = float(np.floor(most * strength)), rounded(length)
+    share = rounded(MOST_STRENGTH * strength, 2)
+    bend = BendBlock(type="bend", origin=(x, y, z), axis=_direction(longest), length=size, angle=(-angle, angle))
+    return (bend, *(LATTICES * [LatticeBlock(type="lattice", spacing=rounded(length / 2), strength=share)]))
+
+
+def _direction(index: int) -> tuple[float, float, float]:
+    x, y, z = np.eye(3)[index]
+    return float(x), float(y), float(z)
+
+
+def rounded(value: float, digits: int = 4) -> float:
+    """Value with so many digits that count."""
+    return float(f"{value:.{digits}g}")
+
+
+def random_motion(mesh: SegmentedMesh, blocks: tuple[DeformationBlock, ...], placement: Normalizer) -> RandomMotion:
+    """Maps that blocks draw for all segments of a mesh, which is placed already."""
+    everything = tuple(range(len(mesh.segments)))
+    target = Target(mesh, mesh.bounds, placement)
+    return RandomMotion(mesh, tuple((block.sampler(target), everything) for block in blocks))
+
+
+# --- the camera -------------------------------------------------------------------------------------------------------
+
+
+def _default_view(rest: SegmentedMesh, draw: Draw, workspace: Workspace) -> tuple[float, float, int]:
+    """Nearest and farthest distance in scene units, and field of view in degrees, that random states fill uncut."""
+    states = _states(rest, draw)
+    reach = max(float(np.linalg.norm(points - center, axis=1).max()) for points, center in states)
+    near = max(NEAR, float(np.ceil(reach / np.sin(MOST_VIEW_RAD / 2))))
+    widest = 0.0
+    for index, (points, center) in enumerate(states):
+        pose = workspace.sample(example_rng(1, index), center)
+        pose[:3, 3] = center - near * pose[:3, 2]
+        seen = transform_points(inverse_rigid(pose), points)
+        widest = max(widest, float(np.abs(seen[:, :2] / seen[:, 2:]).max()))
+    view = int(np.clip(np.ceil(np.rad2deg(2 * np.arctan(MARGIN * widest))), 5, 90))
+    return near, float(np.ceil(FARTHER * near)), view
+
+
+def _states(rest: SegmentedMesh, draw: Draw) -> list[tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "3"]]]:
+    """Places of the surface in random states, and the middle of their box, at which the camera aims."""
+    points, owner = material_points(rest, FRAMED)
+    corners = [segment.vertices[:: 1 + len(segment.vertices) // FRAMED] for segment in rest.segments]
+    owner = np.concatenate([owner, np.repeat(np.arange(len(corners)), [len(part) for part in corners])])
+    points = np.concatenate([points, *corners])
+    moved = [move(points, owner, draw(example_rng(0, index))) for index in range(VIEWS)]
+    return [(places, (places.min(axis=0) + places.max(axis=0)) / 2) for places in moved]
+
+
+def placed(mesh: SegmentedMesh, size: float) -> Normalizer:
+    """Map from the file's frame to the scene's: the joint box centred, its shortest side ``size`` long."""
+    low, high = mesh.bounds
+    shortest = float((high - low).min())
+    if not shortest > 0:
+        raise ValueError(f"the object's box has sides {(high - low).tolist()}; all must be above 0: check the meshes")
+    return Normalizer((low + high) / 2, size / shortest)
+
+
+# --- the file ---------------------------------------------------------------------------------------------------------
 
 SIZE = 20.0
 """Shortest side in scene units, as in the paper, unless the object is longer than ``LONGEST`` then."""
@@ -31,17 +214,7 @@ LABEL_CELLS = 64
 
 @dataclass(frozen=True, eq=False)
 class _Source:
-    """What the files hold.
-
-    Attributes:
-        block: the lines of the scene file that name them.
-        mesh: the segments, in the files' unit.
-        unit: the likely one.
-        reason: why.
-        up: the axis that likely points upwards, 1 for y or 2 for z.
-        up_reason: why.
-        assembly: whether the segments are parts, which may be jointed, and not regions of one body.
-    """
+    """Segments of files in their unit, the lines that name them, and the likely unit and upward axis, with reasons."""
 
     block: str
     mesh: SegmentedMesh
@@ -49,7 +222,6 @@ class _Source:
     reason: str
     up: int
     up_reason: str
-    assembly: bool = True
 
 
 def write_scene_file(
@@ -105,7 +277,7 @@ def _from_meshes(files: Sequence[Path], relative: Sequence[str]) -> _Source:
     names = tuple(re.sub(r"[^\w. -]+", "_", file.stem) for file in files)
     if repeated := sorted({name for name in names if names.count(name) > 1}):
         raise ValueError(f"two files are called {repeated[0]!r}; segments are named after them: rename one of them")
-    mesh = SegmentedMesh(tuple(_one_segment(name, file) for name, file in zip(names, files, strict=True)))
+    mesh = SegmentedMesh(tuple(_whole_file(name, file) for name, file in zip(names, files, strict=True)))
     lines = ["segments:  # one closed mesh for each; their order is that of the labels"]
     for number, (name, file) in enumerate(zip(names, relative, strict=True)):
         lines += [f"  - name: {quoted(name)}", f"    file: {quoted(file)}", f"    color: {_color(number)}"]
@@ -113,7 +285,7 @@ def _from_meshes(files: Sequence[Path], relative: Sequence[str]) -> _Source:
     return _Source("\n".join(lines), mesh, *_unit_of(files[0], mesh.bounds), *_up_of(files[0]))
 
 
-def _one_segment(name: str, file: Path) -> Segment:
+def _whole_file(name: str, file: Path) -> Segment:
     """All parts of a file."""
     vertices, faces, _ = read_segmented_mesh(file).merged()
     return Segment(name, PALETTE[0], vertices, faces)
@@ -137,7 +309,7 @@ def _from_volume(file: Path, relative: str) -> _Source:
     lines = [f"labels: {quoted(relative)}", "names:  # of the volume's values; delete what is not wanted"]
     lines += [f"  {value}: {quoted(name)}" for value, name in names.items()]
     lines.append(f"cells: {LABEL_CELLS}  # of the grid along the longest side on which surfaces are found")
-    return _Source("\n".join(lines), mesh, "mm", "the convention of NIfTI and NRRD", 2, "z is to the head", False)
+    return _Source("\n".join(lines), mesh, "mm", "the convention of NIfTI and NRRD", 2, "z is to the head")
 
 
 def _unit_of(file: Path, bounds: Float[np.ndarray, "2 3"]) -> tuple[str, str]:
@@ -168,7 +340,7 @@ def _text(name: str, source: _Source, units: str | None) -> str:
     blocks = default_deformations(source.mesh)
     rest = source.mesh.with_vertices([placement.apply(segment.vertices) for segment in source.mesh.segments])
     x, y, z = np.eye(3)[source.up].tolist()
-    view = default_view(rest, random_motion(rest, blocks, placement), Workspace(axis=(x, y, z)))
+    near, far, view = _default_view(rest, random_motion(rest, blocks, placement), Workspace(axis=(x, y, z)))
     unit, reason = (units, "as you said") if units else (source.unit, source.reason)
     bend, lattice = blocks[0], blocks[-1]
     assert isinstance(bend, BendBlock) and isinstance(lattice, LatticeBlock)
@@ -181,40 +353,20 @@ def _text(name: str, source: _Source, units: str | None) -> str:
         size=f"{size:g}",
         up=[int(k == source.up) for k in range(3)],
         up_reason=source.up_reason,
-        near=f"{view.near:g}",
-        far=f"{view.far:g}",
-        view=view.field_of_view,
+        near=f"{near:g}",
+        far=f"{far:g}",
+        view=view,
         spacing=f"{lattice.spacing:g}",
         strength=f"{lattice.strength:g}",
         end=_numbers(np.array(bend.origin)),
         axis=[int(value) for value in bend.axis],
         length=f"{bend.length:g}",
         angle=f"{bend.angle[1]:g}",
-        joints=_joints(source.mesh, source.assembly),
+        part=quoted(source.mesh.names[-1]),
+        center=_numbers(source.mesh.bounds.mean(axis=0)),
         push=f"{0.1 * sides.min():.3g}",
         reach=f"{0.5 * sides.min():.3g}",
     )
-
-
-def _joints(mesh: SegmentedMesh, assembly: bool) -> str:
-    """Comments: the joints that the parts seem to have, and what each was found from; else an example."""
-    lines = []
-    for joint in proposed_joints(mesh) if assembly else ():
-        contact = joint.contact
-        round_one = f"the round contact, radius {contact.radius:.3g},"
-        found = f"{round_one if joint.hinge else 'the flat contact'} of {{}} and {{}}".format(
-            *(mesh.names[index] for index in (contact.first, contact.second))
-        )
-        lines += [
-            f"{TURNS_ON if joint.hinge else SLIDES_ALONG} {found}",
-            f"#    segments: [{', '.join(quoted(mesh.names[index]) for index in joint.moved)}]",
-            f"#    pivot: {_numbers(contact.point)}",
-            f"#    axis: {_numbers(joint.axis)}",
-            f"#    {'angle' if joint.hinge else 'slide'}: [{joint.most[0]:.4g}, {joint.most[1]:.4g}]",
-        ]
-    if not lines:
-        return EXAMPLE_JOINT.format(part=quoted(mesh.names[-1]), center=_numbers(mesh.bounds.mean(axis=0)))
-    return "".join(line + "\n" for line in (JOINTS, *lines))
 
 
 def _color(number: int) -> str:
@@ -232,16 +384,6 @@ def _numbers(values: Float[np.ndarray, "3"]) -> str:
     largest = max(float(np.abs(values).max()), 1e-12)  # what is nothing beside it is rounding
     return "[" + ", ".join(f"{value if abs(value) > 1e-4 * largest else 0.0:.4g}" for value in values) + "]"
 
-
-JOINTS = "# Joints that the contacts suggest, in ranges without collisions; remove the '#'. The tip comes first:"
-
-EXAMPLE_JOINT = """\
-#  - type: joint  # rigid, and before what bends the whole; in a chain, the joint at the tip comes first
-#    segments: [{part}]
-#    pivot: {center}
-#    axis: [0, 0, 1]
-#    angle: [-30, 30]
-"""
 
 TEMPLATE = """\
 # A scene for mereo: what the object is, how it may deform, and from where it is seen.
@@ -269,7 +411,12 @@ camera:
 # Segments that touch should move by the same deformations, so that they stay in contact. These bend the object as if it
 # were of rubber, as far as suits soft things: for what has joints, drop them and say how its parts move.
 deformations:
-{joints}  - type: bend  # along the longest side, to any side
+#  - type: joint  # rigid, and before what bends the whole; in a chain, the joint at the tip comes first
+#    segments: [{part}]
+#    pivot: {center}
+#    axis: [0, 0, 1]
+#    angle: [-30, 30]
+  - type: bend  # along the longest side, to any side
     origin: {end}
     axis: {axis}
     length: {length}

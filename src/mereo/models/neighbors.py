@@ -48,9 +48,9 @@ def _by_rank(
     # slot `limit` collects what is not wanted: points outside, and those beyond the limit
     slot = torch.where(near & (rank <= limit), rank - 1, limit).long()
     index = torch.arange(count, device=points.device).expand_as(slot)
-    found = torch.full((*near.shape[:2], limit + 1), -1, dtype=torch.long, device=points.device)
-    found = found.scatter_(-1, slot, index)[..., :limit]
-    return torch.where(found < 0, found[..., :1], found)
+    rows = torch.full((*near.shape[:2], limit + 1), -1, dtype=torch.long, device=points.device)
+    rows = rows.scatter_(-1, slot, index)[..., :limit]
+    return torch.where(rows < 0, rows[..., :1], rows)
 
 
 @torch.library.custom_op("mereo::ball_query", mutates_args=())
@@ -72,9 +72,9 @@ def _first_in_ball(
     first = np.cumsum(count) - count
     rank = np.arange(len(row)) - first[row]
     kept = rank < limit
-    found = np.repeat(column[first][:, None], limit, axis=1)
-    found[row[kept], rank[kept]] = column[kept]
-    return found
+    result = np.repeat(column[first][:, None], limit, axis=1)
+    result[row[kept], rank[kept]] = column[kept]
+    return result
 
 
 @_by_pairs.register_fake
@@ -93,8 +93,8 @@ def nearest(queries: Float[Tensor, "b q d"], points: Float[Tensor, "b n d"], cou
     if queries.is_cuda and not torch.compiler.is_compiling():
         kernels = gpu_kernels()
         if kernels is not None and points.shape[1] <= kernels.MOST_COMPARED:
-            found: Tensor = kernels.nearest(queries, points, count)
-            return found
+            rows: Tensor = kernels.nearest(queries, points, count)
+            return rows
     if queries.device.type == "cpu" and not is_exporting():
         return _by_trees(queries.detach(), points.detach(), count)
     return squared_distances(queries, points).topk(count, dim=-1, largest=False).indices
@@ -102,8 +102,8 @@ def nearest(queries: Float[Tensor, "b q d"], points: Float[Tensor, "b n d"], cou
 
 @cache
 def gpu_kernels() -> ModuleType | None:
-    """Module ``mereo.models.ops.triton_kernels``; None without Triton, which PyTorch's CUDA builds for Linux bring."""
-    return import_module("mereo.models.ops.triton_kernels") if find_spec("triton") is not None else None
+    """Module ``mereo.models.triton_kernels``; None without Triton, which PyTorch's CUDA builds for Linux bring."""
+    return import_module("mereo.models.triton_kernels") if find_spec("triton") is not None else None
 
 
 @torch.library.custom_op("mereo::nearest", mutates_args=())
@@ -123,8 +123,8 @@ def _by_tree(queries: Float[np.ndarray, "q d"], points: Float[np.ndarray, "n d"]
     workers = torch.get_num_threads() if len(queries) >= THREADED_QUERIES else 1
     ranks = np.arange(1, count + 1)  # a list keeps the last axis where one number would drop it
     tree = _tree(points.tobytes(), points.dtype.str, points.shape[1])
-    found: np.ndarray = tree.query(queries, ranks, workers=workers)[1]
-    return found.astype(np.int64, copy=False)
+    rows: np.ndarray = tree.query(queries, ranks, workers=workers)[1]
+    return rows.astype(np.int64, copy=False)
 
 
 @lru_cache(maxsize=16)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from mereo.models.config import AutodecoderConfig, PointNet2Config, PointTransformerConfig
 from mereo.models.device import exact
-from mereo.models.ops.neighbors import ball_query, distinct_distances, gather
+from mereo.models.neighbors import ball_query, distinct_distances, gather
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +35,8 @@ class Encoding:
 
 def share(count: int, ratio: float) -> int:
     """Share of a count, ``max(1, int(count * ratio))``, also of the sizes that an exported graph leaves open."""
-    found: int = torch.sym_max(1, torch.sym_int(count * ratio))
-    return found
+    kept: int = torch.sym_max(1, torch.sym_int(count * ratio))
+    return kept
 
 
 class SharedMLP(nn.Module):

@@ -1,1 +1,0 @@
-"""Point cloud encoders: each maps a normalized cloud to an ``Encoding``."""

@@ -1,1 +1,0 @@
-"""Operations that torch lacks: ball query, batched singular values, kernels for GPUs."""
