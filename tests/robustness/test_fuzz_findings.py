@@ -116,7 +116,7 @@ CASES: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
     "complex places": ("shard-00000.safetensors", complex_centres, "its tensor 'center' has complex numbers"),
     "labels beyond all numbers": ("labels.nii", labels_of_infinity, "holds values that are no labels"),
     "arrays as of Python 2": ("view.npz", of_python_2, "view.npz is not a sample view of mereo"),
-    "a run whose recipe is a number": ("config.json", json_with(train=3), "holds no settings of a training"),
+    "a run whose recipe is a number": ("config.json", json_with(train=3), "holds a run with another train setting"),
     "a score that is a word": ("metrics.json", json_with(iou="high"), "metrics.json is not what .*'iou': Input should"),
     "scores of nothing": ("metrics.json", lambda c: c.replace(b"examples", b"e"), "says neither its scans nor its"),
     "a unit that is none": ("truth.json", json_with(unit="ell"), "its unit is 'ell'"),

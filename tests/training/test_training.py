@@ -57,20 +57,6 @@ def test_other_settings_do_not_continue_a_run(dataset: Path, finished: Path) -> 
         trainer.train(dataset, finished, replace(SMALL, learning_rate=0.1))
 
 
-def test_a_run_of_an_older_mereo_is_continued(dataset: Path, first: Path, tmp_path: Path) -> None:
-    """It does not state the settings that came later, and their defaults are what it did."""
-    shutil.copytree(first.parent, tmp_path / "run")
-    path = tmp_path / "run" / "config.json"
-    settings = json.loads(path.read_text())
-    del settings["train"]["network"]["encoder"], settings["train"]["network"]["dropout"], settings["train"]["init"]
-    del settings["train"]["learned_box"]  # which every network had then
-    path.write_text(json.dumps(settings))
-    assert trainer.train(dataset, tmp_path / "run", replace(SMALL, epochs=0.2)).read_bytes() == first.read_bytes()
-    with pytest.raises(ValueError, match="another train setting network"):
-        other = SMALL.network.changed(encoder="point-transformer")
-        trainer.train(dataset, tmp_path / "run", replace(SMALL, epochs=0.2, network=other))
-
-
 def test_a_directory_with_other_things_is_not_a_run(dataset: Path, tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("precious")
     with pytest.raises(FileExistsError, match=r"is not empty and holds no config\.json"):
