@@ -7,7 +7,7 @@ sentence each. An empty list means that the rule holds.
 import ast
 import re
 from collections import deque
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -58,6 +58,14 @@ BUDGET = {"src/mereo": (46_100, 258), "tests": (35_530, 253)}
 
 TEST_FOLDERS = ("theorems", "journeys", "robustness", "house", "support")
 """Folders of tests beside those of the rooms: see CONTRIBUTING.md."""
+
+BANNED = frozenset(
+    ("told", "said", "asked", "found", "one", "beside", "anew", "elsewhere", "wish", "here", "there", "own")
+)
+"""Words that no name of ours has as a part: they need a noun, which is then the better name (docs/glossary.md)."""
+
+MOST_PARAMETERS = 7
+"""Of a public function; more are a value that its callers have."""
 
 ROOM_ROW = re.compile(r"^\| *\[?`(\w+)/`", re.MULTILINE)
 """How a row of the table of rooms in docs/architecture.md begins; the room's name may be a link."""
@@ -220,3 +228,44 @@ def over_budget(top: Path, budget: Mapping[str, tuple[int, int]]) -> list[str]:
         if len(files) > most_files:
             faults.append(f"{folder} has {len(files)} files, more than {most_files}: merge two that are one idea")
     return faults
+
+
+# --- rules of names ---------------------------------------------------------------------------------------------------
+
+
+def banned_names(package: Package) -> list[str]:
+    """Names that a module defines, locals and parameters included, which have a banned word as a part."""
+    faults = list[str]()
+    for module, tree in package.trees.items():
+        for line, name in sorted(set(_defined_names(tree))):
+            words = re.sub(r"([a-z])([A-Z])", r"\1_\2", name).lower().split("_")
+            if BANNED & set(words) or "at_hand" in name:
+                faults.append(f"{module}.py:{line} defines {name}: call it by its noun (docs/glossary.md)")
+    return faults
+
+
+def _defined_names(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    for node in ast.walk(tree):
+        match node:
+            case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
+                yield node.lineno, name
+            case ast.Name(id=name, ctx=ast.Store()) | ast.Attribute(attr=name, ctx=ast.Store()) | ast.arg(arg=name):
+                yield node.lineno, name
+            case ast.alias(asname=str(name)):
+                yield node.lineno, name
+
+
+def long_signatures(package: Package) -> list[str]:
+    """Public functions and methods with more parameters than ``MOST_PARAMETERS``, the object itself not counted."""
+    return [
+        f"{module}.py:{node.lineno} {node.name} has {count} parameters, more than {MOST_PARAMETERS}"
+        for module, tree in package.trees.items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and not node.name.startswith("_")
+        if (count := _parameters(node.args)) > MOST_PARAMETERS
+    ]
+
+
+def _parameters(arguments: ast.arguments) -> int:
+    names = [argument.arg for argument in (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs)]
+    return len(names) - (names[:1] in (["self"], ["cls"]))

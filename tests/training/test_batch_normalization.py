@@ -11,7 +11,7 @@ import torch
 import torch.distributed as dist
 from torch import nn
 
-from mereo.training.processes import Process, SharedBatchNorm, adapt_momentum, share_statistics
+from mereo.training.processes import Process, SharedBatchNorm, share_statistics
 
 CPU = torch.device("cpu")
 
@@ -68,14 +68,3 @@ def test_in_use_it_has_its_running_statistics() -> None:
 def test_one_process_keeps_torchs() -> None:
     network = nn.Sequential(nn.BatchNorm1d(4))
     assert share_statistics(network, Process(), CPU) is network and type(network[0]) is nn.BatchNorm1d
-
-
-def test_running_statistics_move_as_far_in_parts() -> None:
-    """In as many updates as there are parts; here all parts have the statistics of the whole."""
-    rows, whole, parted = torch.rand(32, 5).repeat(4, 1), nn.BatchNorm1d(5), nn.BatchNorm1d(5)
-    adapt_momentum(nn.Sequential(parted), 4)
-    whole(rows[:32])
-    for part in rows.chunk(4):
-        parted(part)
-    for name in ("running_mean", "running_var"):
-        assert torch.allclose(getattr(parted, name), getattr(whole, name))
