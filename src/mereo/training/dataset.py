@@ -137,8 +137,8 @@ def augment_batch(batch: Batch, augment: AugmentConfig, draws: Draws) -> Batch:
     jitter = augment.jitter_std * draws.rand(count, 1) * draws.randn(*batch.cloud.shape[:2])
     angle = 2 * torch.pi * draws.rand(count) if augment.roll else torch.zeros(count)
     cosine, sine = angle.cos().to(device), angle.sin().to(device)
-    zero, one = torch.zeros_like(cosine), torch.ones_like(cosine)
-    roll = torch.stack([cosine, -sine, zero, sine, cosine, zero, zero, zero, one], dim=-1).view(count, 3, 3)
+    zero, unit = torch.zeros_like(cosine), torch.ones_like(cosine)
+    roll = torch.stack([cosine, -sine, zero, sine, cosine, zero, zero, zero, unit], dim=-1).view(count, 3, 3)
     origin = batch.viewpoint[:, None]
     # depth noise moves a point along its ray: p = v + (p - v) * (z + noise) / z
     rays = batch.cloud - origin
