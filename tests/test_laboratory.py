@@ -10,8 +10,7 @@ from browser import BROWSER, Page, pixels_of, until
 from toy_scene import rest_mesh, toy_scene
 
 from mereo.evaluation.cases import labels_on
-from mereo.evaluation.ground_truth import truth_grid
-from mereo.evaluation.metrics import Scores
+from mereo.evaluation.metrics import Scores, truth_grid
 from mereo.fitting.registration.register import Registrar
 from mereo.geometry.transforms import transform_points
 from mereo.models.model import Model

@@ -7,8 +7,8 @@ import pytest
 from align_cases import object_at_rest, perturbed, pose_error, scan_of, true_poses
 from shapes import ball
 
-from mereo.evaluation.registration.icp import Matches, Registration, exposed, icp, load_icp, moved
-from mereo.evaluation.registration.placement import Placement, Start, _check_runaway, place
+from mereo.evaluation.icp import Matches, Registration, exposed, icp, load_icp, moved
+from mereo.evaluation.placement import Placement, Start, _check_runaway, place
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import transform_points
 

@@ -8,7 +8,7 @@ import pytest
 from align_cases import object_at_rest
 from scipy.spatial.transform import Rotation
 
-from mereo.evaluation.registration.placement import pose_of_pairs, read_start
+from mereo.evaluation.placement import pose_of_pairs, read_start
 from mereo.geometry.transforms import rigid, transform_points
 
 SCALE = 2.5

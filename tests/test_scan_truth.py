@@ -13,11 +13,10 @@ from align_cases import bar_scan, perturbed, pose_error
 from analytic import AnalyticModel
 
 from mereo.__main__ import main
+from mereo.evaluation.icp import moved
 from mereo.evaluation.metrics import Scores
-from mereo.evaluation.registration.icp import moved
-from mereo.evaluation.registration.placement import Start, place, start_from_model
-from mereo.evaluation.registration.truth_file import read_truth
-from mereo.evaluation.scans import BUNNY_SCAN_POSES, SCANS, bunny_posed, bunny_scan
+from mereo.evaluation.placement import Start, place, start_from_model
+from mereo.evaluation.scans import BUNNY_SCAN_POSES, SCANS, bunny_posed, bunny_scan, read_truth
 from mereo.evaluation.scoring import EvaluationConfig, evaluate
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids

@@ -14,7 +14,7 @@ from mereo.training.config import PresetName
 from mereo_experiments.paper.scales import ExperimentName, ScaleName
 
 if TYPE_CHECKING:
-    from mereo.evaluation.registration.placement import Placement
+    from mereo.evaluation.placement import Placement
 
 
 @dataclass(frozen=True)
@@ -56,9 +56,9 @@ class Align:
                 f"{'no start is' if self.start is None else 'two starts are'} given; one is needed: --start FILE or "
                 "--weights NAME (docs/own-object.md says how to make a start file)"
             )
-        from mereo.evaluation.registration.icp import load_icp
-        from mereo.evaluation.registration.placement import place, read_start, start_from_model
-        from mereo.evaluation.registration.truth_file import TRUTH, ScanFile, write_truth
+        from mereo.evaluation.icp import load_icp
+        from mereo.evaluation.placement import place, read_start, start_from_model
+        from mereo.evaluation.scans import TRUTH, ScanFile, write_truth
         from mereo.geometry.conventions import UNITS_M
         from mereo.io.output_folders import new_directory
         from mereo.io.readers import read_point_cloud

@@ -1,8 +1,8 @@
-"""Scores on test sets (paper, appendix B), and on synthetic views of a scene; for real scans see ``scan_scoring``.
+"""Scores on test sets (paper, appendix B): synthetic views of a scene, and real scans.
 
 The joint box of all true segments is divided into 100^3 cells; their centres are labelled by the truth and by the
 model, and those outside every segment's enlarged box are dropped. One confusion matrix is summed over the whole set;
-IoU and mIoU come from it, and the mean over single examples is reported beside it.
+IoU and mIoU come from it, and the mean over single examples is reported as well.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,18 +16,16 @@ from jaxtyping import Float, UInt8
 
 from mereo.evaluation.cases import (
     Evaluation,
-    EvaluationTally,
     ScoredCase,
     Scoring,
     TestCase,
+    evaluation_of,
     grid_confusion,
     names_for,
     network_labels,
 )
-from mereo.evaluation.ground_truth import TruthGrid, truth_grid
-from mereo.evaluation.metrics import Scores, intersection_over_union
-from mereo.evaluation.registration.truth_file import read_truth
-from mereo.evaluation.scans import SCANS, PosedScan, bunny_posed
+from mereo.evaluation.metrics import Scores, TruthGrid, intersection_over_union, truth_grid
+from mereo.evaluation.scans import SCANS, PosedScan, bunny_posed, read_truth
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.register import CURE, Registrar, other_mesh, registrar_for
 from mereo.geometry.camera import PointCloud
@@ -146,8 +144,7 @@ def evaluate(
     case = partial(scene_case, scene, config.settings, seed, config.cells)
     unit_mm = None if scene.unit_m is None else 1000 * scene.unit_m
     registrar = registrar_for(model, method, scene)
-    found = score_cases(model, case, config.examples, progress, registrar, workers=workers)
-    return replace(found, unit_mm=unit_mm)
+    return replace(score_cases(model, case, config.examples, progress, registrar, workers=workers), unit_mm=unit_mm)
 
 
 def trained_scene(model: Model) -> str:
@@ -198,18 +195,16 @@ def score_cases(
     """
     gpu = isinstance(workers, Cluster) and workers.gpus > 0
     # asking which answers there are draws the states in which a fit begins: once, here, and not in every task
-    scoring, tally = Scoring(model, registrar, case, kept, gpu), EvaluationTally(model, names_for(registrar))
+    scoring, answers = Scoring(model, registrar, case, kept, gpu), names_for(registrar)
     scored: dict[int, ScoredCase] = {}
     with (
-        closing(spread(scoring, range(count), workers)) as found,
+        closing(spread(scoring, range(count), workers)) as results,
         stage("evaluate", count, "views", quiet=not progress) as shown,
     ):
-        for number, one in found:
-            scored[number] = one
+        for number, result in results:
+            scored[number] = result
             shown.advance()
-    for number in range(count):
-        tally.add(scored[number])
-    return tally.evaluation()
+    return evaluation_of(model, [scored[number] for number in range(count)], answers)
 
 
 # --- real scans -------------------------------------------------------------------------------------------------------

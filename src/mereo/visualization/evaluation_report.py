@@ -15,7 +15,7 @@ from jaxtyping import Int
 from PIL import Image
 
 from mereo.evaluation.metrics import format_score
-from mereo.evaluation.tables import coverage_line, recognition_line
+from mereo.evaluation.tables import certainty_lines
 from mereo.geometry.mesh import Color
 from mereo.io.atomic_files import atomic_file
 from mereo.visualization.reconstruction_report import BUDGET_BYTES
@@ -76,7 +76,7 @@ def write_evaluation_report(
             f"<h1>{escape(title)}</h1>",
             f"<p>{escape('  ·  '.join(shown))}</p>",
             _overall(metrics["iou"], metrics["miou"], mean["iou"], mean["miou"]),
-            _sure(metrics.get("coverage95"), metrics.get("known")),
+            _sure(metrics),
             f'<div class="pair">{_segments(metrics["per_segment"], colors)}{_examples(metrics["per_example"])}</div>',
             _confusion(("empty", *names), metrics["confusion"]),
             _reliability(metrics.get("reliability") or [], metrics.get("ece"), metrics.get("calibrated") is True),
@@ -106,10 +106,9 @@ def _overall(*figures: float) -> str:
     return f'<section><div class="big">{shown}</div></section>'
 
 
-def _sure(radii: Mapping[str, Any] | None, known: Mapping[str, float] | None) -> str:
-    """How often true places lie within the radii that a registration gives, and frames are said to show the object."""
-    lines = ["" if radii is None else coverage_line(radii), "" if known is None else recognition_line(known)]
-    text = "".join(f"<p>{escape(line)}</p>" for line in lines if line)
+def _sure(metrics: Mapping[str, Any]) -> str:
+    """How often true positions lie within a registration's radii, and frames are said to show the object."""
+    text = "".join(f"<p>{escape(line)}</p>" for line in certainty_lines(metrics))
     return f"<section><h2>How sure</h2>{text}</section>" if text else ""
 
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from mereo.evaluation.registration.placement import Placement
-from mereo.evaluation.registration.truth_file import ScanFile
+from mereo.evaluation.placement import Placement
+from mereo.evaluation.scans import ScanFile
 from mereo.geometry.camera import PointCloud, camera_axes
 from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import SegmentedMesh

@@ -15,8 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mereo.evaluation.cases import grid_confusion, labels_on
-from mereo.evaluation.ground_truth import truth_grid
-from mereo.evaluation.metrics import Scores, intersection_over_union
+from mereo.evaluation.metrics import Scores, intersection_over_union, truth_grid
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import Camera, PointCloud

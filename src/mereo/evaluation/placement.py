@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
-from mereo.evaluation.registration.icp import (
+from mereo.evaluation.icp import (
     CONTACT,
     SEGMENT_LIMITS,
     WHOLE_LIMITS,
