@@ -257,7 +257,7 @@ def test_an_empty_prediction_can_be_drawn(tmp_path: Path) -> None:
 # --- sheets ----------------------------------------------------------------------------------------------------------
 
 
-def test_the_preview_shows_cloud_and_segments_and_turns_with_the_frame(tmp_path: Path) -> None:
+def test_the_preview_shows_cloud_and_segments(tmp_path: Path) -> None:
     mesh = SegmentedMesh((ball((0, 0, 2), 0.3, (255, 0, 0)), ball((0.5, 0, 2), 0.2, (0, 0, 255), "nose")))
     lost = Segment("lost", (0, 255, 0), np.empty((0, 3)), np.empty((0, 3), dtype=np.int64))
     mesh = SegmentedMesh((*mesh.segments, lost))
@@ -266,11 +266,6 @@ def test_the_preview_shows_cloud_and_segments_and_turns_with_the_frame(tmp_path:
     picture = np.asarray(Image.open(tmp_path / "camera.png"))
     assert hue_is(picture, (255, 0, 0)).sum() > 300
     assert hue_is(picture, (0, 0, 255)).sum() > 100
-    # the same things in a y-up frame with z toward the viewer give the same picture
-    flip = rigid(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
-    turned = PointCloud(cloud.points @ flip[:3, :3].T)
-    render_cloud_and_segments(tmp_path / "up.png", turned, mesh.transformed(flip), "title", 90, np.eye(3))
-    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "up.png")), picture)
 
 
 def test_a_preview_of_states_has_three_pictures_for_each_state(tmp_path: Path) -> None:

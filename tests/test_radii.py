@@ -8,7 +8,7 @@ from mereo.evaluation.cases import RegistrationErrors
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.radii import Radii, rounded_to
 from mereo.models.calibration import RadiusFactors
-from mereo.visualization.vertex_colors import radius_scale
+from mereo.visualization.color_scales import radius_scale
 
 
 def some_radii() -> Radii:

@@ -24,7 +24,7 @@ from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
-from mereo.visualization.evaluation_files import evaluate_weights
+from mereo.visualization.evaluation_report import evaluate_weights
 
 pytest.importorskip("small_gicp", reason="the extra align is not installed")
 
@@ -128,7 +128,7 @@ def test_a_truth_file_never_runs_a_python_scene_that_the_user_has_not_named(
             read_truth(truth)
         assert not (folder / "was-run").exists()
     model = AnalyticModel.of(lambda points: points, ("left", "right"))
-    monkeypatch.setattr("mereo.visualization.evaluation_files.load_for", lambda *_: model)
+    monkeypatch.setattr("mereo.visualization.evaluation_report.load_for", lambda *_: model)
     monkeypatch.setattr("mereo.evaluation.scoring.check_names", lambda _, names: named.append(names))
     monkeypatch.setattr("mereo.evaluation.scoring.registrar_for", lambda *_: sys.exit("read"))
     named: list[tuple[str, ...]] = []

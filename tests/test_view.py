@@ -21,13 +21,11 @@ from toy_scene import rest_mesh
 
 from mereo.geometry.camera import PointCloud
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
+from mereo.visualization.color_scales import ColorScale
 from mereo.visualization.units import Unit
-from mereo.visualization.vertex_colors import ColorScale
-from mereo.visualization.viewer import html
 from mereo.visualization.viewer import server as viewer_server
-from mereo.visualization.viewer.display import CLOUD_SIZES, POINT_SHARE, point_size
-from mereo.visualization.viewer.probe import Probed
-from mereo.visualization.viewer.result_page import Content, ResultPage
+from mereo.visualization.viewer.display import CLOUD_SIZES, POINT_SHARE, chips, heading, message, point_size
+from mereo.visualization.viewer.result_page import Content, Probed, ResultPage
 
 needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
 needs_browser = pytest.mark.skipif(
@@ -93,7 +91,7 @@ def test_points_give_way_to_colours_and_a_probe_is_shown(server: object) -> None
     page.coloring.value = "segment"
     assert nodes["/cloud"].visible
     page.move_probe(np.array([0.0, 0.0, 148.0]))
-    assert "box_1" in page.told.content and "2 mm inside the nearest surface" in page.told.content
+    assert "box_1" in page.facts.content and "2 mm inside the nearest surface" in page.facts.content
     assert nodes["/probe"].visible and nodes["/arrow"].visible
 
 
@@ -267,9 +265,9 @@ def test_names_cannot_break_the_panels() -> None:
         np.array([[4.0, 5.0, 6.0]]),
     )
     place = np.array([0.001, 0.002, 0.003])
-    text = html.answer(answer, ("empty", name), ((0, 0, 0), (1, 2, 3)), place, Unit(1.0))
+    text = probe_html(answer, ("empty", name), ((0, 0, 0), (1, 2, 3)), place, Unit(1.0))
     shown = re.sub(r"<[^>]+>", " ", text)
-    assert "<script" not in text + html.chips((name,), ((1, 2, 3),)) + html.heading(name, name) + html.message(name)
+    assert "<script" not in text + chips((name,), ((1, 2, 3),)) + heading(name, name) + message(name)
     for told in (
         "0.75",
         "2 mm inside the nearest surface",

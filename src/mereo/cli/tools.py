@@ -67,7 +67,7 @@ class Align:
         from mereo.scenes.registry import files_of, is_yaml, load_scene
         from mereo.scenes.scene import SCENES
         from mereo.visualization.contact_sheets import save_png
-        from mereo.visualization.scan_overlay import overlay
+        from mereo.visualization.previews import overlay
 
         load_icp()  # its absence is better said before the work
         scan = ScanFile(self.scan, self.unit, self.frame, self.drop_invalid)

@@ -32,10 +32,19 @@ from mereo.scenes.scene import Scene
 from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor
 from mereo.synthesis.depth_sensor import observe
 from mereo.synthesis.examples import View
-from mereo.visualization.depth_picture import depth_picture
-from mereo.visualization.viewer import html
-from mereo.visualization.viewer.display import Display, PointLayer, SegmentControls, SegmentLayer, enlarged
-from mereo.visualization.viewer.probe import source_of
+from mereo.visualization.contact_sheets import depth_picture
+from mereo.visualization.viewer.display import (
+    Display,
+    PointLayer,
+    SegmentControls,
+    SegmentLayer,
+    chips,
+    enlarged,
+    heading,
+    message,
+    score_table,
+)
+from mereo.visualization.viewer.result_page import source_of
 from mereo.visualization.viewer.server import OpenPage, import_viser, start_server
 
 PIXELS = 64
@@ -269,11 +278,11 @@ class LabPage:
         network = self.laboratory.network
         facts = "no weights: a search finds the object" if network is None else f"weights {network.name}"
         with panel.add_tab("Frame"):
-            gui.add_html(html.heading(f"Laboratory: {self.laboratory.scene.name}", facts))
+            gui.add_html(heading(f"Laboratory: {self.laboratory.scene.name}", facts))
             self.picture = gui.add_image(np.zeros((320, 320, 3), dtype=np.uint8), format="png")
             self.scores = gui.add_html("")
-            self.status = gui.add_html(html.message("starting"))
-        gui.add_html(html.chips(rest.names, rest.colors))
+            self.status = gui.add_html(message("starting"))
+        gui.add_html(chips(rest.names, rest.colors))
         gui.add_button("Random state").on_click(lambda _: self.randomize())
         gui.add_button("Reconstruct").on_click(lambda _: self.reconstruct())
         self._build_camera()
@@ -344,7 +353,7 @@ class LabPage:
                 self._say(words_of(error), bad=True)
                 return
             surfaces = self.trial.surfaces
-            self.scores.content = html.scores(self.trial.scores, surfaces.names, surfaces.colors)
+            self.scores.content = score_table(self.trial.scores, surfaces.names, surfaces.colors)
             self._say(f"{self.trial.source}; {self.trial.seconds:.1f} s; scored on {CELLS}³ points")
             self._draw()
             self._look("camera")
@@ -366,7 +375,7 @@ class LabPage:
             self._look("camera")
 
     def _say(self, text: str, bad: bool = False) -> None:
-        self.status.content = html.message(text, bad)
+        self.status.content = message(text, bad)
 
     def _toward(self) -> Float[np.ndarray, "3"]:
         """Direction from the object to the camera."""
