@@ -66,16 +66,16 @@ def test_a_registration_is_as_far_off_as_its_points_are(model: Model, view: View
     cloud = view.depth.to_points()
     found = Registrar.of(model, "modes").register(CloudToFit(cloud.points, scene_unit=1.0))
     shown = seen_points(truth, cloud, 1.0)
-    exact = RegistrationErrors.of(replace(found, material=truth), truth, shown)
+    exact = RegistrationErrors.of(replace(found, material=truth), truth, shown, 1.0)
     assert exact.distances.max() == 0.0 and len(exact.distances) == len(truth) and 0 < exact.seen.sum() < len(truth)
-    shifted = RegistrationErrors.of(replace(found, material=truth + np.array([0.0, 3.0, 0.0])), truth, shown)
+    shifted = RegistrationErrors.of(replace(found, material=truth + np.array([0.0, 3.0, 0.0])), truth, shown, 1.0)
     parts = shifted.summary(unit_mm=2.0)
     for part in ("seen", "hidden"):
         assert parts[part] == pytest.approx({"median": 3.0, "p95": 3.0, "median_mm": 6.0, "p95_mm": 6.0})
     # the same in another unit of length
     large_shown = seen_points(5 * truth, PointCloud(5 * cloud.points), 5.0)
-    moved = replace(found, material=5 * truth + np.array([0.0, 15.0, 0.0]), scene_unit=5 * found.scene_unit)
-    large = RegistrationErrors.of(moved, 5 * truth, large_shown)
+    moved = replace(found, material=5 * truth + np.array([0.0, 15.0, 0.0]))
+    large = RegistrationErrors.of(moved, 5 * truth, large_shown, 5.0)
     np.testing.assert_allclose(large.distances, shifted.distances)
 
 

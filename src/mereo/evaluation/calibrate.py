@@ -128,12 +128,6 @@ def calibrate(
 CAMERAS: tuple[Sensor, ...] = ("paper", "structured-light", "paper", "time-of-flight")
 """Cameras of the views, in turn: half of them clean."""
 
-LIVERS = ("liver", "tumor", "liver-simulated")
-"""Scenes of one liver, of which one is as good as another to be told from other objects."""
-
-OF_OTHERS, OF_PLANES, OF_HEAPS = range(1, 4)
-"""Seeds of what is strange, beyond that of the views; each has a stream of its own."""
-
 
 @dataclass(frozen=True, eq=False)
 class CalibrationView:
@@ -185,21 +179,22 @@ def strange_frames(
     settings = GenerateConfig()
     for other in others:
         for index in range(each):
-            view = sample_view(other, settings, example_rng(seed + OF_OTHERS, index))
+            view = sample_view(other, settings, example_rng(seed + 1, index))
             yield "other object", view.depth.to_points()
     for index in range(4 * each):
-        plane, heap = (example_rng(seed + offset, index) for offset in (OF_PLANES, OF_HEAPS))
+        plane, heap = example_rng(seed + 2, index), example_rng(seed + 3, index)
         yield "plane or clutter", stranger_cloud(scene, "plane", settings, plane)
         yield "plane or clutter", stranger_cloud(scene, "clutter", settings, heap)
 
 
 def other_objects(scene: Scene) -> list[Scene]:
     """Built-in scenes of other objects than this one, whose meshes are here."""
-    same = LIVERS if scene.name in LIVERS else (scene.name,)
+    livers = ("liver", "tumor", "liver-simulated")  # of one liver: one is as good as another to be told from the rest
+    same = livers if scene.name in livers else (scene.name,)
     others = []
     for name in SCENES:
         with suppress(AssetUnavailable):
-            if name not in (*same, *LIVERS[1:]):
+            if name not in (*same, *livers[1:]):
                 others.append(load_scene(name))
     return others
 
@@ -273,17 +268,6 @@ FIELDS = (
 LEAST = 4
 """Views without which nothing is said."""
 
-NOISY = 16
-"""Noisy views that are enough: their fits take longest."""
-
-WRONG_STATE = 5.0
-"""Radii by which half of a noisy view's points are off where its fit has ended in a wrong state. One such view in
-twenty would be all that the scale is made of, and of a camera's views there are more; recognition is to tell them."""
-
-USUALLY = 0.9
-"""Share of the views in which network and registered model are no farther apart than usual. A few views may hold none
-that ended in a wrong state, so that it cannot be measured from where on they do."""
-
 
 @dataclass(frozen=True, eq=False)
 class MeasuredRadii:
@@ -305,7 +289,7 @@ class MeasuredRadii:
     def of(cls, view: CalibrationView, candidate: Candidate, registration: Registration) -> "MeasuredRadii":
         """Measurement of a registration that was made of a candidate, by weights that are not calibrated."""
         truth = view.material(registration.model)
-        errors = RegistrationErrors.of(registration, truth, seen_points(truth, view.seen, 1.0))
+        errors = RegistrationErrors.of(registration, truth, seen_points(truth, view.seen, 1.0), 1.0)
         assert registration.optimum is not None and candidate.modes is not None
         misfit = candidate.modes.problem.cloud_misfit(registration.optimum.surface)
         return cls(errors, misfit, candidate.displaced(registration) or 0.0, registration.model.half)
@@ -336,7 +320,7 @@ class ViewRadii:
         self._noisy_views += not view.is_clean
         if candidate is None or candidate.modes is None or registration is None:
             return
-        if not view.is_clean and self._noisy_views > NOISY:
+        if not view.is_clean and self._noisy_views > 16:  # which are enough: their fits take longest
             return
         full = None if self.full is None else self.full.finish(candidate.modes)
         for kind, fit in enumerate((registration, full)):
@@ -350,7 +334,9 @@ class ViewRadii:
             if len(clean) >= LEAST:
                 factors = factors_of(clean)
                 fields |= {scale: factors.scale, misfit: factors.misfit, displaced: factors.displaced}
-            right = [view.errors for view in noisy if np.median(view.errors.ratios) <= WRONG_STATE]
+            # of which half of the points are farther off, a fit has ended in a wrong state. One such view in twenty
+            # would be all that the scale is made of, and of a camera's views there are more; recognition tells them
+            right = [view.errors for view in noisy if np.median(view.errors.ratios) <= 5.0]
             if len(right) >= LEAST:
                 fields[noisy_scale] = RegistrationErrors.together(right).scale()
         return fields
@@ -359,7 +345,8 @@ class ViewRadii:
 def factors_of(views: Sequence[MeasuredRadii]) -> RadiusFactors:
     """Factors by clean views, those that ended in a wrong state included: users meet them."""
     misfit = float(np.median([view.misfit for view in views]))
-    displaced = float(np.quantile([view.displaced for view in views], USUALLY))
+    # a few views may hold none that ended in a wrong state, so it cannot be measured from where on they do
+    displaced = float(np.quantile([view.displaced for view in views], 0.9))
     factors = RadiusFactors(None, misfit or None, displaced or None)
     scale = RegistrationErrors.together([view.widened(factors) for view in views]).scale()
     return replace(factors, scale=scale)
@@ -385,20 +372,6 @@ The first three are 0 in most views, where what is added to them alone is left."
 
 TRUSTED = 4
 """Views from which on their mean and standard deviation are taken; from fewer, the conservative ones."""
-
-MOSTLY, ABOVE = 0.95, 1.25
-"""The first limit: that quantile of the strangeness of the object's views, times this: there are few of these.
-
-Not their largest: a camera's view that the network misread may well be called strange."""
-
-LEAST_UNSURE = 3.0
-"""Smallest first limit, standard deviations."""
-
-APART = 1.6
-"""The second limit at least, in the first."""
-
-STRANGE = 0.1
-"""Quantile of the strangeness of other things: the second limit is in the middle between it and the first, by ratio."""
 
 
 @dataclass
@@ -433,10 +406,12 @@ class RecognitionSigns:
         noisy = usual_of(self.noisy) if len(self.noisy) >= TRUSTED else dict(CONSERVATIVE.noisy)
         objects = [strangeness(signs.strange(clean)) for signs in self.clean]
         objects += [strangeness(signs.strange(noisy)) for signs in self.noisy]
-        unsure = max(ABOVE * float(np.quantile(objects, MOSTLY)), LEAST_UNSURE)
+        # not the largest: a camera's view that the network misread may well be called strange
+        unsure = max(1.25 * float(np.quantile(objects, 0.95)), 3.0)
         others = [strangeness(signs.strange(noisy if is_noise else clean)) for signs, is_noise in self.strange]
-        lowest = float(np.quantile(others, STRANGE)) if others else unsure * APART**2
-        refused = max(float(np.sqrt(unsure * lowest)), APART * unsure)
+        apart = 1.6  # the second limit at least, in the first; else it is in the middle between it and other things
+        lowest = float(np.quantile(others, 0.1)) if others else unsure * apart**2
+        refused = max(float(np.sqrt(unsure * lowest)), apart * unsure)
         return Recognizing(clean=clean, noisy=noisy, unsure=unsure, refused=refused)
 
 
@@ -460,12 +435,6 @@ def usual_of(signs: Sequence[Signs]) -> dict[SignName, Usual]:
 
 Stranger = Literal["plane", "clutter"]
 
-FEWEST, MOST = 3, 8
-"""Bodies in a heap."""
-
-STEEPEST_RAD = 1.2
-"""Largest angle between a plane's normal and the line of sight."""
-
 
 def stranger_cloud(scene: Scene, kind: Stranger, settings: GenerateConfig, rng: np.random.Generator) -> PointCloud:
     """Cloud of a plane or a heap, about as large as a scene's object, by a camera as far away as the scene's."""
@@ -488,22 +457,22 @@ def stranger_cloud(scene: Scene, kind: Stranger, settings: GenerateConfig, rng: 
 
 
 def _plate(size: float, rng: np.random.Generator) -> trimesh.Trimesh:
-    """Flat box, turned by up to ``STEEPEST_RAD`` from the line of sight."""
+    """Flat box, whose normal is turned by up to 1.2 rad from the line of sight."""
     plate = trimesh.creation.box([*(rng.uniform(0.5, 1.0, size=2) * size), 0.01 * size])
     roll = Rotation.from_euler("z", rng.uniform(0.0, 2 * np.pi))
-    tilt = Rotation.from_euler("zx", [rng.uniform(0.0, 2 * np.pi), rng.uniform(0.0, STEEPEST_RAD)])
+    tilt = Rotation.from_euler("zx", [rng.uniform(0.0, 2 * np.pi), rng.uniform(0.0, 1.2)])
     return _placed(plate, tilt * roll, np.zeros(3))
 
 
 def _heap(size: float, rng: np.random.Generator) -> list[trimesh.Trimesh]:
-    """Boxes, balls and cylinders of a tenth to a half of ``size``, anywhere within it, any way up."""
+    """Three to eight boxes, balls and cylinders of a tenth to a half of ``size``, anywhere within it, any way up."""
     makers: tuple[Callable[[Float[np.ndarray, "3"]], trimesh.Trimesh], ...] = (
         lambda sides: trimesh.creation.box(sides),
         lambda sides: trimesh.creation.icosphere(subdivisions=2, radius=sides[0] / 2),
         lambda sides: trimesh.creation.cylinder(radius=sides[0] / 3, height=1.5 * sides[1], sections=24),
     )
     bodies = []
-    for _ in range(int(rng.integers(FEWEST, MOST + 1))):
+    for _ in range(int(rng.integers(3, 9))):
         body = makers[int(rng.integers(len(makers)))](rng.uniform(0.1, 0.5, size=3) * size)
         turned = Rotation.from_quat(rng.normal(size=4))
         bodies.append(_placed(body, turned, rng.uniform(-0.35, 0.35, size=3) * size))

@@ -39,13 +39,10 @@ from mereo.scenes.statistical_model import StatisticalModel
 #
 # Registration, truth -RegistrationErrors.of-> errors of each view -together, scale-> Calibration.radius_scale
 
-SEEN_WITHIN = 1.5
-"""Distance in scene units up to which a material point counts as seen: that of the nearest observed point."""
-
 
 def seen_points(truth: Float[np.ndarray, "m 3"], cloud: PointCloud, scene_unit: float) -> Bool[np.ndarray, " m"]:
-    """Which material points a cloud shows, by their true positions in its frame and unit."""
-    near: Bool[np.ndarray, " m"] = cKDTree(cloud.points).query(truth)[0] <= SEEN_WITHIN * scene_unit
+    """Which material points a cloud shows: those whose true positions are within 1.5 scene units of an observed one."""
+    near: Bool[np.ndarray, " m"] = cKDTree(cloud.points).query(truth)[0] <= 1.5 * scene_unit
     return near
 
 
@@ -72,7 +69,11 @@ class RegistrationErrors:
 
     @classmethod
     def of(
-        cls, registration: Registration, truth: Float[np.ndarray, "m 3"], seen: Bool[np.ndarray, " m"]
+        cls,
+        registration: Registration,
+        truth: Float[np.ndarray, "m 3"],
+        seen: Bool[np.ndarray, " m"],
+        scene_unit: float,
     ) -> "RegistrationErrors":
         """Errors of one view, with the radii that its registration has, calibrated if the weights are.
 
@@ -81,6 +82,7 @@ class RegistrationErrors:
             truth: true positions of its material points, vertices and interior ones, or of the first of them, in its
                 frame and unit.
             seen: which of these the cloud shows (``seen_points``).
+            scene_unit: true length of a scene unit in that unit, which the registration may have estimated.
 
         Raises ``ValueError`` for a registration without an optimum.
         """
@@ -88,10 +90,12 @@ class RegistrationErrors:
         if sure is None:
             raise ValueError("the registration was read from a file, which has no posterior: fit its frame again")
         count, unit = len(truth), sure.optimum.unit / registration.scene_unit
-        off = np.linalg.norm(registration.material[:count] - truth, axis=1) / registration.scene_unit
+        distances = np.linalg.norm(registration.material[:count] - truth, axis=1)
+        off = distances / registration.scene_unit
         gaussian, other = unit * sure.parts.gaussian[:count], unit * np.hypot(sure.parts.open[:count], sure.beside)
         ratios = np.sqrt(np.maximum(off**2 - other**2, 0.0)) / gaussian
-        return cls(off, ratios, gaussian, other, seen, registration.radius_scale is not None).scaled(sure.scale)
+        errors = cls(distances / scene_unit, ratios, gaussian, other, seen, registration.radius_scale is not None)
+        return errors.scaled(sure.scale)
 
     @classmethod
     def together(cls, each: Sequence["RegistrationErrors"]) -> "RegistrationErrors":
@@ -552,7 +556,8 @@ def _errors(case: TestCase, registration: Registration | None) -> RegistrationEr
     if registration is None or case.material is None or case.scene_unit is None:
         return None
     truth = case.material(registration.model)
-    return RegistrationErrors.of(registration, truth, seen_points(truth, case.cloud, case.scene_unit))
+    seen = seen_points(truth, case.cloud, case.scene_unit)
+    return RegistrationErrors.of(registration, truth, seen, case.scene_unit)
 
 
 def _evaluated_view(case: TestCase, model: Trained, candidates: Candidates, colors: Sequence[Color]) -> EvaluatedView:

@@ -60,9 +60,6 @@ def format_score(score: float | None, missing: str = "-") -> str:
 
 # --- ground truth -----------------------------------------------------------------------------------------------------
 
-BOX_MARGIN = 0.25
-"""Share of its size by which a segment's box is enlarged on each side: by 50 % in all, as in the paper."""
-
 
 @dataclass(frozen=True, eq=False)
 class TruthGrid:
@@ -91,7 +88,7 @@ def truth_grid(mesh: SegmentedMesh, cells: int = 100) -> TruthGrid:
     kept = np.zeros((cells, cells, cells), dtype=bool)
     for segment in mesh.segments:
         first, last = segment.bounds
-        margin = BOX_MARGIN * (last - first)
+        margin = 0.25 * (last - first)  # on each side: 50 % in all, as in the paper
         inside = [(c >= a) & (c <= b) for c, a, b in zip((x, y, z), first - margin, last + margin, strict=True)]
         kept[np.ix_(*inside)] = True
     return TruthGrid(LabelGrid(label_grid(mesh, x, y, z), origin, spacing, mesh.names), kept)

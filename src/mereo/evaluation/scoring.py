@@ -34,7 +34,7 @@ from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.progress import progress as stage
 from mereo.models.model import Model
 from mereo.models.remote import to_cpu
-from mereo.models.trained import EncodedCloud, Trained
+from mereo.models.trained import Trained
 from mereo.reconstruction.pipeline import segment_names
 from mereo.scenes.random_states import state_points
 from mereo.scenes.registry import load_scene
@@ -44,9 +44,6 @@ from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import View, sample_view
 from mereo.workers.spread import Cluster, spread
-
-KEPT_VIEWS = 4
-"""Number of examples, the first ones, that keep their labels and are drawn with their errors."""
 
 CELLS = 100
 """Cells of the paper's grid along each axis."""
@@ -80,21 +77,20 @@ class EvaluationConfig:
 # --- one cloud -------------------------------------------------------------------------------------------------------
 
 
-def predict_grid(model: Trained, seen: PointCloud | EncodedCloud, truth: TruthGrid) -> UInt8[np.ndarray, "x y z"]:
-    """Labels by the network on the grid of ``truth``; ``seen`` is a cloud, or its code."""
-    code = seen if isinstance(seen, EncodedCloud) else model.encode(seen)
-    return network_labels(model, code, truth.grid)
+def predict_grid(model: Trained, cloud: PointCloud, truth: TruthGrid) -> UInt8[np.ndarray, "x y z"]:
+    """Labels by the network on the grid of ``truth``."""
+    return network_labels(model, model.encode(cloud), truth.grid)
 
 
-def grid_scores(model: Model, seen: PointCloud | EncodedCloud, truth: SegmentedMesh, cells: int = CELLS) -> Scores:
-    """Scores of one cloud, or its code, as in the paper; ``truth`` is in the cloud's frame and units.
+def grid_scores(model: Model, cloud: PointCloud, truth: SegmentedMesh, cells: int = CELLS) -> Scores:
+    """Scores of the network on one cloud, as in the paper; ``truth`` is in the cloud's frame and units.
 
     Raises ``ValueError`` where the model knows other segments than the truth has.
     """
     check_names(model, truth.names)
     grid = truth_grid(truth, cells)
     segments = len(segment_names(model)[0])
-    return intersection_over_union(grid_confusion(grid, predict_grid(model, seen, grid), segments), model.segmented)
+    return intersection_over_union(grid_confusion(grid, predict_grid(model, cloud, grid), segments), model.segmented)
 
 
 def check_names(model: Trained, names: Sequence[str]) -> None:
@@ -179,7 +175,7 @@ def score_cases(
     count: int,
     progress: bool,
     registrar: Registrar | None = None,
-    kept: int = KEPT_VIEWS,
+    kept: int = 4,
     workers: int | Cluster = 1,
 ) -> Evaluation:
     """Scores on ``case(0) ... case(count - 1)``, which are made one at a time, as they may be large.

@@ -69,26 +69,16 @@ def evaluate_weights(
                 "device": workers.device if isinstance(workers, Cluster) else model.device.type,
                 "precision": model.working_precision,
             }
-        write_evaluation(directory, evaluation, {**facts, "trained": model.provenance}, options)
+        values, picture = metrics(evaluation, {**facts, "trained": model.provenance}), directory / "errors.png"
+        if options is not None:
+            write_json(directory / CONFIG, options)
+        write_json(directory / "metrics.json", values)
+        (directory / "table.md").write_text(markdown_table(evaluation), encoding="utf-8")
+        error_picture(picture, evaluation.views)
+        write_evaluation_report(directory / "report.html", values, evaluation.views[0].colors, picture)
     print(markdown_table(evaluation))
     print(f"wrote {output}")
     return evaluation
-
-
-def write_evaluation(
-    directory: Path, evaluation: Evaluation, facts: dict[str, Any], options: Mapping[str, Any] | None = None
-) -> None:
-    """Write metrics.json, table.md, errors.png and report.html; ``facts`` come first in the JSON.
-
-    Also config.json of ``options``, where there are any.
-    """
-    if options is not None:
-        write_json(directory / CONFIG, options)
-    values = metrics(evaluation, facts)
-    write_json(directory / "metrics.json", values)
-    (directory / "table.md").write_text(markdown_table(evaluation), encoding="utf-8")
-    error_picture(directory / "errors.png", evaluation.views)
-    write_evaluation_report(directory / "report.html", values, evaluation.views[0].colors, directory / "errors.png")
 
 
 # --- page -------------------------------------------------------------------------------------------------------------

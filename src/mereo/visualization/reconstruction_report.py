@@ -11,7 +11,7 @@ their own; what was observed is in the page alone, and is read from it as data; 
 import base64
 import io
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -71,7 +71,7 @@ class Report:
     cloud: PointCloud
     surfaces: SegmentedMesh
     summary: dict[str, Any]
-    rotation: Float[np.ndarray, "3 3"] = GLTF_CAMERA_ROTATION
+    rotation: Float[np.ndarray, "3 3"] = field(default_factory=lambda: GLTF_CAMERA_ROTATION)
     unit: Unit = UNKNOWN
     registered: Registration | None = None
     depth: DepthImage | None = None

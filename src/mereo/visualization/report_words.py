@@ -50,7 +50,7 @@ def trust(summary: Mapping[str, Any]) -> Trust:
     """Verdict on the answer that a summary is of; every key of it may be missing.
 
     Args:
-        summary: its ``recognition`` (``Recognition.facts``) and ``registration`` (``registration_facts``) are read.
+        summary: its ``recognition`` and ``registration`` are read.
     """
     recognition, registration = _block(summary, "recognition"), _block(summary, "registration")
     known, reason = recognition.get("known"), recognition.get("reason") or registration.get("refusal")

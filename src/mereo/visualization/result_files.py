@@ -78,7 +78,9 @@ def frame_facts(answer: Answer, carried: Sequence[Carried] = ()) -> dict[str, ob
         "points": len(seen.cloud),
     }
     if registrar is not None:
-        facts["registration"] = registration_facts(answer)
+        source = {"answer": "registration" if answer.taken else "network", "found_by": answer.found_by}
+        fit = answer.registration
+        facts["registration"] = source | ({"refusal": answer.refusal} if fit is None else describe(fit))
     facts["recognition"] = answer.recognition.facts()
     if model is not None:
         facts |= {"device": model.device_type, "precision": model.working_precision}
@@ -91,14 +93,6 @@ def frame_facts(answer: Answer, carried: Sequence[Carried] = ()) -> dict[str, ob
         digest = hashlib.sha256((rest_digest(scene.rest) + scene.definition).encode()).hexdigest()
         facts["scene_file"] = {"path": str(scene.file), "sha256": digest}
     return facts
-
-
-def registration_facts(answer: Answer) -> dict[str, object]:
-    """Facts of a summary about where an answer comes from."""
-    source = "registration" if answer.taken else "network"
-    if answer.registration is None:
-        return {"answer": source, "found_by": answer.found_by, "refusal": answer.refusal}
-    return {"answer": source, "found_by": answer.found_by, **describe(answer.registration)}
 
 
 def write_answer(

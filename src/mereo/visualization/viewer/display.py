@@ -27,17 +27,8 @@ CLOUD_SIZES = (0.001, 0.012)
 POINT_SHARE = 0.2
 """Share of the spacing of points that one takes, so that the surface is seen between them."""
 
-SAMPLED = 1000
-"""Points whose neighbours are measured."""
-
 FOV_RAD = float(np.deg2rad(40.0))
 """Angle of view of the page's own camera."""
-
-OBLIQUE = 0.28
-"""Share by which views are turned to the side and from above, so that depth is seen."""
-
-FEW = 6
-"""More segments than this have their check boxes in a closed folder, or the panel would be all boxes."""
 
 PICTURE_PX = 320
 """Width of a picture in the panel, to which small ones are enlarged: a browser would blur their pixels."""
@@ -45,7 +36,7 @@ PICTURE_PX = 320
 
 def point_size(points: Float[np.ndarray, "n 3"]) -> float:
     """Size of points on the stage, from their median distance to the nearest neighbour, within ``CLOUD_SIZES``."""
-    some = points[:: max(1, len(points) // SAMPLED)]
+    some = points[:: max(1, len(points) // 1000)]
     apart = cKDTree(points).query(some, k=2)[0][:, 1] if len(points) > 1 else np.zeros(0)
     apart = apart[np.isfinite(apart) & (apart > 0)]  # repeated points have no spacing
     smallest, largest = CLOUD_SIZES
@@ -106,7 +97,7 @@ class Display:
             ahead = toward()
             side = np.cross(self.up, ahead)
             direction = {first: ahead, "side": side, "behind": -ahead}[name]
-            self.look_from(direction + OBLIQUE * (np.cross(self.up, direction) + self.up), bounds())
+            self.look_from(direction + 0.28 * (np.cross(self.up, direction) + self.up), bounds())
 
         view = self.server.gui.add_button_group("View", (first, "side", "behind"))
         view.on_click(lambda _: look(view.value))
@@ -118,7 +109,7 @@ class SegmentControls:
     """Controls with a check box and an opacity slider for each segment."""
 
     def __init__(self, gui: Any, mesh: SegmentedMesh, changed: Callable[[], None]) -> None:
-        with gui.add_folder("Segments", expand_by_default=len(mesh.segments) <= FEW):
+        with gui.add_folder("Segments", expand_by_default=len(mesh.segments) <= 6):  # or all would be boxes
             self._boxes = [gui.add_checkbox(segment.name, True) for segment in mesh.segments]
         with gui.add_folder("Opacity", expand_by_default=False):
             self._all = gui.add_slider("all", 0.0, 1.0, 0.05, 1.0)

@@ -59,6 +59,137 @@ from mereo.visualization.viewer.server import OpenPage, import_viser, start_serv
 
 EMPTY_COLOR = (150, 156, 168)
 
+# --- probe ------------------------------------------------------------------------------------------------------------
+
+# Probe of an answer or of surfaces, in the input's frame: what is known of a point, and which point a look meets.
+
+ON_SURFACE = 1e-6
+"""Distance, as a share of a place's coordinates, that is none: a click meets the surface up to rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class Probed:
+    """Facts about points of the input's frame, in its unit.
+
+    Attributes:
+        label: 0 for empty space, i + 1 for segment i.
+        distance: to the nearest segment surface, negative inside; NaN where that is not known.
+        direction: unit vector towards it; NaN where that is not known.
+        probability: of empty space and each segment, by the network; None where there is none.
+        rest: where the point was at rest, scene units; None where no model is registered.
+        radius95: radius around the point that holds the true place of what is registered there with probability 0.95;
+            None where that is not known.
+    """
+
+    label: UInt8[np.ndarray, " n"]
+    distance: Float[np.ndarray, " n"]
+    direction: Float[np.ndarray, "n 3"]
+    probability: Float[np.ndarray, "n c"] | None = None
+    rest: Float[np.ndarray, "n 3"] | None = None
+    radius95: Float[np.ndarray, " n"] | None = None
+
+
+def source_of(answer: Answer) -> str:
+    """Where an answer comes from, and whether its frame shows the object, in a phrase for people."""
+    if answer.registrar is None:
+        return "network alone: the weights carry no statistical model"
+    doubt = None if answer.registration is None else answer.recognition.told
+    return answer.source if doubt is None else f"{answer.source}; {doubt}"
+
+
+def ask_network(answer: Answer, points: Float[np.ndarray, "n 3"]) -> NetworkAnswer:
+    """Answers of the network at points of the input's frame, in that frame; it must have been given the frame."""
+    result = answer.reconstruction
+    assert answer.model is not None and result.code is not None
+    network = answer.model.query(result.code, transform_points(result.T_camera_input, points))
+    direction = network.direction @ result.T_camera_input[:3, :3]
+    return NetworkAnswer(network.label, network.probability, network.distance, direction)
+
+
+def probe_answer(answer: Answer, points: Float[np.ndarray, "n 3"]) -> Probed:
+    """Facts about points of the input's frame: those of the registered model where it is the answer."""
+    network = None if answer.reconstruction.code is None else ask_network(answer, points)
+    if answer.registered is None:
+        assert network is not None
+        return Probed(network.label, network.distance, network.direction, network.probability)
+    model = answer.registered.query(points)
+    return Probed(
+        _with_surface(answer.registered.solids, model.label, model.distance, points),
+        model.distance,
+        model.direction,
+        None if network is None else network.probability,
+        model.rest,
+        answer.registered.radius95(points, at="camera"),
+    )
+
+
+def probe_surfaces(solids: Solids, radii: Radii | None, points: Float[np.ndarray, "n 3"]) -> Probed:
+    """Facts about points that closed surfaces alone say."""
+    inside = solids.label(points)
+    distance, direction = signed_distance_and_direction(solids, points, inside)
+    label = _with_surface(solids, inside, distance, points)
+    radius = None
+    if radii is not None and label.all():
+        radius = np.concatenate([radii.at(point[None], int(row)) for point, row in zip(points, label, strict=True)])
+    return Probed(label, distance, direction, radius95=radius)
+
+
+def _with_surface(
+    solids: Solids, label: UInt8[np.ndarray, " n"], distance: Float[np.ndarray, " n"], points: Float[np.ndarray, "n 3"]
+) -> UInt8[np.ndarray, " n"]:
+    """Labels, where a place on a surface is its segment's, whichever side rounding has put it on."""
+    on_surface = (label == 0) & (np.abs(distance) <= ON_SURFACE * np.abs(points).max(axis=1))
+    return np.where(on_surface, nearest_labels(solids, points), label).astype(np.uint8)
+
+
+def first_point(
+    mesh: SegmentedMesh, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"], shown: list[bool]
+) -> Float[np.ndarray, "3"] | None:
+    """Place where a ray first meets the surface of a segment that is shown; None where it meets none."""
+    segments = tuple(s for s, visible in zip(mesh.segments, shown, strict=True) if visible and len(s.faces))
+    if not segments:
+        return None
+    T_mesh_ray = rigid(rotation_along(direction), origin)  # the ray is the z axis
+    seen = Solids(SegmentedMesh(segments).transformed(inverse_rigid(T_mesh_ray)))
+    distance = seen.first_hit(np.array([[0.0, 0.0, 1.0]])).distance[0]
+    return transform_points(T_mesh_ray, np.array([0.0, 0.0, distance])) if np.isfinite(distance) else None
+
+
+def probe_html(
+    probed: Probed, names: Sequence[str], colors: Sequence[Color], point: Float[np.ndarray, "3"], unit: Unit
+) -> str:
+    """Facts about one point: its segment, the network's likeliest classes, distance, direction, and where it rests."""
+    label, distance, direction = int(probed.label[0]), float(probed.distance[0]), probed.direction[0]
+    radius = None if probed.radius95 is None else float(probed.radius95[0])
+    where = f"at {unit.place(point, radius)} {unit.length_name}"
+    where += "" if radius is None else " (95\N{NO-BREAK SPACE}%)"
+    if abs(distance) <= ON_SURFACE * float(np.abs(point).max()):
+        text = "on the surface"
+    elif np.isnan(distance):
+        text = "distance not trained"
+    else:
+        length = f"{rounded(abs(distance) * unit.length_factor)} {unit.length_name}"
+        text = f"{length} {'inside' if distance < 0 else 'outside'} the nearest surface"
+    toward = "" if np.isnan(direction).any() else f"towards {_vector(direction)}"
+    rest = "" if probed.rest is None else f"<br>at rest at {_vector(probed.rest[0])} scene units"
+    likeliest = ""
+    if probed.probability is not None:
+        order = np.argsort(-probed.probability[0], kind="stable")[:4]
+        likeliest = bars([(names[k], colors[k], float(probed.probability[0, k])) for k in order])
+        if probed.rest is not None:
+            likeliest = f'<div style="{BOX};{SOFT}">the network says</div>{likeliest}'
+    return (
+        f'<div style="{BOX}"><b>{escape(names[label])}</b> <span style="{SOFT}">{where}</span></div>'
+        f'{likeliest}<div style="{BOX}">{escape(text)}<br><span style="{SOFT}">{toward}{rest}</span></div>'
+    )
+
+
+def _vector(values: Float[np.ndarray, "3"]) -> str:
+    return ", ".join(f"{float(value):.3g}" for value in values)
+
+
+# --- contents ---------------------------------------------------------------------------------------------------------
+
 SEGMENT, VERTEX, SURE = "segment", "own", "how sure"
 """Colourings: by segment; by the colours of a file's vertices; by the radius that holds each vertex's true place."""
 
@@ -106,9 +237,6 @@ class Content:
         clouds = [] if self.cloud is None else [self.cloud.points]
         joint = np.concatenate([*clouds, *(segment.vertices for segment in self.mesh.segments)])
         return np.stack([joint.min(axis=0), joint.max(axis=0)])
-
-
-# --- contents ---------------------------------------------------------------------------------------------------------
 
 
 def open_answer(answer: Answer, port: int) -> OpenPage:
@@ -253,135 +381,6 @@ def _measured_colorings(
 def _vertex_colors(scene: GlbScene) -> Colors:
     pairs = zip(scene.mesh.segments, scene.colors, strict=True)
     return [np.tile(np.array(s.color, dtype=np.uint8), (len(s.vertices), 1)) if c is None else c for s, c in pairs]
-
-
-# --- probe ------------------------------------------------------------------------------------------------------------
-
-# Probe of an answer or of surfaces, in the input's frame: what is known of a point, and which point a look meets.
-
-ON_SURFACE = 1e-6
-"""Distance, as a share of a place's coordinates, that is none: a click meets the surface up to rounding."""
-
-
-@dataclass(frozen=True, eq=False)
-class Probed:
-    """Facts about points of the input's frame, in its unit.
-
-    Attributes:
-        label: 0 for empty space, i + 1 for segment i.
-        distance: to the nearest segment surface, negative inside; NaN where that is not known.
-        direction: unit vector towards it; NaN where that is not known.
-        probability: of empty space and each segment, by the network; None where there is none.
-        rest: where the point was at rest, scene units; None where no model is registered.
-        radius95: radius around the point that holds the true place of what is registered there with probability 0.95;
-            None where that is not known.
-    """
-
-    label: UInt8[np.ndarray, " n"]
-    distance: Float[np.ndarray, " n"]
-    direction: Float[np.ndarray, "n 3"]
-    probability: Float[np.ndarray, "n c"] | None = None
-    rest: Float[np.ndarray, "n 3"] | None = None
-    radius95: Float[np.ndarray, " n"] | None = None
-
-
-def source_of(answer: Answer) -> str:
-    """Where an answer comes from, and whether its frame shows the object, in a phrase for people."""
-    if answer.registrar is None:
-        return "network alone: the weights carry no statistical model"
-    doubt = None if answer.registration is None else answer.recognition.told
-    return answer.source if doubt is None else f"{answer.source}; {doubt}"
-
-
-def ask_network(answer: Answer, points: Float[np.ndarray, "n 3"]) -> NetworkAnswer:
-    """Answers of the network at points of the input's frame, in that frame; it must have been given the frame."""
-    result = answer.reconstruction
-    assert answer.model is not None and result.code is not None
-    network = answer.model.query(result.code, transform_points(result.T_camera_input, points))
-    direction = network.direction @ result.T_camera_input[:3, :3]
-    return NetworkAnswer(network.label, network.probability, network.distance, direction)
-
-
-def probe_answer(answer: Answer, points: Float[np.ndarray, "n 3"]) -> Probed:
-    """Facts about points of the input's frame: those of the registered model where it is the answer."""
-    network = None if answer.reconstruction.code is None else ask_network(answer, points)
-    if answer.registered is None:
-        assert network is not None
-        return Probed(network.label, network.distance, network.direction, network.probability)
-    model = answer.registered.query(points)
-    return Probed(
-        _with_surface(answer.registered.solids, model.label, model.distance, points),
-        model.distance,
-        model.direction,
-        None if network is None else network.probability,
-        model.rest,
-        answer.registered.radius95(points, at="camera"),
-    )
-
-
-def probe_surfaces(solids: Solids, radii: Radii | None, points: Float[np.ndarray, "n 3"]) -> Probed:
-    """Facts about points that closed surfaces alone say."""
-    inside = solids.label(points)
-    distance, direction = signed_distance_and_direction(solids, points, inside)
-    label = _with_surface(solids, inside, distance, points)
-    radius = None
-    if radii is not None and label.all():
-        radius = np.concatenate([radii.at(point[None], int(row)) for point, row in zip(points, label, strict=True)])
-    return Probed(label, distance, direction, radius95=radius)
-
-
-def _with_surface(
-    solids: Solids, label: UInt8[np.ndarray, " n"], distance: Float[np.ndarray, " n"], points: Float[np.ndarray, "n 3"]
-) -> UInt8[np.ndarray, " n"]:
-    """Labels, where a place on a surface is its segment's, whichever side rounding has put it on."""
-    on_surface = (label == 0) & (np.abs(distance) <= ON_SURFACE * np.abs(points).max(axis=1))
-    return np.where(on_surface, nearest_labels(solids, points), label).astype(np.uint8)
-
-
-def first_point(
-    mesh: SegmentedMesh, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"], shown: list[bool]
-) -> Float[np.ndarray, "3"] | None:
-    """Place where a ray first meets the surface of a segment that is shown; None where it meets none."""
-    segments = tuple(s for s, visible in zip(mesh.segments, shown, strict=True) if visible and len(s.faces))
-    if not segments:
-        return None
-    T_mesh_ray = rigid(rotation_along(direction), origin)  # the ray is the z axis
-    seen = Solids(SegmentedMesh(segments).transformed(inverse_rigid(T_mesh_ray)))
-    distance = seen.first_hit(np.array([[0.0, 0.0, 1.0]])).distance[0]
-    return transform_points(T_mesh_ray, np.array([0.0, 0.0, distance])) if np.isfinite(distance) else None
-
-
-def probe_html(
-    probed: Probed, names: Sequence[str], colors: Sequence[Color], point: Float[np.ndarray, "3"], unit: Unit
-) -> str:
-    """Facts about one point: its segment, the network's likeliest classes, distance, direction, and where it rests."""
-    label, distance, direction = int(probed.label[0]), float(probed.distance[0]), probed.direction[0]
-    radius = None if probed.radius95 is None else float(probed.radius95[0])
-    where = f"at {unit.place(point, radius)} {unit.length_name}"
-    where += "" if radius is None else " (95\N{NO-BREAK SPACE}%)"
-    if abs(distance) <= ON_SURFACE * float(np.abs(point).max()):
-        text = "on the surface"
-    elif np.isnan(distance):
-        text = "distance not trained"
-    else:
-        length = f"{rounded(abs(distance) * unit.length_factor)} {unit.length_name}"
-        text = f"{length} {'inside' if distance < 0 else 'outside'} the nearest surface"
-    toward = "" if np.isnan(direction).any() else f"towards {_vector(direction)}"
-    rest = "" if probed.rest is None else f"<br>at rest at {_vector(probed.rest[0])} scene units"
-    likeliest = ""
-    if probed.probability is not None:
-        order = np.argsort(-probed.probability[0], kind="stable")[:4]
-        likeliest = bars([(names[k], colors[k], float(probed.probability[0, k])) for k in order])
-        if probed.rest is not None:
-            likeliest = f'<div style="{BOX};{SOFT}">the network says</div>{likeliest}'
-    return (
-        f'<div style="{BOX}"><b>{escape(names[label])}</b> <span style="{SOFT}">{where}</span></div>'
-        f'{likeliest}<div style="{BOX}">{escape(text)}<br><span style="{SOFT}">{toward}{rest}</span></div>'
-    )
-
-
-def _vector(values: Float[np.ndarray, "3"]) -> str:
-    return ", ".join(f"{float(value):.3g}" for value in values)
 
 
 # --- page -------------------------------------------------------------------------------------------------------------
