@@ -14,8 +14,8 @@ from mereo.geometry.transforms import rigid
 from mereo.synthesis.examples import View
 from mereo.visualization.contact_sheets import contact_sheet, depth_to_rgb, legend
 from mereo.visualization.error_maps import (
+    EXTRA_OR_MISSING,
     FULL_CELLS,
-    ONE_SIDED,
     OVER,
     PALE,
     SEGMENTATION_WORDS,
@@ -214,7 +214,7 @@ def test_a_reconstruction_that_is_right_but_for_rounding_is_drawn_pale() -> None
 
 def strips(picture: np.ndarray) -> int:
     """Height of the scale and of the legend below a picture of errors."""
-    return 44 + len(legend(SEGMENTATION_WORDS, (PALE, WRONG, ONE_SIDED), picture.shape[1]))
+    return 44 + len(legend(SEGMENTATION_WORDS, (PALE, WRONG, EXTRA_OR_MISSING), picture.shape[1]))
 
 
 def test_the_error_picture_shows_each_error_in_its_column_only(tmp_path: Path) -> None:
@@ -225,11 +225,11 @@ def test_the_error_picture_shows_each_error_in_its_column_only(tmp_path: Path) -
     error_picture(tmp_path / "e.png", [labelled(truth, found)], size=60)
     picture = np.asarray(Image.open(tmp_path / "e.png"))
     below = picture[-strips(picture) :]
-    assert all(hue_is(below, color).any() for color in (OVER, UNDER, WRONG, ONE_SIDED))
+    assert all(hue_is(below, color).any() for color in (OVER, UNDER, WRONG, EXTRA_OR_MISSING))
     columns = np.array_split(picture[: -strips(picture), 12:], 8, axis=1)
     shows = [[bool(hue_is(column, c).sum() > 20) for c in (OVER, UNDER, WRONG)] for column in columns]
     assert shows[3] == shows[4] == [True, True, False]
-    assert shows[6] == [False, False, True] and hue_is(columns[6], ONE_SIDED).sum() > 20
+    assert shows[6] == [False, False, True] and hue_is(columns[6], EXTRA_OR_MISSING).sum() > 20
     for plain in (0, 1, 2, 7):
         assert not any(shows[plain])
     assert [f.name for f in tmp_path.iterdir()] == ["e.png"]

@@ -34,7 +34,7 @@ PALE: Color = (222, 224, 228)
 OVER: Color = (31, 119, 214)
 UNDER: Color = (245, 130, 20)
 WRONG: Color = (214, 39, 60)
-ONE_SIDED: Color = (240, 158, 168)
+EXTRA_OR_MISSING: Color = (240, 158, 168)
 SEGMENTATION_WORDS = (
     "segmentation error: none",
     "another segment than in the reference",
@@ -68,7 +68,7 @@ def error_picture(path: str | Path, cases: Sequence[EvaluatedView], size: int = 
     sheet = contact_sheet(images, captions, 1 + len(COLUMNS))
     strips = [
         _offset_scale(sheet.shape[1]),
-        legend(SEGMENTATION_WORDS, (PALE, WRONG, ONE_SIDED), sheet.shape[1]),
+        legend(SEGMENTATION_WORDS, (PALE, WRONG, EXTRA_OR_MISSING), sheet.shape[1]),
     ]
     save_png(path, np.concatenate([sheet, *strips]))
 
@@ -167,7 +167,7 @@ def segmentation_triangles(case: EvaluatedView) -> Triangles:
     shown = np.where(kinds == 3, 2 + np.minimum(beneath, 2), kinds).astype(np.uint8)
     surface = _labelled(case, shown, [PALE, WRONG, PALE, WRONG])
     share = np.where(surface.owner > 2, np.repeat(_full_share(_union_offset(case, surface)), 2), 0.0)[:, None]
-    colors = (1 - share) * surface.colors + share * np.asarray(ONE_SIDED) / 255.0
+    colors = (1 - share) * surface.colors + share * np.asarray(EXTRA_OR_MISSING) / 255.0
     return replace(surface, colors=colors, owner=np.zeros_like(surface.owner))
 
 
