@@ -16,8 +16,7 @@ from functools import partial
 import numpy as np
 
 from mereo.evaluation.cases import TestCase
-from mereo.evaluation.ground_truth import truth_grid
-from mereo.evaluation.metrics import intersection_over_union
+from mereo.evaluation.metrics import intersection_over_union, truth_grid
 from mereo.evaluation.scoring import CELLS, score_cases
 from mereo.fitting.registration.register import registrar_for
 from mereo.geometry.camera import Camera, DepthImage

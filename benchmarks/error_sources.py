@@ -24,8 +24,7 @@ from scipy.ndimage import binary_erosion
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from mereo.evaluation.ground_truth import TruthGrid, truth_grid
-from mereo.evaluation.metrics import Scores, confusion_matrix, intersection_over_union
+from mereo.evaluation.metrics import Scores, TruthGrid, confusion_matrix, intersection_over_union, truth_grid
 from mereo.evaluation.scoring import predict_grid, trained_scene
 from mereo.models.model import Model
 from mereo.models.rigid_alignment import Alignment, fit_rigid

@@ -16,8 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mereo.evaluation.cases import grid_confusion
-from mereo.evaluation.ground_truth import TruthGrid, truth_grid
-from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
+from mereo.evaluation.metrics import TruthGrid, confusion_matrix, intersection_over_union, truth_grid
 from mereo.evaluation.scans import SCANS, scan_in_camera
 from mereo.evaluation.scoring import predict_grid
 from mereo.fitting.draws.playback import DrawnStates

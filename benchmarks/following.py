@@ -24,8 +24,7 @@ from typing import get_args
 
 import numpy as np
 
-from mereo.evaluation.ground_truth import truth_grid
-from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
+from mereo.evaluation.metrics import confusion_matrix, intersection_over_union, truth_grid
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.fit import CloudToFit
 from mereo.fitting.registration.register import Registrar

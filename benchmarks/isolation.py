@@ -12,8 +12,7 @@ import time
 import numpy as np
 
 from mereo.evaluation.cases import grid_confusion
-from mereo.evaluation.ground_truth import truth_grid
-from mereo.evaluation.metrics import intersection_over_union
+from mereo.evaluation.metrics import intersection_over_union, truth_grid
 from mereo.evaluation.scoring import predict_grid, trained_scene
 from mereo.models.weights import load_model
 from mereo.models.weights_place import shipped_names

@@ -20,7 +20,8 @@ import argparse
 import json
 import time
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -35,13 +36,12 @@ from mereo.evaluation.calibrate import (
     CalibrationView,
     calibrate,
     ece_of,
-    frames_beyond,
+    object_views,
     other_objects,
-    own_views,
     strange_frames,
 )
-from mereo.evaluation.cases import AskedCells
-from mereo.evaluation.ground_truth import truth_grid
+from mereo.evaluation.cases import sample_cells
+from mereo.evaluation.metrics import truth_grid
 from mereo.evaluation.scoring import trained_scene
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.answer_frame import answer_frame
@@ -52,10 +52,12 @@ from mereo.io.atomic_files import atomic_file
 from mereo.models.model import Model
 from mereo.models.weights import load_model
 from mereo.reconstruction.observation import observe
+from mereo.scenes.draw_recorder import with_farther_states
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene, SourceFrame
-from mereo.scenes.seeds import TEST_SEED_START
+from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.examples import sample_view
 from mereo.training.config import PRESETS
 from mereo.training.trainer import train
 
@@ -106,6 +108,14 @@ def registrar_of(model: Model, method: AnswerMethod, scene: Scene) -> Registrar:
     return replace(own, model=replace(own.model, source_frame=SourceFrame(np.eye(4), 1.0)))
 
 
+def clouds_beyond(scene: Scene, count: int, seed: int) -> Iterator[PointCloud]:
+    """Clouds of the object in states whose draws are all 1.5 times as far out; none of a scene that refuses them."""
+    with suppress(ValueError):
+        for index in range(count):
+            rng = example_rng(seed + 4, index)  # beyond the seeds of other strange frames
+            yield sample_view(with_farther_states(scene, 1.5), GenerateConfig(), rng).depth.to_points()
+
+
 def barely_trained(scene: Scene, folder: Path) -> Model:
     """Weights of the preset `tiny` after ten steps."""
     generate(scene, folder / "data", GenerateConfig(), examples=EXAMPLES, seed=3, workers=1)
@@ -122,17 +132,17 @@ def measured(name: str, arguments: argparse.Namespace) -> Found:
         model = replace(model, calibration=calibrate(model, scene, views=arguments.calibration_views, quiet=False))
     registrar, unsized = registrar_of(model, arguments.method, scene), Registrar.of(model, arguments.method, scene)
     found, seed = Found(), arguments.seed
-    views = list(own_views(scene, 2 * arguments.views, seed))
-    clean = [view for view in views if view.clean]
+    views = list(object_views(scene, 2 * arguments.views, seed))
+    clean = [view for view in views if view.is_clean]
     found.own = [said_of(view.seen, model, registrar) for view in clean]
-    found.noisy = [said_of(view.seen, model, registrar) for view in views if not view.clean]
+    found.noisy = [said_of(view.seen, model, registrar) for view in views if not view.is_clean]
     for index, view in enumerate(clean):
         wrong = PointCloud(view.seen.points * FACTORS[index % len(FACTORS)])
         found.strange["wrong unit"].append(said_of(wrong, model, registrar))
-    for strange in strange_frames(scene, other_objects(scene), arguments.strangers, seed):
-        found.strange[strange.kind].append(said_of(strange.cloud, model, unsized, unit_m=None))
-    for strange in frames_beyond(scene, arguments.views, seed):
-        found.strange[strange.kind].append(said_of(strange.cloud, model, registrar))
+    for kind, cloud in strange_frames(scene, other_objects(scene), arguments.strangers, seed):
+        found.strange[kind].append(said_of(cloud, model, unsized, unit_m=None))
+    for cloud in clouds_beyond(scene, arguments.views, seed):
+        found.strange["state beyond"].append(said_of(cloud, model, registrar))
     with TemporaryDirectory() as folder:
         poor = barely_trained(scene, Path(folder))
         of_poor = registrar_of(poor, "modes", scene)
@@ -145,9 +155,9 @@ def calibration_error(model: Model, views: Sequence[CalibrationView]) -> tuple[f
     """Expected calibration error of the probabilities as they are and calibrated, over cells of the paper's metric."""
     logits, truth = [], []
     for view in views:
-        cells = AskedCells.of(truth_grid(view.mesh, CELLS))
-        logits.append(model.logits(model.encode(view.seen), cells.points))
-        truth.append(cells.truth)
+        points, labels = sample_cells(truth_grid(view.mesh, CELLS))
+        logits.append(model.logits(model.encode(view.seen), points))
+        truth.append(labels)
     calibration = model.calibration
     assert calibration is not None and calibration.temperature is not None
     every = np.concatenate(logits), np.concatenate(truth)

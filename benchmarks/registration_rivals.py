@@ -40,7 +40,7 @@ from rivals.frames import Frame, surface_points, thinned_cloud
 from rivals.methods import Registered, Settings
 from rivals.settings import RIVALS, Rival
 
-from mereo.evaluation.ground_truth import TruthGrid, truth_grid
+from mereo.evaluation.metrics import TruthGrid, truth_grid
 from mereo.evaluation.scans import SCANS, scan_in_camera
 from mereo.evaluation.scoring import predict_grid
 from mereo.fitting.config import FitConfig

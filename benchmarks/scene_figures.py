@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mereo.deformation.maps import Compose, Rigid
-from mereo.evaluation.ground_truth import truth_grid
-from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
+from mereo.evaluation.metrics import confusion_matrix, intersection_over_union, truth_grid
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import label_grid

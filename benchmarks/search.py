@@ -29,8 +29,7 @@ import numpy as np
 
 from mereo.api.objects import Object, load_object
 from mereo.evaluation.cases import grid_confusion
-from mereo.evaluation.ground_truth import TruthGrid, truth_grid
-from mereo.evaluation.metrics import intersection_over_union
+from mereo.evaluation.metrics import TruthGrid, intersection_over_union, truth_grid
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.geometry.mesh import SegmentedMesh

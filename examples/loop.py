@@ -32,9 +32,9 @@ from mereo.scenes.parameters import Played, play, random_state, turned
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.synthesis.depth_sensor import add_depth_noise, render_depth
+from mereo.visualization.color_scales import viridis
 from mereo.visualization.contact_sheets import INK, Picture, depth_to_rgb, fit_font, font
 from mereo.visualization.renderer import Canvas, Triangles, Viewpoint
-from mereo.visualization.viridis import viridis
 
 SCENE, SEED, NOISE_STD = "bunny", 1_000_007, 0.1
 """The last is the sensor's noise in scene units, the paper's."""

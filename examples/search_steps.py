@@ -18,7 +18,7 @@ from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import NetworkTerm
 from mereo.fitting.search.search import ROUNDS, candidates, screened, search
-from mereo.reconstruction.observation import find_object
+from mereo.reconstruction.observation import Observation, find_object
 from mereo.scenes.random_states import kept_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import example_rng
@@ -27,7 +27,6 @@ from mereo.synthesis.examples import sample_view
 from mereo.synthesis.occluded_views import occlude
 from mereo.visualization.contact_sheets import save_png
 from mereo.visualization.renderer import Viewpoint, shaded_canvas
-from mereo.visualization.sight_picture import sight_picture
 
 SIDE = 300
 """Pixels along each side of a picture."""
@@ -75,6 +74,26 @@ def main(options: Options) -> None:
         tiles.append(canvas.picture())
     save_png(options.output, np.concatenate(tiles, axis=1))
     print(f"{found.tried} candidates fitted, {found.alike} explain the frame; wrote {options.output}")
+
+
+def sight_picture(seen: Observation) -> np.ndarray:
+    """Depth image in which lines of sight are orange where they met the object, blue past it, red where unknown."""
+    depth = seen.frame.depth if seen.frame.whole is None else seen.frame.whole
+    assert depth is not None
+    measured, gray = depth.depth[depth.valid], np.zeros(depth.depth.shape)
+    gray[depth.valid] = 255 * np.minimum(np.quantile(measured, 0.01) / measured, 1.0)
+    picture = np.repeat(gray[:, :, None], 3, axis=2)
+    kinds = (
+        (seen.lines.past, (60, 130, 255)),
+        (seen.lines.unknown, (225, 60, 60)),
+        (seen.cloud.points, (255, 170, 40)),
+    )
+    for points, color in kinds:
+        columns, rows = np.floor(depth.camera.project(points)).astype(np.int64).T
+        inside = (rows >= 0) & (rows < depth.camera.height) & (columns >= 0) & (columns < depth.camera.width)
+        pixels = rows[inside], columns[inside]
+        picture[pixels] = 0.75 * np.array(color) + 0.25 * picture[pixels]
+    return picture.astype(np.uint8)
 
 
 def square(picture: np.ndarray) -> np.ndarray:

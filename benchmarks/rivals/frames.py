@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mereo.deformation.moving_least_squares import spread
-from mereo.evaluation.registration.icp import exposed
+from mereo.evaluation.icp import exposed
 from mereo.fitting.problem.residuals import Surface
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.transforms import transform_points

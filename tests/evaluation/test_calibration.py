@@ -12,8 +12,8 @@ from safetensors import safe_open
 
 from mereo import __main__ as command_line
 from mereo.evaluation.calibrate import GOOD_ENOUGH, calibrate, ece_of, fit_scaling
-from mereo.evaluation.cases import BINS, AskedCells, Reliability
-from mereo.evaluation.ground_truth import truth_grid
+from mereo.evaluation.cases import BINS, Reliability, sample_cells
+from mereo.evaluation.metrics import truth_grid
 from mereo.models.calibration import Calibration
 from mereo.models.model import Model, scaled_logits
 from mereo.models.weights import load_model, save_model, with_calibration
@@ -68,11 +68,11 @@ def test_scaling_finds_what_made_the_probabilities_wrong(logits: np.ndarray) -> 
 
 def test_cells_are_drawn_among_those_that_count_and_are_the_same_every_time() -> None:
     truth = truth_grid(load_scene("rope").rest, 24)
-    cells = AskedCells.of(truth, 500)
-    index = np.rint((cells.points - truth.grid.origin) / truth.grid.spacing).astype(int)
-    assert len(cells.points) == 500 and truth.kept[tuple(index.T)].all()
-    np.testing.assert_array_equal(truth.grid.labels[tuple(index.T)], cells.truth)
-    np.testing.assert_array_equal(AskedCells.of(truth, 500).points, cells.points)
+    points, labels = sample_cells(truth, 500)
+    index = np.rint((points - truth.grid.origin) / truth.grid.spacing).astype(int)
+    assert len(points) == 500 and truth.kept[tuple(index.T)].all()
+    np.testing.assert_array_equal(truth.grid.labels[tuple(index.T)], labels)
+    np.testing.assert_array_equal(sample_cells(truth, 500)[0], points)
 
 
 # --- the model --------------------------------------------------------------------------------------------------------

@@ -11,8 +11,7 @@ from mereo.api.frames import load_frame
 from mereo.api.objects import Object
 from mereo.cli import demo
 from mereo.evaluation.cases import PICTURE_MARGIN, Evaluation, TestCase, grid_confusion
-from mereo.evaluation.ground_truth import truth_grid
-from mereo.evaluation.metrics import confusion_matrix, format_score, intersection_over_union
+from mereo.evaluation.metrics import confusion_matrix, format_score, intersection_over_union, truth_grid
 from mereo.evaluation.sample_views import DEPTH_STEP, load_view, make_view, save_view
 from mereo.evaluation.scoring import (
     EvaluationConfig,
@@ -32,7 +31,7 @@ from mereo.scenes.scene import AssetUnavailable
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
-from mereo.visualization.evaluation_files import evaluate_weights
+from mereo.visualization.evaluation_report import evaluate_weights
 from mereo_objects import assets
 
 pytestmark = pytest.mark.usefixtures("small_previews")

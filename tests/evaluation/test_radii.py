@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from mereo.evaluation.calibrate import LEAST, Measured, RadiusGauge, factors_of
-from mereo.evaluation.cases import RadiusRatios
+from mereo.evaluation.calibrate import LEAST, MeasuredRadii, ViewRadii, factors_of
+from mereo.evaluation.cases import RegistrationErrors
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.radii import Radii, rounded_to
 from mereo.models.calibration import RadiusFactors
-from mereo.visualization.vertex_colors import radius_scale
+from mereo.visualization.color_scales import radius_scale
 
 
 def some_radii() -> Radii:
@@ -43,10 +43,11 @@ def test_the_scale_of_radii_ends_at_all_but_a_twentieth() -> None:
     assert scale.words[1].endswith(" mm")
 
 
-def measured(off: np.ndarray, misfit: float = 0.1, displaced: float = 0.04) -> Measured:
+def measured(off: np.ndarray, misfit: float = 0.1, displaced: float = 0.04) -> MeasuredRadii:
     """A view whose radii are all 1, and whose points are so far off."""
     one = np.ones(len(off))
-    return Measured(RadiusRatios(np.abs(off), one, 0 * one, one > 0), misfit, displaced, half=20.0)
+    errors = RegistrationErrors(np.abs(off), np.abs(off), one, 0 * one, one > 0)
+    return MeasuredRadii(errors, misfit, displaced, half=20.0)
 
 
 def test_a_scale_is_measured_on_all_clean_views() -> None:
@@ -54,13 +55,13 @@ def test_a_scale_is_measured_on_all_clean_views() -> None:
     rng = np.random.default_rng(0)
     right = [measured(rng.normal(size=200)) for _ in range(20)]
     elsewhere = measured(30.0 + rng.random(200))
-    gauge = RadiusGauge()
-    gauge.clean[0].extend(right[: LEAST - 1])
-    gauge.noisy[1].extend([*right[:LEAST], elsewhere])
-    alone = RadiusRatios.together([one.ratios for one in right[:LEAST]]).scale()
-    assert gauge.fields() == {"noisy_draws_radius_scale": pytest.approx(alone)}
-    gauge.clean[0].extend([*right[LEAST - 1 :], elsewhere])
-    fields = gauge.fields()
+    views = ViewRadii()
+    views.clean[0].extend(right[: LEAST - 1])
+    views.noisy[1].extend([*right[:LEAST], elsewhere])
+    alone = RegistrationErrors.together([one.errors for one in right[:LEAST]]).scale()
+    assert views.fields() == {"noisy_draws_radius_scale": pytest.approx(alone)}
+    views.clean[0].extend([*right[LEAST - 1 :], elsewhere])
+    fields = views.fields()
     assert fields["radius_scale"] > 2.2 > 1.96 > alone - 0.3  # 99 % and more of the right ones
     assert (fields["usual_misfit"], fields["usual_displaced"]) == (0.1, 0.04)
 
@@ -72,7 +73,7 @@ def test_a_frame_that_is_misfitted_or_where_the_network_is_elsewhere_has_wider_r
     lost = [measured(3.0 * rng.normal(size=400), misfit=0.2), measured(4.0 + rng.random(400), displaced=0.4)]
     factors = factors_of([*right, *lost])
     assert factors.scale == pytest.approx(1.96, rel=0.05)
-    plain = RadiusRatios.together([one.ratios for one in (*right, *lost)]).scale()
+    plain = RegistrationErrors.together([one.errors for one in (*right, *lost)]).scale()
     assert plain > 4.0
     assert factors.widening(0.2) == pytest.approx(4.0) and factors.widening(0.05) == 1.0
     assert (

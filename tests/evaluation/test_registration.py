@@ -7,8 +7,8 @@ import pytest
 from align_cases import object_at_rest, perturbed, pose_error, scan_of, true_poses
 from shapes import ball
 
-from mereo.evaluation.registration.icp import Matches, Registration, exposed, icp, load_icp, moved
-from mereo.evaluation.registration.placement import Placement, Start, _check_runaway, place
+from mereo.evaluation.icp import Matches, Registration, exposed, icp, load_icp, moved
+from mereo.evaluation.placement import Placement, Start, _check_runaway, place
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import transform_points
 
@@ -142,7 +142,7 @@ def test_a_rigid_motion_of_scan_and_start_moves_the_result(points: np.ndarray, p
     """Turned about the camera, everything turns with it."""
     turn = perturbed(np.eye(4), np.zeros(3), 40, 0, seed=5)
     rough = start()
-    again = place(object_at_rest(), transform_points(turn, points), Start(turn @ rough.poses, rough.own, ""))
+    again = place(object_at_rest(), transform_points(turn, points), Start(turn @ rough.poses, rough.separate, ""))
     for found, before, middle in zip(again.segments[:2], placement.segments[:2], middles()[:2], strict=True):
         shift, turn_deg = pose_error(found.T_scan_segment, turn @ before.T_scan_segment, middle)
         assert shift < 0.03 and turn_deg < 0.2

@@ -8,7 +8,7 @@ import pytest
 from align_cases import object_at_rest
 from scipy.spatial.transform import Rotation
 
-from mereo.evaluation.registration.placement import pose_of_pairs, read_start
+from mereo.evaluation.placement import pose_of_pairs, read_start
 from mereo.geometry.transforms import rigid, transform_points
 
 SCALE = 2.5
@@ -31,7 +31,7 @@ def test_exact_pairs_and_matrices_give_the_pose(tmp_path: Path) -> None:
     rest = object_at_rest()
     by_pairs = read_start(write(tmp_path, {"object": pairs()}), rest, SCALE)
     np.testing.assert_allclose(by_pairs.poses, np.stack([POSE] * 3), atol=1e-9)
-    assert not by_pairs.own.any()
+    assert not by_pairs.separate.any()
     by_matrix = read_start(write(tmp_path, {"object": POSE.tolist()}), rest)
     np.testing.assert_allclose(by_matrix.poses[0], POSE, atol=1e-9)
 
@@ -41,7 +41,7 @@ def test_a_segment_may_have_a_start_of_its_own(tmp_path: Path) -> None:
     start = read_start(
         write(tmp_path, {"object": pairs(), "segments": {"arm": pairs(pose=other)}}), object_at_rest(), SCALE
     )
-    assert start.own.tolist() == [False, True, False]
+    assert start.separate.tolist() == [False, True, False]
     np.testing.assert_allclose(start.poses, [POSE, other, POSE], atol=1e-9)
     assert start.how == "object; arm from start.json"
 

@@ -13,11 +13,10 @@ from align_cases import bar_scan, perturbed, pose_error
 from analytic import AnalyticModel
 
 from mereo.__main__ import main
+from mereo.evaluation.icp import moved
 from mereo.evaluation.metrics import Scores
-from mereo.evaluation.registration.icp import moved
-from mereo.evaluation.registration.placement import Start, place, start_from_model
-from mereo.evaluation.registration.truth_file import read_truth
-from mereo.evaluation.scans import BUNNY_SCAN_POSES, SCANS, bunny_posed, bunny_scan
+from mereo.evaluation.placement import Start, place, start_from_model
+from mereo.evaluation.scans import BUNNY_SCAN_POSES, SCANS, bunny_posed, bunny_scan, read_truth
 from mereo.evaluation.scoring import EvaluationConfig, evaluate
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
@@ -25,7 +24,7 @@ from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
-from mereo.visualization.evaluation_files import evaluate_weights
+from mereo.visualization.evaluation_report import evaluate_weights
 
 pytest.importorskip("small_gicp", reason="the extra align is not installed")
 
@@ -129,7 +128,7 @@ def test_a_truth_file_never_runs_a_python_scene_that_the_user_has_not_named(
             read_truth(truth)
         assert not (folder / "was-run").exists()
     model = AnalyticModel.of(lambda points: points, ("left", "right"))
-    monkeypatch.setattr("mereo.visualization.evaluation_files.load_for", lambda *_: model)
+    monkeypatch.setattr("mereo.visualization.evaluation_report.load_for", lambda *_: model)
     monkeypatch.setattr("mereo.evaluation.scoring.check_names", lambda _, names: named.append(names))
     monkeypatch.setattr("mereo.evaluation.scoring.registrar_for", lambda *_: sys.exit("read"))
     named: list[tuple[str, ...]] = []

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from mereo.fitting.registration.recognition import MOST, NOT_ASKED, Recognition, Signs
-from mereo.visualization.trust import trust
+from mereo.visualization.report_words import VERDICTS, trust
 
 SIGNS = Signs(size=0.01, unexplained=0.2)
 TAKEN = {"answer": "registration", "explained": 0.989, "accepted": True}
@@ -95,7 +95,8 @@ def test_a_verdict_is_one_line_with_its_reason(
     recognition: Recognition | None, registration: dict[str, Any] | None, level: str, line: str, cure: str | None
 ) -> None:
     found = trust(summary(recognition, registration))
-    assert (found.level, found.line.replace("\N{NO-BREAK SPACE}", " "), found.cure) == (level, line, cure)
+    told = f"{VERDICTS[found.level]}: {found.why}."
+    assert (found.level, told.replace("\N{NO-BREAK SPACE}", " "), found.cure) == (level, line, cure)
 
 
 @pytest.mark.parametrize("junk", [None, 3, "x", [], {"known": None, "explained": float("nan"), "answer": 7}])

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from toy_scene import Lift, Shear, toy_scene
 
-from mereo.evaluation.cases import RadiusRatios, seen_points
+from mereo.evaluation.cases import RegistrationErrors, seen_points
 from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed
 from mereo.fitting.problem.posterior import Posterior, covariance_factor, radius95
@@ -217,19 +217,19 @@ def test_the_interval_of_a_volume_is_around_it_and_not_far_from_the_true_one(
 def test_the_scale_is_that_which_holds_95_percent(found: Registration, material: np.ndarray) -> None:
     """Ratios of radii that are too small by a known factor, and what is said of them with it."""
     shown = seen_points(material, PointCloud(seen(found.model.mesh(material))), 1.0)
-    one = RadiusRatios.of(found, material, shown)
+    one = RegistrationErrors.of(found, material, shown, 1.0)
     np.testing.assert_array_equal(one.seen, shown)
-    calibrated = RadiusRatios.of(replace(found, radius_scale=7.0, extra_radius=0.05), material, shown)
-    np.testing.assert_allclose(calibrated.radii, one.by(7.0).with_extra_radius(0.05).radii)
-    np.testing.assert_allclose(calibrated.ratios, one.by(7.0).with_extra_radius(0.05).ratios, atol=1e-12)
+    calibrated = RegistrationErrors.of(replace(found, radius_scale=7.0, extra_radius=0.05), material, shown, 1.0)
+    np.testing.assert_allclose(calibrated.radii, one.scaled(7.0).with_extra_radius(0.05).radii)
+    np.testing.assert_allclose(calibrated.ratios, one.scaled(7.0).with_extra_radius(0.05).ratios, atol=1e-12)
     off = np.linalg.norm(found.material - material, axis=1)
     assert found.uncertainty is not None
     np.testing.assert_array_equal(one.ratios <= 1.0, off <= found.uncertainty.material)
-    both = RadiusRatios.together([one, RadiusRatios.of(found, material, shown)])
+    both = RegistrationErrors.together([one, RegistrationErrors.of(found, material, shown, 1.0)])
     scale = both.scale()
-    said = both.by(scale).summary(unit_mm=2.0)
+    said = both.scaled(scale).coverage(unit_mm=2.0)
     assert said["all"] == pytest.approx(0.95, abs=1e-3)
-    assert both.by(None).summary()["all"] == pytest.approx((one.ratios <= 1).mean())
+    assert both.scaled(None).coverage()["all"] == pytest.approx((one.ratios <= 1).mean())
     assert said["radius_seen"] == pytest.approx(scale * np.median(one.gaussian[shown]))
     assert said["radius_hidden_mm"] == pytest.approx(2.0 * scale * np.median(one.gaussian[~shown]))
 
@@ -238,7 +238,7 @@ def test_a_registration_from_a_file_has_no_radii(found: Registration, material: 
     read = replace(found, optimum=None)
     assert read.uncertainty is None and read.radius95([[0.0, 0.0, 0.0]], at="rest") is None
     with pytest.raises(ValueError, match="fit its frame again"):
-        RadiusRatios.of(read, material, np.ones(len(material), dtype=bool))
+        RegistrationErrors.of(read, material, np.ones(len(material), dtype=bool), 1.0)
 
 
 def test_the_shares_of_all_evidence_sum_to_one(found: Registration) -> None:

@@ -32,8 +32,8 @@ from mereo.models.model import Model
 from mereo.models.weights import load_model
 from mereo.reconstruction.observation import observe
 from mereo.reconstruction.stream import Outcome
+from mereo.visualization.reconstruction_report import MOST, UNEXPLAINED, explain_centroids, point_marks
 from mereo.visualization.result_files import write_answer, write_answer_file
-from mereo.visualization.sure_colors import MOST, UNEXPLAINED, point_marks, sure_colors
 from mereo.visualization.units import Unit
 
 needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
@@ -197,8 +197,7 @@ def test_points_that_the_model_does_not_explain_are_red(model: Model, cloud: Poi
     assert one is not None and len(one.unexplained)
     marks = point_marks(one, points)
     assert (marks[-40:] == UNEXPLAINED).mean() > 0.8 and (marks[:-40] == UNEXPLAINED).mean() < 0.1
-    colors = sure_colors(registration, Unit(None))
-    assert colors is not None and len(colors.of_points(points)) == len(model.names)
+    assert tuple(explain_centroids(registration)) == model.names
 
 
 def load_unit(model: Model, cloud: PointCloud) -> float:
@@ -240,7 +239,7 @@ def test_the_viewer_colours_it_and_says_it_of_a_place(found: Answer, server: obj
     assert [len(part) for part in colors] == [len(s.vertices) for s in mesh.segments]
     assert scale is not None and "mm" in scale.words[1]
     page.probe(mesh.segments[0].vertices[0])
-    assert re.search(r"± [\d.]+ mm \(95\s%\)", page.told.content)
+    assert re.search(r"± [\d.]+ mm \(95\s%\)", page.facts.content)
 
 
 def test_the_command_explains_segments_and_places(

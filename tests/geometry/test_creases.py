@@ -15,7 +15,7 @@ from mereo.geometry.radii import Radii
 from mereo.geometry.subdivision import split_at_creases
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.writers.glb import write_segments_glb
-from mereo.visualization.reconstruction_report import write_report
+from mereo.visualization.reconstruction_report import Report
 
 RED, BLUE = (213, 94, 0), (86, 180, 233)
 
@@ -144,7 +144,7 @@ def test_a_glb_has_creases_and_merges_to_the_same_surface(tmp_path: Path, colore
 
 def test_the_report_has_the_same_creases(tmp_path: Path) -> None:
     mesh = SegmentedMesh((box(), ball()))
-    write_report(tmp_path / "r.html", PointCloud(ball().vertices[::5]), mesh, {})
+    Report(PointCloud(ball().vertices[::5]), mesh, {}).write(tmp_path / "r.html")
     data = page_data(tmp_path / "r.html")
     flat, smooth = (positions(data, shown["positions"]) for shown in data["segments"])
     assert len(flat) == 24 and len(smooth) == len(ball().vertices)

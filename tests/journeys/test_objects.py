@@ -15,8 +15,7 @@ import mereo
 from mereo import __main__ as command_line
 from mereo.cli.options import loaded_object
 from mereo.evaluation.cases import grid_confusion, labels_on
-from mereo.evaluation.ground_truth import truth_grid
-from mereo.evaluation.metrics import intersection_over_union
+from mereo.evaluation.metrics import intersection_over_union, truth_grid
 from mereo.fitting.registration.register import Registrar
 from mereo.io.config import InputConfig
 from mereo.reconstruction.config import IsolationConfig

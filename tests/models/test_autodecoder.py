@@ -14,7 +14,7 @@ from toy_data import read_all, write_toy_dataset
 from training_runs import assert_resumes_exactly, train_in_two_processes
 
 from mereo.evaluation.cases import TestCase
-from mereo.evaluation.ground_truth import truth_grid
+from mereo.evaluation.metrics import truth_grid
 from mereo.evaluation.scoring import score_cases
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh

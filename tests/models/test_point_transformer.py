@@ -15,7 +15,7 @@ from toy_data import NAMES, write_toy_dataset
 from training_runs import assert_resumes_exactly
 
 from mereo.evaluation.cases import TestCase
-from mereo.evaluation.ground_truth import truth_grid
+from mereo.evaluation.metrics import truth_grid
 from mereo.evaluation.scoring import score_cases
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh

@@ -24,7 +24,6 @@ from mereo.reconstruction.observation import (
     lines_of_points,
     observe,
 )
-from mereo.visualization.sight_picture import OBJECT_COLOR, PAST_COLOR, UNKNOWN_COLOR, sight_picture
 from mereo_serving.options import FrameOptions
 
 
@@ -191,8 +190,3 @@ def test_a_file_keeps_what_its_mask_leaves_out(tmp_path: Path) -> None:
     isolated = find_object(unmasked, IsolationConfig(depth_range=(0.9, 1.1)))
     np.testing.assert_array_equal(isolated.lines.past, seen.lines.past)
     np.testing.assert_array_equal(isolated.lines.unknown, seen.lines.unknown)
-    picture = sight_picture(isolated)
-    for place, color in (((20, 45), PAST_COLOR), ((20, 18), UNKNOWN_COLOR), ((20, 30), OBJECT_COLOR)):
-        assert np.argmax(picture[place]) == np.argmax(color), place
-    with pytest.raises(ValueError, match="cloud has no depth image; lines of sight are drawn in one"):
-        sight_picture(observe(isolated.cloud))

@@ -8,7 +8,7 @@ from scene_files import write_bar
 from scipy.spatial.transform import Rotation
 from shapes import box
 
-from mereo.evaluation.registration.icp import moved
+from mereo.evaluation.icp import moved
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import rigid, transform_points

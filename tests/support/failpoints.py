@@ -82,15 +82,15 @@ def _serve() -> None:
     from mereo.models.export import onnx_export
     from mereo.models.weights import load_model
     from mereo.training import model_card, trainer
-    from mereo.visualization import evaluation_files
+    from mereo.visualization import evaluation_report
 
     del model_card
     torch.set_num_threads(1)
     make_small_datasets(_Patch())  # type: ignore[arg-type]
     assert trainer.train.__kwdefaults__ is not None
     trainer.train.__kwdefaults__["checkpoint_every_s"] = 0.0
-    assert evaluation_files.evaluate_weights.__kwdefaults__ is not None
-    evaluation_files.evaluate_weights.__kwdefaults__["cells"] = 16
+    assert evaluation_report.evaluate_weights.__kwdefaults__ is not None
+    evaluation_report.evaluate_weights.__kwdefaults__["cells"] = 16
     traced = list[onnx_export.Graphs]()
     for line in sys.stdin:
         asked = json.loads(line)

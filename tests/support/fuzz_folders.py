@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from fuzz_files import POINTS, bar, dataset, scene_file, tiny_model
 
-from mereo.evaluation.registration.placement import PlacedSegment, Placement
-from mereo.evaluation.registration.truth_file import ScanFile, read_truth, write_truth
+from mereo.evaluation.placement import PlacedSegment, Placement
+from mereo.evaluation.scans import ScanFile, read_truth, write_truth
 from mereo.evaluation.tables import read_metrics
 from mereo.io.atomic_files import check_new_directory, new_directory, write_json
 from mereo.training.config import PRESETS

@@ -52,7 +52,7 @@ from fuzz_files import (
 from fuzz_folders import claimed, placed, replaced, result, run, scored, scores, truth
 from written_results import COLORS, grid, segments
 
-from mereo.evaluation.registration.placement import read_start
+from mereo.evaluation.placement import read_start
 from mereo.evaluation.sample_views import load_view
 from mereo.io.attachments import Positions, read_pose_table, write_attachment
 from mereo.io.intrinsics import read_intrinsics

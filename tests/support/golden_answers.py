@@ -30,8 +30,7 @@ from golden_objects import FOLDER, OWN, weights_of
 
 import mereo
 from mereo.evaluation.cases import grid_confusion, labels_on
-from mereo.evaluation.ground_truth import truth_grid
-from mereo.evaluation.metrics import intersection_over_union
+from mereo.evaluation.metrics import intersection_over_union, truth_grid
 from mereo.evaluation.scans import SCANS, bunny_posed
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import fit_rigid

@@ -17,7 +17,7 @@ from mereo.geometry.camera import PointCloud
 from mereo.models.model import Model
 from mereo.models.trained import EncodedCloud
 from mereo.synthesis.config import SENSOR_TERMS, SENSORS, GenerateConfig, SamplingConfig, Sensor, SensorConfig
-from mereo.visualization.evaluation_files import evaluate_weights
+from mereo.visualization.evaluation_report import evaluate_weights
 
 SMALL = GenerateConfig(image_size=48, points=64, sampling=SamplingConfig(per_segment=8))
 BASICS = "generate rope --examples 7 --output out"

@@ -21,7 +21,7 @@ from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo.synthesis.examples import sample_view
 from mereo.training.model_card import card
-from mereo.visualization.evaluation_files import evaluate_weights
+from mereo.visualization.evaluation_report import evaluate_weights
 
 SMALL = GenerateConfig(image_size=48, points=64, sampling=SamplingConfig(per_segment=8))
 NARROW = Workspace(axis=(0.0, 1.0, 0.0), aperture_rad=0.5)

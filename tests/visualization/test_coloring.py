@@ -8,13 +8,13 @@ from shapes import ball
 
 from mereo.geometry.mesh import SegmentedMesh, vertex_normals
 from mereo.models.trained import Answer
-from mereo.visualization.vertex_colors import (
+from mereo.visualization.color_scales import (
     ColorScale,
     confidence,
     distance_scale,
     observed_distance,
 )
-from mereo.visualization.viewer.probe import first_hit
+from mereo.visualization.viewer.result_page import first_point
 
 GREYS = ColorScale("grey", 1.0, 3.0, ((0, 0, 0), (100, 100, 100), (250, 250, 250)), ("low", "high"))
 
@@ -68,10 +68,10 @@ def test_vertex_normals_of_a_ball_point_away_from_its_middle() -> None:
 
 def test_a_ray_meets_the_nearest_surface_that_is_shown() -> None:
     mesh, origin, along = two_balls(), np.array([-9.0, 0.01, 0.02]), np.array([2.0, 0.0, 0.0])
-    np.testing.assert_allclose(first_hit(mesh, origin, along, [True, True]), [-2.0, 0.01, 0.02], atol=0.05)
-    np.testing.assert_allclose(first_hit(mesh, origin, along, [False, True]), [4.0, 0.01, 0.02], atol=0.05)
-    assert first_hit(mesh, origin, along, [False, False]) is None
-    assert first_hit(mesh, origin, -along, [True, True]) is None
+    np.testing.assert_allclose(first_point(mesh, origin, along, [True, True]), [-2.0, 0.01, 0.02], atol=0.05)
+    np.testing.assert_allclose(first_point(mesh, origin, along, [False, True]), [4.0, 0.01, 0.02], atol=0.05)
+    assert first_point(mesh, origin, along, [False, False]) is None
+    assert first_point(mesh, origin, -along, [True, True]) is None
 
 
 def test_first_hits_are_those_of_moeller_and_trumbore() -> None:
@@ -86,7 +86,7 @@ def test_first_hits_are_those_of_moeller_and_trumbore() -> None:
         columns = np.stack([b - a, c - a, np.broadcast_to(-direction, a.shape)], axis=-1)
         u, v, t = np.linalg.solve(columns, (origin - a)[..., None])[..., 0].T
         distance = t[(u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)].min(initial=np.inf)
-        found = first_hit(mesh, origin, direction, [True, True])
+        found = first_point(mesh, origin, direction, [True, True])
         assert (found is None) == np.isinf(distance)
         if found is not None:
             hits += 1

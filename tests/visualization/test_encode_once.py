@@ -17,9 +17,9 @@ from mereo.models.trained import EncodedCloud
 from mereo.models.weights import load_model
 from mereo.scenes.parameters import random_state
 from mereo.scenes.registry import load_scene
-from mereo.visualization.vertex_colors import confidence
+from mereo.visualization.color_scales import confidence
 from mereo.visualization.viewer.laboratory import Laboratory
-from mereo.visualization.viewer.probe import ask_network, probe_answer
+from mereo.visualization.viewer.result_page import ask_network, probe_answer
 
 
 @pytest.fixture

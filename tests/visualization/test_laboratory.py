@@ -10,8 +10,7 @@ from browser import BROWSER, Page, pixels_of, until
 from toy_scene import rest_mesh, toy_scene
 
 from mereo.evaluation.cases import labels_on
-from mereo.evaluation.ground_truth import truth_grid
-from mereo.evaluation.metrics import Scores
+from mereo.evaluation.metrics import Scores, truth_grid
 from mereo.fitting.registration.register import Registrar
 from mereo.geometry.transforms import transform_points
 from mereo.models.model import Model
@@ -163,9 +162,9 @@ def test_what_is_found_stands_beside_the_truth_until_something_changes(
     nodes = server.scene._handle_from_node_name  # type: ignore[attr-defined]
     found, true = (np.array(nodes[f"/names/{name}"].position) for name in ("reconstruction", "truth"))
     right = view.T_world_camera[:3, 0]
-    assert (true - found) @ right > 1.0 and len(page.found.handles) == 4
+    assert (true - found) @ right > 1.0 and len(page.answer.handles) == 4
     page.update()
-    assert page.trial is None and not page.found.handles and page.scores.content == ""
+    assert page.trial is None and not page.answer.handles and page.scores.content == ""
 
     def nothing(_: Laboratory, __: object) -> Trial:
         raise ValueError("nothing is found: move the camera")

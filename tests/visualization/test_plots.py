@@ -11,7 +11,7 @@ import mereo
 from mereo import __main__ as command_line
 from mereo.cli.scenes import SceneModes
 from mereo.training.metrics_log import MetricsLog
-from mereo.visualization.viridis import TABLE, viridis
+from mereo.visualization.color_scales import TABLE, viridis
 
 ROWS = [{"step": float(step), "loss": 2.0 / step, "val_iou": 0.1 * step} for step in (1, 2, 3)]
 

@@ -16,15 +16,14 @@ from scipy.spatial import cKDTree
 
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
-from mereo.visualization.contact_sheets import MISSING
-from mereo.visualization.depth_picture import MOST_SIDE, depth_data
-from mereo.visualization.reconstruction_report import BUDGET_BYTES, cluster, write_report
+from mereo.visualization.contact_sheets import MISSING, MOST_DEPTH_PX, depth_data
+from mereo.visualization.reconstruction_report import BUDGET_BYTES, Report, cluster
 from mereo.visualization.units import Unit
 
 
 def test_the_page_holds_the_shapes_to_16_bits_of_the_box(tmp_path: Path) -> None:
     cloud, mesh, summary = example()
-    write_report(tmp_path / "r.html", cloud, mesh, summary)
+    Report(cloud, mesh, summary).write(tmp_path / "r.html")
     data = page_data(tmp_path / "r.html")
     step = (np.asarray(data["high"]) - data["low"]).max() / 65535
     np.testing.assert_allclose(positions(data, data["cloud"]["positions"]), cloud.points, atol=step)
@@ -38,7 +37,7 @@ def test_the_page_holds_the_shapes_to_16_bits_of_the_box(tmp_path: Path) -> None
 
 
 def test_the_page_needs_nothing_from_outside_and_cannot_be_broken_by_names(tmp_path: Path) -> None:
-    write_report(tmp_path / "r.html", *example())
+    Report(*example()).write(tmp_path / "r.html")
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
     assert not re.search(r"https?://|src=|@import|url\(|fetch\(|XMLHttpRequest", page)
     assert page.count("</script>") == 1
@@ -61,7 +60,7 @@ def test_figures_are_in_millimetres_where_the_unit_is_known(
     tmp_path: Path, unit: Unit, heads: list[str], row: list, voxels: str
 ) -> None:
     cloud, mesh, summary = example()
-    write_report(tmp_path / "r.html", cloud, mesh, summary, unit=unit)
+    Report(cloud, mesh, summary, unit=unit).write(tmp_path / "r.html")
     words = page_data(tmp_path / "r.html")["words"]
     assert words["heads"][1:3] == heads and voxels in words["facts"]
     place, volume, confidence = words["rows"][0]
@@ -73,7 +72,7 @@ def test_the_page_counts_the_points_once_and_has_no_words_of_programs(tmp_path: 
     cloud, mesh, summary = example()
     told = {"answer": "registration", "explained": 0.973}
     said = {"recognition": {"known": "unsure", "reason": "a part is bent: look at it", "signs": {"size": 0.1}}}
-    write_report(tmp_path / "r.html", cloud, mesh, {**summary, **said, "registration": told, "patient_pose": "supine"})
+    Report(cloud, mesh, {**summary, **said, "registration": told, "patient_pose": "supine"}).write(tmp_path / "r.html")
     data = page_data(tmp_path / "r.html")
     words = data["words"]
     assert words["facts"][0] == "your model, registered: it explains 97.3% of the points"
@@ -89,7 +88,7 @@ def test_the_page_counts_the_points_once_and_has_no_words_of_programs(tmp_path: 
 @pytest.mark.parametrize("unit, ends", [(Unit(1.0), ["500 mm", "700 mm"]), (Unit(None), ["0.5 units", "0.7 units"])])
 def test_the_page_has_the_depth_image_where_there_is_one(tmp_path: Path, unit: Unit, ends: list[str]) -> None:
     cloud, mesh, summary = example()
-    write_report(tmp_path / "r.html", cloud, mesh, summary, unit=unit, depth=wall(80, 60))
+    Report(cloud, mesh, summary, unit=unit, depth=wall(80, 60)).write(tmp_path / "r.html")
     told = page_data(tmp_path / "r.html")["depth"]
     assert told["ends"] == ends
     kind, _, content = told["url"].partition(",")
@@ -97,13 +96,13 @@ def test_the_page_has_the_depth_image_where_there_is_one(tmp_path: Path, unit: U
     assert kind == "data:image/png;base64" and picture.shape[:2] == (told["height"], told["width"])
     # what was measured, and a little around it: 20 x 15 pixels
     assert (picture != np.array(MISSING)).any(axis=2).sum() == 20 * 15 and picture.shape[:2] == (19, 24)
-    write_report(tmp_path / "none.html", cloud, mesh, summary)
+    Report(cloud, mesh, summary).write(tmp_path / "none.html")
     assert page_data(tmp_path / "none.html")["depth"] is None
 
 
 def test_large_and_empty_depth_images_are_small_pictures() -> None:
     large = depth_data(wall(4000, 3000), Unit(1.0))
-    assert MOST_SIDE / 2 < large["width"] <= MOST_SIDE and len(large["url"]) < 100_000
+    assert MOST_DEPTH_PX / 2 < large["width"] <= MOST_DEPTH_PX and len(large["url"]) < 100_000
     empty = depth_data(DepthImage(np.zeros((4, 6)), Camera.from_fov(6, 4, 0.7)), Unit(1.0))
     assert (empty["width"], empty["height"], empty["ends"]) == (6, 4, [])
 
@@ -111,7 +110,7 @@ def test_large_and_empty_depth_images_are_small_pictures() -> None:
 def test_a_large_reconstruction_stays_under_the_budget_and_in_shape(tmp_path: Path) -> None:
     cloud, _, summary = example()
     mesh = SegmentedMesh(tuple(ball(f"s{i}", 0.2 * i, PALETTE[i], level=6) for i in range(3)))
-    write_report(tmp_path / "r.html", PointCloud(np.tile(cloud.points, (700, 1))), mesh, summary)
+    Report(PointCloud(np.tile(cloud.points, (700, 1))), mesh, summary).write(tmp_path / "r.html")
     assert 1_000_000 < (tmp_path / "r.html").stat().st_size <= BUDGET_BYTES
     data = page_data(tmp_path / "r.html")
     assert data["coarsened"]
@@ -119,7 +118,7 @@ def test_a_large_reconstruction_stays_under_the_budget_and_in_shape(tmp_path: Pa
         distance = np.linalg.norm(positions(data, shown["positions"]) - [0.2 * i, 0, 0.5], axis=1)
         np.testing.assert_allclose(distance, 0.1, atol=0.002)
     with pytest.raises(ValueError, match="at most 5000000: shorten the summary"):
-        write_report(tmp_path / "r2.html", cloud, mesh, {"title": "x" * BUDGET_BYTES})
+        Report(cloud, mesh, {"title": "x" * BUDGET_BYTES}).write(tmp_path / "r2.html")
     assert not (tmp_path / "r2.html").exists()
 
 
@@ -149,7 +148,7 @@ def browse(page: str, tmp_path: Path, *options: str) -> str:
 @pytest.mark.parametrize("mode", ["", "#2d"])
 def test_a_browser_draws_every_segment(tmp_path: Path, mode: str) -> None:
     cloud, mesh, summary = example()
-    write_report(tmp_path / "r.html", cloud, mesh, summary)
+    Report(cloud, mesh, summary).write(tmp_path / "r.html")
     address = (tmp_path / "r.html").as_uri() + mode
     text = browse(address, tmp_path, "--dump-dom")
     drawing = re.search(r'data-drawing="(\w+)"', text)
@@ -180,7 +179,7 @@ def test_every_column_is_seen_on_a_phone_too(tmp_path: Path, width: int) -> None
     segments = [{**told, **sure, "volume95": [3.43e-5, 3.59e-5]} for told in summary["segments"]]
     names = [replace(one, name=f"finger_{k}") for k, one in enumerate(mesh.segments)]
     summary = {**summary, "segments": segments, "radius95": {"median": 1e-4, "max": 1e-3, "calibrated": True}}
-    write_report(tmp_path / "r.html", cloud, SegmentedMesh(tuple(names)), summary, unit=Unit(1.0), depth=wall(80, 60))
+    Report(cloud, SegmentedMesh(tuple(names)), summary, unit=Unit(1.0), depth=wall(80, 60)).write(tmp_path / "r.html")
     with Page(tmp_path, (tmp_path / "r.html").as_uri(), (width, 800)) as page:
         until(lambda: page.evaluate("document.body.dataset.drawing"))
         words = page.text().replace("\N{NO-BREAK SPACE}", " ")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mereo.visualization.surface_offsets import cell_size, signed_distance, surface_offset
+from mereo.visualization.error_maps import cell_size, signed_distance, surface_offset
 
 SPACING = np.array([0.5, 0.3, 0.4])
 CENTER = np.array([8.1, 7.9, 8.05])

@@ -1,14 +1,12 @@
 """`mereo view`: its pages in a real browser, and its command."""
 
 import contextlib
-import gc
 import os
 import re
 import signal
 import socket
 import subprocess
 import sys
-import threading
 import urllib.request
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,13 +19,11 @@ from toy_scene import rest_mesh
 
 from mereo.geometry.camera import PointCloud
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
+from mereo.visualization.color_scales import ColorScale
 from mereo.visualization.units import Unit
-from mereo.visualization.vertex_colors import ColorScale
-from mereo.visualization.viewer import html
 from mereo.visualization.viewer import server as viewer_server
-from mereo.visualization.viewer.display import CLOUD_SIZES, POINT_SHARE, point_size
-from mereo.visualization.viewer.probe import Probed
-from mereo.visualization.viewer.result_page import Content, ResultPage
+from mereo.visualization.viewer.display import CLOUD_SIZES, POINT_SHARE, chips, heading, message, point_size
+from mereo.visualization.viewer.result_page import Content, Probed, ResultPage, probe_html
 
 needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
 needs_browser = pytest.mark.skipif(
@@ -93,7 +89,7 @@ def test_points_give_way_to_colours_and_a_probe_is_shown(server: object) -> None
     page.coloring.value = "segment"
     assert nodes["/cloud"].visible
     page.move_probe(np.array([0.0, 0.0, 148.0]))
-    assert "box_1" in page.told.content and "2 mm inside the nearest surface" in page.told.content
+    assert "box_1" in page.facts.content and "2 mm inside the nearest surface" in page.facts.content
     assert nodes["/probe"].visible and nodes["/arrow"].visible
 
 
@@ -158,7 +154,7 @@ def test_a_page_of_another_address_gets_nothing(server: object, origin: str) -> 
 
 @needs_viser
 def test_a_viser_that_starts_otherwise_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(viewer_server, "own_pages_only", lambda: contextlib.nullcontext([]))
+    monkeypatch.setattr(viewer_server, "local_pages_only", lambda: contextlib.nullcontext([]))
     with pytest.raises(ImportError, match="starts its server in a way that mereo cannot close to other web pages"):
         viewer_server.start_server(0)
 
@@ -171,39 +167,6 @@ def test_a_page_is_on_this_machine_only_and_a_taken_port_is_said(server: object)
         assert answer.status == 200
     with pytest.raises(OSError, match=f"port {port} is taken or not allowed; choose another one with --port"):
         viewer_server.start_server(port)
-
-
-@pytest.mark.slow
-@needs_viser
-def test_pages_that_were_closed_leave_nothing_behind(server: object, monkeypatch: pytest.MonkeyPatch) -> None:
-    from viser import __version__ as version
-    from websockets.asyncio.server import ServerConnection
-    from websockets.sync.client import connect
-
-    def connections() -> int:
-        return sum(type(known) is ServerConnection for known in gc.get_objects())
-
-    monkeypatch.setattr(viewer_server, "COLLECT_EVERY_S", 0.05)
-    address = f"127.0.0.1:{server.get_port()}"  # type: ignore[attr-defined]
-    end = threading.Event()
-    keeper = threading.Thread(target=viewer_server.keep_open, args=(end,))
-    gc.collect()
-    gc.disable()  # or some of the pages might be collected by chance
-    try:
-        frozen, before = gc.get_freeze_count(), connections()
-        for _ in range(12):
-            with connect(f"ws://{address}", origin=f"http://{address}", subprotocols=[f"viser-v{version}"]) as page:
-                page.recv(timeout=20)
-        assert connections() >= before + 6
-        keeper.start()
-        until(lambda: connections() <= before)
-        assert gc.get_freeze_count() > frozen
-        end.set()
-        keeper.join(20)
-    finally:
-        gc.enable()
-        end.set()
-    assert gc.get_freeze_count() == 0
 
 
 @needs_viser
@@ -267,9 +230,9 @@ def test_names_cannot_break_the_panels() -> None:
         np.array([[4.0, 5.0, 6.0]]),
     )
     place = np.array([0.001, 0.002, 0.003])
-    text = html.answer(answer, ("empty", name), ((0, 0, 0), (1, 2, 3)), place, Unit(1.0))
+    text = probe_html(answer, ("empty", name), ((0, 0, 0), (1, 2, 3)), place, Unit(1.0))
     shown = re.sub(r"<[^>]+>", " ", text)
-    assert "<script" not in text + html.chips((name,), ((1, 2, 3),)) + html.heading(name, name) + html.message(name)
+    assert "<script" not in text + chips((name,), ((1, 2, 3),)) + heading(name, name) + message(name)
     for told in (
         "0.75",
         "2 mm inside the nearest surface",

@@ -28,11 +28,16 @@ from mereo.geometry.radii import Radii
 from mereo.io.mesh_formats import read_glb
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION, write_segments_glb
 from mereo.models.model import Model
-from mereo.visualization.reconstruction_report import write_report
+from mereo.visualization.reconstruction_report import Report, read_report
 from mereo.visualization.units import UNKNOWN, Unit
-from mereo.visualization.viewer.probe import Probed, ask_network
-from mereo.visualization.viewer.result_page import OWN, SURE, content_of_answer, content_of_files
-from mereo.visualization.written_report import read_report
+from mereo.visualization.viewer.result_page import (
+    SURE,
+    VERTEX,
+    Probed,
+    ask_network,
+    content_of_answer,
+    content_of_files,
+)
 
 needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
 needs_browser = pytest.mark.skipif(
@@ -60,7 +65,7 @@ def folder(tmp_path: Path) -> Path:
     folder.mkdir()
     write_segments_glb(folder / "segments.glb", found(), GLTF_CAMERA_ROTATION, 0.001, radii_of(found()))
     told = {**summary, "title": "frame <7>"}
-    write_report(folder / "report.html", cloud, found(), told, unit=Unit(0.001), depth=wall(80, 60, 1000.0))
+    Report(cloud, found(), told, unit=Unit(0.001), depth=wall(80, 60, 1000.0)).write(folder / "report.html")
     return folder
 
 
@@ -162,7 +167,7 @@ def test_a_folder_is_shown_with_all_that_its_files_keep(folder: Path) -> None:
     colors, scale = content.colorings[SURE]()
     assert [len(part) for part in colors] == [len(s.vertices) for s in content.mesh.segments] and scale is not None
     cloud, mesh, summary = example()
-    write_report(folder / "report.html", cloud, mesh, summary)
+    Report(cloud, mesh, summary).write(folder / "report.html")
     assert content_of_files(folder).unit == UNKNOWN
     (folder / "report.html").unlink()
     plain = content_of_files(folder)
@@ -197,7 +202,7 @@ def test_any_glb_has_its_own_colours_and_no_probe(tmp_path: Path) -> None:
     write_strange(tmp_path / "s.GLB")
     content = content_of_files(tmp_path / "s.GLB")
     assert content.ask is None and content.first_view == "front" and content.facts.startswith("3 parts")
-    colors, scale = content.colorings[OWN]()
+    colors, scale = content.colorings[VERTEX]()
     assert scale is None and [len(part) for part in colors] == [len(s.vertices) for s in content.mesh.segments]
 
 

@@ -31,7 +31,7 @@ from mereo.scenes.seeds import example_rng
 from mereo.synthesis import shards
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
-from mereo.visualization.evaluation_files import evaluate_weights
+from mereo.visualization.evaluation_report import evaluate_weights
 from mereo.workers.spread import Cluster
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'mereo[cluster]'")

@@ -33,7 +33,7 @@ from mereo.scenes.seeds import TEST_SEED_START
 from mereo.synthesis.config import GenerateConfig
 from mereo.training import trainer
 from mereo.training.config import PRESETS, PresetName, TrainConfig
-from mereo.visualization.evaluation_files import evaluate_weights
+from mereo.visualization.evaluation_report import evaluate_weights
 from mereo.workers.spread import Cluster, choose_cluster
 
 

@@ -11,7 +11,7 @@ from mereo.cli.options import Outcome
 if TYPE_CHECKING:
     from mereo.api.objects import Object
     from mereo.api.result import Result
-    from mereo.evaluation.ground_truth import TruthGrid
+    from mereo.evaluation.metrics import TruthGrid
     from mereo.io.sensor_frame import SensorFrame
 
 RESOLUTION = 100
@@ -74,7 +74,7 @@ def _inputs(output: Path) -> "Iterator[tuple[str, str, Object, SensorFrame, Trut
 
     from mereo.api.frames import load_frame
     from mereo.api.objects import load_object
-    from mereo.evaluation.ground_truth import truth_grid
+    from mereo.evaluation.metrics import truth_grid
     from mereo.evaluation.sample_views import SHIPPED_SCAN, load_view
     from mereo.evaluation.scans import BUNNY_SCAN_POSES
     from mereo.geometry.mesh import SegmentedMesh

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.radii import level_told
 from mereo.io.writers.meshes import write_explained_ply
-from mereo.visualization.sure_colors import UNEXPLAINED, mark_colors, point_marks, shares_told
+from mereo.visualization.reconstruction_report import UNEXPLAINED, describe_shares, mark_colors, point_marks
 from mereo.visualization.units import Unit, rounded
 
 FOLDER = "explained"
@@ -74,7 +74,7 @@ def explain(
         named = f"the centre of {wish}" if isinstance(wish, str) else "the object's point"
         level = level_told(registered.uncertainty.calibrated)
         said = f"{named} is at {unit.place(found.place, radius)} {unit.length_name}"
-        told = f"{said} ({level}); what leaves it unsure: {shares_told(found)}"
+        told = f"{said} ({level}); what leaves it unsure: {describe_shares(found)}"
         lost = len(found.unexplained)
         print(f"{told}; {lost} points are not the model's" if lost else told)
         marks = point_marks(found, points)

@@ -135,7 +135,7 @@ class SceneModes:
         from mereo.io.atomic_files import atomic_file, check_file_place
         from mereo.io.extras import CURE, has_plots
         from mereo.scenes.registry import files_of
-        from mereo.visualization.mode_pictures import preview_modes
+        from mereo.visualization.previews import preview_modes
 
         check_file_place(self.output, force=self.force)
         if self.output is not None and self.output.suffix.lower() != ".png":

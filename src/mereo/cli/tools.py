@@ -14,7 +14,7 @@ from mereo.training.config import PresetName
 from mereo_experiments.paper.scales import ExperimentName, ScaleName
 
 if TYPE_CHECKING:
-    from mereo.evaluation.registration.placement import Placement
+    from mereo.evaluation.placement import Placement
 
 
 @dataclass(frozen=True)
@@ -56,9 +56,9 @@ class Align:
                 f"{'no start is' if self.start is None else 'two starts are'} given; one is needed: --start FILE or "
                 "--weights NAME (docs/own-object.md says how to make a start file)"
             )
-        from mereo.evaluation.registration.icp import load_icp
-        from mereo.evaluation.registration.placement import place, read_start, start_from_model
-        from mereo.evaluation.registration.truth_file import TRUTH, ScanFile, write_truth
+        from mereo.evaluation.icp import load_icp
+        from mereo.evaluation.placement import place, read_start, start_from_model
+        from mereo.evaluation.scans import TRUTH, ScanFile, write_truth
         from mereo.geometry.conventions import UNITS_M
         from mereo.io.atomic_files import new_directory
         from mereo.io.readers import read_point_cloud
@@ -67,7 +67,7 @@ class Align:
         from mereo.scenes.registry import files_of, is_yaml, load_scene
         from mereo.scenes.scene import SCENES
         from mereo.visualization.contact_sheets import save_png
-        from mereo.visualization.scan_overlay import overlay
+        from mereo.visualization.previews import overlay
 
         load_icp()  # its absence is better said before the work
         scan = ScanFile(self.scan, self.unit, self.frame, self.drop_invalid)

@@ -1,6 +1,6 @@
 """One test case scored by itself, wherever that is done, and the set of them put together.
 
-    case(i) -Scoring-> ScoredCase -EvaluationTally-> Evaluation
+    case(i) -Scoring-> ScoredCase -evaluation_of-> Evaluation
 
 What a case leaves is small, so cases may be scored anywhere; they are put together in their order, so that sums are the
 same bits wherever each one comes from.
@@ -16,8 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import cKDTree
 
-from mereo.evaluation.ground_truth import TruthGrid
-from mereo.evaluation.metrics import Scores, confusion_matrix, intersection_over_union
+from mereo.evaluation.metrics import Scores, TruthGrid, confusion_matrix, intersection_over_union
 from mereo.fitting.problem.posterior import LEVEL
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.recognition import Known
@@ -34,103 +33,129 @@ from mereo.reconstruction.observation import observe
 from mereo.reconstruction.pipeline import segment_names
 from mereo.scenes.statistical_model import StatisticalModel
 
-# --- coverage of radii ------------------------------------------------------------------------------------------------
+# --- errors of a registration, and their radii ------------------------------------------------------------------------
 
-# Coverage: how often true places lie within the radii of a registration, and the factor with which 95 % of them do.
+# Coverage: how often true positions lie within the radii of a registration, and the factor with which 95 % of them do.
 #
-# Registration, truth -RadiusRatios.of-> ratios of each view -together, scale-> Calibration.radius_scale
-
-SEEN_WITHIN = 1.5
-"""Distance in scene units up to which a material point counts as seen: that of the nearest observed point."""
+# Registration, truth -RegistrationErrors.of-> errors of each view -together, scale-> Calibration.radius_scale
 
 
 def seen_points(truth: Float[np.ndarray, "m 3"], cloud: PointCloud, scene_unit: float) -> Bool[np.ndarray, " m"]:
-    """Which material points a cloud shows, by their true places in its frame and unit."""
-    near: Bool[np.ndarray, " m"] = cKDTree(cloud.points).query(truth)[0] <= SEEN_WITHIN * scene_unit
+    """Which material points a cloud shows: those whose true positions are within 1.5 scene units of an observed one."""
+    near: Bool[np.ndarray, " m"] = cKDTree(cloud.points).query(truth)[0] <= 1.5 * scene_unit
     return near
 
 
 @dataclass(frozen=True, eq=False)
-class RadiusRatios:
-    """Distances of registered material points from their true places, in the radii that they have.
+class RegistrationErrors:
+    """Distances of registered material points from their true positions, and the radii that they have.
 
     Attributes:
-        ratios: factor of the posterior's Gaussian radius with which the true place lies on the rim of the whole one; 0
-            where it lies within in any case.
+        distances: scene units.
+        ratios: factor of the posterior's Gaussian radius with which the true position lies on the rim of the whole one;
+            0 where it lies within in any case.
         gaussian: these radii, scene units.
-        beside: radii of the other parts, whose squares add to theirs (``RadiusParts.open`` and ``Uncertainty.beside``).
+        other: radii of the other parts, whose squares add to theirs (``RadiusParts.open`` and ``Uncertainty.beside``).
         seen: which of the points the cloud shows.
+        calibrated: whether the radii are.
     """
 
+    distances: Float[np.ndarray, " n"]
     ratios: Float[np.ndarray, " n"]
     gaussian: Float[np.ndarray, " n"]
-    beside: Float[np.ndarray, " n"]
+    other: Float[np.ndarray, " n"]
     seen: Bool[np.ndarray, " n"]
+    calibrated: bool = False
 
     @classmethod
     def of(
-        cls, registration: Registration, truth: Float[np.ndarray, "m 3"], seen: Bool[np.ndarray, " m"]
-    ) -> "RadiusRatios":
-        """Ratios of one view, to the radii that its registration has, with the weights' calibration if there is one.
+        cls,
+        registration: Registration,
+        truth: Float[np.ndarray, "m 3"],
+        seen: Bool[np.ndarray, " m"],
+        scene_unit: float,
+    ) -> "RegistrationErrors":
+        """Errors of one view, with the radii that its registration has, calibrated if the weights are.
 
         Args:
             registration: fitted, not read from a file.
-            truth: true places of its material points, vertices and interior ones, or of the first of them, in its frame
-                and unit.
+            truth: true positions of its material points, vertices and interior ones, or of the first of them, in its
+                frame and unit.
             seen: which of these the cloud shows (``seen_points``).
+            scene_unit: true length of a scene unit in that unit, which the registration may have estimated.
 
         Raises ``ValueError`` for a registration without an optimum.
         """
-        found = registration.uncertainty
-        if found is None:
+        sure = registration.uncertainty
+        if sure is None:
             raise ValueError("the registration was read from a file, which has no posterior: fit its frame again")
-        count, own = len(truth), found.optimum.unit / registration.scene_unit
-        off = np.linalg.norm(registration.material[:count] - truth, axis=1) / registration.scene_unit
-        gaussian, beside = own * found.parts.gaussian[:count], own * np.hypot(found.parts.open[:count], found.beside)
-        ratios = np.sqrt(np.maximum(off**2 - beside**2, 0.0)) / gaussian
-        return cls(ratios, gaussian, beside, seen).by(found.scale)
+        count, unit = len(truth), sure.optimum.unit / registration.scene_unit
+        distances = np.linalg.norm(registration.material[:count] - truth, axis=1)
+        off = distances / registration.scene_unit
+        gaussian, other = unit * sure.parts.gaussian[:count], unit * np.hypot(sure.parts.open[:count], sure.beside)
+        ratios = np.sqrt(np.maximum(off**2 - other**2, 0.0)) / gaussian
+        errors = cls(distances / scene_unit, ratios, gaussian, other, seen, registration.radius_scale is not None)
+        return errors.scaled(sure.scale)
 
     @classmethod
-    def together(cls, each: Sequence["RadiusRatios"]) -> "RadiusRatios":
-        """Ratios of several views, every point counted once."""
-        columns = zip(*((one.ratios, one.gaussian, one.beside, one.seen) for one in each), strict=True)
-        return cls(*(np.concatenate(column) for column in columns))
+    def together(cls, each: Sequence["RegistrationErrors"]) -> "RegistrationErrors":
+        """Errors of several views, every point counted once; calibrated where all of them are."""
+        columns = (
+            [getattr(view, name) for view in each] for name in ("distances", "ratios", "gaussian", "other", "seen")
+        )
+        distances, ratios, gaussian, other, seen = (np.concatenate(column) for column in columns)
+        return cls(distances, ratios, gaussian, other, seen, all(view.calibrated for view in each))
 
     @property
     def radii(self) -> Float[np.ndarray, " n"]:
         """Radii of all points, scene units."""
-        return np.hypot(self.gaussian, self.beside)
+        return np.hypot(self.gaussian, self.other)
 
     def scale(self) -> float:
-        """Factor of the Gaussian's radii that holds 95 % of the true places: ``Calibration.radius_scale``."""
+        """Factor of the Gaussian's radii that holds 95 % of the true positions: ``Calibration.radius_scale``."""
         return float(np.quantile(self.ratios, LEVEL))
 
-    def by(self, scale: float | None) -> "RadiusRatios":
+    def scaled(self, scale: float | None) -> "RegistrationErrors":
         """The same with the Gaussian's radii times a scale, where there is one."""
-        if scale is None:
-            return self
-        return RadiusRatios(self.ratios / scale, self.gaussian * scale, self.beside, self.seen)
+        return self if scale is None else replace(self, ratios=self.ratios / scale, gaussian=self.gaussian * scale)
 
-    def with_extra_radius(self, radius: float) -> "RadiusRatios":
-        """The same with a radius, in scene units, that every point has beside the others."""
+    def with_extra_radius(self, radius: float) -> "RegistrationErrors":
+        """The same with a radius, in scene units, that every point has on top of the others."""
         off = np.maximum((self.ratios * self.gaussian) ** 2 - radius**2, 0.0)
-        return RadiusRatios(np.sqrt(off) / self.gaussian, self.gaussian, np.hypot(self.beside, radius), self.seen)
+        return replace(self, ratios=np.sqrt(off) / self.gaussian, other=np.hypot(self.other, radius))
 
-    def summary(self, unit_mm: float | None = None) -> dict[str, float | None]:
-        """Share of the true places within the radii, and how large these are.
+    def summary(self, unit_mm: float | None) -> dict[str, dict[str, float | None]]:
+        """Median and 95 % quantile of seen and of hidden points' distances, in scene units, and in mm where known."""
+        return {
+            name: {
+                "median": _quantile(self.distances[rows], 0.5),
+                "p95": _quantile(self.distances[rows], 0.95),
+                "median_mm": _quantile(self.distances[rows], 0.5, unit_mm),
+                "p95_mm": _quantile(self.distances[rows], 0.95, unit_mm),
+            }
+            for name, rows in (("seen", self.seen), ("hidden", ~self.seen))
+        }
+
+    def coverage(self, unit_mm: float | None = None) -> dict[str, float | bool | None]:
+        """Share of the true positions within the radii, and how large these are.
 
         Of ``all``, ``seen`` and ``hidden`` points (None where there are none), with the medians of the radii in scene
-        units, and in mm where ``unit_mm``, millimetres per scene unit, is known.
+        units, and in mm where ``unit_mm``, millimetres per scene unit, is known; and whether they are calibrated.
         """
-        named = {"all": np.ones(len(self.seen), dtype=bool), "seen": self.seen, "hidden": ~self.seen}
-        result = {
-            name: float((self.ratios[rows] <= 1.0).mean()) if rows.any() else None for name, rows in named.items()
+        parts = {"all": np.ones(len(self.seen), dtype=bool), "seen": self.seen, "hidden": ~self.seen}
+        result: dict[str, float | bool | None] = {
+            name: float((self.ratios[rows] <= 1.0).mean()) if rows.any() else None for name, rows in parts.items()
         }
         for name in ("seen", "hidden"):
-            median = float(np.median(self.radii[named[name]])) if named[name].any() else None
+            median = float(np.median(self.radii[parts[name]])) if parts[name].any() else None
             result[f"radius_{name}"] = median
             result[f"radius_{name}_mm"] = None if median is None or unit_mm is None else median * unit_mm
-        return result
+        return {**result, "calibrated": self.calibrated}
+
+
+def _quantile(values: Float[np.ndarray, " n"], share: float, factor: float | None = 1.0) -> float | None:
+    """Quantile of values times a factor; None without values, and without a factor."""
+    return None if len(values) == 0 or factor is None else float(np.quantile(values, share)) * factor
 
 
 # --- reliability of probabilities -------------------------------------------------------------------------------------
@@ -139,34 +164,23 @@ class RadiusRatios:
 #
 # The expected calibration error (Naeini et al., AAAI 2015; Guo et al., ICML 2017) is the mean distance of the share of
 # right answers from their confidence, over bins of equal width, weighed by how many answers fall into each. Confidence
-# is the probability of the answered label, over the cells of the paper's metric (``evaluation.ground_truth``).
+# is the probability of the answered label, over the cells of the paper's metric (``evaluation.metrics``).
 
 BINS = 15
 """Bins of equal width, as in the papers."""
 
-ASKED = 20_000
-"""Cells of a view that are asked for, at most, evenly drawn: all of them would take longer than the evaluation."""
+SAMPLED_CELLS = 20_000
+"""Cells of a view at which the network is evaluated, evenly drawn: all would take longer than the evaluation."""
 
 
-@dataclass(frozen=True, eq=False)
-class AskedCells:
-    """What a network says at some of the cells that count, and what is true there.
-
-    Attributes:
-        points: the cells' centres, in the cloud's frame and unit.
-        truth: their labels.
-    """
-
-    points: Float[np.ndarray, "n 3"]
-    truth: UInt8[np.ndarray, " n"]
-
-    @classmethod
-    def of(cls, truth: TruthGrid, count: int = ASKED) -> "AskedCells":
-        """Cells that count, the same ones every time."""
-        kept = np.argwhere(truth.kept)
-        if len(kept) > count:
-            kept = kept[np.sort(np.random.default_rng(0).choice(len(kept), count, replace=False))]
-        return cls(truth.grid.positions(kept), truth.grid.labels[tuple(kept.T)])
+def sample_cells(
+    truth: TruthGrid, count: int = SAMPLED_CELLS
+) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, " n"]]:
+    """Centres and true labels of at most ``count`` of the cells that count, the same ones every time."""
+    kept = np.argwhere(truth.kept)
+    if len(kept) > count:
+        kept = kept[np.sort(np.random.default_rng(0).choice(len(kept), count, replace=False))]
+    return truth.grid.positions(kept), truth.grid.labels[tuple(kept.T)]
 
 
 @dataclass
@@ -183,20 +197,21 @@ class Reliability:
     confidence: Float[np.ndarray, " b"] = field(default_factory=lambda: np.zeros(BINS))
     right: Float[np.ndarray, " b"] = field(default_factory=lambda: np.zeros(BINS))
 
+    @classmethod
+    def of_view(cls, model: Trained, code: EncodedCloud, truth: TruthGrid) -> "Reliability":
+        """Answers of a network about a view; one that tells no segments apart is asked for the whole."""
+        points, labels = sample_cells(truth)
+        answer, result = model.query(code, points), cls()
+        right = answer.label == np.minimum(labels, answer.probability.shape[1] - 1)
+        result.add(answer.probability[np.arange(len(right)), answer.label].astype(np.float64), right)
+        return result
+
     def add(self, confidence: Float[np.ndarray, " n"], right: Bool[np.ndarray, " n"]) -> None:
         """Count further answers, by the probability of what was answered and whether that is right."""
         index = np.minimum((confidence * BINS).astype(np.int64), BINS - 1)
         self.count += np.bincount(index, minlength=BINS)
         self.confidence += np.bincount(index, weights=confidence, minlength=BINS)
         self.right += np.bincount(index, weights=right, minlength=BINS)
-
-    def add_view(self, model: Trained, code: EncodedCloud, truth: TruthGrid) -> None:
-        """Count what a network answers about a view; one that tells no segments apart is asked for the whole."""
-        cells = AskedCells.of(truth)
-        found = model.query(code, cells.points)
-        true = np.minimum(cells.truth, found.probability.shape[1] - 1)
-        rows = np.arange(len(true))
-        self.add(found.probability[rows, found.label].astype(np.float64), found.label == true)
 
     def add_all(self, other: "Reliability") -> None:
         """Count what another one has counted."""
@@ -212,23 +227,20 @@ class Reliability:
 
     def facts(self) -> list[dict[str, Any]]:
         """Bins that have answers: their share of all, mean confidence and share of right ones."""
-        filled = np.flatnonzero(self.count)
         return [
             {
                 "share": float(self.count[i] / self.count.sum()),
                 "confidence": float(self.confidence[i] / self.count[i]),
                 "right": float(self.right[i] / self.count[i]),
             }
-            for i in filled
+            for i in np.flatnonzero(self.count)
         ]
 
 
 # --- answers to a test case -------------------------------------------------------------------------------------------
 
-# Answers to one test case: the network's, that of the modes, that of the scene's own draws, and which a user gets.
-
 AnswerName = Literal["network", "modes", "full"]
-"""Who answers: the network alone, the registered modes, the better of these and the scene's own draws."""
+"""Who answers: the network alone, the registered modes, the better of these and the scene's own parameters."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,12 +256,6 @@ class Candidate:
     labels: UInt8[np.ndarray, "x y z"]
     seconds: float
     registration: Registration | None = None
-
-    def labels_on(self, grid: LabelGrid, model: Trained, code: EncodedCloud) -> UInt8[np.ndarray, "x y z"]:
-        """Labels on another grid."""
-        if self.registration is None:
-            return network_labels(model, code, grid)
-        return label_grid(self.registration.mesh, *grid.axes())
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,8 +284,7 @@ class Candidates:
     @property
     def source(self) -> str:
         """Where that answer comes from: network, rest, modes or draws."""
-        found = self.answer.registration
-        return "network" if found is None else found.method
+        return "network" if self.answer.registration is None else self.answer.registration.method
 
 
 def network_labels(model: Trained, code: EncodedCloud, grid: LabelGrid) -> UInt8[np.ndarray, "x y z"]:
@@ -301,79 +306,27 @@ def find_candidates(
     started = time.perf_counter()
     code, encoding = answer.likelier.code, answer.likelier.timings_s["encode"]
     labels = network_labels(model, code, grid)
-    each: dict[AnswerName, Candidate] = {"network": Candidate(labels, encoding + time.perf_counter() - started)}
+    network = Candidate(labels, encoding + time.perf_counter() - started)
     if registrar is None:
-        return Candidates(code, each, "network", seconds=each["network"].seconds)
+        return Candidates(code, {"network": network}, "network", seconds=network.seconds)
     known, names = answer.recognition.known, names_for(registrar)
-    if answer.candidate.modes is None or answer.registration is None:  # too little is found, whoever is scored
-        return Candidates(code, dict.fromkeys(names, each["network"]), "network", known, answer.seconds)
-    each["modes"] = _registered(answer.candidate.modes.registration(), grid, encoding)
-    if "full" in names:
-        each["full"] = _registered(answer.registration, grid, encoding)
+    if answer.candidate.modes is None or answer.registration is None:  # too few correspondences, whoever is scored
+        return Candidates(code, dict.fromkeys(names, network), "network", known, answer.seconds)
+    registrations = {"modes": answer.candidate.modes.registration(), "full": answer.registration}
+    each: dict[AnswerName, Candidate] = {"network": network}
+    for name in names[1:]:
+        fit = registrations[name]
+        each[name] = Candidate(label_grid(fit.mesh, *grid.axes()), encoding + fit.seconds, fit)
     return Candidates(code, each, names[-1] if answer.taken else "network", known, answer.seconds)
 
 
 def names_for(registrar: Registrar | None) -> tuple[AnswerName, ...]:
-    """Names of the answers that can be had: the draws only of an object whose scene is at hand."""
+    """Names of the answers that can be had: the scene's parameters only of an object whose scene is there."""
     if registrar is None:
         return ("network",)
     if registrar.method == "modes" or registrar.states_or_none is None:
         return ("network", "modes")
     return ("network", "modes", "full")
-
-
-def _registered(registration: Registration, grid: LabelGrid, encoding: float) -> Candidate:
-    labels = label_grid(registration.mesh, *grid.axes())
-    return Candidate(labels, encoding + registration.seconds, registration)
-
-
-@dataclass(frozen=True, eq=False)
-class RegistrationErrors:
-    """Distances of registered material points from where they truly are, scene units.
-
-    Attributes:
-        seen: of those near an observed point.
-        hidden: of all others.
-    """
-
-    seen: Float[np.ndarray, " n"]
-    hidden: Float[np.ndarray, " m"]
-
-    @classmethod
-    def of(
-        cls,
-        registration: Registration,
-        truth: Float[np.ndarray, "m 3"],
-        seen: Bool[np.ndarray, " m"],
-        scene_unit: float,
-    ) -> "RegistrationErrors":
-        """Errors at the material points whose true places are given, the first ones, in the registration's unit.
-
-        ``seen`` says which of these the cloud shows (``coverage.seen_points``).
-        """
-        error = np.linalg.norm(registration.material[: len(truth)] - truth, axis=1) / scene_unit
-        return cls(error[seen], error[~seen])
-
-    @classmethod
-    def together(cls, each: list["RegistrationErrors"]) -> "RegistrationErrors":
-        """Errors of several frames as one set."""
-        nothing = [np.empty(0)]
-        return cls(
-            np.concatenate([*nothing, *(one.seen for one in each)]),
-            np.concatenate([*nothing, *(one.hidden for one in each)]),
-        )
-
-    def summary(self, unit_mm: float | None) -> dict[str, dict[str, float | None]]:
-        """Median and 95 % quantile of the seen and of the hidden points, in scene units, and in mm where known."""
-        return {"seen": _quantiles(self.seen, unit_mm), "hidden": _quantiles(self.hidden, unit_mm)}
-
-
-def _quantiles(errors: Float[np.ndarray, " n"], unit_mm: float | None) -> dict[str, float | None]:
-    if len(errors) == 0:
-        return {"median": None, "p95": None, "median_mm": None, "p95_mm": None}
-    median, p95 = (float(value) for value in np.quantile(errors, [0.5, 0.95]))
-    millimetres = [None if unit_mm is None else value * unit_mm for value in (median, p95)]
-    return {"median": median, "p95": p95, "median_mm": millimetres[0], "p95_mm": millimetres[1]}
 
 
 # --- results of a test set --------------------------------------------------------------------------------------------
@@ -418,6 +371,12 @@ class AnswerScores:
     examples: tuple[Scores, ...]
     seconds: tuple[float, ...]
 
+    @classmethod
+    def of(cls, cases: Sequence[tuple[Int[np.ndarray, "c c"], float]], segmented: bool) -> "AnswerScores":
+        """Scores of a set by the confusion matrix and the seconds of each case."""
+        each = tuple(intersection_over_union(confusion, segmented) for confusion, _ in cases)
+        return cls(np.sum([confusion for confusion, _ in cases], axis=0), each, tuple(seconds for _, seconds in cases))
+
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
@@ -432,10 +391,8 @@ class Evaluation:
         answers: the same of each that could have answered; ``confusion`` and ``examples`` are of what a user gets.
         sources: where that answer came from, in each example: network, modes or draws.
         known: whether each example was said to show the object, where a registration was asked for.
-        errors: distances of registered points from their true places, where a registration was taken.
+        errors: distances of registered points from their true positions, where a registration was taken.
         unit_mm: millimetres per scene unit, where they are known.
-        coverage: distances of the same points over the radii that are told of them.
-        radii_calibrated: whether all of these are.
         reliability: of the network's probabilities.
         calibrated: whether these are.
         seconds: of each example, from the cloud to the answer that a user gets.
@@ -451,8 +408,6 @@ class Evaluation:
     known: tuple[Known, ...] = ()
     errors: RegistrationErrors | None = None
     unit_mm: float | None = None
-    coverage: RadiusRatios | None = None
-    radii_calibrated: bool = False
     reliability: Reliability = field(default_factory=Reliability)
     calibrated: bool = False
     seconds: tuple[float, ...] = ()
@@ -490,26 +445,6 @@ def labels_on(surfaces: SegmentedMesh, grid: LabelGrid) -> UInt8[np.ndarray, "x 
     return np.array([0, *(number + 1 for number in present)], dtype=np.uint8)[labels]
 
 
-@dataclass
-class Tally:
-    """Running sum of the scores of one of the answers."""
-
-    confusion: Int[np.ndarray, "c c"] = field(default_factory=lambda: np.zeros((0, 0), dtype=np.int64))
-    examples: list[Scores] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
-
-    def add(self, confusion: Int[np.ndarray, "c c"], seconds: float, segmented: bool) -> None:
-        """Count one more example."""
-        self.confusion = confusion if len(self.examples) == 0 else self.confusion + confusion
-        self.examples.append(intersection_over_union(confusion, segmented))
-        self.seconds.append(seconds)
-
-    @property
-    def scores(self) -> AnswerScores:
-        """Scores of the set."""
-        return AnswerScores(self.confusion, tuple(self.examples), tuple(self.seconds))
-
-
 # --- test cases -------------------------------------------------------------------------------------------------------
 
 PICTURE_MARGIN = 12
@@ -525,7 +460,7 @@ class TestCase:
         cloud: what the model is given.
         truth: true labels on a grid.
         scene_unit: length of a scene unit in the cloud's unit, where it is known.
-        material: true places of a statistical model's material points, or of the first of them, in the cloud's frame
+        material: true positions of a statistical model's material points, or of the first of them, in the cloud's frame
             and unit; None where no correspondence is known.
     """
 
@@ -539,21 +474,6 @@ class TestCase:
 
 
 @dataclass(frozen=True, eq=False)
-class RegisteredPlaces:
-    """How well an answer's registration places the object's points.
-
-    Attributes:
-        errors: their distances from where they truly are.
-        ratios: these over the radii that are told.
-        calibrated: whether the radii are.
-    """
-
-    errors: RegistrationErrors
-    ratios: RadiusRatios
-    calibrated: bool
-
-
-@dataclass(frozen=True, eq=False)
 class ScoredCase:
     """What is kept of one test case.
 
@@ -563,7 +483,7 @@ class ScoredCase:
         default: whose answer a user gets.
         source: where that comes from.
         reliability: of the network's probabilities on this case.
-        places: of the registration behind the answer; None without one, or without known places.
+        errors: of the registration behind the answer; None without one, or without known true positions.
         view: labels for a picture; None where none is wanted.
         known: as ``Candidates`` has it.
         seconds: as ``Candidates`` has them.
@@ -574,7 +494,7 @@ class ScoredCase:
     default: AnswerName
     source: str
     reliability: Reliability
-    places: RegisteredPlaces | None
+    errors: RegistrationErrors | None
     view: EvaluatedView | None
     known: Known | None = None
     seconds: float = 0.0
@@ -610,88 +530,67 @@ class Scoring:
 
     def __call__(self, index: int) -> ScoredCase:
         """Score a case."""
-        one, (model, registrar) = self.case(index), self.moved
-        found = find_candidates(model, one.cloud, one.truth.grid, registrar, one.scene_unit)
+        case, (model, registrar) = self.case(index), self.moved
+        candidates = find_candidates(model, case.cloud, case.truth.grid, registrar, case.scene_unit)
         names, colors = segment_names(model)
-        reliability = Reliability()
-        reliability.add_view(model, found.code, one.truth)
         return ScoredCase(
-            name=one.name,
+            name=case.name,
             each={
-                name: (grid_confusion(one.truth, found.each[name].labels, len(names)), found.each[name].seconds)
+                name: (
+                    grid_confusion(case.truth, candidates.each[name].labels, len(names)),
+                    candidates.each[name].seconds,
+                )
                 for name in names_for(registrar)
             },
-            default=found.default,
-            source=found.source,
-            reliability=reliability,
-            places=_places(one, found.answer),
-            view=_evaluated_view(one, model, found, colors) if index < self.kept else None,
-            known=found.known,
-            seconds=found.seconds,
+            default=candidates.default,
+            source=candidates.source,
+            reliability=Reliability.of_view(model, candidates.code, case.truth),
+            errors=_errors(case, candidates.answer.registration),
+            view=_evaluated_view(case, model, candidates, colors) if index < self.kept else None,
+            known=candidates.known,
+            seconds=candidates.seconds,
         )
 
 
-def _places(one: TestCase, answer: Candidate) -> RegisteredPlaces | None:
-    registration = answer.registration
-    if registration is None or one.material is None or one.scene_unit is None:
+def _errors(case: TestCase, registration: Registration | None) -> RegistrationErrors | None:
+    if registration is None or case.material is None or case.scene_unit is None:
         return None
-    truth = one.material(registration.model)
-    seen = seen_points(truth, one.cloud, one.scene_unit)
-    return RegisteredPlaces(
-        RegistrationErrors.of(registration, truth, seen, one.scene_unit),
-        RadiusRatios.of(registration, truth, seen),
-        registration.radius_scale is not None,
+    truth = case.material(registration.model)
+    seen = seen_points(truth, case.cloud, case.scene_unit)
+    return RegistrationErrors.of(registration, truth, seen, case.scene_unit)
+
+
+def _evaluated_view(case: TestCase, model: Trained, candidates: Candidates, colors: Sequence[Color]) -> EvaluatedView:
+    """Truth and answer on the truth's grid and ``PICTURE_MARGIN`` cells around it, which are empty in truth."""
+    grid, registration = case.truth.grid, candidates.answer.registration
+    labels = np.pad(grid.labels, PICTURE_MARGIN)
+    wide = replace(grid, labels=labels, origin=grid.origin - PICTURE_MARGIN * grid.spacing)
+    if registration is None:
+        predicted = network_labels(model, candidates.code, wide)
+    else:
+        predicted = label_grid(registration.mesh, *wide.axes())
+    reference = np.minimum(labels, np.uint8(len(colors)))
+    return EvaluatedView(case.name, case.cloud, reference, predicted, wide.origin, wide.spacing, colors)
+
+
+def evaluation_of(model: Trained, cases: Sequence[ScoredCase], answers: Sequence[AnswerName]) -> Evaluation:
+    """Result of a test set from its cases, in order, which all have these answers."""
+    scores = AnswerScores.of([case.each[case.default] for case in cases], model.segmented)
+    errors = [case.errors for case in cases if case.errors is not None]
+    reliability = Reliability()
+    for case in cases:
+        reliability.add_all(case.reliability)
+    return Evaluation(
+        names=segment_names(model)[0],
+        confusion=scores.confusion,
+        examples={case.name: example for case, example in zip(cases, scores.examples, strict=True)},
+        views=tuple(case.view for case in cases if case.view is not None),
+        segmented=model.segmented,
+        answers={name: AnswerScores.of([case.each[name] for case in cases], model.segmented) for name in answers},
+        sources=tuple(case.source for case in cases),
+        known=tuple(case.known for case in cases if case.known is not None),
+        errors=RegistrationErrors.together(errors) if errors else None,
+        reliability=reliability,
+        calibrated=model.calibrates,
+        seconds=tuple(case.seconds for case in cases),
     )
-
-
-def _evaluated_view(one: TestCase, model: Trained, found: Candidates, colors: Sequence[Color]) -> EvaluatedView:
-    """Truth and answer on the truth's grid and ``PICTURE_MARGIN`` cells around it."""
-    wide = _widened(one.truth)
-    reference = np.minimum(wide.grid.labels, np.uint8(len(colors)))
-    predicted = found.answer.labels_on(wide.grid, model, found.code)
-    return EvaluatedView(one.name, one.cloud, reference, predicted, wide.grid.origin, wide.grid.spacing, colors)
-
-
-def _widened(truth: TruthGrid) -> TruthGrid:
-    """The same cells and ``PICTURE_MARGIN`` more on each side, which are empty, since the box holds every segment."""
-    grid = truth.grid
-    labels, kept = (np.pad(values, PICTURE_MARGIN) for values in (grid.labels, truth.kept))
-    return TruthGrid(replace(grid, labels=labels, origin=grid.origin - PICTURE_MARGIN * grid.spacing), kept)
-
-
-class EvaluationTally:
-    """Running sums over a test set, whose cases are added in order."""
-
-    def __init__(self, model: Trained, answers: Sequence[AnswerName]) -> None:
-        self.model = model
-        self.answer, self.tallies = Tally(), {name: Tally() for name in answers}
-        self.cases: list[ScoredCase] = []
-        self.reliability = Reliability()
-
-    def add(self, one: ScoredCase) -> None:
-        """Count one more case."""
-        for name, tally in self.tallies.items():
-            tally.add(*one.each[name], self.model.segmented)
-        self.answer.add(*one.each[one.default], self.model.segmented)
-        self.reliability.add_all(one.reliability)
-        self.cases.append(one)
-
-    def evaluation(self) -> Evaluation:
-        """Result of the set."""
-        places = [one.places for one in self.cases if one.places is not None]
-        return Evaluation(
-            names=segment_names(self.model)[0],
-            confusion=self.answer.confusion,
-            examples={one.name: scores for one, scores in zip(self.cases, self.answer.examples, strict=True)},
-            views=tuple(one.view for one in self.cases if one.view is not None),
-            segmented=self.model.segmented,
-            answers={name: tally.scores for name, tally in self.tallies.items()},
-            sources=tuple(one.source for one in self.cases),
-            known=tuple(one.known for one in self.cases if one.known is not None),
-            errors=RegistrationErrors.together([one.errors for one in places]) if places else None,
-            coverage=RadiusRatios.together([one.ratios for one in places]) if places else None,
-            radii_calibrated=bool(places) and all(one.calibrated for one in places),
-            reliability=self.reliability,
-            calibrated=self.model.calibrates,
-            seconds=tuple(one.seconds for one in self.cases),
-        )

@@ -1,10 +1,14 @@
-"""Metrics of the paper (appendix B): IoU and mIoU from one confusion matrix over a whole test set."""
+"""Metrics of the paper (appendix B): truth on a grid, and IoU and mIoU from one confusion matrix over a test set."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isnan
 
 import numpy as np
-from jaxtyping import Float, Int, Integer
+from jaxtyping import Bool, Float, Int, Integer
+
+from mereo.geometry.labels import LabelGrid
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.solids import label_grid
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,3 +56,39 @@ def intersection_over_union(confusion: Int[np.ndarray, "c c"], segmented: bool =
 def format_score(score: float | None, missing: str = "-") -> str:
     """Score with three decimals as a table shows it, or ``missing`` where it is undefined (NaN, or JSON's null)."""
     return missing if score is None or isnan(score) else f"{score:.3f}"
+
+
+# --- ground truth -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class TruthGrid:
+    """Ground truth of an evaluation: true labels on a grid, and which of its cells count (paper, appendix B).
+
+    Attributes:
+        grid: true labels at the centres of the cells into which the joint box of all segments is divided.
+        kept: which of them count: those in the enlarged box of at least one segment.
+    """
+
+    grid: LabelGrid
+    kept: Bool[np.ndarray, "x y z"]
+
+    def scaled(self, factor: float) -> "TruthGrid":
+        """The same with all lengths ``factor`` times as long."""
+        grid = replace(self.grid, origin=factor * self.grid.origin, spacing=factor * self.grid.spacing)
+        return TruthGrid(grid, self.kept)
+
+
+def truth_grid(mesh: SegmentedMesh, cells: int = 100) -> TruthGrid:
+    """Ground truth at the centres of ``cells`` ** 3 cells, into which the joint box of all segments is divided."""
+    low, high = mesh.bounds
+    spacing = (high - low) / cells
+    origin = low + spacing / 2
+    x, y, z = (origin[axis] + np.arange(cells) * spacing[axis] for axis in range(3))
+    kept = np.zeros((cells, cells, cells), dtype=bool)
+    for segment in mesh.segments:
+        first, last = segment.bounds
+        margin = 0.25 * (last - first)  # on each side: 50 % in all, as in the paper
+        inside = [(c >= a) & (c <= b) for c, a, b in zip((x, y, z), first - margin, last + margin, strict=True)]
+        kept[np.ix_(*inside)] = True
+    return TruthGrid(LabelGrid(label_grid(mesh, x, y, z), origin, spacing, mesh.names), kept)

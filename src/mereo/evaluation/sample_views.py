@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mereo.evaluation.ground_truth import TruthGrid, truth_grid
+from mereo.evaluation.metrics import TruthGrid, truth_grid
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.labels import LabelGrid
 from mereo.io.atomic_files import atomic_file

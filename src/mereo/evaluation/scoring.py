@@ -1,8 +1,8 @@
-"""Scores on test sets (paper, appendix B), and on synthetic views of a scene; for real scans see ``scan_scoring``.
+"""Scores on test sets (paper, appendix B): synthetic views of a scene, and real scans.
 
 The joint box of all true segments is divided into 100^3 cells; their centres are labelled by the truth and by the
 model, and those outside every segment's enlarged box are dropped. One confusion matrix is summed over the whole set;
-IoU and mIoU come from it, and the mean over single examples is reported beside it.
+IoU and mIoU come from it, and the mean over single examples is reported as well.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,18 +16,16 @@ from jaxtyping import Float, UInt8
 
 from mereo.evaluation.cases import (
     Evaluation,
-    EvaluationTally,
     ScoredCase,
     Scoring,
     TestCase,
+    evaluation_of,
     grid_confusion,
     names_for,
     network_labels,
 )
-from mereo.evaluation.ground_truth import TruthGrid, truth_grid
-from mereo.evaluation.metrics import Scores, intersection_over_union
-from mereo.evaluation.registration.truth_file import read_truth
-from mereo.evaluation.scans import SCANS, PosedScan, bunny_posed
+from mereo.evaluation.metrics import Scores, TruthGrid, intersection_over_union, truth_grid
+from mereo.evaluation.scans import SCANS, PosedScan, bunny_posed, read_truth
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.register import CURE, Registrar, other_mesh, registrar_for
 from mereo.geometry.camera import PointCloud
@@ -36,7 +34,7 @@ from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.progress import progress as stage
 from mereo.models.model import Model
 from mereo.models.remote import to_cpu
-from mereo.models.trained import EncodedCloud, Trained
+from mereo.models.trained import Trained
 from mereo.reconstruction.pipeline import segment_names
 from mereo.scenes.random_states import state_points
 from mereo.scenes.registry import load_scene
@@ -46,9 +44,6 @@ from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import View, sample_view
 from mereo.workers.spread import Cluster, spread
-
-KEPT_VIEWS = 4
-"""Number of examples, the first ones, that keep their labels and are drawn with their errors."""
 
 CELLS = 100
 """Cells of the paper's grid along each axis."""
@@ -82,21 +77,20 @@ class EvaluationConfig:
 # --- one cloud -------------------------------------------------------------------------------------------------------
 
 
-def predict_grid(model: Trained, seen: PointCloud | EncodedCloud, truth: TruthGrid) -> UInt8[np.ndarray, "x y z"]:
-    """Labels by the network on the grid of ``truth``; ``seen`` is a cloud, or its code."""
-    code = seen if isinstance(seen, EncodedCloud) else model.encode(seen)
-    return network_labels(model, code, truth.grid)
+def predict_grid(model: Trained, cloud: PointCloud, truth: TruthGrid) -> UInt8[np.ndarray, "x y z"]:
+    """Labels by the network on the grid of ``truth``."""
+    return network_labels(model, model.encode(cloud), truth.grid)
 
 
-def grid_scores(model: Model, seen: PointCloud | EncodedCloud, truth: SegmentedMesh, cells: int = CELLS) -> Scores:
-    """Scores of one cloud, or its code, as in the paper; ``truth`` is in the cloud's frame and units.
+def grid_scores(model: Model, cloud: PointCloud, truth: SegmentedMesh, cells: int = CELLS) -> Scores:
+    """Scores of the network on one cloud, as in the paper; ``truth`` is in the cloud's frame and units.
 
     Raises ``ValueError`` where the model knows other segments than the truth has.
     """
     check_names(model, truth.names)
     grid = truth_grid(truth, cells)
     segments = len(segment_names(model)[0])
-    return intersection_over_union(grid_confusion(grid, predict_grid(model, seen, grid), segments), model.segmented)
+    return intersection_over_union(grid_confusion(grid, predict_grid(model, cloud, grid), segments), model.segmented)
 
 
 def check_names(model: Trained, names: Sequence[str]) -> None:
@@ -146,8 +140,7 @@ def evaluate(
     case = partial(scene_case, scene, config.settings, seed, config.cells)
     unit_mm = None if scene.unit_m is None else 1000 * scene.unit_m
     registrar = registrar_for(model, method, scene)
-    found = score_cases(model, case, config.examples, progress, registrar, workers=workers)
-    return replace(found, unit_mm=unit_mm)
+    return replace(score_cases(model, case, config.examples, progress, registrar, workers=workers), unit_mm=unit_mm)
 
 
 def trained_scene(model: Model) -> str:
@@ -182,7 +175,7 @@ def score_cases(
     count: int,
     progress: bool,
     registrar: Registrar | None = None,
-    kept: int = KEPT_VIEWS,
+    kept: int = 4,
     workers: int | Cluster = 1,
 ) -> Evaluation:
     """Scores on ``case(0) ... case(count - 1)``, which are made one at a time, as they may be large.
@@ -198,18 +191,16 @@ def score_cases(
     """
     gpu = isinstance(workers, Cluster) and workers.gpus > 0
     # asking which answers there are draws the states in which a fit begins: once, here, and not in every task
-    scoring, tally = Scoring(model, registrar, case, kept, gpu), EvaluationTally(model, names_for(registrar))
+    scoring, answers = Scoring(model, registrar, case, kept, gpu), names_for(registrar)
     scored: dict[int, ScoredCase] = {}
     with (
-        closing(spread(scoring, range(count), workers)) as found,
+        closing(spread(scoring, range(count), workers)) as results,
         stage("evaluate", count, "views", quiet=not progress) as shown,
     ):
-        for number, one in found:
-            scored[number] = one
+        for number, result in results:
+            scored[number] = result
             shown.advance()
-    for number in range(count):
-        tally.add(scored[number])
-    return tally.evaluation()
+    return evaluation_of(model, [scored[number] for number in range(count)], answers)
 
 
 # --- real scans -------------------------------------------------------------------------------------------------------

@@ -20,11 +20,22 @@ CLEARLY = 0.01
 
 
 def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
-    """Content of ``metrics.json``: ``facts`` first, then definition, scores and confusion matrix."""
-    scores, (iou, miou) = evaluation.scores, evaluation.example_mean
+    """Content of ``metrics.json``: ``facts`` first, then definition, scores and confusion matrix.
+
+    The part that compares who could have answered (network, modes, full) has ``miou_tenth`` of each, the mIoU that a
+    tenth of its examples do not reach. ``chosen`` has the share of examples by where the scored answer came from,
+    ``better`` the share in which another answer would have been better than it by more than ``CLEARLY``.
+    ``registration_error`` and ``coverage95``, the share of true positions within the registration's radii, are None
+    where none was taken, and so is ``known``, the share of examples by whether they are said to show the object, where
+    no registration was asked for.
+    """
+    scores, (iou, miou), errors = evaluation.scores, evaluation.example_mean, evaluation.errors
+    count = len(evaluation.examples)
+    sources = evaluation.sources if len(evaluation.sources) == count else (None,) * count
+    known = evaluation.known if len(evaluation.known) == count else (None,) * count
     return {
         **facts,
-        "examples": len(evaluation.examples),
+        "examples": count,
         "definition": f"{CELLS}^3 cell centres of the joint box, kept inside any segment's box enlarged by 50 %; one "
         "confusion matrix over the set; miou is the mean over the segments without empty space",
         "iou": scores.iou,
@@ -32,130 +43,91 @@ def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
         "seconds": float(np.median(evaluation.seconds)) if evaluation.seconds else None,
         "per_segment": dict(zip(evaluation.names, scores.per_segment.tolist(), strict=True)),
         "example_mean": {"iou": iou, "miou": miou},
-        "per_example": per_example(evaluation),
+        "per_example": {
+            name: {"iou": example.iou, "miou": example.miou, "answered_by": source, "known": is_known}
+            for (name, example), source, is_known in zip(evaluation.examples.items(), sources, known, strict=True)
+        },
         "confusion": evaluation.confusion,
         "ece": evaluation.reliability.ece,
         "calibrated": evaluation.calibrated,
         "reliability": evaluation.reliability.facts(),
-        **answers(evaluation),
+        **{name: _answer(answer, evaluation.segmented) for name, answer in evaluation.answers.items()},
+        "chosen": {
+            name: evaluation.sources.count(name) / max(1, len(evaluation.sources))
+            for name in ("network", "rest", "modes", "draws")
+        },
+        "better": {name: _share_better(answer, evaluation) for name, answer in evaluation.answers.items()},
+        "registration_error": None if errors is None else errors.summary(evaluation.unit_mm),
+        "coverage95": None if errors is None else errors.coverage(evaluation.unit_mm),
+        "known": _recognition(evaluation),
     }
 
 
-def per_example(evaluation: Evaluation) -> dict[str, dict[str, Any]]:
-    """Each example's scores, who answered it, and whether it was said to show the object; None where nothing was."""
-    count = len(evaluation.examples)
-    sources = evaluation.sources if len(evaluation.sources) == count else (None,) * count
-    known = evaluation.known if len(evaluation.known) == count else (None,) * count
-    each = zip(evaluation.examples.items(), sources, known, strict=True)
-    return {
-        name: {"iou": scores.iou, "miou": scores.miou, "answered_by": source, "known": said}
-        for (name, scores), source, said in each
-    }
-
-
-def answers(evaluation: Evaluation) -> dict[str, Any]:
-    """Part of ``metrics.json`` that compares who could have answered: network, modes, full.
-
-    Each has ``miou_tenth``, the mIoU that a tenth of its examples do not reach. ``chosen`` has the share of examples
-    by where the scored answer came from, ``better`` the share in which another answer would have been better than it by
-    more than ``CLEARLY``. ``registration_error`` and ``coverage95``, the share of true places within the registration's
-    radii, are None where none was taken, and so is ``known``, the share of examples by whether they are said to show
-    the object, where no registration was asked for.
-    """
-    count = max(1, len(evaluation.sources))
-    sources = {name: evaluation.sources.count(name) / count for name in ("network", "rest", "modes", "draws")}
-    taken = list(evaluation.examples.values())
-    better = {
-        name: float(
-            np.mean([_value(other) > _value(one) + CLEARLY for other, one in zip(all_.examples, taken, strict=True)])
-        )
-        for name, all_ in evaluation.answers.items()
-    }
-    errors = None if evaluation.errors is None else evaluation.errors.summary(evaluation.unit_mm)
-    return {
-        **{name: _answer(found, evaluation.segmented) for name, found in evaluation.answers.items()},
-        "chosen": sources,
-        "better": better,
-        "registration_error": errors,
-        "coverage95": coverage(evaluation),
-        "known": recognition(evaluation),
-    }
-
-
-def recognition(evaluation: Evaluation) -> dict[str, float] | None:
-    """Share of the examples that are said to show the object, not to, and unsure; None where nothing was said."""
-    if not evaluation.known:
-        return None
-    words = [str(one).lower() for one in evaluation.known]
-    return {word: words.count(word) / len(words) for word in ("true", "unsure", "false")}
-
-
-def recognition_line(found: Mapping[str, float]) -> str:
-    """Sentence on ``recognition``."""
-    return f"Said to show the object: {found['true']:.1%}; unsure {found['unsure']:.1%}, not {found['false']:.1%}."
-
-
-def coverage(evaluation: Evaluation) -> dict[str, float | bool | None] | None:
-    """Share of the true places within the radii of 95 %, and medians of these; None where none was registered."""
-    if evaluation.coverage is None:
-        return None
-    return {**evaluation.coverage.summary(evaluation.unit_mm), "calibrated": evaluation.radii_calibrated}
-
-
-def coverage_line(found: Mapping[str, Any]) -> str:
-    """Sentence on ``coverage``."""
-    shares = ", ".join(f"{name} {found[name]:.1%}" for name in ("seen", "hidden") if found[name] is not None)
-    medians = [
-        f"{name} {found[f'radius_{name}']:.3g} scene units"
-        + ("" if found[f"radius_{name}_mm"] is None else f" ({found[f'radius_{name}_mm']:.3g} mm)")
-        for name in ("seen", "hidden")
-        if found[f"radius_{name}"] is not None
-    ]
-    how = "calibrated" if found["calibrated"] else "not calibrated"
-    return (
-        f"Radii of 95 % ({how}) hold {found['all']:.1%} of the true places: {shares}. In the median they are "
-        f"{', '.join(medians)}."
-    )
+def _share_better(answer: AnswerScores, evaluation: Evaluation) -> float:
+    """Share of the examples in which an answer would have been clearly better than the scored one."""
+    pairs = zip(answer.examples, evaluation.examples.values(), strict=True)
+    return float(np.mean([_value(other) > _value(scored) + CLEARLY for other, scored in pairs]))
 
 
 def _value(scores: Scores) -> float:
     return scores.iou if np.isnan(scores.miou) else scores.miou
 
 
-def _answer(found: AnswerScores, segmented: bool) -> dict[str, float]:
-    scores = intersection_over_union(found.confusion, segmented)
-    tenth = float(np.quantile([one.miou for one in found.examples], 0.1))
-    return {"iou": scores.iou, "miou": scores.miou, "seconds": float(np.median(found.seconds)), "miou_tenth": tenth}
+def _answer(answer: AnswerScores, segmented: bool) -> dict[str, float]:
+    scores = intersection_over_union(answer.confusion, segmented)
+    tenth = float(np.quantile([example.miou for example in answer.examples], 0.1))
+    return {"iou": scores.iou, "miou": scores.miou, "seconds": float(np.median(answer.seconds)), "miou_tenth": tenth}
+
+
+def _recognition(evaluation: Evaluation) -> dict[str, float] | None:
+    """Share of the examples that are said to show the object, not to, and unsure; None where nothing was said."""
+    if not evaluation.known:
+        return None
+    words = [str(known).lower() for known in evaluation.known]
+    return {word: words.count(word) / len(words) for word in ("true", "unsure", "false")}
+
+
+def certainty_lines(metrics: Mapping[str, Any]) -> list[str]:
+    """Sentences on ``coverage95`` and ``known`` of ``metrics``, where these are not None."""
+    lines, radii, known = [], metrics.get("coverage95"), metrics.get("known")
+    if radii is not None:
+        shares = ", ".join(f"{name} {radii[name]:.1%}" for name in ("seen", "hidden") if radii[name] is not None)
+        medians = [
+            f"{name} {radii[f'radius_{name}']:.3g} scene units"
+            + ("" if radii[f"radius_{name}_mm"] is None else f" ({radii[f'radius_{name}_mm']:.3g} mm)")
+            for name in ("seen", "hidden")
+            if radii[f"radius_{name}"] is not None
+        ]
+        how = "calibrated" if radii["calibrated"] else "not calibrated"
+        lines.append(
+            f"Radii of 95 % ({how}) hold {radii['all']:.1%} of the true places: {shares}. In the median they are "
+            f"{', '.join(medians)}."
+        )
+    if known is not None:
+        shares = f"{known['true']:.1%}; unsure {known['unsure']:.1%}, not {known['false']:.1%}"
+        lines.append(f"Said to show the object: {shares}.")
+    return lines
 
 
 def markdown_table(evaluation: Evaluation) -> str:
-    """Markdown table of the whole set and the mean over its examples, and a line on the radii; a dash for no score."""
-    scores, (iou, miou) = evaluation.scores, evaluation.example_mean
-    names = " | ".join(evaluation.names)
-    values = " | ".join(format_score(value) for value in scores.per_segment)
+    """Markdown table of the whole set and the mean over its examples, and a line on the radii; a dash for no score.
+
+    Also a row of the whole set for each who answers, where more than the network could.
+    """
+    values = metrics(evaluation, {})
     blank = " | ".join("" for _ in evaluation.names)
-    found, said = coverage(evaluation), recognition(evaluation)
+    rows = [("whole set", values, " | ".join(format_score(value) for value in evaluation.scores.per_segment))]
+    rows.append(("mean over examples", values["example_mean"], blank))
+    if len(evaluation.answers) > 1:
+        rows += [(f"{name} alone, {values[name]['seconds']:.2f} s", values[name], blank) for name in evaluation.answers]
+    head = f"| {len(evaluation.examples)} examples | IoU | mIoU | {' | '.join(evaluation.names)} |\n"
     return (
-        f"| {len(evaluation.examples)} examples | IoU | mIoU | {names} |\n"
-        f"|---|---|---|{'---|' * len(evaluation.names)}\n"
-        f"| whole set | {format_score(scores.iou)} | {format_score(scores.miou)} | {values} |\n"
-        f"| mean over examples | {format_score(iou)} | {format_score(miou)} | {blank} |\n"
-        + _answer_rows(evaluation, blank)
-        + ("" if found is None else f"\n{coverage_line(found)}\n")
-        + ("" if said is None else f"\n{recognition_line(said)}\n")
+        f"{head}|---|---|---|{'---|' * len(evaluation.names)}\n"
+        + "".join(
+            f"| {title} | {format_score(s['iou'])} | {format_score(s['miou'])} | {rest} |\n" for title, s, rest in rows
+        )
+        + "".join(f"\n{line}\n" for line in certainty_lines(values))
     )
-
-
-def _answer_rows(evaluation: Evaluation, blank: str) -> str:
-    """Rows of the whole set by who answers, where more than the network could."""
-    if len(evaluation.answers) < 2:
-        return ""
-    rows = ""
-    for name, found in evaluation.answers.items():
-        each = _answer(found, evaluation.segmented)
-        title = f"{name} alone, {each['seconds']:.2f} s"
-        rows += f"| {title} | {format_score(each['iou'])} | {format_score(each['miou'])} | {blank} |\n"
-    return rows
 
 
 # --- read again -------------------------------------------------------------------------------------------------------
@@ -207,11 +179,11 @@ def read_metrics(path: Path) -> dict[str, Any]:
     Raises ``FileNotFoundError``, and ``ValueError`` where it is not what ``mereo evaluate`` writes.
     """
     with readable(path, "table of scores"):
-        found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     try:
-        given = _Written.model_validate(found).model_fields_set
+        given = _Written.model_validate(content).model_fields_set
     except ValidationError as error:
         raise ValueError(f"{path} is not what mereo evaluate writes ({first_problem(error)}): evaluate again") from None
     if not {"scans"} <= given and not {"examples", "seed"} <= given:
         raise ValueError(f"{path} says neither its scans nor its examples and their seed: evaluate again")
-    return found
+    return content

@@ -58,7 +58,7 @@ from mereo.training.config import PRESETS, TrainConfig
 from mereo.training.trainer import VALIDATIONS
 from mereo.training.trainer import train as train_network
 from mereo.training.trial import STEPS, nearest, small_dataset, timed, trial_steps
-from mereo.visualization.evaluation_files import evaluate_weights
+from mereo.visualization.evaluation_report import evaluate_weights
 
 # --- schedule ---------------------------------------------------------------------------------------------------------
 

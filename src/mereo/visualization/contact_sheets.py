@@ -1,8 +1,11 @@
 """Contact sheets, captions, legends, and depth as colour: what all pictures are put together from."""
 
+import base64
+import io
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -11,14 +14,20 @@ from PIL import Image, ImageDraw, ImageFont
 from mereo.geometry.camera import DepthImage
 from mereo.geometry.mesh import Color
 from mereo.io.atomic_files import atomic_file
+from mereo.visualization.color_scales import viridis
 from mereo.visualization.renderer import Canvas, Viewpoint
-from mereo.visualization.viridis import viridis
+from mereo.visualization.units import Unit, rounded
 
 Picture = UInt8[np.ndarray, "_ _ 3"]
 Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 
 INK: Color = (28, 32, 38)
 MISSING: Color = (236, 237, 240)
+
+MOST_DEPTH_PX = 480
+"""Longer side of a page's depth image at most; larger ones are thinned, pixel by pixel."""
+
+PNG_URL = "data:image/png;base64,"
 
 
 def save_png(path: str | Path, picture: Picture) -> None:
@@ -85,34 +94,61 @@ def enlarge(picture: Picture, width: int) -> Picture:
     return np.asarray(Image.fromarray(picture).resize((width, width * picture.shape[0] // picture.shape[1]), 0))
 
 
-def _draw_cloud(canvas: Canvas, points: Float[np.ndarray, "n 3"], radius_px: float = 1.5) -> None:
-    """Points coloured by depth in the picture: bright is near."""
-    if len(points) == 0:
-        return
-    z = canvas.view.apply(points)[:, 2]
-    nearness = 1 - (z - z.min()) / max(float(np.ptp(z)), 1e-12)
-    canvas.draw_points(points, viridis(0.05 + 0.85 * nearness) / 255, radius_px)
+def depth_picture(depth: DepthImage) -> Picture:
+    """Picture of what was measured, and a little around it, near is bright, of ``MOST_DEPTH_PX`` pixels at most."""
+    rows, columns = (np.flatnonzero(depth.valid.any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        rows, columns = np.arange(depth.depth.shape[0]), np.arange(depth.depth.shape[1])
+    margin = 1 + int(0.08 * max(np.ptp(rows), np.ptp(columns)))
+    window = tuple(slice(max(int(part[0]) - margin, 0), int(part[-1]) + 1 + margin) for part in (rows, columns))
+    shown = depth_to_rgb(depth)[window]
+    step = -(-max(shown.shape) // MOST_DEPTH_PX)
+    return np.ascontiguousarray(shown[::step, ::step])
+
+
+def depth_ends(depth: DepthImage, unit: Unit) -> list[str]:
+    """Nearest and farthest depth in words; of an image without measurements none."""
+    measured = depth.depth[depth.valid]
+    ends = (float(measured.min()), float(measured.max())) if len(measured) else ()
+    return [f"{rounded(end * unit.length_factor)} {unit.length_name}" for end in ends]
+
+
+def depth_data(depth: DepthImage, unit: Unit) -> dict[str, Any]:
+    """What a page needs to show a depth image: ``url``, ``width`` and ``height`` of its picture, ``ends`` in words."""
+    picture = depth_picture(depth)
+    height, width = picture.shape[:2]
+    return {"url": data_url(picture), "width": width, "height": height, "ends": depth_ends(depth, unit)}
+
+
+def data_url(picture: Picture) -> str:
+    """Picture as an address that holds it; its 96 colours make it a quarter as large."""
+    content = io.BytesIO()
+    Image.fromarray(picture).quantize(96, dither=Image.Dither.NONE).save(content, format="PNG", optimize=True)
+    return PNG_URL + base64.b64encode(content.getvalue()).decode("ascii")
 
 
 def cloud_picture(points: Float[np.ndarray, "n 3"], view: Viewpoint, size: tuple[int, int]) -> Picture:
-    """Picture of a point cloud coloured by depth, on white."""
+    """Picture of a point cloud coloured by depth, near is bright, on white."""
     canvas = Canvas.empty(view, size)
-    _draw_cloud(canvas, points)
+    if len(points):
+        z = view.apply(points)[:, 2]
+        nearness = 1 - (z - z.min()) / max(float(np.ptp(z)), 1e-12)
+        canvas.draw_points(points, viridis(0.05 + 0.85 * nearness) / 255, 1.5)
     return canvas.picture()
 
 
 def legend(names: Sequence[str], colors: Sequence[Color], width: int) -> Picture:
     """Strip with a swatch and a name for each segment, in as many rows as are needed."""
-    places, x, y = [], 12, 6
+    corners, x, y = [], 12, 6
     for name in names:
         length = 22 + int(font(15).getlength(name)) + 20
         if x > 12 and x + length > width:
             x, y = 12, y + 26
-        places.append((x, y))
+        corners.append((x, y))
         x += length
     strip = Image.new("RGB", (width, y + 30), "white")
     pen = ImageDraw.Draw(strip)
-    for name, color, (left, top) in zip(names, colors, places, strict=True):
+    for name, color, (left, top) in zip(names, colors, corners, strict=True):
         pen.rounded_rectangle((left, top + 2, left + 15, top + 17), 4, fill=color)
         pen.text((left + 22, top + 10), name, fill=INK, font=font(15), anchor="lm")
     return np.asarray(strip)

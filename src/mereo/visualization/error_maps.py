@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
-from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 
 from mereo.evaluation.cases import EvaluatedView
 from mereo.geometry.mesh import Color
@@ -21,7 +21,6 @@ from mereo.visualization.contact_sheets import (
     scale_bar,
 )
 from mereo.visualization.renderer import Canvas, Triangles, Vector, Viewpoint
-from mereo.visualization.surface_offsets import surface_offset
 
 CAMERA: tuple[Vector, Vector] = ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
 """Direction in which a camera looks, and what is up in its picture."""
@@ -35,7 +34,7 @@ PALE: Color = (222, 224, 228)
 OVER: Color = (31, 119, 214)
 UNDER: Color = (245, 130, 20)
 WRONG: Color = (214, 39, 60)
-ONE_SIDED: Color = (240, 158, 168)
+EXTRA_OR_MISSING: Color = (240, 158, 168)
 SEGMENTATION_WORDS = (
     "segmentation error: none",
     "another segment than in the reference",
@@ -47,17 +46,8 @@ TOLERANCE_CELLS = 0.5
 FULL_CELLS = 3.0
 """From this distance on a surface has the full colour of ``OVER`` or ``UNDER``."""
 
-SCALE_TITLE = "reconstruction error, in cells of the grid"
-SCALE_WORDS = (f"-{FULL_CELLS:g}, too far in", "right", f"{FULL_CELLS:g}, too far out")
 
-
-def error_picture(
-    path: str | Path,
-    cases: Sequence[EvaluatedView],
-    direction: Vector = CAMERA[0],
-    up: Vector = CAMERA[1],
-    size: int = 240,
-) -> None:
+def error_picture(path: str | Path, cases: Sequence[EvaluatedView], size: int = 240) -> None:
     """Write the paper's figure of reconstructions, one row for each case, eight columns, and a scale of the errors.
 
     Name, point cloud, reconstruction (all segments as one), reconstruction error (blue where the surface lies too far
@@ -67,20 +57,18 @@ def error_picture(
 
     Args:
         path: the .png file.
-        cases: the rows.
-        direction: where to look, in the cases' frame; the default is the camera's view.
-        up: what is up in the picture, in the same frame.
+        cases: the rows, seen by the camera.
         size: width and height of each picture in pixels.
     """
     images: list[Picture] = []
     captions: list[str] = []
     for case in cases:
-        images += [name_plate(case.name, size // 2, size), *_error_row(case, direction, up, size)]
+        images += [name_plate(case.name, size // 2, size), *_error_row(case, size)]
         captions += ["", *COLUMNS]
     sheet = contact_sheet(images, captions, 1 + len(COLUMNS))
     strips = [
         _offset_scale(sheet.shape[1]),
-        legend(SEGMENTATION_WORDS, (PALE, WRONG, ONE_SIDED), sheet.shape[1]),
+        legend(SEGMENTATION_WORDS, (PALE, WRONG, EXTRA_OR_MISSING), sheet.shape[1]),
     ]
     save_png(path, np.concatenate([sheet, *strips]))
 
@@ -131,17 +119,22 @@ def comparison_picture(path: str | Path, comparison: Comparison, size: int = 320
 
 def _offset_scale(width: int) -> Picture:
     """Scale of ``offset_colors``, for the foot of a picture."""
-    return scale_bar(offset_colors(np.linspace(-FULL_CELLS, FULL_CELLS, 181)), SCALE_TITLE, SCALE_WORDS, width)
+    colors = offset_colors(np.linspace(-FULL_CELLS, FULL_CELLS, 181))
+    words = (f"-{FULL_CELLS:g}, too far in", "right", f"{FULL_CELLS:g}, too far out")
+    return scale_bar(colors, "reconstruction error, in cells of the grid", words, width)
 
 
-def _error_row(case: EvaluatedView, direction: Vector, up: Vector, size: int) -> list[Picture]:
+def _error_row(case: EvaluatedView, size: int) -> list[Picture]:
+    direction, up = CAMERA
     front, behind = (Viewpoint.along(_bounds(case), tuple(sign * np.asarray(direction)), up) for sign in (1, -1))
-    segments = np.asarray(case.colors, dtype=float).reshape(-1, 3)
-    found = _labelled(case, (case.predicted > 0).astype(np.uint8), [PLAIN])
-    offset, wrong = offset_triangles(case), segmentation_triangles(case)
+    segments, offset = np.asarray(case.colors, dtype=float).reshape(-1, 3), offset_triangles(case)
     shown = (
-        *((found, front), (offset, front), (offset, behind), (_labelled(case, case.predicted, segments), front)),
-        *((wrong, front), (_labelled(case, case.reference, segments), front)),
+        (_labelled(case, (case.predicted > 0).astype(np.uint8), [PLAIN]), front),
+        (offset, front),
+        (offset, behind),
+        (_labelled(case, case.predicted, segments), front),
+        (segmentation_triangles(case), front),
+        (_labelled(case, case.reference, segments), front),
     )
     pictures = [_solid_picture(triangles, view, size) for triangles, view in shown]
     return [cloud_picture(case.cloud.points, front, (size, size)), *pictures]
@@ -174,7 +167,7 @@ def segmentation_triangles(case: EvaluatedView) -> Triangles:
     shown = np.where(kinds == 3, 2 + np.minimum(beneath, 2), kinds).astype(np.uint8)
     surface = _labelled(case, shown, [PALE, WRONG, PALE, WRONG])
     share = np.where(surface.owner > 2, np.repeat(_full_share(_union_offset(case, surface)), 2), 0.0)[:, None]
-    colors = (1 - share) * surface.colors + share * np.asarray(ONE_SIDED) / 255.0
+    colors = (1 - share) * surface.colors + share * np.asarray(EXTRA_OR_MISSING) / 255.0
     return replace(surface, colors=colors, owner=np.zeros_like(surface.owner))
 
 
@@ -191,8 +184,8 @@ def offset_triangles(case: EvaluatedView) -> Triangles:
 def _union_offset(case: EvaluatedView, surface: Triangles) -> Float[np.ndarray, " n"]:
     """Offset in cells (``surface_offset``) at the middle of each of the squares of a surface of both together."""
     middles = surface.vertices.reshape(-1, 4, 3).mean(axis=1)
-    places = (middles - case.origin) / case.spacing
-    return surface_offset(case.reference > 0, case.predicted > 0, case.spacing, places)
+    positions = (middles - case.origin) / case.spacing
+    return surface_offset(case.reference > 0, case.predicted > 0, case.spacing, positions)
 
 
 def offset_colors(cells: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
@@ -256,13 +249,13 @@ def voxel_triangles(
 def _exposed_faces(
     occupied: Bool[np.ndarray, "x y z"],
 ) -> tuple[Int[np.ndarray, "n 3"], Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-    """Voxel, axis and side (-1, 1) of every face beside empty space; the border must be empty."""
-    found = []
+    """Voxel, axis and side (-1, 1) of every face next to empty space; the border must be empty."""
+    faces = []
     for axis in range(3):
         for sign in (-1, 1):
             cells = np.argwhere(occupied & ~np.roll(occupied, -sign, axis=axis))
-            found.append((cells, np.full(len(cells), axis), np.full(len(cells), sign)))
-    cells, axes, signs = (np.concatenate(column) for column in zip(*found, strict=True))
+            faces.append((cells, np.full(len(cells), axis), np.full(len(cells), sign)))
+    cells, axes, signs = (np.concatenate(column) for column in zip(*faces, strict=True))
     return cells, axes, signs
 
 
@@ -285,10 +278,68 @@ def _smooth_normals(
     signs: Int[np.ndarray, " n"],
     spacing: Float[np.ndarray, "3"],
 ) -> Float[np.ndarray, "n 3"]:
-    """Unit gradient of the blurred occupancy at each face, or the face's own normal where that vanishes."""
+    """Unit gradient of the blurred occupancy at each face, or the face's normal where that vanishes."""
     blurred = gaussian_filter(occupied.astype(np.float32), 1.5)
     index = tuple(np.clip(np.rint(places).astype(int), 0, np.asarray(occupied.shape) - 1).T)
     normals = np.stack([-slope[index] for slope in np.gradient(blurred)], axis=1) / spacing
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    own = np.eye(3)[axes] * signs[:, None]
-    return np.where(length > 1e-6 / np.min(spacing), normals / np.maximum(length, 1e-30), own)
+    flat = np.eye(3)[axes] * signs[:, None]
+    return np.where(length > 1e-6 / np.min(spacing), normals / np.maximum(length, 1e-30), flat)
+
+
+# --- distances between surfaces on grids ------------------------------------------------------------------------------
+
+BORDER = 3
+"""Empty cells put around a grid, so that its surface is closed where it touches the border."""
+
+
+def cell_size(spacing: Float[np.ndarray, "3"]) -> float:
+    """Longest side of a grid cell, which is what is meant by a cell as a unit of distance."""
+    return float(np.max(spacing))
+
+
+def surface_offset(
+    reference: Bool[np.ndarray, "x y z"],
+    predicted: Bool[np.ndarray, "x y z"],
+    spacing: Float[np.ndarray, "3"],
+    positions: Float[np.ndarray, "n 3"],
+) -> Float[np.ndarray, " n"]:
+    """Signed distance between a predicted and the true surface, in cells, on the surface of both together.
+
+    Where that is the predicted surface it is the distance to the truth, above 0 (too far out), where it is the true
+    surface that to the prediction, below 0 (too far in). Where both fall together it is 0, exactly so for equal grids.
+    In a part that one grid lacks it is as large as the way to the nearest place that both have.
+
+    Args:
+        reference: whether each cell is truly occupied.
+        predicted: whether it is by the prediction.
+        spacing: sides of a cell.
+        positions: in grid coordinates, the centre of cell [0, 0, 0] at the origin.
+    """
+    true_side, predicted_side = (signed_distance(np.pad(grid, BORDER), spacing) for grid in (reference, predicted))
+    # takes the staircase out of distances to a grid's surface
+    difference = gaussian_filter(true_side - predicted_side, 0.5 * cell_size(spacing) / spacing)
+    offset: Float[np.ndarray, " n"] = map_coordinates(difference, (positions + BORDER).T, order=1, mode="nearest")
+    return offset / cell_size(spacing)
+
+
+def signed_distance(occupied: Bool[np.ndarray, "x y z"], spacing: Float[np.ndarray, "3"]) -> Float[np.ndarray, "x y z"]:
+    """Distance of every cell's centre to the faces between occupied and empty cells, below 0 in occupied cells.
+
+    Where there are no such faces it is the grid's diagonal.
+    """
+    return _way_to(occupied, spacing) - _way_to(~occupied, spacing)
+
+
+def _way_to(wanted: Bool[np.ndarray, "x y z"], spacing: Float[np.ndarray, "3"]) -> Float[np.ndarray, "x y z"]:
+    """Distance of every other cell's centre to the ellipsoid that fills the nearest wanted cell; 0 in wanted ones.
+
+    Corners of a staircase stand out from the slope that it means; ellipsoids have none. Where nothing is wanted it is
+    the grid's diagonal.
+    """
+    if not wanted.any():
+        return np.full(wanted.shape, float(np.linalg.norm(np.asarray(wanted.shape) * spacing)))
+    away, nearest = distance_transform_edt(~wanted, spacing, return_indices=True)
+    apart = np.sqrt(((nearest - np.indices(wanted.shape, dtype=np.int32)).astype(np.float32) ** 2).sum(axis=0))
+    way: Float[np.ndarray, "x y z"] = away * (1.0 - 0.5 / np.maximum(apart, 1.0))
+    return np.where(wanted, 0.0, way)

@@ -1,11 +1,13 @@
-"""``report.html`` of ``mereo evaluate``: the scores of a test set on one self-contained page, with its error picture.
+"""Folders of results that ``mereo evaluate`` leaves: metrics.json, table.md, errors.png and ``report.html``.
 
-Plain HTML with its style inside: no script, nothing from outside.
+The page has the scores of a test set and its error picture: plain HTML with its style inside, no script, nothing from
+outside.
 """
 
 import base64
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -14,11 +16,71 @@ import numpy as np
 from jaxtyping import Int
 from PIL import Image
 
+from mereo.evaluation.cases import Evaluation
 from mereo.evaluation.metrics import format_score
-from mereo.evaluation.tables import coverage_line, recognition_line
+from mereo.evaluation.scoring import EvaluationConfig, evaluate, trained_scene
+from mereo.evaluation.tables import certainty_lines, markdown_table, metrics
 from mereo.geometry.mesh import Color
-from mereo.io.atomic_files import atomic_file
+from mereo.io.atomic_files import atomic_file, new_directory, write_json
+from mereo.io.config import CONFIG
+from mereo.models.config import EXACT, InferenceConfig
+from mereo.models.model import Model
+from mereo.models.remote import settings_for
+from mereo.models.weights import load_for
+from mereo.scenes.registry import files_of
+from mereo.scenes.scene import Scene
+from mereo.visualization.error_maps import error_picture
 from mereo.visualization.reconstruction_report import BUDGET_BYTES
+from mereo.workers.spread import Cluster
+
+
+def evaluate_weights(
+    weights: Model | str | Path,
+    output: str | Path,
+    config: EvaluationConfig,
+    *,
+    inference: InferenceConfig = EXACT,
+    workers: int | Cluster = 1,
+    force: bool = False,
+    options: Mapping[str, Any] | None = None,
+) -> Evaluation:
+    """Score weights, write metrics.json, table.md, errors.png, report.html, and print the table: ``mereo evaluate``.
+
+    With ``force`` an existing folder that mereo wrote is replaced; ``options`` are written to config.json.
+    Each view is a task of a cluster, where ``workers`` is one.
+    """
+    scene = config.scene
+    read = [*([] if isinstance(weights, Model) else [weights]), *(config.scans or ())]
+    with new_directory(output, force, [*read, *(files_of(scene) if isinstance(scene, str) else [])]) as directory:
+        model = weights if isinstance(weights, Model) else load_for(weights, settings_for(inference, workers))
+        evaluation = evaluate(model, config, progress=True, workers=workers)
+        if config.scans is not None:
+            facts: dict[str, Any] = {"scans": list(evaluation.examples), "truths": [str(path) for path in config.scans]}
+        else:
+            facts = {
+                "weights": model.name if isinstance(weights, Model) else str(weights),
+                "scene": scene.name if isinstance(scene, Scene) else scene or trained_scene(model),
+                "seed": config.seed,
+                "image_size": config.settings.image_size,
+                "noise_std": config.settings.noise_std,
+                "sensor": asdict(config.settings.sensor),
+                "workspace": config.settings.workspace,
+                "device": workers.device if isinstance(workers, Cluster) else model.device.type,
+                "precision": model.working_precision,
+            }
+        values, picture = metrics(evaluation, {**facts, "trained": model.provenance}), directory / "errors.png"
+        if options is not None:
+            write_json(directory / CONFIG, options)
+        write_json(directory / "metrics.json", values)
+        (directory / "table.md").write_text(markdown_table(evaluation), encoding="utf-8")
+        error_picture(picture, evaluation.views)
+        write_evaluation_report(directory / "report.html", values, evaluation.views[0].colors, picture)
+    print(markdown_table(evaluation))
+    print(f"wrote {output}")
+    return evaluation
+
+
+# --- page -------------------------------------------------------------------------------------------------------------
 
 STYLE = """
 :root { color-scheme: light dark; --bg: #f6f7f9; --card: #fff; --ink: #1d2430; --soft: #667085; --line: #e3e6ec; --accent: 37 99 201; }
@@ -68,15 +130,15 @@ def write_evaluation_report(
     """
     names, mean = tuple(metrics["per_segment"]), metrics["example_mean"]
     title = " on ".join(str(metrics[key]) for key in ("weights", "scene") if key in metrics) or "mereo evaluation"
-    told = {"iou", "miou", "definition", "ece", "calibrated"}
-    facts = {k: v for k, v in metrics.items() if isinstance(v, str | int | float) and k not in told}
+    below = {"iou", "miou", "definition", "ece", "calibrated"}
+    facts = {k: v for k, v in metrics.items() if isinstance(v, str | int | float) and k not in below}
     shown = [f"{key.replace('_', ' ')}: {value}" for key, value in facts.items()]
     text = "".join(
         (
             f"<h1>{escape(title)}</h1>",
             f"<p>{escape('  ·  '.join(shown))}</p>",
             _overall(metrics["iou"], metrics["miou"], mean["iou"], mean["miou"]),
-            _sure(metrics.get("coverage95"), metrics.get("known")),
+            _sure(metrics),
             f'<div class="pair">{_segments(metrics["per_segment"], colors)}{_examples(metrics["per_example"])}</div>',
             _confusion(("empty", *names), metrics["confusion"]),
             _reliability(metrics.get("reliability") or [], metrics.get("ece"), metrics.get("calibrated") is True),
@@ -106,10 +168,9 @@ def _overall(*figures: float) -> str:
     return f'<section><div class="big">{shown}</div></section>'
 
 
-def _sure(radii: Mapping[str, Any] | None, known: Mapping[str, float] | None) -> str:
-    """How often true places lie within the radii that a registration gives, and frames are said to show the object."""
-    lines = ["" if radii is None else coverage_line(radii), "" if known is None else recognition_line(known)]
-    text = "".join(f"<p>{escape(line)}</p>" for line in lines if line)
+def _sure(metrics: Mapping[str, Any]) -> str:
+    """How often true positions lie within a registration's radii, and frames are said to show the object."""
+    text = "".join(f"<p>{escape(line)}</p>" for line in certainty_lines(metrics))
     return f"<section><h2>How sure</h2>{text}</section>" if text else ""
 
 

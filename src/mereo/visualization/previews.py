@@ -1,24 +1,32 @@
-"""Previews: a reconstruction from several sides, random states of one scene, and all built-in scenes on one sheet.
+"""Previews: a reconstruction or a placed scan from several sides, states of scenes, and an object's modes.
 
 Everything is drawn by ``mereo.visualization.renderer``, without a display.
 """
 
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from PIL import Image
 
-from mereo.geometry.camera import PointCloud
+from mereo.evaluation.placement import Placement
+from mereo.evaluation.scans import ScanFile
+from mereo.geometry.camera import PointCloud, camera_axes
+from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.transforms import rigid, transform_points
-from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
+from mereo.geometry.solids import Solids
+from mereo.geometry.transforms import transform_points
+from mereo.io.extras import has_plots, pyplot
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES, Scene
 from mereo.scenes.seeds import example_rng
+from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import View, sample_view
+from mereo.visualization.color_scales import viridis
 from mereo.visualization.contact_sheets import (
     Picture,
     cloud_picture,
@@ -28,7 +36,7 @@ from mereo.visualization.contact_sheets import (
     legend,
     save_png,
 )
-from mereo.visualization.renderer import Vector, Viewpoint, shade, shaded_canvas
+from mereo.visualization.renderer import Canvas, Triangles, Vector, Viewpoint, shade, shaded_canvas
 
 CAMERA_VIEWS = {
     "as the camera sees it": ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),
@@ -63,55 +71,45 @@ def render_cloud_and_segments(
     surfaces: SegmentedMesh,
     title: str = "",
     size: int = 420,
-    frame_rotation: Float[np.ndarray, "3 3"] = GLTF_CAMERA_ROTATION,
 ) -> None:
     """Write a preview of a reconstruction: input cloud (top), segments (bottom); from the camera, its right and behind.
 
     Args:
         path: the .png file.
-        cloud: what was observed.
+        cloud: what was observed, camera frame.
         surfaces: what was reconstructed, in the same frame; segments without faces are left out.
         title: one line above.
         size: width and height of each of the six pictures in pixels.
-        frame_rotation: rotation from the input's frame to x right, y up, z toward the viewer, as for the GLB.
     """
-    to_camera = rigid(GLTF_CAMERA_ROTATION.T @ frame_rotation, np.zeros(3))
-    points = transform_points(to_camera, cloud.points)
-    solid = _with_faces(surfaces).transformed(to_camera)
-    bounds = _joint_bounds(points, *(segment.vertices for segment in solid.segments if len(segment.faces)))
+    solid = _with_faces(surfaces)
+    bounds = _joint_bounds(cloud.points, solid)
     views = {name: Viewpoint.along(bounds, *pair) for name, pair in CAMERA_VIEWS.items()}
-    clouds = [cloud_picture(points, view, (size, size)) for view in views.values()]
+    clouds = [cloud_picture(cloud.points, view, (size, size)) for view in views.values()]
     shaded = [shade(solid, view, (size, size)) for view in views.values()]
     captions = [f"input, {name}" for name in views] + [f"segments, {name}" for name in views]
     sheet = contact_sheet(clouds + shaded, captions, 3, title)
     save_png(path, np.concatenate([sheet, legend(surfaces.names, surfaces.colors, sheet.shape[1])]))
 
 
-SEEN_COLOR = (0.09, 0.1, 0.13)
-
-SEEN_LIFT = 0.012
-"""Share of the picture's height by which observed points are drawn nearer, or noise would hide half of them."""
-
-
-def seen_on_found(
+def points_on_segments(
     points: Float[np.ndarray, "n 3"], surfaces: SegmentedMesh, sides: Sequence[tuple[Vector, Vector]], size: int
 ) -> list[Picture]:
     """Pictures of the segments with the observed points on them as dark dots, one from each side.
 
     Args:
         points: observed, camera frame.
-        surfaces: found, in the same frame; segments without faces are left out.
+        surfaces: reconstructed, in the same frame; segments without faces are left out.
         sides: viewing direction and up of each, as in ``CAMERA_VIEWS``.
         size: width and height in pixels; what is shown fills it.
     """
-    solid = _with_faces(surfaces)
-    meshes = [points, *(segment.vertices for segment in solid.segments if len(segment.faces))]
-    bounds, pictures = _joint_bounds(*meshes), []
+    solid, pictures = _with_faces(surfaces), []
+    bounds = _joint_bounds(points, solid)
     for direction, up in sides:
         view = Viewpoint.along(bounds, direction, up)
         canvas = shaded_canvas(solid, view, (size, size))
-        lifted = points - SEEN_LIFT * 2 * view.half_size * np.asarray(direction)
-        canvas.draw_points(lifted, np.tile(SEEN_COLOR, (len(points), 1)), 0.75)
+        # nearer by a share of the picture's height, or noise would hide half of them
+        lifted = points - 0.012 * 2 * view.half_size * np.asarray(direction)
+        canvas.draw_points(lifted, np.tile((0.09, 0.1, 0.13), (len(points), 1)), 0.75)
         pictures.append(canvas.picture())
     return pictures
 
@@ -122,9 +120,34 @@ def _with_faces(surfaces: SegmentedMesh) -> SegmentedMesh:
     return SegmentedMesh(kept, tuple(pair for pair in surfaces.nested if set(pair) <= set(names)))
 
 
-def _joint_bounds(*clouds: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "2 3"]:
-    points = np.concatenate(clouds)
-    return np.stack([points.min(axis=0), points.max(axis=0)])
+def _joint_bounds(points: Float[np.ndarray, "n 3"], solid: SegmentedMesh) -> Float[np.ndarray, "2 3"]:
+    joint = np.concatenate([points, *(segment.vertices for segment in solid.segments if len(segment.faces))])
+    return np.stack([joint.min(axis=0), joint.max(axis=0)])
+
+
+def overlay(placement: Placement, cloud: PointCloud, scan: ScanFile) -> Picture:
+    """Picture of a scan on the placed segments (top) and of its distance from them (bottom), from several sides."""
+    to_camera = camera_axes(scan.frame)
+    mesh = placement.mesh.transformed(to_camera)
+    chosen = np.random.default_rng(0).permutation(len(cloud))[:40_000]  # most points that a picture shows
+    points = transform_points(to_camera, cloud.points[chosen])
+    distance = Solids(mesh).nearest(points).distance
+    views = {name: Viewpoint.along(mesh.bounds, *pair) for name, pair in CAMERA_VIEWS.items()}
+    mm = 1000 * UNITS_M[scan.unit] * placement.limit
+    near = viridis(distance / placement.limit) / 255
+    colors = np.where((distance > placement.limit)[:, None], (0.85, 0.1, 0.1), near)
+    pictures = []
+    for is_solid, ink, radius_px in ((True, np.zeros_like(points), 0.5), (False, colors, 1.2)):
+        for view in views.values():
+            canvas = Canvas.empty(view, (420, 420))
+            if is_solid:
+                canvas.draw_triangles(Triangles.of(mesh))
+            canvas.draw_points(points, ink, radius_px)
+            pictures.append(canvas.picture())
+    captions = [f"scan on segments, {name}" for name in views]
+    captions += [f"distance 0 (dark) to {mm:.2g} mm (bright), red: more"] * len(views)
+    sheet = contact_sheet(pictures, captions, len(views), f"{scan.path.name} on {len(mesh.segments)} segments")
+    return np.concatenate([sheet, legend(mesh.names, mesh.colors, sheet.shape[1])])
 
 
 # --- states of one scene ---------------------------------------------------------------------------------------------
@@ -194,8 +217,10 @@ def _arrow(center: Float[np.ndarray, "3"], toward: Float[np.ndarray, "3"], radiu
     # (distance from the centre, thickness), both in radii, from the tip to the end of the shaft
     profile = ((0.85, 0.0), (1.03, 0.08), (1.03, 0.03), (1.35, 0.03), (1.35, 0.0))
     vertices = np.concatenate([center + radius * (far * toward + thick * ring) for far, thick in profile])
-    here, beside = np.arange(sides), np.roll(np.arange(sides), -1)
-    quads = [(here + k * sides, beside + k * sides, beside + (k + 1) * sides, here + (k + 1) * sides) for k in range(4)]
+    row, next_row = np.arange(sides), np.roll(np.arange(sides), -1)
+    quads = [
+        (row + k * sides, next_row + k * sides, next_row + (k + 1) * sides, row + (k + 1) * sides) for k in range(4)
+    ]
     faces = np.concatenate([np.stack(corner, axis=1) for a, b, c, d in quads for corner in ((a, b, c), (a, c, d))])
     return Segment("camera direction", (40, 44, 52), vertices, faces)
 
@@ -246,3 +271,62 @@ def common_viewpoint(meshes: list[SegmentedMesh], direction: Vector, up: Vector)
     centered = turned.copy()
     centered[:3, 3] -= (low + high) / 2
     return Viewpoint(centered, half_size=1.04 * float((high - low)[:2].max()) / 2)
+
+
+# --- modes ------------------------------------------------------------------------------------------------------------
+
+SHOWN_STD = (-2.0, 0.0, 2.0)
+"""Coefficients, in standard deviations, at which a mode is drawn."""
+
+
+def preview_modes(model: StatisticalModel, path: str | Path, name: str = "", modes: int = 6, size: int = 200) -> None:
+    """Write a sheet of the largest modes, each at -2, 0 and +2 standard deviations.
+
+    Below them the residue by their number, where the extra `plots` is installed.
+
+    Args:
+        model: the statistical model.
+        path: the .png file.
+        name: of the object; a built-in scene's is drawn from its own side.
+        modes: how many are drawn at most.
+        size: width of each picture in pixels.
+    """
+    shown = min(modes, model.count)
+    states = [[_at(model, mode, std) for std in SHOWN_STD] for mode in range(shown)] or [[_at(model, 0, 0.0)]]
+    viewpoint = common_viewpoint(
+        [mesh for row in states for mesh in row], *SCENE_VIEWS.get(name, ((0.3, -0.4, -1.0), (0.0, 1.0, 0.0)))
+    )
+    images = [shade(mesh, viewpoint, (size, size)) for row in states for mesh in row]
+    captions = [_caption(model, mode, std) for mode in range(shown) for std in SHOWN_STD] or ["does not deform"]
+    title = f"{name}: {model.count} modes leave {model.residue:.3f} units of an unseen state"
+    sheet = contact_sheet(images, captions, 2 * len(SHOWN_STD) if shown > 1 else len(images), title)
+    plotted = model.count and has_plots()
+    save_png(path, np.concatenate([sheet, _residue_plot(model, sheet.shape[1])]) if plotted else sheet)
+
+
+def _at(model: StatisticalModel, mode: int, std: float) -> SegmentedMesh:
+    z = np.zeros(model.count)
+    if model.count:
+        z[mode] = std
+    return model.mesh(model.material(z))
+
+
+def _caption(model: StatisticalModel, mode: int, std: float) -> str:
+    if std == 0.0:
+        return "mean state"
+    share = float(model.motion[mode] ** 2 / (np.sum(model.motion**2) + model.residue**2))
+    return f"mode {mode + 1} at {std:+.0f} std, {share:.1%} of the variance"
+
+
+def _residue_plot(model: StatisticalModel, width: int, height: int = 260) -> Picture:
+    """Distance that is left of a state against the number of modes, as wide as the sheet above it."""
+    plt = pyplot()
+    figure, axes = plt.subplots(figsize=(width / 100, height / 100), dpi=100, layout="constrained")
+    axes.semilogy(np.arange(model.count + 1), model.residues, color="#2563c9")
+    axes.axhline(model.residue, color="#98a2b3", linestyle=":")
+    axes.set(xlabel="modes", ylabel="left of a state, rms (units)", xlim=(0, model.count))
+    axes.grid(alpha=0.3)
+    content = io.BytesIO()
+    figure.savefig(content, format="png")
+    plt.close(figure)
+    return np.asarray(Image.open(content).convert("RGB").resize((width, height)))

@@ -1,32 +1,44 @@
 """``report.html``: one self-contained page that shows the input cloud and the segments, offline, in any browser.
 
-The page is ``report.html`` beside this module with its data in place of one marker. Positions are 16-bit steps of the
-joint box and travel as base64, so that the page stays under ``BUDGET_BYTES``; surfaces over the budget are coarsened
-for the page only (``segments.glb`` keeps all).
+    Report -write-> report.html -read_report-> WrittenReport
+
+The page is ``report.html`` beside this module with its data, one line of JSON, in place of one marker. Positions are
+16-bit steps of the joint box and travel as base64, so that the page stays under ``BUDGET_BYTES``; surfaces over the
+budget are coarsened for the page only (``segments.glb`` keeps all). A folder of results has its surfaces in files of
+their own; what was observed is in the page alone, and is read from it as data; no script is run.
 """
 
 import base64
+import io
 import json
+from dataclasses import dataclass, field
 from html import escape
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from jaxtyping import Float, Int, UInt16
+from jaxtyping import Float, Int, UInt8, UInt16
+from PIL import Image
+from pydantic import BaseModel, Field, FiniteFloat, ValidationError
+from scipy.spatial import cKDTree
 
 from mereo.fitting.registration.registration import Registration
+from mereo.fitting.uncertainty.uncertainty import Explanation
 from mereo.geometry.camera import DepthImage, PointCloud
 from mereo.geometry.downsampling import random_subset
-from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.mesh import Color, Segment, SegmentedMesh
+from mereo.geometry.radii import STOPS, Radii, between_stops, level_told
 from mereo.geometry.subdivision import split_at_creases
 from mereo.io.atomic_files import atomic_file
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
 from mereo.io.writers.meshes import OUTER_OPACITY
-from mereo.visualization.depth_picture import depth_data
-from mereo.visualization.report_words import page_words
-from mereo.visualization.sure_colors import SureColors, sure_colors
-from mereo.visualization.units import UNKNOWN, Unit
+from mereo.visualization.contact_sheets import MOST_DEPTH_PX, PNG_URL, Picture, depth_data
+from mereo.visualization.report_words import Level, page_words
+from mereo.visualization.units import UNKNOWN, Unit, rounded
+
+REPORT = "report.html"
+"""Name of the page in a folder of results."""
 
 BUDGET_BYTES = 5_000_000
 """Most bytes of a page."""
@@ -34,95 +46,102 @@ BUDGET_BYTES = 5_000_000
 CLOUD_POINTS = 60_000
 """Most points of the cloud that the page shows."""
 
-DATA_MARKER = "/*DATA*/null"
-TITLE_MARKER = "<!--TITLE-->"
 STEPS = 65535
 
 
-def write_report(
-    path: str | Path,
-    cloud: PointCloud,
-    surfaces: SegmentedMesh,
-    summary: dict[str, Any],
-    frame_rotation: Float[np.ndarray, "3 3"] = GLTF_CAMERA_ROTATION,
-    unit: Unit = UNKNOWN,
-    registered: Registration | None = None,
-    depth: DepthImage | None = None,
-) -> None:
-    """Write the page of a reconstruction.
+# --- written ----------------------------------------------------------------------------------------------------------
 
-    Args:
-        path: the .html file.
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """Content of the page of a reconstruction.
+
+    Attributes:
         cloud: the input, in its frame and units; at most ``CLOUD_POINTS`` of it are shown.
-        surfaces: the segments in the same frame; those without faces are listed but not drawn, those
-            around a nested one are drawn see-through.
+        surfaces: the segments in the same frame; those without faces are listed but not drawn, those around a nested
+            one are drawn see-through.
         summary: what the page says in words; every key may be missing. ``title`` is text; ``segments`` is a list of
             ``{"name", "centroid" [3], "volume", "confidence" in 0..1}`` in the order of ``surfaces``; ``timings_s``
             maps stages to seconds; of the other texts and numbers those for people are listed (``report_words``).
-        frame_rotation: rotation from the input's frame to the viewer's (x right, y up, z toward the viewer).
+        rotation: rotation from the input's frame to the viewer's (x right, y up, z toward the viewer).
         unit: of the cloud's lengths; the page has millimetres and cubic centimetres where it is known.
         registered: the model that the last of ``surfaces`` are, in the cloud's frame, to show how sure they are.
         depth: the image that the cloud comes from, in its unit, where it comes from one.
-
-    Raises ``ValueError`` when the page cannot be brought under the budget.
     """
-    page = files("mereo.visualization").joinpath("report.html").read_text(encoding="utf-8")
-    sure = None if registered is None else sure_colors(registered, unit)
-    picture = None if depth is None else depth_data(depth, unit)
-    data = _page_data(cloud, surfaces, page_words(summary, unit), np.asarray(frame_rotation), sure, picture)
-    # "</script>" inside a name must not end the script; \u003c is the same character to JSON
-    text = json.dumps(data, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
-    title = data["words"]["title"]
-    page = page.replace(TITLE_MARKER, escape(title)).replace(DATA_MARKER, text)
-    encoded = page.encode("utf-8", errors="replace")
-    if len(encoded) > BUDGET_BYTES:
-        raise ValueError(f"the report has {len(encoded)} bytes; at most {BUDGET_BYTES}: shorten the summary")
-    with atomic_file(path) as partial:
-        partial.write_bytes(encoded)
 
+    cloud: PointCloud
+    surfaces: SegmentedMesh
+    summary: dict[str, Any]
+    rotation: Float[np.ndarray, "3 3"] = field(default_factory=lambda: GLTF_CAMERA_ROTATION)
+    unit: Unit = UNKNOWN
+    registered: Registration | None = None
+    depth: DepthImage | None = None
 
-def _page_data(
-    cloud: PointCloud,
-    surfaces: SegmentedMesh,
-    words: dict[str, Any],
-    rotation: Float[np.ndarray, "3 3"],
-    sure: SureColors | None,
-    depth: dict[str, Any] | None,
-) -> dict[str, Any]:
-    points = _thin(cloud.points)
-    low, high = _joint_bounds(points, surfaces)
-    marks = None if sure is None else sure.of_points(points)
-    # binary room: the page's text takes the rest; base64 grows data by a third
-    taken = len(json.dumps([words, depth]))
-    room = int((BUDGET_BYTES - 300_000 - taken) * 3 / 4) - (6 + len(marks or ())) * len(points)
-    shown = _fit(surfaces, float((high - low).max()), room)
-    return {
-        "low": low.tolist(),
-        "high": high.tolist(),
-        "rotation": rotation.tolist(),
-        "cloud": {"count": len(cloud), "shown": len(points), "positions": _base64(_quantize(points, low, high))},
-        "segments": [
-            {
-                "name": full.name,
-                "color": list(full.color),
-                "opacity": 1.0 if opaque else OUTER_OPACITY,
-                "faces": len(full.faces),
-                "positions": _base64(_quantize(part.vertices, low, high)),
-                "indices": _base64(part.faces.astype("<u4")),
-                "sure": None if sure is None else sure.of_surface(part),
-            }
-            for full, part, opaque in zip(surfaces.segments, shown, surfaces.opaque, strict=True)
-        ],
-        "coarsened": any(len(a.faces) != len(b.faces) for a, b in zip(surfaces.segments, shown, strict=True)),
-        "words": words,
-        "depth": depth,
-        "sure": None if sure is None else sure.page_data(marks),
-    }
+    def write(self, path: str | Path) -> None:
+        """Write the page; raises ``ValueError`` when it cannot be brought under the budget."""
+        data = self._data()
+        # "</script>" inside a name must not end the script; \u003c is the same character to JSON
+        text = json.dumps(data, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
+        page = files("mereo.visualization").joinpath("report.html").read_text(encoding="utf-8")
+        page = page.replace("<!--TITLE-->", escape(data["words"]["title"])).replace("/*DATA*/null", text)
+        encoded = page.encode("utf-8", errors="replace")
+        if len(encoded) > BUDGET_BYTES:
+            raise ValueError(f"the report has {len(encoded)} bytes; at most {BUDGET_BYTES}: shorten the summary")
+        with atomic_file(path) as partial:
+            partial.write_bytes(encoded)
 
-
-def _thin(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """The cloud, or ``CLOUD_POINTS`` of it in their order, the same every time."""
-    return points[np.sort(random_subset(np.arange(len(points)), CLOUD_POINTS))]
+    def _data(self) -> dict[str, Any]:
+        words = page_words(self.summary, self.unit)
+        depth = None if self.depth is None else depth_data(self.depth, self.unit)
+        points = self.cloud.points
+        points = points[np.sort(random_subset(np.arange(len(points)), CLOUD_POINTS))]  # the same every time
+        low, high = _joint_bounds(points, self.surfaces)
+        centroids = {} if self.registered is None else explain_centroids(self.registered)
+        marks = {name: point_marks(explanation, points) for name, explanation in centroids.items()}
+        # binary room: the page's text takes the rest; base64 grows data by a third
+        room = int((BUDGET_BYTES - 300_000 - len(json.dumps([words, depth]))) * 3 / 4) - (6 + len(marks)) * len(points)
+        shown = _fit(self.surfaces, float((high - low).max()), room)
+        registered, full = self.registered, self.surfaces.segments
+        sure = None if registered is None else registered.uncertainty
+        radii = None if registered is None or sure is None else sure.radii(registered.material)
+        return {
+            "low": low.tolist(),
+            "high": high.tolist(),
+            "rotation": np.asarray(self.rotation).tolist(),
+            "cloud": {
+                "count": len(self.cloud),
+                "shown": len(points),
+                "positions": _base64(_quantize(points, low, high)),
+            },
+            "segments": [
+                {
+                    "name": segment.name,
+                    "color": list(segment.color),
+                    "opacity": 1.0 if opaque else OUTER_OPACITY,
+                    "faces": len(segment.faces),
+                    "positions": _base64(_quantize(part.vertices, low, high)),
+                    "indices": _base64(part.faces.astype("<u4")),
+                    "sure": None if radii is None else _radius_bytes(radii, tuple(centroids), part),
+                }
+                for segment, part, opaque in zip(full, shown, self.surfaces.opaque, strict=True)
+            ],
+            "coarsened": any(len(a.faces) != len(b.faces) for a, b in zip(full, shown, strict=True)),
+            "words": words,
+            "depth": depth,
+            "sure": None
+            if radii is None
+            else {
+                "stops": [list(color) for color in STOPS],
+                "weights": [list(color) for color in WEIGHTS],
+                "unexplained": list(RED),
+                "ends": ["0", f"{rounded(radii.high * self.unit.length_factor)} {self.unit.length_name}"],
+                "title": f"the true place is so far away at most ({level_told(radii.calibrated)})",
+                "centroids": [
+                    {"name": name, "marks": _base64(marks[name]), "shares": describe_shares(explanation)}
+                    for name, explanation in centroids.items()
+                ],
+            },
+        }
 
 
 def _joint_bounds(
@@ -169,8 +188,169 @@ def cluster(segment: Segment, cell: float) -> Segment:
 
 
 def _same(rows: Int[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " n"]]:
-    """First place of each different row, and for each row which one it is; packed, because sorting rows is slow."""
+    """First index of each different row, and for each row which one it is; packed, because sorting rows is slow."""
     base = int(rows.max(initial=0)) + 1
     packed = (rows[:, 0] * base + rows[:, 1]) * base + rows[:, 2]
     _, first, inverse = np.unique(packed, return_index=True, return_inverse=True)
     return first, inverse
+
+
+# --- how sure a registered model is -----------------------------------------------------------------------------------
+
+# Bytes for the page: of the surfaces, by their radii, and of the observed points, by what decides each centroid.
+
+UNEXPLAINED = 255
+"""Byte of an observed point that the model does not explain; all others are less."""
+
+MOST = 254
+"""Byte of the point that decides a centroid most."""
+
+WEIGHTS: tuple[Color, ...] = ((150, 156, 168), (40, 120, 255), (255, 176, 0))
+"""Colours of observed points from those that decide nothing of a place to those that decide most of it; seen on dark
+and on light."""
+
+RED: Color = (229, 40, 50)
+"""Colour of unexplained points."""
+
+EVIDENCE = {
+    "points": "the points' noise",
+    "network": "what the network says",
+    "silhouette": "its outline",
+    "states": "the states that it can have",
+}
+"""Each kind of evidence in words."""
+
+
+def explain_centroids(registered: Registration) -> dict[str, Explanation]:
+    """What decides the centroid of each segment; nothing of a registration that was read from a file."""
+    explanations = ((name, registered.explain(name)) for name in registered.model.rest.names)
+    return {name: explanation for name, explanation in explanations if explanation is not None}
+
+
+def point_marks(explanation: Explanation, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
+    """A byte for each observed point: how much it decides a place, 0 to ``MOST``, or that it is ``UNEXPLAINED``.
+
+    The weights are those of the fit's observed samples, which stand for the points around them.
+    """
+    away, nearest = cKDTree(explanation.points).query(points)
+    share = explanation.weights[nearest] / max(float(explanation.weights.max()), np.finfo(np.float64).tiny)
+    marks: UInt8[np.ndarray, " n"] = np.rint(MOST * share).astype(np.uint8)
+    if len(explanation.unexplained):
+        samples, spacing = explanation.points, np.inf
+        if len(samples) > 1:
+            spacing = float(np.median(cKDTree(samples).query(samples, k=2)[0][:, 1]))
+        lost = cKDTree(explanation.unexplained).query(points)[0]
+        marks[(lost <= away) & (lost < spacing)] = UNEXPLAINED
+    return marks
+
+
+def mark_colors(marks: UInt8[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
+    """Colours (red, green, blue) of ``point_marks``."""
+    mixed = between_stops(marks / MOST, WEIGHTS)
+    return np.where((marks == UNEXPLAINED)[:, None], RED, mixed).round().astype(np.uint8)
+
+
+def describe_shares(explanation: Explanation) -> str:
+    """What leaves a place unsure, in words, largest first."""
+    order = sorted(explanation.shares.items(), key=lambda item: -item[1])
+    return ", ".join(f"{EVIDENCE[name]} {share:.0%}" for name, share in order if share >= 0.005)
+
+
+def _radius_bytes(radii: Radii, names: tuple[str, ...], part: Segment) -> str | None:
+    """A byte for each vertex, 255 at ``Radii.high``, as base64; None for what is no segment of the model."""
+    if part.name not in names or not len(part.vertices):
+        return None
+    share = radii.at(part.vertices, names.index(part.name) + 1) / max(radii.high, 1e-30)
+    return _base64(np.rint(255 * np.clip(share, 0.0, 1.0)).astype(np.uint8))
+
+
+# --- read again -------------------------------------------------------------------------------------------------------
+
+Corner = Annotated[tuple[FiniteFloat, ...], Field(min_length=3, max_length=3)]
+
+
+class _Cloud(BaseModel):
+    count: Annotated[int, Field(ge=0)]
+    positions: str
+
+
+class _Depth(BaseModel):
+    url: str
+    ends: Annotated[tuple[str, ...], Field(max_length=2)]
+
+
+class _Words(BaseModel):
+    title: str
+    trust: tuple[Level, str, str] | None = None
+    warnings: tuple[str, ...] = ()
+    heads: tuple[str, ...] = ()
+
+
+class _Page(BaseModel):
+    low: Corner
+    high: Corner
+    cloud: _Cloud
+    words: _Words
+    depth: _Depth | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class WrittenReport:
+    """What a page shows beside the surfaces.
+
+    Attributes:
+        title: of the page.
+        level: of the verdict; None for a page without one.
+        verdict: the verdict and why, then what to do: sentences.
+        cloud: the observed points in the input's frame and unit, to 16 bits of the box of all, as many as are shown.
+        count: number of points of the input.
+        depth: the depth image as a picture; None without one.
+        ends: the nearest and farthest depth in words.
+        unit_known: whether the page tells millimetres.
+    """
+
+    title: str
+    level: Level | None
+    verdict: str
+    cloud: PointCloud | None
+    count: int
+    depth: Picture | None
+    ends: tuple[str, ...]
+    unit_known: bool
+
+
+def read_report(path: Path) -> WrittenReport | None:
+    """What a page shows; None where there is none, or another one (of `mereo evaluate`, of somebody, a damaged one)."""
+    if not path.is_file() or path.stat().st_size > 2 * BUDGET_BYTES:
+        return None
+    _, is_page, rest = path.read_text(encoding="utf-8", errors="replace").partition("const DATA = ")
+    text, is_whole, _ = rest.partition(";\n")
+    if not is_page or not is_whole:
+        return None
+    try:
+        page = _Page.model_validate(json.loads(text))
+        steps = np.frombuffer(base64.b64decode(page.cloud.positions), "<u2").reshape(-1, 3)
+        points = np.array(page.low) + steps / STEPS * (np.array(page.high) - np.array(page.low))
+        depth = None if page.depth is None else _picture(page.depth.url)
+    except (ValidationError, ValueError, OSError, RecursionError):
+        return None
+    words = page.words
+    return WrittenReport(
+        title=words.title,
+        level=None if words.trust is None else words.trust[0],
+        verdict="" if words.trust is None else " ".join([*words.trust[1:], *words.warnings]),
+        cloud=PointCloud(points) if len(points) else None,
+        count=page.cloud.count,
+        depth=depth,
+        ends=() if page.depth is None else page.depth.ends,
+        unit_known=any("mm" in head for head in words.heads),
+    )
+
+
+def _picture(url: str) -> Picture:
+    if not url.startswith(PNG_URL):
+        raise ValueError("no picture in the page")
+    with Image.open(io.BytesIO(base64.b64decode(url.removeprefix(PNG_URL))), formats=("PNG",)) as image:
+        if max(image.size) > MOST_DEPTH_PX:
+            raise ValueError("a picture that is larger than those of pages")
+        return np.asarray(image.convert("RGB"))

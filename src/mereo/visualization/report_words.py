@@ -1,16 +1,90 @@
-"""What the page of a reconstruction says: facts, the table of its segments and its times, in words and known units.
+"""Text of the page of a reconstruction: whether to trust it, facts, the table of its segments and its times.
 
-``reconstruction_report`` is about the page's shapes and bytes; here is all of its text that depends on a result.
+    summary of a result -trust-> Trust (a verdict, why, and what to do)
+                        -page_words-> all text of the page, in known units
+
+Nothing is decided here: the verdict is that of ``fitting.registration.recognition``, with what the registration says of
+itself, as a summary has both.
 """
 
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 
 from mereo.geometry.radii import level_told
-from mereo.visualization.trust import Trust, trust
 from mereo.visualization.units import Unit, rounded
+
+# --- trust ------------------------------------------------------------------------------------------------------------
+
+Level = Literal["yes", "doubt", "no", "unchecked", "alone"]
+
+VERDICTS: Mapping[Level, str] = {
+    "yes": "Trust it",
+    "doubt": "Doubtful",
+    "no": "Do not trust it",
+    "unchecked": "Not checked",
+    "alone": "Network alone",
+}
+"""First words of the line."""
+
+
+@dataclass(frozen=True)
+class Trust:
+    """Verdict on an answer.
+
+    Attributes:
+        level: how far it can be trusted; "alone" where no model was registered, which could tell, and "unchecked" where
+            one was, but nobody looked.
+        why: a phrase, without a full stop.
+        cure: what to do, a phrase; None where nothing is to be done, or nothing known.
+    """
+
+    level: Level
+    why: str
+    cure: str | None = None
+
+
+def trust(summary: Mapping[str, Any]) -> Trust:
+    """Verdict on the answer that a summary is of; every key of it may be missing.
+
+    Args:
+        summary: its ``recognition`` and ``registration`` are read.
+    """
+    recognition, registration = _block(summary, "recognition"), _block(summary, "registration")
+    known, reason = recognition.get("known"), recognition.get("reason") or registration.get("refusal")
+    number = _number(registration.get("explained"))
+    explained = None if number is None else f"{100 * number:.1f}\N{NO-BREAK SPACE}% of the points"
+    model_explains = "" if explained is None else f"; the model explains {explained}"
+    is_model = registration.get("answer") == "registration"
+    if known is not True and not recognition.get("signs") and not registration.get("refusal"):
+        return Trust("unchecked" if is_model else "alone", f"nothing says whether this is the object{model_explains}")
+    if known is not True:
+        # a reason is what was seen, a colon, and what to do about it
+        why, _, cure = str(reason or "it was not recognized").removesuffix(".").partition(": ")
+        if explained is not None and not is_model and "of the points" not in why:
+            why = f"{why}; the model explains only {explained}"
+        return Trust("doubt" if known == "unsure" else "no", why, cure or None)
+    if not is_model or registration.get("accepted") is False:
+        why = "the model explains too little" if explained is None else f"the model explains only {explained}"
+        return Trust("doubt", why if is_model else f"{why}, so this is the network's answer")
+    return Trust("yes", f"the frame shows the object{model_explains}")
+
+
+def _block(summary: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    value = summary.get(key)
+    return value if isinstance(value, Mapping) else {}
+
+
+def _number(value: object) -> float | None:
+    """The value as a finite number; None for everything else."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        return None
+    return float(value) if np.isfinite(value) else None
+
+
+# --- page -------------------------------------------------------------------------------------------------------------
 
 STAGES = {
     "encode": "reading the points",
@@ -24,37 +98,18 @@ STAGES = {
 }
 """What each stage of ``timings_s`` does; another one keeps its name."""
 
-SAID_ELSEWHERE = frozenset(
-    {
-        "title",
-        "recognition",
-        "radius95",
-        "unit",
-        "unit_m",
-        "source",
-        "frame",
-        "points",
-        "segments",
-        "nested",
-        "timings_s",
-        "registration",
-    }
+SHOWN_APART = (
+    *("title", "recognition", "radius95", "unit", "unit_m", "source", "frame", "points", "segments", "nested"),
+    *("timings_s", "registration", "weights", "spacing", "device", "resolution", "clipped", "calibrated"),
 )
 """Keys of a summary that the page shows in another place, or that its units say."""
 
-FOR_PROGRAMS = frozenset(
-    {
-        "precision",
-        "evaluated_points",
-        "depth_m",
-        "visible_size_m",
-        "invalid_points",
-        "isolation",
-        "carried",
-        "scene_file",
-    }
+FOR_PROGRAMS = (
+    *("precision", "evaluated_points", "depth_m", "visible_size_m", "invalid_points", "isolation", "carried"),
+    "scene_file",
 )
 """Keys that only summary.json has."""
+
 
 DEVICES = {"cpu": "the processor", "cuda": "the GPU"}
 DASH, GAP = "\N{EN DASH}", 3 * "\N{NO-BREAK SPACE}"
@@ -70,7 +125,7 @@ def page_words(summary: Mapping[str, Any], unit: Unit) -> dict[str, Any]:
     """Texts of the page.
 
     Args:
-        summary: as ``write_report`` takes it.
+        summary: as a ``Report`` has it.
         unit: of the lengths in it.
 
     Returns ``title``, ``trust`` (level, verdict and why), ``facts`` (phrases), ``warnings`` (sentences), ``heads``
@@ -78,65 +133,61 @@ def page_words(summary: Mapping[str, Any], unit: Unit) -> dict[str, Any]:
     confidence is None where there is none), ``weights`` (their name) and ``timings_s``, seconds of each stage in words.
     """
     verdict = trust(summary)
-    title = confidence_title(summary.get("calibrated") is True)
     times = {name: _number(seconds) for name, seconds in dict(summary.get("timings_s") or {}).items()}
     return {
         "title": str(summary.get("title", "mereo reconstruction")),
-        "trust": [verdict.level, f"{verdict.verdict}:", f"{verdict.why}."],
+        "trust": [verdict.level, f"{VERDICTS[verdict.level]}:", f"{verdict.why}."],
         "facts": _facts(summary, unit, verdict),
         "warnings": _warnings(summary, verdict),
-        "heads": _heads(summary, unit, title),
+        "heads": _heads(summary, unit),
         "units": [unit.length_name, unit.volume_name],
-        "rows": [_row(told, unit) for told in summary.get("segments") or ()],
+        "rows": [_row(segment, unit) for segment in summary.get("segments") or ()],
         "weights": str(summary.get("weights") or ""),
         "timings_s": {STAGES.get(name, _plain(name)): value for name, value in times.items() if value is not None},
     }
 
 
-def _heads(summary: Mapping[str, Any], unit: Unit, confidence: str) -> list[str]:
+def _heads(summary: Mapping[str, Any], unit: Unit) -> list[str]:
     """Heads of the table; with radii of 95 % its centres and volumes say how sure they are."""
     sure = isinstance(summary.get("radius95"), Mapping)
     centre, volume = (", ± 95 %", ", 95 % range") if sure else ("", "")
     heads = [f"centre x, y, z{centre} ({unit.length_name})", f"volume{volume} ({unit.volume_name})"]
-    known = any(_number(told.get("confidence")) is not None for told in summary.get("segments") or ())
-    return ["segment", *heads, *([confidence] if known or not summary.get("segments") else [])]
+    segments = summary.get("segments") or ()
+    if not segments or any(_number(segment.get("confidence")) is not None for segment in segments):
+        heads.append(confidence_title(summary.get("calibrated") is True))
+    return ["segment", *heads]
 
 
 def _facts(summary: Mapping[str, Any], unit: Unit, verdict: Trust) -> list[str]:
     """Where the answer comes from, what it was made with, then whatever else a caller has to say."""
-    registration = summary.get("registration")
+    registration, radius95 = summary.get("registration"), summary.get("radius95")
     facts = [_answer(registration, verdict)] if isinstance(registration, Mapping) else []
     source, spacing = summary.get("source"), _number(summary.get("spacing"))
     if source is not None and str(source) != str(summary.get("title")):
         facts.append(f"from {source}")
-    if isinstance(summary.get("radius95"), Mapping):
-        facts.append(_sure(summary["radius95"], unit))
+    if isinstance(radius95, Mapping):
+        middle, most = (rounded(float(radius95[key]) * unit.length_factor) for key in ("median", "max"))
+        level = level_told(bool(radius95.get("calibrated")))
+        facts.append(f"surface within {middle} {unit.length_name} in the median, {most} at most ({level})")
     if spacing is not None:
         facts.append(f"voxels of {rounded(spacing * unit.length_factor)} {unit.length_name}")
     if summary.get("device"):
         facts.append(f"computed on {DEVICES.get(str(summary['device']), str(summary['device']))}")
-    said = SAID_ELSEWHERE | FOR_PROGRAMS | {"weights", "spacing", "device", "resolution", "clipped", "calibrated"}
     for key, value in summary.items():
-        number = None if isinstance(value, bool) else _number(value)
-        if key not in said and (number is not None or isinstance(value, str)):
+        number = _number(value)
+        if key not in SHOWN_APART + FOR_PROGRAMS and (number is not None or isinstance(value, str)):
             facts.append(f"{_plain(key)}: {value if number is None else rounded(number)}")
     return facts
-
-
-def _sure(radius95: Mapping[str, Any], unit: Unit) -> str:
-    middle, most = (rounded(float(radius95[key]) * unit.length_factor) for key in ("median", "max"))
-    level = level_told(bool(radius95.get("calibrated")))
-    return f"surface within {middle} {unit.length_name} in the median, {most} at most ({level})"
 
 
 def _answer(registration: Mapping[str, Any], verdict: Trust) -> str:
     explained = _number(registration.get("explained"))
     if registration.get("answer") != "registration":
         return "the network's own answer"
-    found = "your model, found by a search" if registration.get("found_by") == "search" else "your model, registered"
-    if explained is None or verdict.level in ("yes", "unchecked"):  # which say it themselves
-        return found
-    return f"{found}: it explains {explained:.1%} of the points"
+    how = "found by a search" if registration.get("found_by") == "search" else "registered"
+    # two of the verdicts say themselves how much it explains
+    share = "" if explained is None or verdict.level in ("yes", "unchecked") else f"{explained:.1%}"
+    return f"your model, {how}" + (share and f": it explains {share} of the points")
 
 
 def _warnings(summary: Mapping[str, Any], verdict: Trust) -> list[str]:
@@ -147,22 +198,15 @@ def _warnings(summary: Mapping[str, Any], verdict: Trust) -> list[str]:
     return [text[0].upper() + text[1:] + ("" if text.endswith(".") else ".") for text in warnings]
 
 
-def _row(told: Mapping[str, Any], unit: Unit) -> list[Any]:
-    centre, volume = told.get("centroid"), _number(told.get("volume"))
-    radius, between = _number(told.get("centroid_radius95")), told.get("volume95")
+def _row(segment: Mapping[str, Any], unit: Unit) -> list[Any]:
+    centre, volume = segment.get("centroid"), _number(segment.get("volume"))
+    radius = _number(segment.get("centroid_radius95"))
     words = DASH if centre is None else unit.place(np.asarray(centre, dtype=float), radius)
     place, sign, off = words.partition(" ± ")
     # a narrow page breaks these lines at their plain spaces
     place = GAP.join(place.split()) + (f"{GAP} ±\N{NO-BREAK SPACE}{off}" if sign else "")
-    size = DASH if volume is None else unit.volume(volume, between)
-    return [place, size, _number(told.get("confidence"))]
-
-
-def _number(value: object) -> float | None:
-    """The value as a finite number; None for everything else."""
-    if not isinstance(value, int | float | np.integer | np.floating) or not np.isfinite(value):
-        return None
-    return float(value)
+    size = DASH if volume is None else unit.volume(volume, segment.get("volume95"))
+    return [place, size, _number(segment.get("confidence"))]
 
 
 def _plain(key: str) -> str:

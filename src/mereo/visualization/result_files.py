@@ -7,25 +7,24 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.carry import Carried
 from mereo.fitting.registration.register import describe
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.registration.state import write_state
 from mereo.geometry.camera import PointCloud, camera_axes
-from mereo.geometry.conventions import CloudAxes
-from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.radii import Radii
 from mereo.geometry.transforms import transform_points
-from mereo.io.attachments import write_attachment
+from mereo.io.attachments import Surfaces, write_attachment
 from mereo.io.config import DEFAULT_FILES, FilesConfig
 from mereo.io.writers.formats import WRITERS, Results, chosen_formats, write_formats
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.scenes.rest_pose import rest_digest
-from mereo.scenes.scene import Scene
-from mereo.visualization.pictured import pictured, with_carried
 from mereo.visualization.previews import render_cloud_and_segments
-from mereo.visualization.reconstruction_report import write_report
+from mereo.visualization.reconstruction_report import REPORT, Report, cluster
 from mereo.visualization.units import Unit
 
 
@@ -36,24 +35,24 @@ def summary_of(
     result, frame = answer.reconstruction, answer.seen.frame
     segments: list[dict[str, Any]] = [
         {
-            "name": found.name,
-            "label": found.label,
+            "name": segment.name,
+            "label": segment.label,
             "color": list(color),
-            "volume": found.volume,
-            "centroid": found.centroid.tolist(),
-            "box": found.box.tolist(),
-            "confidence": found.confidence,
-            "voxels": found.voxels,
-            "components": found.components,
+            "volume": segment.volume,
+            "centroid": segment.centroid.tolist(),
+            "box": segment.box.tolist(),
+            "confidence": segment.confidence,
+            "voxels": segment.voxels,
+            "components": segment.components,
         }
-        for found, color in zip(result.segments, result.surfaces.colors, strict=True)
+        for segment, color in zip(result.segments, result.surfaces.colors, strict=True)
     ]
     radii: dict[str, Any] = {}
     sure = None if answer.registered is None else answer.registered.uncertainty
     if sure is not None:
         radii["radius95"] = {**sure.summary(), "unit_m": frame.unit_m}
-        for row, one in zip(segments, sure.segments, strict=True):
-            row |= {"centroid_radius95": one.centroid_radius95, "volume95": list(one.volume95)}
+        for row, segment in zip(segments, sure.segments, strict=True):
+            row |= {"centroid_radius95": segment.centroid_radius95, "volume95": list(segment.volume95)}
     return {
         "frame": frame.axes,
         "unit_m": frame.unit_m,
@@ -79,32 +78,21 @@ def frame_facts(answer: Answer, carried: Sequence[Carried] = ()) -> dict[str, ob
         "points": len(seen.cloud),
     }
     if registrar is not None:
-        facts["registration"] = registration_facts(answer)
+        source = {"answer": "registration" if answer.taken else "network", "found_by": answer.found_by}
+        fit = answer.registration
+        facts["registration"] = source | ({"refusal": answer.refusal} if fit is None else describe(fit))
     facts["recognition"] = answer.recognition.facts()
     if model is not None:
         facts |= {"device": model.device_type, "precision": model.working_precision}
     if carried:
-        facts["carried"] = [one.facts() for one in carried]
-    return {**facts, **seen.facts(), **scene_facts(None if registrar is None else registrar.given)}
-
-
-def scene_facts(scene: Scene | None) -> dict[str, object]:
-    """What a summary says of the scene file that was given; nothing of a scene that is no file's.
-
-    The digest is of what the file states and of the segments at rest.
-    """
-    if scene is None or scene.file is None:
-        return {}
-    digest = hashlib.sha256((rest_digest(scene.rest) + scene.definition).encode()).hexdigest()
-    return {"scene_file": {"path": str(scene.file), "sha256": digest}}
-
-
-def registration_facts(answer: Answer) -> dict[str, object]:
-    """Facts of a summary about where an answer comes from."""
-    source = "registration" if answer.taken else "network"
-    if answer.registration is None:
-        return {"answer": source, "found_by": answer.found_by, "refusal": answer.refusal}
-    return {"answer": source, "found_by": answer.found_by, **describe(answer.registration)}
+        facts["carried"] = [item.facts() for item in carried]
+    facts |= seen.facts()
+    scene = None if registrar is None else registrar.given
+    if scene is not None and scene.file is not None:
+        # of what the file states and of the segments at rest
+        digest = hashlib.sha256((rest_digest(scene.rest) + scene.definition).encode()).hexdigest()
+        facts["scene_file"] = {"path": str(scene.file), "sha256": digest}
+    return facts
 
 
 def write_answer(
@@ -122,35 +110,33 @@ def write_answer(
     Raises ``ValueError`` where the network answers and finds no segment, ``ImportError`` where a format's extra is
     missing.
     """
-    result, frame, cloud = answer.reconstruction, answer.seen.frame, answer.seen.cloud
+    reconstruction, frame = answer.reconstruction, answer.seen.frame
     started = time.perf_counter()
     formats = chosen_formats(files.formats)
     results, to_viewer = _results(answer, files), viewer_rotation(frame.axes)
     write_formats(directory, [name for name in formats if name != "json"], results)  # which states the time of these
-    for one in carried:
-        write_attachment(directory / "carried" / one.name, one.content, results.factor, to_viewer, frame.metres)
-    shown = with_carried(result.surfaces, carried)
-    if "glb" in formats and len(shown.segments) > len(result.surfaces.segments):
+    for item in carried:
+        write_attachment(directory / "carried" / item.name, item.content, results.factor, to_viewer, frame.metres)
+    shown = with_carried(reconstruction.surfaces, carried)
+    extra = shown.names[: len(shown.segments) - len(reconstruction.surfaces.segments)]
+    if "glb" in formats and extra:
         write_segments_glb(directory / "carried.glb", shown, to_viewer, frame.metres)
-    drawn = pictured(shown)
-    write_preview(directory / "preview.png", drawn, cloud, frame.axes, frame.source)
-    summary = summary_of(answer, carried, {**result.timings_s, "write": time.perf_counter() - started})
-    extra = shown.segments[: len(shown.segments) - len(result.surfaces.segments)]
-    rows = [*({"name": part.name} for part in extra), *summary["segments"]]
-    page, unit = {**summary, "segments": rows}, Unit(frame.unit_m)
-    write_report(directory / "report.html", cloud, drawn, page, to_viewer, unit, answer.registered, frame.depth)
+    drawn = coarsened(shown)
+    write_preview(directory / "preview.png", answer, drawn)
+    summary = summary_of(answer, carried, {**reconstruction.timings_s, "write": time.perf_counter() - started})
+    rows = [*({"name": name} for name in extra), *summary["segments"]]
+    report_of(answer, drawn, {**summary, "segments": rows}).write(directory / REPORT)
     write_formats(directory, [name for name in formats if name == "json"], replace(results, summary=summary))
     write_state(directory, answer)
 
 
 def write_answer_file(path: Path, suffix: str, answer: Answer, files: FilesConfig) -> None:
     """Write the one file of a folder of results that has this suffix (".glb", ".html", ...) to a path."""
-    result, frame, cloud = answer.reconstruction, answer.seen.frame, answer.seen.cloud
+    surfaces = answer.reconstruction.surfaces
     if suffix == ".png":
-        write_preview(path, pictured(result.surfaces), cloud, frame.axes, frame.source)
+        write_preview(path, answer, coarsened(surfaces))
     elif suffix == ".html":
-        drawn, summary, unit = pictured(result.surfaces), summary_of(answer), Unit(frame.unit_m)
-        write_report(path, cloud, drawn, summary, viewer_rotation(frame.axes), unit, answer.registered, frame.depth)
+        report_of(answer, coarsened(surfaces), summary_of(answer)).write(path)
     else:
         (name,) = (name for name, writer in WRITERS.items() if writer.file.endswith(suffix) and name != "points")
         chosen_formats([name])
@@ -165,6 +151,13 @@ def _results(answer: Answer, files: FilesConfig) -> Results:
     return Results(*parts, to_viewer, frame.metres, files.millimetres, radii=radii)
 
 
+def report_of(answer: Answer, surfaces: SegmentedMesh, summary: dict[str, Any]) -> Report:
+    """Page of an answer with these surfaces, which may be coarser and more than its own."""
+    frame, cloud = answer.seen.frame, answer.seen.cloud
+    to_viewer, unit = viewer_rotation(frame.axes), Unit(frame.unit_m)
+    return Report(cloud, surfaces, summary, to_viewer, unit, answer.registered, frame.depth)
+
+
 def radii_of(registered: Registration | None) -> Radii | None:
     """Radii of a registered model's points, in its frame; None where they are not known."""
     if registered is None or registered.uncertainty is None:
@@ -172,8 +165,42 @@ def radii_of(registered: Registration | None) -> Radii | None:
     return registered.uncertainty.radii(registered.material)
 
 
-def write_preview(path: Path, surfaces: SegmentedMesh, cloud: PointCloud, frame: CloudAxes, title: str) -> None:
-    """Write the picture of cloud and segments, both turned as a camera sees them."""
-    to_camera = camera_axes(frame)
-    seen = PointCloud(transform_points(to_camera, cloud.points))
-    render_cloud_and_segments(path, seen, surfaces.transformed(to_camera), title)
+def write_preview(path: Path, answer: Answer, surfaces: SegmentedMesh) -> None:
+    """Write the picture of an answer's cloud and these surfaces, both turned as a camera sees them."""
+    frame, to_camera = answer.seen.frame, camera_axes(answer.seen.frame.axes)
+    cloud = PointCloud(transform_points(to_camera, answer.seen.cloud.points))
+    render_cloud_and_segments(path, cloud, surfaces.transformed(to_camera), frame.source)
+
+
+# --- surfaces as pictures and reports need them -----------------------------------------------------------------------
+
+
+def coarsened(mesh: SegmentedMesh) -> SegmentedMesh:
+    """A mesh coarse enough to be drawn: shading takes seconds for each hundred thousand faces of a segment."""
+    return replace(
+        mesh,
+        segments=tuple(
+            cluster(segment, float(np.ptp(segment.vertices, axis=0).max()) / 150)  # cells along the longest side
+            if len(segment.faces) > 100_000
+            else segment
+            for segment in mesh.segments
+        ),
+    )
+
+
+def with_carried(surfaces: SegmentedMesh, carried: Sequence[Carried]) -> SegmentedMesh:
+    """Segments with all carried surfaces before them, declared to lie inside them, so that they are seen through them.
+
+    Their names are those of their files, with that of the part where a file has several; their colours differ from the
+    segments'.
+    """
+    parts: list[Segment] = []
+    for item in carried:
+        if isinstance(item.content, Surfaces):
+            segments = item.content.mesh.segments
+            several = len(segments) > 1
+            parts += [replace(s, name=f"{item.name}: {s.name}" if several else item.name) for s in segments]
+    free = [color for color in reversed(PALETTE) if color not in surfaces.colors] or list(PALETTE)
+    parts = [replace(part, color=free[index % len(free)]) for index, part in enumerate(parts)]
+    nested = tuple((part.name, name) for part in parts for name in surfaces.names)
+    return SegmentedMesh((*parts, *surfaces.segments), (*surfaces.nested, *nested))

@@ -20,39 +20,39 @@ class Unit:
 
     @property
     def length_name(self) -> str:
-        """Name of the unit that lengths are told in."""
+        """Name of the unit in which lengths are written."""
         return "units" if self.metres is None else "mm"
 
     @property
     def volume_name(self) -> str:
-        """Name of the unit that volumes are told in."""
+        """Name of the unit in which volumes are written."""
         return "units³" if self.metres is None else "cm³"
 
     @property
     def length_factor(self) -> float:
-        """Factor from a length of the frame to one that is told."""
+        """Factor from a length of the frame to the written one."""
         return 1.0 if self.metres is None else 1000 * self.metres
 
     @property
     def volume_factor(self) -> float:
-        """Factor from a volume of the frame to one that is told."""
+        """Factor from a volume of the frame to the written one."""
         return 1.0 if self.metres is None else (100 * self.metres) ** 3
 
     def place(self, point: Float[np.ndarray, "3"], radius: float | None = None) -> str:
         """Coordinates of a point of the frame, without the unit's name; with a radius all as exact as that, and it."""
-        told = [float(value) for value in point * self.length_factor]
+        values = [float(value) for value in point * self.length_factor]
         if radius is None:
-            return " ".join(rounded(value) for value in told)
-        *near, off = as_exact_as(radius * self.length_factor, *told, radius * self.length_factor)
+            return " ".join(rounded(value) for value in values)
+        *near, off = as_exact_as(radius * self.length_factor, *values, radius * self.length_factor)
         return f"{' '.join(near)} ± {off}"
 
     def volume(self, volume: float, between: Sequence[float] | None = None) -> str:
         """Volume of the frame, without the unit's name; with its bounds all as exact as they are wide, and these."""
-        told = volume * self.volume_factor
+        value = volume * self.volume_factor
         if between is None:
-            return rounded(told)
+            return rounded(value)
         low, high = (bound * self.volume_factor for bound in between)
-        middle, least, most = as_exact_as(high - low, told, low, high)
+        middle, least, most = as_exact_as(high - low, value, low, high)
         return f"{middle} ({least} to {most})"
 
 

@@ -16,8 +16,8 @@ from mereo.evaluation.cases import EvaluatedView
 from mereo.evaluation.metrics import format_score
 from mereo.io.atomic_files import atomic_file, new_directory, write_json
 from mereo.io.extras import pyplot
+from mereo.visualization.color_scales import viridis
 from mereo.visualization.error_maps import Comparison, Shown, comparison_picture, error_picture
-from mereo.visualization.viridis import viridis
 from mereo_experiments.paper.store import Score
 
 Figures = dict[str, float]

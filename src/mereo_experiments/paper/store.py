@@ -23,7 +23,7 @@ from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.shards import MANIFEST, NOT_COMPARED, DatasetConfig, generate, make_manifest
 from mereo.training.config import TrainConfig
 from mereo.training.trainer import train
-from mereo.visualization.evaluation_files import evaluate_weights
+from mereo.visualization.evaluation_report import evaluate_weights
 from mereo_experiments.paper.scales import TRAINING_SEED
 
 NETWORK: AnswerMethod = "network"

@@ -1,10 +1,11 @@
-"""Parts that the pages share: the stage, the layer and the controls of segments, observed points, depth, views.
+"""Parts that the pages share: the stage, layer and controls of segments, observed points, views, pieces of HTML.
 
 Everything is shown in stage coordinates: the object's middle is the origin and half its longest side is 1, whatever
 the input's unit, so that sizes of points, gizmos and clipping distances fit.
 """
 
 from collections.abc import Callable, Sequence
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,11 @@ import trimesh
 from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
+from mereo.evaluation.metrics import Scores, format_score
 from mereo.geometry.camera import PointCloud
-from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
+from mereo.geometry.mesh import Color, Segment, SegmentedMesh, vertex_normals
 from mereo.geometry.subdivision import split_at_creases
+from mereo.visualization.color_scales import ColorScale
 from mereo.visualization.contact_sheets import Picture, enlarge
 
 CLOUD_COLOR = (244, 246, 250)
@@ -24,17 +27,8 @@ CLOUD_SIZES = (0.001, 0.012)
 POINT_SHARE = 0.2
 """Share of the spacing of points that one takes, so that the surface is seen between them."""
 
-SAMPLED = 1000
-"""Points whose neighbours are measured."""
-
 FOV_RAD = float(np.deg2rad(40.0))
 """Angle of view of the page's own camera."""
-
-OBLIQUE = 0.28
-"""Share by which views are turned to the side and from above, so that depth is seen."""
-
-FEW = 6
-"""More segments than this have their check boxes in a closed folder, or the panel would be all boxes."""
 
 PICTURE_PX = 320
 """Width of a picture in the panel, to which small ones are enlarged: a browser would blur their pixels."""
@@ -42,7 +36,7 @@ PICTURE_PX = 320
 
 def point_size(points: Float[np.ndarray, "n 3"]) -> float:
     """Size of points on the stage, from their median distance to the nearest neighbour, within ``CLOUD_SIZES``."""
-    some = points[:: max(1, len(points) // SAMPLED)]
+    some = points[:: max(1, len(points) // 1000)]
     apart = cKDTree(points).query(some, k=2)[0][:, 1] if len(points) > 1 else np.zeros(0)
     apart = apart[np.isfinite(apart) & (apart > 0)]  # repeated points have no spacing
     smallest, largest = CLOUD_SIZES
@@ -103,7 +97,7 @@ class Display:
             ahead = toward()
             side = np.cross(self.up, ahead)
             direction = {first: ahead, "side": side, "behind": -ahead}[name]
-            self.look_from(direction + OBLIQUE * (np.cross(self.up, direction) + self.up), bounds())
+            self.look_from(direction + 0.28 * (np.cross(self.up, direction) + self.up), bounds())
 
         view = self.server.gui.add_button_group("View", (first, "side", "behind"))
         view.on_click(lambda _: look(view.value))
@@ -115,7 +109,7 @@ class SegmentControls:
     """Controls with a check box and an opacity slider for each segment."""
 
     def __init__(self, gui: Any, mesh: SegmentedMesh, changed: Callable[[], None]) -> None:
-        with gui.add_folder("Segments", expand_by_default=len(mesh.segments) <= FEW):
+        with gui.add_folder("Segments", expand_by_default=len(mesh.segments) <= 6):  # or all would be boxes
             self._boxes = [gui.add_checkbox(segment.name, True) for segment in mesh.segments]
         with gui.add_folder("Opacity", expand_by_default=False):
             self._all = gui.add_slider("all", 0.0, 1.0, 0.05, 1.0)
@@ -232,3 +226,77 @@ class PointLayer:
 def enlarged(picture: Picture) -> Picture:
     """Picture for the panel, of ``PICTURE_PX`` pixels across at least."""
     return picture if picture.shape[1] >= PICTURE_PX else enlarge(picture, PICTURE_PX)
+
+
+# --- pieces of HTML ---------------------------------------------------------------------------------------------------
+
+# Every text from outside is escaped.
+
+SOFT = "opacity:.62"
+
+BOX = "padding:2px 0.9em 6px;font-size:0.82em;line-height:1.5"
+
+
+def css(color: Color) -> str:
+    """Colour as CSS writes it."""
+    return "rgb({},{},{})".format(*color)
+
+
+def heading(title: str, text: str) -> str:
+    """Heading of a panel: what the page is about."""
+    return (
+        f'<div style="padding:6px 0.75em 4px"><div style="font-weight:650;font-size:1.05em">{escape(title)}</div>'
+        f'<div style="font-size:0.8em;{SOFT}">{escape(text)}</div></div>'
+    )
+
+
+def message(text: str, bad: bool = False) -> str:
+    """Line on what is going on; "" is an empty line, so that nothing jumps."""
+    color = "color:#e5484d" if bad else SOFT
+    return f'<div style="{BOX};min-height:1.9em;{color}">{escape(text) or "&nbsp;"}</div>'
+
+
+def chips(names: Sequence[str], colors: Sequence[Color]) -> str:
+    """Chips that name the segments' colours."""
+    each = "".join(
+        f'<span style="white-space:nowrap;margin-right:11px"><span style="display:inline-block;width:10px;height:10px;'
+        f'border-radius:3px;background:{css(color)};margin-right:5px"></span>{escape(name)}</span> '
+        for name, color in zip(names, colors, strict=True)
+    )
+    return f'<div style="{BOX}">{each}</div>'
+
+
+def color_bar(scale: ColorScale) -> str:
+    """Bar with all colours of a scale, and what its ends mean."""
+    stops = ",".join(css(color) for color in scale.stops)
+    return (
+        f'<div style="{BOX}"><div>{escape(scale.title)}</div><div style="height:9px;border-radius:5px;margin:3px 0;'
+        f'background:linear-gradient(90deg,{stops})"></div><div style="display:flex;justify-content:space-between;'
+        f'{SOFT}"><span>{escape(scale.words[0])}</span><span>{escape(scale.words[1])}</span></div></div>'
+    )
+
+
+def bars(rows: Sequence[tuple[str, Color, float]]) -> str:
+    """Bars that show named numbers from 0 to 1; NaN is a dash."""
+    cells = "".join(
+        f"<div>{escape(name)}</div>"
+        f'<div style="background:rgba(128,128,128,.22);border-radius:4px;height:7px;align-self:center"><div style="'
+        f"width:{0 if np.isnan(value) else 100 * min(max(value, 0.0), 1.0):.1f}%;height:7px;border-radius:4px;"
+        f'background:{css(color)}"></div></div>'
+        f'<div style="text-align:right">{"–" if np.isnan(value) else f"{value:.2f}"}</div>'
+        for name, color, value in rows
+    )
+    grid = "display:grid;grid-template-columns:minmax(4.5em,auto) 1fr 2.4em;gap:1px 9px"
+    return f'<div style="{BOX};font-variant-numeric:tabular-nums;{grid}">{cells}</div>'
+
+
+def score_table(scores: Scores, names: Sequence[str], colors: Sequence[Color]) -> str:
+    """Scores: IoU and mIoU large, each segment below."""
+    big = "".join(
+        f'<div><div style="font-size:2.1em;font-weight:650;line-height:1.15">{format_score(value, "–")}</div>'
+        f'<div style="{SOFT}">{label}</div></div>'
+        for label, value in (("IoU, whole object", scores.iou), ("mIoU, segments", scores.miou))
+    )
+    head = f'<div style="{BOX};display:flex;gap:2em;font-variant-numeric:tabular-nums">{big}</div>'
+    rows = [(name, color, float(value)) for name, color, value in zip(names, colors, scores.per_segment, strict=True)]
+    return head + bars(rows)

@@ -15,8 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mereo.evaluation.cases import grid_confusion, labels_on
-from mereo.evaluation.ground_truth import truth_grid
-from mereo.evaluation.metrics import Scores, intersection_over_union
+from mereo.evaluation.metrics import Scores, intersection_over_union, truth_grid
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import Camera, PointCloud
@@ -33,20 +32,23 @@ from mereo.scenes.scene import Scene
 from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor
 from mereo.synthesis.depth_sensor import observe
 from mereo.synthesis.examples import View
-from mereo.visualization.depth_picture import depth_picture
-from mereo.visualization.viewer import html
-from mereo.visualization.viewer.display import Display, PointLayer, SegmentControls, SegmentLayer, enlarged
-from mereo.visualization.viewer.probe import source_of
+from mereo.visualization.contact_sheets import depth_picture
+from mereo.visualization.viewer.display import (
+    Display,
+    PointLayer,
+    SegmentControls,
+    SegmentLayer,
+    chips,
+    enlarged,
+    heading,
+    message,
+    score_table,
+)
+from mereo.visualization.viewer.result_page import source_of
 from mereo.visualization.viewer.server import OpenPage, import_viser, start_server
-
-PIXELS = 64
-"""Pixels a side of the simulated camera."""
 
 CELLS = 64
 """Cells a side on which an answer is scored; the paper takes 100, fewer are faster and a little off."""
-
-RESOLUTION = 96
-"""Cells along the longest side of a network's surfaces."""
 
 GAP = 0.15
 """Room beside and below truth and reconstruction, side by side, in stage units."""
@@ -131,7 +133,7 @@ class Laboratory:
         center, cosine = state.mesh.bounds.mean(axis=0), float(np.cos(place.tilt_rad))
         T_world_camera = workspace.pose(center, cosine, place.azimuth_rad, place.distance)
         mesh = state.mesh.transformed(inverse_rigid(T_world_camera))
-        camera = Camera.from_fov(PIXELS, PIXELS, workspace.fov_rad)
+        camera = Camera.from_fov(64, 64, workspace.fov_rad)
         seen = observe(Solids(mesh), camera, GenerateConfig().noise_std, SENSORS[sensor], np.random.default_rng(0))
         if seen.object_points < MIN_POINTS:
             raise ValueError(
@@ -147,7 +149,7 @@ class Laboratory:
         """
         started = time.perf_counter()
         seen = observe_cloud(view.depth.to_points(), unit_m=self.scene.unit_m)
-        answer = answer_frame(seen, self.network, self.registrar, resolution=RESOLUTION)
+        answer = answer_frame(seen, self.network, self.registrar, resolution=96)
         surfaces, seconds = answer.surfaces, time.perf_counter() - started
         truth = truth_grid(view.mesh, CELLS)
         confusion = grid_confusion(truth, labels_on(surfaces, truth.grid), len(surfaces.segments))
@@ -258,7 +260,7 @@ class LabPage:
         self._seeds = np.random.default_rng(seed)
         rest = laboratory.scene.rest
         self.stage = Display(server, rest.bounds, np.asarray(laboratory.scene.workspace.axis, dtype=float))
-        self.true, self.found = SegmentLayer(self.stage, "/true"), SegmentLayer(self.stage, "/found")
+        self.truth, self.answer = SegmentLayer(self.stage, "/true"), SegmentLayer(self.stage, "/found")
         self._names: list[Any] = []
         self._build()
 
@@ -270,11 +272,11 @@ class LabPage:
         network = self.laboratory.network
         facts = "no weights: a search finds the object" if network is None else f"weights {network.name}"
         with panel.add_tab("Frame"):
-            gui.add_html(html.heading(f"Laboratory: {self.laboratory.scene.name}", facts))
+            gui.add_html(heading(f"Laboratory: {self.laboratory.scene.name}", facts))
             self.picture = gui.add_image(np.zeros((320, 320, 3), dtype=np.uint8), format="png")
             self.scores = gui.add_html("")
-            self.status = gui.add_html(html.message("starting"))
-        gui.add_html(html.chips(rest.names, rest.colors))
+            self.status = gui.add_html(message("starting"))
+        gui.add_html(chips(rest.names, rest.colors))
         gui.add_button("Random state").on_click(lambda _: self.randomize())
         gui.add_button("Reconstruct").on_click(lambda _: self.reconstruct())
         self._build_camera()
@@ -309,8 +311,8 @@ class LabPage:
         """Set one number of the state; a draw that has just gone has nothing left to set."""
 
         def changed(shape: Played) -> Played:
-            known = [one for one in parameters(shape) if (one.key, one.index) == slot]
-            return set_value(self.laboratory.scene, shape, known[0], value) if known else shape
+            matches = [known for known in parameters(shape) if (known.key, known.index) == slot]
+            return set_value(self.laboratory.scene, shape, matches[0], value) if matches else shape
 
         self._change(slot, changed)
 
@@ -345,7 +347,7 @@ class LabPage:
                 self._say(words_of(error), bad=True)
                 return
             surfaces = self.trial.surfaces
-            self.scores.content = html.scores(self.trial.scores, surfaces.names, surfaces.colors)
+            self.scores.content = score_table(self.trial.scores, surfaces.names, surfaces.colors)
             self._say(f"{self.trial.source}; {self.trial.seconds:.1f} s; scored on {CELLS}³ points")
             self._draw()
             self._look("camera")
@@ -367,7 +369,7 @@ class LabPage:
             self._look("camera")
 
     def _say(self, text: str, bad: bool = False) -> None:
-        self.status.content = html.message(text, bad)
+        self.status.content = message(text, bad)
 
     def _toward(self) -> Float[np.ndarray, "3"]:
         """Direction from the object to the camera."""
@@ -393,15 +395,15 @@ class LabPage:
             if view is None:
                 return
             T_world_camera, aside = view.T_world_camera, self._aside(view)
-            self.true.show(view.mesh.transformed(T_world_camera), self.controls, shift=aside)
+            self.truth.show(view.mesh.transformed(T_world_camera), self.controls, shift=aside)
             self.points.show(PointCloud(transform_points(T_world_camera, view.depth.to_points().points)), -aside)
             for name in self._names:
                 name.remove()
             self._names = []
             if trial is None:
-                self.found.clear_from()
+                self.answer.clear_from()
                 return
-            self.found.show(trial.surfaces.transformed(T_world_camera), self.controls, shift=-aside)
+            self.answer.show(trial.surfaces.transformed(T_world_camera), self.controls, shift=-aside)
             low, high = view.mesh.bounds  # of the camera frame, where y is down
             foot = np.array([(low[0] + high[0]) / 2, high[1] + GAP / self.stage.scale, (low[2] + high[2]) / 2])
             place = self.stage.place(transform_points(T_world_camera, foot))

@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -16,20 +17,19 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.registration import nearest_labels
 from mereo.fitting.registration.state import STATE
 from mereo.geometry.brief import counted
 from mereo.geometry.camera import PointCloud
-from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.mesh import Color, SegmentedMesh
 from mereo.geometry.radii import Radii
-from mereo.geometry.solids import Solids
+from mereo.geometry.solids import Solids, signed_distance_and_direction
+from mereo.geometry.transforms import inverse_rigid, rigid, rotation_along, transform_points
 from mereo.io.mesh_formats import GlbScene, is_glb, read_glb
 from mereo.io.writers.formats import WRITERS
 from mereo.io.writers.glb import viewer_rotation
-from mereo.visualization.contact_sheets import Picture
-from mereo.visualization.depth_picture import depth_data, depth_picture
-from mereo.visualization.result_files import radii_of
-from mereo.visualization.units import UNKNOWN, Unit, rounded
-from mereo.visualization.vertex_colors import (
+from mereo.models.trained import Answer as NetworkAnswer
+from mereo.visualization.color_scales import (
     CONFIDENCE,
     ColorScale,
     confidence,
@@ -37,15 +37,160 @@ from mereo.visualization.vertex_colors import (
     observed_distance,
     radius_scale,
 )
-from mereo.visualization.viewer import html
-from mereo.visualization.viewer.display import Display, PointLayer, SegmentControls, SegmentLayer, enlarged
-from mereo.visualization.viewer.probe import Probed, ask_network, first_hit, probe_answer, probe_surfaces, source_of
+from mereo.visualization.contact_sheets import Picture, depth_ends, depth_picture
+from mereo.visualization.reconstruction_report import REPORT, read_report
+from mereo.visualization.result_files import radii_of
+from mereo.visualization.units import UNKNOWN, Unit, rounded
+from mereo.visualization.viewer.display import (
+    BOX,
+    SOFT,
+    Display,
+    PointLayer,
+    SegmentControls,
+    SegmentLayer,
+    bars,
+    chips,
+    color_bar,
+    enlarged,
+    heading,
+    message,
+)
 from mereo.visualization.viewer.server import OpenPage, import_viser, start_server
-from mereo.visualization.written_report import REPORT, read_report
 
 EMPTY_COLOR = (150, 156, 168)
 
-SEGMENT, OWN, SURE = "segment", "own", "how sure"
+# --- probe ------------------------------------------------------------------------------------------------------------
+
+# Probe of an answer or of surfaces, in the input's frame: what is known of a point, and which point a look meets.
+
+ON_SURFACE = 1e-6
+"""Distance, as a share of a place's coordinates, that is none: a click meets the surface up to rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class Probed:
+    """Facts about points of the input's frame, in its unit.
+
+    Attributes:
+        label: 0 for empty space, i + 1 for segment i.
+        distance: to the nearest segment surface, negative inside; NaN where that is not known.
+        direction: unit vector towards it; NaN where that is not known.
+        probability: of empty space and each segment, by the network; None where there is none.
+        rest: where the point was at rest, scene units; None where no model is registered.
+        radius95: radius around the point that holds the true place of what is registered there with probability 0.95;
+            None where that is not known.
+    """
+
+    label: UInt8[np.ndarray, " n"]
+    distance: Float[np.ndarray, " n"]
+    direction: Float[np.ndarray, "n 3"]
+    probability: Float[np.ndarray, "n c"] | None = None
+    rest: Float[np.ndarray, "n 3"] | None = None
+    radius95: Float[np.ndarray, " n"] | None = None
+
+
+def source_of(answer: Answer) -> str:
+    """Where an answer comes from, and whether its frame shows the object, in a phrase for people."""
+    if answer.registrar is None:
+        return "network alone: the weights carry no statistical model"
+    doubt = None if answer.registration is None else answer.recognition.told
+    return answer.source if doubt is None else f"{answer.source}; {doubt}"
+
+
+def ask_network(answer: Answer, points: Float[np.ndarray, "n 3"]) -> NetworkAnswer:
+    """Answers of the network at points of the input's frame, in that frame; it must have been given the frame."""
+    result = answer.reconstruction
+    assert answer.model is not None and result.code is not None
+    network = answer.model.query(result.code, transform_points(result.T_camera_input, points))
+    direction = network.direction @ result.T_camera_input[:3, :3]
+    return NetworkAnswer(network.label, network.probability, network.distance, direction)
+
+
+def probe_answer(answer: Answer, points: Float[np.ndarray, "n 3"]) -> Probed:
+    """Facts about points of the input's frame: those of the registered model where it is the answer."""
+    network = None if answer.reconstruction.code is None else ask_network(answer, points)
+    if answer.registered is None:
+        assert network is not None
+        return Probed(network.label, network.distance, network.direction, network.probability)
+    model = answer.registered.query(points)
+    return Probed(
+        _with_surface(answer.registered.solids, model.label, model.distance, points),
+        model.distance,
+        model.direction,
+        None if network is None else network.probability,
+        model.rest,
+        answer.registered.radius95(points, at="camera"),
+    )
+
+
+def probe_surfaces(solids: Solids, radii: Radii | None, points: Float[np.ndarray, "n 3"]) -> Probed:
+    """Facts about points that closed surfaces alone say."""
+    inside = solids.label(points)
+    distance, direction = signed_distance_and_direction(solids, points, inside)
+    label = _with_surface(solids, inside, distance, points)
+    radius = None
+    if radii is not None and label.all():
+        radius = np.concatenate([radii.at(point[None], int(row)) for point, row in zip(points, label, strict=True)])
+    return Probed(label, distance, direction, radius95=radius)
+
+
+def _with_surface(
+    solids: Solids, label: UInt8[np.ndarray, " n"], distance: Float[np.ndarray, " n"], points: Float[np.ndarray, "n 3"]
+) -> UInt8[np.ndarray, " n"]:
+    """Labels, where a place on a surface is its segment's, whichever side rounding has put it on."""
+    on_surface = (label == 0) & (np.abs(distance) <= ON_SURFACE * np.abs(points).max(axis=1))
+    return np.where(on_surface, nearest_labels(solids, points), label).astype(np.uint8)
+
+
+def first_point(
+    mesh: SegmentedMesh, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"], shown: list[bool]
+) -> Float[np.ndarray, "3"] | None:
+    """Place where a ray first meets the surface of a segment that is shown; None where it meets none."""
+    segments = tuple(s for s, visible in zip(mesh.segments, shown, strict=True) if visible and len(s.faces))
+    if not segments:
+        return None
+    T_mesh_ray = rigid(rotation_along(direction), origin)  # the ray is the z axis
+    seen = Solids(SegmentedMesh(segments).transformed(inverse_rigid(T_mesh_ray)))
+    distance = seen.first_hit(np.array([[0.0, 0.0, 1.0]])).distance[0]
+    return transform_points(T_mesh_ray, np.array([0.0, 0.0, distance])) if np.isfinite(distance) else None
+
+
+def probe_html(
+    probed: Probed, names: Sequence[str], colors: Sequence[Color], point: Float[np.ndarray, "3"], unit: Unit
+) -> str:
+    """Facts about one point: its segment, the network's likeliest classes, distance, direction, and where it rests."""
+    label, distance, direction = int(probed.label[0]), float(probed.distance[0]), probed.direction[0]
+    radius = None if probed.radius95 is None else float(probed.radius95[0])
+    where = f"at {unit.place(point, radius)} {unit.length_name}"
+    where += "" if radius is None else " (95\N{NO-BREAK SPACE}%)"
+    if abs(distance) <= ON_SURFACE * float(np.abs(point).max()):
+        text = "on the surface"
+    elif np.isnan(distance):
+        text = "distance not trained"
+    else:
+        length = f"{rounded(abs(distance) * unit.length_factor)} {unit.length_name}"
+        text = f"{length} {'inside' if distance < 0 else 'outside'} the nearest surface"
+    toward = "" if np.isnan(direction).any() else f"towards {_vector(direction)}"
+    rest = "" if probed.rest is None else f"<br>at rest at {_vector(probed.rest[0])} scene units"
+    likeliest = ""
+    if probed.probability is not None:
+        order = np.argsort(-probed.probability[0], kind="stable")[:4]
+        likeliest = bars([(names[k], colors[k], float(probed.probability[0, k])) for k in order])
+        if probed.rest is not None:
+            likeliest = f'<div style="{BOX};{SOFT}">the network says</div>{likeliest}'
+    return (
+        f'<div style="{BOX}"><b>{escape(names[label])}</b> <span style="{SOFT}">{where}</span></div>'
+        f'{likeliest}<div style="{BOX}">{escape(text)}<br><span style="{SOFT}">{toward}{rest}</span></div>'
+    )
+
+
+def _vector(values: Float[np.ndarray, "3"]) -> str:
+    return ", ".join(f"{float(value):.3g}" for value in values)
+
+
+# --- contents ---------------------------------------------------------------------------------------------------------
+
+SEGMENT, VERTEX, SURE = "segment", "own", "how sure"
 """Colourings: by segment; by the colours of a file's vertices; by the radius that holds each vertex's true place."""
 
 Colors = list[UInt8[np.ndarray, "_ 3"]]
@@ -67,7 +212,7 @@ class Content:
         rotation: from it to x right, y up, z toward the eye.
         cloud: observed points, in that frame.
         depth: picture of the depth image, and the nearest and farthest depth in words.
-        colorings: other colours than those of the segments, by name; the first shown first where it is ``OWN``.
+        colorings: other colours than those of the segments, by name; the first shown first where it is ``VERTEX``.
         ask: what is known of places; None where there is nothing to probe.
         is_doubtful: whether the verdict is that the surfaces are not to be trusted.
         first_view: name of the view from ahead.
@@ -92,9 +237,6 @@ class Content:
         clouds = [] if self.cloud is None else [self.cloud.points]
         joint = np.concatenate([*clouds, *(segment.vertices for segment in self.mesh.segments)])
         return np.stack([joint.min(axis=0), joint.max(axis=0)])
-
-
-# --- contents ---------------------------------------------------------------------------------------------------------
 
 
 def open_answer(answer: Answer, port: int) -> OpenPage:
@@ -126,7 +268,7 @@ def content_of_answer(answer: Answer) -> Content:
     frame, mesh, cloud = answer.seen.frame, answer.reconstruction.surfaces, answer.reconstruction.reading.cloud
     unit, radii = Unit(frame.unit_m), radii_of(answer.registered)
     made_with = "no weights" if answer.model is None else f"weights {answer.model.name or 'of this program'}"
-    depth = None if frame.depth is None else (depth_picture(frame.depth), depth_data(frame.depth, unit)["ends"])
+    depth = None if frame.depth is None else (depth_picture(frame.depth), depth_ends(frame.depth, unit))
     colorings: dict[str, Coloring] = {}
     if answer.reconstruction.code is not None:
         colorings["confidence"] = lambda: _painted(confidence(mesh, partial(ask_network, answer)), CONFIDENCE)
@@ -174,7 +316,7 @@ def content_of_files(path: Path) -> Content:
     cloud = None if report is None else report.cloud
     colorings: dict[str, Coloring] = {}
     if any(colors is not None for colors in scene.colors):
-        colorings[OWN] = lambda: (_own_colors(scene), None)
+        colorings[VERTEX] = lambda: (_vertex_colors(scene), None)
     colorings |= _measured_colorings(scene.mesh, unit, cloud, scene.radii)
     return Content(
         title=path.name if report is None else report.title,
@@ -229,14 +371,14 @@ def _measured_colorings(
 
     def by_radius() -> tuple[Colors, ColorScale]:
         assert radii is not None
-        told = radii.scaled(unit.length_factor)
-        return _painted(told.vertices, radius_scale(told, name))
+        scaled = radii.scaled(unit.length_factor)
+        return _painted(scaled.vertices, radius_scale(scaled, name))
 
     result: dict[str, Coloring] = {} if cloud is None else {"distance": by_distance}
     return result if radii is None else {**result, SURE: by_radius}
 
 
-def _own_colors(scene: GlbScene) -> Colors:
+def _vertex_colors(scene: GlbScene) -> Colors:
     pairs = zip(scene.mesh.segments, scene.colors, strict=True)
     return [np.tile(np.array(s.color, dtype=np.uint8), (len(s.vertices), 1)) if c is None else c for s, c in pairs]
 
@@ -258,12 +400,12 @@ class ResultPage:
 
     def _build(self) -> None:
         gui, content = self.server.gui, self.content
-        gui.add_html(html.heading(content.title, content.facts))
+        gui.add_html(heading(content.title, content.facts))
         if content.verdict:
-            gui.add_html(html.message(content.verdict, bad=content.is_doubtful))
-        gui.add_html(html.chips(content.mesh.names, content.mesh.colors))
+            gui.add_html(message(content.verdict, bad=content.is_doubtful))
+        gui.add_html(chips(content.mesh.names, content.mesh.colors))
         colorings = (SEGMENT, *content.colorings)
-        first = OWN if OWN in colorings else SEGMENT
+        first = VERTEX if VERTEX in colorings else SEGMENT
         self.coloring = gui.add_dropdown("Colour", colorings, initial_value=first, visible=len(colorings) > 1)
         self.legend = gui.add_html("", visible=False)
         self.coloring.on_update(lambda _: self._draw())
@@ -281,13 +423,13 @@ class ResultPage:
             with gui.add_folder("Depth image"):
                 gui.add_image(enlarged(content.depth[0]), format="png")
                 if len(content.depth[1]) == 2:
-                    gui.add_html(html.message("bright: {}; dark: {}".format(*content.depth[1])))
+                    gui.add_html(message("bright: {}; dark: {}".format(*content.depth[1])))
 
     def _build_probe(self) -> None:
         gui = self.server.gui
         with gui.add_folder("Probe"):
             self.probing = gui.add_checkbox("ask at a point", False)
-            self.told = gui.add_html(html.message("Click a surface, or drag the arrows of the probe."))
+            self.facts = gui.add_html(message("Click a surface, or drag the arrows of the probe."))
         self.gizmo = self.server.scene.add_transform_controls(
             "/probe", scale=0.35, disable_rotations=True, depth_test=False, visible=False
         )
@@ -303,7 +445,7 @@ class ResultPage:
             if name != SEGMENT and name not in self._known_colors:
                 self._known_colors[name] = self.content.colorings[name]()
             colors, scale = (None, None) if name == SEGMENT else self._known_colors[name]
-            self.legend.content = "" if scale is None else html.color_bar(scale)
+            self.legend.content = "" if scale is None else color_bar(scale)
             self.legend.visible = scale is not None
             self.layer.show(self.content.mesh, self.controls, colors)
 
@@ -311,7 +453,7 @@ class ResultPage:
 
     def _clicked(self, event: Any) -> None:
         origin, direction = (np.array(ray, dtype=float) for ray in (event.ray_origin, event.ray_direction))
-        point = first_hit(self.content.mesh, self.stage.back(origin), direction, self.controls.visible())
+        point = first_point(self.content.mesh, self.stage.back(origin), direction, self.controls.visible())
         if point is not None:
             self.move_probe(point)
             self.probing.value = True
@@ -337,7 +479,7 @@ class ResultPage:
         assert self.content.ask is not None
         answer, mesh = self.content.ask(point[None]), self.content.mesh
         names, colors = ("empty space", *mesh.names), (EMPTY_COLOR, *mesh.colors)
-        self.told.content = html.answer(answer, names, colors, point, self.content.unit)
+        self.facts.content = probe_html(answer, names, colors, point, self.content.unit)
         distance, direction = float(answer.distance[0]), answer.direction[0]
         if np.isnan(distance) or np.isnan(direction).any():
             return

@@ -4,7 +4,6 @@ From another machine a page is opened through a tunnel: ``ssh -L 8080:127.0.0.1:
 """
 
 import contextlib
-import gc
 import io
 import logging
 import re
@@ -23,21 +22,8 @@ LOOPBACK = "127.0.0.1"
 PORT = 8080
 """Port of a page that is waited for, where none is chosen."""
 
-OWN_PAGES = re.compile(r"http://(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?")
+LOCAL_PAGES = re.compile(r"http://(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?")
 """Origins of pages that may connect; with any port, because a tunnel may end at another one."""
-
-BACKDROP = ((58, 65, 78), (22, 25, 32))
-"""Top and bottom of the background, neutral and dark: the palette's yellow is hard to see on white."""
-
-ENVIRONMENT = 0.45
-"""Share of viser's surrounding light; with all of it the palette's colours fade to white."""
-
-FRAME_PX = 560
-"""Height of the page within a notebook."""
-
-COLLECT_EVERY_S = 5.0
-"""Time between two collections of what closed pages leave behind."""
-
 
 # --- server -----------------------------------------------------------------------------------------------------------
 
@@ -60,7 +46,7 @@ def start_server(port: int) -> Any:
     port = free_port(port)  # viser would silently take another one
     # browsers open connections ahead and drop them, which websockets reports with a traceback each
     logging.getLogger("websockets").setLevel(logging.CRITICAL)
-    with contextlib.redirect_stdout(io.StringIO()), own_pages_only() as checked:  # without viser's banner
+    with contextlib.redirect_stdout(io.StringIO()), local_pages_only() as checked:  # without viser's banner
         server = viser.ViserServer(host=LOOPBACK, port=port, label="mereo", verbose=False)
     if not checked:
         stop_server(server)
@@ -72,11 +58,13 @@ def start_server(port: int) -> Any:
         dark_mode=True, show_logo=False, show_share_button=False, control_width="medium", brand_color=(86, 180, 233)
     )
     server.gui.main_panel.dock_right()
+    # neutral and dark, as the palette's yellow is hard to see on white, with a share of viser's surrounding light, in
+    # all of which the palette's colours would fade to white
     share = np.linspace(0.0, 1.0, 256)[:, None, None]
-    backdrop = np.array(BACKDROP[0]) * (1 - share) + np.array(BACKDROP[1]) * share
+    backdrop = np.array((58, 65, 78)) * (1 - share) + np.array((22, 25, 32)) * share
     server.scene.set_background_image(np.broadcast_to(backdrop, (256, 8, 3)).astype(np.uint8), format="png")
     server.scene.configure_default_lights(cast_shadow=False)
-    server.scene.configure_environment_map(environment_intensity=ENVIRONMENT)
+    server.scene.configure_environment_map(environment_intensity=0.45)
     return server
 
 
@@ -98,7 +86,7 @@ def free_port(port: int) -> int:
 
 
 @contextlib.contextmanager
-def own_pages_only() -> Iterator[list[str]]:
+def local_pages_only() -> Iterator[list[str]]:
     """Let websocket servers that are started meanwhile refuse pages of other addresses; the list has a word for each.
 
     Browsers let any page open a websocket to 127.0.0.1, also under a name that is made to mean it (DNS rebinding), and
@@ -109,11 +97,11 @@ def own_pages_only() -> Iterator[list[str]]:
 
     serve, checked = server.serve, list[str]()
 
-    def serve_own_pages(*arguments: Any, **options: Any) -> Any:
+    def serve_local_pages(*arguments: Any, **options: Any) -> Any:
         checked.append("checked")
-        return serve(*arguments, origins=[OWN_PAGES, None], **options)
+        return serve(*arguments, origins=[LOCAL_PAGES, None], **options)
 
-    server.serve = serve_own_pages  # type: ignore[assignment, misc]
+    server.serve = serve_local_pages  # type: ignore[assignment, misc]
     try:
         yield checked
     finally:
@@ -148,7 +136,7 @@ class OpenPage:
     def wait(self) -> None:
         """Wait until Ctrl-C, and close."""
         try:
-            keep_open(threading.Event())
+            threading.Event().wait()
         except KeyboardInterrupt:
             print("closed")
         finally:
@@ -174,25 +162,8 @@ class OpenPage:
         if self._closed:
             return "<p>closed</p>"
         address = escape(self.address)
-        frame = f'<iframe src="{address}" width="100%" height="{FRAME_PX}" style="border:0"></iframe>'
+        frame = f'<iframe src="{address}" width="100%" height="560" style="border:0"></iframe>'
         return f'{frame}<p>or open <a href="{address}">{address}</a>; <code>close()</code> ends</p>'
-
-
-def keep_open(end: threading.Event) -> None:
-    """Wait for the end, and collect meanwhile what pages leave behind that were closed.
-
-    viser keeps the exception that says so beside the task that raised it (``ws_handler``), and with that cycle the
-    page's buffers, about 0.4 MB. CPython collects cycles that have grown old only after a quarter of all objects known
-    at the last full collection have come new: of the 400,000 of the libraries and the model. Those are put aside
-    (``gc.freeze``), which makes a full collection of the others a matter of a millisecond.
-    """
-    gc.collect()
-    gc.freeze()
-    try:
-        while not end.wait(COLLECT_EVERY_S):
-            gc.collect()
-    finally:
-        gc.unfreeze()
 
 
 def is_interactive() -> bool:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
-from mereo.evaluation.registration.icp import (
+from mereo.evaluation.icp import (
     CONTACT,
     SEGMENT_LIMITS,
     WHOLE_LIMITS,
@@ -39,15 +39,6 @@ from mereo.io.errors import readable
 from mereo.models.model import Model
 from mereo.scenes.rest_pose import rest_frame
 
-FAR = 1000.0
-"""Distance of a scanner where the scan does not say it, in diagonals of the object."""
-
-LEAST_EXPLAINED = 0.4
-"""Share of the scan's points that must lie on the placed object: below, the start or the unit is wrong."""
-
-MEASURED = 200_000
-"""Most points of the scan at which residuals are taken."""
-
 
 @dataclass(frozen=True, eq=False)
 class Start:
@@ -55,12 +46,12 @@ class Start:
 
     Attributes:
         poses: ``T_scan_segment`` of every segment.
-        own: whether the segment was given a pose of its own; the others share the object's.
+        separate: whether the segment was given a pose of its own; the others share the object's.
         how: where they come from, for the truth file.
     """
 
     poses: Poses
-    own: Bool[np.ndarray, " s"]
+    separate: Bool[np.ndarray, " s"]
     how: str
 
 
@@ -121,11 +112,6 @@ def scale_of(pose: Float[np.ndarray, "4 4"]) -> float:
     return float(np.cbrt(np.linalg.det(pose[:3, :3])))
 
 
-def viewpoint_of(points: Float[np.ndarray, "n 3"], frame: CloudAxes, size: float) -> Float[np.ndarray, "3"]:
-    """Place where the scanner stood: the origin of a camera frame, far off along z of a scanner's."""
-    return np.zeros(3) if frame == "camera" else points.mean(axis=0) + np.array([0.0, 0.0, FAR * size])
-
-
 def place(
     rest: SegmentedMesh,
     points: Float[np.ndarray, "n 3"],
@@ -152,11 +138,12 @@ def place(
             f"there is no segment {unknown[0]!r} to hold; the segments are {', '.join(rest.names)}: correct the name"
         )
     size = scale_of(start.poses[0]) * diagonal(rest)
-    scan = Scan.of(points, viewpoint_of(points, frame, size), size)
-    shown = exposed(rest)
+    # a scanner does not say where it stood: far off along z
+    viewpoint = np.zeros(3) if frame == "camera" else points.mean(axis=0) + np.array([0.0, 0.0, 1000.0 * size])
+    scan, shown = Scan.of(points, viewpoint, size), exposed(rest)
     held = np.isin(rest.names, list(hold))
-    together = [int(index) for index in np.flatnonzero(~start.own)]
-    alone = [[int(index)] for index in np.flatnonzero(start.own & ~held)]
+    together = [int(index) for index in np.flatnonzero(~start.separate)]
+    alone = [[int(index)] for index in np.flatnonzero(start.separate & ~held)]
     whole = register(shown, scan, start.poses, [together, *alone] if together else alone, WHOLE_LIMITS)
     _check_explained(whole, scan)
     _check_runaway(rest, start.poses, whole, diagonal(rest))
@@ -165,26 +152,36 @@ def place(
     others = [[index] for index in range(len(held)) if not held[index]]
     each = register(shown, scan, whole.poses, others, SEGMENT_LIMITS, hold=True)
     _check_explained(each, scan)
-    _check_runaway(rest, np.where(start.own[:, None, None], start.poses, whole.poses), each)
-    final, placed_by = _with_neighbours(rest, start, each)
-    return _measured(rest, shown, points, scan, start, final, placed_by)
+    _check_runaway(rest, np.where(start.separate[:, None, None], start.poses, whole.poses), each)
+    # segments that are not seen get their start or their neighbour's pose
+    poses, placed_by = each.poses.copy(), ["scan"] * len(each.poses)
+    counts = np.bincount(each.matches.owner[each.matches.owner >= 0], minlength=len(poses))
+    for index in np.flatnonzero(~each.fitted):
+        if start.separate[index]:
+            poses[index], placed_by[index] = start.poses[index], "start"
+        elif each.fitted.any():
+            nearest = neighbour(rest, int(index), each.fitted, counts)
+            poses[index], placed_by[index] = each.poses[nearest], f"with {rest.names[nearest]}"
+        else:
+            raise ValueError("the scan shows no segment well enough to place it: check the start, or give --as-one")
+    return _measured(rest, shown, points, scan, start, replace(each, poses=poses), placed_by)
 
 
-def _check_explained(found: Registration, scan: Scan) -> None:
-    share = float((found.matches.owner >= 0).mean())
-    if not (share >= LEAST_EXPLAINED and found.matches.limit < 0.1 * scan.size):
+def _check_explained(result: Registration, scan: Scan) -> None:
+    share = float((result.matches.owner >= 0).mean())
+    if not (share >= 0.4 and result.matches.limit < 0.1 * scan.size):
         raise ValueError(
-            f"{share:.0%} of the scan's points lie within {found.matches.limit:.3g} of the placed object, which is "
+            f"{share:.0%} of the scan's points lie within {result.matches.limit:.3g} of the placed object, which is "
             f"{scan.size:.3g} long; most must: check that the scan shows this object alone, its unit and --frame, and "
             "give a better start"
         )
 
 
-def _check_runaway(rest: SegmentedMesh, before: Poses, found: Registration, least: float = 0.0) -> None:
+def _check_runaway(rest: SegmentedMesh, before: Poses, result: Registration, least: float = 0.0) -> None:
     """No segment may move farther than its own size, or than ``least`` (scene units)."""
     for index, segment in enumerate(rest.segments):
         low, high = segment.bounds
-        shift = _shift(before[index], found.poses[index], (low + high) / 2)
+        shift = _shift(before[index], result.poses[index], (low + high) / 2)
         size = max(float(np.linalg.norm(high - low)), least) * scale_of(before[index])
         if shift > size:
             raise ValueError(
@@ -194,23 +191,8 @@ def _check_runaway(rest: SegmentedMesh, before: Poses, found: Registration, leas
             )
 
 
-def _shift(before: Float[np.ndarray, "4 4"], after: Float[np.ndarray, "4 4"], place: Float[np.ndarray, "3"]) -> float:
-    return float(np.linalg.norm(transform_points(after, place) - transform_points(before, place)))
-
-
-def _with_neighbours(rest: SegmentedMesh, start: Start, found: Registration) -> tuple[Registration, list[str]]:
-    """Segments that are not seen get their start or their neighbour's pose; and by what each one is placed."""
-    poses, placed_by = found.poses.copy(), ["scan"] * len(found.poses)
-    counts = np.bincount(found.matches.owner[found.matches.owner >= 0], minlength=len(poses))
-    for index in np.flatnonzero(~found.fitted):
-        if start.own[index]:
-            poses[index], placed_by[index] = start.poses[index], "start"
-        elif found.fitted.any():
-            beside = neighbour(rest, int(index), found.fitted, counts)
-            poses[index], placed_by[index] = found.poses[beside], f"with {rest.names[beside]}"
-        else:
-            raise ValueError("the scan shows no segment well enough to place it: check the start, or give --as-one")
-    return replace(found, poses=poses), placed_by
+def _shift(before: Float[np.ndarray, "4 4"], after: Float[np.ndarray, "4 4"], point: Float[np.ndarray, "3"]) -> float:
+    return float(np.linalg.norm(transform_points(after, point) - transform_points(before, point)))
 
 
 def neighbour(rest: SegmentedMesh, index: int, seen: Bool[np.ndarray, " s"], counts: Int[np.ndarray, " s"]) -> int:
@@ -227,17 +209,17 @@ def _measured(
     points: Float[np.ndarray, "n 3"],
     scan: Scan,
     start: Start,
-    found: Registration,
+    result: Registration,
     placed_by: Sequence[str],
 ) -> Placement:
     """Residuals at the scan's own points, not at the thinned ones."""
-    points = random_subset(points, MEASURED)
-    matches = match(points, facing(moved(shown, found.poses), scan.viewpoint), found.matches.limit)
+    points = random_subset(points, 200_000)
+    matches = match(points, facing(moved(shown, result.poses), scan.viewpoint), result.matches.limit)
     segments = []
     for index, segment in enumerate(rest.segments):
         distances = matches.distance[matches.owner == index]
         median, p95 = np.quantile(distances, [0.5, 0.95]) if len(distances) else (np.nan, np.nan)
-        before, after = start.poses[index], found.poses[index]
+        before, after = start.poses[index], result.poses[index]
         turn = Rotation.from_matrix((after @ np.linalg.inv(before))[:3, :3])
         segments.append(
             PlacedSegment(
@@ -250,11 +232,11 @@ def _measured(
                 p95=float(p95),
                 shift=_shift(before, after, segment.bounds.mean(axis=0)),
                 turn_deg=float(np.rad2deg(turn.magnitude())),
-                held=int(found.held[index]) if placed_by[index] == "scan" else 0,
+                held=int(result.held[index]) if placed_by[index] == "scan" else 0,
             )
         )
     explained = float((matches.owner >= 0).mean())
-    return Placement(tuple(segments), moved(rest, found.poses), matches.limit, explained)
+    return Placement(tuple(segments), moved(rest, result.poses), matches.limit, explained)
 
 
 # --- initial poses ----------------------------------------------------------------------------------------------------
@@ -267,18 +249,6 @@ def _measured(
 # ``object`` and each of ``segments`` is either a 4 x 4 matrix from model to scan coordinates, or pairs: at least three
 # points of the model and the same points in the scan. Model coordinates are those of the scene at rest, as
 # ``mereo scene export`` writes it; scan coordinates those of the scan's file.
-
-LEAST_PAIRS = 3
-"""Pairs of points at least; two leave a turn about their line."""
-
-LEAST_GUESSES = 30
-"""Least number of points that a network must give to a segment for a start of its own."""
-
-SCALE_ERROR = 0.25
-"""Share by which a start's scale may differ from the known one; beyond, the unit is another, not picking inaccurate."""
-
-MIRROR_ERROR = 0.2
-"""Share of the largest residual below which pairs may be mirrored or not: nearly flat, they do not tell."""
 
 PAIR_ERROR = 0.1
 """Largest RMS distance of pairs after the best fit, in diagonals of the object."""
@@ -309,33 +279,28 @@ def read_start(path: str | Path, rest: SegmentedMesh, scale: float | None = None
             f"{path} gives a start of the segment {unknown[0]!r}; the segments are {', '.join(rest.names)}: correct "
             "the name"
         )
-    poses = {name: _stated(path, entry, f"segment {name!r}", rest, scale) for name, entry in segments.items()}
-    if "object" in stated:
-        common = _stated(path, stated["object"], "the object", rest, scale)
-    elif missing := [name for name in rest.names if name not in poses]:
+    try:
+        with np.errstate(all="ignore"):
+            poses = {name: _pose(entry, f"segment {name!r}", rest, scale) for name, entry in segments.items()}
+            common = _pose(stated["object"], "the object", rest, scale) if "object" in stated else None
+    except ValueError as error:  # numpy's LinAlgError too
+        raise ValueError(f"{path} cannot be used: {error}") from None
+    missing = [name for name in rest.names if name not in poses]
+    if common is None and missing:
         raise ValueError(
             f'{path} has no start for the segment {missing[0]!r} and none of the object; add it, or add "object", '
             "from which segments without a start of their own begin"
         )
-    else:
-        common = next(iter(poses.values()))
+    shared = next(iter(poses.values())) if common is None else common
     return Start(
-        np.stack([poses.get(name, common) for name in rest.names]),
+        np.stack([poses.get(name, shared) for name in rest.names]),
         np.array([name in poses for name in rest.names]),
         "; ".join([*(["object"] if "object" in stated else []), *poses]) + f" from {path.name}",
     )
 
 
-def _stated(path: Path, *entry: Any) -> Float[np.ndarray, "4 4"]:
-    """Pose of an entry; ``ValueError`` names the file before what is wrong with it."""
-    try:
-        with np.errstate(all="ignore"):
-            return _pose(*entry)
-    except ValueError as error:  # numpy's LinAlgError too
-        raise ValueError(f"{path} cannot be used: {error}") from None
-
-
 def _pose(entry: Any, of: str, rest: SegmentedMesh, scale: float | None) -> Float[np.ndarray, "4 4"]:
+    """Pose by an entry: of pairs, or a matrix, which must be a similarity without reflection, of the known scale."""
     if isinstance(entry, dict):
         if set(entry) != {"model", "scan"}:
             raise ValueError(
@@ -344,7 +309,27 @@ def _pose(entry: Any, of: str, rest: SegmentedMesh, scale: float | None) -> Floa
             )
         model, scan = (_numbers(entry[key], (-1, 3), f"{key} of the start of {of}") for key in ("model", "scan"))
         return pose_of_pairs(model, scan, of, scale, PAIR_ERROR * diagonal(rest))
-    return _checked(_numbers(entry, (4, 4), f"the start of {of}"), of, scale, rest)
+    pose = _numbers(entry, (4, 4), f"the start of {of}")
+    size = scale_of(pose)
+    if not np.allclose(pose[3], [0, 0, 0, 1]):
+        raise ValueError(
+            f"the start of {of} has the last row {pose[3].tolist()}; it must be 0 0 0 1: is it transposed?"
+        )
+    if size < 0:
+        raise ValueError(
+            f"the start of {of} is a reflection (its determinant is negative); it must turn, scale and shift only: "
+            "align again without mirroring"
+        )
+    if size == 0 or not np.allclose(pose[:3, :3] @ pose[:3, :3].T, size**2 * np.eye(3), atol=0.01 * size**2):
+        raise ValueError(
+            f"the start of {of} shears or stretches; it must be a rotation times one scale: align again without"
+        )
+    rotation = Rotation.from_matrix(pose[:3, :3] / size).as_matrix()
+    if scale is None:
+        return rigid(size * rotation, pose[:3, 3])
+    check_scale(size, scale, of)
+    middle = rest.bounds.mean(axis=0)  # stays where the start puts it
+    return rigid(scale * rotation, pose[:3, :3] @ middle + pose[:3, 3] - scale * rotation @ middle)
 
 
 def _numbers(value: Any, shape: tuple[int, int], what: str) -> np.ndarray:
@@ -357,32 +342,6 @@ def _numbers(value: Any, shape: tuple[int, int], what: str) -> np.ndarray:
         rows = "4 rows of 4" if shape == (4, 4) else "rows of 3"
         raise ValueError(f"{what} must be {rows} finite numbers up to {LARGEST:g}: correct the start file")
     return array
-
-
-def _checked(
-    pose: Float[np.ndarray, "4 4"], of: str, scale: float | None, rest: SegmentedMesh
-) -> Float[np.ndarray, "4 4"]:
-    """A similarity without reflection, of the known scale."""
-    found = scale_of(pose)
-    if not np.allclose(pose[3], [0, 0, 0, 1]):
-        raise ValueError(
-            f"the start of {of} has the last row {pose[3].tolist()}; it must be 0 0 0 1: is it transposed?"
-        )
-    if found < 0:
-        raise ValueError(
-            f"the start of {of} is a reflection (its determinant is negative); it must turn, scale and shift only: "
-            "align again without mirroring"
-        )
-    if found == 0 or not np.allclose(pose[:3, :3] @ pose[:3, :3].T, found**2 * np.eye(3), atol=0.01 * found**2):
-        raise ValueError(
-            f"the start of {of} shears or stretches; it must be a rotation times one scale: align again without"
-        )
-    rotation = Rotation.from_matrix(pose[:3, :3] / found).as_matrix()
-    if scale is None:
-        return rigid(found * rotation, pose[:3, 3])
-    check_scale(found, scale, of)
-    middle = rest.bounds.mean(axis=0)  # stays where the start puts it
-    return rigid(scale * rotation, pose[:3, :3] @ middle + pose[:3, 3] - scale * rotation @ middle)
 
 
 def pose_of_pairs(
@@ -404,25 +363,26 @@ def pose_of_pairs(
     Raises ``ValueError`` for fewer than three pairs, points on a line, an unknown or another scale, mirrored pairs, or
     a residual above ``tolerance``.
     """
-    if len(model) != len(scan) or len(model) < LEAST_PAIRS:
+    if len(model) != len(scan) or len(model) < 3:  # two leave a turn about their line
         raise ValueError(
             f"the start of {of} has {len(model)} points of the model and {len(scan)} of the scan; at least "
-            f"{LEAST_PAIRS} pairs are needed: pick more"
+            "3 pairs are needed: pick more"
         )
     source, target = model - model.mean(axis=0), scan - scan.mean(axis=0)
     spread = np.linalg.svd(source, compute_uv=False)
     if not spread[1] > 0.05 * spread[0]:
         raise ValueError(f"the points of the start of {of} lie on a line; they must span a triangle: pick another")
     rotation = fit_rigid(source, target)[:3, :3]
-    found = float(np.sum(target * (source @ rotation.T)) / np.sum(source**2))
+    size = float(np.sum(target * (source @ rotation.T)) / np.sum(source**2))
     if scale is None:
         raise ValueError(
             f"the size of the object is not known, and pairs are too rough to measure it (those of {of} say about "
-            f"{found:.4g} scan units per scene unit): give the scene's unit with --scene-unit-mm"
+            f"{size:.4g} scan units per scene unit): give the scene's unit with --scene-unit-mm"
         )
-    check_scale(found, scale, of)
+    check_scale(size, scale, of)
     error, mirrored = (misfit(scale * source * hand, target) for hand in ([1, 1, 1], [-1, 1, 1]))
-    if error > MIRROR_ERROR * tolerance * scale and mirrored < error / 2:
+    # nearly flat pairs do not tell whether they are mirrored
+    if error > 0.2 * tolerance * scale and mirrored < error / 2:
         raise ValueError(
             f"the pairs of {of} fit a mirror image better ({mirrored:.3g} apart instead of {error:.3g}); poses do not "
             "mirror: check that left and right are not exchanged, and the axes of both files"
@@ -446,8 +406,8 @@ def start_from_model(
 ) -> Start:
     """Rough poses from a trained network: where it believes the seen points were at rest, fitted segment by segment.
 
-    A segment with fewer than ``LEAST_GUESSES`` points shares the object's pose. Raises ``ValueError`` for another
-    object's model, one without rest coordinates, and an unknown scale.
+    A segment with fewer than 30 points shares the object's pose. Raises ``ValueError`` for another object's model, one
+    without rest coordinates, and an unknown scale.
     """
     if model.names != rest.names:
         raise ValueError(
@@ -467,19 +427,20 @@ def start_from_model(
     tolerance = 2 * PAIR_ERROR * diagonal(rest)
     common = pose_of_pairs(source, seen, "the object by its weights", scale, tolerance)
     label = model.logits(code, code.cloud)[:, 1:].argmax(axis=1)
-    poses, own = [], []
-    for index, name in enumerate(rest.names):
-        mine = label == index
-        own.append(bool(mine.sum() >= LEAST_GUESSES))
-        pairs = (source[mine], seen[mine]) if own[-1] else None
-        poses.append(common if pairs is None else pose_of_pairs(*pairs, f"segment {name!r}", scale, tolerance))
-    return Start(np.stack(poses), np.array(own), "weights: not independent of the network")
+    separate = np.bincount(label, minlength=len(rest.names)) >= 30
+    poses = [
+        pose_of_pairs(source[label == index], seen[label == index], f"segment {name!r}", scale, tolerance)
+        if separate[index]
+        else common
+        for index, name in enumerate(rest.names)
+    ]
+    return Start(np.stack(poses), separate, "weights: not independent of the network")
 
 
-def check_scale(found: float, scale: float, of: str) -> None:
+def check_scale(stated: float, scale: float, of: str) -> None:
     """Raise ``ValueError`` unless the start's scale is about the known one."""
-    if not 1 - SCALE_ERROR < found / scale < 1 + SCALE_ERROR:
+    if not 0.75 < stated / scale < 1.25:  # beyond, the unit is another, not picking inaccurate
         raise ValueError(
-            f"the start of {of} has {found:.4g} scan units per scene unit, but the units of scene and scan give "
+            f"the start of {of} has {stated:.4g} scan units per scene unit, but the units of scene and scan give "
             f"{scale:.4g}; they must agree: check --unit, --scene-unit-mm and the coordinates"
         )

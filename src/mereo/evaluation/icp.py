@@ -43,14 +43,8 @@ Poses = Float[np.ndarray, "s 4 4"]
 CONTACT = 0.005
 """Distance from another segment at rest below which faces are in contact with it, in diagonals of the object."""
 
-FACING = -0.1
-"""Least cosine between a face's normal and the way to the scanner; below 0, as the pose is not right yet."""
-
 CLUSTER = 6
 """Number of points of one sample of the surface; five are the least from which the library estimates a normal."""
-
-RING = 1e-3
-"""Radius of a sample, in distances between samples."""
 
 
 def diagonal(mesh: SegmentedMesh) -> float:
@@ -94,7 +88,8 @@ def _facing(segment: Segment, viewpoint: Float[np.ndarray, "3"]) -> Segment:
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     way = viewpoint - corners.mean(axis=1)
     size = np.linalg.norm(normal, axis=1) * np.linalg.norm(way, axis=1)
-    return replace(segment, faces=segment.faces[np.einsum("ij,ij->i", normal, way) > FACING * size])
+    is_facing = np.einsum("ij,ij->i", normal, way) > -0.1 * size  # below 0, as the pose is not right yet
+    return replace(segment, faces=segment.faces[is_facing])
 
 
 def face_areas(mesh: SegmentedMesh) -> Float[np.ndarray, " f"]:
@@ -125,20 +120,14 @@ def sample_surface(
     second = np.cross(normal / np.linalg.norm(normal, axis=1, keepdims=True), first)
     angle = np.linspace(0, 2 * np.pi, CLUSTER, endpoint=False)[:, None]
     ring = np.cos(angle) * first[:, None] + np.sin(angle) * second[:, None]
-    return places[:, None] + RING * np.sqrt(areas.sum() / count) * ring
+    return places[:, None] + 1e-3 * np.sqrt(areas.sum() / count) * ring
 
 
 # --- iterative closest points -----------------------------------------------------------------------------------------
 
-CELLS = 200
-"""Cells along the object's diagonal, in each of which one point of the scan is kept."""
-
 WHOLE_LIMITS = (0.15, 0.1, 0.06, 0.04, 0.025, 0.015, 0.01, 0.007, 0.005)
 SEGMENT_LIMITS = (0.05, 0.03, 0.02, 0.013, 0.009, 0.007, 0.005, 0.005)
-"""Largest distance of a point from the surface in each round, in diagonals of the object, but see ``NOISE_LIMIT``."""
-
-NOISE_LIMIT = 5.0
-"""Medians of the points' distances that a limit is at least: it trims outliers, not the scanner's noise."""
+"""Largest distance of a point from the surface in each round, in diagonals of the object, but see ``match``."""
 
 LEAST_POINTS = 40
 LEAST_SHARE = 0.02
@@ -148,15 +137,9 @@ LOOSE = 0.002
 """Curvature, per point and with the body's radius as unit, below which a direction is held. A flat square turns
 about its normal with 0 and tilts with 0.2; the bunny's right ear, seen from the side, has 0.008."""
 
-NEIGHBORS = 12
-"""Number of scan points from which the scanned surface's direction is estimated."""
-
 FLATNESS = 1e-3
 """Variance of a surface across itself that the library assumes, where that along it is 1. It adds those of scan and
 model, so that one point's distance counts 1 / (2 ``FLATNESS``), and its place on the surface 1/2."""
-
-ITERATIONS = 8
-"""Steps of ICP in each round; the next round goes on from there."""
 
 
 def load_icp() -> ModuleType:
@@ -196,10 +179,11 @@ class Scan:
 
         Raises ``ValueError`` where fewer than ``LEAST_POINTS`` points are left.
         """
-        kept = thinned(points, size / CELLS)
+        spacing = size / 200
+        kept = thinned(points, spacing)
         if len(kept) < LEAST_POINTS:
             raise ValueError(
-                f"the scan has {len(kept)} points that are {size / CELLS:.3g} apart; at least {LEAST_POINTS} are "
+                f"the scan has {len(kept)} points that are {spacing:.3g} apart; at least {LEAST_POINTS} are "
                 "needed: check the scan and its unit"
             )
         apart = KDTree(kept).query(kept, k=2)[0][:, 1]
@@ -222,10 +206,13 @@ class Matches:
 
 
 def match(points: Float[np.ndarray, "p 3"], surfaces: SegmentedMesh, limit: float) -> Matches:
-    """Segment of the nearest surface to each point, if within ``limit`` or ``NOISE_LIMIT`` medians of all distances."""
+    """Segment of the nearest surface to each point, if within ``limit`` or 5 medians of all distances.
+
+    So a limit trims outliers, not the scanner's noise.
+    """
     filled = [index for index, segment in enumerate(surfaces.segments) if len(segment.faces)]
     nearest = Solids(SegmentedMesh(tuple(surfaces.segments[index] for index in filled))).nearest(points)
-    limit = max(limit, NOISE_LIMIT * float(np.median(nearest.distance)))
+    limit = max(limit, 5.0 * float(np.median(nearest.distance)))
     owner = np.where(nearest.distance < limit, np.asarray(filled)[nearest.owner], -1)
     return Matches(owner, nearest.distance, limit)
 
@@ -309,14 +296,14 @@ def icp(
     target, source = (library.PointCloud((a - center) / radius) for a in (samples.reshape(-1, 3), points))
     tree = library.KdTree(target)
     library.estimate_covariances(target, tree, CLUSTER)
-    library.estimate_covariances(source, num_neighbors=NEIGHBORS)
+    library.estimate_covariances(source, num_neighbors=12)
     result = library.align(
         target,
         source,
         tree,
         registration_type="GICP",
         max_correspondence_distance=2 * (limit + np.sqrt(area)) / radius,  # points are chosen; it only must not cut
-        max_iterations=ITERATIONS,
+        max_iterations=8,  # the next round goes on from there
         rotation_epsilon=1e-6,
         translation_epsilon=1e-6,
     )
