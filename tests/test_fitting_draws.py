@@ -86,7 +86,7 @@ def test_the_simpler_description_is_preferred_by_its_evidence(model: Statistical
     """Draws are taken where their misfit is lower, or higher by less than what the modes' more free numbers buy."""
     points, material = shown(model, 0.5)
     fitted = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
-    problem = DrawsProblem.of(fitted.problem, states, fitted.found)
+    problem = DrawsProblem.of(fitted.problem, states, fitted.correspondences)
     drawn = fit_draws(problem, fitted.posed)
     assert drawn is not None
     modes = problem.last.misfit(fitted.posed).total
@@ -99,7 +99,7 @@ def test_the_simpler_description_is_preferred_by_its_evidence(model: Statistical
 def test_draws_that_move_nothing_narrow_nothing(model: StatisticalModel, states: DrawnStates) -> None:
     points, material = shown(model, 0.5)
     fitted = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
-    problem = DrawsProblem.of(fitted.problem, states, fitted.found)
+    problem = DrawsProblem.of(fitted.problem, states, fitted.correspondences)
     drawn = fit_draws(problem, fitted.posed)
     assert drawn is not None and drawn.motion is not None
     one_moves, none_moves = drawn.motion.copy(), np.zeros_like(drawn.motion)
@@ -115,10 +115,10 @@ def test_a_second_pass_follows_where_the_first_has_failed(
     """Modes that are wrong and a single step leave the cloud unexplained; a pass from there comes nearer."""
     points, material = shown(model, 0.5)
     fitted = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
-    problem = DrawsProblem.of(fitted.problem, states, fitted.found)
+    problem = DrawsProblem.of(fitted.problem, states, fitted.correspondences)
     wrong = replace(fitted.posed, z=np.full(model.count, 2.0))
     poor = replace(problem.config, starts=1, sieve=((1, 1),), kept=1, last_rounds=0, steps=1, hopeless=0.0)
-    poor = replace(poor, jumps=0, asked_again=False)
+    poor = replace(poor, jumps=0, network_start=False)
     once, twice = (fit_draws(replace(problem, config=replace(poor, passes=n)), wrong) for n in (0, 1))
     assert once is not None and twice is not None and twice.misfit < 0.9 * once.misfit
     monkeypatch.setattr("mereo.fitting.draws.fit.fit_from_end", None)  # not called where the first explains the cloud
@@ -134,5 +134,5 @@ def test_after_a_search_nobody_is_asked_about_a_frame_that_is_not_explained(
     base = replace(fitted.problem, network=NetworkTerm.none(model))
     problem = DrawsProblem.of(base, states, nothing())
     strict = replace(problem, config=replace(problem.config, explained=0.0, jumps=0))
-    assert strict.config.asked_again
+    assert strict.config.network_start
     assert fit_draws(strict, fitted.posed) is not None

@@ -54,7 +54,7 @@ def test_under_noise_draws_are_asked_too_and_an_object_at_rest_stays_at_rest(mod
     points, material = seen(model.rest.transformed(IN_FRONT)), transform_points(IN_FRONT, model.rest_points)
     clean = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
     noisy = replace(clean, problem=replace(clean.problem, noisy=True))
-    assert noisy.asks_draws and not clean.asks_draws
+    assert noisy.may_take_draws and not clean.may_take_draws
     found = noisy.with_draws(DrawnStates.of(SCENE, model, 30))
     assert found.method == "rest" and found.seconds > clean.seconds
 

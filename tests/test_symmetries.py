@@ -182,7 +182,7 @@ def test_of_many_draws_those_jump_that_slide_along_the_surface() -> None:
     material = transform_points(IN_FRONT, material_moved(scene, model, deformations))
     fitted = ModesFit.of(CloudToFit(seen(model.mesh(material)), 1.0), said(model, material), model)
     config = replace(MANY_DRAWS, explained=0.01)
-    problem = DrawsProblem.of(fitted.problem, states, fitted.found, config)
+    problem = DrawsProblem.of(fitted.problem, states, fitted.correspondences, config)
     wrong = truth.copy()
     wrong[0] = ndtri((ndtr(truth[0]) + 1 / 6) % 1.0)
     pose = Posed(IN_FRONT[:3, :3], IN_FRONT[:3, 3], np.empty(0))

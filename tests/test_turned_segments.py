@@ -81,7 +81,7 @@ def problem_of(z: np.ndarray, points: int = 4000) -> DrawsProblem:
     material = transform_points(IN_FRONT, moved(z))
     cloud = seen(model().mesh(material))
     fitted = ModesFit.of(CloudToFit(cloud[:: max(1, len(cloud) // points)], 1.0), said(model(), material), model())
-    return DrawsProblem.of(fitted.problem, states(), fitted.found)
+    return DrawsProblem.of(fitted.problem, states(), fitted.correspondences)
 
 
 def state(problem: DrawsProblem, z: np.ndarray) -> DrawsFit:

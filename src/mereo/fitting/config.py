@@ -35,7 +35,7 @@ class FitConfig:
         neighbor_std: standard deviation of each coefficient that is added to theirs.
         refine_sigma, refine_steps: the cloud's first sigma, and steps, under the prior of the neighbours.
         explained: the cloud's misfit, in squared standard deviations of a sample, above which other states are tried.
-        tries, places: states of the library that are tried, and states in which one joint is elsewhere, of each joint.
+        tries, per_joint: states of the library that are tried, and states of each joint that differ in it alone.
         screened, screen_steps: how many of either are drawn towards the frame by few points, and in how many steps.
         refined, last_widening, last_refine: how many are refined, from which ``refine_sigma`` and in how many steps.
         rounds: how often other states are tried.
@@ -72,7 +72,7 @@ class FitConfig:
     refine_steps: int = 10
     explained: float = 0.147
     tries: int = 12
-    places: int = 4
+    per_joint: int = 4
     screened: int = 8
     screen_steps: int = 4
     last_widening: float = 1.0
@@ -105,7 +105,7 @@ class DrawsConfig:
         met: misfit up to which a start meets a shape; beyond, ``choices`` states with other discrete draws are tried,
             and the ``chosen`` most like the shape approach it.
         shape_std: standard deviation of the shape that the modes found, as a share of half the rest box's longest side.
-        shape_worth: how many independent points a shape is worth.
+        shape_weight: how many independent points a shape is worth.
         cloud_weight, network_weight: the same of the cloud and of the correspondences, from beginning to end, also
             where draws and modes are compared.
         first_rounds, last_rounds: sets of differences in the fit to the frame, after a jump and else.
@@ -119,13 +119,13 @@ class DrawsConfig:
         passes: while it is above ``hopeless``, how often the modes are refined from where the draws ended, and the
             draws fitted to that shape again.
         jumps: how often one draw may jump to another place of its range.
-        places, places_kept: into how many even steps its range is divided, so that there is one place fewer to jump to;
-            and how many of these, the best, are compared: all where None.
+        jump_steps, jumps_kept: into how many even steps its range is divided, so that a draw may jump to one position
+            fewer; and how many of these, the best, are compared: all where None.
         sliding: most share of a draw's motion that may leave the surface; 1 lets all draws jump.
         turned_worse: misfit by which a state may be worse with segments stiffly turned that look alike turned
             (``turned_segments``), for that shape to be tried.
         turned_sieve: ``sieve`` for it; one start is then fitted to the frame.
-        asked_again: whether the network's answer is a start too, where the cloud is not explained.
+        network_start: whether the network's answer is a start too, where the cloud is not explained.
         every_point: whether the answer is fitted to every observed point in the end.
         few: scenes with more draws than this get ``MANY_DRAWS`` instead: every set of differences plays each draw once.
         near: how many states count as near where draws are guessed from the modes.
@@ -139,7 +139,7 @@ class DrawsConfig:
     chosen: int = 4
     sieve: tuple[tuple[int, int], ...] = ((1, 10), (1, 3))
     shape_std: float = 0.04
-    shape_worth: float = 500.0
+    shape_weight: float = 500.0
     cloud_weight: float = 1500.0
     network_weight: float = 30.0
     first_rounds: int = 1
@@ -154,12 +154,12 @@ class DrawsConfig:
     batches: int = 1
     passes: int = 0
     jumps: int = 2
-    places: int = 6
-    places_kept: int | None = None
+    jump_steps: int = 6
+    jumps_kept: int | None = None
     sliding: float = 1.0
     turned_worse: float = 25.0
     turned_sieve: tuple[tuple[int, int], ...] = ((1, 4), (1, 1))
-    asked_again: bool = True
+    network_start: bool = True
     every_point: bool = True
     few: int = 30
     near: int = 100
@@ -176,10 +176,10 @@ MANY_DRAWS = DrawsConfig(
     sieve=((1, 3), (1, 1)),
     first_rounds=1,
     last_rounds=4,
-    places=12,
-    places_kept=1,
+    jump_steps=12,
+    jumps_kept=1,
     sliding=0.2,
-    asked_again=False,
+    network_start=False,
     every_point=False,
 )
 """Constants for scenes with many draws."""

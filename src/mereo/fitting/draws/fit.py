@@ -54,16 +54,16 @@ SLIDES = 0.03
 
 def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
     """The best of several starts; None where the scene plays none of them back."""
-    found = fit_near_modes(problem, modes, [])
+    fits = fit_near_modes(problem, modes, [])
     for _ in range(problem.config.passes):
-        if explains_cloud(problem, found, problem.config.hopeless):
+        if explains_cloud(problem, fits, problem.config.hopeless):
             break
-        found += fit_from_end(problem, min(found, key=by_misfit, default=None))
-    has_network = len(problem.found.points) > 0  # after a search there are no correspondences
-    if problem.config.asked_again and has_network and not explains_cloud(problem, found, problem.config.explained):
+        fits += fit_from_end(problem, min(fits, key=by_misfit, default=None))
+    has_network = len(problem.correspondences.points) > 0  # after a search there are no correspondences
+    if problem.config.network_start and has_network and not explains_cloud(problem, fits, problem.config.explained):
         camera = Posed(np.eye(3), np.zeros(3), np.empty(0), modes.log_scale)
-        found += fit_from_shape(problem, camera, shape_of_network(problem, modes.log_scale), [])
-    best = min(found, key=by_misfit, default=None)
+        fits += fit_from_shape(problem, camera, shape_of_network(problem, modes.log_scale), [])
+    best = min(fits, key=by_misfit, default=None)
     return None if best is None else refine_by_sight(problem, try_jumps(problem, try_symmetric_states(problem, best)))
 
 
@@ -78,12 +78,12 @@ def refine_by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     start = simulate(dense, fit.drawn, fit.z, fit.posed)
     if start is None:
         return fit
-    found = descend(dense, start, problem.config.last_rounds)
+    fit = descend(dense, start, problem.config.last_rounds)
     if dense.base is sighted.base:
-        return found
-    end = simulate(sighted, found.drawn, found.z, found.posed)
+        return fit
+    end = simulate(sighted, fit.drawn, fit.z, fit.posed)
     assert end is not None  # it was played before
-    return replace(end, motion=found.motion, misfit=found.misfit)
+    return replace(end, motion=fit.motion, misfit=fit.misfit)
 
 
 def fit_near_modes(problem: DrawsProblem, modes: Posed, others: list[Drawn]) -> list[DrawsFit]:
@@ -102,27 +102,27 @@ def fit_from_end(problem: DrawsProblem, best: DrawsFit | None) -> list[DrawsFit]
     return fit_near_modes(problem, modes, [replace(best.drawn, z=best.z)])
 
 
-def explains_cloud(problem: DrawsProblem, found: list[DrawsFit], most: float) -> bool:
+def explains_cloud(problem: DrawsProblem, fits: list[DrawsFit], most: float) -> bool:
     """Whether one of the states explains the cloud: ``Problem.explained``."""
     sigma = problem.base.config.cloud_sigma
-    misfits = [float(robust_square(fit.distance, sigma).mean()) for fit in found]
+    misfits = [float(robust_square(fit.distance, sigma).mean()) for fit in fits]
     if not misfits:
         return False
-    best = found[int(np.argmin(misfits))]
+    best = fits[int(np.argmin(misfits))]
     return problem.base.explained(min(misfits), best.surface, most)
 
 
 def shape_of(problem: DrawsProblem, material: Float[np.ndarray, "m 3"]) -> Shape:
     """Shape of material points, unposed: dense and smooth."""
     config, few = problem.config, problem.states.played.index
-    return Shape.of(material[few], config.shape_std * problem.model.half, config.shape_worth, np.ones(len(few)))
+    return Shape.of(material[few], config.shape_std * problem.model.half, config.shape_weight, np.ones(len(few)))
 
 
 def shape_of_network(problem: DrawsProblem, log_scale: float) -> Shape:
     """Shape that the correspondences have, in the camera frame."""
-    found, sigma = problem.found, problem.base.network_sigma
-    points = found.points * np.exp(-log_scale)
-    return Shape.of(points, sigma, problem.config.shape_worth, found.confidence, problem.followed)
+    matches, sigma = problem.correspondences, problem.base.network_sigma
+    points = matches.points * np.exp(-log_scale)
+    return Shape.of(points, sigma, problem.config.shape_weight, matches.confidence, problem.following_played)
 
 
 def fit_from_shape(problem: DrawsProblem, frame: Posed, shape: Shape, guesses: list[Drawn]) -> list[DrawsFit]:
@@ -160,18 +160,18 @@ def find_other_choices(problem: DrawsProblem, shape: Shape, best: StateOnShape |
         return []
     others = redraw_choices(states.scene, replace(best.drawn, z=best.z), config.choices)
     states_near = [lay_on_shape(states, shape, other, other.z) for other in others]
-    new = [state for state in states_near if state is not None and differ(state, best, shape.std)]
+    new = [state for state in states_near if state is not None and are_different(state, best, shape.std)]
     return [approach(states, shape, state, 1) for state in sorted(new, key=by_misfit)[: config.chosen]]
 
 
-def differ(one: StateOnShape, other: StateOnShape, least: float) -> bool:
+def are_different(first: StateOnShape, second: StateOnShape, least: float) -> bool:
     """Whether any played point of two states is farther apart than ``least``; a choice may come out the same again."""
-    return bool(np.abs(one.points - other.points).max() > least)
+    return bool(np.abs(first.points - second.points).max() > least)
 
 
-def by_misfit(one: StateOnShape | DrawsFit) -> float:
+def by_misfit(state: StateOnShape | DrawsFit) -> float:
     """Misfit, as a key to sort by."""
-    return one.misfit
+    return state.misfit
 
 
 def similar_states(problem: DrawsProblem, shape: Shape) -> list[int]:
@@ -182,7 +182,7 @@ def similar_states(problem: DrawsProblem, shape: Shape) -> list[int]:
     if shape.follow is None:
         compared = library[:, some]
     else:
-        compared = np.stack([shape.follow[some] @ one for one in library])
+        compared = np.stack([shape.follow[some] @ played for played in library])
     cost = robust_poses(compared, goal, shape.weight[some].astype(np.float32), problem.base.network_sigma)[0]
     return [states.seeds[row] for row in np.argsort(cost)[: problem.config.starts]]
 
@@ -219,8 +219,8 @@ def try_jumps(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     for _ in range(config.jumps):
         if explains_cloud(problem, [fit], config.explained):
             break
-        each = [jump_candidates(problem, fit, int(number), sigma) for number in draws_that_may_jump(problem, fit)]
-        best_first = sorted((place for places in each for place in places), key=lambda place: place[0])
+        each = [find_jumps(problem, fit, int(number), sigma) for number in draws_that_may_jump(problem, fit)]
+        best_first = sorted((candidate for places in each for candidate in places), key=lambda candidate: candidate[0])
         fits = [descend(problem, other, config.first_rounds) for _, other in best_first[: config.kept + 1]]
         best = min(fits, key=by_misfit, default=fit)
         if best.misfit >= fit.misfit:
@@ -229,16 +229,16 @@ def try_jumps(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     return fit
 
 
-def jump_candidates(problem: DrawsProblem, fit: DrawsFit, number: int, sigma: float) -> list[tuple[float, DrawsFit]]:
+def find_jumps(problem: DrawsProblem, fit: DrawsFit, number: int, sigma: float) -> list[tuple[float, DrawsFit]]:
     """A state with one draw at other places of its range: all, or the best where there are many draws, with misfits."""
     config, candidates = problem.config, list[tuple[float, DrawsFit]]()
-    for turn in range(1, config.places):
+    for turn in range(1, config.jump_steps):
         z = fit.z.copy()
-        z[number] = ndtri(np.clip((ndtr(z[number]) + turn / config.places) % 1.0, SMALLEST, 1 - SMALLEST))
+        z[number] = ndtri(np.clip((ndtr(z[number]) + turn / config.jump_steps) % 1.0, SMALLEST, 1 - SMALLEST))
         other = simulate(problem, fit.drawn, z, fit.posed)
         if other is not None:
             candidates.append((misfit(problem, other, sigma), other))
-    return sorted(candidates, key=lambda candidate: candidate[0])[: config.places_kept]
+    return sorted(candidates, key=lambda candidate: candidate[0])[: config.jumps_kept]
 
 
 def draws_that_may_jump(problem: DrawsProblem, fit: DrawsFit) -> Int[np.ndarray, " n"]:
@@ -331,8 +331,8 @@ def redraw_choices(scene: Scene, drawn: Drawn, count: int) -> list[Drawn]:
     if not discrete:
         return []
     rng = np.random.default_rng(drawn.seed)
-    found = [_drawn_anew(scene, calls, _some(discrete, rng), int(rng.integers(2**31))) for _ in range(count)]
-    return [one for one in found if one is not None]
+    redrawn = [_redraw(scene, calls, _some(discrete, rng), int(rng.integers(2**31))) for _ in range(count)]
+    return [drawn for drawn in redrawn if drawn is not None]
 
 
 def _some(numbers: Sequence[int], rng: np.random.Generator) -> set[int]:
@@ -342,7 +342,7 @@ def _some(numbers: Sequence[int], rng: np.random.Generator) -> set[int]:
     return {number for number, take in zip(numbers, taken, strict=True) if take}
 
 
-def _drawn_anew(scene: Scene, calls: Sequence[Call], left_out: set[int], seed: int) -> Drawn | None:
+def _redraw(scene: Scene, calls: Sequence[Call], left_out: set[int], seed: int) -> Drawn | None:
     given = {call.key: call.shares for number, call in enumerate(calls) if number not in left_out}
     recorder = Recorder(seed, given, len(calls) + MORE_CALLS)
     try:

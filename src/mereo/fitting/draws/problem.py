@@ -39,7 +39,7 @@ class DrawsProblem:
     Attributes:
         base: the same frame, explained by modes, with the worths that the draws are fitted by.
         states: random states of the scene.
-        found: correspondences, scene units.
+        correspondences: correspondences, scene units.
         weights: how their rest positions follow the material points.
         config: constants.
         by_sight: whether observed points are compared with what their lines of sight meet, or with the nearest places.
@@ -47,7 +47,7 @@ class DrawsProblem:
 
     base: Problem
     states: DrawnStates
-    found: Correspondences
+    correspondences: Correspondences
     weights: PointWeights
     config: DrawsConfig
     by_sight: bool = False
@@ -69,29 +69,35 @@ class DrawsProblem:
 
     @classmethod
     def of(
-        cls, base: Problem, states: DrawnStates, found: Correspondences, config: DrawsConfig | None = None
+        cls, base: Problem, states: DrawnStates, correspondences: Correspondences, config: DrawsConfig | None = None
     ) -> "DrawsProblem":
         """Problem with the constants for as many draws as the scene has, where none are given."""
         model = base.model
         if config is None:
             config = DrawsConfig() if states.z.shape[1] <= DrawsConfig().few else MANY_DRAWS
-        worths = replace(base.config, cloud_weight=config.cloud_weight, network_weight=(config.network_weight,) * 2)
-        base = replace(base, config=worths)
-        return cls(base, states, found, model.weights(found.rest, found.labels), config)
+        weights_config = replace(
+            base.config, cloud_weight=config.cloud_weight, network_weight=(config.network_weight,) * 2
+        )
+        base = replace(base, config=weights_config)
+        return cls(base, states, correspondences, model.weights(correspondences.rest, correspondences.labels), config)
 
     def around(self, mean: Float[np.ndarray, "m 3"], modes: Float32[np.ndarray, "m 3 d"]) -> Problem:
         """The problem in the linear neighbourhood of a state."""
         model = self.model.around(mean, modes)
-        network = NetworkTerm(self.found.points, self.weights(mean), self.weights(modes), self.found.confidence)
+        network = NetworkTerm(
+            self.correspondences.points, self.weights(mean), self.weights(modes), self.correspondences.confidence
+        )
         return replace(self.base, model=model, network=network)
 
     def network(self, fit: "DrawsFit", modes: Float32[np.ndarray, "n 3 d"] | None = None) -> NetworkTerm:
         """Correspondences in the neighbourhood of a state."""
-        modes = np.zeros((len(self.found.labels), 3, 0), dtype=np.float32) if modes is None else modes
-        return NetworkTerm(self.found.points, self.weights(fit.material), modes, self.found.confidence)
+        modes = np.zeros((len(self.correspondences.labels), 3, 0), dtype=np.float32) if modes is None else modes
+        return NetworkTerm(
+            self.correspondences.points, self.weights(fit.material), modes, self.correspondences.confidence
+        )
 
     @cached_property
-    def followed(self) -> csr_array:
+    def following_played(self) -> csr_array:
         """How the rest positions of the correspondences follow the played points."""
         return as_sparse(self.weights, len(self.model.rest_points)) @ self.states.played.spread
 
@@ -186,7 +192,7 @@ def terms(problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3
     base, posed, config = problem.base, fit.posed, problem.base.config
     flat, count = motion.reshape(len(motion), -1), len(fit.z)
     nothing, state = NormalEquations.nothing(POSE + count), replace(posed, z=np.zeros(count))
-    network = problem.network(fit, (problem.followed @ flat).reshape(-1, 3, count))
+    network = problem.network(fit, (problem.following_played @ flat).reshape(-1, 3, count))
     return Terms(
         known=prior_of_draws(fit.z, motion, posed.log_scale, base.scale_std),
         network=network.add_to(nothing, state, base.network_sigma, config.network_weight[1], robust=True),
@@ -280,12 +286,12 @@ class Shape:
         cls,
         points: Float[np.ndarray, "n 3"],
         std: float,
-        worth: float,
+        weight: float,
         confidence: Float[np.ndarray, " n"],
         follow: csr_array | None = None,
     ) -> "Shape":
-        """Shape worth ``worth`` points."""
-        return cls(points, std, confidence / confidence.sum() * (worth / std**2), follow)
+        """Shape worth ``weight`` points."""
+        return cls(points, std, confidence / confidence.sum() * (weight / std**2), follow)
 
     def at(self, values: Float[np.ndarray, "a *c"]) -> Float[np.ndarray, "n *c"]:
         """Values at the points, from values at the played points."""
@@ -336,23 +342,23 @@ def lay_on_shape(states: DrawnStates, shape: Shape, drawn: Drawn, z: Float[np.nd
 
 
 def derivatives(
-    states: DrawnStates, drawn: Drawn, z: Float[np.ndarray, " d"], here: Float[np.ndarray, "a 3"]
+    states: DrawnStates, drawn: Drawn, z: Float[np.ndarray, " d"], positions: Float[np.ndarray, "a 3"]
 ) -> Float32[np.ndarray, "a 3 d"]:
-    """Motion of the played points, which are ``here``, for a standard deviation of each draw.
+    """Motion of the played points, which are ``positions``, for a standard deviation of each draw.
 
     Neighbours are played without the scene's own test where this state is the same without it: it is not where a scene
     refuses and draws again in a way that ``Drawn`` does not see through.
     """
-    change = np.zeros((*here.shape, len(z)), dtype=np.float32)
+    change = np.zeros((*positions.shape, len(z)), dtype=np.float32)
     untested = drawn.deformations(states.scene, z, checked=False)
-    checked = untested is None or float(np.abs(states.played.moved(untested) - here).max()) > SAME
+    checked = untested is None or float(np.abs(states.played.moved(untested) - positions).max()) > SAME
     for number in np.flatnonzero(drawn.smooth):
         step = DIFFERENCE * (-1.0 if z[number] > 0 else 1.0)
         other = z.copy()
         other[number] += step
         moved = drawn.deformations(states.scene, other, checked)
         if moved is not None:
-            change[:, :, number] = (states.played.moved(moved) - here) / step
+            change[:, :, number] = (states.played.moved(moved) - positions) / step
     return change
 
 

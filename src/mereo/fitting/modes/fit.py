@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.evidence import MOST_POINTS
 from mereo.fitting.problem.gauss_newton import Posed
-from mereo.fitting.problem.joints import corner_places
+from mereo.fitting.problem.joints import corner_positions
 from mereo.fitting.problem.problem import UNEXPLAINED, Misfit, Problem
 from mereo.fitting.problem.residuals import NetworkTerm, Prior, Surface
 from mereo.geometry.downsampling import means_along_sight
@@ -43,7 +43,7 @@ def explored(problem: Problem, best: "ScoredFit") -> "ScoredFit":
         if problem.explained(best.misfit.cloud, best.surface, config.explained):
             break
         before = best
-        for other in likely(problem, best.posed, number):
+        for other in find_candidates(problem, best.posed, number):
             best = best.better(problem, refine(problem, other, config.last_widening, config.last_refine))
         if best is before:
             break
@@ -66,33 +66,35 @@ class ScoredFit:
 
     def better(self, problem: Problem, other: Posed) -> "ScoredFit":
         """This, or the other where its misfit is lower."""
-        judged = ScoredFit.of(problem, other)
-        return judged if judged.misfit.total < self.misfit.total else self
+        scored = ScoredFit.of(problem, other)
+        return scored if scored.misfit.total < self.misfit.total else self
 
 
-def likely(problem: Problem, best: Posed, number: int) -> list[Posed]:
+def find_candidates(problem: Problem, best: Posed, number: int) -> list[Posed]:
     """Other states that may explain the frame: chosen by few points, drawn towards the frame, chosen again."""
     config, coarse = problem.config, problem.coarse
-    library = by_likeness(problem, best, config.tries) + (by_network(problem, config.refined) if number == 0 else [])
-    groups = (library, problem.joints.others(best, config.places))
+    library = similar_states(problem, best, config.tries) + (
+        states_like_network(problem, config.refined) if number == 0 else []
+    )
+    groups = (library, problem.joints.others(best, config.per_joint))
     sigma = config.refine_sigma * problem.model.half
     screened = [
         group[index]
         for group in groups
         for index in np.argsort([coarse.screen(other, sigma).total for other in group])[: config.screened]
     ]
-    drawn = distinct(problem, best, [refine(coarse, other, 2.0, config.screen_steps) for other in screened])
+    drawn = keep_diverse(problem, best, [refine(coarse, other, 2.0, config.screen_steps) for other in screened])
     order = np.argsort([problem.screen(other, sigma).total for other in drawn])
     return [drawn[index] for index in order[: config.refined]]
 
 
-def distinct(problem: Problem, best: Posed, others: list[Posed]) -> list[Posed]:
+def keep_diverse(problem: Problem, best: Posed, others: list[Posed]) -> list[Posed]:
     """Those that differ from ``best`` and from all before them: from alike starts a fit ends alike."""
     model = problem.model
-    places = corner_places(model, [best, *others])
+    positions = corner_positions(model, [best, *others])
     kept = [0]
-    for index in range(1, len(places)):
-        apart = [np.linalg.norm(places[index] - places[other], axis=1).max() for other in kept]
+    for index in range(1, len(positions)):
+        apart = [np.linalg.norm(positions[index] - positions[other], axis=1).max() for other in kept]
         if min(apart) > ALIKE * model.half:
             kept.append(index)
     return [others[index - 1] for index in kept[1:]]
@@ -140,10 +142,10 @@ def fit_cloud(problem: Problem, posed: Posed, prior: Prior, start: float, steps:
     for step in range(steps):
         share = step / max(1, steps - 1)
         sigma = max(start * half * config.cooling**step, config.cloud_sigma)
-        worth = config.network_weight[0] * (1 - share) + config.network_weight[1] * share
+        weight = config.network_weight[0] * (1 - share) + config.network_weight[1] * share
         normal = problem.known(posed, prior, slack * half * config.pair_cooling**step)
         exact = steps - step <= config.exact_steps and sigma <= 2 * config.cloud_sigma
-        posed = posed.moved(problem.seen(normal, posed, sigma, worth, exact).step(config.damping))
+        posed = posed.moved(problem.seen(normal, posed, sigma, weight, exact).step(config.damping))
     return posed
 
 
@@ -191,7 +193,7 @@ def robust_poses(
     return cost, rotation.astype(np.float64), translation[:, 0].astype(np.float64)
 
 
-def by_network(problem: Problem, count: int) -> list[Posed]:
+def states_like_network(problem: Problem, count: int) -> list[Posed]:
     """The states of the library that explain the correspondences best, posed on them."""
     network, library = problem.network, problem.model.library
     if len(network.target) == 0:
@@ -206,7 +208,7 @@ def by_network(problem: Problem, count: int) -> list[Posed]:
     return [Posed(rotation[i], translation[i], library[i].astype(np.float64)) for i in best]
 
 
-def by_likeness(problem: Problem, posed: Posed, count: int) -> list[Posed]:
+def similar_states(problem: Problem, posed: Posed, count: int) -> list[Posed]:
     """States of the library that agree with a fit in most points but differ in others, as different as there are.
 
     A wheel that is seen on one side only may be half a turn off, or a finger taken for the other: everything else is
@@ -246,9 +248,9 @@ def _different(shapes: Float[np.ndarray, "n c"], count: int) -> Int[np.ndarray, 
 # prior is N(0, 1) each.
 
 
-def fit_rest(problem: Problem, found: Correspondences, modes: Posed) -> ScoredFit:
+def fit_rest(problem: Problem, correspondences: Correspondences, modes: Posed) -> ScoredFit:
     """Fit of the rest model's pose, from that of the modes; its ``posed.z`` is empty."""
-    model, config, rest = problem.model, problem.config, of_rest(problem, found)
+    model, config, rest = problem.model, problem.config, of_rest(problem, correspondences)
     T = fit_rigid(model.rest_points, modes.place(model.material(modes.z)))
     start = Posed(T[:3, :3], T[:3, 3], np.empty(0), modes.log_scale)
     prior = Prior(np.empty(0), np.empty((0, 0)))
@@ -256,11 +258,11 @@ def fit_rest(problem: Problem, found: Correspondences, modes: Posed) -> ScoredFi
     return ScoredFit.of(rest, posed)
 
 
-def of_rest(problem: Problem, found: Correspondences) -> Problem:
+def of_rest(problem: Problem, correspondences: Correspondences) -> Problem:
     """The problem of the rest model's pose alone."""
     model = problem.model
     rigid = model.around(model.rest_points, np.zeros((len(model.rest_points), 3, 0), dtype=np.float32))
-    return replace(problem, model=rigid, network=NetworkTerm.of(rigid, found))
+    return replace(problem, model=rigid, network=NetworkTerm.of(rigid, correspondences))
 
 
 def is_at_rest(problem: Problem, modes: ScoredFit, rest: ScoredFit) -> bool:
@@ -286,7 +288,7 @@ NetworkFit = tuple[Problem, Correspondences, ScoredFit]
 """A frame with what the network states of it, and the fit to both."""
 
 
-def as_noisy(start: NetworkFit, points: Float[np.ndarray, "n 3"], ask: PredictCorrespondences | None) -> NetworkFit:
+def as_noisy(start: NetworkFit, points: Float[np.ndarray, "n 3"], predict: PredictCorrespondences | None) -> NetworkFit:
     """The fit to a noisy frame where what a fit leaves over is noise, else that one.
 
     Whether that is so is asked of the second fit: noise throws the first off by more than it is itself.
@@ -294,14 +296,14 @@ def as_noisy(start: NetworkFit, points: Float[np.ndarray, "n 3"], ask: PredictCo
     Args:
         start: the frame, taken for a clean one.
         points: its cloud, scene units.
-        ask: the network, which is also asked about the smoothed cloud.
+        predict: the network, which is also asked about the smoothed cloud.
     """
-    problem, found, modes = start
+    problem, correspondences, modes = start
     noisy = problem.as_noisy_as(modes.surface)
     if noisy is None:
         return start
-    others = [] if ask is None else [ask(smoothed(means_along_sight(points, MOST_POINTS)))]
-    candidates = [(noisy, found), *((noisy.with_network(other), other) for other in others)]
+    others = [] if predict is None else [predict(smoothed(means_along_sight(points, MOST_POINTS)))]
+    candidates = [(noisy, correspondences), *((noisy.with_network(other), other) for other in others)]
     fits = [(*candidate, fit_modes(candidate[0])) for candidate in candidates]
     best = min(fits, key=lambda fit: fit[2].misfit.without_network)
     return best if best[0].leaves_noise(best[2].surface) else start
@@ -342,37 +344,39 @@ def turns(axis: Float[np.ndarray, "3"]) -> Iterator[Float[np.ndarray, "3 3"]]:
         yield (Rotation.from_rotvec(tilt) * Rotation.from_rotvec(number * ROLL * axis)).as_matrix()
 
 
-def with_turns(start: NetworkFit, ask: PredictCorrespondences | None) -> NetworkFit:
+def with_turned_camera(start: NetworkFit, predict: PredictCorrespondences | None) -> NetworkFit:
     """A fit as it is, or where much is unexplained the best of it and of those with the camera turned.
 
     Args:
         start: the frame as it is.
-        ask: the network, in scene units.
+        predict: the network, in scene units.
     """
     problem, _, modes = start
-    if ask is None or not problem.config.turned or not problem.wants_turns(modes.misfit.cloud, modes.surface):
+    if predict is None or not problem.config.turned or not problem.wants_turns(modes.misfit.cloud, modes.surface):
         return start
     points, anyway = problem.evidence.points, problem.config.turned_anyway
     best, waiting = start, turns(points.mean(axis=0))
     while rounds := list(islice(waiting, ROUND)):
-        for problem, found in best_turned([seen_turned(start[0], points, turn, ask) for turn in rounds]):
+        for problem, correspondences in keep_best_turned(
+            [predict_turned(start[0], points, turn, predict) for turn in rounds]
+        ):
             modes = ScoredFit.of(problem, refine(problem, fit_whole(problem)))
             if modes.misfit.without_network < best[2].misfit.without_network:
-                best = problem, found, modes
+                best = problem, correspondences, modes
         if best[2].misfit.cloud < UNEXPLAINED or (anyway and best[0].leaves_noise(best[2].surface)):
             break
     return best if best is start else (best[0], best[1], explored(best[0], best[2]))
 
 
-def seen_turned(
-    problem: Problem, points: Float[np.ndarray, "n 3"], turn: Float[np.ndarray, "3 3"], ask: PredictCorrespondences
+def predict_turned(
+    problem: Problem, points: Float[np.ndarray, "n 3"], turn: Float[np.ndarray, "3 3"], predict: PredictCorrespondences
 ) -> tuple[Problem, Correspondences]:
     """The frame with what the network states when the camera is turned, turned back."""
-    found = ask(points @ turn.T).turned(turn.T)
-    return problem.with_network(found), found
+    correspondences = predict(points @ turn.T).turned(turn.T)
+    return problem.with_network(correspondences), correspondences
 
 
-def best_turned(frames: list[tuple[Problem, Correspondences]]) -> list[tuple[Problem, Correspondences]]:
+def keep_best_turned(frames: list[tuple[Problem, Correspondences]]) -> list[tuple[Problem, Correspondences]]:
     """Those whose fit by few points explains the frame best."""
     costs = []
     for problem, _ in frames:

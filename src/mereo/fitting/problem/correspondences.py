@@ -107,10 +107,10 @@ def find_correspondences(
     lines = seen[:SIGHT_LINES]
     behind = DEPTHS / code.normalizer.scale / np.linalg.norm(lines, axis=1)[:, None]
     inner = (lines[:, None] * (1.0 + behind[..., None])).reshape(-1, 3)
-    found = model.correspond(code, np.concatenate([seen, inner]))
-    if found is None:
+    predicted = model.correspond(code, np.concatenate([seen, inner]))
+    if predicted is None:
         return None
-    probability, rest = found
+    probability, rest = predicted
     probability[: len(seen), 0] = 0.0  # an observed point is on the object, whatever the network thinks
     probability[: len(seen)] /= np.maximum(probability[: len(seen)].sum(axis=1, keepdims=True), 1e-12)
     labels = probability.argmax(axis=1).astype(np.uint8)
@@ -132,21 +132,21 @@ SCALE_PAIRS = 4000
 """Pairs of correspondences whose distances, there and at rest, tell an unknown unit."""
 
 
-def agree(one: float, other: float) -> bool:
+def agree(first: float, second: float) -> bool:
     """Whether two units differ by no more than ``UNIT_TOLERANCE``."""
-    return abs(float(np.log(one / other))) < float(np.log1p(UNIT_TOLERANCE))
+    return abs(float(np.log(first / second))) < float(np.log1p(UNIT_TOLERANCE))
 
 
-def estimate_unit(found: Correspondences) -> float:
+def estimate_unit(correspondences: Correspondences) -> float:
     """Length of a scene unit in the unit of the correspondences: distances within a segment hardly change."""
     rng = np.random.default_rng(0)
-    first, second = rng.integers(len(found.labels), size=(2, SCALE_PAIRS))
-    rest = np.linalg.norm(found.rest[first] - found.rest[second], axis=1)
-    seen = np.linalg.norm(found.points[first] - found.points[second], axis=1)
-    usable = (found.labels[first] == found.labels[second]) & (rest > np.median(rest[rest > 0]) / 4)
+    first, second = rng.integers(len(correspondences.labels), size=(2, SCALE_PAIRS))
+    rest = np.linalg.norm(correspondences.rest[first] - correspondences.rest[second], axis=1)
+    seen = np.linalg.norm(correspondences.points[first] - correspondences.points[second], axis=1)
+    usable = (correspondences.labels[first] == correspondences.labels[second]) & (rest > np.median(rest[rest > 0]) / 4)
     if not usable.any():
         raise ValueError(
-            f"the network finds only {len(found.labels)} points of the object, too few to tell its size: name the "
-            "unit with scene_unit, or isolate the object first"
+            f"the network finds only {len(correspondences.labels)} points of the object, too few to tell its size: "
+            "name the unit with scene_unit, or isolate the object first"
         )
     return float(np.median(seen[usable] / rest[usable]))

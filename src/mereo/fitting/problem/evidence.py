@@ -162,15 +162,15 @@ class Evidence:
         distance = np.linalg.norm(vertices, axis=1)
         toward = vertices / distance[:, None]
         angle, near = self.sight.query(toward)
-        beside = angle > SILHOUETTE_PITCHES * self.pitch
+        is_past = angle > SILHOUETTE_PITCHES * self.pitch
         sideways = self.sight.data[near] * distance[:, None] - vertices
         length = np.sqrt(np.einsum("ni,ni->n", sideways, sideways))
         out = sideways / np.maximum(length, 1e-12)[:, None]
         ahead = self.front[near] - slack - distance
-        direction = np.where(beside[:, None], out, toward)
-        amount = np.maximum(np.where(beside, length - self.pitch * distance, ahead), 0.0)
+        direction = np.where(is_past[:, None], out, toward)
+        amount = np.maximum(np.where(is_past, length - self.pitch * distance, ahead), 0.0)
         if self.past is not None or self.other_lines == "unknown":
-            rows = np.flatnonzero(beside)
+            rows = np.flatnonzero(is_past)
             nearest = np.where(near[rows] < len(self.points), np.inf, angle[rows])
             amount[rows[distance[rows] > self._free(toward[rows], nearest) - slack]] = 0.0
         return direction, amount

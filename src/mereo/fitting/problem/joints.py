@@ -57,9 +57,9 @@ class Joints:
 
     def others(self, posed: Posed, each: int) -> list[Posed]:
         """States in which one joint is elsewhere, ``each`` of every joint, as different as there are."""
-        here = positions(self.model, self.corners, posed.z[None].astype(np.float32))
-        rotation, translation = segment_poses(self.model.mean[self.corners], here)
-        found = []
+        corners = positions(self.model, self.corners, posed.z[None].astype(np.float32))
+        rotation, translation = segment_poses(self.model.mean[self.corners], corners)
+        shapes_of_branches = []
         for fixed, hanging, moving in self.branches:
             # the hanging segment's pose in the fixed one's frame, in each state of the library and here
             inverse = self.rotation[:, fixed].transpose(0, 2, 1)
@@ -67,13 +67,17 @@ class Joints:
             offset = self.translation[:, hanging] - self.translation[:, fixed]
             shift = (rotation[0, fixed] @ inverse @ offset[..., None])[..., 0] + translation[0, fixed]
             shift = shift - (turn @ translation[0, hanging])
-            shapes = np.broadcast_to(here, (len(turn), *here.shape[1:])).copy()
-            branch = here[0, moving].reshape(-1, 3)
+            shapes = np.broadcast_to(corners, (len(turn), *corners.shape[1:])).copy()
+            branch = corners[0, moving].reshape(-1, 3)
             moved = branch @ turn.transpose(0, 2, 1) + shift[:, None]
-            shapes[:, moving] = moved.reshape(len(turn), -1, *here.shape[2:])
+            shapes[:, moving] = moved.reshape(len(turn), -1, *corners.shape[2:])
             apart = different(moved.reshape(len(turn), -1), branch.ravel(), each)
-            found.append(shapes[apart])
-        return self._expressed(np.concatenate(found).reshape(-1, self.corners.size, 3), posed) if found else []
+            shapes_of_branches.append(shapes[apart])
+        return (
+            self._expressed(np.concatenate(shapes_of_branches).reshape(-1, self.corners.size, 3), posed)
+            if shapes_of_branches
+            else []
+        )
 
     def _expressed(self, shapes: Float[np.ndarray, "n p 3"], posed: Posed) -> list[Posed]:
         """States nearest to shapes of the corners that are given in the frame of ``posed``'s modes."""
@@ -82,14 +86,14 @@ class Joints:
         normal += RIDGE * np.trace(normal) / max(1, len(normal)) * np.eye(len(normal))
         solve = np.linalg.solve(normal, flat.T)
         mean = self.model.mean[self.corners.ravel()]
-        own = np.broadcast_to(mean, shapes.shape)
+        fitted = np.broadcast_to(mean, shapes.shape)
         goal = shapes.mean(axis=1, keepdims=True)
         for _ in range(ROUNDS):
-            middle = own.mean(axis=1, keepdims=True)
-            rotation = best_rotations(np.matmul((own - middle).transpose(0, 2, 1), shapes - goal))
+            middle = fitted.mean(axis=1, keepdims=True)
+            rotation = best_rotations(np.matmul((fitted - middle).transpose(0, 2, 1), shapes - goal))
             unposed = np.matmul(shapes - goal, rotation) + middle
             z = (unposed - mean).reshape(len(shapes), -1) @ solve.T
-            own = mean + (z @ flat.T).reshape(shapes.shape)
+            fitted = mean + (z @ flat.T).reshape(shapes.shape)
         translation = (goal - middle @ rotation.transpose(0, 2, 1))[:, 0]
         shift = posed.place(translation)
         return [Posed(posed.rotation @ rotation[i], shift[i], z[i], posed.log_scale) for i in range(len(z))]
@@ -109,7 +113,7 @@ def positions(
     return model.mean[corners] + motion.reshape(len(z), *corners.shape, 3).astype(np.float64)
 
 
-def corner_places(model: StatisticalModel, states: list[Posed]) -> Float[np.ndarray, "n p 3"]:
+def corner_positions(model: StatisticalModel, states: list[Posed]) -> Float[np.ndarray, "n p 3"]:
     """Places of the corners of all segments in states, by which these are told apart."""
     z = np.stack([posed.z for posed in states]).astype(np.float32)
     unposed = positions(model, corners_of(model), z).reshape(len(z), -1, 3)

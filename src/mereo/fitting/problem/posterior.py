@@ -67,9 +67,9 @@ class RadiusParts:
     gaussian: Float[np.ndarray, " n"]
     open: Float[np.ndarray, " n"]
 
-    def radii(self, scale: float = 1.0, beside: float = 0.0) -> Float[np.ndarray, " n"]:
+    def radii(self, scale: float = 1.0, extra_radius: float = 0.0) -> Float[np.ndarray, " n"]:
         """Radii with a scale of the Gaussian, and a radius that all points have beside; in the parts' unit."""
-        result: np.ndarray = np.sqrt((scale * self.gaussian) ** 2 + self.open**2 + beside**2)
+        result: np.ndarray = np.sqrt((scale * self.gaussian) ** 2 + self.open**2 + extra_radius**2)
         return result
 
 
@@ -159,8 +159,10 @@ class Posterior:
     def radii(self, follow: PointWeights | None = None) -> "RadiusParts":
         """Radii of 95 % of all material points, or of points that follow them; scene units."""
         with one_blas_thread():
-            motion, beside = self.motion, self._open(slice(None))
-            return self._radii(motion, beside) if follow is None else self._radii(follow(motion), follow(beside))
+            motion, open_motion = self.motion, self._open(slice(None))
+            return (
+                self._radii(motion, open_motion) if follow is None else self._radii(follow(motion), follow(open_motion))
+            )
 
     def radii_of(self, rows: Int[np.ndarray, " n"]) -> "RadiusParts":
         """Radii of 95 % of some material points alone, which cost as little as they are few."""
@@ -173,10 +175,12 @@ class Posterior:
             return np.zeros((len(self._arm[rows]), 3, 0), dtype=np.float32)
         return np.matmul(self.posed.rotation.T.astype(np.float32), self.open[rows])
 
-    def _radii(self, motion: Float32[np.ndarray, "n 3 p"], beside: Float32[np.ndarray, "n 3 e"]) -> "RadiusParts":
-        near, far = (np.matmul(part, part.transpose(0, 2, 1)).astype(np.float64) for part in (motion, beside))
-        near[:, range(3), range(3)] += self.residue**2 / 3
-        return RadiusParts(radius95(near), radius95(far))
+    def _radii(self, motion: Float32[np.ndarray, "n 3 p"], open_motion: Float32[np.ndarray, "n 3 e"]) -> "RadiusParts":
+        gaussian, open_ = (
+            np.matmul(part, part.transpose(0, 2, 1)).astype(np.float64) for part in (motion, open_motion)
+        )
+        gaussian[:, range(3), range(3)] += self.residue**2 / 3
+        return RadiusParts(radius95(gaussian), radius95(open_))
 
     def motion_of(self, gradient: Float[np.ndarray, "c v 3"]) -> Float[np.ndarray, "c p"]:
         """Change of c numbers with each of p independent standard normal ones.

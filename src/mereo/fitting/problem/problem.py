@@ -29,7 +29,7 @@ from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
 COARSE = 3
 """How many times fewer observed samples and correspondences a choice among many states needs."""
 
-BESIDE = 1.0
+TANGENTIAL_SLACK = 1.0
 """Share of the samples' spacing: an observed sample so far beside one is still on its plane."""
 
 KNOWN_SCALE_STD = 1e-6
@@ -93,10 +93,15 @@ class Problem:
 
     @classmethod
     def of(
-        cls, model: StatisticalModel, found: Correspondences, evidence: Evidence, scale_std: float, config: FitConfig
+        cls,
+        model: StatisticalModel,
+        correspondences: Correspondences,
+        evidence: Evidence,
+        scale_std: float,
+        config: FitConfig,
     ) -> "Problem":
         """Problem of one frame: what the network found, and what the frame shows."""
-        return cls(model, NetworkTerm.of(model, found), evidence, scale_std, config)
+        return cls(model, NetworkTerm.of(model, correspondences), evidence, scale_std, config)
 
     @property
     def is_scale_open(self) -> bool:
@@ -123,7 +128,7 @@ class Problem:
         normal = NormalEquations.prior(posed.z, prior.center, prior.precision, posed.log_scale, self.scale_std)
         return self.pairs.add_to(normal, posed.z, self.config.pair_weight, slack)
 
-    def noise_beside(self, surface: Surface) -> float:
+    def residual_noise(self, surface: Surface) -> float:
         """Noise of the frame, in scene units, as a fit with this surface leaves it over."""
         return noise_of(surface.offsets(self.evidence.points), self.evidence.around)
 
@@ -134,7 +139,7 @@ class Problem:
             surface: the fit's.
             is_shared: take for noise what neighbours share too.
         """
-        noise = noise_with_shared(surface.offsets(self.evidence.points)) if is_shared else self.noise_beside(surface)
+        noise = noise_with_shared(surface.offsets(self.evidence.points)) if is_shared else self.residual_noise(surface)
         config = constants_for(noise, self.config)
         if config is self.config:
             return None
@@ -146,7 +151,7 @@ class Problem:
             return False
         if self.config.turned_anyway:
             return not self.leaves_noise(surface)
-        return cloud > TAILS * (self.noise_beside(surface) / self.config.cloud_sigma) ** 2
+        return cloud > TAILS * (self.residual_noise(surface) / self.config.cloud_sigma) ** 2
 
     @property
     def by_every_point(self) -> "Problem":
@@ -156,9 +161,9 @@ class Problem:
             return self
         return replace(self, evidence=evidence.with_more_samples)
 
-    def with_network(self, found: Correspondences) -> "Problem":
+    def with_network(self, correspondences: Correspondences) -> "Problem":
         """The problem with other correspondences."""
-        return replace(self, network=NetworkTerm.of(self.model, found))
+        return replace(self, network=NetworkTerm.of(self.model, correspondences))
 
     def leaves_noise(self, surface: Surface, is_shared: bool = False) -> bool:
         """Whether what a fit leaves over is noise, and not its own error; ``is_shared`` as in ``as_noisy_as``."""
@@ -220,8 +225,8 @@ class Problem:
         place, normal, _ = samples.planes(self.evidence.observed_samples)
         offset = self.evidence.observed_samples - place
         across = np.einsum("pi,pi->p", offset, normal)
-        beside = np.sqrt(np.maximum((offset**2).sum(axis=1) - across**2, 0.0))
-        distance = np.hypot(across, np.maximum(beside - BESIDE * self.samples.spacing, 0.0))
+        tangential = np.sqrt(np.maximum((offset**2).sum(axis=1) - across**2, 0.0))
+        distance = np.hypot(across, np.maximum(tangential - TANGENTIAL_SLACK * self.samples.spacing, 0.0))
         amount = self.evidence.violations(samples.few(self.config.silhouette_vertices).place, ROBUST * sigma)[1]
         return self.total(
             float(robust_square(distance, sigma).mean()),
@@ -325,9 +330,9 @@ Of 13 noisy training views that explain .76 to .95, the network was better in on
 
 def unshared(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
     """What each point's offset does not share with those around it, as large as its noise alone would be."""
-    own = offset - np.median(offset[around], axis=1)
+    unshared_offset = offset - np.median(offset[around], axis=1)
     # the median of k neighbours is itself off by pi / 2k of their variance
-    return own / np.sqrt(1.0 + np.pi / (2 * around.shape[1]))
+    return unshared_offset / np.sqrt(1.0 + np.pi / (2 * around.shape[1]))
 
 
 def noise_of(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"]) -> float:
@@ -366,8 +371,8 @@ def is_noise(offset: Float[np.ndarray, " n"], noise: float) -> bool:
 
 def shared(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"], sigma: float) -> float:
     """Misfit of a cloud, in misfits of what its points' offsets do not share with those around them."""
-    own = unshared(offset, around)
-    return float(robust_square(offset, sigma).mean() / max(robust_square(own, sigma).mean(), 1e-12))
+    unshared_offset = unshared(offset, around)
+    return float(robust_square(offset, sigma).mean() / max(robust_square(unshared_offset, sigma).mean(), 1e-12))
 
 
 def constants_for(noise: float, config: FitConfig) -> FitConfig:

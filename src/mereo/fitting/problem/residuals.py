@@ -184,13 +184,13 @@ class Surface:
         toward, normal = points[rows], self.normals[met]
         corner = self.material[self.model.faces[self.facing[met], 0]]
         shares = np.einsum("pi,pi->p", normal, corner) / np.einsum("pi,pi->p", normal, toward)
-        there = toward * shares[:, None]
-        off = np.abs(np.einsum("pi,pi->p", normal, toward - there))
+        met_position = toward * shares[:, None]
+        off = np.abs(np.einsum("pi,pi->p", normal, toward - met_position))
         near = off <= far
         other = np.ones(len(points), dtype=bool)
         other[rows[near]] = False
         distance, face, place = np.empty(len(points)), np.empty(len(points), dtype=np.int64), np.empty_like(points)
-        distance[~other], face[~other], place[~other] = off[near], met[near], there[near]  # rows are in order
+        distance[~other], face[~other], place[~other] = off[near], met[near], met_position[near]  # rows are in order
         if other.any():
             distance[other], face[other], place[other] = self.nearest(points[other])
         return distance, face, place
@@ -234,10 +234,10 @@ class NetworkTerm:
     confidence: Float[np.ndarray, " n"]
 
     @classmethod
-    def of(cls, model: StatisticalModel, found: Correspondences) -> "NetworkTerm":
+    def of(cls, model: StatisticalModel, correspondences: Correspondences) -> "NetworkTerm":
         """Term of correspondences, whose rest places follow the model."""
-        weights = model.weights(found.rest, found.labels)
-        return cls(found.points, weights(model.mean), weights(model.modes), found.confidence)
+        weights = model.weights(correspondences.rest, correspondences.labels)
+        return cls(correspondences.points, weights(model.mean), weights(model.modes), correspondences.confidence)
 
     @classmethod
     def none(cls, model: StatisticalModel) -> "NetworkTerm":
@@ -257,14 +257,14 @@ class NetworkTerm:
         return float(self.confidence / self.confidence.sum() @ robust_square(distance, sigma))
 
     def add_to(
-        self, normal: NormalEquations, posed: Posed, sigma: float, worth: float, robust: bool
+        self, normal: NormalEquations, posed: Posed, sigma: float, total_weight: float, robust: bool
     ) -> NormalEquations:
-        """Sum with the squared distances, together worth as many independent points as ``worth``."""
+        """Sum with the squared distances, together worth as many independent points as ``total_weight``."""
         if len(self.target) == 0:
             return normal
         points = self.place(posed)
         offset = points - self.target
-        weight = self.confidence / self.confidence.sum() * (worth / sigma**2)
+        weight = self.confidence / self.confidence.sum() * (total_weight / sigma**2)
         if robust:
             weight = weight * geman_mcclure(np.linalg.norm(offset, axis=1), ROBUST * sigma)
         return normal.add(in_space(posed, points, self.modes), offset.ravel(), np.repeat(weight, 3))
@@ -276,17 +276,19 @@ def add_cloud(
     points: Float[np.ndarray, "p 3"],
     planes: Planes,
     sigma: float,
-    worth: float,
+    total_weight: float,
 ) -> NormalEquations:
     """Sum with each point's distance to its plane of the facing surface."""
-    return normal.add(*cloud_rows(posed, points, planes, sigma, worth))
+    return normal.add(*cloud_rows(posed, points, planes, sigma, total_weight))
 
 
-def cloud_rows(posed: Posed, points: Float[np.ndarray, "p 3"], planes: Planes, sigma: float, worth: float) -> Rows:
+def cloud_rows(
+    posed: Posed, points: Float[np.ndarray, "p 3"], planes: Planes, sigma: float, total_weight: float
+) -> Rows:
     """Each point's distance to its plane of the facing surface, its derivatives, and its weight."""
     place, across, modes = planes
     residual = np.einsum("pi,pi->p", across, place - points)
-    weight = geman_mcclure(residual, ROBUST * sigma) * (worth / len(points) / sigma**2)
+    weight = geman_mcclure(residual, ROBUST * sigma) * (total_weight / len(points) / sigma**2)
     return along(posed, place, modes, across), residual, weight
 
 
@@ -357,16 +359,16 @@ class PairTerm:
         return vector, np.linalg.norm(vector, axis=1)
 
     def add_to(
-        self, normal: NormalEquations, z: Float[np.ndarray, " k"], worth: float, slack: float
+        self, normal: NormalEquations, z: Float[np.ndarray, " k"], weight: float, slack: float
     ) -> NormalEquations:
-        """Sum with squared errors of all lengths, together worth ``worth`` points; ``slack`` is added to their std."""
+        """Sum with squared errors of all lengths, together worth ``weight`` points; ``slack`` is added to their std."""
         if len(self.std) == 0:
             return normal
         vector, length = self._vectors(z)
         direction = (vector / np.maximum(length, 1e-12)[:, None]).astype(np.float32)
         jacobian = np.zeros((len(length), POSE + len(z)), dtype=np.float32)
         jacobian[:, POSE:] = np.matmul(direction[:, None], self.modes)[:, 0]
-        return normal.add(jacobian, length - self.distance, worth / len(length) / (self.std**2 + slack**2))
+        return normal.add(jacobian, length - self.distance, weight / len(length) / (self.std**2 + slack**2))
 
     def energy(self, z: Float[np.ndarray, " k"]) -> float:
         """Mean squared error of the lengths, in standard deviations; 0 without pairs."""

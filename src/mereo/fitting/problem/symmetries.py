@@ -79,7 +79,7 @@ def find_symmetries(model: StatisticalModel) -> tuple[Symmetry, ...]:
     """All such turns of an object that its states make, none of one without states; found once for a model."""
     if model.count == 0:
         return ()
-    corners, found = corners_of(model), list[Symmetry]()
+    corners, symmetries = corners_of(model), list[Symmetry]()
     # from the rest pose, not from the mean, in which a part that spins is crushed
     states = positions(model, corners, model.library[:: max(1, len(model.library) // STATES)])
     rotation, joints = segment_poses(model.rest_points[corners], states)[0], branches(model)
@@ -88,11 +88,11 @@ def find_symmetries(model: StatisticalModel) -> tuple[Symmetry, ...]:
         for axis in axes:
             alike = ANGLES[self_distances(segment, center, axis) <= ALIKE]
             neighbors = {b if a == index else a for a, b, _ in joints if index in (a, b)}
-            plausible = turned_so(rotation, index, neighbors, axis, alike)
+            plausible = plausibility(rotation, index, neighbors, axis, alike)
             kept = plausible > SELDOM
             if kept.any():
-                found.append(Symmetry(index + 1, center, axis, alike[kept], plausible[kept]))
-    return tuple(found)
+                symmetries.append(Symmetry(index + 1, center, axis, alike[kept], plausible[kept]))
+    return tuple(symmetries)
 
 
 def principal_axes(segment: Segment) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
@@ -118,7 +118,7 @@ def self_distances(
     return off
 
 
-def turned_so(
+def plausibility(
     rotation: Float[np.ndarray, "n s 3 3"],
     index: int,
     neighbors: Collection[int],
@@ -156,7 +156,7 @@ def left_open(
     material: Float[np.ndarray, "m 3"],
     observed_samples: Float[np.ndarray, "n 3"],
     sigma: float,
-    worth: float,
+    total_weight: float,
 ) -> Float32[np.ndarray, "m 3 e"]:
     """Motion of each material point with e independent standard normal numbers, of the second moments of its turns.
 
@@ -165,7 +165,7 @@ def left_open(
         material: registered material points.
         observed_samples: observed points, in the same frame.
         sigma: the cloud's, scene units.
-        worth: how many independent points all observed samples are worth.
+        total_weight: how many independent points all observed samples are worth.
     """
     turns = find_symmetries(model)
     motion = np.zeros((len(material), 3, 2 * len(turns)), dtype=np.float32)
@@ -179,7 +179,11 @@ def left_open(
         T = fit_rigid(model.rest_points[rows], material[rows])
         center, axis = T[:3, :3] @ turn.center + T[:3, 3], T[:3, :3] @ turn.axis
         seen = observed_samples[owner == turn.label]
-        worse = _worse(segments[turn.label - 1], turn.angles, seen, center, axis, sigma) * worth / len(observed_samples)
+        worse = (
+            _worse(segments[turn.label - 1], turn.angles, seen, center, axis, sigma)
+            * total_weight
+            / len(observed_samples)
+        )
         weight = np.append(turn.plausible * np.exp(-0.5 * COUNTED * np.maximum(worse, 0.0)), 1.0)
         angle = np.append(turn.angles, 0.0)
         steps = np.stack([np.sin(angle), 1.0 - np.cos(angle)])

@@ -67,7 +67,7 @@ class Candidate:
         """How far apart network and registration have the same places (``Signs.displaced``); None without a fit."""
         if self.modes is None:
             return None
-        return self.modes.found.displaced(registration.model, registration.material / self.modes.unit)
+        return self.modes.correspondences.displaced(registration.model, registration.material / self.modes.unit)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -138,8 +138,8 @@ class Answer:
             return "lost"
         if self.registration is None:
             return "network alone" if self.refusal is None else f"network alone: {self.refusal}"
-        told = self.registration.told
-        return told if self.taken else f"network alone: the {told}, too few"
+        description = self.registration.told
+        return description if self.taken else f"network alone: the {description}, too few"
 
     @cached_property
     def registered(self) -> Registration | None:

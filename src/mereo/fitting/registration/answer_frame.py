@@ -107,7 +107,7 @@ def answer_of(
     taken = registrar is not None and registration is not None and registrar.takes(registration)
     hypothesis = candidate.hypothesis if taken else likelier.reading
     if taken and registrar is not None and registration is not None:
-        seen = in_found_unit(seen, registrar, registration, recognition)
+        seen = in_registered_unit(seen, registrar, registration, recognition)
     return Answer(
         seen=seen.read_as(hypothesis),
         model=model,
@@ -123,7 +123,7 @@ def answer_of(
     )
 
 
-def in_found_unit(
+def in_registered_unit(
     seen: Observation, registrar: Registrar, registration: Registration, recognition: Recognition
 ) -> Observation:
     """Observation in the unit that a registration finds, where the frame knows none; another object's says nothing."""
@@ -146,16 +146,18 @@ def find(
     if registrar is not None and not registrar.asks_network:
         return search_hypotheses(seen, registrar, keep_all, scene_unit)
     assert model is not None
-    found, likelier = fit_hypotheses(seen, model, registrar, keep_all, scene_unit)
-    if registrar is None or not registrar.asks_search or not is_doubtful(seen, found):
-        return found, likelier
+    candidate, likelier = fit_hypotheses(seen, model, registrar, keep_all, scene_unit)
+    if registrar is None or not registrar.asks_search or not is_doubtful(seen, candidate):
+        return candidate, likelier
     searched, _ = search_hypotheses(seen, registrar, keep_all, scene_unit)
-    return more_evident(found, searched), likelier
+    return more_evident(candidate, searched), likelier
 
 
-def is_doubtful(seen: Observation, found: Candidate) -> bool:
+def is_doubtful(seen: Observation, candidate: Candidate) -> bool:
     """Whether a search may find the object where the network's fit has not."""
-    return not found.is_accepted or is_forced(found) or is_astray(found) or is_hidden_in_part(seen, found)
+    return (
+        not candidate.is_accepted or is_forced(candidate) or is_astray(candidate) or is_hidden_in_part(seen, candidate)
+    )
 
 
 def is_forced(candidate: Candidate) -> bool:
@@ -192,8 +194,8 @@ def more_evident(first: Candidate, second: Candidate) -> Candidate:
         return first if second.modes is None else second
     if second.is_accepted and not first.is_accepted:
         return second
-    one, other = first.modes.problem.evidence.other_lines, second.modes.problem.evidence.other_lines
-    if one == other:
+    first_kind, second_kind = first.modes.problem.evidence.other_lines, second.modes.problem.evidence.other_lines
+    if first_kind == second_kind:
         return second if misfit_in(first.modes, second.modes) < misfit_in(first.modes, first.modes) else first
     cost = [
         misfit_in(each, each) + (WHOLE if each.problem.evidence.other_lines == "unknown" else 0.0)
@@ -293,7 +295,7 @@ def search_hypotheses(
     the likelier hypothesis.
     """
     unit, axes = registrar.stated_scene_unit(seen.frame.unit_m) if scene_unit is None else scene_unit, seen.frame.axes
-    likelier, *others = (encode_frame(one, None, axes) for one in readings(seen.cloud, axes, keep_all))
+    likelier, *others = (encode_frame(reading, None, axes) for reading in readings(seen.cloud, axes, keep_all))
     best = _searched(likelier, registrar, unit, seen.lines)
     for other in others:
         if best.is_accepted:
@@ -302,11 +304,11 @@ def search_hypotheses(
     return best, likelier
 
 
-def _searched(frame: EncodedFrame, registrar: Registrar, scene_unit: float | None, beside: SightLines) -> Candidate:
-    """Candidate of one hypothesis by a search; ``beside`` are the lines of sight beside the object."""
+def _searched(frame: EncodedFrame, registrar: Registrar, scene_unit: float | None, lines: SightLines) -> Candidate:
+    """Candidate of one hypothesis by a search; ``lines`` are the lines of sight beside the object."""
     try:
         check_size(frame, registrar.model, scene_unit)
-        modes = search_modes(cloud_to_fit(frame, beside, scene_unit), registrar.model, registrar.config)
+        modes = search_modes(cloud_to_fit(frame, lines, scene_unit), registrar.model, registrar.config)
     except ValueError as error:
         return Candidate(frame, error=error, found_by="search")
     return Candidate(frame, modes, found_by="search")
@@ -339,8 +341,10 @@ def check_size(frame: EncodedFrame, model: StatisticalModel, scene_unit: float |
 def _are_object(everything: Candidate, surfaces: Candidate) -> bool:
     """Whether the points that one hypothesis drops are the object's: either fit explains them."""
     dropped = ~surfaces.hypothesis.keep
-    fits = [(one, one.modes) for one in (everything, surfaces) if one.modes is not None]
-    return bool(max((one.off_surface[dropped] <= modes.tolerance).mean() for one, modes in fits) > GIVEN_BACK)
+    fits = [(candidate, candidate.modes) for candidate in (everything, surfaces) if candidate.modes is not None]
+    return bool(
+        max((candidate.off_surface[dropped] <= modes.tolerance).mean() for candidate, modes in fits) > GIVEN_BACK
+    )
 
 
 def _with_explained_given_back(surfaces: Candidate) -> Reading | None:
@@ -353,8 +357,8 @@ def _with_explained_given_back(surfaces: Candidate) -> Reading | None:
 def _most_explained(everything: Candidate, surfaces: Candidate, again: Candidate) -> Candidate:
     """Choose among every point, the points on surfaces, and these with explained points given back."""
     candidates = everything, surfaces, again
-    tolerance = min(one.modes.tolerance for one in candidates if one.modes is not None)
-    by_all, by_surfaces, by_again = (one.explained(tolerance) for one in candidates)
+    tolerance = min(candidate.modes.tolerance for candidate in candidates if candidate.modes is not None)
+    by_all, by_surfaces, by_again = (candidate.explained(tolerance) for candidate in candidates)
     if by_all >= max(by_surfaces, by_again) + CLEARLY:
         return everything
     return again if by_again >= by_surfaces - AS_WELL else surfaces
@@ -391,12 +395,12 @@ def search_modes(
         evidence = cloud.evidence(unit)
         whole = Problem(model, NetworkTerm.none(model), evidence, cloud.scale_std(config), config)
         partial = replace(whole, evidence=replace(evidence, other_lines="unknown")) if is_open else None
-        found = search(whole, partial)
-        problem, modes = found.problem, found.best
+        outcome = search(whole, partial)
+        problem, modes = outcome.problem, outcome.best
         rest = fit_rest(problem, nothing(), modes.posed)
         at_rest = is_at_rest(problem, modes, rest)
     seconds = time.perf_counter() - started
-    return ModesFit(problem, nothing(), unit, modes.posed, seconds, rest if at_rest else None, alike=found.alike)
+    return ModesFit(problem, nothing(), unit, modes.posed, seconds, rest if at_rest else None, alike=outcome.alike)
 
 
 def size_of(points: Float[np.ndarray, "n 3"], model: StatisticalModel) -> float:

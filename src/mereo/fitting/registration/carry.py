@@ -50,7 +50,7 @@ TOLERANCE = 0.04
 """Voxels of the source by which that may be off at a cell's centre. Elsewhere in it, where the nearest material points
 change, it is up to twice as much: inside the object less than 0.1."""
 
-ASKED_AT_ONCE = 2000
+QUERIES_AT_ONCE = 2000
 """Points that ``to_rest`` is asked about at once: of more its weights leave the cache, and it takes twice as long."""
 
 CELLS_AT_ONCE = 1024
@@ -128,14 +128,14 @@ def check_overlap(
     sample = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
     if solids.label(transform_points(volume.T_world_index, sample)).any():
         return
-    there, own = (
+    volume_extent, object_extent = (
         " to ".join(str(corner.round(2).tolist()) for corner in _box(np.linalg.inv(T_scene_file), bounds))
         for bounds in (volume.bounds, model.rest.bounds)
     )
     raise ValueError(
-        f"{name} holds nothing of the object: in RAS its voxels lie from {there}, and the object's own files from "
-        f"{own}; both must have one frame and unit: export the volume in that of the object's own files, or say "
-        "--carry-frame scene if it is in scene units"
+        f"{name} holds nothing of the object: in RAS its voxels lie from {volume_extent}, and the object's own files "
+        f"from {object_extent}; both must have one frame and unit: export the volume in that of the object's own "
+        "files, or say --carry-frame scene if it is in scene units"
     )
 
 
@@ -212,8 +212,8 @@ class _Grid:
         rows = rows[owner.ravel()[rows] == 0]
         for first in range(0, len(rows), POINTS_AT_ONCE):
             part = rows[first : first + POINTS_AT_ONCE]
-            found = solids.nearest(self.at(np.stack(np.unravel_index(part, self.shape), axis=1)))
-            owner.reshape(-1)[part] = np.where(found.distance <= margin, found.owner + 1, 0)
+            nearest = solids.nearest(self.at(np.stack(np.unravel_index(part, self.shape), axis=1)))
+            owner.reshape(-1)[part] = np.where(nearest.distance <= margin, nearest.owner + 1, 0)
         return owner, inside
 
 
@@ -230,12 +230,12 @@ class _Sampler:
         values, held = self.source.values, self.source.holds(index)
         if self.interpolation == "nearest":
             nearest = np.clip(np.rint(index).astype(np.int64), 0, np.array(values.shape) - 1)
-            found = values[tuple(nearest.T)]
+            sampled = values[tuple(nearest.T)]
         else:
             smooth = map_coordinates(values, index.T, order=1, mode="nearest", output=np.float64)
-            found = (np.rint(smooth) if values.dtype.kind in "iu" else smooth).astype(values.dtype)
-        found[~held] = self.background
-        return found, held
+            sampled = (np.rint(smooth) if values.dtype.kind in "iu" else smooth).astype(values.dtype)
+        sampled[~held] = self.background
+        return sampled, held
 
 
 def _fill(
@@ -292,9 +292,9 @@ def _source_index(
 ) -> Float[np.ndarray, "n 3"]:
     """Voxel indices, with fractions, of where places were at rest that move along with a segment."""
     rest = np.empty_like(places)
-    for first in range(0, len(places), ASKED_AT_ONCE):
-        part = places[first : first + ASKED_AT_ONCE]
-        rest[first : first + ASKED_AT_ONCE] = registration.to_rest(part, np.full(len(part), label, dtype=np.uint8))
+    for first in range(0, len(places), QUERIES_AT_ONCE):
+        part = places[first : first + QUERIES_AT_ONCE]
+        rest[first : first + QUERIES_AT_ONCE] = registration.to_rest(part, np.full(len(part), label, dtype=np.uint8))
     return source.index_of(rest)
 
 
@@ -430,7 +430,7 @@ def place(attachments: Sequence[Attachment], registrar: Registrar, frame: CarryF
     """
     T_scene_file = np.eye(4) if frame == "scene" else _source_frame(registrar).T_scene_source
     solids = Solids(registrar.model.rest)
-    return tuple(_placed(one, T_scene_file, registrar.model, solids) for one in attachments)
+    return tuple(_placed(attachment, T_scene_file, registrar.model, solids) for attachment in attachments)
 
 
 def carry(placed: Placed, registration: Registration, interpolation: Interpolation = "auto") -> Carried:
@@ -440,14 +440,14 @@ def carry(placed: Placed, registration: Registration, interpolation: Interpolati
     """
     content = placed.content
     if isinstance(content, Volume):
-        found, around = resampled(content, registration, interpolation), MARGIN * registration.model.half
+        resampled_volume, around = resampled(content, registration, interpolation), MARGIN * registration.model.half
         return CarriedVolume(
             placed.name,
-            found.volume,
-            found.inside,
+            resampled_volume.volume,
+            resampled_volume.inside,
             around * registration.scene_unit,
-            found.within,
-            found.interpolation,
+            resampled_volume.within,
+            resampled_volume.interpolation,
         )
     points = moved(registration, content.points, placed.shares)
     rotations = None
@@ -489,15 +489,15 @@ def local_rotations(
 
 
 def _source_frame(registrar: Registrar) -> SourceFrame:
-    found = registrar.model.source_frame
-    if found is None and registrar.given is not None:
-        found = registrar.given.source_frame
-    if found is None:
+    frame = registrar.model.source_frame
+    if frame is None and registrar.given is not None:
+        frame = registrar.given.source_frame
+    if frame is None:
         raise ValueError(
             f"the weights of {', '.join(registrar.model.rest.names)} do not say how the object's own files lie in the "
             "scene: name the object's scene file with --scene, or carry files in scene units with --carry-frame scene"
         )
-    return found
+    return frame
 
 
 def _placed(

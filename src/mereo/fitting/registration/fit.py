@@ -23,7 +23,7 @@ from mereo.fitting.modes.fit import (
     fit_rest,
     is_at_rest,
     of_rest,
-    with_turns,
+    with_turned_camera,
 )
 from mereo.fitting.modes.fit import narrowing as modes_narrowing
 from mereo.fitting.problem.correspondences import Correspondences, agree, estimate_unit, find_correspondences
@@ -77,7 +77,7 @@ class ModesFit:
 
     Attributes:
         problem: everything the fit works on, scene units.
-        found: correspondences, scene units.
+        correspondences: correspondences, scene units.
         unit: length of a scene unit in the cloud's unit, before the fit's own scale.
         posed: coefficients and pose.
         seconds: that it took.
@@ -87,7 +87,7 @@ class ModesFit:
     """
 
     problem: Problem
-    found: Correspondences
+    correspondences: Correspondences
     unit: float
     posed: Posed
     seconds: float
@@ -99,42 +99,46 @@ class ModesFit:
     def of(
         cls,
         cloud: CloudToFit,
-        found: Correspondences,
+        correspondences: Correspondences,
         model: StatisticalModel,
         config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
-        ask: PredictCorrespondences | None = None,
+        predict: PredictCorrespondences | None = None,
     ) -> "ModesFit":
         """Fit of the modes to a cloud, with correspondences in its unit.
 
-        Where much is unexplained, the network is asked again with the camera turned (``with_turns``); where what is
-        left is noise, the frame is fitted once more as a noisy one.
+        Where much is unexplained, the network predicts again with the camera turned (``with_turned_camera``); where
+        what is left is noise, the frame is fitted once more as a noisy one.
 
         Args:
             cloud: its lines of sight went past the object where it leaves that open.
-            found: correspondences.
+            correspondences: correspondences.
             model: the statistical model.
             config: constants.
-            ask: what the network states about points of the camera frame, in the cloud's unit; None without one.
+            predict: what the network states about points of the camera frame, in the cloud's unit; None without one.
         """
         started = time.perf_counter()
-        unit = estimate_unit(found) if cloud.scene_unit is None else cloud.scene_unit
-        found = found.scaled(1 / unit)
+        unit = estimate_unit(correspondences) if cloud.scene_unit is None else cloud.scene_unit
+        correspondences = correspondences.scaled(1 / unit)
 
-        def asked(seen: Float[np.ndarray, "s 3"]) -> Correspondences:
-            assert ask is not None
-            return ask(seen * unit).scaled(1 / unit)
+        def predict_in_scene_units(seen: Float[np.ndarray, "s 3"]) -> Correspondences:
+            assert predict is not None
+            return predict(seen * unit).scaled(1 / unit)
 
         with one_blas_thread():
-            problem = Problem.of(model, found, cloud.evidence(unit), cloud.scale_std(config), config)
-            understood = problem, found, fit_modes(problem)
-            again = None if ask is None else asked
-            problem, found, modes = as_noisy(with_turns(understood, again), cloud.points / unit, again)
-            rest = fit_rest(problem, found, modes.posed)
+            problem = Problem.of(model, correspondences, cloud.evidence(unit), cloud.scale_std(config), config)
+            network_fit = problem, correspondences, fit_modes(problem)
+            predict_scaled = None if predict is None else predict_in_scene_units
+            problem, correspondences, modes = as_noisy(
+                with_turned_camera(network_fit, predict_scaled), cloud.points / unit, predict_scaled
+            )
+            rest = fit_rest(problem, correspondences, modes.posed)
             at_rest = is_at_rest(problem, modes, rest)
-        return cls(problem, found, unit, modes.posed, time.perf_counter() - started, rest if at_rest else None)
+        return cls(
+            problem, correspondences, unit, modes.posed, time.perf_counter() - started, rest if at_rest else None
+        )
 
     @property
-    def asks_draws(self) -> bool:
+    def may_take_draws(self) -> bool:
         """Whether draws may be the answer: beside the rest model only under noise, where modes may miss what moved."""
         return self.rest is None or self.problem.noisy
 
@@ -163,7 +167,7 @@ class ModesFit:
     def _registered(self) -> Registration:
         if self.rest is not None:
             bent = self.posed.place(self.problem.model.material(self.posed.z))
-            end = ModesOptimum(of_rest(self.problem, self.found), self.rest.posed, self.unit, bent)
+            end = ModesOptimum(of_rest(self.problem, self.correspondences), self.rest.posed, self.unit, bent)
             return self._registration("rest", self.problem.model.rest_z, end, self.rest.posed, self.surface)
         end = ModesOptimum(self.problem, self.posed, self.unit)
         return self._registration("modes", self.posed.z, end, self.posed, self.surface)
@@ -174,26 +178,26 @@ class ModesFit:
         Modes can imitate what they do not hold, with more of them than a scene has draws; the evidence counts that.
         It does not speak against draws, which have the states that there really are.
         """
-        if not self.asks_draws:
+        if not self.may_take_draws:
             return self.registration()
         started = time.perf_counter()
         with one_blas_thread():
-            problem = DrawsProblem.of(self.problem, states, self.found)
+            problem = DrawsProblem.of(self.problem, states, self.correspondences)
             drawn = fit_draws(problem, self.posed)
             taken = drawn is not None and is_drawn(problem, drawn, self.posed, self.rest)
         seconds = self.seconds + time.perf_counter() - started
         if drawn is None or not taken:
             return replace(self.registration(), seconds=seconds)
         end = DrawsOptimum(problem, drawn, self.unit)
-        found = self._registration("draws", drawn.z, end, drawn.posed, drawn.surface)
-        return replace(found, drawn=replace(drawn.drawn, z=drawn.z), seconds=seconds)
+        registration = self._registration("draws", drawn.z, end, drawn.posed, drawn.surface)
+        return replace(registration, drawn=replace(drawn.drawn, z=drawn.z), seconds=seconds)
 
     def _registration(
         self, method: Method, z: Float[np.ndarray, " k"], optimum: Optimum, posed: Posed, surface: Surface
     ) -> Registration:
         distance = surface.nearest(self.problem.evidence.observed_samples)[0]
         explained = float((distance <= self.tolerance).mean())
-        scale, beside = self._radius_factors(method, surface)
+        scale, extra_radius = self._radius_factors(method, surface)
         return Registration(
             model=self.problem.model,
             material=surface.material * self.unit,
@@ -209,7 +213,7 @@ class ModesFit:
             needed=self.problem.config.accepted,
             optimum=optimum,
             radius_scale=scale,
-            extra_radius=beside,
+            extra_radius=extra_radius,
             alike=self.alike,
         )
 
@@ -219,7 +223,7 @@ class ModesFit:
             return None, 0.0
         factors, model = self.calibration.radii(draws=method == "draws", noisy=self.problem.noisy), self.problem.model
         scale = factors.scale if factors.misfit is None else factors.scale_at(self.problem.cloud_misfit(surface))
-        displaced = None if factors.displaced is None else self.found.displaced(model, surface.material)
+        displaced = None if factors.displaced is None else self.correspondences.displaced(model, surface.material)
         return scale, model.half * factors.beside(displaced)
 
     def _is_believed(self, explained: float, surface: Surface) -> bool:
@@ -233,7 +237,7 @@ class ModesFit:
 
     def _agreement(self, surface: Surface) -> float:
         """Share of the correspondences on the object whose segment is that of the nearest place of the surface."""
-        seen = self.found.rows(self.found.observed)
+        seen = self.correspondences.rows(self.correspondences.observed)
         if len(seen.points) == 0:  # a tracked frame, of which the network was not asked
             return 0.0
         face = surface.nearest(seen.points)[1]
@@ -247,7 +251,7 @@ def is_drawn(problem: DrawsProblem, drawn: DrawsFit, modes: Posed, rest: ScoredF
     By the points that the answer was fitted to.
     """
     if rest is not None:
-        unbent = of_rest(problem.last, problem.found).misfit(rest.posed).total
+        unbent = of_rest(problem.last, problem.correspondences).misfit(rest.posed).total
         return drawn.misfit + draws_narrowing(problem, drawn) < unbent
     gain = drawn.misfit - problem.last.misfit(modes).total
     return gain < 0 or gain < modes_narrowing(problem.base, modes) - draws_narrowing(problem, drawn)
@@ -278,37 +282,37 @@ def fit_frame(
             f"{', '.join(model.rest.names)}; they must be of one object: build the model from the weights' own scene"
         )
     code = network.encode(PointCloud(cloud.points)) if code is None else code
-    found = _asked(network, model, code)
+    correspondences = predict_correspondences(network, model, code)
     unit = cloud.scene_unit
-    if unit is not None and not cloud.is_unit_certain and not agree(estimate_unit(found), unit):
+    if unit is not None and not cloud.is_unit_certain and not agree(estimate_unit(correspondences), unit):
         cloud = replace(cloud, scene_unit=None)
-    asked = time.perf_counter() - started
+    encoding_s = time.perf_counter() - started
 
-    def ask(points: Float[np.ndarray, "s 3"]) -> Correspondences:
-        return _asked(network, model, network.encode(PointCloud(points)))
+    def predict(points: Float[np.ndarray, "s 3"]) -> Correspondences:
+        return predict_correspondences(network, model, network.encode(PointCloud(points)))
 
-    fitted = ModesFit.of(cloud, found, model, config, ask)
-    return replace(fitted, seconds=fitted.seconds + asked, calibration=network.calibration)
+    fitted = ModesFit.of(cloud, correspondences, model, config, predict)
+    return replace(fitted, seconds=fitted.seconds + encoding_s, calibration=network.calibration)
 
 
-def _asked(network: Trained, model: StatisticalModel, code: EncodedCloud) -> Correspondences:
+def predict_correspondences(network: Trained, model: StatisticalModel, code: EncodedCloud) -> Correspondences:
     """Correspondences that the network states for a cloud, evenly."""
-    found = find_correspondences(network, code, model.rest_center, model.half)
-    if found is None:
+    correspondences = find_correspondences(network, code, model.rest_center, model.half)
+    if correspondences is None:
         raise ValueError(
             "the weights predict no rest coordinates, from which a fit starts; train with a dataset that has a template"
         )
-    return found.evenly()
+    return correspondences.evenly()
 
 
 def fit_correspondences(
     points: Float[np.ndarray, "n 3"],
-    found: Correspondences,
+    correspondences: Correspondences,
     model: StatisticalModel,
     scene_unit: float | None = None,
     states: DrawnStates | None = None,
     config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
 ) -> Registration:
     """Registration from given correspondences, with ``states`` by the scene's draws too; ``points`` are the cloud."""
-    fitted = ModesFit.of(CloudToFit(points, scene_unit), found, model, config)
+    fitted = ModesFit.of(CloudToFit(points, scene_unit), correspondences, model, config)
     return fitted.registration() if states is None else fitted.with_draws(states)

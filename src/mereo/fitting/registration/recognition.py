@@ -107,8 +107,8 @@ class Signs:
     @property
     def logarithms(self) -> dict[SignName, float]:
         """Logarithms of the signs that are known."""
-        found = {name: getattr(self, name) for name in LEAST}
-        return {name: float(np.log(value + LEAST[name])) for name, value in found.items() if value is not None}
+        signs = {name: getattr(self, name) for name in LEAST}
+        return {name: float(np.log(value + LEAST[name])) for name, value in signs.items() if value is not None}
 
     def strange(self, usual: Mapping[SignName, Usual]) -> dict[SignName, float]:
         """Standard deviations by which each sign lies above what is usual; 0 where it does not."""
@@ -151,7 +151,11 @@ class Recognition:
     @property
     def told(self) -> str | None:
         """Sentence for people; None where the object is known."""
-        return None if self.reason is None else told_of(self.known, self.reason)
+        if self.reason is None:
+            return None
+        return (
+            f"{'doubtful' if self.known == 'unsure' else 'not the object in a state that was learned'}: {self.reason}"
+        )
 
     def facts(self) -> dict[str, Any]:
         """Content of ``recognition`` in a result's summary."""
@@ -162,11 +166,6 @@ class Recognition:
             "calibrated": self.calibrated,
             "signs": None if self.signs is None else asdict(self.signs),
         }
-
-
-def told_of(known: Known, reason: str) -> str:
-    """Sentence for people about a frame that is not known for sure."""
-    return f"{'doubtful' if known == 'unsure' else 'not the object in a state that was learned'}: {reason}"
 
 
 NOT_ASKED = Recognition("unsure", "the network alone cannot tell its object from others: use --method auto", 0.0)
@@ -191,17 +190,17 @@ def recognize(
     """
     if registration is None:
         return NOT_ASKED if refusal is None else Recognition(False, refusal, MOST)
-    own = None if calibration is None else calibration.recognizing
-    limits = CONSERVATIVE if own is None else own
+    calibrated = None if calibration is None else calibration.recognizing
+    limits = CONSERVATIVE if calibrated is None else calibrated
     signs = Signs.of(registration, displaced, stated_scene_unit)
     each = signs.strange(limits.noisy if is_noisy(registration) else limits.clean)
     total = strangeness(each)
     is_unit_wrong = signs.size is not None and signs.size > WRONG_UNIT
     if total <= limits.unsure and not is_unit_wrong:
-        return Recognition(True, None, total, signs, own is not None)
+        return Recognition(True, None, total, signs, calibrated is not None)
     known: Known = False if total >= limits.refused or is_unit_wrong else "unsure"
     reason = REASONS["size" if is_unit_wrong else max(each, key=lambda name: each[name])](registration, signs)
-    return Recognition(known, reason, total, signs, own is not None)
+    return Recognition(known, reason, total, signs, calibrated is not None)
 
 
 # --- reasons ----------------------------------------------------------------------------------------------------------

@@ -120,8 +120,8 @@ class Registrar:
     @property
     def asks_search(self) -> bool:
         """Whether a search is asked too where the network's fit does not explain the frame: seconds a frame."""
-        is_one = self.network is not None and self.network.names == self.model.rest.names
-        return self.method == "auto" and self.config.turned and is_one
+        is_same_object = self.network is not None and self.network.names == self.model.rest.names
+        return self.method == "auto" and self.config.turned and is_same_object
 
     @property
     def fits_draws(self) -> bool:
@@ -187,7 +187,7 @@ class Registrar:
         """
         modes = fitted.registration()
         hopeless = self.method != "full" and not modes.accepted
-        states = None if not self.fits_draws or hopeless or not fitted.asks_draws else self.states_or_none
+        states = None if not self.fits_draws or hopeless or not fitted.may_take_draws else self.states_or_none
         return modes if states is None else fitted.with_draws(states)
 
     def takes(self, registration: Registration) -> bool:
@@ -224,16 +224,16 @@ def other_mesh(scene: Scene, model: StatisticalModel) -> str | None:
 
     Places of a statistical model mean nothing on another mesh.
     """
-    said = f"the scene {scene.name!r} has other segments or meshes than the weights' own model"
+    difference = f"the scene {scene.name!r} has other segments or meshes than the weights' own model"
     if scene.rest.names != model.rest.names:
-        return f"{said} ({listed(scene.rest.names)}; theirs: {listed(model.rest.names)})"
+        return f"{difference} ({listed(scene.rest.names)}; theirs: {listed(model.rest.names)})"
     for now, then in zip(scene.rest.segments, model.rest.segments, strict=True):
         for count, before, what in (
             (len(now.vertices), len(then.vertices), "vertices"),
             (len(now.faces), len(then.faces), "faces"),
         ):
             if count != before:
-                return f"{said} (its segment {now.name!r} has {count} {what}, theirs {before})"
+                return f"{difference} (its segment {now.name!r} has {count} {what}, theirs {before})"
     return None
 
 

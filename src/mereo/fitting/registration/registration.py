@@ -165,8 +165,8 @@ class Registration:
         for label in np.unique(labels):
             rows = np.flatnonzero(labels == label)
             motion = SegmentMotion(self.model.rest_anchors[label - 1], self.material)
-            found, converged = newton(motion, points[rows], guess[rows])
-            result[rows[converged]] = found[converged]
+            inverted, converged = newton(motion, points[rows], guess[rows])
+            result[rows[converged]] = inverted[converged]
         return result
 
     def query(self, points: ArrayLike) -> Located:
@@ -230,10 +230,10 @@ class Registration:
             rest = self.to_rest(point, label) if at == "camera" else point
             place = self.to_camera(rest, label)[0]
             decided = self.uncertainty.decided_point(rest, label)
-        return Explanation.of(place, decided, self.uncertainty.optimum, self._T_here_fit)
+        return Explanation.of(place, decided, self.uncertainty.optimum, self._T_registration_fit)
 
     @cached_property
-    def _T_here_fit(self) -> Float[np.ndarray, "4 4"]:
+    def _T_registration_fit(self) -> Float[np.ndarray, "4 4"]:
         """From the camera frame of the fit, in the input's unit, to that in which this registration is."""
         assert self.optimum is not None
         return fit_rigid(self.optimum.unit * self.optimum.posterior.material, self.material)

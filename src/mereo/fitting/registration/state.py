@@ -182,10 +182,12 @@ def parse_state(content: str | bytes, name: str) -> RegistrationState:
     try:
         return RegistrationState.model_validate_json(content)
     except ValidationError as error:
-        raise ValueError(f"{name} is no state of a registration: {said(error.errors()[0])}: {STATE_CURE}") from None
+        raise ValueError(
+            f"{name} is no state of a registration: {describe_error(error.errors()[0])}: {STATE_CURE}"
+        ) from None
 
 
-def said(problem: ErrorDetails) -> str:
+def describe_error(problem: ErrorDetails) -> str:
     """What is wrong first, and its value."""
     place = ".".join(str(step) for step in problem["loc"])
     rule = problem["msg"].removeprefix("Value error, ").replace("Input should", "it must").replace("should", "must")

@@ -98,12 +98,12 @@ class SightTable:
         row = index[..., 0] * cells + index[..., 1]
         distance = np.sqrt(np.einsum("nwi,nwi->nw", place, place))
         toward, free = self.toward[row], self.free[row]
-        beside = free > distance - slack
+        is_past = free > distance - slack
         sideways = toward * distance[..., None] - place
         length = np.sqrt(np.einsum("nwi,nwi->nw", sideways, sideways))
-        direction = np.where(beside[..., None], sideways / np.maximum(length, 1e-9)[..., None], toward)
+        direction = np.where(is_past[..., None], sideways / np.maximum(length, 1e-9)[..., None], toward)
         ahead = np.where(free < 0, self.front[row] - slack - distance, 0.0)
-        amount = np.where(beside, length - self.pitch * distance, ahead)
+        amount = np.where(is_past, length - self.pitch * distance, ahead)
         return direction, np.maximum(amount, 0.0).astype(np.float32)
 
 
@@ -244,7 +244,7 @@ class Poses:
     @classmethod
     def of_all(cls, parts: "list[Poses]") -> "Poses":
         """All of several."""
-        return cls(*(np.concatenate(part) for part in zip(*(vars(one).values() for one in parts), strict=True)))
+        return cls(*(np.concatenate(part) for part in zip(*(vars(part).values() for part in parts), strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,7 +320,7 @@ class Screen:
         """Poses after a rigid step, with the costs that they had before; ``sigma`` is a share of ``half``."""
         return self._in_blocks(poses, sigma, True)
 
-    def judged(self, poses: Poses, sigma: float) -> Poses:
+    def scored(self, poses: Poses, sigma: float) -> Poses:
         """Poses with their costs for a sigma in shares of ``half``."""
         return self._in_blocks(poses, sigma, False)
 

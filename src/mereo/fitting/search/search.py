@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from mereo.fitting.modes.fit import ScoredFit, explored, fit_cloud, fit_wide, refined
 from mereo.fitting.problem.gauss_newton import Posed
-from mereo.fitting.problem.joints import corner_places
+from mereo.fitting.problem.joints import corner_positions
 from mereo.fitting.problem.problem import UNEXPLAINED, Problem
 from mereo.fitting.problem.residuals import Prior
 from mereo.fitting.search.screening import Poses, Screen, tables_of
@@ -121,7 +121,7 @@ class _Trail:
         return is_explained(self.problem, self.best)
 
     def go_on(self, stage: SearchRound) -> None:
-        self.fitted += fit_likely(self.problem, candidates(self.problem, stage), stage.fitted)
+        self.fitted += fit_candidates(self.problem, candidates(self.problem, stage), stage.fitted)
         if not self.is_explained:
             self.fitted.append(explored(self.problem, self.best))
 
@@ -131,7 +131,7 @@ class _Trail:
         Each pixel's own, or shared by neighbours. Not before other states were tried: a wrong state may leave over
         what looks like noise.
         """
-        states = [judged.posed for judged in sorted(self.fitted, key=_total)]
+        states = [scored.posed for scored in sorted(self.fitted, key=_total)]
         for is_shared in (False, True):
             noisy = self.problem.as_noisy_as(self.best.surface, is_shared)
             if noisy is None:
@@ -144,8 +144,8 @@ class _Trail:
 
     def outcome(self) -> SearchOutcome:
         best = self.best
-        likely = [judged for judged in self.fitted if judged.misfit.cloud < best.misfit.cloud + ALIKE]
-        alike = differing(self.problem, [judged.posed for judged in sorted(likely, key=_total)], APART)
+        rivals = [scored for scored in self.fitted if scored.misfit.cloud < best.misfit.cloud + ALIKE]
+        alike = differing(self.problem, [scored.posed for scored in sorted(rivals, key=_total)], APART)
         return SearchOutcome(self.problem, best, len(alike), len(self.fitted))
 
 
@@ -174,16 +174,16 @@ def search(whole: Problem, partial: Problem | None = None) -> SearchOutcome:
     return chosen.outcome()
 
 
-def _total(judged: ScoredFit) -> float:
-    return judged.misfit.total
+def _total(scored: ScoredFit) -> float:
+    return scored.misfit.total
 
 
-def is_explained(problem: Problem, judged: ScoredFit) -> bool:
+def is_explained(problem: Problem, scored: ScoredFit) -> bool:
     """Whether a state explains the cloud, noise aside."""
-    return problem.explained(judged.misfit.cloud, judged.surface, problem.config.explained)
+    return problem.explained(scored.misfit.cloud, scored.surface, problem.config.explained)
 
 
-def fit_likely(problem: Problem, candidates: list[tuple[float, Posed]], most: int) -> list[ScoredFit]:
+def fit_candidates(problem: Problem, candidates: list[tuple[float, Posed]], most: int) -> list[ScoredFit]:
     """Fits of candidates that may be the best, of those given with their misfits by few points, the lowest first."""
     fitted: list[ScoredFit] = []
     for cost, posed in candidates[:most]:
@@ -196,7 +196,7 @@ def fit_likely(problem: Problem, candidates: list[tuple[float, Posed]], most: in
 def candidates(problem: Problem, stage: SearchRound) -> list[tuple[float, Posed]]:
     """Candidates of a round with their misfits by few points, the lowest first."""
     coarse, whole = problem.coarse, Prior.whole(problem.model)
-    bent, cost = screened(problem, stage), list[float]()
+    bent, cost = screen_poses(problem, stage), list[float]()
     for start, steps, sigma in BENDING:
         bent = [fit_cloud(coarse, posed, whole, start, steps, problem.config.pair_slack) for posed in bent]
         cost = [coarse.screen(posed, sigma * problem.model.half).without_network for posed in bent]
@@ -209,19 +209,19 @@ def candidates(problem: Problem, stage: SearchRound) -> list[tuple[float, Posed]
 
 def differing(problem: Problem, states: list[Posed], apart: float) -> list[int]:
     """Rows of the states of which each differs from all before it by ``apart`` half lengths in the mean."""
-    return _first_of_each(corner_places(problem.model, states), apart * problem.model.half)
+    return _first_of_each(corner_positions(problem.model, states), apart * problem.model.half)
 
 
-def _first_of_each(places: Float[np.ndarray, "n p 3"], apart: float) -> list[int]:
+def _first_of_each(positions: Float[np.ndarray, "n p 3"], apart: float) -> list[int]:
     """Rows of which each is farther than ``apart`` from all before it, in the root mean square."""
     kept: list[int] = []
-    for row, place in enumerate(places):
-        if not kept or np.sqrt(((places[kept] - place) ** 2).sum(axis=2).mean(axis=1)).min() > apart:
+    for row, place in enumerate(positions):
+        if not kept or np.sqrt(((positions[kept] - place) ** 2).sum(axis=2).mean(axis=1)).min() > apart:
             kept.append(row)
     return kept
 
 
-def screened(problem: Problem, stage: SearchRound) -> list[Posed]:
+def screen_poses(problem: Problem, stage: SearchRound) -> list[Posed]:
     """Poses that are worth bending, which differ from each other."""
     tables = tables_of(problem.model, stage.states)
     screen = Screen.of(tables, problem.evidence, problem.model.half, problem.is_scale_open)
@@ -230,10 +230,10 @@ def screened(problem: Problem, stage: SearchRound) -> list[Posed]:
         poses = screen.aligned(poses, sigma)
         count = max(round(share * len(poses)), 2 * stage.bent)
         poses = poses if count >= len(poses) else poses.rows(np.argpartition(poses.cost, count)[:count])
-    poses = screen.judged(poses, SIGMAS[-1][0])
+    poses = screen.scored(poses, SIGMAS[-1][0])
     poses = poses.rows(np.argsort(poses.cost))
-    places = poses.place(tables.place[poses.state, ::16])
-    return [_posed(screen, poses, row) for row in _first_of_each(places, APART * problem.model.half)[: stage.bent]]
+    positions = poses.place(tables.place[poses.state, ::16])
+    return [_posed(screen, poses, row) for row in _first_of_each(positions, APART * problem.model.half)[: stage.bent]]
 
 
 def _posed(screen: Screen, poses: Poses, row: int) -> Posed:

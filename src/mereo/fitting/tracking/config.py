@@ -23,7 +23,7 @@ class TrackConfig:
         first_speed: the same while nothing is known of its motion, right after the network was asked.
         least: standard deviation in however short a time, scene units.
         smoothing: share of what a frame says of the motion that is believed, the rest is what was known before.
-        motion_worth: how many independent points the expectation is worth, in each direction.
+        motion_weight: how many independent points the expectation is worth, in each direction.
         points: denser clouds are averaged to so many points.
         observed_samples: observed points, evenly spread, that are compared with the surface.
         first_sigma: the cloud's first standard deviation, as a share of half the rest box's longest side; it falls by
@@ -45,7 +45,7 @@ class TrackConfig:
     first_speed: float = 20.0
     least: float = 0.02
     smoothing: float = 0.2
-    motion_worth: float = 300.0
+    motion_weight: float = 300.0
     points: int = 2000
     observed_samples: int = 500
     first_sigma: float = 0.04

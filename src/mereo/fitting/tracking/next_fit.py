@@ -75,7 +75,7 @@ class Track:
         scale_std = config.scale_std if base.is_scale_open else KNOWN_SCALE_STD
         problem = replace(base, network=NetworkTerm.none(model), scale_std=scale_std)
         share_surfaces(base, problem)
-        still, noise = np.zeros(POSE + model.count), fitted.problem.noise_beside(fitted.surface)
+        still, noise = np.zeros(POSE + model.count), fitted.problem.residual_noise(fitted.surface)
         unit, unsure, seen = fitted.unit * scale, config.first_speed, base.evidence
         area, kind = seen_area(seen), seen.other_lines
         return cls(problem, unit, posed, time_s, still, unsure, noise, clean, kind, area, fitted.calibration)
@@ -152,9 +152,9 @@ def next_fit(
         expectation = Expectation.of(track, start, max(time_s - track.time_s, 0.0), config)
 
         def fit(other_lines: SightKind) -> ModesFit:
-            beside = replace(lines.scaled(1 / track.unit), other_lines=other_lines)
+            sight_lines = replace(lines.scaled(1 / track.unit), other_lines=other_lines)
             problem = replace(
-                track.problem, evidence=Evidence.of(few, outliers / track.unit, config.observed_samples, beside)
+                track.problem, evidence=Evidence.of(few, outliers / track.unit, config.observed_samples, sight_lines)
             )
             share_surfaces(track.problem, problem)
             posed = descend(problem, start, expectation, config)
@@ -184,7 +184,7 @@ def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig)
     passed = max(time_s - track.time_s, 1e-3)
     velocity = track.velocity + config.smoothing * (between(track.posed, posed) / passed - track.velocity)
     unsure = track.unsure * (1 - config.smoothing)
-    noise = track.noise + config.smoothing * (fitted.problem.noise_beside(fitted.surface) - track.noise)
+    noise = track.noise + config.smoothing * (fitted.problem.residual_noise(fitted.surface) - track.noise)
     problem = replace(fitted.problem, config=constants_for(noise, track.clean))
     share_surfaces(fitted.problem, problem)
     return replace(
@@ -231,7 +231,7 @@ class Expectation:
         # noisy frames weigh less, and a moving object must not lag behind for that
         coarser = track.problem.config.cloud_sigma / track.clean.cloud_sigma
         sigma = coarser * (speed * passed_s + config.least)
-        return cls(state, track.squared * (config.motion_worth / sigma**2))
+        return cls(state, track.squared * (config.motion_weight / sigma**2))
 
     def add_to(self, normal: NormalEquations, posed: Posed) -> NormalEquations:
         """Sum with the squared distance from the expectation."""

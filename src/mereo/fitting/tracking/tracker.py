@@ -18,7 +18,7 @@ import numpy as np
 
 from mereo.fitting.config import FitConfig, FoundBy, Tracking
 from mereo.fitting.registration.answer import Answer, Candidate
-from mereo.fitting.registration.answer_frame import answer_of, find, in_found_unit, search_hypotheses
+from mereo.fitting.registration.answer_frame import answer_of, find, in_registered_unit, search_hypotheses
 from mereo.fitting.registration.fit import ModesFit
 from mereo.fitting.registration.recognition import MOST, Recognition, recognize
 from mereo.fitting.registration.register import Registrar
@@ -94,15 +94,15 @@ class BackgroundSearch:
     def __init__(self, registrar: Registrar, executor: Executor | None = None) -> None:
         self.registrar = replace(registrar, config=replace(registrar.config, search_rounds=ROUNDS))
         self.executor = executor
-        self._own: ThreadPoolExecutor | None = None
+        self._thread: ThreadPoolExecutor | None = None
         self._running: Future[Searched] | None = None
 
     def start(self, frame: TrackedFrame) -> None:
         """Search a frame, unless one is being searched, or was and has not been taken."""
         if self._running is None:
-            if self.executor is None and self._own is None:
-                self._own = ThreadPoolExecutor(1, "mereo-search")
-            executor = self.executor or self._own
+            if self.executor is None and self._thread is None:
+                self._thread = ThreadPoolExecutor(1, "mereo-search")
+            executor = self.executor or self._thread
             assert executor is not None
             self._running = executor.submit(_search, self.registrar, frame)
 
@@ -128,9 +128,9 @@ class BackgroundSearch:
     def close(self, wait: bool) -> None:
         """Forget it, and let the own thread end with its search, which ``wait`` waits for."""
         self.drop()
-        if self._own is not None:
-            self._own.shutdown(wait, cancel_futures=True)
-            self._own = None
+        if self._thread is not None:
+            self._thread.shutdown(wait, cancel_futures=True)
+            self._thread = None
 
 
 def _search(registrar: Registrar, frame: TrackedFrame) -> Searched:
@@ -241,7 +241,7 @@ class Tracker:
 
         tracked = fit(self.config)
         if not tracked.registration.accepted and not self.registrar.asks_network:  # it may have moved far
-            tracked = max(tracked, fit(self.config.patient), key=lambda one: one.score)
+            tracked = max(tracked, fit(self.config.patient), key=lambda fit_: fit_.score)
         return tracked, ""
 
     def _searched(self, frame: TrackedFrame) -> "_Tracked | None":
@@ -251,9 +251,9 @@ class Tracker:
             return None
         before = self._T_camera_input, self._axes
         self._T_camera_input, self._axes = searched.candidate.encoded.T_camera_input, searched.frame.seen.frame.axes
-        own = _Tracked.of_frame(searched.candidate, searched.frame.time_s, self.config, self.registrar.config)
+        begun = _Tracked.of_frame(searched.candidate, searched.frame.time_s, self.config, self.registrar.config)
         area = 0.0 if self._track is None else self._track.area
-        tracked, _ = self._tracked(replace(own.track, area=max(area, own.track.area)), frame, np.inf)
+        tracked, _ = self._tracked(replace(begun.track, area=max(area, begun.track.area)), frame, np.inf)
         if tracked is not None and self._takes(tracked):
             self._found_by = "search"
             return tracked
@@ -266,23 +266,29 @@ class Tracker:
         It is lost where neither explains the frame, and then the track is kept.
         """
         seen, registrar, config = frame.seen, self.registrar, self.config
-        found, likelier = find(seen, registrar.network, registrar, frame.keep_all, frame.scene_unit)
+        candidate, likelier = find(seen, registrar.network, registrar, frame.keep_all, frame.scene_unit)
         must_register = registrar.method != "auto" or registrar.network is None
-        if found.modes is None and tracked is None and must_register:
-            assert found.error is not None
-            raise found.error
+        if candidate.modes is None and tracked is None and must_register:
+            assert candidate.error is not None
+            raise candidate.error
         self._has_begun = True
-        own = None if found.modes is None else _Tracked.of_frame(found, frame.time_s, config, registrar.config)
-        if tracked is not None and self._takes(tracked) and (own is None or own.score <= tracked.score + config.margin):
+        alone = (
+            None if candidate.modes is None else _Tracked.of_frame(candidate, frame.time_s, config, registrar.config)
+        )
+        if (
+            tracked is not None
+            and self._takes(tracked)
+            and (alone is None or alone.score <= tracked.score + config.margin)
+        ):
             return self._gone_on(frame, tracked, started, restart=True)
-        if own is None or not self._takes(own):
-            registration = None if own is None else own.registration
-            answer = answer_of(seen, registrar.network, None, found, likelier, registration)
+        if alone is None or not self._takes(alone):
+            registration = None if alone is None else alone.registration
+            answer = answer_of(seen, registrar.network, None, candidate, likelier, registration)
             return replace(answer, registrar=registrar, tracking="lost")
         self._search.drop()
-        self._track, self._best, self._found_by = own.track, own.score, found.found_by
-        self._T_camera_input, self._axes = found.encoded.T_camera_input, seen.frame.axes
-        answer = answer_of(seen, registrar.network, registrar, found, likelier, own.registration)
+        self._track, self._best, self._found_by = alone.track, alone.score, candidate.found_by
+        self._T_camera_input, self._axes = candidate.encoded.T_camera_input, seen.frame.axes
+        answer = answer_of(seen, registrar.network, registrar, candidate, likelier, alone.registration)
         return replace(answer, seconds=time.perf_counter() - started)
 
     # --- what is believed ---------------------------------------------------------------------------------------------
@@ -328,7 +334,7 @@ class Tracker:
         stated = self.registrar.stated_scene_unit(frame.seen.frame.unit_m)
         calibration = None if model is None else model.calibration
         recognition = recognize(tracked.registration, calibration, stated_scene_unit=stated)
-        seen = in_found_unit(frame.seen, self.registrar, tracked.registration, recognition)
+        seen = in_registered_unit(frame.seen, self.registrar, tracked.registration, recognition)
         return Answer(
             seen=seen.read_as(tracked.hypothesis),
             model=model,
@@ -362,11 +368,11 @@ class _Tracked:
     hypothesis: Reading
 
     @classmethod
-    def of_frame(cls, found: Candidate, time_s: float, config: TrackConfig, clean: FitConfig) -> "_Tracked":
+    def of_frame(cls, candidate: Candidate, time_s: float, config: TrackConfig, clean: FitConfig) -> "_Tracked":
         """Candidate of a frame that was fitted by itself."""
-        assert found.modes is not None
-        fitted = replace(found.modes, rest=None)
-        return cls(fitted, Track.of(fitted, time_s, config, clean), found.hypothesis)
+        assert candidate.modes is not None
+        fitted = replace(candidate.modes, rest=None)
+        return cls(fitted, Track.of(fitted, time_s, config, clean), candidate.hypothesis)
 
     @cached_property
     def registration(self) -> Registration:

@@ -88,10 +88,12 @@ class ModesOptimum:
         model = self.problem.model
         material = self.posed.place(model.material(self.posed.z))
         with one_blas_thread():
-            beside = turns_left_open(self.problem, material)
+            open_motion = turns_left_open(self.problem, material)
             if self.bent is not None:
-                beside = np.concatenate([beside, (self.bent - material)[:, :, None].astype(np.float32)], axis=2)
-            return Posterior.of(self.terms.total, self.posed, material, model.modes, model.residue, beside)
+                open_motion = np.concatenate(
+                    [open_motion, (self.bent - material)[:, :, None].astype(np.float32)], axis=2
+                )
+            return Posterior.of(self.terms.total, self.posed, material, model.modes, model.residue, open_motion)
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,22 +207,26 @@ class Explanation:
 
     @classmethod
     def of(
-        cls, place: Float[np.ndarray, "3"], decided: Decided, optimum: Optimum, T_here_fit: Float[np.ndarray, "4 4"]
+        cls,
+        place: Float[np.ndarray, "3"],
+        decided: Decided,
+        optimum: Optimum,
+        T_registration_fit: Float[np.ndarray, "4 4"],
     ) -> "Explanation":
-        """Explanation in the frame to which ``T_here_fit`` leads from the fit's, both in the input's unit."""
+        """Explanation in the frame to which ``T_registration_fit`` leads from the fit's, both in the input's unit."""
         unit, (observed, distance), (shares, weights, influence) = optimum.unit, optimum.observed, decided
         return cls(
             place=place,
             shares=shares,
-            points=transform_points(T_here_fit, unit * optimum.terms.observed_samples),
+            points=transform_points(T_registration_fit, unit * optimum.terms.observed_samples),
             weights=weights,
-            influence=influence @ T_here_fit[:3, :3].T,
-            unexplained=transform_points(T_here_fit, unit * observed[distance > optimum.tolerance]),
+            influence=influence @ T_registration_fit[:3, :3].T,
+            unexplained=transform_points(T_registration_fit, unit * observed[distance > optimum.tolerance]),
         )
 
     def __repr__(self) -> str:
-        told = ", ".join(f"{name} {share:.0%}" for name, share in self.shares.items())
-        return f"Explanation(unsure by {told}; {counted(len(self.unexplained), 'point')} unexplained)"
+        shares = ", ".join(f"{name} {share:.0%}" for name, share in self.shares.items())
+        return f"Explanation(unsure by {shares}; {counted(len(self.unexplained), 'point')} unexplained)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -359,7 +365,7 @@ class Uncertainty:
         return result
 
     @cached_property
-    def _own(self) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, "s 4 p"]]:
+    def _owned(self) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, "s 4 p"]]:
         """Volume that belongs to each segment, and the motion of it and of its centroid; scene units, camera's axes."""
         mesh: SegmentedMesh = self.model.mesh(self.posterior.material)
         gradients = owned_gradients(mesh)
@@ -371,7 +377,7 @@ class Uncertainty:
         """Each segment's, of the volume that belongs to it, without that of segments nested in it."""
         unit, scale = self.optimum.unit, self._scale
         result = []
-        for name, volume, motion in zip(self.model.rest.names, *self._own, strict=True):
+        for name, volume, motion in zip(self.model.rest.names, *self._owned, strict=True):
             off = WITHIN * scale * float(np.linalg.norm(motion[0]))
             radius = unit * float(np.hypot(scale * radius95((motion[1:] @ motion[1:].T)[None])[0], self.beside))
             between = (max(float(volume) - off, 0.0) * unit**3, (float(volume) + off) * unit**3)
@@ -384,7 +390,7 @@ class Uncertainty:
 
     def decided_centroid(self, index: int) -> Decided:
         """What decides where the centroid of a segment is."""
-        return self._weighing.decided(self._own[1][index, 1:])
+        return self._weighing.decided(self._owned[1][index, 1:])
 
     def decided_point(self, point: Float[np.ndarray, "1 3"], label: UInt8[np.ndarray, "1"]) -> Decided:
         """What decides where a point of the rest model is, which moves along with the segment ``label``."""
