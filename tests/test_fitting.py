@@ -11,8 +11,8 @@ from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
 from mereo.fitting.problem.correspondences import Correspondences, estimate_unit
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import POSE, Posed, along
-from mereo.fitting.registration.fit import fit_correspondences
 from mereo.fitting.registration.recognition import recognize
+from mereo.fitting.registration.register import fit_correspondences
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
 from mereo.scenes.random_states import state_points

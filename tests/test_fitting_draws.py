@@ -11,10 +11,10 @@ from mereo.fitting.draws.fit import fit_draws
 from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
 from mereo.fitting.draws.problem import DrawsProblem, Shape, approach, derivatives, lay_on_shape, secant
 from mereo.fitting.draws.problem import narrowing as draws_narrowing
-from mereo.fitting.modes.fit import narrowing as modes_narrowing
+from mereo.fitting.modes import narrowing as modes_narrowing
 from mereo.fitting.problem.correspondences import nothing
 from mereo.fitting.problem.residuals import NetworkTerm
-from mereo.fitting.registration.fit import CloudToFit, ModesFit, is_drawn
+from mereo.fitting.registration.register import CloudToFit, ModesFit, is_drawn
 from mereo.scenes.statistical_model import StatisticalModel
 
 SCENE = toy_scene()

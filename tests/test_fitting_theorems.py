@@ -7,7 +7,7 @@ from toy_scene import Lift, Shear, toy_scene
 
 from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.residuals import Surface
-from mereo.fitting.registration.fit import fit_correspondences
+from mereo.fitting.registration.register import fit_correspondences
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import rigid, transform_points

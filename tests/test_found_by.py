@@ -18,8 +18,7 @@ from mereo.fitting.registration.answer_frame import (
     more_evident,
     search_modes,
 )
-from mereo.fitting.registration.fit import CloudToFit
-from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.register import CloudToFit, Registrar
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.sight_lines import SightLines
 from mereo.models.model import Model
@@ -49,7 +48,7 @@ def confused(monkeypatch: pytest.MonkeyPatch) -> None:
         assert found is not None
         return replace(found, rest=np.random.default_rng(0).permutation(found.rest))
 
-    monkeypatch.setattr("mereo.fitting.registration.fit.find_correspondences", lying)
+    monkeypatch.setattr("mereo.fitting.registration.register.find_correspondences", lying)
 
 
 def answer(liver: Model, cloud: PointCloud, method: Any = "auto") -> Answer:
@@ -82,7 +81,7 @@ def test_other_methods_ask_nobody_else(
 
 
 def test_the_network_is_left_out_on_request(liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mereo.fitting.registration.fit.find_correspondences", None)
+    monkeypatch.setattr("mereo.fitting.registration.register.find_correspondences", None)
     found = answer(liver, cloud, "search")
     assert found.found_by == "search" and found.taken
 

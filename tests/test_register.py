@@ -19,8 +19,14 @@ from mereo.evaluation.scoring import EvaluationConfig, evaluate
 from mereo.fitting.draws.playback import DrawnStates
 from mereo.fitting.registration import register
 from mereo.fitting.registration.answer import Answer
-from mereo.fitting.registration.fit import CloudToFit, ModesFit
-from mereo.fitting.registration.register import ChangedSceneWarning, Registrar, registrar_for, statistical_model_of
+from mereo.fitting.registration.register import (
+    ChangedSceneWarning,
+    CloudToFit,
+    ModesFit,
+    Registrar,
+    registrar_for,
+    statistical_model_of,
+)
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import SCANNER_TO_CAMERA, PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh

@@ -8,11 +8,11 @@ from test_fitting_theorems import IN_FRONT, SCENE, said, seen, shown
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.draws.playback import DrawnStates
-from mereo.fitting.modes.fit import narrowing
+from mereo.fitting.modes import narrowing
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import NormalEquations, Posed
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
-from mereo.fitting.registration.fit import CloudToFit, ModesFit, fit_correspondences
+from mereo.fitting.registration.register import CloudToFit, ModesFit, fit_correspondences
 from mereo.geometry.transforms import transform_points
 from mereo.scenes.statistical_model import StatisticalModel
 

@@ -11,9 +11,8 @@ from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.registration.answer_frame import search_modes, size_of
-from mereo.fitting.registration.fit import CloudToFit
-from mereo.fitting.search.screening import CELLS, Poses, Screen, SightTable, medoids, tables_of
-from mereo.fitting.search.search import rotations
+from mereo.fitting.registration.register import CloudToFit
+from mereo.fitting.search import CELLS, Poses, Screen, SightTable, medoids, rotations, tables_of
 from mereo.geometry.sight_lines import SightLines
 from mereo.models.weights import load_model
 from mereo.scenes.statistical_model import StatisticalModel

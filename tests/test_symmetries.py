@@ -17,9 +17,9 @@ from mereo.fitting.draws.fit import descend, draws_that_may_jump, try_jumps
 from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
 from mereo.fitting.draws.problem import DrawsProblem, simulate
 from mereo.fitting.problem.gauss_newton import Posed
-from mereo.fitting.problem.posterior import Posterior, covariance_factor
-from mereo.fitting.problem.symmetries import ANGLES, find_symmetries, left_open
-from mereo.fitting.registration.fit import CloudToFit, ModesFit
+from mereo.fitting.problem.segments import ANGLES, find_symmetries, left_open
+from mereo.fitting.registration.register import CloudToFit, ModesFit
+from mereo.fitting.uncertainty import Posterior, covariance_factor
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import transform_points
 from mereo.scenes.random_states import scene_model

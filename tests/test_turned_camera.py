@@ -5,9 +5,9 @@ import pytest
 from test_fitting_theorems import IN_FRONT, SCENE, said, shown
 
 from mereo.fitting.config import FitConfig
-from mereo.fitting.modes.fit import turns
+from mereo.fitting.modes import turns
 from mereo.fitting.problem.correspondences import Correspondences
-from mereo.fitting.registration.fit import CloudToFit, ModesFit
+from mereo.fitting.registration.register import CloudToFit, ModesFit
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.statistical_model import StatisticalModel
 

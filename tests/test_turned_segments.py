@@ -23,7 +23,7 @@ from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
 from mereo.fitting.draws.problem import DrawsFit, DrawsProblem, simulate
 from mereo.fitting.problem.evidence import OBSERVED_SAMPLES
 from mereo.fitting.problem.gauss_newton import Posed
-from mereo.fitting.registration.fit import CloudToFit, ModesFit
+from mereo.fitting.registration.register import CloudToFit, ModesFit
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import transform_points
 from mereo.scenes.random_states import scene_model

@@ -11,9 +11,9 @@ from toy_scene import Lift, Shear, toy_scene
 from mereo.evaluation.cases import RadiusRatios, seen_points
 from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed
-from mereo.fitting.problem.posterior import Posterior, covariance_factor, radius95
-from mereo.fitting.registration.fit import fit_correspondences
+from mereo.fitting.registration.register import fit_correspondences
 from mereo.fitting.registration.registration import Registration
+from mereo.fitting.uncertainty import Posterior, covariance_factor, radius95
 from mereo.geometry.camera import Camera, PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import owned_centroids, owned_gradients

@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
 from mereo.fitting.registration.registration import Registration
-from mereo.fitting.uncertainty.uncertainty import Explanation
+from mereo.fitting.uncertainty import Explanation
 from mereo.geometry.mesh import Color, Segment
 from mereo.geometry.radii import STOPS, Radii, between_stops, level_told
 from mereo.visualization.units import Unit, rounded

@@ -31,11 +31,10 @@ from mereo.fitting.draws.problem import (
     simulate,
     try_material,
 )
-from mereo.fitting.modes.fit import refine, robust_poses
+from mereo.fitting.modes import refine, robust_poses
 from mereo.fitting.problem.gauss_newton import POSE, Posed
-from mereo.fitting.problem.joints import branches
 from mereo.fitting.problem.residuals import robust_square
-from mereo.fitting.problem.symmetries import Symmetry, find_symmetries
+from mereo.fitting.problem.segments import Symmetry, branches, find_symmetries
 from mereo.geometry.transforms import fit_rigid
 from mereo.scenes.draw_recorder import SMOOTH, Call, OutOfDraws, Recorder
 from mereo.scenes.parameters import play, played_back

@@ -16,7 +16,6 @@ from mereo.fitting.config import MANY_DRAWS, DrawsConfig
 from mereo.fitting.draws.playback import Drawn, DrawnStates, as_sparse, material_moved
 from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, Rows, along, geman_mcclure, in_space
-from mereo.fitting.problem.posterior import Terms
 from mereo.fitting.problem.problem import Problem
 from mereo.fitting.problem.residuals import (
     MOST_VIOLATIONS,
@@ -24,6 +23,7 @@ from mereo.fitting.problem.residuals import (
     SILHOUETTE_WEIGHT,
     NetworkTerm,
     Surface,
+    Terms,
     robust_square,
 )
 from mereo.geometry.mesh import barycentric

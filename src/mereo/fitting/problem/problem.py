@@ -10,7 +10,6 @@ from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.evidence import MORE_SAMPLES, OBSERVED_SAMPLES, Evidence
 from mereo.fitting.problem.gauss_newton import NormalEquations, Posed, Rows
-from mereo.fitting.problem.joints import Joints
 from mereo.fitting.problem.residuals import (
     ROBUST,
     SILHOUETTE_WEIGHT,
@@ -24,6 +23,7 @@ from mereo.fitting.problem.residuals import (
     cloud_rows,
     robust_square,
 )
+from mereo.fitting.problem.segments import Joints
 from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
 
 COARSE = 3

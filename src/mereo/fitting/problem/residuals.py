@@ -375,3 +375,30 @@ class PairTerm:
         if len(self.std) == 0:
             return 0.0
         return float((((self._vectors(z)[1] - self.distance) / self.std) ** 2).mean())
+
+
+# --- all of them ---
+
+
+@dataclass(frozen=True, eq=False)
+class Terms:
+    """What a fit's normal equations at its optimum are made of.
+
+    Attributes:
+        known: without the frame: prior, scale, kept distances.
+        network: the correspondences.
+        cloud: distances of the observed samples from the surface, as rows.
+        observed_samples: the observed samples, camera frame, scene units.
+        ruled_out: silhouette and free space.
+    """
+
+    known: NormalEquations
+    network: NormalEquations
+    cloud: Rows
+    observed_samples: Float[np.ndarray, "n 3"]
+    ruled_out: NormalEquations
+
+    @cached_property
+    def total(self) -> NormalEquations:
+        """All of them together."""
+        return self.known.plus(self.network).add(*self.cloud).plus(self.ruled_out)

@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mereo.fitting.config import FoundBy, Tracking
-from mereo.fitting.registration.fit import ModesFit
 from mereo.fitting.registration.recognition import NOT_ASKED, Recognition
-from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.register import ModesFit, Registrar
 from mereo.fitting.registration.registration import Registration, nearest_labels
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import SegmentedMesh

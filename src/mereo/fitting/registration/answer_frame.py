@@ -11,18 +11,16 @@ import numpy as np
 from jaxtyping import Float
 
 from mereo.fitting.config import FitConfig
-from mereo.fitting.modes.fit import fit_rest, is_at_rest
+from mereo.fitting.modes import fit_rest, is_at_rest
 from mereo.fitting.problem.correspondences import nothing
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.problem import Problem
 from mereo.fitting.problem.residuals import NetworkTerm, Surface
 from mereo.fitting.registration.answer import Answer, Candidate
-from mereo.fitting.registration.fit import CloudToFit, ModesFit
 from mereo.fitting.registration.recognition import Recognition, recognize
-from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.register import CloudToFit, ModesFit, Registrar
 from mereo.fitting.registration.registration import Registration
-from mereo.fitting.search.screening import Screen, tables_of
-from mereo.fitting.search.search import WHOLE, rotations, search
+from mereo.fitting.search import WHOLE, Screen, rotations, search, tables_of
 from mereo.geometry.sight_lines import SightLines
 from mereo.geometry.transforms import transform_points
 from mereo.io.cores import one_blas_thread

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from mereo.deformation.maps import newton
 from mereo.deformation.moving_least_squares import Anchors
 from mereo.fitting.draws.playback import Drawn
-from mereo.fitting.uncertainty.uncertainty import Explanation, Optimum, Uncertainty
+from mereo.fitting.uncertainty import Explanation, Optimum, Uncertainty
 from mereo.geometry.brief import counted
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids, owned_centroids, signed_distance_and_direction

@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation
 from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.evidence import MOST_POINTS
 from mereo.fitting.problem.gauss_newton import Posed
-from mereo.fitting.problem.joints import corner_positions
 from mereo.fitting.problem.problem import UNEXPLAINED, Misfit, Problem
 from mereo.fitting.problem.residuals import NetworkTerm, Prior, Surface
+from mereo.fitting.problem.segments import corner_positions
 from mereo.geometry.downsampling import means_along_sight
 from mereo.geometry.surface_patches import smoothed
 from mereo.geometry.transforms import best_rotations, fit_rigid, robust_rigid, rotation_along
