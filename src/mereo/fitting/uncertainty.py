@@ -24,7 +24,7 @@ from mereo.fitting.draws.problem import DrawsFit, DrawsProblem
 from mereo.fitting.draws.problem import terms as terms_of_draws
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed
 from mereo.fitting.problem.problem import Problem
-from mereo.fitting.problem.residuals import Prior, Surface, Terms, add_silhouette
+from mereo.fitting.problem.residuals import Prior, Surface, Terms
 from mereo.fitting.problem.segments import left_open
 from mereo.geometry.brief import counted
 from mereo.geometry.mesh import SegmentedMesh
@@ -255,7 +255,6 @@ class ModesOptimum:
         problem, posed, config = self.problem, self.posed, self.problem.config
         nothing = NormalEquations.nothing(POSE + len(posed.z))
         with one_blas_thread():
-            samples = problem.samples.posed(posed).few(config.silhouette_vertices)
             return Terms(
                 known=problem.known(posed, Prior.whole(problem.model), 0.0),
                 network=problem.network.add_to(
@@ -263,7 +262,7 @@ class ModesOptimum:
                 ),
                 cloud=problem.cloud_rows(posed),
                 observed_samples=problem.evidence.observed_samples,
-                ruled_out=add_silhouette(nothing, posed, samples, problem.evidence, config.cloud_sigma),
+                ruled_out=problem.add_silhouette(nothing, posed, problem.samples.posed(posed), config.cloud_sigma),
             )
 
     @cached_property

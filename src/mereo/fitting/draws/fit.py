@@ -52,18 +52,14 @@ SLIDES = 0.03
 
 
 def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
-    """The best of several starts; None where the scene plays none of them back."""
-    fits = fit_near_modes(problem, modes, [])
-    for _ in range(problem.config.passes):
-        if explains_cloud(problem, fits, problem.config.hopeless):
-            break
-        fits += fit_from_end(problem, min(fits, key=by_misfit, default=None))
-    has_network = len(problem.correspondences.points) > 0  # after a search there are no correspondences
-    if problem.config.network_start and has_network and not explains_cloud(problem, fits, problem.config.explained):
-        camera = Posed(np.eye(3), np.zeros(3), np.empty(0), modes.log_scale)
-        fits += fit_from_shape(problem, camera, shape_of_network(problem, modes.log_scale), [])
+    """Fit the draws from several starts, and improve the best; None where the scene plays none of them back."""
+    fits: list[DrawsFit] = []
+    for start in (fit_near_modes, *(fit_from_end,) * problem.config.passes, fit_like_network):
+        fits += start(problem, modes, fits)
     best = min(fits, key=by_misfit, default=None)
-    return None if best is None else refine_by_sight(problem, try_jumps(problem, try_symmetric_states(problem, best)))
+    for improve in (try_symmetric_states, try_jumps, refine_by_sight):
+        best = None if best is None else improve(problem, best)
+    return best
 
 
 def refine_by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
@@ -85,20 +81,34 @@ def refine_by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     return replace(end, motion=fit.motion, misfit=fit.misfit)
 
 
-def fit_near_modes(problem: DrawsProblem, modes: Posed, others: list[Drawn]) -> list[DrawsFit]:
-    """States that explain the frame, from starts like a fit of the modes, and from ``others``."""
+def fit_near_modes(
+    problem: DrawsProblem, modes: Posed, fits: list[DrawsFit], others: Sequence[Drawn] = ()
+) -> list[DrawsFit]:
+    """Fit from states like a fit of the modes, and from ``others``."""
     guess = problem.states.guess(modes.z, problem.model.motion, problem.config.near)
     return fit_from_shape(problem, modes, shape_of(problem, problem.model.material(modes.z)), [guess, *others])
 
 
-def fit_from_end(problem: DrawsProblem, best: DrawsFit | None) -> list[DrawsFit]:
-    """States like the modes' own fit from where the draws ended, which may be in another basin than their first."""
-    if best is None:
+def fit_from_end(problem: DrawsProblem, modes: Posed, fits: list[DrawsFit]) -> list[DrawsFit]:
+    """Fit from the modes' fit to where the draws ended, if far off: it may lie in another basin than their first."""
+    if not fits or explains_cloud(problem, fits, problem.config.hopeless):
         return []
+    best = min(fits, key=by_misfit)
     pose, z = problem.model.project(best.placed())
     scale = float(np.cbrt(np.linalg.det(pose[:3, :3])))
     modes = refine(problem.base, Posed(pose[:3, :3] / scale, pose[:3, 3], z, float(np.log(scale))))
-    return fit_near_modes(problem, modes, [replace(best.drawn, z=best.z)])
+    return fit_near_modes(problem, modes, fits, [replace(best.drawn, z=best.z)])
+
+
+def fit_like_network(problem: DrawsProblem, modes: Posed, fits: list[DrawsFit]) -> list[DrawsFit]:
+    """Fit from states like the network's shape, if the cloud is not explained; a search has no correspondences."""
+    config, matches = problem.config, problem.correspondences
+    if not config.network_start or not len(matches.points) or explains_cloud(problem, fits, config.explained):
+        return []
+    camera = Posed(np.eye(3), np.zeros(3), np.empty(0), modes.log_scale)
+    points, sigma = matches.points * np.exp(-modes.log_scale), problem.base.network_sigma
+    shape = Shape.of(points, sigma, config.shape_weight, matches.confidence, problem.following_played)
+    return fit_from_shape(problem, camera, shape, [])
 
 
 def explains_cloud(problem: DrawsProblem, fits: list[DrawsFit], most: float) -> bool:
@@ -115,13 +125,6 @@ def shape_of(problem: DrawsProblem, material: Float[np.ndarray, "m 3"]) -> Shape
     """Shape of material points, unposed: dense and smooth."""
     config, few = problem.config, problem.states.played.index
     return Shape.of(material[few], config.shape_std * problem.model.half, config.shape_weight, np.ones(len(few)))
-
-
-def shape_of_network(problem: DrawsProblem, log_scale: float) -> Shape:
-    """Shape that the correspondences have, in the camera frame."""
-    matches, sigma = problem.correspondences, problem.base.network_sigma
-    points = matches.points * np.exp(-log_scale)
-    return Shape.of(points, sigma, problem.config.shape_weight, matches.confidence, problem.following_played)
 
 
 def fit_from_shape(problem: DrawsProblem, frame: Posed, shape: Shape, guesses: list[Drawn]) -> list[DrawsFit]:

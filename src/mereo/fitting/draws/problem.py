@@ -1,7 +1,7 @@
 """States of a scene as explanations of a frame: playing them, judging them, and their linear neighbourhood.
 
 Around a state the material points are linear in the draws, so its neighbourhood is a linear model like that of the
-modes, fitted by the same code.
+modes; the residuals are those of the modes' fit.
 """
 
 from dataclasses import dataclass, replace
@@ -15,16 +15,17 @@ from mereo.deformation.moving_least_squares import PointWeights
 from mereo.fitting.config import MANY_DRAWS, DrawsConfig
 from mereo.fitting.draws.playback import Drawn, DrawnStates, as_sparse, material_moved
 from mereo.fitting.problem.correspondences import Correspondences
-from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, Rows, along, geman_mcclure, in_space
+from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, geman_mcclure, in_space
 from mereo.fitting.problem.problem import Problem
 from mereo.fitting.problem.residuals import (
-    MOST_VIOLATIONS,
-    ROBUST,
     SILHOUETTE_WEIGHT,
     NetworkTerm,
     Surface,
     Terms,
+    add_silhouette,
+    cloud_rows,
     robust_square,
+    silhouette_losses,
 )
 from mereo.geometry.mesh import barycentric
 from mereo.geometry.transforms import best_rotations
@@ -81,14 +82,6 @@ class DrawsProblem:
         base = replace(base, config=weights_config)
         return cls(base, states, correspondences, model.weights(correspondences.rest, correspondences.labels), config)
 
-    def around(self, mean: Float[np.ndarray, "m 3"], modes: Float32[np.ndarray, "m 3 d"]) -> Problem:
-        """The problem in the linear neighbourhood of a state."""
-        model = self.model.around(mean, modes)
-        network = NetworkTerm(
-            self.correspondences.points, self.weights(mean), self.weights(modes), self.correspondences.confidence
-        )
-        return replace(self.base, model=model, network=network)
-
     def network(self, fit: "DrawsFit", modes: Float32[np.ndarray, "n 3 d"] | None = None) -> NetworkTerm:
         """Correspondences in the neighbourhood of a state."""
         modes = np.zeros((len(self.correspondences.labels), 3, 0), dtype=np.float32) if modes is None else modes
@@ -100,10 +93,6 @@ class DrawsProblem:
     def following_played(self) -> csr_array:
         """How the rest positions of the correspondences follow the played points."""
         return as_sparse(self.weights, len(self.model.rest_points)) @ self.states.played.spread
-
-    def rigid(self, material: Float[np.ndarray, "m 3"]) -> Problem:
-        """Problem of one state's pose alone."""
-        return self.around(material, np.zeros((len(material), 3, 0), dtype=np.float32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,9 +157,8 @@ def misfit(problem: DrawsProblem, fit: DrawsFit, sigma: float) -> float:
     base = problem.base
     cloud = base.config.cloud_weight * float(robust_square(fit.distance, sigma).mean())
     network = base.config.network_weight[1] * problem.network(fit).energy(fit.posed, base.network_sigma)
-    amount = base.evidence.violations(fit.surface.material[base.silhouette_vertices], ROBUST * sigma)[1]
-    silhouette_vertices = SILHOUETTE_WEIGHT * float(robust_square(amount, sigma, 4 * ROBUST).sum())
-    return cloud + network + silhouette_vertices + float(fit.z @ fit.z)
+    losses = silhouette_losses(fit.surface.material[base.silhouette_vertices], base.evidence, sigma)
+    return cloud + network + SILHOUETTE_WEIGHT * float(losses.sum()) + float(fit.z @ fit.z)
 
 
 def narrowing(problem: DrawsProblem, fit: DrawsFit) -> float:
@@ -188,49 +176,39 @@ def normal_equations(
 
 
 def terms(problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3 d"], sigma: float) -> Terms:
-    """Terms of ``normal_equations``."""
-    base, posed, config = problem.base, fit.posed, problem.base.config
-    flat, count = motion.reshape(len(motion), -1), len(fit.z)
+    """Terms of ``normal_equations``: those of the modes, with the played points' motion in the place of modes."""
+    base, posed, config, surface = problem.base, fit.posed, problem.base.config, fit.surface
+    samples, spread, count = base.evidence.observed_samples, problem.states.played.spread, len(fit.z)
+    flat, vertices = motion.reshape(len(motion), -1), base.silhouette_vertices
+
+    def modes_of(follow: csr_array) -> Float32[np.ndarray, "n 3 d"]:
+        return (follow @ flat).reshape(-1, 3, count)
+
     nothing, state = NormalEquations.nothing(POSE + count), replace(posed, z=np.zeros(count))
-    network = problem.network(fit, (problem.following_played @ flat).reshape(-1, 3, count))
+    network = problem.network(fit, modes_of(problem.following_played))
+    planes = fit.place, surface.normals[fit.face], modes_of(surface_weights(fit, spread.shape[0]) @ spread)
     return Terms(
         known=prior_of_draws(fit.z, motion, posed.log_scale, base.scale_std),
         network=network.add_to(nothing, state, base.network_sigma, config.network_weight[1], robust=True),
-        cloud=cloud_rows(problem, fit, motion, sigma),
-        observed_samples=base.evidence.observed_samples,
-        ruled_out=ruled_out(problem, fit, motion, sigma),
+        cloud=cloud_rows(posed, samples, planes, sigma, config.cloud_weight),
+        observed_samples=samples,
+        ruled_out=add_silhouette(
+            nothing,
+            posed,
+            surface.material[vertices],
+            lambda rows: modes_of(spread[vertices[rows]]),
+            base.evidence,
+            sigma,
+        ),
     )
 
 
-def cloud_rows(problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3 d"], sigma: float) -> Rows:
-    """Each observed sample's distance to its plane of the surface, its derivatives, and its weight."""
-    base, spread = problem.base, problem.states.played.spread
-    corners = problem.model.faces[fit.surface.facing[fit.face]]
+def surface_weights(fit: DrawsFit, count: int) -> csr_array:
+    """Weights of all ``count`` material points by which the positions on the surface follow them."""
+    corners = fit.surface.model.faces[fit.surface.facing[fit.face]]
     within = barycentric(fit.surface.material[corners], fit.place).astype(np.float32)
     rows = np.repeat(np.arange(len(corners)), 3)
-    at_places = csr_array((within.ravel(), (rows, corners.ravel())), shape=(len(corners), spread.shape[0])) @ spread
-    modes = (at_places @ motion.reshape(len(motion), -1)).reshape(-1, 3, len(fit.z))
-    direction = fit.surface.normals[fit.face]
-    residual = np.einsum("pi,pi->p", direction, fit.place - base.evidence.observed_samples)
-    weight = geman_mcclure(residual, ROBUST * sigma) * (base.config.cloud_weight / len(residual) / sigma**2)
-    return along(fit.posed, fit.place, modes, direction), residual, weight
-
-
-def ruled_out(
-    problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3 d"], sigma: float
-) -> NormalEquations:
-    """Normal equations of the vertices that are outside the silhouette or in free space."""
-    base, spread, nothing = problem.base, problem.states.played.spread, NormalEquations.nothing(POSE + len(fit.z))
-    chosen = base.silhouette_vertices
-    direction, amount = base.evidence.violations(fit.surface.material[chosen], ROBUST * sigma)
-    rows = np.flatnonzero(amount > 0)
-    if len(rows) == 0:
-        return nothing
-    rows = rows[:: max(1, -(-len(rows) // MOST_VIOLATIONS))]
-    modes = (spread[chosen[rows]] @ motion.reshape(len(motion), -1)).reshape(-1, 3, len(fit.z))
-    jacobian = along(fit.posed, fit.surface.material[chosen[rows]], modes, direction[rows])
-    weight = SILHOUETTE_WEIGHT / sigma**2 * geman_mcclure(amount[rows], 4 * ROBUST * sigma)
-    return nothing.add(jacobian, -amount[rows], weight)
+    return csr_array((within.ravel(), (rows, corners.ravel())), shape=(len(corners), count))
 
 
 # --- the state of a given shape ---------------------------------------------------------------------------------------

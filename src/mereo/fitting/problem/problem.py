@@ -15,13 +15,14 @@ from mereo.fitting.problem.residuals import (
     SILHOUETTE_WEIGHT,
     NetworkTerm,
     PairTerm,
+    PosedSamples,
     Prior,
     SampledSurface,
     Surface,
-    add_cloud,
     add_silhouette,
     cloud_rows,
     robust_square,
+    silhouette_losses,
 )
 from mereo.fitting.problem.segments import Joints
 from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
@@ -227,11 +228,11 @@ class Problem:
         across = np.einsum("pi,pi->p", offset, normal)
         tangential = np.sqrt(np.maximum((offset**2).sum(axis=1) - across**2, 0.0))
         distance = np.hypot(across, np.maximum(tangential - TANGENTIAL_SLACK * self.samples.spacing, 0.0))
-        amount = self.evidence.violations(samples.few(self.config.silhouette_vertices).place, ROBUST * sigma)[1]
+        few = samples.few(self.config.silhouette_vertices).place
         return self.total(
             float(robust_square(distance, sigma).mean()),
             self.network.energy(posed, self.network_sigma),
-            float(robust_square(amount, sigma, 4 * ROBUST).mean()),
+            float(silhouette_losses(few, self.evidence, sigma).mean()),
             posed.z,
         )
 
@@ -242,8 +243,15 @@ class Problem:
         samples, observed = self.samples.posed(posed), self.evidence.observed_samples
         planes = Surface.of(self.model, posed).planes(observed, self.far) if exact else samples.planes(observed)
         normal = self.network.add_to(normal, posed, self.network_sigma, network_weight, robust=True)
-        normal = add_cloud(normal, posed, observed, planes, sigma, self.config.cloud_weight)
-        return add_silhouette(normal, posed, samples.few(self.config.silhouette_vertices), self.evidence, sigma)
+        normal = normal.add(*cloud_rows(posed, observed, planes, sigma, self.config.cloud_weight))
+        return self.add_silhouette(normal, posed, samples, sigma)
+
+    def add_silhouette(
+        self, normal: NormalEquations, posed: Posed, samples: PosedSamples, sigma: float
+    ) -> NormalEquations:
+        """Sum with the samples of a state's surface that the frame rules out."""
+        few = samples.few(self.config.silhouette_vertices)
+        return add_silhouette(normal, posed, few.points, few.modes_at, self.evidence, sigma)
 
     def cloud_rows(self, posed: Posed) -> Rows:
         """Residuals of the observed samples from the faces, as the last steps of a fit have them."""
@@ -263,9 +271,8 @@ class Problem:
 
     def _silhouette_square(self, surface: Surface) -> float:
         """Mean square of how far a vertex is ruled out, in standard deviations."""
-        sigma = self.config.cloud_sigma
-        amount = self.evidence.violations(surface.material[self.silhouette_vertices], ROBUST * sigma)[1]
-        return float(robust_square(amount, sigma, 4 * ROBUST).mean())
+        vertices = surface.material[self.silhouette_vertices]
+        return float(silhouette_losses(vertices, self.evidence, self.config.cloud_sigma).mean())
 
     def ruled_out(self, surface: Surface) -> float:
         """Share of a surface's vertices that the frame rules out by more than ``FAR``."""

@@ -4,6 +4,7 @@ Every term gives normal equations near a state; lengths in scene units, camera f
 observed samples, k modes.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -96,6 +97,15 @@ class PosedSamples:
     place: Float32[np.ndarray, "s 3"]
     normal: Float32[np.ndarray, "s 3"]
     facing: Bool[np.ndarray, " s"]
+
+    @property
+    def points(self) -> Float[np.ndarray, "s 3"]:
+        """Positions of the samples, in double precision."""
+        return self.place.astype(np.float64)
+
+    def modes_at(self, rows: Int[np.ndarray, " r"]) -> Float32[np.ndarray, "r 3 k"]:
+        """Modes of some of the samples."""
+        return self.surface.modes[rows, 0]
 
     def few(self, count: int) -> "PosedSamples":
         """About ``count`` samples, as evenly spread."""
@@ -270,18 +280,6 @@ class NetworkTerm:
         return normal.add(in_space(posed, points, self.modes), offset.ravel(), np.repeat(weight, 3))
 
 
-def add_cloud(
-    normal: NormalEquations,
-    posed: Posed,
-    points: Float[np.ndarray, "p 3"],
-    planes: Planes,
-    sigma: float,
-    total_weight: float,
-) -> NormalEquations:
-    """Sum with each point's distance to its plane of the facing surface."""
-    return normal.add(*cloud_rows(posed, points, planes, sigma, total_weight))
-
-
 def cloud_rows(
     posed: Posed, points: Float[np.ndarray, "p 3"], planes: Planes, sigma: float, total_weight: float
 ) -> Rows:
@@ -293,18 +291,30 @@ def cloud_rows(
 
 
 def add_silhouette(
-    normal: NormalEquations, posed: Posed, samples: PosedSamples, evidence: Evidence, sigma: float
+    normal: NormalEquations,
+    posed: Posed,
+    points: Float[np.ndarray, "n 3"],
+    modes_at: Callable[[Int[np.ndarray, " r"]], Float32[np.ndarray, "r 3 k"]],
+    evidence: Evidence,
+    sigma: float,
 ) -> NormalEquations:
-    """Sum with the samples of the surface that are outside the silhouette or in free space."""
-    place = samples.place.astype(np.float64)
-    direction, amount = evidence.violations(place, ROBUST * sigma)
+    """Sum with those points of the surface that are outside the silhouette or in free space.
+
+    ``modes_at`` gives the modes of some of the points, by their rows.
+    """
+    direction, amount = evidence.violations(points, ROBUST * sigma)
     rows = np.flatnonzero(amount > 0)
     if len(rows) == 0:
         return normal
     rows = rows[:: max(1, -(-len(rows) // MOST_VIOLATIONS))]
-    jacobian = along(posed, place[rows], samples.surface.modes[rows, 0], direction[rows])
+    jacobian = along(posed, points[rows], modes_at(rows), direction[rows])
     weight = SILHOUETTE_WEIGHT / sigma**2 * geman_mcclure(amount[rows], 4 * ROBUST * sigma)
     return normal.add(jacobian, -amount[rows], weight)
+
+
+def silhouette_losses(points: Float[np.ndarray, "n 3"], evidence: Evidence, sigma: float) -> Float[np.ndarray, " n"]:
+    """Loss of each point of the surface by how far the frame rules it out, in squared sigmas."""
+    return robust_square(evidence.violations(points, ROBUST * sigma)[1], sigma, 4 * ROBUST)
 
 
 # --- priors -----------------------------------------------------------------------------------------------------------
