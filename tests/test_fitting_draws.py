@@ -72,7 +72,7 @@ def test_a_secant_agrees_with_the_step_and_only_there() -> None:
 def test_the_approach_reaches_a_state_of_the_scene(model: StatisticalModel, states: DrawnStates) -> None:
     """From another state, to the shape of one whose draws are known, in any pose."""
     points = states.material[7][states.played.index].astype(np.float64) @ np.diag([-1.0, -1.0, 1.0]) + 5.0
-    shape = Shape.of(points, 0.04 * model.half, 500.0, np.ones(len(points)))
+    shape = Shape.of(points, 0.04 * model.half, np.ones(len(points)))
     drawn = Drawn.of(SCENE, states.seeds[3])
     start = lay_on_shape(states, shape, drawn, drawn.z)
     assert start is not None
@@ -121,7 +121,7 @@ def test_a_second_pass_follows_where_the_first_has_failed(
     poor = replace(poor, jumps=0, network_start=False)
     once, twice = (fit_draws(replace(problem, config=replace(poor, passes=n)), wrong) for n in (0, 1))
     assert once is not None and twice is not None and twice.misfit < 0.9 * once.misfit
-    monkeypatch.setattr("mereo.fitting.draws.fit.fit_from_end", None)  # not called where the first explains the cloud
+    monkeypatch.setattr("mereo.fitting.draws.fit.refine", None)  # not called where the first explains the cloud
     assert fit_draws(replace(problem, config=replace(problem.config, passes=1, hopeless=9.0)), fitted.posed) is not None
 
 

@@ -18,80 +18,40 @@ known."""
 
 @dataclass(frozen=True)
 class FitConfig:
-    """Constants of the fit; lengths are shares of half the rest box's longest side where not said otherwise.
+    """Constants of the fit; lengths are scene units where not said otherwise.
 
     Attributes:
-        start_sigma: standard deviation of the network's correspondences.
-        first_steps: steps on the correspondences alone, their sigma falling from ``first_widening`` times to once.
-        first_weight: how many independent points the correspondences are worth in these.
-        last_steps: steps on cloud, silhouette and correspondences; the cloud's sigma falls by ``cooling`` in each.
-        cloud_sigma: last standard deviation of the cloud, in scene units, where its noise is not larger.
+        start_sigma: standard deviation of the network's correspondences, and the cloud's at first, as a share of half
+            the rest box's longest side.
+        cloud_sigma: last standard deviation of the cloud, where its noise is not larger.
         cloud_weight: how many independent points the cloud is worth.
-        network_weight: the same of the correspondences, at the first and at the last of these steps.
-        pair_weight: the same of the distances that the states keep.
-        pair_slack: how far these distances may be off at first; it falls by ``pair_cooling`` in each step.
-        damping: of every step, relative to the diagonal.
-        neighbors: states of the library around an answer whose Gaussian is the prior of the next.
-        neighbor_std: standard deviation of each coefficient that is added to theirs.
-        refine_sigma, refine_steps: the cloud's first sigma, and steps, under the prior of the neighbours.
+        network_weight: the same of the correspondences, at the first and at the last step with the cloud.
         explained: the cloud's misfit, in squared standard deviations of a sample, above which other states are tried.
-        tries, per_joint: states of the library that are tried, and states of each joint that differ in it alone.
-        screened, screen_steps: how many of either are drawn towards the frame by few points, and in how many steps.
-        refined, last_widening, last_refine: how many are refined, from which ``refine_sigma`` and in how many steps.
-        rounds: how often other states are tried.
-        curved: other states are tried only where this many distances are kept: smooth bending has one optimum.
-        samples, coarse_samples: points of the surface that stand for it in most steps, and in the choice of states.
+        samples: points of the surface that stand for it in most steps.
         silhouette_vertices: how many of them are compared with what the frame rules out.
         exact_steps: last steps, which ask the faces themselves.
         search_rounds: rounds of the search at most, while nothing explains the frame.
         scale_std: standard deviation of the scale's logarithm where the unit is not known.
-        accepted, tolerance: a fit is believed where this share of the observed points lies as near its facing surface,
-            in scene units.
-        turned: whether the network is asked again, with the camera turned, where much is unexplained: seconds a frame.
-        turned_anyway: whether it is, however much noise that may be: for frames that nothing else explains.
-        agreed, accepted_agreed: where the network and the fit give as large a share of the correspondences on the
-            object's surface the same segment, this smaller share is enough.
+        accepted, tolerance: a fit is believed where this share of the observed points lies as near its facing surface.
+            Where network and fit give .8 of the correspondences the same segment, a share of .85 is enough.
+        turned: whether the network also predicts with the camera turned, where much is unexplained: seconds a frame.
+        turned_anyway: whether it does, however much noise that may be: for frames that nothing else explains.
     """
 
     start_sigma: float = 0.06
-    first_steps: int = 8
-    first_widening: float = 2.5
-    first_weight: float = 500.0
-    last_steps: int = 15
-    cooling: float = 0.75
     cloud_sigma: float = 0.2
     cloud_weight: float = 3000.0
     network_weight: tuple[float, float] = (60.0, 10.0)
-    pair_weight: float = 100.0
-    pair_slack: float = 0.05
-    pair_cooling: float = 0.7
-    damping: float = 1e-3
-    neighbors: int = 50
-    neighbor_std: float = 0.17
-    refine_sigma: float = 0.02
-    refine_steps: int = 10
     explained: float = 0.147
-    tries: int = 12
-    per_joint: int = 4
-    screened: int = 8
-    screen_steps: int = 4
-    last_widening: float = 1.0
-    last_refine: int = 8
-    refined: int = 2
-    rounds: int = 2
-    curved: int = 300
-    search_rounds: int = 3
-    scale_std: float = 0.1
     samples: int = 3000
-    coarse_samples: int = 1000
     silhouette_vertices: int = 500
     exact_steps: int = 3
+    search_rounds: int = 3
+    scale_std: float = 0.1
     accepted: float = 0.95
     tolerance: float = 0.45
     turned: bool = True
     turned_anyway: bool = False
-    agreed: float = 0.8
-    accepted_agreed: float = 0.85
 
 
 @dataclass(frozen=True)
@@ -99,56 +59,37 @@ class DrawsConfig:
     """Constants of the fit of draws.
 
     Attributes:
-        starts: random states that are compared with a shape, the most like it.
+        starts: random states, most like a shape, from which fits start.
         sieve: sets of differences spent on each start, and on how many of the best, one stage after the other.
         kept: how many of them are then fitted to the frame.
-        met: misfit up to which a start meets a shape; beyond, ``choices`` states with other discrete draws are tried,
-            and the ``chosen`` most like the shape approach it.
-        shape_std: standard deviation of the shape that the modes found, as a share of half the rest box's longest side.
-        shape_weight: how many independent points a shape is worth.
-        cloud_weight, network_weight: the same of the cloud and of the correspondences, from beginning to end, also
-            where draws and modes are compared.
+        choices: states with other discrete draws that are tried, where no start meets a shape.
+        cloud_weight, network_weight: how many independent points cloud and correspondences are worth, from beginning
+            to end, also where draws and modes are compared.
         first_rounds, last_rounds: sets of differences in the fit to the frame, after a jump and else.
         steps: at most with one set of differences.
-        tries: dampings at most in one step.
-        damping: the first one, relative to the diagonal.
-        cooling: of the cloud's sigma in each step.
-        gain: relative gain of a step below which nothing more is tried.
         explained: the cloud's misfit above which the network's answer is a start too, and draws may jump.
         hopeless: the same, above which the next starts are tried, in at most ``batches`` of them.
         passes: while it is above ``hopeless``, how often the modes are refined from where the draws ended, and the
             draws fitted to that shape again.
-        jumps: how often one draw may jump to another place of its range.
+        jumps: how often one draw may jump to another position of its range.
         jump_steps, jumps_kept: into how many even steps its range is divided, so that a draw may jump to one position
             fewer; and how many of these, the best, are compared: all where None.
         sliding: most share of a draw's motion that may leave the surface; 1 lets all draws jump.
         turned_worse: misfit by which a state may be worse with segments stiffly turned that look alike turned
-            (``turned_segments``), for that shape to be tried.
-        turned_sieve: ``sieve`` for it; one start is then fitted to the frame.
+            (``symmetric_groups``), for that shape to be tried.
         network_start: whether the network's answer is a start too, where the cloud is not explained.
         every_point: whether the answer is fitted to every observed point in the end.
-        few: scenes with more draws than this get ``MANY_DRAWS`` instead: every set of differences plays each draw once.
-        near: how many states count as near where draws are guessed from the modes.
-        start_sigma: the cloud's first sigma, as a share of half the rest box's longest side.
     """
 
     starts: int = 40
     kept: int = 2
-    met: float = 100.0
     choices: int = 100
-    chosen: int = 4
     sieve: tuple[tuple[int, int], ...] = ((1, 10), (1, 3))
-    shape_std: float = 0.04
-    shape_weight: float = 500.0
     cloud_weight: float = 1500.0
     network_weight: float = 30.0
     first_rounds: int = 1
     last_rounds: int = 2
     steps: int = 6
-    tries: int = 3
-    damping: float = 0.03
-    cooling: float = 0.6
-    gain: float = 0.003
     explained: float = 0.125
     hopeless: float = 0.25
     batches: int = 1
@@ -158,12 +99,8 @@ class DrawsConfig:
     jumps_kept: int | None = None
     sliding: float = 1.0
     turned_worse: float = 25.0
-    turned_sieve: tuple[tuple[int, int], ...] = ((1, 4), (1, 1))
     network_start: bool = True
     every_point: bool = True
-    few: int = 30
-    near: int = 100
-    start_sigma: float = 0.03
 
 
 MANY_DRAWS = DrawsConfig(
@@ -174,7 +111,6 @@ MANY_DRAWS = DrawsConfig(
     starts=16,
     kept=1,
     sieve=((1, 3), (1, 1)),
-    first_rounds=1,
     last_rounds=4,
     jump_steps=12,
     jumps_kept=1,
@@ -182,7 +118,9 @@ MANY_DRAWS = DrawsConfig(
     network_start=False,
     every_point=False,
 )
-"""Constants for scenes with many draws."""
+"""Constants for scenes with more than ``FEW_DRAWS``: every set of differences plays each draw once."""
+
+FEW_DRAWS = 30
 
 
 StreamMethod = Literal["auto", "network", "search", "modes"]

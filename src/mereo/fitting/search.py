@@ -20,12 +20,12 @@ from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from mereo.fitting.modes import ScoredFit, explored, fit_cloud, fit_wide, refined
+from mereo.fitting.modes import PAIR_SLACK, ScoredFit, explored, fit_cloud, fit_wide, refined
 from mereo.fitting.problem.evidence import Evidence
-from mereo.fitting.problem.gauss_newton import Posed, cross
+from mereo.fitting.problem.gauss_newton import DAMPING, Posed, cross
 from mereo.fitting.problem.problem import UNEXPLAINED, Problem
 from mereo.fitting.problem.residuals import ROBUST, SILHOUETTE_WEIGHT, Prior, SampledSurface
-from mereo.fitting.problem.segments import corner_positions
+from mereo.fitting.problem.segments import corner_positions, diverse_rows, rms_distance
 from mereo.geometry.transforms import rotation_along
 from mereo.io.cores import cores
 from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
@@ -207,9 +207,6 @@ BLOCK = 150
 
 OUTSIDE = SILHOUETTE_WEIGHT * SILHOUETTE_VERTICES / 3000.0
 """Weight of what the frame rules out beside that of the cloud: as in the fit."""
-
-DAMPING = 1e-3
-"""Damping of a step, relative to the diagonal."""
 
 FARTHEST = 0.5
 """Largest turn of one step, rad, and largest change of the scale's logarithm."""
@@ -591,7 +588,7 @@ def candidates(problem: Problem, stage: SearchRound) -> list[tuple[float, Posed]
     coarse, whole = problem.coarse, Prior.whole(problem.model)
     bent, cost = screen_poses(problem, stage), list[float]()
     for start, steps, sigma in BENDING:
-        bent = [fit_cloud(coarse, posed, whole, start, steps, problem.config.pair_slack) for posed in bent]
+        bent = [fit_cloud(coarse, posed, whole, start, steps, PAIR_SLACK) for posed in bent]
         cost = [coarse.screen(posed, sigma * problem.model.half).without_network for posed in bent]
         order = np.argsort(cost)
         bent, cost = [bent[index] for index in order], [cost[index] for index in order]
@@ -602,16 +599,7 @@ def candidates(problem: Problem, stage: SearchRound) -> list[tuple[float, Posed]
 
 def differing(problem: Problem, states: list[Posed], apart: float) -> list[int]:
     """Rows of the states of which each differs from all before it by ``apart`` half lengths in the mean."""
-    return _first_of_each(corner_positions(problem.model, states), apart * problem.model.half)
-
-
-def _first_of_each(positions: Float[np.ndarray, "n p 3"], apart: float) -> list[int]:
-    """Rows of which each is farther than ``apart`` from all before it, in the root mean square."""
-    kept: list[int] = []
-    for row, place in enumerate(positions):
-        if not kept or np.sqrt(((positions[kept] - place) ** 2).sum(axis=2).mean(axis=1)).min() > apart:
-            kept.append(row)
-    return kept
+    return diverse_rows(corner_positions(problem.model, states), apart * problem.model.half, rms_distance)
 
 
 def screen_poses(problem: Problem, stage: SearchRound) -> list[Posed]:
@@ -626,7 +614,10 @@ def screen_poses(problem: Problem, stage: SearchRound) -> list[Posed]:
     poses = screen.scored(poses, SIGMAS[-1][0])
     poses = poses.rows(np.argsort(poses.cost))
     positions = poses.place(tables.place[poses.state, ::16])
-    return [_posed(screen, poses, row) for row in _first_of_each(positions, APART * problem.model.half)[: stage.bent]]
+    return [
+        _posed(screen, poses, row)
+        for row in diverse_rows(positions, APART * problem.model.half, rms_distance)[: stage.bent]
+    ]
 
 
 def _posed(screen: Screen, poses: Poses, row: int) -> Posed:

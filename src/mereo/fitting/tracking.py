@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from mereo.fitting.config import FitConfig, FoundBy, TrackConfig, Tracking
 from mereo.fitting.problem.correspondences import nothing
 from mereo.fitting.problem.evidence import Evidence
-from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, in_space
+from mereo.fitting.problem.gauss_newton import DAMPING, POSE, NormalEquations, Posed, in_space
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem, constants_for
 from mereo.fitting.problem.residuals import NetworkTerm, Prior
 from mereo.fitting.registration.answer import Answer, Candidate
@@ -261,7 +261,7 @@ def descend(problem: Problem, start: Posed, expectation: Expectation, config: Tr
         sigma = max(config.first_sigma * half * config.cooling**step, constants.cloud_sigma)
         normal = expectation.add_to(problem.known(posed, prior, 0.0), posed)
         normal = problem.seen(normal, posed, sigma, 0.0, exact=step >= config.steps)
-        posed = posed.moved(normal.step(constants.damping))
+        posed = posed.moved(normal.step(DAMPING))
     return posed
 
 

@@ -44,8 +44,8 @@ from mereo.scenes.statistical_model import StatisticalModel
 RANKED_BY = 150
 """Points by which random states are compared with a shape."""
 
-SMALLEST = 1e-4
-"""Least share of a draw that jumps."""
+GAIN = 0.003
+"""Relative gain of a step below which nothing more is tried."""
 
 SLIDES = 0.03
 """Least motion, for one standard deviation of a draw that may jump, of the point that moves farthest: of ``half``."""
@@ -85,7 +85,7 @@ def fit_near_modes(
     problem: DrawsProblem, modes: Posed, fits: list[DrawsFit], others: Sequence[Drawn] = ()
 ) -> list[DrawsFit]:
     """Fit from states like a fit of the modes, and from ``others``."""
-    guess = problem.states.guess(modes.z, problem.model.motion, problem.config.near)
+    guess = problem.states.guess(modes.z, problem.model.motion)
     return fit_from_shape(problem, modes, shape_of(problem, problem.model.material(modes.z)), [guess, *others])
 
 
@@ -107,7 +107,7 @@ def fit_like_network(problem: DrawsProblem, modes: Posed, fits: list[DrawsFit]) 
         return []
     camera = Posed(np.eye(3), np.zeros(3), np.empty(0), modes.log_scale)
     points, sigma = matches.points * np.exp(-modes.log_scale), problem.base.network_sigma
-    shape = Shape.of(points, sigma, config.shape_weight, matches.confidence, problem.following_played)
+    shape = Shape.of(points, sigma, matches.confidence, problem.following_played)
     return fit_from_shape(problem, camera, shape, [])
 
 
@@ -123,8 +123,8 @@ def explains_cloud(problem: DrawsProblem, fits: list[DrawsFit], most: float) -> 
 
 def shape_of(problem: DrawsProblem, material: Float[np.ndarray, "m 3"]) -> Shape:
     """Shape of material points, unposed: dense and smooth."""
-    config, few = problem.config, problem.states.played.index
-    return Shape.of(material[few], config.shape_std * problem.model.half, config.shape_weight, np.ones(len(few)))
+    few = problem.states.played.index
+    return Shape.of(material[few], 0.04 * problem.model.half, np.ones(len(few)))
 
 
 def fit_from_shape(problem: DrawsProblem, frame: Posed, shape: Shape, guesses: list[Drawn]) -> list[DrawsFit]:
@@ -158,12 +158,12 @@ def descend_best(problem: DrawsProblem, frame: Posed, shape: Shape, starts: list
 def find_other_choices(problem: DrawsProblem, shape: Shape, best: StateOnShape | None) -> list[StateOnShape]:
     """States near a shape that ``best`` does not meet, made from that one by other discrete draws."""
     config, states = problem.config, problem.states
-    if best is None or best.misfit < config.met:
+    if best is None or best.misfit < 100.0:
         return []
     others = redraw_choices(states.scene, replace(best.drawn, z=best.z), config.choices)
     states_near = [lay_on_shape(states, shape, other, other.z) for other in others]
     new = [state for state in states_near if state is not None and are_different(state, best, shape.std)]
-    return [approach(states, shape, state, 1) for state in sorted(new, key=by_misfit)[: config.chosen]]
+    return [approach(states, shape, state, 1) for state in sorted(new, key=by_misfit)[:4]]
 
 
 def are_different(first: StateOnShape, second: StateOnShape, least: float) -> bool:
@@ -196,7 +196,7 @@ def try_symmetric_states(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     the frame nearly as well: what is seen of a right one mostly tells.
     """
     config = problem.config
-    few = replace(problem, config=replace(config, sieve=config.turned_sieve, kept=1, batches=1))
+    few = replace(problem, config=replace(config, sieve=((1, 4), (1, 1)), kept=1, batches=1))
     for together in symmetric_groups(problem.model):
         material = turn_segments(problem.model, fit.material, together)
         stiff = try_material(problem, fit.drawn, fit.z, fit.posed, material)
@@ -236,7 +236,7 @@ def find_jumps(problem: DrawsProblem, fit: DrawsFit, number: int, sigma: float) 
     config, candidates = problem.config, list[tuple[float, DrawsFit]]()
     for turn in range(1, config.jump_steps):
         z = fit.z.copy()
-        z[number] = ndtri(np.clip((ndtr(z[number]) + turn / config.jump_steps) % 1.0, SMALLEST, 1 - SMALLEST))
+        z[number] = ndtri(np.clip((ndtr(z[number]) + turn / config.jump_steps) % 1.0, 1e-4, 1 - 1e-4))
         other = simulate(problem, fit.drawn, z, fit.posed)
         if other is not None:
             candidates.append((misfit(problem, other, sigma), other))
@@ -269,7 +269,7 @@ def draws_that_may_jump(problem: DrawsProblem, fit: DrawsFit) -> Int[np.ndarray,
 
 def first_sigma(problem: DrawsProblem) -> float:
     """The cloud's first standard deviation, scene units."""
-    return max(problem.config.start_sigma * problem.model.half, problem.base.config.cloud_sigma)
+    return max(0.03 * problem.model.half, problem.base.config.cloud_sigma)
 
 
 def descend(
@@ -277,7 +277,7 @@ def descend(
 ) -> DrawsFit:
     """Levenberg and Marquardt's method on played states, by ``fresh`` sets of differences after the given one."""
     config, least = problem.config, problem.base.config.cloud_sigma
-    index, sigma, damping = problem.states.played.index, first_sigma(problem), config.damping
+    index, sigma, damping = problem.states.played.index, first_sigma(problem), 0.03
     for number in range(fresh + (motion is not None)):
         if number or motion is None:
             motion = derivatives(problem.states, fit.drawn, fit.z, fit.material[index])
@@ -286,10 +286,10 @@ def descend(
             before = misfit(problem, fit, sigma)
             fit, motion, damping = lower(problem, fit, motion, sigma, damping)
             gain = before - misfit(problem, fit, sigma)
-            if gain == 0 or (gain < config.gain * before and sigma <= least):
+            if gain == 0 or (gain < GAIN * before and sigma <= least):
                 break
-            sigma = max(sigma * config.cooling, least)
-        if sigma <= least and start - fit.misfit < config.gain * start:
+            sigma = max(sigma * 0.6, least)
+        if sigma <= least and start - fit.misfit < GAIN * start:
             break
         damping = min(damping, 1.0)
     return replace(fit, motion=motion)
@@ -300,7 +300,7 @@ def lower(
 ) -> tuple[DrawsFit, Float32[np.ndarray, "a 3 d"], float]:
     """A state of lower misfit, or the same; what was learnt of the motion; the next damping."""
     index, least = problem.states.played.index, misfit(problem, fit, sigma)
-    for _ in range(problem.config.tries):
+    for _ in range(3):
         step = normal_equations(problem, fit, motion, sigma).step(damping)
         tried = simulate(problem, fit.drawn, fit.z + step[POSE:], fit.posed.moved(step[:POSE]))
         if tried is not None:
@@ -318,9 +318,6 @@ def lower(
 # Derivatives do not reach across them, and random states hold one combination too seldom to be near everything else.
 # So a state that is right but for such a choice keeps all that it has drawn; the choice, and what it asks for, is drawn
 # anew.
-
-MORE_CALLS = 12
-"""Calls that another choice may ask for in addition; a scene that asks for more has thrown its first attempt away."""
 
 
 def redraw_choices(scene: Scene, drawn: Drawn, count: int) -> list[Drawn]:
@@ -346,7 +343,8 @@ def _some(numbers: Sequence[int], rng: np.random.Generator) -> set[int]:
 
 def _redraw(scene: Scene, calls: Sequence[Call], left_out: set[int], seed: int) -> Drawn | None:
     given = {call.key: call.shares for number, call in enumerate(calls) if number not in left_out}
-    recorder = Recorder(seed, given, len(calls) + MORE_CALLS)
+    # a scene that asks for more calls than these has thrown its first attempt away
+    recorder = Recorder(seed, given, len(calls) + 12)
     try:
         play(scene, recorder)
     except (OutOfDraws, ValueError):

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from scipy.sparse import csr_array
 
 from mereo.deformation.moving_least_squares import PointWeights
-from mereo.fitting.config import MANY_DRAWS, DrawsConfig
+from mereo.fitting.config import FEW_DRAWS, MANY_DRAWS, DrawsConfig
 from mereo.fitting.draws.playback import Drawn, DrawnStates, as_sparse, material_moved
 from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, geman_mcclure, in_space
@@ -75,11 +75,10 @@ class DrawsProblem:
         """Problem with the constants for as many draws as the scene has, where none are given."""
         model = base.model
         if config is None:
-            config = DrawsConfig() if states.z.shape[1] <= DrawsConfig().few else MANY_DRAWS
-        weights_config = replace(
-            base.config, cloud_weight=config.cloud_weight, network_weight=(config.network_weight,) * 2
-        )
-        base = replace(base, config=weights_config)
+            config = DrawsConfig() if states.z.shape[1] <= FEW_DRAWS else MANY_DRAWS
+        network_weight = config.network_weight, config.network_weight
+        fit_config = replace(base.config, cloud_weight=config.cloud_weight, network_weight=network_weight)
+        base = replace(base, config=fit_config)
         return cls(base, states, correspondences, model.weights(correspondences.rest, correspondences.labels), config)
 
     def network(self, fit: "DrawsFit", modes: Float32[np.ndarray, "n 3 d"] | None = None) -> NetworkTerm:
@@ -218,29 +217,17 @@ def surface_weights(fit: DrawsFit, count: int) -> csr_array:
 # The fit of the modes is dense and smooth, so the draws of a state like it are found from far away. Playing few
 # points of a state costs milliseconds; one set of differences serves for several steps (Broyden's rule).
 
+SHAPE_WEIGHT = 500.0
+"""How many independent points a shape is worth."""
+
 SHAPE_ROBUST = 2.5
 """Points farther off than this many standard deviations count for little."""
-
-DIFFERENCE = 0.02
-"""Step of finite differences, in standard deviations of a draw."""
-
-STEPS = 6
-"""Steps at most with one set of differences."""
-
-TRIES = 5
-"""Dampings at most in one step."""
 
 ENOUGH = 0.02
 """Relative gain of a step below which nothing more is tried."""
 
 HELD = 1e6
-"""Precision of draws that move nothing here: they stay."""
-
-SAME = 1e-4
-"""Distance, in scene units, below which two plays are of one state; rest points are in single precision."""
-
-STILL = 1e-9
-"""Motion, in scene units for a standard deviation, below which a draw moves nothing."""
+"""Precision of draws that move nothing at a state: they stay."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,12 +251,11 @@ class Shape:
         cls,
         points: Float[np.ndarray, "n 3"],
         std: float,
-        weight: float,
         confidence: Float[np.ndarray, " n"],
         follow: csr_array | None = None,
     ) -> "Shape":
-        """Shape worth ``weight`` points."""
-        return cls(points, std, confidence / confidence.sum() * (weight / std**2), follow)
+        """Shape worth ``SHAPE_WEIGHT`` points."""
+        return cls(points, std, confidence / confidence.sum() * (SHAPE_WEIGHT / std**2), follow)
 
     def at(self, values: Float[np.ndarray, "a *c"]) -> Float[np.ndarray, "n *c"]:
         """Values at the points, from values at the played points."""
@@ -329,9 +315,11 @@ def derivatives(
     """
     change = np.zeros((*positions.shape, len(z)), dtype=np.float32)
     untested = drawn.deformations(states.scene, z, checked=False)
-    checked = untested is None or float(np.abs(states.played.moved(untested) - positions).max()) > SAME
+    checked = (
+        untested is None or float(np.abs(states.played.moved(untested) - positions).max()) > 1e-4
+    )  # rest points are in single precision
     for number in np.flatnonzero(drawn.smooth):
-        step = DIFFERENCE * (-1.0 if z[number] > 0 else 1.0)
+        step = 0.02 * (-1.0 if z[number] > 0 else 1.0)
         other = z.copy()
         other[number] += step
         moved = drawn.deformations(states.scene, other, checked)
@@ -342,7 +330,7 @@ def derivatives(
 
 def unmoving(motion: Float32[np.ndarray, "a 3 d"]) -> Bool[np.ndarray, " d"]:
     """Which draws move nothing here."""
-    return np.asarray(np.abs(motion).max(axis=(0, 1)) < STILL)
+    return np.asarray(np.abs(motion).max(axis=(0, 1)) < 1e-9)  # scene units
 
 
 def prior_of_draws(
@@ -368,7 +356,7 @@ def approach(states: DrawnStates, shape: Shape, state: StateOnShape, fresh: int)
     for _ in range(fresh):
         motion = derivatives(states, state.drawn, state.z, state.points)
         before = state.misfit
-        for _ in range(STEPS):
+        for _ in range(6):
             nearer, motion, damping = _step(states, shape, state, motion, damping)
             gain, state = state.misfit - nearer.misfit, nearer
             if gain < ENOUGH * state.misfit:
@@ -382,9 +370,18 @@ def approach(states: DrawnStates, shape: Shape, state: StateOnShape, fresh: int)
 def _step(
     states: DrawnStates, shape: Shape, state: StateOnShape, motion: Float32[np.ndarray, "a 3 d"], damping: float
 ) -> tuple[StateOnShape, Float32[np.ndarray, "a 3 d"], float]:
-    """The next state, or the same; what was learnt of the motion; the next damping."""
-    for _ in range(TRIES):
-        step = _solved(shape, state, motion, damping)
+    """Take Levenberg and Marquardt's step of the draws, the pose free.
+
+    Returns the next state, or the same; what was learnt of the motion; the next damping.
+    """
+    posed = Posed(state.rotation, state.translation, np.zeros(len(state.z)))
+    points = posed.place(shape.at(state.points))
+    offset = points - shape.points
+    weight = shape.weight * geman_mcclure(np.linalg.norm(offset, axis=1), 2 * SHAPE_ROBUST * shape.std)
+    for _ in range(5):
+        normal = prior_of_draws(state.z, motion, 0.0, 1e-6)
+        jacobian = in_space(posed, points, shape.at(motion))
+        step = normal.add(jacobian, offset.ravel(), np.repeat(weight, 3)).step(damping)[POSE:]
         tried = lay_on_shape(states, shape, state.drawn, state.z + step)
         if tried is not None:
             motion = secant(motion, step, tried.points - state.points)
@@ -392,16 +389,3 @@ def _step(
                 return tried, motion, max(damping / 4.0, 1e-3)
         damping *= 5.0
     return state, motion, damping
-
-
-def _solved(
-    shape: Shape, state: StateOnShape, motion: Float32[np.ndarray, "a 3 d"], damping: float
-) -> Float[np.ndarray, " d"]:
-    """Levenberg and Marquardt's step of the draws, the pose free."""
-    normal = prior_of_draws(state.z, motion, 0.0, 1e-6)
-    posed = Posed(state.rotation, state.translation, np.zeros(len(state.z)))
-    points = posed.place(shape.at(state.points))
-    offset = points - shape.points
-    weight = shape.weight * geman_mcclure(np.linalg.norm(offset, axis=1), 2 * SHAPE_ROBUST * shape.std)
-    jacobian = in_space(posed, points, shape.at(motion))
-    return normal.add(jacobian, offset.ravel(), np.repeat(weight, 3)).step(damping)[POSE:]

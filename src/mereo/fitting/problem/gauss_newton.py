@@ -18,6 +18,9 @@ from scipy.spatial.transform import Rotation
 POSE = 7
 """Parameters before the coefficients."""
 
+DAMPING = 1e-3
+"""Damping of a step of the modes, relative to the diagonal."""
+
 Rows = tuple[Float[np.ndarray, "p q"], Float[np.ndarray, " p"], Float[np.ndarray, " p"]]
 """Derivatives of residuals by the q parameters, the residuals, and their weights, as ``NormalEquations.add`` takes."""
 

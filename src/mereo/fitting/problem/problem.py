@@ -33,6 +33,9 @@ COARSE = 3
 TANGENTIAL_SLACK = 1.0
 """Share of the samples' spacing: an observed sample so far beside one is still on its plane."""
 
+PAIR_WEIGHT = 100.0
+"""How many independent points the distances that the states keep are worth."""
+
 KNOWN_SCALE_STD = 1e-6
 """``Problem.scale_std`` of a frame whose unit is known."""
 
@@ -127,7 +130,7 @@ class Problem:
     def known(self, posed: Posed, prior: Prior, slack: float) -> NormalEquations:
         """Normal equations of what is known without the frame: prior, scale, kept distances up to ``slack``."""
         normal = NormalEquations.prior(posed.z, prior.center, prior.precision, posed.log_scale, self.scale_std)
-        return self.pairs.add_to(normal, posed.z, self.config.pair_weight, slack)
+        return self.pairs.add_to(normal, posed.z, PAIR_WEIGHT, slack)
 
     def residual_noise(self, surface: Surface) -> float:
         """Noise of the frame, in scene units, as a fit with this surface leaves it over."""
@@ -208,7 +211,7 @@ class Problem:
         """Problem with fewer points, for the choice among many states."""
         config = replace(
             self.config,
-            samples=self.config.coarse_samples,
+            samples=1000,
             silhouette_vertices=self.config.silhouette_vertices // COARSE,
         )
         if self.noisy:  # its sigma would ask the faces in all steps
@@ -283,7 +286,7 @@ class Problem:
         """Misfit from the mean squares of one observed sample, one correspondence and one silhouette vertex."""
         network = network * self.config.network_weight[1]
         silhouette = silhouette * SILHOUETTE_WEIGHT * SILHOUETTE_VERTICES
-        prior, pairs = float(z @ z), self.config.pair_weight * self.pairs.energy(z)
+        prior, pairs = float(z @ z), PAIR_WEIGHT * self.pairs.energy(z)
         total = self.config.cloud_weight * cloud + network + silhouette + prior + pairs
         return Misfit(cloud, network, silhouette, prior, pairs, total)
 

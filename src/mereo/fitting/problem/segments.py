@@ -5,7 +5,7 @@ Both are learned from the states of the statistical model, without code of a sce
 Notation: s segments, c corners of each (a few anchors), n states, k modes, m material points, a angles.
 """
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -158,6 +158,28 @@ def branches(model: StatisticalModel) -> tuple[tuple[int, int, Bool[np.ndarray, 
         volume = [sum(model.vertex_counts[i] for i in np.flatnonzero(side)) for side in (beyond, ~beyond)]
         result.append((int(a), int(b), beyond) if volume[0] <= volume[1] else (int(b), int(a), ~beyond))
     return tuple(result)
+
+
+def diverse_rows(
+    positions: Float[np.ndarray, "n p 3"], apart: float, measure: Callable[[Float[np.ndarray, "m p 3"]], np.ndarray]
+) -> list[int]:
+    """Rows of which each is farther than ``apart`` from all before it, by a measure of the points' offsets."""
+    kept: list[int] = []
+    for row, points in enumerate(positions):
+        if not kept or measure(positions[kept] - points).min() > apart:
+            kept.append(row)
+    return kept
+
+
+def largest_distance(offset: Float[np.ndarray, "m p 3"]) -> Float[np.ndarray, " m"]:
+    """Length of the longest offset of each row."""
+    longest: np.ndarray = np.linalg.norm(offset, axis=2).max(axis=1)
+    return longest
+
+
+def rms_distance(offset: Float[np.ndarray, "m p 3"]) -> Float[np.ndarray, " m"]:
+    """Root mean square length of the offsets of each row."""
+    return np.sqrt((offset**2).sum(axis=2).mean(axis=1))
 
 
 def different(shapes: Float[np.ndarray, "n q"], first: Float[np.ndarray, " q"], count: int) -> Int[np.ndarray, " m"]:

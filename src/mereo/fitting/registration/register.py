@@ -240,8 +240,8 @@ class ModesFit:
         On clean training views the fit was better than the network in each that the second rule adds.
         """
         config = self.problem.config
-        least = min(config.accepted, config.accepted_agreed)
-        return explained >= config.accepted or (explained >= least and self._agreement(surface) >= config.agreed)
+        least = min(config.accepted, 0.85)
+        return explained >= config.accepted or (explained >= least and self._agreement(surface) >= 0.8)
 
     def _agreement(self, surface: Surface) -> float:
         """Share of the correspondences on the object whose segment is that of the nearest place of the surface."""
