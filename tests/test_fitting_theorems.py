@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from fitted_clouds import fit_correspondences
 from scipy.spatial.transform import Rotation
 from toy_scene import Lift, Shear, toy_scene
 
 from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.residuals import Surface
-from mereo.fitting.registration.register import fit_correspondences
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import rigid, transform_points

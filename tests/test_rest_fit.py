@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fitted_clouds import fit_correspondences
 from test_fitting_theorems import IN_FRONT, SCENE, said, seen, shown
 
 from mereo.fitting.config import FitConfig
@@ -12,7 +13,7 @@ from mereo.fitting.modes import narrowing
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import NormalEquations, Posed
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
-from mereo.fitting.registration.register import CloudToFit, ModesFit, fit_correspondences
+from mereo.fitting.registration.register import CloudToFit, ModesFit
 from mereo.geometry.transforms import transform_points
 from mereo.scenes.statistical_model import StatisticalModel
 

@@ -1,13 +1,10 @@
-"""What is known of a frame once it is answered: the fits to it, and the answer, whose surfaces are made when asked for.
-
-``answer_frame`` makes it, a tracker too.
-"""
+"""The answer to a frame and the fits that led to it; its surfaces are made on first use."""
 
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from mereo.fitting.config import FoundBy, Tracking
 from mereo.fitting.registration.recognition import NOT_ASKED, Recognition
@@ -137,8 +134,8 @@ class Answer:
             return "lost"
         if self.registration is None:
             return "network alone" if self.refusal is None else f"network alone: {self.refusal}"
-        description = self.registration.told
-        return description if self.taken else f"network alone: the {description}, too few"
+        phrase = self.registration.told
+        return phrase if self.taken else f"network alone: the {phrase}, too few"
 
     @cached_property
     def registered(self) -> Registration | None:
@@ -178,10 +175,6 @@ class Answer:
 
 # --- surfaces ---------------------------------------------------------------------------------------------------------
 
-# Surfaces, label grid and figures of a registered model: the same that the network's answer has.
-#
-# EncodedFrame, Registration -registered_reconstruction-> Reconstruction
-
 
 def registered_reconstruction(
     seen: EncodedFrame,
@@ -190,7 +183,7 @@ def registered_reconstruction(
     resolution: int = 128,
     label_points: bool = False,
 ) -> Reconstruction:
-    """Reconstruction that is the registered model itself, in the input's frame.
+    """Make the reconstruction that is the registered model itself, in the input's frame.
 
     Confidence stays the network's: its mean probability of a segment over the voxels that the registration gives it;
     NaN without a network.
@@ -198,8 +191,7 @@ def registered_reconstruction(
     seconds = {**seen.timings_s, "fit": registration.seconds}
     mesh = registration.mesh
     with timed(seconds, "label"):
-        low, high = mesh.bounds
-        grid = padded_label_grid(mesh, float((high - low).max()) / resolution)
+        grid = _label_grid(mesh, resolution)
     with timed(seconds, "measure"):
         segments = measure(Extraction(mesh, grid, 0), model, seen.code)
     observed = None
@@ -222,6 +214,16 @@ def registered_reconstruction(
     return result if seen.axes == "camera" else turned_back(result)
 
 
+def _label_grid(mesh: SegmentedMesh, resolution: int) -> LabelGrid:
+    """Labels of a mesh on a grid of so many cells along its longest side, with one empty voxel around it."""
+    low, high = mesh.bounds
+    spacing = float((high - low).max()) / resolution
+    counts = np.ceil((high - low) / spacing).astype(int) + 3
+    origin = (low + high - (counts - 1) * spacing) / 2
+    labels = label_grid(mesh, *(origin[axis] + np.arange(counts[axis]) * spacing for axis in range(3)))
+    return LabelGrid(labels, origin, np.full(3, spacing), mesh.names)
+
+
 def _observed(seen: EncodedFrame, registration: Registration, model: Trained | None) -> SegmentedCloud:
     """Segment of each observed point by the registration, with a network's probabilities of it, or NaN."""
     points = seen.seen.points
@@ -231,13 +233,3 @@ def _observed(seen: EncodedFrame, registration: Registration, model: Trained | N
         return SegmentedCloud(seen.points, labels, unknown, unknown, rest.names, rest.colors)
     logits = model.logits(seen.code, points)
     return segment_points(logits, seen.points, model.names, model.colors, model.calibration, labels)
-
-
-def padded_label_grid(mesh: SegmentedMesh, spacing: float) -> LabelGrid:
-    """Labels of a mesh on a grid with one empty voxel around it."""
-    low, high = mesh.bounds
-    counts = np.ceil((high - low) / spacing).astype(int) + 3
-    origin = (low + high - (counts - 1) * spacing) / 2
-    x, y, z = (origin[axis] + np.arange(counts[axis]) * spacing for axis in range(3))
-    labels: UInt8[np.ndarray, "x y z"] = label_grid(mesh, x, y, z)
-    return LabelGrid(labels, origin, np.full(3, spacing), mesh.names)

@@ -1,4 +1,4 @@
-"""Is it my object, in a state that I know? One answer from what a fit and the network leave unexplained.
+"""Recognize whether a frame shows the object in a learned state, from what a fit and the network leave unexplained.
 
     Registration, correspondences, stated scene unit -Signs.of-> Signs -recognize-> Recognition (known or not, and why)
 
@@ -9,7 +9,7 @@ deviations and together, is the frame's strangeness; two limits make three answe
 gives the reason, so there is one voice.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -36,34 +36,22 @@ LEAST: Mapping[SignName, float] = {
 SIZE = Usual(mean=float(np.log(LEAST["size"] + 0.03)), std=0.5)
 """Usual logarithm of how far sizes are off, of all weights: by 3 %, and by 15 % at most where the unit is right."""
 
-WRONG_UNIT = float(np.log(2.0))
-"""Logarithm of the ratio of sizes above which the frame's unit, or its object, is another one: a factor of two."""
 
-WIDE = 0.5
-"""Standard deviations of logarithms for weights that were not calibrated: those of single objects are smaller."""
+def _usual(unexplained: float, ruled_out: float, beyond: float, displaced: float) -> dict[SignName, Usual]:
+    """Usual values of the signs, with wider spreads of their logarithms than single objects have."""
+    return {
+        "unexplained": Usual(mean=float(np.log(unexplained)), std=0.5),
+        "ruled_out": Usual(mean=float(np.log(ruled_out)), std=0.5),
+        "beyond": Usual(mean=float(np.log(beyond)), std=0.5),
+        "unusual": Usual(mean=float(np.log(0.6)), std=0.5),
+        "displaced": Usual(mean=float(np.log(displaced)), std=0.4),
+    }
+
 
 CONSERVATIVE = Recognizing(
-    clean={
-        "unexplained": Usual(mean=float(np.log(0.3)), std=WIDE),
-        "ruled_out": Usual(mean=float(np.log(0.015)), std=WIDE),
-        "beyond": Usual(mean=float(np.log(0.15)), std=WIDE),
-        "unusual": Usual(mean=float(np.log(0.6)), std=WIDE),
-        "displaced": Usual(mean=float(np.log(0.06)), std=0.4),
-    },
-    noisy={
-        "unexplained": Usual(mean=float(np.log(0.6)), std=WIDE),
-        "ruled_out": Usual(mean=float(np.log(0.03)), std=WIDE),
-        "beyond": Usual(mean=float(np.log(0.2)), std=WIDE),
-        "unusual": Usual(mean=float(np.log(0.6)), std=WIDE),
-        "displaced": Usual(mean=float(np.log(0.09)), std=0.4),
-    },
-    unsure=4.0,
-    refused=8.0,
+    clean=_usual(0.3, 0.015, 0.15, 0.06), noisy=_usual(0.6, 0.03, 0.2, 0.09), unsure=4.0, refused=8.0
 )
 """For weights that were not calibrated."""
-
-LEAST_LEFT = 0.01
-"""Smallest share of the points that a believed fit may leave unexplained, whatever a caller has set."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +85,7 @@ class Signs:
         at_rest, z = registration.method == "rest", registration.modes_z  # at rest it is known, whatever was learned
         return cls(
             size=None if stated_scene_unit is None else abs(float(np.log(registration.scene_unit / stated_scene_unit))),
-            unexplained=(1.0 - registration.explained) / max(1.0 - registration.needed, LEAST_LEFT),
+            unexplained=(1.0 - registration.explained) / max(1.0 - registration.needed, 0.01),
             ruled_out=registration.ruled_out,
             beyond=None if at_rest else registration.beyond_states,
             unusual=None if at_rest or not len(z) else float((z**2).mean()),
@@ -195,80 +183,51 @@ def recognize(
     signs = Signs.of(registration, displaced, stated_scene_unit)
     each = signs.strange(limits.noisy if is_noisy(registration) else limits.clean)
     total = strangeness(each)
-    is_unit_wrong = signs.size is not None and signs.size > WRONG_UNIT
+    is_unit_wrong = signs.size is not None and signs.size > float(np.log(2.0))  # a factor of two
     if total <= limits.unsure and not is_unit_wrong:
         return Recognition(True, None, total, signs, calibrated is not None)
     known: Known = False if total >= limits.refused or is_unit_wrong else "unsure"
-    reason = REASONS["size" if is_unit_wrong else max(each, key=lambda name: each[name])](registration, signs)
+    reason = _reason("size" if is_unit_wrong else max(each, key=lambda name: each[name]), registration, signs)
     return Recognition(known, reason, total, signs, calibrated is not None)
 
 
 # --- reasons ----------------------------------------------------------------------------------------------------------
 
-HARDLY = 0.5
-"""Share of the observed points below which it is probably another object, or no camera frame."""
-
-BEYOND = 0.5
-"""Scene units outside all states that were learned from which on they are worth telling."""
-
 LOOK = "look at the result before you rely on it"
-
 WIDEN = f"{LOOK}, or name the weights of what it is; if it is this object, widen the scene's ranges and learn it anew"
 
 
-def _size(registration: Registration, signs: Signs) -> str:
-    return (
-        f"its size differs by a factor of {np.exp(signs.size or 0.0):.3g} from the object's in the frame's unit: "
-        "correct the unit (--unit-m, --depth-scale), or name the object's own weights"
-    )
-
-
-def _unexplained(registration: Registration, signs: Signs) -> str:
-    if registration.explained < HARDLY:
+def _reason(sign: SignName, registration: Registration, signs: Signs) -> str:
+    """Sentence about the sign that is strangest, with what to do."""
+    if sign == "size":
+        return (
+            f"its size differs by a factor of {np.exp(signs.size or 0.0):.3g} from the object's in the frame's unit: "
+            "correct the unit (--unit-m, --depth-scale), or name the object's own weights"
+        )
+    if sign == "unexplained" and registration.explained < 0.5:
         return (
             f"only {registration.explained:.0%} of the points can be the model's: this is probably another object, "
             "not the object alone, or no camera frame: leave out what is not the object, turn the cloud (--frame), or "
             "name the object's own weights"
         )
-    return (
-        f"{1 - registration.explained:.0%} of the points are not the model's: {LOOK}, or leave out of the cloud what "
-        "is not the object"
-    )
-
-
-def _ruled_out(registration: Registration, signs: Signs) -> str:
-    return (
-        f"{registration.ruled_out:.0%} of the model's surface lies where the frame shows none of it, beside or in "
-        f"front of what was seen: {LOOK}, or take the frame from nearer"
-    )
-
-
-def _beyond(registration: Registration, signs: Signs) -> str:
-    return (
-        f"the state lies {registration.beyond_states:.1f} scene units outside those that were learned, and rigid parts "
-        f"may be bent: {WIDEN}"
-    )
-
-
-def _unusual(registration: Registration, signs: Signs) -> str:
-    if registration.beyond_states > BEYOND:
-        return _beyond(registration, signs)
-    return f"the object would be bent farther than in the states that were learned: {WIDEN}"
-
-
-def _displaced(registration: Registration, signs: Signs) -> str:
+    if sign == "unexplained":
+        return (
+            f"{1 - registration.explained:.0%} of the points are not the model's: {LOOK}, or leave out of the cloud "
+            "what is not the object"
+        )
+    if sign == "ruled_out":
+        return (
+            f"{registration.ruled_out:.0%} of the model's surface lies where the frame shows none of it, beside or in "
+            f"front of what was seen: {LOOK}, or take the frame from nearer"
+        )
+    if sign == "beyond" or (sign == "unusual" and registration.beyond_states > 0.5):
+        return (
+            f"the state lies {registration.beyond_states:.1f} scene units outside those that were learned, and rigid "
+            f"parts may be bent: {WIDEN}"
+        )
+    if sign == "unusual":
+        return f"the object would be bent farther than in the states that were learned: {WIDEN}"
     return (
         f"network and registered model have the same places of the object {signs.displaced or 0.0:.0%} of half its "
         f"length apart: {LOOK}, or name the object's own weights"
     )
-
-
-REASONS: Mapping[SignName, Callable[[Registration, Signs], str]] = {
-    "size": _size,
-    "unexplained": _unexplained,
-    "ruled_out": _ruled_out,
-    "beyond": _beyond,
-    "unusual": _unusual,
-    "displaced": _displaced,
-}
-"""Sentences by the sign that is strangest."""

@@ -85,7 +85,7 @@ class ModesFit:
 
     Attributes:
         problem: everything the fit works on, scene units.
-        correspondences: correspondences, scene units.
+        correspondences: of the network, scene units.
         unit: length of a scene unit in the cloud's unit, before the fit's own scale.
         posed: coefficients and pose.
         seconds: that it took.
@@ -112,7 +112,7 @@ class ModesFit:
         config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
         predict: PredictCorrespondences | None = None,
     ) -> "ModesFit":
-        """Fit of the modes to a cloud, with correspondences in its unit.
+        """Fit the modes to a cloud, with correspondences in its unit.
 
         Where much is unexplained, the network predicts again with the camera turned (``with_turned_camera``); where
         what is left is noise, the frame is fitted once more as a noisy one.
@@ -134,11 +134,10 @@ class ModesFit:
 
         with one_blas_thread():
             problem = Problem.of(model, correspondences, cloud.evidence(unit), cloud.scale_std(config), config)
-            network_fit = problem, correspondences, fit_modes(problem)
+            fit = problem, correspondences, fit_modes(problem)
             predict_scaled = None if predict is None else predict_in_scene_units
-            problem, correspondences, modes = as_noisy(
-                with_turned_camera(network_fit, predict_scaled), cloud.points / unit, predict_scaled
-            )
+            fit = with_turned_camera(fit, predict_scaled)
+            problem, correspondences, modes = as_noisy(fit, cloud.points / unit, predict_scaled)
             rest = fit_rest(problem, correspondences, modes.posed)
             at_rest = is_at_rest(problem, modes, rest)
         return cls(
@@ -168,7 +167,7 @@ class ModesFit:
         return Surface.through(model, self.rest.posed.place(model.rest_points))
 
     def registration(self) -> Registration:
-        """The answer of the modes, or the rest model where the frame speaks for that."""
+        """Return the registration of the modes, or of the rest model where the frame speaks for that."""
         return self._registered
 
     @cached_property
@@ -181,7 +180,7 @@ class ModesFit:
         return self._registration("modes", self.posed.z, end, self.posed, self.surface)
 
     def with_draws(self, states: DrawnStates) -> Registration:
-        """The answer of the scene's own draws where their misfit is lower or their evidence greater, else the modes'.
+        """Fit the scene's draws too, and return them where their misfit is lower or their evidence greater.
 
         Modes can imitate what they do not hold, with more of them than a scene has draws; the evidence counts that.
         It does not speak against draws, which have the states that there really are.
@@ -272,7 +271,7 @@ def fit_frame(
     config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
     code: EncodedCloud | None = None,
 ) -> ModesFit:
-    """Fit of the modes to a cloud, from the network's correspondences.
+    """Fit the modes to a cloud from the network's correspondences.
 
     Args:
         cloud: the observed points, with what is known of their unit and surroundings.
@@ -304,7 +303,7 @@ def fit_frame(
 
 
 def predict_correspondences(network: Trained, model: StatisticalModel, code: EncodedCloud) -> Correspondences:
-    """Correspondences that the network states for a cloud, evenly."""
+    """Predict correspondences of a cloud with the network, and return an even subset."""
     correspondences = find_correspondences(network, code, model.rest_center, model.half)
     if correspondences is None:
         raise ValueError(
@@ -313,23 +312,7 @@ def predict_correspondences(network: Trained, model: StatisticalModel, code: Enc
     return correspondences.evenly()
 
 
-def fit_correspondences(
-    points: Float[np.ndarray, "n 3"],
-    correspondences: Correspondences,
-    model: StatisticalModel,
-    scene_unit: float | None = None,
-    states: DrawnStates | None = None,
-    config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
-) -> Registration:
-    """Registration from given correspondences, with ``states`` by the scene's draws too; ``points`` are the cloud."""
-    fitted = ModesFit.of(CloudToFit(points, scene_unit), correspondences, model, config)
-    return fitted.registration() if states is None else fitted.with_draws(states)
-
-
 # --- the registrar of an object ---------------------------------------------------------------------------------------
-
-ROUNDING = 1e-6
-"""Relative difference up to which a unit that was known is exactly the metre."""
 
 
 class ChangedSceneWarning(UserWarning):
@@ -358,21 +341,16 @@ class Registrar:
 
     @classmethod
     def of(cls, network: Trained, method: AnswerMethod = "auto", scene: Scene | str | None = None) -> "Registrar":
-        """Registrar of the model that the weights carry.
+        """Make the registrar of the model that the weights carry.
 
-        Args:
-            network: the weights.
-            method: which description of the states is fitted.
-            scene: the object's scene, its name or its file, where it is not the built-in one of the weights.
-
-        Raises ``ValueError`` where the weights carry no statistical model, and where ``method`` is "full" without a
-        scene or with one of another object.
+        ``scene`` is the object's scene, its name or its file, where it is not the built-in one of the weights. Raises
+        ``ValueError`` where the weights carry no statistical model, and as ``checked`` does.
         """
         given = load_scene(scene) if isinstance(scene, str) else scene
         return cls(network, statistical_model_of(network), method, given).checked()
 
     def checked(self) -> "Registrar":
-        """Itself; raises ``ValueError`` where ``method`` is "full" without a scene or with one of another object."""
+        """Return itself; raise ``ValueError`` where ``method`` is "full" without the object's scene."""
         if self.method == "full" and self.scene is None:
             raise ValueError(
                 f"the weights were trained on {self.trained_scene!r}, which is no built-in scene; the fit "
@@ -396,9 +374,8 @@ class Registrar:
     def scene(self) -> Scene | None:
         """Scene whose draws can be played: the given one, or the built-in one of the weights; None where neither is.
 
-        Also None, with a ``ChangedSceneWarning``, where the scene that the weights were trained on has other meshes
-        since, unless ``method`` is "full". Raises ``ValueError`` for such a scene with "full" and for a given scene
-        of another object, and ``AssetUnavailable`` where its mesh cannot be had.
+        Where the weights' own scene has other meshes since, it is None with a ``ChangedSceneWarning``, and with "full"
+        a ``ValueError``, as a given scene of another object is. Raises ``AssetUnavailable`` where its mesh is missing.
         """
         name = self.trained_scene
         scene = self.given if self.given is not None else load_scene(name) if name in SCENES else None
@@ -438,25 +415,22 @@ class Registrar:
         return self.method != "modes"
 
     def prepare(self) -> None:
-        """Do once what all frames need: simulate the states in which a fit of draws begins, where draws are fitted.
-
-        Raises as ``states_or_none`` does.
-        """
+        """Simulate once the states in which a fit of draws begins, where draws are fitted; raises as that does."""
         if self.fits_draws:
             _ = self.states_or_none
 
     @property
     def without_retries(self) -> "Registrar":
-        """The same without the patience to ask about a frame again with the camera turned."""
+        """The same without predictions with the camera turned."""
         return replace(self, config=replace(self.config, turned=False))
 
     @property
     def with_retries(self) -> "Registrar":
-        """The same, which asks about a frame with the camera turned however noisy it may be."""
+        """The same with predictions with the camera turned, however noisy a frame may be."""
         return replace(self, config=replace(self.config, turned_anyway=True))
 
     def asking(self, network: Trained | None) -> "Registrar":
-        """The same, asking the same weights on another device; scene and states that are known stay so."""
+        """The same with the same weights on another device; scene and states that are known stay so."""
         if network is self.network:
             return self
         moved = copy(self)
@@ -474,7 +448,7 @@ class Registrar:
         if frame is None or frame.unit_m is None:
             return None
         unit_m = frame.unit_m / registration.scene_unit
-        return 1.0 if registration.unit_known and abs(unit_m - 1.0) < ROUNDING else unit_m
+        return 1.0 if registration.unit_known and abs(unit_m - 1.0) < 1e-6 else unit_m
 
     def fit_modes(self, cloud: CloudToFit, code: EncodedCloud | None = None) -> ModesFit:
         """Fit of the modes from the network, with ``fit_frame``'s arguments; raises ``ValueError`` as that does."""
@@ -482,14 +456,11 @@ class Registrar:
         return fit_frame(cloud, self.network, self.model, self.config, code)
 
     def register(self, cloud: CloudToFit, code: EncodedCloud | None = None) -> Registration:
-        """Registration of the model to a cloud, as ``method`` says; ``code`` is what ``network`` made of it, if known.
-
-        Raises ``ValueError`` as ``fit_frame`` does.
-        """
+        """Register the model to a cloud, as ``method`` says; takes ``fit_frame``'s arguments and raises as it does."""
         return self.finish(self.fit_modes(cloud, code))
 
     def finish(self, fitted: ModesFit) -> Registration:
-        """The answer from a fit of the modes: the draws too where ``method`` asks for them.
+        """Return the registration from a fit of the modes, with the draws too where ``method`` wants them.
 
         Unless that is "full", not where the modes do not explain the frame: the draws, which begin there and take
         longest on such frames, did not explain one of them either (experiments, entry 62).
@@ -537,10 +508,8 @@ def other_mesh(scene: Scene, model: StatisticalModel) -> str | None:
     if scene.rest.names != model.rest.names:
         return f"{difference} ({listed(scene.rest.names)}; theirs: {listed(model.rest.names)})"
     for now, then in zip(scene.rest.segments, model.rest.segments, strict=True):
-        for count, before, what in (
-            (len(now.vertices), len(then.vertices), "vertices"),
-            (len(now.faces), len(then.faces), "faces"),
-        ):
+        for what in ("vertices", "faces"):
+            count, before = len(getattr(now, what)), len(getattr(then, what))
             if count != before:
                 return f"{difference} (its segment {now.name!r} has {count} {what}, theirs {before})"
     return None
