@@ -3,7 +3,7 @@
     cloud, lines of sight, statistical model -search-> the state that explains the frame, and how many explain it alike
 
 1. Rotations, evenly over all, of the mean state, with its visible side on the cloud; rigid steps draw each towards the
-   frame (``screening``).
+   frame (``Screen``).
 2. The best that differ are bent towards the frame by few points, from wide to narrow.
 3. The best of these are fitted as a frame always is, as long as they may be better or as good.
 4. While the frame is not explained, the same again from other states of the library, more and more of them.
@@ -32,12 +32,7 @@ from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
 
 # --- table of lines of sight ------------------------------------------------------------------------------------------
 
-# What a frame rules out as a table, in which many places are looked up at once.
-#
-# Notation: n poses, w places of each, c cells.
-
-SIDE = 96
-"""Cells along each side of the table of what a frame rules out; about as many as a depth image has pixels there."""
+# Notation: n poses, w positions of each, c cells.
 
 
 def clipped(place: Float32[np.ndarray, "n w d"], count: int) -> Int32[np.ndarray, "n w d"]:
@@ -77,7 +72,7 @@ class SightTable:
         low, high = slope.min(axis=0), slope.max(axis=0)
         side = 3.0 * float((high - low).max()) + 4 * evidence.pitch
         corner = (low + high - side) / 2
-        cells = min(SIDE, max(16, int(side / evidence.pitch)))
+        cells = min(96, max(16, int(side / evidence.pitch)))
         across = corner + (np.stack(np.meshgrid(*(np.arange(cells) + 0.5,) * 2, indexing="ij"), -1)) * side / cells
         sight = np.concatenate([across.reshape(-1, 2), np.ones((cells * cells, 1))], axis=1) @ T
         sight /= np.linalg.norm(sight, axis=1, keepdims=True)
@@ -114,23 +109,12 @@ class SightTable:
 
 # --- tables of shapes -------------------------------------------------------------------------------------------------
 
-# Some states of an object as tables: evenly spread samples of the surface, and the nearest of them to every place.
-#
 # A table is made once for an object. With it, thousands of poses are compared with a cloud in single array operations.
 #
 # Notation: q states, s samples, r cells along each side of a table.
 
-SAMPLES = 512
-"""Samples of the surface: they are 2 to 4 % of half its longest side apart, far less than the first sigma."""
-
 CELLS = 32
 """Cells along each side of a table."""
-
-MARGIN = 0.5
-"""By so much of its half length is a table larger than its state on each side; beyond, all points are outliers."""
-
-MODELS = 4
-"""Objects whose tables are kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +143,7 @@ class ShapeTables:
         place = np.ascontiguousarray(frame[:, :, 0])
         normal = cross(frame[:, :, 1].reshape(-1, 3), frame[:, :, 2].reshape(-1, 3))
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-        margin = np.float32(MARGIN * model.half)
+        margin = np.float32(0.5 * model.half)  # beyond, all points are outliers
         low, high = place.min(axis=1) - margin, place.max(axis=1) + margin
         cell = (high - low).max(axis=1) / CELLS
         low = (low + high - CELLS * cell[:, None]) / 2
@@ -186,10 +170,10 @@ def medoids(model: StatisticalModel, count: int) -> Int[np.ndarray, " q"]:
     return rows
 
 
-@lru_cache(maxsize=MODELS)
+@lru_cache(maxsize=4)
 def tables_of(model: StatisticalModel, count: int) -> ShapeTables:
     """Tables of the mean state (``count`` 0), or of ``count`` medoids of the library; those of few models are kept."""
-    surface = SampledSurface.of(model, SAMPLES)
+    surface = SampledSurface.of(model, 512)  # far nearer to each other than the first sigma
     z = np.zeros((1, model.count), dtype=np.float32) if count == 0 else model.library[medoids(model, count)]
     return ShapeTables.of(model, z, surface)
 
@@ -197,10 +181,7 @@ def tables_of(model: StatisticalModel, count: int) -> ShapeTables:
 # --- screening --------------------------------------------------------------------------------------------------------
 
 POINTS = 128
-"""Observed points that a pose is compared with."""
-
-LOOKED_UP = 128
-"""Samples of the surface that are looked up."""
+"""Observed points that a pose is compared with, and samples of the surface that are looked up."""
 
 BLOCK = 150
 """Poses in one array operation: their arrays fit a core's cache, where 3,600 at once take seven times as long each."""
@@ -210,9 +191,6 @@ OUTSIDE = SILHOUETTE_WEIGHT * SILHOUETTE_VERTICES / 3000.0
 
 FARTHEST = 0.5
 """Largest turn of one step, rad, and largest change of the scale's logarithm."""
-
-ALONG = 0.2
-"""Weight of the distance along the surface in a step: with planes alone, poses far away slide past each other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -344,7 +322,7 @@ class Screen:
         facing = np.einsum("npi,npi->np", camera - place, normal) > 0
         squared = np.einsum("npi,npi->np", offset, offset) / narrow**2
         squared = np.where(facing, squared, squared + ROBUST**2)
-        few = tables.place[poses.state, :: max(1, tables.place.shape[1] // LOOKED_UP)]
+        few = tables.place[poses.state, :: max(1, tables.place.shape[1] // POINTS)]
         direction, amount = self.sight.violations(poses.place(few), ROBUST * sigma)
         outside, robust = (amount / sigma) ** 2, (4 * ROBUST) ** 2
         cost = (squared / (1.0 + squared / ROBUST**2)).mean(axis=1)
@@ -366,7 +344,8 @@ class Screen:
             )
         )
         matrix, gradient = _normal_equations(rows, residual, weight)
-        near, pulled = _along(seen, offset, ALONG * weight[:, : len(self.points)])
+        # with planes alone, poses far away would slide past each other
+        near, pulled = _along(seen, offset, 0.2 * weight[:, : len(self.points)])
         return _moved(poses, matrix + near, gradient + pulled, self.scaled)
 
 

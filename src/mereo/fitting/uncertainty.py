@@ -22,7 +22,7 @@ from scipy.stats import norm
 from mereo.deformation.moving_least_squares import PointWeights
 from mereo.fitting.draws.problem import DrawsFit, DrawsProblem
 from mereo.fitting.draws.problem import terms as terms_of_draws
-from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed
+from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, rigid_motion
 from mereo.fitting.problem.problem import Problem
 from mereo.fitting.problem.residuals import Prior, Surface, Terms
 from mereo.fitting.problem.segments import left_open
@@ -42,29 +42,20 @@ LEVEL = 0.95
 WITHIN = float(norm.ppf(0.5 + LEVEL / 2))
 """Standard deviations of one Gaussian number on either side that hold it with this probability: 1.96."""
 
-ROUNDED = 4 * float(np.finfo(np.float32).eps)
-"""Share of the greatest precision below which a smaller one is rounding."""
-
 _FREEDOM = np.linspace(1.0, 3.0, 201)
 _QUANTILE = chdtri(_FREEDOM, 1.0 - LEVEL)
 """Quantile of chi square by its degrees of freedom, between which it is nearly straight."""
 
 
 def radius95(covariance: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
-    """Radius of the ball around the mean that holds a Gaussian point with probability 0.95.
+    """Return the radius of the ball around the mean that holds a Gaussian point with probability 0.95.
 
     By a chi square of the same mean and variance as the squared distance (Satterthwaite, Biometrics Bulletin 1946):
     exact where one direction alone is unsure or all are alike, within 2 % between.
     """
     first = np.trace(covariance, axis1=1, axis2=2)
     second = np.einsum("nij,nij->n", covariance, covariance)
-    return radius_by_moments(first, second)
-
-
-def radius_by_moments(first: Float[np.ndarray, " n"], second: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """``radius95`` from the trace of each covariance, and from that of its square."""
-    small = np.finfo(np.float64).tiny
-    freedom = np.clip(first**2 / np.maximum(second, small), 1.0, 3.0)
+    freedom = np.clip(first**2 / np.maximum(second, np.finfo(np.float64).tiny), 1.0, 3.0)
     squared: np.ndarray = first / freedom * np.interp(freedom, _FREEDOM, _QUANTILE)
     return np.sqrt(squared)
 
@@ -150,9 +141,9 @@ class Posterior:
         """Radii of 95 % of all material points, or of points that follow them; scene units."""
         with one_blas_thread():
             motion, open_motion = self.motion, self._open(slice(None))
-            return (
-                self._radii(motion, open_motion) if follow is None else self._radii(follow(motion), follow(open_motion))
-            )
+            if follow is not None:
+                motion, open_motion = follow(motion), follow(open_motion)
+            return self._radii(motion, open_motion)
 
     def radii_of(self, rows: Int[np.ndarray, " n"]) -> "RadiusParts":
         """Radii of 95 % of some material points alone, which cost as little as they are few."""
@@ -175,10 +166,8 @@ class Posterior:
     def motion_of(self, gradient: Float[np.ndarray, "c v 3"]) -> Float[np.ndarray, "c p"]:
         """Change of c numbers with each of p independent standard normal ones.
 
-        What the coefficients cannot express (``residue``) is left out: over a segment it averages out.
-
-        Args:
-            gradient: of the numbers by the first v material points, in the camera's axes.
+        ``gradient`` is theirs by the first v material points, in the camera's axes. What the coefficients cannot
+        express (``residue``) is left out: over a segment it averages out.
         """
         pose, state = self._local
         turned, count = (gradient @ self.posed.rotation).astype(np.float32), gradient.shape[1]
@@ -194,16 +183,6 @@ class Posterior:
         return moved
 
 
-def rigid_motion(arm: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3 7"]:
-    """Motion of points with a turn, a shift and the scale, from their places relative to the pose's centre."""
-    rigid = np.zeros((len(arm), 3, POSE), dtype=np.float32)
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        rigid[:, i, j], rigid[:, i, k] = arm[:, k], -arm[:, j]
-        rigid[:, i, 3 + i] = 1.0
-    rigid[:, :, 6] = arm
-    return rigid
-
-
 def covariance_factor(precision: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
     """Factor F of an inverse, ``F F^T = precision^-1``; unlike units of the parameters do no harm.
 
@@ -212,18 +191,13 @@ def covariance_factor(precision: Float[np.ndarray, "p p"]) -> Float[np.ndarray, 
     """
     unit = 1.0 / np.sqrt(np.diag(precision))
     values, vectors = eigh(precision * unit[:, None] * unit)
-    least = ROUNDED * float(values[-1])
+    least = 4 * float(np.finfo(np.float32).eps) * float(values[-1])  # smaller ones are rounding
     factor: np.ndarray = unit[:, None] * vectors / np.sqrt(np.maximum(values, least))
     return factor
 
 
-Observed = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]
-"""Observed points in the fit's camera frame, and the distance of each from the facing surface; scene units."""
-
 # --- the optimum and its posterior ------------------------------------------------------------------------------------
 
-# Where fits of modes, of the rest model and of draws have ended, from which a posterior is made when it is asked for.
-#
 # ModesOptimum, DrawsOptimum -> Terms of the normal equations -> Posterior
 
 
@@ -245,9 +219,9 @@ class ModesOptimum:
     bent: Float[np.ndarray, "m 3"] | None = None
 
     @property
-    def tolerance(self) -> float:
-        """Distance in scene units up to which an observed point lies on the surface, by the frame's noise."""
-        return self.problem.config.tolerance
+    def frame(self) -> Problem:
+        """The frame, explained by modes."""
+        return self.problem
 
     @cached_property
     def terms(self) -> Terms:
@@ -271,12 +245,6 @@ class ModesOptimum:
         return Surface.of(self.problem.model, self.posed)
 
     @cached_property
-    def observed(self) -> Observed:
-        """Observed points beside the surface."""
-        points = self.problem.evidence.points
-        return points, self.surface.nearest(points)[0]
-
-    @cached_property
     def posterior(self) -> Posterior:
         """Posterior of pose, scale and coefficients."""
         model = self.problem.model
@@ -284,9 +252,8 @@ class ModesOptimum:
         with one_blas_thread():
             open_motion = turns_left_open(self.problem, material)
             if self.bent is not None:
-                open_motion = np.concatenate(
-                    [open_motion, (self.bent - material)[:, :, None].astype(np.float32)], axis=2
-                )
+                bending = (self.bent - material)[:, :, None].astype(np.float32)
+                open_motion = np.concatenate([open_motion, bending], axis=2)
             return Posterior.of(self.terms.total, self.posed, material, model.modes, model.residue, open_motion)
 
 
@@ -305,9 +272,9 @@ class DrawsOptimum:
     unit: float
 
     @property
-    def tolerance(self) -> float:
-        """Distance in scene units up to which an observed point lies on the surface, by the frame's noise."""
-        return self.problem.base.config.tolerance
+    def frame(self) -> Problem:
+        """The frame, explained by modes."""
+        return self.problem.base
 
     @cached_property
     def terms(self) -> Terms:
@@ -326,12 +293,6 @@ class DrawsOptimum:
         return self.fit.motion
 
     @cached_property
-    def observed(self) -> Observed:
-        """Observed points beside the surface."""
-        points = self.problem.base.evidence.points
-        return points, self.fit.surface.nearest(points)[0]
-
-    @cached_property
     def posterior(self) -> Posterior:
         """Posterior of pose, scale and draws."""
         motion, spread = self._motion, self.problem.states.played.spread
@@ -346,10 +307,8 @@ class DrawsOptimum:
 
 def turns_left_open(problem: Problem, material: Float[np.ndarray, "m 3"]) -> Float32[np.ndarray, "m 3 e"]:
     """How far turns of single segments that the frame does not tell apart may have moved the material points."""
-    config = problem.config
-    return left_open(
-        problem.model, material, problem.evidence.observed_samples, config.cloud_sigma, config.cloud_weight
-    )
+    samples, config = problem.evidence.observed_samples, problem.config
+    return left_open(problem.model, material, samples, config.cloud_sigma, config.cloud_weight)
 
 
 Optimum = ModesOptimum | DrawsOptimum
@@ -358,8 +317,6 @@ Optimum = ModesOptimum | DrawsOptimum
 
 # --- what decides a point ---------------------------------------------------------------------------------------------
 
-# Explanation of a place: which observed points decide it, and what leaves it unsure.
-#
 # At the optimum a point of the object is ``x = A u`` for parameters u of covariance S. Where an observed point moves by
 # d along its surface's normal, x moves by ``A S J_i^T w_i d``: its leverage. Each term of the fit adds its part H_t to
 # the precision ``S^-1``, so that the variance of x is a sum over the terms of what the error of each contributes to it:
@@ -404,18 +361,18 @@ class Explanation:
         cls,
         place: Float[np.ndarray, "3"],
         decided: Decided,
-        optimum: Optimum,
+        uncertainty: "Uncertainty",
         T_registration_fit: Float[np.ndarray, "4 4"],
     ) -> "Explanation":
         """Explanation in the frame to which ``T_registration_fit`` leads from the fit's, both in the input's unit."""
-        unit, (observed, distance), (shares, weights, influence) = optimum.unit, optimum.observed, decided
+        optimum, unit, (shares, weights, influence) = uncertainty.optimum, uncertainty.optimum.unit, decided
         return cls(
             place=place,
             shares=shares,
             points=transform_points(T_registration_fit, unit * optimum.terms.observed_samples),
             weights=weights,
             influence=influence @ T_registration_fit[:3, :3].T,
-            unexplained=transform_points(T_registration_fit, unit * observed[distance > optimum.tolerance]),
+            unexplained=transform_points(T_registration_fit, unit * uncertainty.unexplained),
         )
 
     def __repr__(self) -> str:
@@ -581,6 +538,13 @@ class Uncertainty:
     @cached_property
     def _weighing(self) -> Weighing:
         return Weighing.of(self.optimum.terms, self.posterior)
+
+    @cached_property
+    def unexplained(self) -> Float[np.ndarray, "k 3"]:
+        """Observed points farther from the surface than the tolerance; the fit's camera frame, scene units."""
+        frame = self.optimum.frame
+        points = frame.evidence.points
+        return points[self.optimum.surface.nearest(points)[0] > frame.config.tolerance]
 
     def decided_centroid(self, index: int) -> Decided:
         """What decides where the centroid of a segment is."""

@@ -127,14 +127,20 @@ def in_space(
     posed: Posed, points: Float[np.ndarray, "n 3"], modes: Float[np.ndarray, "n 3 k"]
 ) -> Float[np.ndarray, "m p"]:
     """Derivatives of y at posed points, three rows for each point: x, y, z."""
-    arm = points - posed.translation
-    result = np.zeros((len(points), 3, POSE + modes.shape[2]), dtype=modes.dtype)
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        result[:, i, j], result[:, i, k] = arm[:, k], -arm[:, j]
-        result[:, i, 3 + i] = 1.0
-    result[:, :, 6] = arm
+    result = np.empty((len(points), 3, POSE + modes.shape[2]), dtype=modes.dtype)
+    result[:, :, :POSE] = rigid_motion((points - posed.translation).astype(modes.dtype))
     result[:, :, POSE:] = np.matmul((np.exp(posed.log_scale) * posed.rotation).astype(modes.dtype), modes)
     return result.reshape(3 * len(points), -1)
+
+
+def rigid_motion(arm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 7"]:
+    """Derivatives of points by a turn, a shift and the scale, from their positions relative to the pose's centre."""
+    rigid = np.zeros((len(arm), 3, POSE), dtype=arm.dtype)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        rigid[:, i, j], rigid[:, i, k] = arm[:, k], -arm[:, j]
+        rigid[:, i, 3 + i] = 1.0
+    rigid[:, :, 6] = arm
+    return rigid
 
 
 def cross(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -141,7 +141,7 @@ class Registration:
         return Solids(self.model.rest)
 
     def to_camera(self, points: ArrayLike, labels: UInt8[np.ndarray, " n"] | None = None) -> Float[np.ndarray, "n 3"]:
-        """Positions of points of the rest model in the camera frame.
+        """Map points of the rest model to the camera frame.
 
         Args:
             points: n x 3, rest pose, scene units.
@@ -230,7 +230,7 @@ class Registration:
             rest = self.to_rest(point, label) if at == "camera" else point
             place = self.to_camera(rest, label)[0]
             decided = self.uncertainty.decided_point(rest, label)
-        return Explanation.of(place, decided, self.uncertainty.optimum, self._T_registration_fit)
+        return Explanation.of(place, decided, self.uncertainty, self._T_registration_fit)
 
     @cached_property
     def _T_registration_fit(self) -> Float[np.ndarray, "4 4"]:
