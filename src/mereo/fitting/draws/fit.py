@@ -35,20 +35,13 @@ from mereo.fitting.modes import refine, robust_poses
 from mereo.fitting.problem.gauss_newton import POSE, Posed
 from mereo.fitting.problem.residuals import robust_square
 from mereo.fitting.problem.segments import Symmetry, branches, find_symmetries
-from mereo.geometry.transforms import fit_rigid
 from mereo.scenes.draw_recorder import SMOOTH, Call, OutOfDraws, Recorder
 from mereo.scenes.parameters import play, played_back
 from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel
 
-RANKED_BY = 150
-"""Points by which random states are compared with a shape."""
-
 GAIN = 0.003
 """Relative gain of a step below which nothing more is tried."""
-
-SLIDES = 0.03
-"""Least motion, for one standard deviation of a draw that may jump, of the point that moves farthest: of ``half``."""
 
 
 def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
@@ -179,7 +172,7 @@ def by_misfit(state: StateOnShape | DrawsFit) -> float:
 def similar_states(problem: DrawsProblem, shape: Shape) -> list[int]:
     """Seeds of the random states most like a shape."""
     states = problem.states
-    some = spread(shape.points, RANKED_BY)
+    some = spread(shape.points, 150)
     library, goal = states.material[:, states.played.index], shape.points[some].astype(np.float32)
     if shape.follow is None:
         compared = library[:, some]
@@ -257,13 +250,11 @@ def draws_that_may_jump(problem: DrawsProblem, fit: DrawsFit) -> Int[np.ndarray,
     normal = igl.per_vertex_normals(fit.material[: sum(model.vertex_counts)], model.faces)[index[surface]]
     moved, off = (motion**2).sum(axis=(0, 1)), (np.einsum("ac,acd->ad", normal, motion) ** 2).sum(axis=0)
     farthest = np.sqrt((motion**2).sum(axis=1).max(axis=0, initial=0.0))
-    return smooth[(off < problem.config.sliding * moved) & (farthest > SLIDES * model.half)]
+    return smooth[(off < problem.config.sliding * moved) & (farthest > 0.03 * model.half)]
 
 
 # --- descent on simulated states --------------------------------------------------------------------------------------
 
-# Levenberg and Marquardt's method on played states: from a start to the nearest state that explains the frame.
-#
 # DrawsFit -derivatives-> motion of the played points -normal_equations-> a step of pose and draws -played-> DrawsFit
 
 
@@ -313,7 +304,7 @@ def lower(
 
 # --- other discrete choices -------------------------------------------------------------------------------------------
 
-# States that differ from another in discrete draws: how many corners of a sheet are folded, and which.
+# Discrete draws are such as how many corners of a sheet are folded, and which.
 #
 # Derivatives do not reach across them, and random states hold one combination too seldom to be near everything else.
 # So a state that is right but for such a choice keeps all that it has drawn; the choice, and what it asks for, is drawn
@@ -354,18 +345,11 @@ def _redraw(scene: Scene, calls: Sequence[Call], left_out: set[int], seed: int) 
 
 # --- segments turned by their symmetries ------------------------------------------------------------------------------
 
-# Shapes in which segments that look alike turned are turned together, as a target for the draws.
-#
-#     rest shapes, joints -find_symmetries-> Symmetry -symmetric_groups-> groups -turn_segments-> a shape to be fitted
-#
 # An arm looks the same with the forearm half a turn round, the wrist bent the other way and the hand turned back. No
 # small step leads there, and no jump of one draw: several change at once. But the shape is known, so that the draws can
 # be drawn towards it as towards that of the modes. Lengths are scene units.
 #
 # Notation: m material points.
-
-NEXT = np.deg2rad(15.0)
-"""Turns that are no farther apart than this are one: the angles asked about are 10 degrees apart."""
 
 Twins = tuple[tuple[Symmetry, float], ...]
 """Segments that hang on each other, and the angle by which each is turned."""
@@ -394,9 +378,9 @@ def symmetric_groups(model: StatisticalModel) -> tuple[Twins, ...]:
 
 
 def _only_angle(turn: Symmetry) -> tuple[Symmetry, float | None]:
-    """The middle of a turn's angles where these are one run no wider than ``NEXT`` on either side, else None."""
+    """The middle of a turn's angles, which are 10 degrees apart, where these are one run of two or three; else None."""
     middle = float(turn.angles.mean())
-    return turn, middle if np.abs(turn.angles - middle).max() <= NEXT else None
+    return turn, middle if np.abs(turn.angles - middle).max() <= np.deg2rad(15.0) else None
 
 
 def turn_segments(
@@ -405,8 +389,6 @@ def turn_segments(
     """Material points of a state with some segments turned, each stiffly about its own axis."""
     moved = material.copy()
     for turn, angle in together:
-        rows = np.flatnonzero(model.labels == turn.label)
-        T = fit_rigid(model.rest_points[rows], material[rows])
-        center, axis = T[:3, :3] @ turn.center + T[:3, 3], T[:3, :3] @ turn.axis
+        rows, center, axis = turn.posed(model, material)
         moved[rows] = Rotation.from_rotvec(angle * axis).apply(material[rows] - center) + center
     return moved

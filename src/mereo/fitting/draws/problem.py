@@ -156,7 +156,7 @@ def misfit(problem: DrawsProblem, fit: DrawsFit, sigma: float) -> float:
     base = problem.base
     cloud = base.config.cloud_weight * float(robust_square(fit.distance, sigma).mean())
     network = base.config.network_weight[1] * problem.network(fit).energy(fit.posed, base.network_sigma)
-    losses = silhouette_losses(fit.surface.material[base.silhouette_vertices], base.evidence, sigma)
+    losses = silhouette_losses(fit.surface.material[base.model.silhouette_vertices], base.evidence, sigma)
     return cloud + network + SILHOUETTE_WEIGHT * float(losses.sum()) + float(fit.z @ fit.z)
 
 
@@ -178,7 +178,7 @@ def terms(problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3
     """Terms of ``normal_equations``: those of the modes, with the played points' motion in the place of modes."""
     base, posed, config, surface = problem.base, fit.posed, problem.base.config, fit.surface
     samples, spread, count = base.evidence.observed_samples, problem.states.played.spread, len(fit.z)
-    flat, vertices = motion.reshape(len(motion), -1), base.silhouette_vertices
+    flat, vertices = motion.reshape(len(motion), -1), base.model.silhouette_vertices
 
     def modes_of(follow: csr_array) -> Float32[np.ndarray, "n 3 d"]:
         return (follow @ flat).reshape(-1, 3, count)

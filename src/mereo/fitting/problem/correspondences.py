@@ -1,8 +1,8 @@
-"""Correspondences between what a camera sees and the rest pose, as a trained network states them.
+"""Predict correspondences between what a camera sees and the rest pose with a trained network.
 
-Every point of the object lies on a line of sight through an observed point, at it or behind it. So the network is asked
-at the observed points and along the lines of sight behind them: where it finds a segment, it says where that place was
-at rest. It is right on what is seen and vague on what is hidden.
+Every point of the object lies on a line of sight through an observed point, at it or behind it. So the network is
+evaluated at the observed points and along the lines of sight behind them: where it finds a segment, it predicts the
+rest position of that point. It is right on what is seen and vague on what is hidden.
 """
 
 from dataclasses import dataclass, replace
@@ -14,25 +14,19 @@ from mereo.deformation.moving_least_squares import spread
 from mereo.models.trained import EncodedCloud, Trained
 from mereo.scenes.statistical_model import StatisticalModel
 
-SIGHT_LINES = 256
-"""Lines of sight along which the hidden inside is asked for."""
+OBSERVED, SIGHT_LINES = 400, 256
+"""Observed points at which the network is evaluated, and lines of sight behind them."""
 
 DEPTHS = np.concatenate([np.arange(0.04, 0.6, 0.08), np.arange(0.6, 2.4, 0.15)])
 """Depths behind the observed point, in half longest sides of the visible part."""
 
-OBSERVED = 400
-"""Observed points that are asked for."""
-
 CLIPPED = 0.5
-"""Largest distance of one place that counts in ``Correspondences.displaced``."""
-
-EACH = 125
-"""Correspondences kept of the observed points, and of the inside."""
+"""Largest distance of a point that counts in ``Correspondences.displaced``."""
 
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
-    """Places of the object in the camera frame and at rest.
+    """Positions of points of the object in the camera frame and at rest.
 
     Attributes:
         points: in the camera frame, input unit.
@@ -75,7 +69,7 @@ class Correspondences:
         apart = np.linalg.norm(model.weights(self.rest, self.labels)(material) - self.points, axis=1) / model.half
         return float(np.sqrt((np.minimum(apart, CLIPPED) ** 2).mean()))
 
-    def evenly(self, each: int = EACH) -> "Correspondences":
+    def evenly(self, each: int = 125) -> "Correspondences":
         """Even subset: at most ``each`` observed and as many inside, evenly spread in space."""
         chosen = [np.empty(0, dtype=np.int64)]
         for rows in (np.flatnonzero(self.observed), np.flatnonzero(~self.observed)):
@@ -122,14 +116,9 @@ def find_correspondences(
 
 # --- length of a scene unit -------------------------------------------------------------------------------------------
 
-# Length of a scene unit in a frame's unit, as the network's correspondences tell it.
-
 UNIT_TOLERANCE = 0.15
 """Difference of a stated unit from the correspondences' own up to which it is believed: they are off by less in 258 of
 264 training views, and no two units that are mistaken for each other are nearer than a factor of 2.5."""
-
-SCALE_PAIRS = 4000
-"""Pairs of correspondences whose distances, there and at rest, tell an unknown unit."""
 
 
 def agree(first: float, second: float) -> bool:
@@ -138,9 +127,9 @@ def agree(first: float, second: float) -> bool:
 
 
 def estimate_unit(correspondences: Correspondences) -> float:
-    """Length of a scene unit in the unit of the correspondences: distances within a segment hardly change."""
+    """Estimate a scene unit's length in the correspondences' unit: distances within a segment hardly change."""
     rng = np.random.default_rng(0)
-    first, second = rng.integers(len(correspondences.labels), size=(2, SCALE_PAIRS))
+    first, second = rng.integers(len(correspondences.labels), size=(2, 4000))
     rest = np.linalg.norm(correspondences.rest[first] - correspondences.rest[second], axis=1)
     seen = np.linalg.norm(correspondences.points[first] - correspondences.points[second], axis=1)
     usable = (correspondences.labels[first] == correspondences.labels[second]) & (rest > np.median(rest[rest > 0]) / 4)

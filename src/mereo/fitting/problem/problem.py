@@ -1,4 +1,4 @@
-"""One frame to be explained by one object: all terms of the fit, and how badly a state explains them."""
+"""The problem of explaining one frame by one object: all terms of the fit, and the misfit of a state."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -30,23 +30,14 @@ from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
 COARSE = 3
 """How many times fewer observed samples and correspondences a choice among many states needs."""
 
-TANGENTIAL_SLACK = 1.0
-"""Share of the samples' spacing: an observed sample so far beside one is still on its plane."""
-
 PAIR_WEIGHT = 100.0
 """How many independent points the distances that the states keep are worth."""
 
 KNOWN_SCALE_STD = 1e-6
 """``Problem.scale_std`` of a frame whose unit is known."""
 
-FAR = 1.0
-"""Scene units beyond the tolerance by which a vertex is ruled out for good."""
-
 UNEXPLAINED = 0.3
 """The cloud's misfit, in squared standard deviations of an observed sample, above which a fit is likely wrong."""
-
-TAILS = 1.5
-"""The same, in those of normal noise as great as what the fit leaves over."""
 
 
 @dataclass(frozen=True)
@@ -118,11 +109,6 @@ class Problem:
         return PairTerm.of(self.model)
 
     @property
-    def silhouette_vertices(self) -> Int[np.ndarray, " w"]:
-        """Surface vertices that are compared with silhouette and free space."""
-        return self.model.silhouette_vertices
-
-    @property
     def network_sigma(self) -> float:
         """Standard deviation of a correspondence, scene units."""
         return self.config.start_sigma * self.model.half
@@ -155,7 +141,7 @@ class Problem:
             return False
         if self.config.turned_anyway:
             return not self.leaves_noise(surface)
-        return cloud > TAILS * (self.residual_noise(surface) / self.config.cloud_sigma) ** 2
+        return cloud > 1.5 * (self.residual_noise(surface) / self.config.cloud_sigma) ** 2
 
     @property
     def by_every_point(self) -> "Problem":
@@ -230,7 +216,8 @@ class Problem:
         offset = self.evidence.observed_samples - place
         across = np.einsum("pi,pi->p", offset, normal)
         tangential = np.sqrt(np.maximum((offset**2).sum(axis=1) - across**2, 0.0))
-        distance = np.hypot(across, np.maximum(tangential - TANGENTIAL_SLACK * self.samples.spacing, 0.0))
+        # an observed sample up to one spacing beside a sample is still on its plane
+        distance = np.hypot(across, np.maximum(tangential - self.samples.spacing, 0.0))
         few = samples.few(self.config.silhouette_vertices).place
         return self.total(
             float(robust_square(distance, sigma).mean()),
@@ -274,13 +261,13 @@ class Problem:
 
     def _silhouette_square(self, surface: Surface) -> float:
         """Mean square of how far a vertex is ruled out, in standard deviations."""
-        vertices = surface.material[self.silhouette_vertices]
+        vertices = surface.material[self.model.silhouette_vertices]
         return float(silhouette_losses(vertices, self.evidence, self.config.cloud_sigma).mean())
 
     def ruled_out(self, surface: Surface) -> float:
-        """Share of a surface's vertices that the frame rules out by more than ``FAR``."""
-        amount = self.evidence.violations(surface.material[self.silhouette_vertices], self.config.tolerance)[1]
-        return float((amount > FAR).mean())
+        """Share of a surface's vertices that the frame rules out by more than a scene unit beyond the tolerance."""
+        amount = self.evidence.violations(surface.material[self.model.silhouette_vertices], self.config.tolerance)[1]
+        return float((amount > 1.0).mean())
 
     def total(self, cloud: float, network: float, silhouette: float, z: Float[np.ndarray, " k"]) -> Misfit:
         """Misfit from the mean squares of one observed sample, one correspondence and one silhouette vertex."""
@@ -297,12 +284,10 @@ class Problem:
 
 # --- noise of a frame -------------------------------------------------------------------------------------------------
 
-# Noise of a frame, told by what a first fit leaves over, and the constants of a fit to such a frame.
-#
 # Depth cameras are off by a twentieth of a scene unit or by half of one, depending on their principle, the distance and
-# the slant. Differences between neighbouring pixels do not tell, as edges and curvature look like noise too; a fitted
-# model takes these away. What it leaves over is noise where every pixel has its own; where neighbours have the same,
-# the model is wrong.
+# the slant. Differences between neighbouring pixels do not show that, as edges and curvature look like noise too; a
+# fitted model takes these away. What it leaves over is noise where every pixel differs; where neighbours share it, the
+# model is wrong.
 
 TO_STD = 1.4826
 """Standard deviation of normal numbers over the median of their absolute values."""

@@ -25,17 +25,8 @@ from mereo.scenes.statistical_model import StatisticalModel
 
 # --- joints -----------------------------------------------------------------------------------------------------------
 
-CORNERS = 12
-"""Anchors of each segment that tell its place."""
-
-STATES = 60
-"""States of the library whose joints are tried."""
-
-RIDGE = 1e-3
-"""Weight of the prior where coefficients are found from the corners, relative to the modes' mean square."""
-
-ROUNDS = 3
-"""Rounds of alignment and least squares that express a state in modes."""
+# Segments that touch form a tree. One branch of it is moved as the library moves it there, and the rest stays: a hand
+# half a turn round, with the arm as it is. A library of random states hardly ever holds such a state.
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,12 +50,11 @@ class Joints:
     def of(cls, model: StatisticalModel) -> "Joints":
         """Joints of a model's library."""
         corners = corners_of(model)
-        states = positions(model, corners, model.library[:: max(1, len(model.library) // STATES)])
-        rotation, translation = segment_poses(model.mean[corners], states)
+        rotation, translation = segment_poses(model.mean[corners], sampled_positions(model, corners))
         return cls(model, corners, branches(model), rotation, translation)
 
     def others(self, posed: Posed, each: int) -> list[Posed]:
-        """States in which one joint is elsewhere, ``each`` of every joint, as different as there are."""
+        """Make states that differ from one in a single joint, ``each`` of every joint, as different as there are."""
         corners = positions(self.model, self.corners, posed.z[None].astype(np.float32))
         rotation, translation = segment_poses(self.model.mean[self.corners], corners)
         shapes_of_branches = []
@@ -88,15 +78,15 @@ class Joints:
         )
 
     def _expressed(self, shapes: Float[np.ndarray, "n p 3"], posed: Posed) -> list[Posed]:
-        """States nearest to shapes of the corners that are given in the frame of ``posed``'s modes."""
+        """Find the states nearest to shapes of the corners in the frame of ``posed``'s modes."""
         flat = self.model.modes[self.corners.ravel()].reshape(-1, self.model.count).astype(np.float64)
         normal = flat.T @ flat
-        normal += RIDGE * np.trace(normal) / max(1, len(normal)) * np.eye(len(normal))
+        normal += 1e-3 * np.trace(normal) / max(1, len(normal)) * np.eye(len(normal))
         solve = np.linalg.solve(normal, flat.T)
         mean = self.model.mean[self.corners.ravel()]
         fitted = np.broadcast_to(mean, shapes.shape)
         goal = shapes.mean(axis=1, keepdims=True)
-        for _ in range(ROUNDS):
+        for _ in range(3):
             middle = fitted.mean(axis=1, keepdims=True)
             rotation = best_rotations(np.matmul((fitted - middle).transpose(0, 2, 1), shapes - goal))
             unposed = np.matmul(shapes - goal, rotation) + middle
@@ -110,7 +100,7 @@ class Joints:
 def corners_of(model: StatisticalModel) -> Int[np.ndarray, "s c"]:
     """A few anchors of each segment, as many of each."""
     least = min(len(anchors) for anchors in model.anchors)
-    return np.stack([anchors[: min(CORNERS, least)] for anchors in model.anchors])
+    return np.stack([anchors[: min(12, least)] for anchors in model.anchors])
 
 
 def positions(
@@ -121,8 +111,13 @@ def positions(
     return model.mean[corners] + motion.reshape(len(z), *corners.shape, 3).astype(np.float64)
 
 
+def sampled_positions(model: StatisticalModel, corners: Int[np.ndarray, "s c"]) -> Float[np.ndarray, "n s c 3"]:
+    """Positions of the corners in about 60 states of the library."""
+    return positions(model, corners, model.library[:: max(1, len(model.library) // 60)])
+
+
 def corner_positions(model: StatisticalModel, states: list[Posed]) -> Float[np.ndarray, "n p 3"]:
-    """Places of the corners of all segments in states, by which these are told apart."""
+    """Positions of the corners of all segments in the camera frame, by which states are compared."""
     z = np.stack([posed.z for posed in states]).astype(np.float32)
     unposed = positions(model, corners_of(model), z).reshape(len(z), -1, 3)
     return np.stack([posed.place(points) for posed, points in zip(states, unposed, strict=True)])
@@ -200,21 +195,8 @@ ALIKE = 0.06
 """Root mean square distance of a turned segment from itself up to which it looks the same, in mean distances from the
 axis. Of the robot's segments, which a view cannot tell half a turn round, .04 is the largest; its base has .08."""
 
-COMPARED = 150
-"""Vertices by which a segment is compared with itself."""
-
 BINS = 36
 """Bins of the angle by which states turn a segment against its neighbour."""
-
-SELDOM = 0.02
-"""Plausibility up to which a turn is left out."""
-
-LEANS = 0.2
-"""Angle up to which a segment leans alike against its neighbour in two states, rad."""
-
-LEAST_PAIRS = 30
-"""Pairs of states that are turned alike, at least, in the share that is turned otherwise."""
-
 
 COUNTED = 0.03
 """Share of the loss of a turned segment that counts: it is turned stiffly here, and a fit from there takes most of that
@@ -239,23 +221,31 @@ class Symmetry:
     angles: Float[np.ndarray, " a"]
     plausible: Float[np.ndarray, " a"]
 
+    def posed(
+        self, model: StatisticalModel, material: Float[np.ndarray, "m 3"]
+    ) -> tuple[Int[np.ndarray, " v"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+        """Rows of the segment's material points, and the centre and the axis of its turns in a state."""
+        rows = np.flatnonzero(model.labels == self.label)
+        T = fit_rigid(model.rest_points[rows], material[rows])
+        return rows, T[:3, :3] @ self.center + T[:3, 3], T[:3, :3] @ self.axis
+
 
 @lru_cache(maxsize=8)
 def find_symmetries(model: StatisticalModel) -> tuple[Symmetry, ...]:
-    """All such turns of an object that its states make, none of one without states; found once for a model."""
+    """Find all such turns of an object that its states make, once for a model; none without states."""
     if model.count == 0:
         return ()
     corners, symmetries = corners_of(model), list[Symmetry]()
     # from the rest pose, not from the mean, in which a part that spins is crushed
-    states = positions(model, corners, model.library[:: max(1, len(model.library) // STATES)])
-    rotation, joints = segment_poses(model.rest_points[corners], states)[0], branches(model)
+    rotation = segment_poses(model.rest_points[corners], sampled_positions(model, corners))[0]
+    joints = branches(model)
     for index, segment in enumerate(model.rest.segments):
         center, axes = principal_axes(segment)
         for axis in axes:
             alike = ANGLES[self_distances(segment, center, axis) <= ALIKE]
             neighbors = {b if a == index else a for a, b, _ in joints if index in (a, b)}
             plausible = plausibility(rotation, index, neighbors, axis, alike)
-            kept = plausible > SELDOM
+            kept = plausible > 0.02
             if kept.any():
                 symmetries.append(Symmetry(index + 1, center, axis, alike[kept], plausible[kept]))
     return tuple(symmetries)
@@ -275,7 +265,7 @@ def self_distances(
     segment: Segment, center: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, " a"]:
     """Distance of a segment, turned by each of ``ANGLES``, from itself, in mean distances from the axis."""
-    arm = segment.vertices[spread(segment.vertices, COMPARED)] - center
+    arm = segment.vertices[spread(segment.vertices, 150)] - center
     turned = Rotation.from_rotvec(ANGLES[:, None] * axis).as_matrix()
     points = (arm @ turned.transpose(0, 2, 1)).reshape(-1, 3) + center
     squared = igl.point_mesh_squared_distance(points, segment.vertices, segment.faces)[0]
@@ -293,15 +283,9 @@ def plausibility(
 ) -> Float[np.ndarray, " a"]:
     """``Symmetry.plausible`` against that neighbour of a segment against which it turns most; 1 for all without any.
 
-    Of pairs of states in which the segment leans alike against the neighbour, so that the turn is a freedom of its own:
-    a rope that bends twists too, but never by itself.
-
-    Args:
-        rotation: of each segment in some states, from rest.
-        index: the segment.
-        neighbors: the segments that hang on it, or it on them.
-        axis: of the turn, at rest.
-        angles: of the turn.
+    It counts pairs of states in which the segment leans alike against the neighbour (.2 rad), so that the turn is a
+    freedom of its own: a rope that bends twists too, but never by itself. ``rotation`` is that of each segment in some
+    states, from rest.
     """
     plausible = np.zeros(len(angles)) if neighbors else np.ones(len(angles))
     for other in neighbors:
@@ -309,11 +293,11 @@ def plausibility(
         turn = relative.as_quat()
         roll = 2.0 * np.arctan2(turn[:, :3] @ axis, turn[:, 3])  # the twist of a swing and a twist
         lean = (relative * Rotation.from_rotvec(-roll[:, None] * axis)).as_rotvec()
-        first, second = np.nonzero(np.linalg.norm(lean[:, None] - lean, axis=2) + np.eye(len(lean)) < LEANS)
+        first, second = np.nonzero(np.linalg.norm(lean[:, None] - lean, axis=2) + np.eye(len(lean)) < 0.2)
         apart = np.rint(np.mod(roll[second] - roll[first], 2 * np.pi) * BINS / (2 * np.pi)).astype(int) % BINS
         count = np.bincount(apart, minlength=BINS)
         steps = np.rint(angles * BINS / (2 * np.pi)).astype(int) % BINS
-        plausible = np.maximum(plausible, np.minimum(count[steps] / max(LEAST_PAIRS, count[0]), 1.0))
+        plausible = np.maximum(plausible, np.minimum(count[steps] / max(30, count[0]), 1.0))
     return plausible
 
 
@@ -326,12 +310,8 @@ def left_open(
 ) -> Float32[np.ndarray, "m 3 e"]:
     """Motion of each material point with e independent standard normal numbers, of the second moments of its turns.
 
-    Args:
-        model: the statistical model.
-        material: registered material points.
-        observed_samples: observed points, in the same frame.
-        sigma: the cloud's, scene units.
-        total_weight: how many independent points all observed samples are worth.
+    ``observed_samples`` are in the frame of the registered material, ``sigma`` is the cloud's, ``total_weight`` how
+    many independent points all observed samples are worth.
     """
     turns = find_symmetries(model)
     motion = np.zeros((len(material), 3, 2 * len(turns)), dtype=np.float32)
@@ -341,9 +321,7 @@ def left_open(
     owner = model.labels[cKDTree(material[:vertices]).query(observed_samples)[1]]
     segments = model.mesh(material).segments
     for number, turn in enumerate(turns):
-        rows = np.flatnonzero(model.labels == turn.label)
-        T = fit_rigid(model.rest_points[rows], material[rows])
-        center, axis = T[:3, :3] @ turn.center + T[:3, 3], T[:3, :3] @ turn.axis
+        rows, center, axis = turn.posed(model, material)
         seen = observed_samples[owner == turn.label]
         worse = (
             _worse(segments[turn.label - 1], turn.angles, seen, center, axis, sigma)
