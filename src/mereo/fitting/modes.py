@@ -48,7 +48,7 @@ def explored(problem: Problem, best: "ScoredFit") -> "ScoredFit":
     Only where many distances are kept: smooth bending has one optimum.
     """
     for number in range(2 if len(problem.model.pairs) >= 300 else 0):
-        if problem.explained(best.misfit.cloud, best.surface, problem.config.explained):
+        if best.explains(problem):
             break
         before = best
         for other in find_candidates(problem, best.posed, number):
@@ -71,6 +71,10 @@ class ScoredFit:
         """Score a state."""
         surface = Surface.of(problem.model, posed)
         return cls(posed, problem.misfit(posed, surface), surface)
+
+    def explains(self, problem: Problem) -> bool:
+        """Whether the state explains the cloud, noise aside."""
+        return problem.explained(self.misfit.cloud, self.surface, problem.config.explained)
 
     def better(self, problem: Problem, other: Posed) -> "ScoredFit":
         """Return this fit, or another state where its misfit is lower."""

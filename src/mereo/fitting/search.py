@@ -433,9 +433,6 @@ RIVAL = 1.5
 
 Of 65 candidates with more, of 25 training views that others explain, none ended lower by a cloud's misfit of .01."""
 
-NOISY_FITS = 4
-"""Candidates that are fitted again where a frame is noisy."""
-
 ALIKE = 0.05
 """Difference of the cloud's misfit up to which two states explain a frame alike."""
 
@@ -464,7 +461,7 @@ class SearchOutcome:
 
 
 def rotations(count: int) -> Float[np.ndarray, "n 3 3"]:
-    """Rotations, evenly over all (super-Fibonacci spirals; Alexa, CVPR 2022)."""
+    """Return rotations, evenly over all (super-Fibonacci spirals; Alexa, CVPR 2022)."""
     step = np.arange(count) + 0.5
     inner, outer = np.sqrt(step / count), np.sqrt(1 - step / count)
     first, second = 2 * np.pi * step / np.sqrt(2), 2 * np.pi * step / 1.533751168755204288118041
@@ -487,7 +484,7 @@ class _Trail:
 
     @property
     def is_explained(self) -> bool:
-        return is_explained(self.problem, self.best)
+        return self.best.explains(self.problem)
 
     def go_on(self, stage: SearchRound) -> None:
         self.fitted += fit_candidates(self.problem, candidates(self.problem, stage), stage.fitted)
@@ -495,17 +492,16 @@ class _Trail:
             self.fitted.append(explored(self.problem, self.best))
 
     def as_noisy(self) -> "_Trail | None":
-        """The same with the constants for what the best fit leaves over, where that is noise and not its own error.
+        """The same with the constants for what the best fit leaves over, where that is noise and not the fit's error.
 
-        Each pixel's own, or shared by neighbours. Not before other states were tried: a wrong state may leave over
-        what looks like noise.
+        Only after other states were tried: a wrong state may leave over what looks like noise.
         """
         states = [scored.posed for scored in sorted(self.fitted, key=_total)]
         for is_shared in (False, True):
             noisy = self.problem.as_noisy_as(self.best.surface, is_shared)
             if noisy is None:
                 continue
-            rows = differing(noisy, states, BENT_APART)[:NOISY_FITS]
+            rows = differing(noisy, states, BENT_APART)[:4]
             trail = _Trail(noisy, 0.0, [explored(noisy, refined(noisy, fit_wide(noisy, states[row]))) for row in rows])
             if noisy.leaves_noise(trail.best.surface, is_shared):
                 return trail
@@ -547,23 +543,18 @@ def _total(scored: ScoredFit) -> float:
     return scored.misfit.total
 
 
-def is_explained(problem: Problem, scored: ScoredFit) -> bool:
-    """Whether a state explains the cloud, noise aside."""
-    return problem.explained(scored.misfit.cloud, scored.surface, problem.config.explained)
-
-
 def fit_candidates(problem: Problem, candidates: list[tuple[float, Posed]], most: int) -> list[ScoredFit]:
-    """Fits of candidates that may be the best, of those given with their misfits by few points, the lowest first."""
+    """Fit the candidates that may be the best, given with their misfits by few points, the lowest first."""
     fitted: list[ScoredFit] = []
     for cost, posed in candidates[:most]:
-        if fitted and cost > RIVAL * candidates[0][0] and is_explained(problem, min(fitted, key=_total)):
+        if fitted and cost > RIVAL * candidates[0][0] and min(fitted, key=_total).explains(problem):
             break
         fitted.append(refined(problem, fit_wide(problem, posed)))
     return fitted
 
 
 def candidates(problem: Problem, stage: SearchRound) -> list[tuple[float, Posed]]:
-    """Candidates of a round with their misfits by few points, the lowest first."""
+    """Find candidates in a round, with their misfits by few points, the lowest first."""
     coarse, whole = problem.coarse, Prior.whole(problem.model)
     bent, cost = screen_poses(problem, stage), list[float]()
     for start, steps, sigma in BENDING:
@@ -582,7 +573,7 @@ def differing(problem: Problem, states: list[Posed], apart: float) -> list[int]:
 
 
 def screen_poses(problem: Problem, stage: SearchRound) -> list[Posed]:
-    """Poses that are worth bending, which differ from each other."""
+    """Choose diverse poses from which bending goes on."""
     tables = tables_of(problem.model, stage.states)
     screen = Screen.of(tables, problem.evidence, problem.model.half, problem.is_scale_open)
     poses = screen.starts(rotations(stage.rotations))

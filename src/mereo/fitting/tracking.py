@@ -1,4 +1,4 @@
-"""An object followed from frame to frame: each fit starts where the last ended, and network or search find it if lost.
+"""Follow an object from frame to frame: each fit starts where the last ended; network or search find a lost object.
 
     Observation, time -Tracker.follow-> Answer (found, followed or lost)
 
@@ -119,7 +119,7 @@ class Track:
 
 
 def without_scale(posed: Posed) -> tuple[Posed, float]:
-    """A state in the unit that its own scale makes of the scene's, and that scale."""
+    """Return a state in the unit that its scale makes of the scene's, and that scale."""
     scale = float(np.exp(posed.log_scale))
     return replace(posed, translation=posed.translation / scale, log_scale=0.0), scale
 
@@ -130,7 +130,7 @@ def share_surfaces(base: Problem, other: Problem) -> None:
 
 
 def gated(track: Track, points: Float[np.ndarray, "n 3"], time_s: float, config: TrackConfig) -> Bool[np.ndarray, " n"]:
-    """Which points, in the cloud's unit, lie near the expected surface; others are strays, or the object is lost."""
+    """Mark the points, in the cloud's unit, near the expected surface; others are outliers, or the object is lost."""
     samples = track.problem.samples.every(2)
     place = samples.posed(track.expected(time_s, config)).place
     most = config.gate * track.problem.model.half + samples.spacing
@@ -146,7 +146,7 @@ def next_fit(
     config: TrackConfig,
     lines: SightLines,
 ) -> tuple[ModesFit, Track]:
-    """Fit of the modes to a frame, and the track that ends with it.
+    """Fit the modes to a frame, and return the fit with the track that ends with it.
 
     Args:
         track: up to the frame before.
@@ -166,29 +166,19 @@ def next_fit(
 
         def fit(other_lines: SightKind) -> ModesFit:
             sight_lines = replace(lines.scaled(1 / track.unit), other_lines=other_lines)
-            problem = replace(
-                track.problem, evidence=Evidence.of(few, outliers / track.unit, config.observed_samples, sight_lines)
-            )
+            evidence = Evidence.of(few, outliers / track.unit, config.observed_samples, sight_lines)
+            problem = replace(track.problem, evidence=evidence)
             share_surfaces(track.problem, problem)
             posed = descend(problem, start, expectation, config)
             return ModesFit(problem, nothing(), track.unit, posed, 0.0, calibration=track.calibration)
 
         fitted = fit(lines.other_lines or track.other_lines)
-        if lines.other_lines is None and is_ruled_out(fitted):
-            fitted = less_ruled_out(fitted, fit("unknown"))
+        if lines.other_lines is None and fitted.problem.silhouette_misfit(fitted.surface) > WHOLE:
+            partial = fit("unknown")
+            whole_misfit, misfit = (end.problem.misfit(end.posed, end.surface).total for end in (fitted, partial))
+            fitted = partial if misfit + WHOLE < whole_misfit else fitted
     fitted = replace(fitted, seconds=time.perf_counter() - started)
     return fitted, followed(track, fitted, time_s, config)
-
-
-def is_ruled_out(fitted: ModesFit) -> bool:
-    """Whether a frame rules out so much of a state that something may hide the object in part."""
-    return fitted.problem.silhouette_misfit(fitted.surface) > WHOLE
-
-
-def less_ruled_out(whole: ModesFit, partial: ModesFit) -> ModesFit:
-    """The second fit, to an object of which a part is hidden, where it is better by as much as a search demands."""
-    misfits = [fitted.problem.misfit(fitted.posed, fitted.surface).total for fitted in (whole, partial)]
-    return partial if misfits[1] + WHOLE < misfits[0] else whole
 
 
 def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig) -> Track:
@@ -267,16 +257,10 @@ def descend(problem: Problem, start: Posed, expectation: Expectation, config: Tr
 
 # --- search in the background -----------------------------------------------------------------------------------------
 
-# Search for a lost object beside the frames that come meanwhile: one frame at a time, always the latest.
-#
-#     TrackedFrame -BackgroundSearch.start-> (seconds later) -BackgroundSearch.take-> Searched
+# TrackedFrame -BackgroundSearch.start-> (seconds later) -BackgroundSearch.take-> Searched
 #
 # A search takes a second to several, and frames come 30 times a second. NumPy lets go of the interpreter in most of a
 # search, so a thread is enough.
-
-ROUNDS = 2
-"""Rounds of a search at most. Where they find nothing, a newer frame is worth more than the last round, which takes as
-long as both and longer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,7 +310,8 @@ class BackgroundSearch:
     """
 
     def __init__(self, registrar: Registrar, executor: Executor | None = None) -> None:
-        self.registrar = replace(registrar, config=replace(registrar.config, search_rounds=ROUNDS))
+        # a newer frame is worth more than the last round, which takes as long as the two before and longer
+        self.registrar = replace(registrar, config=replace(registrar.config, search_rounds=2))
         self.executor = executor
         self._thread: ThreadPoolExecutor | None = None
         self._running: Future[Searched] | None = None
@@ -360,7 +345,7 @@ class BackgroundSearch:
             self._running = None
 
     def close(self, wait: bool) -> None:
-        """Forget it, and let the own thread end with its search, which ``wait`` waits for."""
+        """Forget it, and let its thread end with the search, which ``wait`` waits for."""
         self.drop()
         if self._thread is not None:
             self._thread.shutdown(wait, cancel_futures=True)
@@ -377,10 +362,7 @@ def _search(registrar: Registrar, frame: TrackedFrame) -> Searched:
 class Tracker:
     """Follows one object through a sequence of frames; not safe for use by several threads at once.
 
-    Attributes:
-        registrar: of the object; its ``method`` says whether a registration that does not explain its frame is taken.
-            Draws and rest model are not asked: they take longer than the time between two frames.
-        config: constants.
+    Draws and rest model are not fitted: they take longer than the time between two frames.
     """
 
     def __init__(
@@ -392,11 +374,12 @@ class Tracker:
         """Follow an object.
 
         Args:
-            registrar: of the object.
+            registrar: of the object; its ``method`` says whether a registration that does not explain its frame is
+                taken.
             config: constants.
             executor: what searches for a lost object (``BackgroundSearch``); None for a thread of its own.
         """
-        # a frame that nobody understands comes 30 times a second while the object is away
+        # a frame that nothing explains comes 30 times a second while the object is away
         self.registrar = registrar.without_retries
         self.config = config
         self._search = BackgroundSearch(registrar, executor)
@@ -424,7 +407,7 @@ class Tracker:
     def follow(
         self, seen: Observation, time_s: float, *, scene_unit: float | None = None, keep_all: bool = False
     ) -> Answer:
-        """Answer to the next frame.
+        """Answer the next frame.
 
         Args:
             seen: the object in the frame, any density, in one unit throughout the sequence.
@@ -453,10 +436,8 @@ class Tracker:
             return self._gone_on(frame, again, started, "found")
         return self._lost(frame, alone, why if tracked is None else self._doubt(tracked), started)
 
-    # --- fits that may be the answer ----------------------------------------------------------------------------------
-
     def _tracked(self, track: Track | None, frame: TrackedFrame, longest_s: float) -> "tuple[_Tracked | None, str]":
-        """The frame fitted from an earlier state; None, and why, without one that leads here."""
+        """Fit the frame from an earlier state; None, and why, without one that leads to it."""
         seen, time_s = frame.seen, frame.time_s
         if track is None or seen.frame.axes != self._axes:
             return None, "nothing explains what is seen"
@@ -479,7 +460,7 @@ class Tracker:
         return tracked, ""
 
     def _searched(self, frame: TrackedFrame) -> "_Tracked | None":
-        """The frame fitted from the state that a search has found in an earlier one; None where that explains none."""
+        """Fit the frame from the state that a search has found in an earlier one; None where that explains none."""
         searched = self._search.take()
         if searched is None or searched.candidate.modes is None:
             return None
@@ -495,9 +476,9 @@ class Tracker:
         return None
 
     def _by_itself(self, frame: TrackedFrame, tracked: "_Tracked | None", started: float) -> Answer:
-        """Answer of a frame by itself, with which a track begins; or of the track that went on, where that is better.
+        """Answer a frame by itself, which begins a track, or by the track that went on, where that is better.
 
-        It is lost where neither explains the frame, and then the track is kept.
+        The object is lost where neither explains the frame, and then the track is kept.
         """
         seen, registrar, config = frame.seen, self.registrar, self.config
         candidate, likelier = find(seen, registrar.network, registrar, frame.keep_all, frame.scene_unit)
@@ -525,8 +506,6 @@ class Tracker:
         answer = answer_of(seen, registrar.network, registrar, candidate, likelier, alone.registration)
         return replace(answer, seconds=time.perf_counter() - started)
 
-    # --- what is believed ---------------------------------------------------------------------------------------------
-
     def _is_believed(self, tracked: "_Tracked") -> bool:
         """Whether the frame need not be fitted by itself."""
         if not self._takes(tracked):
@@ -550,8 +529,6 @@ class Tracker:
             return f"{registration.ruled_out:.0%} of it would lie where the frame shows none of it"
         return ""
 
-    # --- answers ------------------------------------------------------------------------------------------------------
-
     def _gone_on(
         self,
         frame: TrackedFrame,
@@ -560,7 +537,7 @@ class Tracker:
         tracking: Tracking = "followed",
         restart: bool = False,
     ) -> Answer:
-        """Answer that an earlier frame's state led to."""
+        """Answer a frame by a fit that an earlier frame's state led to."""
         self._track = tracked.track
         self._best = tracked.score if restart or tracking == "found" else max(self._best, tracked.score)
         self._search.drop()
@@ -584,7 +561,7 @@ class Tracker:
         )
 
     def _lost(self, frame: TrackedFrame, alone: Answer | None, why: str, started: float) -> Answer:
-        """Answer of a frame in which the object cannot be found: what a network alone says of it, or nothing."""
+        """Answer a frame in which the object is lost: by the network alone, or by nothing."""
         reason = f"the object is lost: {why}; it is being searched for, so keep it in view, or start again with it"
         if alone is None or alone.model is None:
             hypothesis = Reading.of_all(frame.seen.cloud)

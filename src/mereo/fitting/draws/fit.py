@@ -1,4 +1,4 @@
-"""A scene's own draws that explain a frame: Gauss and Newton's method on states that the scene really has.
+"""Fit a scene's own draws to a frame: Gauss and Newton's method on states that the scene really has.
 
 Around a state the scene is linear in its draws (``draws.problem``); it is played with the draws that fit best there,
 and so on, from several starts.
@@ -56,7 +56,7 @@ def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
 
 
 def refine_by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
-    """The state brought to what the lines of sight meet, by every observed point.
+    """Refine a state by what the lines of sight meet, with every observed point.
 
     Nearest places lead there from afar, and noise takes them a little beside it; over more points it averages out. The
     answer has the observed samples of all other states, but its misfit by every point: those it was fitted to.
@@ -121,10 +121,7 @@ def shape_of(problem: DrawsProblem, material: Float[np.ndarray, "m 3"]) -> Shape
 
 
 def fit_from_shape(problem: DrawsProblem, frame: Posed, shape: Shape, guesses: list[Drawn]) -> list[DrawsFit]:
-    """States that explain the frame, from starts like a shape; ``frame`` poses the shape in the camera frame.
-
-    While what is found is far from explaining the cloud, the next starts are tried.
-    """
+    """Fit from starts like a shape, which ``frame`` poses in the camera frame; the next ones while that is hopeless."""
     config, states = problem.config, problem.states
     drawn = [states.drawn(seed) for seed in similar_states(problem, shape)] + guesses
     near_shape = [lay_on_shape(states, shape, start, start.z) for start in drawn]
@@ -138,7 +135,7 @@ def fit_from_shape(problem: DrawsProblem, frame: Posed, shape: Shape, guesses: l
 
 
 def descend_best(problem: DrawsProblem, frame: Posed, shape: Shape, starts: list[StateOnShape]) -> list[DrawsFit]:
-    """The best of some starts, followed to the end."""
+    """Descend from the best of some starts."""
     config, states = problem.config, problem.states
     for fresh, keep in config.sieve:
         starts = [approach(states, shape, start, fresh) for start in sorted(starts, key=by_misfit)[:keep]]
@@ -149,7 +146,7 @@ def descend_best(problem: DrawsProblem, frame: Posed, shape: Shape, starts: list
 
 
 def find_other_choices(problem: DrawsProblem, shape: Shape, best: StateOnShape | None) -> list[StateOnShape]:
-    """States near a shape that ``best`` does not meet, made from that one by other discrete draws."""
+    """Find states near a shape that ``best`` does not meet, made from that one by other discrete draws."""
     config, states = problem.config, problem.states
     if best is None or best.misfit < 100.0:
         return []
@@ -183,10 +180,9 @@ def similar_states(problem: DrawsProblem, shape: Shape) -> list[int]:
 
 
 def try_symmetric_states(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
-    """The state, or one with segments turned that look alike turned, where that explains the frame better.
+    """Try states with segments turned that look alike turned, as a forearm by half a turn; return the best.
 
-    A forearm by half a turn, for which several draws change at once. Only where the shape, stiffly turned, explains
-    the frame nearly as well: what is seen of a right one mostly tells.
+    Only where the shape, stiffly turned, explains the frame nearly as well.
     """
     config = problem.config
     few = replace(problem, config=replace(config, sieve=((1, 4), (1, 1)), kept=1, batches=1))
@@ -205,10 +201,7 @@ def pose_on_shape(frame: Posed, state: StateOnShape) -> Posed:
 
 
 def try_jumps(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
-    """One draw anywhere in its range, where that explains the frame better: a wheel by half a turn.
-
-    Only while the cloud is not explained.
-    """
+    """Try single draws anywhere in their range, as a wheel by half a turn, while the cloud is not explained."""
     config = problem.config
     sigma = first_sigma(problem)
     for _ in range(config.jumps):
@@ -237,7 +230,7 @@ def find_jumps(problem: DrawsProblem, fit: DrawsFit, number: int, sigma: float) 
 
 
 def draws_that_may_jump(problem: DrawsProblem, fit: DrawsFit) -> Int[np.ndarray, " n"]:
-    """Draws that may jump: of many, those that move what they move along its own surface, as a ring on its post.
+    """Choose draws that may jump: of many, those that move a part along its own surface, as a ring on its post.
 
     Only then a state far away may look nearly the same, so that no small step leads there.
     """
@@ -266,7 +259,7 @@ def first_sigma(problem: DrawsProblem) -> float:
 def descend(
     problem: DrawsProblem, fit: DrawsFit, fresh: int, motion: Float32[np.ndarray, "a 3 d"] | None = None
 ) -> DrawsFit:
-    """Levenberg and Marquardt's method on played states, by ``fresh`` sets of differences after the given one."""
+    """Descend by Levenberg and Marquardt's method, with ``fresh`` sets of differences after the given one."""
     config, least = problem.config, problem.base.config.cloud_sigma
     index, sigma, damping = problem.states.played.index, first_sigma(problem), 0.03
     for number in range(fresh + (motion is not None)):

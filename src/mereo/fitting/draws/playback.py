@@ -1,4 +1,4 @@
-"""A scene's own random numbers as coordinates of its states.
+"""Use a scene's own random numbers as coordinates of its states.
 
 Every number that a scene draws is a share of its distribution, uniform in 0..1; as ``z = Phi^-1(share)`` it is standard
 normal. Played back in the order of the calls, the same shares give the same state, and others its neighbours.

@@ -1,4 +1,4 @@
-"""States of a scene as explanations of a frame: playing them, judging them, and their linear neighbourhood.
+"""Explain a frame by states of a scene: simulate them, score them, and linearize around them.
 
 Around a state the material points are linear in the draws, so its neighbourhood is a linear model like that of the
 modes; the residuals are those of the modes' fit.
@@ -29,7 +29,6 @@ from mereo.fitting.problem.residuals import (
 )
 from mereo.geometry.mesh import barycentric
 from mereo.geometry.transforms import best_rotations
-from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel
 
 
@@ -62,11 +61,6 @@ class DrawsProblem:
     def last(self) -> Problem:
         """``base`` with the points of the last descent."""
         return self.base.by_every_point if self.config.every_point else self.base
-
-    @property
-    def scene(self) -> Scene:
-        """Scene whose draws are played."""
-        return self.states.scene
 
     @classmethod
     def of(
@@ -125,11 +119,11 @@ class DrawsFit:
 
 
 def simulate(problem: DrawsProblem, drawn: Drawn, z: Float[np.ndarray, " d"], posed: Posed) -> DrawsFit | None:
-    """The state of these draws and how badly it explains the frame; None where the scene refuses it."""
-    deformations = drawn.deformations(problem.scene, z)
+    """Simulate the state of these draws and score it; None where the scene refuses it."""
+    deformations = drawn.deformations(problem.states.scene, z)
     if deformations is None:
         return None
-    material = material_moved(problem.scene, problem.model, deformations)
+    material = material_moved(problem.states.scene, problem.model, deformations)
     return try_material(problem, drawn, z, posed, material)
 
 
@@ -140,7 +134,7 @@ def try_material(
     posed: Posed,
     material: Float[np.ndarray, "m 3"],
 ) -> DrawsFit | None:
-    """Material points beside the frame as those of a state; None where no face of them is seen."""
+    """Score material points as those of a state; None where no face of them is seen."""
     rigid = replace(posed, z=np.empty(0))
     surface = Surface.through(problem.model, rigid.place(material))
     if len(surface.facing) == 0:
@@ -287,7 +281,7 @@ class StateOnShape:
 
 
 def lay_on_shape(states: DrawnStates, shape: Shape, drawn: Drawn, z: Float[np.ndarray, " d"]) -> StateOnShape | None:
-    """The state of these draws, laid robustly onto the shape; None where the scene refuses it."""
+    """Lay the state of these draws robustly onto the shape; None where the scene refuses it."""
     deformations = drawn.deformations(states.scene, z)
     if deformations is None:
         return None
@@ -351,7 +345,7 @@ def secant(
 
 
 def approach(states: DrawnStates, shape: Shape, state: StateOnShape, fresh: int) -> StateOnShape:
-    """The state near the shape, by ``fresh`` sets of differences."""
+    """Approach the shape from a state, by ``fresh`` sets of differences."""
     damping = 0.1
     for _ in range(fresh):
         motion = derivatives(states, state.drawn, state.z, state.points)

@@ -1,11 +1,10 @@
-"""What a frame shows, and what it rules out: observed points, the silhouette, and the free space in front of them.
+"""The evidence of a frame: observed points, and what silhouette and free space rule out. The camera is at the origin.
 
-A frame is a cloud seen from one place, and what is known of the lines of sight beside it (``geometry.sight_lines``). A
-vertex of a fitted model may lie neither on a line of sight that went past the object, before what that met (outside the
-silhouette), nor in front of the observed points around its own line of sight (free space). Nothing is ruled out along
+A frame is a cloud seen from one position, and what is known of the lines of sight beside it (``geometry.sight_lines``).
+A vertex of a fitted model may lie neither on a line of sight that went past the object, before what that met (outside
+the silhouette), nor in front of the observed points around its line of sight (free space). Nothing is ruled out along
 lines of sight on which nothing is known. Lines of sight are compared by their angles, so a depth image and a cloud
 without one are the same, and so is any axis or unit.
-The camera is at the origin.
 """
 
 from dataclasses import dataclass, replace
@@ -178,7 +177,7 @@ class Evidence:
     def along(
         self, toward: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """What each line of sight says, as ``violations`` takes it.
+        """Look up lines of sight, as ``violations`` takes them.
 
         Returns the unit vector of the nearest one that met the object or of which nothing is known, the distance before
         which that is free, and the distance up to which a line of sight beside it is free; -1 where it is not beside.

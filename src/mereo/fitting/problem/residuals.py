@@ -1,4 +1,4 @@
-"""Terms of the fit: what the network said, the observed points, and what the frame rules out.
+"""Terms of the fit: the network's correspondences, the observed points, and what the frame rules out.
 
 Every term gives normal equations near a state; lengths in scene units, camera frame. Notation: n correspondences, p
 observed samples, k modes.
@@ -24,8 +24,6 @@ from mereo.scenes.statistical_model import StatisticalModel
 
 # --- the surface as samples -------------------------------------------------------------------------------------------
 
-# A model's surface as evenly spread points that carry their planes: the nearest of them is found in no time.
-#
 # A search among all faces is exact and slow. Samples are as good while the model is farther from the cloud than they
 # are from each other; the last steps of a fit ask the faces themselves.
 #
@@ -318,8 +316,6 @@ def silhouette_losses(points: Float[np.ndarray, "n 3"], evidence: Evidence, sigm
 
 
 # --- priors -----------------------------------------------------------------------------------------------------------
-
-# What is known of the coefficients before a frame is seen: Gaussians of all states or of some, and kept distances.
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""The answer to one frame: the one way that every command and every public function goes.
+"""Answer one frame: the one way that every command and every public function goes.
 
 Observation -find-> Candidate (by network, by search, or the better of both) -fit draws-> Registration
 -recognize-> Recognition -> Answer
@@ -32,19 +32,19 @@ from mereo.reconstruction.pipeline import EncodedFrame, encode_frame
 from mereo.scenes.statistical_model import StatisticalModel
 
 FORCED = 350.0
-"""Misfit of prior and ruled-out surface together from which a search is asked too.
+"""Misfit of prior and ruled-out surface together from which a search follows.
 
 Fits to whole clean training views have at most 150; fits that take a view whose half is hidden for a whole one have 400
 and more, although they explain its points."""
 
 ASTRAY = 0.25
-"""Distance between network and fit, in half lengths, from which a search is asked too: the network is no start there.
+"""Distance between network and fit, in half lengths, from which a search follows: the network is no start there.
 
 Of 48 clean training views of six shipped objects none has more than .1, under a camera's noise one in six has; weights
 after 40 seconds of training have .3 to .5 in each view, where their fits explain the points by chance at most."""
 
 HIDDEN = 0.12
-"""Share of the silhouette beside which nothing is known from which a search is asked too, as a part is hidden.
+"""Share of the silhouette beside which nothing is known from which a search follows, as a part is hidden.
 
 Whole clean views have at most .03, those of which a tool hides 30 % .01 to .32, others that are cut .15 to .57."""
 
@@ -59,7 +59,7 @@ def answer_frame(
     resolution: int = 128,
     label_points: bool = False,
 ) -> Answer:
-    """Answer to a frame, wherever it comes from.
+    """Answer a frame, wherever it comes from.
 
     Args:
         seen: the object in the frame, outliers among its points.
@@ -97,7 +97,7 @@ def answer_of(
     likelier: EncodedFrame,
     registration: Registration | None,
 ) -> Answer:
-    """Answer from the best candidate and its registration: recognize the object, and choose who answers."""
+    """Make the answer of the best candidate: recognize the object, and choose between registration and network."""
     displaced = None if registration is None else candidate.displaced(registration)
     stated = None if registrar is None else registrar.stated_scene_unit(seen.frame.unit_m)
     refusal = None if candidate.error is None else str(candidate.error)
@@ -134,12 +134,11 @@ def in_registered_unit(
 def find(
     seen: Observation, model: Trained | None, registrar: Registrar | None, keep_all: bool, scene_unit: float | None
 ) -> tuple[Candidate, EncodedFrame]:
-    """Best fit to a frame by itself, and the hypothesis on its points that is likelier without a fit.
+    """Find the best fit to a frame by itself, and the hypothesis on its points that is likelier without a fit.
 
-    A network starts the fit where there is one, in tenths of a second; where that does not explain the frame, or only
-    with an unlikely state, or far from where the network has the object, and where a part of the object is hidden, a
-    search is asked too, and the fit with the greater evidence is taken. Takes the arguments of ``answer_frame``, and
-    raises as it does for unusable clouds.
+    A network starts the fit where there is one, in tenths of a second; where that is doubtful (``is_doubtful``), a
+    search follows, and the fit with the greater evidence is taken. Takes the arguments of ``answer_frame``, and raises
+    as it does for unusable clouds.
     """
     if registrar is not None and not registrar.asks_network:
         return search_hypotheses(seen, registrar, keep_all, scene_unit)
@@ -192,8 +191,7 @@ def more_evident(first: Candidate, second: Candidate) -> Candidate:
         return first if second.modes is None else second
     if second.is_accepted and not first.is_accepted:
         return second
-    first_kind, second_kind = first.modes.problem.evidence.other_lines, second.modes.problem.evidence.other_lines
-    if first_kind == second_kind:
+    if first.modes.problem.evidence.other_lines == second.modes.problem.evidence.other_lines:
         return second if misfit_in(first.modes, second.modes) < misfit_in(first.modes, first.modes) else first
     cost = [
         misfit_in(each, each) + (WHOLE if each.problem.evidence.other_lines == "unknown" else 0.0)
@@ -213,15 +211,9 @@ def misfit_in(frame: ModesFit, fitted: ModesFit) -> float:
 
 # --- outlier hypotheses -----------------------------------------------------------------------------------------------
 
-# Which of a frame's points belong to the object: each hypothesis is fitted, and the fits decide.
-#
-#     Observation -hypotheses-> which points belong to the object -encode, fit modes-> Candidate of each hypothesis
-#         -choose-> the best candidate
-#
 # Outliers move the box that the network's frame is made from, thin parts of the object look like outliers, and geometry
-# alone cannot tell them apart (``reconstruction.isolation``). A model that explains the points can. A network is quick,
-# and is asked about every hypothesis; a search takes seconds, and goes on to the next where the first explains too
-# little.
+# alone cannot tell them apart (``reconstruction.isolation``), so a fit to each hypothesis decides. A network is quick,
+# and starts a fit to each; a search takes seconds, and goes on to the next where the first explains too little.
 
 CLEARLY = 0.05
 """Share of all points that the hypothesis with every point must explain beyond the others: outliers pull its fit
@@ -233,9 +225,6 @@ point is kept. The fit to all explains .86 and more of them on clean views, and 
 
 SMALLEST, LARGEST = 0.05, 3.0
 """Longest side of a view, in those of the object at rest, beyond which a unit is wrong or the cloud another thing's."""
-
-AS_WELL = 0.01
-"""Share of all points that a fit with points given back may explain less."""
 
 
 def fit_hypotheses(
@@ -265,7 +254,7 @@ def fit_hypotheses(
 
     if len(hypotheses) == 1:
         return fit(likelier, registrar), likelier
-    # beside outliers much stays unexplained in any case, which is no reason to ask again
+    # with outliers much stays unexplained in any case, which is no reason to turn the camera
     quick = registrar.without_retries
     pair = fit(likelier, quick), fit(encode_frame(hypotheses[1], model, axes), quick)
     everything, surfaces = sorted(pair, key=lambda candidate: candidate.hypothesis.dropped)
@@ -359,7 +348,7 @@ def _most_explained(everything: Candidate, surfaces: Candidate, again: Candidate
     by_all, by_surfaces, by_again = (candidate.explained(tolerance) for candidate in candidates)
     if by_all >= max(by_surfaces, by_again) + CLEARLY:
         return everything
-    return again if by_again >= by_surfaces - AS_WELL else surfaces
+    return again if by_again >= by_surfaces - 0.01 else surfaces
 
 
 def better(first: Candidate, second: Candidate) -> Candidate:
@@ -372,20 +361,13 @@ def better(first: Candidate, second: Candidate) -> Candidate:
 
 # --- the search -------------------------------------------------------------------------------------------------------
 
-# Fit of the modes to a frame, found by search instead of from a network's correspondences.
-#
-# cloud, lines of sight, statistical model -search-> ModesFit
-
-ROTATIONS = 200
-"""Rotations by which the size of an object is guessed from its cloud."""
-
 
 def search_modes(
     cloud: CloudToFit,
     model: StatisticalModel,
     config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
 ) -> ModesFit:
-    """Fit of the modes to a cloud, found by search; where it leaves open what is beside it, the fits decide."""
+    """Fit the modes to a cloud by search; where it leaves open what lies beside it, the fits decide."""
     started = time.perf_counter()
     with one_blas_thread():
         unit = size_of(cloud.points, model) if cloud.scene_unit is None else cloud.scene_unit
@@ -402,12 +384,7 @@ def search_modes(
 
 
 def size_of(points: Float[np.ndarray, "n 3"], model: StatisticalModel) -> float:
-    """Length of a scene unit by the cloud's extent: the median over all rotations of the mean state.
-
-    Args:
-        points: the cloud, seen from the origin, any unit.
-        model: the statistical model.
-    """
+    """Guess a scene unit's length from a cloud seen from the origin: the median over rotations of the mean state."""
     evidence = Evidence.of(points)
-    poses = Screen.of(tables_of(model, 0), evidence, model.half, scaled=True).starts(rotations(ROTATIONS))
+    poses = Screen.of(tables_of(model, 0), evidence, model.half, scaled=True).starts(rotations(200))
     return float(np.exp(np.median(poses.log_scale)))

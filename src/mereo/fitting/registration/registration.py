@@ -48,18 +48,6 @@ class Located:
 
 
 @dataclass(frozen=True, eq=False)
-class SegmentMotion:
-    """Motion from rest to the frame, for points of one segment. Satisfies ``Deformation``."""
-
-    rest: Anchors
-    moved: Float[np.ndarray, "m 3"]
-
-    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Positions in the frame of points at rest."""
-        return self.rest.weights(points)(self.moved)
-
-
-@dataclass(frozen=True, eq=False)
 class Registration:
     """A state of the object's own deformation model, in the frame of an observed cloud.
 
@@ -164,8 +152,8 @@ class Registration:
         result = guess.copy()
         for label in np.unique(labels):
             rows = np.flatnonzero(labels == label)
-            motion = SegmentMotion(self.model.rest_anchors[label - 1], self.material)
-            inverted, converged = newton(motion, points[rows], guess[rows])
+            anchors = self.model.rest_anchors[label - 1]
+            inverted, converged = newton(lambda at: anchors.weights(at)(self.material), points[rows], guess[rows])  # noqa: B023 (called at once)
             result[rows[converged]] = inverted[converged]
         return result
 
