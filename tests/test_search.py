@@ -67,8 +67,8 @@ def test_a_table_names_the_sample_nearest_to_each_cell(model: StatisticalModel) 
     steps = np.indices((CELLS,) * 3).reshape(3, -1).T + 0.5
     for row in range(len(tables.z)):
         centers = tables.low[row] + tables.cell[row] * steps
-        distance = np.linalg.norm(tables.place[row, tables.nearest[row]] - centers, axis=1)
-        np.testing.assert_allclose(distance, cKDTree(tables.place[row]).query(centers)[0], rtol=1e-5)
+        distance = np.linalg.norm(tables.position[row, tables.nearest[row]] - centers, axis=1)
+        np.testing.assert_allclose(distance, cKDTree(tables.position[row]).query(centers)[0], rtol=1e-5)
 
 
 def test_medoids_are_states_that_stand_for_all(model: StatisticalModel) -> None:

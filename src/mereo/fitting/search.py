@@ -35,9 +35,11 @@ from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
 # Notation: n poses, w positions of each, c cells.
 
 
-def clipped(place: Float32[np.ndarray, "n w d"], count: int) -> Int32[np.ndarray, "n w d"]:
+def clipped(position: Float32[np.ndarray, "n w d"], count: int) -> Int32[np.ndarray, "n w d"]:
     """Index of a cell along each axis, of ``count``: that at the border for what lies beyond, or nowhere."""
-    index: Int32[np.ndarray, "n w d"] = np.fmax(np.fmin(place, np.float32(count - 1)), np.float32(0)).astype(np.int32)
+    index: Int32[np.ndarray, "n w d"] = np.fmax(np.fmin(position, np.float32(count - 1)), np.float32(0)).astype(
+        np.int32
+    )
     return index
 
 
@@ -64,7 +66,7 @@ class SightTable:
 
     @classmethod
     def of(cls, evidence: Evidence) -> "SightTable":
-        """Table around the cloud, three times as wide; beyond, the nearest cell of the border stands for a place."""
+        """Table around the cloud, three times as wide; beyond, the nearest cell of the border stands for a position."""
         direction = evidence.sight.data[: len(evidence.points)]
         T = rotation_along(direction.mean(axis=0) / np.linalg.norm(direction.mean(axis=0))).T
         turned = evidence.points @ T.T
@@ -88,18 +90,18 @@ class SightTable:
         )
 
     def violations(
-        self, place: Float32[np.ndarray, "n w 3"], slack: float
+        self, position: Float32[np.ndarray, "n w 3"], slack: float
     ) -> tuple[Float32[np.ndarray, "n w 3"], Float32[np.ndarray, "n w"]]:
-        """``Evidence.violations`` of many places, up to a cell."""
+        """``Evidence.violations`` of many positions, up to a cell."""
         cells = round(np.sqrt(len(self.front)))
-        turned = place @ self.T.T
+        turned = position @ self.T.T
         slope = turned[..., :2] / np.maximum(turned[..., 2:], 1e-6)
         index = clipped((slope - self.low) / self.cell, cells)
         row = index[..., 0] * cells + index[..., 1]
-        distance = np.sqrt(np.einsum("nwi,nwi->nw", place, place))
+        distance = np.sqrt(np.einsum("nwi,nwi->nw", position, position))
         toward, free = self.toward[row], self.free[row]
         is_past = free > distance - slack
-        sideways = toward * distance[..., None] - place
+        sideways = toward * distance[..., None] - position
         length = np.sqrt(np.einsum("nwi,nwi->nw", sideways, sideways))
         direction = np.where(is_past[..., None], sideways / np.maximum(length, 1e-9)[..., None], toward)
         ahead = np.where(free < 0, self.front[row] - slack - distance, 0.0)
@@ -123,13 +125,13 @@ class ShapeTables:
 
     Attributes:
         z: coefficients of each state.
-        place, normal: of its samples.
+        position, normal: of its samples.
         low, cell: corner of each table's box, and the length of a cell.
         nearest: index of the sample nearest to the centre of each cell.
     """
 
     z: Float32[np.ndarray, "q k"]
-    place: Float32[np.ndarray, "q s 3"]
+    position: Float32[np.ndarray, "q s 3"]
     normal: Float32[np.ndarray, "q s 3"]
     low: Float32[np.ndarray, "q 3"]
     cell: Float32[np.ndarray, " q"]
@@ -140,21 +142,21 @@ class ShapeTables:
         """Tables of states with the coefficients ``z``."""
         flat = z @ surface.modes.reshape(-1, model.count).T
         frame = surface.mean + flat.reshape(len(z), *surface.mean.shape)
-        place = np.ascontiguousarray(frame[:, :, 0])
+        position = np.ascontiguousarray(frame[:, :, 0])
         normal = cross(frame[:, :, 1].reshape(-1, 3), frame[:, :, 2].reshape(-1, 3))
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
         margin = np.float32(0.5 * model.half)  # beyond, all points are outliers
-        low, high = place.min(axis=1) - margin, place.max(axis=1) + margin
+        low, high = position.min(axis=1) - margin, position.max(axis=1) + margin
         cell = (high - low).max(axis=1) / CELLS
         low = (low + high - CELLS * cell[:, None]) / 2
         steps = np.stack(np.meshgrid(*(np.arange(CELLS, dtype=np.float32) + 0.5,) * 3, indexing="ij"), axis=-1)
         nearest = [
-            cKDTree(place[i], balanced_tree=False, compact_nodes=False).query(low[i] + cell[i] * steps.reshape(-1, 3))[
-                1
-            ]
+            cKDTree(position[i], balanced_tree=False, compact_nodes=False).query(
+                low[i] + cell[i] * steps.reshape(-1, 3)
+            )[1]
             for i in range(len(z))
         ]
-        return cls(z, place, normal.reshape(place.shape), low, cell, np.stack(nearest).astype(np.int32))
+        return cls(z, position, normal.reshape(position.shape), low, cell, np.stack(nearest).astype(np.int32))
 
 
 def medoids(model: StatisticalModel, count: int) -> Int[np.ndarray, " q"]:
@@ -266,7 +268,7 @@ class Screen:
         parts = [visible]
         if self.in_part:
             for axis in rotation_along(ahead)[:, :2].T.astype(np.float32):
-                across = self.tables.place @ (rotations.transpose(0, 2, 1) @ axis).T
+                across = self.tables.position @ (rotations.transpose(0, 2, 1) @ axis).T
                 middle = (across * visible).sum(axis=1, keepdims=True) / np.maximum(
                     visible.sum(axis=1, keepdims=True), 1e-9
                 )
@@ -282,14 +284,14 @@ class Screen:
         """Every state at every rotation, with the centre of its weighted samples on that of the cloud."""
         center = self.points.mean(axis=0)
         weight = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-9)
-        middle = np.matmul(weight.transpose(0, 2, 1), self.tables.place)  # q r 3
+        middle = np.matmul(weight.transpose(0, 2, 1), self.tables.position)  # q r 3
         state, turn = np.divmod(np.arange(len(middle) * len(rotations)), len(rotations))
         rotation, middle = rotations[turn], middle[state, turn]
         log_scale = np.zeros(len(state), dtype=np.float32)
         if self.scaled:
-            place = np.matmul(self.tables.place[state] - middle[:, None], rotation.transpose(0, 2, 1))
+            position = np.matmul(self.tables.position[state] - middle[:, None], rotation.transpose(0, 2, 1))
             across = np.eye(3, dtype=np.float32) - ahead[:, None] * ahead
-            spread = np.einsum("nsi,nsi,ns->n", place @ across, place, weight.transpose(0, 2, 1)[state, turn])
+            spread = np.einsum("nsi,nsi,ns->n", position @ across, position, weight.transpose(0, 2, 1)[state, turn])
             seen = ((self.points - center) @ across * (self.points - center)).sum(axis=1).mean()
             log_scale = (0.5 * np.log(seen / np.maximum(spread, 1e-9))).astype(np.float32)
         shift = np.exp(log_scale)[:, None] * np.einsum("nij,nj->ni", rotation, middle)
@@ -316,13 +318,13 @@ class Screen:
         seen = np.matmul(self.points - poses.translation[:, None], poses.rotation) / size
         index = clipped((seen - tables.low[state]) / tables.cell[state][..., None], CELLS)
         sample = tables.nearest[state, (index[..., 0] * CELLS + index[..., 1]) * CELLS + index[..., 2]]
-        place, normal = tables.place[state, sample], tables.normal[state, sample]
-        offset, narrow = seen - place, sigma / size[..., 0]
+        position, normal = tables.position[state, sample], tables.normal[state, sample]
+        offset, narrow = seen - position, sigma / size[..., 0]
         camera = -np.matmul(inverse, poses.translation[..., None]).transpose(0, 2, 1) / size
-        facing = np.einsum("npi,npi->np", camera - place, normal) > 0
+        facing = np.einsum("npi,npi->np", camera - position, normal) > 0
         squared = np.einsum("npi,npi->np", offset, offset) / narrow**2
         squared = np.where(facing, squared, squared + ROBUST**2)
-        few = tables.place[poses.state, :: max(1, tables.place.shape[1] // POINTS)]
+        few = tables.position[poses.state, :: max(1, tables.position.shape[1] // POINTS)]
         direction, amount = self.sight.violations(poses.place(few), ROBUST * sigma)
         outside, robust = (amount / sigma) ** 2, (4 * ROBUST) ** 2
         cost = (squared / (1.0 + squared / ROBUST**2)).mean(axis=1)
@@ -583,7 +585,7 @@ def screen_poses(problem: Problem, stage: SearchRound) -> list[Posed]:
         poses = poses if count >= len(poses) else poses.rows(np.argpartition(poses.cost, count)[:count])
     poses = screen.scored(poses, SIGMAS[-1][0])
     poses = poses.rows(np.argsort(poses.cost))
-    positions = poses.place(tables.place[poses.state, ::16])
+    positions = poses.place(tables.position[poses.state, ::16])
     return [
         _posed(screen, poses, row)
         for row in diverse_rows(positions, APART * problem.model.half, rms_distance)[: stage.bent]

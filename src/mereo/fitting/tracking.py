@@ -107,8 +107,8 @@ class Track:
         model = self.problem.model
         rows = model.sparse
         modes = model.modes[rows]
-        place = self.posed.place(model.mean[rows] + modes @ self.posed.z.astype(np.float32))
-        jacobian = in_space(self.posed, place, modes).astype(np.float64)
+        position = self.posed.place(model.mean[rows] + modes @ self.posed.z.astype(np.float32))
+        jacobian = in_space(self.posed, position, modes).astype(np.float64)
         form: Float[np.ndarray, "p p"] = jacobian.T @ jacobian / len(rows)
         return form
 
@@ -132,9 +132,9 @@ def share_surfaces(base: Problem, other: Problem) -> None:
 def gated(track: Track, points: Float[np.ndarray, "n 3"], time_s: float, config: TrackConfig) -> Bool[np.ndarray, " n"]:
     """Mark the points, in the cloud's unit, near the expected surface; others are outliers, or the object is lost."""
     samples = track.problem.samples.every(2)
-    place = samples.posed(track.expected(time_s, config)).place
+    position = samples.posed(track.expected(time_s, config)).position
     most = config.gate * track.problem.model.half + samples.spacing
-    distance = cKDTree(place).query(points / track.unit, distance_upper_bound=most)[0]
+    distance = cKDTree(position).query(points / track.unit, distance_upper_bound=most)[0]
     return np.isfinite(distance)
 
 
@@ -397,7 +397,7 @@ class Tracker:
         self._track: Track | None = None
         self._T_camera_input, self._axes = np.eye(4), "camera"
         self._best = 0.0
-        self._found_by: FoundBy = "network"
+        self._located_by: FoundBy = "network"
         self._has_begun = False
 
     def close(self) -> None:
@@ -470,7 +470,7 @@ class Tracker:
         area = 0.0 if self._track is None else self._track.area
         tracked, _ = self._tracked(replace(begun.track, area=max(area, begun.track.area)), frame, np.inf)
         if tracked is not None and self._takes(tracked):
-            self._found_by = "search"
+            self._located_by = "search"
             return tracked
         self._T_camera_input, self._axes = before
         return None
@@ -501,7 +501,7 @@ class Tracker:
             answer = answer_of(seen, registrar.network, None, candidate, likelier, registration)
             return replace(answer, registrar=registrar, tracking="lost")
         self._search.drop()
-        self._track, self._best, self._found_by = alone.track, alone.score, candidate.found_by
+        self._track, self._best, self._located_by = alone.track, alone.score, candidate.found_by
         self._T_camera_input, self._axes = candidate.encoded.T_camera_input, seen.frame.axes
         answer = answer_of(seen, registrar.network, registrar, candidate, likelier, alone.registration)
         return replace(answer, seconds=time.perf_counter() - started)
@@ -555,7 +555,7 @@ class Tracker:
             registration=tracked.registration,
             taken=True,
             recognition=recognition,
-            found_by=self._found_by,
+            found_by=self._located_by,
             tracking=tracking,
             seconds=time.perf_counter() - started,
         )

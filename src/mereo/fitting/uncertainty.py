@@ -37,7 +37,7 @@ from mereo.scenes.statistical_model import StatisticalModel
 # --- posterior --------------------------------------------------------------------------------------------------------
 
 LEVEL = 0.95
-"""Probability with which a true place lies within a radius, and a true number in an interval."""
+"""Probability with which a true position lies within a radius, and a true number in an interval."""
 
 WITHIN = float(norm.ppf(0.5 + LEVEL / 2))
 """Standard deviations of one Gaussian number on either side that hold it with this probability: 1.96."""
@@ -209,7 +209,7 @@ class ModesOptimum:
         problem: everything the fit worked on.
         posed: coefficients and pose.
         unit: length of a scene unit in the input's unit, before the fit's own scale.
-        bent: places of the material points by a fit of the modes, where the answer is the rest model: an object that
+        bent: positions of the material points by a fit of the modes, where the answer is the rest model: an object that
             is hardly bent may pass for one at rest. None else.
     """
 
@@ -326,7 +326,7 @@ Optimum = ModesOptimum | DrawsOptimum
 # Notation: n observed samples, p parameters, J_i and w_i derivatives and weight of an observed sample's residual.
 
 Evidence = Literal["points", "network", "silhouette", "states"]
-"""What leaves a place unsure by its errors: the observed points, what the network says of them, what the frame rules
+"""What leaves a position unsure by its errors: the observed points, what the network says of them, what the frame rules
 out, and what was known of the object's states before the frame was seen."""
 
 Decided = tuple[dict[Evidence, float], Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]
@@ -343,7 +343,7 @@ class Explanation:
         shares: of each kind of evidence in the variance that is left; they sum to one. What a hidden point is unsure by
             comes largely from ``states``: from how far the object's own state may be from the likely ones.
         points: observed points that the surface was fitted to, evenly spread.
-        influence: how the place moves, in multiples of its motion, when one of them moves along its surface's normal.
+        influence: how the position moves, in multiples of its motion, when one of them moves along the normal.
         weights: how much each of them decides the place: the length of its influence over the sum of all.
         unexplained: observed points, of all that were seen, that are farther from the registered surface than the
             tolerance.
@@ -407,7 +407,7 @@ class Weighing:
         return cls(terms.cloud[0].astype(np.float64) @ factor, terms.cloud[2], parts)
 
     def decided(self, motion: Float[np.ndarray, "3 p"]) -> Decided:
-        """What decides a place that moves so."""
+        """What decides a position that moves so."""
         motion = motion.astype(np.float64)
         whole, leverage = float((motion**2).sum()), self.rows @ motion.T
         shares: dict[Evidence, float] = {"points": float((self.weight[:, None] * leverage**2).sum()) / whole}
@@ -429,7 +429,7 @@ OUTLINE = 300
 
 @dataclass(frozen=True)
 class SegmentUncertainty:
-    """How sure the place and the size of a segment are.
+    """How sure the position and the size of a segment are.
 
     Attributes:
         name: of the segment.
@@ -444,18 +444,18 @@ class SegmentUncertainty:
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """How far the true places may be from where a registration has them; lengths in the input's unit.
+    """How far the true positions may be from where a registration has them; lengths in the input's unit.
 
-    A ``radius95`` is that of the ball around a point that holds its true place with probability 0.95: by the posterior
-    of the fit, times ``scale`` where the weights were calibrated. It says nothing of an object that is not the model's,
-    nor of a fit that ended in a wrong state (``fitting.registration.recognition`` is to tell both).
+    A ``radius95`` is that of the ball around a point that holds its true position with probability 0.95: by the
+    posterior of the fit, times ``scale`` where the weights were calibrated. It does not cover another object, nor a fit
+    that ended in a wrong state (``fitting.registration.recognition`` detects both).
 
     Attributes:
         optimum: where the fit has ended.
         model: statistical model of the object.
         scale: factor by which views of training seeds showed the posterior's radii to be too small, in frames like
             this; None where that was not measured, and then they are as the posterior has them.
-        beside: radius that every place has beside that, because the network has the object elsewhere; scene units.
+        beside: radius added in quadrature at every position where network and fit disagree; scene units.
     """
 
     optimum: Optimum
@@ -503,12 +503,12 @@ class Uncertainty:
         return tuple(np.split(self.material[: ends[-1]], ends[:-1]))
 
     def radii(self, material: Float[np.ndarray, "m 3"]) -> Radii:
-        """Radii as files and pictures take them, of material points at these places, in a frame of the input's unit."""
+        """Radii as files and pictures take them, of material points at these positions, in the input's unit."""
         counts = self.model.vertex_counts
         return Radii(material, self.model.labels, self.material, counts, self.calibrated)
 
     def of_rest(self, points: Float[np.ndarray, "n 3"], labels: UInt8[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """``radius95`` of the places to which points at rest, of the segments ``labels``, are registered."""
+        """``radius95`` of the positions to which points at rest, of the segments ``labels``, are registered."""
         result = np.empty(len(points))
         for first in range(0, len(points), AT_ONCE):
             rows = slice(first, first + AT_ONCE)

@@ -58,8 +58,8 @@ def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
 def refine_by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     """Refine a state by what the lines of sight meet, with every observed point.
 
-    Nearest places lead there from afar, and noise takes them a little beside it; over more points it averages out. The
-    answer has the observed samples of all other states, but its misfit by every point: those it was fitted to.
+    Nearest points lead there from afar, and noise takes them a little beside it; over more points it averages out. The
+    fit has the observed samples of all other states, but its misfit by every point: those it was fitted to.
     """
     sighted = replace(problem, by_sight=True)
     dense = replace(sighted, base=problem.last)
@@ -208,7 +208,7 @@ def try_jumps(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
         if explains_cloud(problem, [fit], config.explained):
             break
         each = [find_jumps(problem, fit, int(number), sigma) for number in draws_that_may_jump(problem, fit)]
-        best_first = sorted((candidate for places in each for candidate in places), key=lambda candidate: candidate[0])
+        best_first = sorted((jump for jumps in each for jump in jumps), key=lambda jump: jump[0])
         fits = [descend(problem, other, config.first_rounds) for _, other in best_first[: config.kept + 1]]
         best = min(fits, key=by_misfit, default=fit)
         if best.misfit >= fit.misfit:
@@ -218,7 +218,7 @@ def try_jumps(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
 
 
 def find_jumps(problem: DrawsProblem, fit: DrawsFit, number: int, sigma: float) -> list[tuple[float, DrawsFit]]:
-    """A state with one draw at other places of its range: all, or the best where there are many draws, with misfits."""
+    """Simulate one draw at other positions of its range: all, or the best where draws are many, with misfits."""
     config, candidates = problem.config, list[tuple[float, DrawsFit]]()
     for turn in range(1, config.jump_steps):
         z = fit.z.copy()

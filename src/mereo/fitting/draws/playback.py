@@ -123,8 +123,8 @@ class Played:
         each = max(24, 400 // len(model.anchors))
         chosen = [anchors[spread(model.rest_points[anchors], each)] for anchors in model.anchors]
         counts = tuple(len(part) for part in chosen)
-        places = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
-        few = tuple(Anchors(at, model.rest_points[part]) for at, part in zip(places, chosen, strict=True))
+        positions = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
+        few = tuple(Anchors(at, model.rest_points[part]) for at, part in zip(positions, chosen, strict=True))
         follow = as_sparse(following(few, model.rest_points, model.labels), sum(counts))
         index = np.concatenate(chosen)
         return cls(model.rest_points[index], index, counts, follow)

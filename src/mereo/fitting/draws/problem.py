@@ -42,7 +42,7 @@ class DrawsProblem:
         correspondences: correspondences, scene units.
         weights: how their rest positions follow the material points.
         config: constants.
-        by_sight: whether observed points are compared with what their lines of sight meet, or with the nearest places.
+        by_sight: whether observed points are compared with what their lines of sight meet, or with the nearest points.
     """
 
     base: Problem
@@ -97,7 +97,7 @@ class DrawsFit:
         posed: rigid pose; its ``z`` is empty.
         material: material points, unposed.
         surface: the posed surface.
-        distance, face, place: of what each observed sample is compared with.
+        distance, face, position: of what each observed sample is compared with.
         misfit: with the prior of the draws, the cloud by its last sigma.
         motion: of the played points for a standard deviation of each draw, where it is known.
     """
@@ -109,7 +109,7 @@ class DrawsFit:
     surface: Surface
     distance: Float[np.ndarray, " p"]
     face: Int[np.ndarray, " p"]
-    place: Float[np.ndarray, "p 3"]
+    position: Float[np.ndarray, "p 3"]
     misfit: float
     motion: Float32[np.ndarray, "a 3 d"] | None = None
 
@@ -179,7 +179,7 @@ def terms(problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3
 
     nothing, state = NormalEquations.nothing(POSE + count), replace(posed, z=np.zeros(count))
     network = problem.network(fit, modes_of(problem.following_played))
-    planes = fit.place, surface.normals[fit.face], modes_of(surface_weights(fit, spread.shape[0]) @ spread)
+    planes = fit.position, surface.normals[fit.face], modes_of(surface_weights(fit, spread.shape[0]) @ spread)
     return Terms(
         known=prior_of_draws(fit.z, motion, posed.log_scale, base.scale_std),
         network=network.add_to(nothing, state, base.network_sigma, config.network_weight[1], robust=True),
@@ -199,7 +199,7 @@ def terms(problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3
 def surface_weights(fit: DrawsFit, count: int) -> csr_array:
     """Weights of all ``count`` material points by which the positions on the surface follow them."""
     corners = fit.surface.model.faces[fit.surface.facing[fit.face]]
-    within = barycentric(fit.surface.material[corners], fit.place).astype(np.float32)
+    within = barycentric(fit.surface.material[corners], fit.position).astype(np.float32)
     rows = np.repeat(np.arange(len(corners)), 3)
     return csr_array((within.ravel(), (rows, corners.ravel())), shape=(len(corners), count))
 

@@ -171,7 +171,7 @@ class Problem:
 
     @property
     def far(self) -> float:
-        """Distance, in scene units, beyond which a place along a line of sight is of another surface than was seen."""
+        """Distance, in scene units, beyond which a point along a line of sight is of another surface than was seen."""
         return ROBUST * self.config.cloud_sigma
 
     def met(self, surface: Surface) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
@@ -212,13 +212,13 @@ class Problem:
     def screen(self, posed: Posed, sigma: float) -> Misfit:
         """Misfit by the samples alone: good enough to choose among states, and ten times as fast."""
         samples = self.samples.posed(posed)
-        place, normal, _ = samples.planes(self.evidence.observed_samples)
-        offset = self.evidence.observed_samples - place
+        position, normal, _ = samples.planes(self.evidence.observed_samples)
+        offset = self.evidence.observed_samples - position
         across = np.einsum("pi,pi->p", offset, normal)
         tangential = np.sqrt(np.maximum((offset**2).sum(axis=1) - across**2, 0.0))
         # an observed sample up to one spacing beside a sample is still on its plane
         distance = np.hypot(across, np.maximum(tangential - self.samples.spacing, 0.0))
-        few = samples.few(self.config.silhouette_vertices).place
+        few = samples.few(self.config.silhouette_vertices).position
         return self.total(
             float(robust_square(distance, sigma).mean()),
             self.network.energy(posed, self.network_sigma),
@@ -278,7 +278,7 @@ class Problem:
         return Misfit(cloud, network, silhouette, prior, pairs, total)
 
     def unposed(self, z: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 3"]:
-        """The correspondences' places in the model's frame."""
+        """The correspondences' positions in the model's frame."""
         return self.network.mean + self.network.modes @ z.astype(np.float32)
 
 

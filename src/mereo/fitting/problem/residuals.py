@@ -27,10 +27,10 @@ from mereo.scenes.statistical_model import StatisticalModel
 # A search among all faces is exact and slow. Samples are as good while the model is farther from the cloud than they
 # are from each other; the last steps of a fit ask the faces themselves.
 #
-# Notation: s samples, k modes. A frame is three vectors: the sample's place and two edges of its face.
+# Notation: s samples, k modes. A frame is three vectors: the sample's position and two edges of its face.
 
 Planes = tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"], Float32[np.ndarray, "p 3 k"]]
-"""Planes that observed points are compared with: a place on each, its normal, and the modes there."""
+"""Planes that observed points are compared with: a position on each, its normal, and the modes there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,10 +74,10 @@ class SampledSurface:
         flat = self.modes.reshape(9 * len(self.mean), -1) @ posed.z.astype(np.float32)
         turn = (np.exp(posed.log_scale) * posed.rotation.T).astype(np.float32)
         frame = ((self.mean + flat.reshape(self.mean.shape)).reshape(-1, 3) @ turn).reshape(self.mean.shape)
-        place = frame[:, 0] + posed.translation.astype(np.float32)
+        position = frame[:, 0] + posed.translation.astype(np.float32)
         normal = cross(frame[:, 1], frame[:, 2])
         normal /= np.maximum(np.sqrt(np.einsum("si,si->s", normal, normal)), 1e-30)[:, None]
-        return PosedSamples(self, place, normal, np.einsum("si,si->s", normal, place) < 0)
+        return PosedSamples(self, position, normal, np.einsum("si,si->s", normal, position) < 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,20 +86,20 @@ class PosedSamples:
 
     Attributes:
         surface: of which they are.
-        place: of each.
+        position: of each.
         normal: outward.
         facing: whether the camera sees their outside.
     """
 
     surface: SampledSurface
-    place: Float32[np.ndarray, "s 3"]
+    position: Float32[np.ndarray, "s 3"]
     normal: Float32[np.ndarray, "s 3"]
     facing: Bool[np.ndarray, " s"]
 
     @property
     def points(self) -> Float[np.ndarray, "s 3"]:
         """Positions of the samples, in double precision."""
-        return self.place.astype(np.float64)
+        return self.position.astype(np.float64)
 
     def modes_at(self, rows: Int[np.ndarray, " r"]) -> Float32[np.ndarray, "r 3 k"]:
         """Modes of some of the samples."""
@@ -107,16 +107,16 @@ class PosedSamples:
 
     def few(self, count: int) -> "PosedSamples":
         """About ``count`` samples, as evenly spread."""
-        step = max(1, len(self.place) // count)
-        return PosedSamples(self.surface.every(step), self.place[::step], self.normal[::step], self.facing[::step])
+        step = max(1, len(self.position) // count)
+        return PosedSamples(self.surface.every(step), self.position[::step], self.normal[::step], self.facing[::step])
 
     def planes(self, points: Float[np.ndarray, "p 3"]) -> Planes:
         """Place, normal and modes of the facing sample nearest to each point."""
         rows = np.flatnonzero(self.facing)
-        rows = rows if len(rows) else np.arange(len(self.place))
-        tree = cKDTree(self.place[rows], balanced_tree=False, compact_nodes=False)
+        rows = rows if len(rows) else np.arange(len(self.position))
+        tree = cKDTree(self.position[rows], balanced_tree=False, compact_nodes=False)
         near = rows[tree.query(points)[1]]
-        return self.place[near].astype(np.float64), self.normal[near].astype(np.float64), self.surface.modes[near, 0]
+        return self.position[near].astype(np.float64), self.normal[near].astype(np.float64), self.surface.modes[near, 0]
 
 
 # --- residuals --------------------------------------------------------------------------------------------------------
@@ -174,19 +174,19 @@ class Surface:
     def nearest(
         self, points: Float[np.ndarray, "p 3"]
     ) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
-        """Distance, face among the facing ones, and place of the nearest point of the facing surface."""
+        """Distance, face among the facing ones, and position of the nearest point of the facing surface."""
         tree, vertices, faces = self._tree
-        squared, face, place = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
-        return np.sqrt(squared), face.astype(np.int64), place
+        squared, face, position = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
+        return np.sqrt(squared), face.astype(np.int64), position
 
     def along_sight(
         self, points: Float[np.ndarray, "p 3"], far: float
     ) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
-        """Like ``nearest``, but of the place that each point's line of sight meets, and of the distance from its plane.
+        """Like ``nearest``, but of the point that each line of sight meets, and of the distance from its plane.
 
-        A depth camera is off along the line of sight. The nearest place is another one: of a surface that bulges, it
+        A depth camera is off along the line of sight. The nearest position is another one: of a surface that bulges, it
         has a noisy cloud a little in front, and noise across an edge pulls that edge along. Where nothing is met, or
-        only a plane farther than ``far`` from the point, it is the nearest place all the same.
+        only a plane farther than ``far`` from the point, it is the nearest position all the same.
         """
         rows, met = first_faces(self._rays, self._center, points)
         toward, normal = points[rows], self.normals[met]
@@ -197,11 +197,11 @@ class Surface:
         near = off <= far
         other = np.ones(len(points), dtype=bool)
         other[rows[near]] = False
-        distance, face, place = np.empty(len(points)), np.empty(len(points), dtype=np.int64), np.empty_like(points)
-        distance[~other], face[~other], place[~other] = off[near], met[near], met_position[near]  # rows are in order
+        distance, face, position = np.empty(len(points)), np.empty(len(points), dtype=np.int64), np.empty_like(points)
+        distance[~other], face[~other], position[~other] = off[near], met[near], met_position[near]  # rows are in order
         if other.any():
-            distance[other], face[other], place[other] = self.nearest(points[other])
-        return distance, face, place
+            distance[other], face[other], position[other] = self.nearest(points[other])
+        return distance, face, position
 
     @cached_property
     def _center(self) -> Float[np.ndarray, "3"]:
@@ -214,16 +214,16 @@ class Surface:
 
     def offsets(self, points: Float[np.ndarray, "p 3"], far: float | None = None) -> Float[np.ndarray, " p"]:
         """Signed distance of each point from the facing surface, negative behind it; with ``far``, ``along_sight``."""
-        distance, face, place = self.nearest(points) if far is None else self.along_sight(points, far)
-        return np.copysign(distance, np.einsum("pi,pi->p", points - place, self.normals[face]))
+        distance, face, position = self.nearest(points) if far is None else self.along_sight(points, far)
+        return np.copysign(distance, np.einsum("pi,pi->p", points - position, self.normals[face]))
 
     def planes(self, points: Float[np.ndarray, "p 3"], far: float) -> Planes:
         """Place of the facing surface along each point's line of sight, its normal and its modes."""
-        _, face, place = self.along_sight(points, far)
+        _, face, position = self.along_sight(points, far)
         corners = self.model.faces[self.facing[face]]
-        weight = barycentric(self.material[corners], place).astype(np.float32)
+        weight = barycentric(self.material[corners], position).astype(np.float32)
         modes = np.matmul(weight[:, None], self.model.modes[corners].reshape(len(points), 3, -1))
-        return place, self.normals[face], modes.reshape(len(points), 3, -1)
+        return position, self.normals[face], modes.reshape(len(points), 3, -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,7 +243,7 @@ class NetworkTerm:
 
     @classmethod
     def of(cls, model: StatisticalModel, correspondences: Correspondences) -> "NetworkTerm":
-        """Term of correspondences, whose rest places follow the model."""
+        """Term of correspondences, whose rest positions follow the model."""
         weights = model.weights(correspondences.rest, correspondences.labels)
         return cls(correspondences.points, weights(model.mean), weights(model.modes), correspondences.confidence)
 
@@ -282,10 +282,10 @@ def cloud_rows(
     posed: Posed, points: Float[np.ndarray, "p 3"], planes: Planes, sigma: float, total_weight: float
 ) -> Rows:
     """Each point's distance to its plane of the facing surface, its derivatives, and its weight."""
-    place, across, modes = planes
-    residual = np.einsum("pi,pi->p", across, place - points)
+    position, across, modes = planes
+    residual = np.einsum("pi,pi->p", across, position - points)
     weight = geman_mcclure(residual, ROBUST * sigma) * (total_weight / len(points) / sigma**2)
-    return along(posed, place, modes, across), residual, weight
+    return along(posed, position, modes, across), residual, weight
 
 
 def add_silhouette(

@@ -200,7 +200,7 @@ BINS = 36
 
 COUNTED = 0.03
 """Share of the loss of a turned segment that counts: it is turned stiffly here, and a fit from there takes most of that
-back. On training views of the shapes 78 % of the places lay within the radii with all of it, 91 % with a tenth, 96 %
+back. On training views of the shapes 78 % of the positions lay within the radii with all of it, 91 % with a tenth, 96 %
 with this."""
 
 

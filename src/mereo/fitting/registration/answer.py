@@ -60,7 +60,7 @@ class Candidate:
         return float((self.off_surface <= tolerance).mean())
 
     def displaced(self, registration: Registration) -> float | None:
-        """How far apart network and registration have the same places (``Signs.displaced``); None without a fit."""
+        """How far apart network and registration have the same positions (``Signs.displaced``); None without a fit."""
         if self.modes is None:
             return None
         return self.modes.correspondences.displaced(registration.model, registration.material / self.modes.unit)

@@ -243,7 +243,7 @@ class ModesFit:
         return explained >= config.accepted or (explained >= least and self._agreement(surface) >= 0.8)
 
     def _agreement(self, surface: Surface) -> float:
-        """Share of the correspondences on the object whose segment is that of the nearest place of the surface."""
+        """Share of the correspondences on the object whose segment is that of the nearest position of the surface."""
         seen = self.correspondences.rows(self.correspondences.observed)
         if len(seen.points) == 0:  # a tracked frame, of which the network was not asked
             return 0.0

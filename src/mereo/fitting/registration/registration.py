@@ -70,7 +70,7 @@ class Registration:
         optimum: where the fit ended, from which uncertainty and explanations are made when they are asked for; None
             where the registration was read from a file.
         radius_scale: factor of the radii by the weights' calibration of such fits to such frames; None without one.
-        extra_radius: radius that every place has beside that, as ``Uncertainty.beside``; scene units.
+        extra_radius: radius that every position has beside that, as ``Uncertainty.beside``; scene units.
         alike: number of states, each elsewhere, that a search found to explain the frame alike, this one included.
     """
 
@@ -167,7 +167,7 @@ class Registration:
 
     @cached_property
     def uncertainty(self) -> Uncertainty | None:
-        """How far the true places may be from the registered ones; None where the registration was read from a file."""
+        """How far the true positions may be from the registered ones; None where it was read from a file."""
         if self.optimum is None:
             return None
         return Uncertainty(self.optimum, self.model, self.radius_scale, self.extra_radius)
@@ -175,10 +175,10 @@ class Registration:
     def radius95(
         self, points: ArrayLike, labels: UInt8[np.ndarray, " n"] | None = None, *, at: Literal["camera", "rest"]
     ) -> Float[np.ndarray, " n"] | None:
-        """Radius around each point that holds its true place with probability 0.95, in the input's unit.
+        """Radius around each point that holds its true position with probability 0.95, in the input's unit.
 
-        The point is one of the object: that which the registration has at the given place of the camera frame, or
-        that which was at the given place of the rest model. ``uncertainty`` has the radii of all vertices, and says
+        The point is one of the object: that which the registration has at the given position of the camera frame, or
+        that which was at the given position of the rest model. ``uncertainty`` has the radii of all vertices, and says
         whether they are calibrated. None where the registration was read from a file.
 
         Args:
