@@ -155,7 +155,7 @@ def test_auto_plays_the_scene_where_it_is_at_hand(
     fitted = registrar.fit_modes(CloudToFit(view.depth.to_points().points))
     assert fitted.rest is None
     modes = replace(registrar, method="modes")
-    assert modes.finish(fitted).method == "modes" and "states" not in vars(modes)
+    assert modes.finish(fitted).method == "modes" and "states_or_none" not in vars(modes)
     foreign = replace(registrar, network=replace(model, provenance={"scene": "mine"}))
     assert foreign.finish(fitted).method == "modes" and foreign.states_or_none is None
     asked: list[DrawnStates] = []

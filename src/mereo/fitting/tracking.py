@@ -281,7 +281,7 @@ class TrackedFrame:
 
 
 class Searched(NamedTuple):
-    """Frame in which a lost object was searched for, and the best candidate there, which may not explain it."""
+    """Frame in which a lost object was searched for, and its best candidate, which may not explain it."""
 
     frame: TrackedFrame
     candidate: Candidate

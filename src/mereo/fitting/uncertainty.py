@@ -279,23 +279,20 @@ class DrawsOptimum:
     @cached_property
     def terms(self) -> Terms:
         """Terms of the neighbourhood in which the scene is linear in its draws."""
+        assert self.fit.motion is not None
         with one_blas_thread():
-            return terms_of_draws(self.problem, self.fit, self._motion, self.problem.base.config.cloud_sigma)
+            return terms_of_draws(self.problem, self.fit, self.fit.motion, self.problem.base.config.cloud_sigma)
 
     @property
     def surface(self) -> Surface:
         """The posed surface."""
         return self.fit.surface
 
-    @property
-    def _motion(self) -> Float32[np.ndarray, "a 3 d"]:
-        assert self.fit.motion is not None
-        return self.fit.motion
-
     @cached_property
     def posterior(self) -> Posterior:
         """Posterior of pose, scale and draws."""
-        motion, spread = self._motion, self.problem.states.played.spread
+        motion, spread = self.fit.motion, self.problem.states.played.spread
+        assert motion is not None
         modes: Float32[np.ndarray, "m 3 d"] = (spread @ motion.reshape(len(motion), -1)).reshape(
             spread.shape[0], *motion.shape[1:]
         )

@@ -112,7 +112,7 @@ def along(
     modes: Float[np.ndarray, "n 3 k"],
     direction: Float[np.ndarray, "n 3"],
 ) -> Float[np.ndarray, "n p"]:
-    """Derivatives of ``direction . y`` at posed ``points`` whose modes are given."""
+    """Derivatives of ``direction . y`` at posed points with their modes."""
     arm = points - posed.translation
     local = (np.exp(posed.log_scale) * (direction @ posed.rotation)).astype(modes.dtype)
     result = np.empty((len(points), POSE + modes.shape[2]), dtype=modes.dtype)

@@ -60,7 +60,7 @@ class Candidate:
         return float((self.off_surface <= tolerance).mean())
 
     def displaced(self, registration: Registration) -> float | None:
-        """How far apart network and registration have the same positions (``Signs.displaced``); None without a fit."""
+        """How far apart network and registration have the same points (``Signs.displaced``); None without a fit."""
         if self.modes is None:
             return None
         return self.modes.correspondences.displaced(registration.model, registration.material / self.modes.unit)
@@ -109,12 +109,12 @@ class Answer:
 
     @property
     def error(self) -> ValueError | None:
-        """Why no registration was found, where one was wanted, as it was raised."""
+        """Error of the registration, where one was wanted and none was found."""
         return None if self.candidate is None else self.candidate.error
 
     @property
     def refusal(self) -> str | None:
-        """Why no registration was found, where one was wanted."""
+        """Message of ``error``."""
         return None if self.error is None else str(self.error)
 
     @property
@@ -167,7 +167,7 @@ class Answer:
 
     @property
     def encoded(self) -> EncodedFrame:
-        """Observed points of the registered model, and what the network makes of them; asked now where it was not."""
+        """Observed points of the registered model, encoded by the network, now where they were not before."""
         if self.candidate is not None and (self.model is None or self.candidate.encoded.code is not None):
             return self.candidate.encoded
         return encode_frame(self.hypothesis, self.model, self.seen.frame.axes)

@@ -2,11 +2,10 @@
 
     Registration, correspondences, stated scene unit -Signs.of-> Signs -recognize-> Recognition (known or not, and why)
 
-A sign is a number that is small for the object in states that were learned, and grows with what is wrong. Views of the
-object say how large it usually is, clean and under a camera's noise (``Calibration.recognizing``; conservative values
-here for weights that were not calibrated). How far the logarithms of all signs lie above the usual, in standard
-deviations and together, is the frame's strangeness; two limits make three answers of it. The sign that is strangest
-gives the reason, so there is one voice.
+A sign is a number that is small for the object in learned states, and grows with what is wrong. Views of the object
+tell how large it usually is, clean and under a camera's noise (``Calibration.recognizing``; conservative values for
+weights that were not calibrated). How far the logarithms of all signs lie above the usual, in standard deviations and
+together, is the frame's strangeness; two limits make three answers of it. The strangest sign gives the reason.
 """
 
 from collections.abc import Mapping

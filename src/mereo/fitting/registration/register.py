@@ -119,10 +119,10 @@ class ModesFit:
 
         Args:
             cloud: its lines of sight went past the object where it leaves that open.
-            correspondences: correspondences.
+            correspondences: of the network, or others.
             model: the statistical model.
             config: constants.
-            predict: what the network states about points of the camera frame, in the cloud's unit; None without one.
+            predict: the network, about points of the camera frame in the cloud's unit; None without one.
         """
         started = time.perf_counter()
         unit = estimate_unit(correspondences) if cloud.scene_unit is None else cloud.scene_unit
@@ -392,20 +392,9 @@ class Registrar:
             return None
         raise ValueError(f"{fault}, so its draws move other points: {CURE}, or use --method modes")
 
-    @cached_property
-    def states(self) -> DrawnStates | None:
-        """Random states of the scene, among which a fit of its draws starts; they take seconds once.
-
-        None without a scene, and for one with more than ``MOST_DRAWS``, which is left to the modes.
-        """
-        if self.scene is None or number_of_draws(self.scene) > MOST_DRAWS:
-            return None
-        with stage("simulate random states of the scene, once for an object"):
-            return DrawnStates.of(self.scene, self.model)
-
     @property
     def asks_search(self) -> bool:
-        """Whether a search is asked too where the network's fit does not explain the frame: seconds a frame."""
+        """Whether a search follows where the network's fit does not explain the frame: seconds a frame."""
         is_same_object = self.network is not None and self.network.names == self.model.rest.names
         return self.method == "auto" and self.config.turned and is_same_object
 
@@ -476,12 +465,16 @@ class Registrar:
 
     @cached_property
     def states_or_none(self) -> DrawnStates | None:
-        """``states``, but None where the scene's mesh cannot be had: the weights carry all that the modes need.
+        """Random states of the scene, among which a fit of its draws starts; they take seconds once.
 
-        With "full" that raises ``AssetUnavailable``.
+        None without a scene, for one with more than ``MOST_DRAWS`` draws, and where the scene's mesh cannot be had: the
+        weights carry all that the modes need. With "full" that raises ``AssetUnavailable``.
         """
         try:
-            return self.states
+            if self.scene is None or number_of_draws(self.scene) > MOST_DRAWS:
+                return None
+            with stage("simulate random states of the scene, once for an object"):
+                return DrawnStates.of(self.scene, self.model)
         except AssetUnavailable:
             if self.method != "full":
                 return None
