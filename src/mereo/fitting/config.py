@@ -12,13 +12,13 @@ FoundBy = Literal["search", "network"]
 """Who found the object in a frame: a search over poses and states, or a trained network."""
 
 Tracking = Literal["found", "followed", "lost"]
-"""State of a tracked object in a frame: found anew; followed from the last frame; or lost, so that its pose is not
-known."""
+"""State of a tracked object in a frame: found by itself; followed from the last frame; or lost, so that its pose is
+not known."""
 
 
 @dataclass(frozen=True)
 class FitConfig:
-    """Constants of the fit; lengths are scene units where not said otherwise.
+    """Constants of the fit; lengths are scene units if nothing else is stated.
 
     Attributes:
         start_sigma: standard deviation of the network's correspondences, and the cloud's at first, as a share of half
@@ -29,7 +29,7 @@ class FitConfig:
         explained: the cloud's misfit, in squared standard deviations of a sample, above which other states are tried.
         samples: points of the surface that stand for it in most steps.
         silhouette_vertices: how many of them are compared with what the frame rules out.
-        exact_steps: last steps, which ask the faces themselves.
+        exact_steps: last steps, which use the faces themselves.
         search_rounds: rounds of the search at most, while nothing explains the frame.
         scale_std: standard deviation of the scale's logarithm where the unit is not known.
         accepted, tolerance: a fit is believed where this share of the observed points lies as near its facing surface.
@@ -140,17 +140,17 @@ class TrackConfig:
         gain: how many times its present speed is added to that: what is still stays still, what moves may turn.
         dead: speed that noise alone makes a still object seem to have, which is not counted, neither here nor in where
             it is expected; scene units per second.
-        first_speed: the same while nothing is known of its motion, right after the network was asked.
+        first_speed: the same while nothing is known of its motion, right after a frame's own fit.
         least: standard deviation in however short a time, scene units.
-        smoothing: share of what a frame says of the motion that is believed, the rest is what was known before.
+        smoothing: weight of a frame's motion against what was known before.
         motion_weight: how many independent points the expectation is worth, in each direction.
         points: denser clouds are averaged to so many points.
         observed_samples: observed points, evenly spread, that are compared with the surface.
         first_sigma: the cloud's first standard deviation, as a share of half the rest box's longest side; it falls by
             ``cooling`` in each step to that of the frame's noise.
-        steps, exact_steps: steps that ask samples of the surface, and last ones that ask its faces.
+        steps, exact_steps: steps on samples of the surface, and last ones on its faces.
         gate: distance from the expected surface beyond which a point is left out, as a share of the same half.
-        drop: share of the points by which a frame may be explained less than the best since the network was asked.
+        drop: share of the points by which a frame may be explained less than the best since the track began.
         margin: share of the points that a frame's own fit must explain more than a lost track to take its place.
         least_area: share of the greatest area that was ever seen of the object, below which it is lost.
         most_ruled_out: share of the surface that the frame may rule out before the object is lost.

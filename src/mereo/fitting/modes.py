@@ -211,7 +211,7 @@ def similar_states(problem: Problem, posed: Posed, count: int) -> list[Posed]:
 
 # --- the object at rest -----------------------------------------------------------------------------------------------
 
-# The object at rest: the hypothesis that nothing is bent, judged against the modes by its evidence.
+# The object at rest: the hypothesis that nothing is bent, compared with the modes by its evidence.
 #
 # Modes can imitate noise, so their misfit is always lower; a hypothesis with fewer free numbers is right when the
 # difference is smaller than what that freedom buys. By Laplace's approximation (MacKay, Neural Computation 1992) that
@@ -282,7 +282,7 @@ def as_noisy(start: NetworkFit, points: Float[np.ndarray, "n 3"], predict: Predi
 
 # A camera that turns about its own centre sees the same points along the same lines of sight, so the correspondences
 # may only turn along with it. A network's do so where it recognizes what it sees; where it does not, each turn gives
-# another guess, and the fit tells which is right.
+# another guess, and the fit decides which is right.
 
 ROLL = np.pi / 4
 """Angle between two turns about the line of sight to the object, rad."""

@@ -371,7 +371,7 @@ def _along(
 
 
 def _moved(poses: Poses, matrix: Float[np.ndarray, "n 7 7"], gradient: Float[np.ndarray, "n 7"], scaled: bool) -> Poses:
-    """Poses after the step that the normal equations ask for."""
+    """Poses after the step of the normal equations."""
     count = 7 if scaled else 6
     matrix, gradient = matrix[:, :count, :count].astype(np.float64), gradient[:, :count].astype(np.float64)
     diagonal = np.einsum("nkk->nk", matrix)
@@ -474,7 +474,7 @@ def rotations(count: int) -> Float[np.ndarray, "n 3 3"]:
 
 @dataclass(eq=False)
 class _Trail:
-    """Search under one hypothesis of what the lines of sight beside the cloud say, as far as it has come."""
+    """Search under one hypothesis on the lines of sight beside the cloud, as far as it has come."""
 
     problem: Problem
     handicap: float = 0.0

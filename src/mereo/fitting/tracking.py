@@ -4,7 +4,7 @@
 
 What can be seen of a lost object: few points lie near where it was expected, the model explains fewer of them than it
 must, or the frame rules out much of it. Then, and at first, a network fits the frame by itself, as `mereo reconstruct`
-does, and the better of both is gone on with. Where that explains nothing, or there is no network, the answer says that
+does, and the better of both is continued. Where that explains nothing, or there is no network, the answer says that
 the object is lost, and a search goes on in the background; its state, fitted to the newest frame, begins a new track.
 """
 
@@ -392,7 +392,7 @@ class Tracker:
         self.close()
 
     def forget(self) -> None:
-        """Start anew: the next frame is fitted by itself; a search that goes on is given up."""
+        """Forget the track: the next frame is fitted by itself; a search that goes on is given up."""
         self._search.close(wait=False)
         self._track: Track | None = None
         self._T_camera_input, self._axes = np.eye(4), "camera"

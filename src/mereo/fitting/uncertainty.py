@@ -62,7 +62,7 @@ def radius95(covariance: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
 
 @dataclass(frozen=True, eq=False)
 class RadiusParts:
-    """Radii of 95 % in two parts, whose squares add: views of the object say how far the first is to be trusted.
+    """Radii of 95 % in two parts, whose squares add: views of the object calibrate the first.
 
     Attributes:
         gaussian: by the Gaussian around the optimum, which a calibration scales.
@@ -83,7 +83,7 @@ class Posterior:
     """Gaussian around a registered state, as factors of its covariance.
 
     Attributes:
-        posed: pose of the optimum; its coefficients are not asked.
+        posed: pose of the optimum; its coefficients do not matter.
         material: posed material points.
         modes: how each of them moves with the coefficients, before the pose.
         factor: p x p, ``factor factor^T`` is the covariance of the parameters.
@@ -323,8 +323,8 @@ Optimum = ModesOptimum | DrawsOptimum
 # Notation: n observed samples, p parameters, J_i and w_i derivatives and weight of an observed sample's residual.
 
 Evidence = Literal["points", "network", "silhouette", "states"]
-"""What leaves a position unsure by its errors: the observed points, what the network says of them, what the frame rules
-out, and what was known of the object's states before the frame was seen."""
+"""What leaves a position unsure by its errors: the observed points, the network's correspondences, what the frame
+rules out, and what was known of the object's states before the frame was seen."""
 
 Decided = tuple[dict[Evidence, float], Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]
 """Shares of each kind of evidence in what is unsure; weight of each observed sample, and its influence in the camera's
@@ -375,44 +375,6 @@ class Explanation:
     def __repr__(self) -> str:
         shares = ", ".join(f"{name} {share:.0%}" for name, share in self.shares.items())
         return f"Explanation(unsure by {shares}; {counted(len(self.unexplained), 'point')} unexplained)"
-
-
-@dataclass(frozen=True, eq=False)
-class Weighing:
-    """Terms of a fit in parameters that are independent and standard normal after it (u = F v, ``F F^T = S``).
-
-    Attributes:
-        rows: derivatives of the observed samples' residuals.
-        weight: of the residuals.
-        parts: of each kind of evidence but the points in the unit matrix that is their sum.
-    """
-
-    rows: Float[np.ndarray, "n p"]
-    weight: Float[np.ndarray, " n"]
-    parts: dict[Evidence, Float[np.ndarray, "p p"]]
-
-    @classmethod
-    def of(cls, terms: Terms, posterior: Posterior) -> "Weighing":
-        """Weighing of a fit's terms."""
-        factor = posterior.factor
-        others: dict[Evidence, Float[np.ndarray, "p p"]] = {
-            "network": terms.network.matrix,
-            "silhouette": terms.ruled_out.matrix,
-            "states": terms.known.matrix,
-        }
-        parts = {name: factor.T @ matrix @ factor for name, matrix in others.items()}
-        return cls(terms.cloud[0].astype(np.float64) @ factor, terms.cloud[2], parts)
-
-    def decided(self, motion: Float[np.ndarray, "3 p"]) -> Decided:
-        """What decides a position that moves so."""
-        motion = motion.astype(np.float64)
-        whole, leverage = float((motion**2).sum()), self.rows @ motion.T
-        shares: dict[Evidence, float] = {"points": float((self.weight[:, None] * leverage**2).sum()) / whole}
-        for name, part in self.parts.items():
-            shares[name] = float(((motion @ part) * motion).sum()) / whole
-        influence = self.weight[:, None] * leverage
-        length = np.linalg.norm(influence, axis=1)
-        return shares, length / max(float(length.sum()), np.finfo(np.float64).tiny), influence
 
 
 # --- uncertainty ------------------------------------------------------------------------------------------------------
@@ -533,8 +495,32 @@ class Uncertainty:
         return tuple(result)
 
     @cached_property
-    def _weighing(self) -> Weighing:
-        return Weighing.of(self.optimum.terms, self.posterior)
+    def _whitened(
+        self,
+    ) -> tuple[Float[np.ndarray, "n p"], Float[np.ndarray, " n"], dict[Evidence, Float[np.ndarray, "p p"]]]:
+        """Terms of the fit in parameters that are independent and standard normal after it (u = F v, ``F F^T = S``).
+
+        Derivatives and weights of the observed samples' residuals, and the parts of all other kinds of evidence in the
+        unit matrix that is the sum of all.
+        """
+        terms, factor = self.optimum.terms, self.posterior.factor
+        others: dict[Evidence, Float[np.ndarray, "p p"]] = {
+            "network": terms.network.matrix,
+            "silhouette": terms.ruled_out.matrix,
+            "states": terms.known.matrix,
+        }
+        parts = {name: factor.T @ matrix @ factor for name, matrix in others.items()}
+        return terms.cloud[0].astype(np.float64) @ factor, terms.cloud[2], parts
+
+    def _decided(self, motion: Float[np.ndarray, "3 p"]) -> Decided:
+        """What decides a position that moves so."""
+        (rows, weight, parts), motion = self._whitened, motion.astype(np.float64)
+        whole, leverage = float((motion**2).sum()), rows @ motion.T
+        shares: dict[Evidence, float] = {"points": float((weight[:, None] * leverage**2).sum()) / whole}
+        shares |= {name: float(((motion @ part) * motion).sum()) / whole for name, part in parts.items()}
+        influence = weight[:, None] * leverage
+        length = np.linalg.norm(influence, axis=1)
+        return shares, length / max(float(length.sum()), np.finfo(np.float64).tiny), influence
 
     @cached_property
     def unexplained(self) -> Float[np.ndarray, "k 3"]:
@@ -545,11 +531,11 @@ class Uncertainty:
 
     def decided_centroid(self, index: int) -> Decided:
         """What decides where the centroid of a segment is."""
-        return self._weighing.decided(self._owned[1][index, 1:])
+        return self._decided(self._owned[1][index, 1:])
 
     def decided_point(self, point: Float[np.ndarray, "1 3"], label: UInt8[np.ndarray, "1"]) -> Decided:
         """What decides where a point of the rest model is, which moves along with the segment ``label``."""
-        return self._weighing.decided(self.posterior.motion_at(self.model.weights(point, label))[0])
+        return self._decided(self.posterior.motion_at(self.model.weights(point, label))[0])
 
     def summary(self, radii: Float[np.ndarray, " n"] | None = None) -> dict[str, float | bool]:
         """Median and greatest ``radius95`` of the vertices, or of the given radii, and whether they are calibrated."""

@@ -300,12 +300,11 @@ def lower(
 # Discrete draws are such as how many corners of a sheet are folded, and which.
 #
 # Derivatives do not reach across them, and random states hold one combination too seldom to be near everything else.
-# So a state that is right but for such a choice keeps all that it has drawn; the choice, and what it asks for, is drawn
-# anew.
+# So a state that is right but for such a choice keeps all other draws; the choice, and what depends on it, is redrawn.
 
 
 def redraw_choices(scene: Scene, drawn: Drawn, count: int) -> list[Drawn]:
-    """States with some of the discrete draws, and what they ask for, drawn anew; fewer than ``count`` where refused.
+    """Redraw some of the discrete draws of a state, and what depends on them; fewer than ``count`` where refused.
 
     Nothing where the scene has no discrete draws. The same state gives the same ones.
     """

@@ -37,7 +37,7 @@ class DrawsProblem:
     """A frame to be explained by the states of a scene.
 
     Attributes:
-        base: the same frame, explained by modes, with the worths that the draws are fitted by.
+        base: the same frame, explained by modes, with the weights that the draws are fitted by.
         states: random states of the scene.
         correspondences: correspondences, scene units.
         weights: how their rest positions follow the material points.

@@ -79,7 +79,7 @@ class Correspondences:
 
 
 def nothing() -> Correspondences:
-    """No correspondences, of a frame of which no network was asked."""
+    """No correspondences, of a frame without a network."""
     none = np.empty((0, 3))
     return Correspondences(none, none, np.empty(0, np.uint8), np.empty(0), np.empty(0, dtype=bool))
 
@@ -87,7 +87,7 @@ def nothing() -> Correspondences:
 def find_correspondences(
     model: Trained, code: EncodedCloud, center: Float[np.ndarray, "3"], half: float
 ) -> Correspondences | None:
-    """Correspondences: all that the network says about observed points and the lines of sight behind them.
+    """Predict correspondences at observed points and along the lines of sight behind them.
 
     Args:
         model: the trained network.

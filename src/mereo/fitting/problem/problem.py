@@ -136,7 +136,7 @@ class Problem:
         return replace(self, config=config, evidence=self.evidence.with_more_samples, noisy=True)
 
     def wants_turns(self, cloud: float, surface: Surface) -> bool:
-        """Whether a misfit of the cloud, much greater than its noise, says that the fit is likely wrong."""
+        """Whether a misfit of the cloud, much greater than its noise, shows that the fit is likely wrong."""
         if cloud < UNEXPLAINED:
             return False
         if self.config.turned_anyway:
@@ -200,7 +200,7 @@ class Problem:
             samples=1000,
             silhouette_vertices=self.config.silhouette_vertices // COARSE,
         )
-        if self.noisy:  # its sigma would ask the faces in all steps
+        if self.noisy:  # its sigma would use the faces in all steps
             config = replace(config, exact_steps=0)
         some = slice(None, None, COARSE)
         network = NetworkTerm(*(part[some] for part in vars(self.network).values()))
@@ -229,7 +229,7 @@ class Problem:
     def seen(
         self, normal: NormalEquations, posed: Posed, sigma: float, network_weight: float, exact: bool
     ) -> NormalEquations:
-        """Sum with cloud, silhouette and correspondences; ``exact`` asks the faces and not the samples."""
+        """Sum with cloud, silhouette and correspondences; ``exact`` uses the faces and not the samples."""
         samples, observed = self.samples.posed(posed), self.evidence.observed_samples
         planes = Surface.of(self.model, posed).planes(observed, self.far) if exact else samples.planes(observed)
         normal = self.network.add_to(normal, posed, self.network_sigma, network_weight, robust=True)
@@ -318,7 +318,7 @@ SHARED = 1.05
 Fits to noisy training views that other states do not improve have 1.02 to 1.15, those that they do mostly more."""
 
 ACCEPTED = 0.75
-"""Share of a noisy frame's points that a fit must explain to be believed: what remains are strays that nothing tells.
+"""Share of a noisy frame's points that a fit must explain to be believed: the rest are outliers that nothing reveals.
 
 Of 13 noisy training views that explain .76 to .95, the network was better in one, that with .76."""
 

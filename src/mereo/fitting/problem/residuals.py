@@ -25,7 +25,7 @@ from mereo.scenes.statistical_model import StatisticalModel
 # --- the surface as samples -------------------------------------------------------------------------------------------
 
 # A search among all faces is exact and slow. Samples are as good while the model is farther from the cloud than they
-# are from each other; the last steps of a fit ask the faces themselves.
+# are from each other; the last steps of a fit use the faces themselves.
 #
 # Notation: s samples, k modes. A frame is three vectors: the sample's position and two edges of its face.
 

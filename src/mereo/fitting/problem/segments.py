@@ -189,7 +189,7 @@ def different(shapes: Float[np.ndarray, "n q"], first: Float[np.ndarray, " q"], 
 # --- symmetries -------------------------------------------------------------------------------------------------------
 
 ANGLES = np.deg2rad(np.arange(30, 331, 10))
-"""Turns that are asked about; of smaller ones the Gaussian around an optimum knows."""
+"""Turns that are compared; smaller ones belong to the Gaussian around an optimum."""
 
 ALIKE = 0.06
 """Root mean square distance of a turned segment from itself up to which it looks the same, in mean distances from the

@@ -82,10 +82,10 @@ class Answer:
         recognition: whether the frame shows the object, in a state that was learned; whoever answers.
         likelier: the hypothesis that is likelier without a fit, encoded: from it the network answers.
         resolution: cells along the longest side of the object's box in ``reconstruction``.
-        label_points: whether ``reconstruction`` also says on which segment each observed point lies.
+        label_points: whether ``reconstruction`` also labels the observed points by segment.
         seconds: that it took, without ``reconstruction``.
         found_by: who found the object; of a tracked answer, when it began to be followed.
-        tracking: of a tracked object; what is lost has no pose, and ``recognition`` says why.
+        tracking: of a tracked object; a lost one has no pose, and ``recognition`` has the reason.
     """
 
     seen: Observation
@@ -119,7 +119,7 @@ class Answer:
 
     @property
     def tracked(self) -> bool:
-        """Whether the last frame's state led to the answer, so that the network was not asked."""
+        """Whether the last frame's state led to the answer, without the network."""
         return self.tracking == "followed"
 
     @property

@@ -71,7 +71,7 @@ def answer_frame(
         scene_unit: length of a scene unit in the frame's unit, where it is known for certain. Otherwise it follows
             from the frame's unit (where a network's estimate agrees), or is found together with the pose.
         resolution: cells along the longest side of the object's box in ``Answer.reconstruction``.
-        label_points: let ``Answer.reconstruction`` also say on which segment each observed point lies.
+        label_points: let ``Answer.reconstruction`` also label the observed points by segment.
 
     Raises ``ValueError`` for unusable clouds, and where nothing is found and no network can answer.
     """

@@ -66,7 +66,7 @@ class Signs:
         beyond: how far the state lies outside all that were learned, scene units; None at rest.
         unusual: mean square of the state's coefficients; None at rest.
         displaced: how far apart network and registered model have the same places of the object, as a share of half its
-            length (``Correspondences.displaced``); None where the network was not asked.
+            length (``Correspondences.displaced``); None without correspondences.
     """
 
     size: float | None = None
@@ -169,11 +169,11 @@ def recognize(
     """Whether a frame shows the object, in a state that was learned.
 
     Args:
-        registration: of the object's model to the frame; None where none was found or none was asked for.
+        registration: of the object's model to the frame; None where none was found or none was wanted.
         calibration: of the weights, with what is usual.
         displaced: as in ``Signs``.
         stated_scene_unit: length of a scene unit in the frame's unit, where the input states that.
-        refusal: why no registration was found; None where none was asked for, and then it cannot be told.
+        refusal: why no registration was found; None where none was wanted, and then recognition is not possible.
     """
     if registration is None:
         return NOT_ASKED if refusal is None else Recognition(False, refusal, MOST)

@@ -245,7 +245,7 @@ class ModesFit:
     def _agreement(self, surface: Surface) -> float:
         """Share of the correspondences on the object whose segment is that of the nearest position of the surface."""
         seen = self.correspondences.rows(self.correspondences.observed)
-        if len(seen.points) == 0:  # a tracked frame, of which the network was not asked
+        if len(seen.points) == 0:  # a tracked frame, without correspondences
             return 0.0
         face = surface.nearest(seen.points)[1]
         model = self.problem.model

@@ -67,11 +67,11 @@ class Registration:
         ruled_out: share of the surface's vertices that the frame rules out, by more than a scene unit: they lie beside
             all that was seen of the object or in front of it; None where the registration was read from a file.
         needed: least ``explained`` of a frame of this noise to be believed.
-        optimum: where the fit ended, from which uncertainty and explanations are made when they are asked for; None
+        optimum: where the fit ended, from which uncertainty and explanations are made on first use; None
             where the registration was read from a file.
         radius_scale: factor of the radii by the weights' calibration of such fits to such frames; None without one.
         extra_radius: radius that every position has beside that, as ``Uncertainty.beside``; scene units.
-        alike: number of states, each elsewhere, that a search found to explain the frame alike, this one included.
+        alike: number of different states that a search found to explain the frame alike, this one included.
     """
 
     model: StatisticalModel
@@ -120,12 +120,12 @@ class Registration:
 
     @cached_property
     def solids(self) -> Solids:
-        """Segments in the camera frame, to be asked what is inside and how far."""
+        """Segments in the camera frame, for queries of labels and distances."""
         return Solids(self.mesh)
 
     @cached_property
     def rest_solids(self) -> Solids:
-        """Segments at rest, to be asked the same."""
+        """Segments at rest, for the same queries."""
         return Solids(self.model.rest)
 
     def to_camera(self, points: ArrayLike, labels: UInt8[np.ndarray, " n"] | None = None) -> Float[np.ndarray, "n 3"]:
