@@ -20,7 +20,7 @@ from mereo.evaluation.metrics import TruthGrid, confusion_matrix, intersection_o
 from mereo.evaluation.scans import SCANS, scan_in_camera
 from mereo.evaluation.scoring import predict_grid
 from mereo.fitting.draws.playback import DrawnStates
-from mereo.fitting.registration.fit import CloudToFit, fit_frame
+from mereo.fitting.registration.register import CloudToFit, fit_frame
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh

@@ -25,12 +25,11 @@ from typing import get_args
 import numpy as np
 
 from mereo.evaluation.metrics import confusion_matrix, intersection_over_union, truth_grid
+from mereo.fitting.config import TrackConfig
 from mereo.fitting.registration.answer import Answer
-from mereo.fitting.registration.fit import CloudToFit
-from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.register import CloudToFit, Registrar
 from mereo.fitting.registration.registration import Registration
-from mereo.fitting.tracking.config import TrackConfig
-from mereo.fitting.tracking.tracker import Tracker
+from mereo.fitting.tracking import Tracker
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import label_grid

@@ -45,7 +45,7 @@ from mereo.evaluation.scans import SCANS, scan_in_camera
 from mereo.evaluation.scoring import predict_grid
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.correspondences import find_correspondences
-from mereo.fitting.registration.fit import CloudToFit, fit_frame
+from mereo.fitting.registration.register import CloudToFit, fit_frame
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh

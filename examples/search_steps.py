@@ -17,7 +17,7 @@ from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import NetworkTerm
-from mereo.fitting.search.search import ROUNDS, candidates, screened, search
+from mereo.fitting.search import ROUNDS, candidates, screen_poses, search
 from mereo.reconstruction.observation import Observation, find_object
 from mereo.scenes.random_states import kept_model
 from mereo.scenes.registry import load_scene
@@ -60,7 +60,7 @@ def main(options: Options) -> None:
     model = kept_model(scene)
     evidence = Evidence.of(seen.cloud.points, lines=seen.lines)
     problem = Problem(model, NetworkTerm.none(model), evidence, KNOWN_SCALE_STD, FitConfig())
-    rigid = screened(problem, ROUNDS[0])
+    rigid = screen_poses(problem, ROUNDS[0])
     bent = candidates(problem, ROUNDS[0])
     found = search(problem)
     states = (rigid[-1], rigid[0], bent[0][1], found.best.posed)

@@ -114,7 +114,7 @@ def without_turns(monkeypatch: pytest.MonkeyPatch) -> None:
 
     For tests of what happens to such a frame afterwards; ``test_turned_camera.py`` tests the search.
     """
-    monkeypatch.setattr("mereo.fitting.registration.fit.with_turns", lambda start, ask: start)
+    monkeypatch.setattr("mereo.fitting.registration.register.with_turned_camera", lambda start, predict: start)
 
 
 @pytest.fixture

@@ -11,8 +11,7 @@ from mereo.evaluation.cases import Evaluation, RegistrationErrors, find_candidat
 from mereo.evaluation.metrics import Scores, truth_grid
 from mereo.evaluation.scoring import EvaluationConfig, evaluate
 from mereo.evaluation.tables import markdown_table, metrics
-from mereo.fitting.registration.fit import CloudToFit
-from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.register import CloudToFit, Registrar
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.atomic_files import write_json

@@ -10,8 +10,7 @@ import trimesh
 
 from mereo import __main__ as command_line
 from mereo.evaluation.sample_views import SampleView, load_view
-from mereo.fitting.registration.fit import CloudToFit, fit_frame
-from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.register import CloudToFit, Registrar, fit_frame
 from mereo.io.attachments import PoseTable, Surfaces, read_attachments, read_pose_table
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.volume_files import Volume, read_volume

@@ -131,8 +131,8 @@ def test_far_from_the_object_there_is_background(model: StatisticalModel) -> Non
     assert (found.volume.values.ravel()[distance > 1.001 * width] == source.values.min()).all()
     assert (found.volume.values.ravel()[distance < 0.999 * width] > source.values.min()).all()
     half = replace(source, values=source.values[:, :, : source.values.shape[2] // 2])
-    cut = resampled(half, here, background=-1000.0)
-    assert 0.4 < cut.within / cut.inside < 0.6 and cut.volume.values.min() == -1000
+    cut = resampled(half, here)
+    assert 0.4 < cut.within / cut.inside < 0.6 and cut.volume.values.min() == half.values.min()
     scaled = resampled(replace(source, slope=-1.0), here)
     assert scaled.volume.values[0, 0, 0] == source.values.max()  # the least of what they mean
 
@@ -294,8 +294,3 @@ def test_a_volume_beside_the_object_is_refused(registrar: Registrar) -> None:
     small = np.diag([0.1, 0.1, 0.1, 1.0])  # between all material points, and inside
     small[:3, 3] = (2.0, 1.0, 1.0)
     place([Attachment("in.nii", Volume(np.zeros((2, 2, 2)), small))], registrar, "scene")
-
-
-def test_a_background_that_the_type_cannot_hold_is_refused(bent: Registration) -> None:
-    with pytest.raises(ValueError, match="the background is -1000; the volume's type uint8 holds 0 to 255: choose"):
-        resampled(halves("uint8"), bent, background=-1000.0)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fitted_clouds import fit_correspondences
 from scipy.spatial.transform import Rotation
 from toy_scene import toy_scene
 
@@ -11,7 +12,6 @@ from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
 from mereo.fitting.problem.correspondences import Correspondences, estimate_unit
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import POSE, Posed, along
-from mereo.fitting.registration.fit import fit_correspondences
 from mereo.fitting.registration.recognition import recognize
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.transforms import inverse_rigid, rigid, transform_points

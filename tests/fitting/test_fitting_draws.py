@@ -11,10 +11,10 @@ from mereo.fitting.draws.fit import fit_draws
 from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
 from mereo.fitting.draws.problem import DrawsProblem, Shape, approach, derivatives, lay_on_shape, secant
 from mereo.fitting.draws.problem import narrowing as draws_narrowing
-from mereo.fitting.modes.fit import narrowing as modes_narrowing
+from mereo.fitting.modes import narrowing as modes_narrowing
 from mereo.fitting.problem.correspondences import nothing
 from mereo.fitting.problem.residuals import NetworkTerm
-from mereo.fitting.registration.fit import CloudToFit, ModesFit, is_drawn
+from mereo.fitting.registration.register import CloudToFit, ModesFit, is_drawn
 from mereo.scenes.statistical_model import StatisticalModel
 
 SCENE = toy_scene()
@@ -72,7 +72,7 @@ def test_a_secant_agrees_with_the_step_and_only_there() -> None:
 def test_the_approach_reaches_a_state_of_the_scene(model: StatisticalModel, states: DrawnStates) -> None:
     """From another state, to the shape of one whose draws are known, in any pose."""
     points = states.material[7][states.played.index].astype(np.float64) @ np.diag([-1.0, -1.0, 1.0]) + 5.0
-    shape = Shape.of(points, 0.04 * model.half, 500.0, np.ones(len(points)))
+    shape = Shape.of(points, 0.04 * model.half, np.ones(len(points)))
     drawn = Drawn.of(SCENE, states.seeds[3])
     start = lay_on_shape(states, shape, drawn, drawn.z)
     assert start is not None
@@ -86,7 +86,7 @@ def test_the_simpler_description_is_preferred_by_its_evidence(model: Statistical
     """Draws are taken where their misfit is lower, or higher by less than what the modes' more free numbers buy."""
     points, material = shown(model, 0.5)
     fitted = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
-    problem = DrawsProblem.of(fitted.problem, states, fitted.found)
+    problem = DrawsProblem.of(fitted.problem, states, fitted.correspondences)
     drawn = fit_draws(problem, fitted.posed)
     assert drawn is not None
     modes = problem.last.misfit(fitted.posed).total
@@ -99,7 +99,7 @@ def test_the_simpler_description_is_preferred_by_its_evidence(model: Statistical
 def test_draws_that_move_nothing_narrow_nothing(model: StatisticalModel, states: DrawnStates) -> None:
     points, material = shown(model, 0.5)
     fitted = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
-    problem = DrawsProblem.of(fitted.problem, states, fitted.found)
+    problem = DrawsProblem.of(fitted.problem, states, fitted.correspondences)
     drawn = fit_draws(problem, fitted.posed)
     assert drawn is not None and drawn.motion is not None
     one_moves, none_moves = drawn.motion.copy(), np.zeros_like(drawn.motion)
@@ -115,13 +115,13 @@ def test_a_second_pass_follows_where_the_first_has_failed(
     """Modes that are wrong and a single step leave the cloud unexplained; a pass from there comes nearer."""
     points, material = shown(model, 0.5)
     fitted = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
-    problem = DrawsProblem.of(fitted.problem, states, fitted.found)
+    problem = DrawsProblem.of(fitted.problem, states, fitted.correspondences)
     wrong = replace(fitted.posed, z=np.full(model.count, 2.0))
     poor = replace(problem.config, starts=1, sieve=((1, 1),), kept=1, last_rounds=0, steps=1, hopeless=0.0)
-    poor = replace(poor, jumps=0, asked_again=False)
+    poor = replace(poor, jumps=0, network_start=False)
     once, twice = (fit_draws(replace(problem, config=replace(poor, passes=n)), wrong) for n in (0, 1))
     assert once is not None and twice is not None and twice.misfit < 0.9 * once.misfit
-    monkeypatch.setattr("mereo.fitting.draws.fit.fit_from_end", None)  # not called where the first explains the cloud
+    monkeypatch.setattr("mereo.fitting.draws.fit.refine", None)  # not called where the first explains the cloud
     assert fit_draws(replace(problem, config=replace(problem.config, passes=1, hopeless=9.0)), fitted.posed) is not None
 
 
@@ -134,5 +134,5 @@ def test_after_a_search_nobody_is_asked_about_a_frame_that_is_not_explained(
     base = replace(fitted.problem, network=NetworkTerm.none(model))
     problem = DrawsProblem.of(base, states, nothing())
     strict = replace(problem, config=replace(problem.config, explained=0.0, jumps=0))
-    assert strict.config.asked_again
+    assert strict.config.network_start
     assert fit_draws(strict, fitted.posed) is not None

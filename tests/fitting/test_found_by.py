@@ -18,8 +18,7 @@ from mereo.fitting.registration.answer_frame import (
     more_evident,
     search_modes,
 )
-from mereo.fitting.registration.fit import CloudToFit
-from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.register import CloudToFit, Registrar
 from mereo.geometry.camera import PointCloud, SightLines
 from mereo.models.model import Model
 from mereo.models.weights import load_model
@@ -48,7 +47,7 @@ def confused(monkeypatch: pytest.MonkeyPatch) -> None:
         assert found is not None
         return replace(found, rest=np.random.default_rng(0).permutation(found.rest))
 
-    monkeypatch.setattr("mereo.fitting.registration.fit.find_correspondences", lying)
+    monkeypatch.setattr("mereo.fitting.registration.register.find_correspondences", lying)
 
 
 def answer(liver: Model, cloud: PointCloud, method: Any = "auto") -> Answer:
@@ -81,7 +80,7 @@ def test_other_methods_ask_nobody_else(
 
 
 def test_the_network_is_left_out_on_request(liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mereo.fitting.registration.fit.find_correspondences", None)
+    monkeypatch.setattr("mereo.fitting.registration.register.find_correspondences", None)
     found = answer(liver, cloud, "search")
     assert found.found_by == "search" and found.taken
 
@@ -109,7 +108,7 @@ def test_a_network_far_from_what_it_starts_is_no_start(liver: Model, cloud: Poin
     by_network = answer(liver, cloud).candidate
     assert by_network is not None and by_network.modes is not None
     assert not is_astray(by_network)
-    found = by_network.modes.found
+    found = by_network.modes.correspondences
     guessed = replace(found, rest=np.random.default_rng(0).permutation(found.rest))
     lucky = replace(by_network, modes=replace(by_network.modes, found=guessed))
     assert lucky.is_accepted and is_astray(lucky)

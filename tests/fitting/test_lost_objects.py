@@ -14,11 +14,11 @@ from tracked_views import CAMERA, bare, lump_model, mesh_of, rms, view
 from mereo.api.result import Result
 from mereo.cli.stream import SurfaceFolder, line
 from mereo.cli.stream_answers import Answering, Seen
+from mereo.fitting import tracking
 from mereo.fitting.registration.answer import Candidate
 from mereo.fitting.registration.answer_frame import search_hypotheses
 from mereo.fitting.registration.register import Registrar
-from mereo.fitting.tracking import tracker as tracking
-from mereo.fitting.tracking.tracker import BackgroundSearch, SynchronousExecutor, TrackedFrame, Tracker
+from mereo.fitting.tracking import BackgroundSearch, SynchronousExecutor, TrackedFrame, Tracker
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.reconstruction.observation import Observation, observe
@@ -249,7 +249,7 @@ def test_faults_of_a_search_are_raised_and_unusable_frames_are_none(registrar: R
         else:
             with pytest.raises(OSError, match="broken"):
                 search.take()
-    assert len(held.held) == 2 and search.registrar.config.search_rounds == tracking.ROUNDS < 3
+    assert len(held.held) == 2 and search.registrar.config.search_rounds == 2
 
 
 def test_a_stream_says_it(

@@ -19,8 +19,14 @@ from mereo.evaluation.scoring import EvaluationConfig, evaluate
 from mereo.fitting.draws.playback import DrawnStates
 from mereo.fitting.registration import register
 from mereo.fitting.registration.answer import Answer
-from mereo.fitting.registration.fit import CloudToFit, ModesFit
-from mereo.fitting.registration.register import ChangedSceneWarning, Registrar, registrar_for, statistical_model_of
+from mereo.fitting.registration.register import (
+    ChangedSceneWarning,
+    CloudToFit,
+    ModesFit,
+    Registrar,
+    registrar_for,
+    statistical_model_of,
+)
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import SCANNER_TO_CAMERA, PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
@@ -149,7 +155,7 @@ def test_auto_plays_the_scene_where_it_is_at_hand(
     fitted = registrar.fit_modes(CloudToFit(view.depth.to_points().points))
     assert fitted.rest is None
     modes = replace(registrar, method="modes")
-    assert modes.finish(fitted).method == "modes" and "states" not in vars(modes)
+    assert modes.finish(fitted).method == "modes" and "states_or_none" not in vars(modes)
     foreign = replace(registrar, network=replace(model, provenance={"scene": "mine"}))
     assert foreign.finish(fitted).method == "modes" and foreign.states_or_none is None
     asked: list[DrawnStates] = []

@@ -5,14 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fit_cases import IN_FRONT, SCENE, said, seen, shown
+from fitted_clouds import fit_correspondences
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.draws.playback import DrawnStates
-from mereo.fitting.modes.fit import narrowing
+from mereo.fitting.modes import narrowing
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import NormalEquations, Posed
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
-from mereo.fitting.registration.fit import CloudToFit, ModesFit, fit_correspondences
+from mereo.fitting.registration.register import CloudToFit, ModesFit
 from mereo.geometry.transforms import transform_points
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -54,7 +55,7 @@ def test_under_noise_draws_are_asked_too_and_an_object_at_rest_stays_at_rest(mod
     points, material = seen(model.rest.transformed(IN_FRONT)), transform_points(IN_FRONT, model.rest_points)
     clean = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
     noisy = replace(clean, problem=replace(clean.problem, noisy=True))
-    assert noisy.asks_draws and not clean.asks_draws
+    assert noisy.may_take_draws and not clean.may_take_draws
     found = noisy.with_draws(DrawnStates.of(SCENE, model, 30))
     assert found.method == "rest" and found.seconds > clean.seconds
 

@@ -11,9 +11,8 @@ from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.registration.answer_frame import search_modes, size_of
-from mereo.fitting.registration.fit import CloudToFit
-from mereo.fitting.search.screening import CELLS, Poses, Screen, SightTable, medoids, tables_of
-from mereo.fitting.search.search import rotations
+from mereo.fitting.registration.register import CloudToFit
+from mereo.fitting.search import CELLS, Poses, Screen, SightTable, medoids, rotations, tables_of
 from mereo.geometry.camera import SightLines
 from mereo.models.weights import load_model
 from mereo.scenes.statistical_model import StatisticalModel
@@ -68,8 +67,8 @@ def test_a_table_names_the_sample_nearest_to_each_cell(model: StatisticalModel) 
     steps = np.indices((CELLS,) * 3).reshape(3, -1).T + 0.5
     for row in range(len(tables.z)):
         centers = tables.low[row] + tables.cell[row] * steps
-        distance = np.linalg.norm(tables.place[row, tables.nearest[row]] - centers, axis=1)
-        np.testing.assert_allclose(distance, cKDTree(tables.place[row]).query(centers)[0], rtol=1e-5)
+        distance = np.linalg.norm(tables.position[row, tables.nearest[row]] - centers, axis=1)
+        np.testing.assert_allclose(distance, cKDTree(tables.position[row]).query(centers)[0], rtol=1e-5)
 
 
 def test_medoids_are_states_that_stand_for_all(model: StatisticalModel) -> None:
@@ -108,10 +107,10 @@ def test_a_rigid_step_draws_a_pose_to_the_frame(model: StatisticalModel) -> None
         np.zeros(size, dtype=np.float32),
         np.zeros(size, dtype=np.float32),
     )
-    before = screen.judged(poses, 0.05).cost
+    before = screen.scored(poses, 0.05).cost
     for sigma in (0.15, 0.1, 0.1, 0.05, 0.05, 0.05):
         poses = screen.aligned(poses, sigma)
-    assert (screen.judged(poses, 0.05).cost < before).all()
+    assert (screen.scored(poses, 0.05).cost < before).all()
     assert np.linalg.norm(poses.translation - FAR, axis=1).max() < 0.1 * model.half  # from 0.16
 
 

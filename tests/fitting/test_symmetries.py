@@ -17,9 +17,9 @@ from mereo.fitting.draws.fit import descend, draws_that_may_jump, try_jumps
 from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
 from mereo.fitting.draws.problem import DrawsProblem, simulate
 from mereo.fitting.problem.gauss_newton import Posed
-from mereo.fitting.problem.posterior import Posterior, covariance_factor
-from mereo.fitting.problem.symmetries import ANGLES, find_symmetries, left_open
-from mereo.fitting.registration.fit import CloudToFit, ModesFit
+from mereo.fitting.problem.segments import ANGLES, find_symmetries, left_open
+from mereo.fitting.registration.register import CloudToFit, ModesFit
+from mereo.fitting.uncertainty import Posterior, covariance_factor
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import transform_points
 from mereo.scenes.random_states import scene_model
@@ -182,7 +182,7 @@ def test_of_many_draws_those_jump_that_slide_along_the_surface() -> None:
     material = transform_points(IN_FRONT, material_moved(scene, model, deformations))
     fitted = ModesFit.of(CloudToFit(seen(model.mesh(material)), 1.0), said(model, material), model)
     config = replace(MANY_DRAWS, explained=0.01)
-    problem = DrawsProblem.of(fitted.problem, states, fitted.found, config)
+    problem = DrawsProblem.of(fitted.problem, states, fitted.correspondences, config)
     wrong = truth.copy()
     wrong[0] = ndtri((ndtr(truth[0]) + 1 / 6) % 1.0)
     pose = Posed(IN_FRONT[:3, :3], IN_FRONT[:3, 3], np.empty(0))

@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 from answers import reconstruct
 
+from mereo.fitting.config import TrackConfig
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed
 from mereo.fitting.problem.residuals import NetworkTerm
 from mereo.fitting.registration.answer import Answer
-from mereo.fitting.registration.fit import CloudToFit
-from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.register import CloudToFit, Registrar
 from mereo.fitting.registration.registration import Registration
-from mereo.fitting.tracking.config import TrackConfig
-from mereo.fitting.tracking.next_fit import Expectation, Track, between
-from mereo.fitting.tracking.tracker import Tracker
+from mereo.fitting.tracking import Expectation, Track, Tracker, between
 from mereo.geometry.camera import SCANNER_TO_CAMERA, Camera, PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids

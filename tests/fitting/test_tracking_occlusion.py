@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from tracked_views import bare, lump_model, mesh_of, rms, vertices, view, whole
 
+from mereo.fitting import tracking as next_fit
 from mereo.fitting.registration.register import Registrar
-from mereo.fitting.tracking import next_fit
-from mereo.fitting.tracking.tracker import SynchronousExecutor, Tracker
+from mereo.fitting.tracking import SynchronousExecutor, Tracker
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.reconstruction.observation import Observation
 from mereo.synthesis.clutter import Capsule

@@ -5,9 +5,9 @@ import pytest
 from fit_cases import IN_FRONT, SCENE, said, shown
 
 from mereo.fitting.config import FitConfig
-from mereo.fitting.modes.fit import turns
+from mereo.fitting.modes import turns
 from mereo.fitting.problem.correspondences import Correspondences
-from mereo.fitting.registration.fit import CloudToFit, ModesFit
+from mereo.fitting.registration.register import CloudToFit, ModesFit
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -59,7 +59,7 @@ def test_a_frame_that_the_network_understands_only_when_it_is_turned_is_found(
     turn = list(turns(points.mean(axis=0)))[number]
     network = Network(points, right, turn)
     alone = ModesFit.of(CloudToFit(points, 1.0), confused(right), model)
-    turned = ModesFit.of(CloudToFit(points, 1.0), confused(right), model, ask=network)
+    turned = ModesFit.of(CloudToFit(points, 1.0), confused(right), model, predict=network)
     off, mended = (np.linalg.norm(one.registration().material - material, axis=1) for one in (alone, turned))
     assert np.median(off) > 3.0 and np.median(mended) < 0.3
     assert number < network.asked <= 8 * (number // 8 + 1)  # no more than its round
@@ -68,7 +68,7 @@ def test_a_frame_that_the_network_understands_only_when_it_is_turned_is_found(
 def test_a_frame_that_is_explained_is_asked_about_once(model: StatisticalModel) -> None:
     points, material = shown(model, 0.5)
     network = Network(points, said(model, material), None)
-    ModesFit.of(CloudToFit(points, 1.0), said(model, material), model, ask=network)
+    ModesFit.of(CloudToFit(points, 1.0), said(model, material), model, predict=network)
     assert network.asked == 0
 
 
@@ -81,7 +81,7 @@ def test_no_better_answer_leaves_the_fit_as_it_is(model: StatisticalModel) -> No
     points = ball[ball[:, 2] < -3.0] + IN_FRONT[:3, 3]
     found = said(model, material)
     alone = ModesFit.of(CloudToFit(points, 1.0), found, model)
-    asked = ModesFit.of(CloudToFit(points, 1.0), found, model, ask=lambda seen: found.rows(np.arange(20)))
+    asked = ModesFit.of(CloudToFit(points, 1.0), found, model, predict=lambda seen: found.rows(np.arange(20)))
     assert asked.problem.misfit(asked.posed).without_network <= alone.problem.misfit(alone.posed).without_network
 
 
@@ -89,7 +89,7 @@ def test_where_frames_do_not_wait_none_is_asked_about_again(model: StatisticalMo
     points, material = shown(model, 0.8)
     network = Network(points, said(model, material), None)
     found = confused(said(model, material))
-    ModesFit.of(CloudToFit(points, 1.0), found, model, FitConfig(turned=False), ask=network)
+    ModesFit.of(CloudToFit(points, 1.0), found, model, FitConfig(turned=False), predict=network)
     assert network.asked == 0
 
 
@@ -98,8 +98,8 @@ def test_noise_that_hides_how_wrong_a_fit_is_hides_it_from_a_last_try_no_more(mo
     points = points * (1 + np.random.default_rng(0).normal(scale=0.4, size=(len(points), 1)) / IN_FRONT[2, 3])
     right = said(model, material)
     network = Network(points, right, list(turns(points.mean(axis=0)))[2])
-    first = ModesFit.of(CloudToFit(points, 1.0), confused(right), model, FitConfig(turned=False), ask=network)
-    last = ModesFit.of(CloudToFit(points, 1.0), confused(right), model, FitConfig(turned_anyway=True), ask=network)
+    first = ModesFit.of(CloudToFit(points, 1.0), confused(right), model, FitConfig(turned=False), predict=network)
+    last = ModesFit.of(CloudToFit(points, 1.0), confused(right), model, FitConfig(turned_anyway=True), predict=network)
     off, mended = (np.linalg.norm(one.registration().material - material, axis=1) for one in (first, last))
     assert not first.registration().accepted and np.median(off) > 3.0
     assert last.registration().accepted and np.median(mended) < 0.5

@@ -23,7 +23,7 @@ from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
 from mereo.fitting.draws.problem import DrawsFit, DrawsProblem, simulate
 from mereo.fitting.problem.evidence import OBSERVED_SAMPLES
 from mereo.fitting.problem.gauss_newton import Posed
-from mereo.fitting.registration.fit import CloudToFit, ModesFit
+from mereo.fitting.registration.register import CloudToFit, ModesFit
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import transform_points
 from mereo.scenes.random_states import scene_model
@@ -81,7 +81,7 @@ def problem_of(z: np.ndarray, points: int = 4000) -> DrawsProblem:
     material = transform_points(IN_FRONT, moved(z))
     cloud = seen(model().mesh(material))
     fitted = ModesFit.of(CloudToFit(cloud[:: max(1, len(cloud) // points)], 1.0), said(model(), material), model())
-    return DrawsProblem.of(fitted.problem, states(), fitted.found)
+    return DrawsProblem.of(fitted.problem, states(), fitted.correspondences)
 
 
 def state(problem: DrawsProblem, z: np.ndarray) -> DrawsFit:

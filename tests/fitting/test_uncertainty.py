@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fitted_clouds import fit_correspondences
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from toy_scene import Lift, Shear, toy_scene
@@ -11,9 +12,8 @@ from toy_scene import Lift, Shear, toy_scene
 from mereo.evaluation.cases import RegistrationErrors, seen_points
 from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed
-from mereo.fitting.problem.posterior import Posterior, covariance_factor, radius95
-from mereo.fitting.registration.fit import fit_correspondences
 from mereo.fitting.registration.registration import Registration
+from mereo.fitting.uncertainty import Posterior, covariance_factor, radius95
 from mereo.geometry.camera import Camera, PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import owned_centroids, owned_gradients

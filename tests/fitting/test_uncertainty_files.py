@@ -22,9 +22,8 @@ from mereo.cli.stream import line
 from mereo.cli.stream_answers import FrameAnswer
 from mereo.evaluation.sample_views import load_view
 from mereo.fitting.registration.answer import Answer
-from mereo.fitting.registration.fit import CloudToFit
-from mereo.fitting.registration.register import Registrar
-from mereo.fitting.tracking.tracker import Tracker
+from mereo.fitting.registration.register import CloudToFit, Registrar
+from mereo.fitting.tracking import Tracker
 from mereo.geometry.camera import PointCloud
 from mereo.io.config import FilesConfig
 from mereo.models.calibration import Calibration

@@ -12,7 +12,7 @@ from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Deformation
 from mereo.fitting.draws.fit import redraw_choices
 from mereo.fitting.draws.playback import Drawn, DrawnStates
-from mereo.fitting.registration.fit import CloudToFit, ModesFit
+from mereo.fitting.registration.register import CloudToFit, ModesFit
 from mereo.geometry.transforms import transform_points
 from mereo.scenes.parameters import random_state
 from mereo.scenes.random_states import scene_model, state_points

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from shapes import box
 
 from mereo.fitting.problem.gauss_newton import Posed
-from mereo.fitting.problem.joints import Joints, different
+from mereo.fitting.problem.segments import Joints, different
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.scenes.random_states import build_model
 from mereo.scenes.statistical_model import StatisticalModel

@@ -6,7 +6,7 @@ import numpy as np
 
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.registration.answer import Answer
-from mereo.fitting.search.search import rotations
+from mereo.fitting.search import rotations
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from fit_cases import IN_FRONT, said, seen, shown
+from fitted_clouds import fit_correspondences
 
 from mereo.fitting.problem.residuals import Surface
-from mereo.fitting.registration.fit import fit_correspondences
 from mereo.geometry.transforms import transform_points
 from mereo.scenes.statistical_model import StatisticalModel
 

@@ -10,8 +10,8 @@ from mereo.api.objects import Object, Source, object_of
 from mereo.api.reconstruct import observation_of
 from mereo.api.result import Result
 from mereo.api.words import python_words
+from mereo.fitting import tracking as tracker
 from mereo.fitting.config import AnswerMethod
-from mereo.fitting.tracking import tracker
 from mereo.reconstruction.config import IsolationConfig
 
 

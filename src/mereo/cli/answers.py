@@ -10,8 +10,7 @@ from tyro.conf import UseAppendAction, arg
 
 from mereo.cli.config_file import ConfigFile
 from mereo.cli.options import InputName, Inputs, MeshUnits, Outcome
-from mereo.fitting.config import AnswerMethod
-from mereo.fitting.tracking.config import StreamMethod
+from mereo.fitting.config import AnswerMethod, StreamMethod
 from mereo.io.bounds import Cells, Port, Positive, Threads, Workers
 from mereo.io.config import CarryFrame, FilesConfig, InputConfig
 from mereo.models.config import InferenceConfig

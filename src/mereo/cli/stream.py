@@ -12,7 +12,7 @@ from typing import Any
 from mereo.cli.options import MeshUnits, check_named, loaded_object
 from mereo.cli.stream_answers import Answering, FrameAnswer, Seen
 from mereo.cli.stream_rerun import RerunLog, RerunTarget
-from mereo.fitting.tracking.config import StreamMethod
+from mereo.fitting.config import StreamMethod
 from mereo.geometry.conventions import CloudAxes
 from mereo.io.atomic_files import atomic_file, check_place, remove_all_abandoned, to_json
 from mereo.io.config import InputConfig

@@ -12,7 +12,7 @@ from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.recognition import NOT_ASKED, Recognition
 from mereo.fitting.registration.register import Registrar
-from mereo.fitting.tracking.tracker import SynchronousExecutor, Tracker
+from mereo.fitting.tracking import SynchronousExecutor, Tracker
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import owned_centroids
 from mereo.models.trained import Trained

@@ -17,11 +17,11 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import cKDTree
 
 from mereo.evaluation.metrics import Scores, TruthGrid, confusion_matrix, intersection_over_union
-from mereo.fitting.problem.posterior import LEVEL
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.recognition import Known
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
+from mereo.fitting.uncertainty import LEVEL
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.labels import LabelGrid

@@ -24,7 +24,7 @@ from pydantic import BaseModel, Field, FiniteFloat, ValidationError
 from scipy.spatial import cKDTree
 
 from mereo.fitting.registration.registration import Registration
-from mereo.fitting.uncertainty.uncertainty import Explanation
+from mereo.fitting.uncertainty import Explanation
 from mereo.geometry.camera import DepthImage, PointCloud
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.mesh import Color, Segment, SegmentedMesh

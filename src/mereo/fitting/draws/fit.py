@@ -1,4 +1,4 @@
-"""A scene's own draws that explain a frame: Gauss and Newton's method on states that the scene really has.
+"""Fit a scene's own draws to a frame: Gauss and Newton's method on states that the scene really has.
 
 Around a state the scene is linear in its draws (``draws.problem``); it is played with the draws that fit best there,
 and so on, from several starts.
@@ -31,105 +31,97 @@ from mereo.fitting.draws.problem import (
     simulate,
     try_material,
 )
-from mereo.fitting.modes.fit import refine, robust_poses
+from mereo.fitting.modes import refine, robust_poses
 from mereo.fitting.problem.gauss_newton import POSE, Posed
-from mereo.fitting.problem.joints import branches
 from mereo.fitting.problem.residuals import robust_square
-from mereo.fitting.problem.symmetries import Symmetry, find_symmetries
-from mereo.geometry.transforms import fit_rigid
+from mereo.fitting.problem.segments import Symmetry, branches, find_symmetries
 from mereo.scenes.draw_recorder import SMOOTH, Call, OutOfDraws, Recorder
 from mereo.scenes.parameters import play, played_back
 from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel
 
-RANKED_BY = 150
-"""Points by which random states are compared with a shape."""
-
-SMALLEST = 1e-4
-"""Least share of a draw that jumps."""
-
-SLIDES = 0.03
-"""Least motion, for one standard deviation of a draw that may jump, of the point that moves farthest: of ``half``."""
+GAIN = 0.003
+"""Relative gain of a step below which nothing more is tried."""
 
 
 def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
-    """The best of several starts; None where the scene plays none of them back."""
-    found = fit_near_modes(problem, modes, [])
-    for _ in range(problem.config.passes):
-        if explains_cloud(problem, found, problem.config.hopeless):
-            break
-        found += fit_from_end(problem, min(found, key=by_misfit, default=None))
-    has_network = len(problem.found.points) > 0  # after a search there are no correspondences
-    if problem.config.asked_again and has_network and not explains_cloud(problem, found, problem.config.explained):
-        camera = Posed(np.eye(3), np.zeros(3), np.empty(0), modes.log_scale)
-        found += fit_from_shape(problem, camera, shape_of_network(problem, modes.log_scale), [])
-    best = min(found, key=by_misfit, default=None)
-    return None if best is None else refine_by_sight(problem, try_jumps(problem, try_symmetric_states(problem, best)))
+    """Fit the draws from several starts, and improve the best; None where the scene plays none of them back."""
+    fits: list[DrawsFit] = []
+    for start in (fit_near_modes, *(fit_from_end,) * problem.config.passes, fit_like_network):
+        fits += start(problem, modes, fits)
+    best = min(fits, key=by_misfit, default=None)
+    for improve in (try_symmetric_states, try_jumps, refine_by_sight):
+        best = None if best is None else improve(problem, best)
+    return best
 
 
 def refine_by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
-    """The state brought to what the lines of sight meet, by every observed point.
+    """Refine a state by what the lines of sight meet, with every observed point.
 
-    Nearest places lead there from afar, and noise takes them a little beside it; over more points it averages out. The
-    answer has the observed samples of all other states, but its misfit by every point: those it was fitted to.
+    Nearest points lead there from afar, and noise takes them a little beside it; over more points it averages out. The
+    fit has the observed samples of all other states, but its misfit by every point: those it was fitted to.
     """
     sighted = replace(problem, by_sight=True)
     dense = replace(sighted, base=problem.last)
     start = simulate(dense, fit.drawn, fit.z, fit.posed)
     if start is None:
         return fit
-    found = descend(dense, start, problem.config.last_rounds)
+    fit = descend(dense, start, problem.config.last_rounds)
     if dense.base is sighted.base:
-        return found
-    end = simulate(sighted, found.drawn, found.z, found.posed)
+        return fit
+    end = simulate(sighted, fit.drawn, fit.z, fit.posed)
     assert end is not None  # it was played before
-    return replace(end, motion=found.motion, misfit=found.misfit)
+    return replace(end, motion=fit.motion, misfit=fit.misfit)
 
 
-def fit_near_modes(problem: DrawsProblem, modes: Posed, others: list[Drawn]) -> list[DrawsFit]:
-    """States that explain the frame, from starts like a fit of the modes, and from ``others``."""
-    guess = problem.states.guess(modes.z, problem.model.motion, problem.config.near)
+def fit_near_modes(
+    problem: DrawsProblem, modes: Posed, fits: list[DrawsFit], others: Sequence[Drawn] = ()
+) -> list[DrawsFit]:
+    """Fit from states like a fit of the modes, and from ``others``."""
+    guess = problem.states.guess(modes.z, problem.model.motion)
     return fit_from_shape(problem, modes, shape_of(problem, problem.model.material(modes.z)), [guess, *others])
 
 
-def fit_from_end(problem: DrawsProblem, best: DrawsFit | None) -> list[DrawsFit]:
-    """States like the modes' own fit from where the draws ended, which may be in another basin than their first."""
-    if best is None:
+def fit_from_end(problem: DrawsProblem, modes: Posed, fits: list[DrawsFit]) -> list[DrawsFit]:
+    """Fit from the modes' fit to where the draws ended, if far off: it may lie in another basin than their first."""
+    if not fits or explains_cloud(problem, fits, problem.config.hopeless):
         return []
+    best = min(fits, key=by_misfit)
     pose, z = problem.model.project(best.placed())
     scale = float(np.cbrt(np.linalg.det(pose[:3, :3])))
     modes = refine(problem.base, Posed(pose[:3, :3] / scale, pose[:3, 3], z, float(np.log(scale))))
-    return fit_near_modes(problem, modes, [replace(best.drawn, z=best.z)])
+    return fit_near_modes(problem, modes, fits, [replace(best.drawn, z=best.z)])
 
 
-def explains_cloud(problem: DrawsProblem, found: list[DrawsFit], most: float) -> bool:
+def fit_like_network(problem: DrawsProblem, modes: Posed, fits: list[DrawsFit]) -> list[DrawsFit]:
+    """Fit from states like the network's shape, if the cloud is not explained; a search has no correspondences."""
+    config, matches = problem.config, problem.correspondences
+    if not config.network_start or not len(matches.points) or explains_cloud(problem, fits, config.explained):
+        return []
+    camera = Posed(np.eye(3), np.zeros(3), np.empty(0), modes.log_scale)
+    points, sigma = matches.points * np.exp(-modes.log_scale), problem.base.network_sigma
+    shape = Shape.of(points, sigma, matches.confidence, problem.following_played)
+    return fit_from_shape(problem, camera, shape, [])
+
+
+def explains_cloud(problem: DrawsProblem, fits: list[DrawsFit], most: float) -> bool:
     """Whether one of the states explains the cloud: ``Problem.explained``."""
     sigma = problem.base.config.cloud_sigma
-    misfits = [float(robust_square(fit.distance, sigma).mean()) for fit in found]
+    misfits = [float(robust_square(fit.distance, sigma).mean()) for fit in fits]
     if not misfits:
         return False
-    best = found[int(np.argmin(misfits))]
+    best = fits[int(np.argmin(misfits))]
     return problem.base.explained(min(misfits), best.surface, most)
 
 
 def shape_of(problem: DrawsProblem, material: Float[np.ndarray, "m 3"]) -> Shape:
     """Shape of material points, unposed: dense and smooth."""
-    config, few = problem.config, problem.states.played.index
-    return Shape.of(material[few], config.shape_std * problem.model.half, config.shape_worth, np.ones(len(few)))
-
-
-def shape_of_network(problem: DrawsProblem, log_scale: float) -> Shape:
-    """Shape that the correspondences have, in the camera frame."""
-    found, sigma = problem.found, problem.base.network_sigma
-    points = found.points * np.exp(-log_scale)
-    return Shape.of(points, sigma, problem.config.shape_worth, found.confidence, problem.followed)
+    few = problem.states.played.index
+    return Shape.of(material[few], 0.04 * problem.model.half, np.ones(len(few)))
 
 
 def fit_from_shape(problem: DrawsProblem, frame: Posed, shape: Shape, guesses: list[Drawn]) -> list[DrawsFit]:
-    """States that explain the frame, from starts like a shape; ``frame`` poses the shape in the camera frame.
-
-    While what is found is far from explaining the cloud, the next starts are tried.
-    """
+    """Fit from starts like a shape, which ``frame`` poses in the camera frame; the next ones while that is hopeless."""
     config, states = problem.config, problem.states
     drawn = [states.drawn(seed) for seed in similar_states(problem, shape)] + guesses
     near_shape = [lay_on_shape(states, shape, start, start.z) for start in drawn]
@@ -143,7 +135,7 @@ def fit_from_shape(problem: DrawsProblem, frame: Posed, shape: Shape, guesses: l
 
 
 def descend_best(problem: DrawsProblem, frame: Posed, shape: Shape, starts: list[StateOnShape]) -> list[DrawsFit]:
-    """The best of some starts, followed to the end."""
+    """Descend from the best of some starts."""
     config, states = problem.config, problem.states
     for fresh, keep in config.sieve:
         starts = [approach(states, shape, start, fresh) for start in sorted(starts, key=by_misfit)[:keep]]
@@ -154,47 +146,46 @@ def descend_best(problem: DrawsProblem, frame: Posed, shape: Shape, starts: list
 
 
 def find_other_choices(problem: DrawsProblem, shape: Shape, best: StateOnShape | None) -> list[StateOnShape]:
-    """States near a shape that ``best`` does not meet, made from that one by other discrete draws."""
+    """Find states near a shape that ``best`` does not meet, made from that one by other discrete draws."""
     config, states = problem.config, problem.states
-    if best is None or best.misfit < config.met:
+    if best is None or best.misfit < 100.0:
         return []
     others = redraw_choices(states.scene, replace(best.drawn, z=best.z), config.choices)
     states_near = [lay_on_shape(states, shape, other, other.z) for other in others]
-    new = [state for state in states_near if state is not None and differ(state, best, shape.std)]
-    return [approach(states, shape, state, 1) for state in sorted(new, key=by_misfit)[: config.chosen]]
+    new = [state for state in states_near if state is not None and are_different(state, best, shape.std)]
+    return [approach(states, shape, state, 1) for state in sorted(new, key=by_misfit)[:4]]
 
 
-def differ(one: StateOnShape, other: StateOnShape, least: float) -> bool:
+def are_different(first: StateOnShape, second: StateOnShape, least: float) -> bool:
     """Whether any played point of two states is farther apart than ``least``; a choice may come out the same again."""
-    return bool(np.abs(one.points - other.points).max() > least)
+    return bool(np.abs(first.points - second.points).max() > least)
 
 
-def by_misfit(one: StateOnShape | DrawsFit) -> float:
+def by_misfit(state: StateOnShape | DrawsFit) -> float:
     """Misfit, as a key to sort by."""
-    return one.misfit
+    return state.misfit
 
 
 def similar_states(problem: DrawsProblem, shape: Shape) -> list[int]:
     """Seeds of the random states most like a shape."""
     states = problem.states
-    some = spread(shape.points, RANKED_BY)
+    some = spread(shape.points, 150)
     library, goal = states.material[:, states.played.index], shape.points[some].astype(np.float32)
     if shape.follow is None:
         compared = library[:, some]
     else:
-        compared = np.stack([shape.follow[some] @ one for one in library])
+        compared = np.stack([shape.follow[some] @ played for played in library])
     cost = robust_poses(compared, goal, shape.weight[some].astype(np.float32), problem.base.network_sigma)[0]
     return [states.seeds[row] for row in np.argsort(cost)[: problem.config.starts]]
 
 
 def try_symmetric_states(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
-    """The state, or one with segments turned that look alike turned, where that explains the frame better.
+    """Try states with segments turned that look alike turned, as a forearm by half a turn; return the best.
 
-    A forearm by half a turn, for which several draws change at once. Only where the shape, stiffly turned, explains
-    the frame nearly as well: what is seen of a right one mostly tells.
+    Only where the shape, stiffly turned, explains the frame nearly as well.
     """
     config = problem.config
-    few = replace(problem, config=replace(config, sieve=config.turned_sieve, kept=1, batches=1))
+    few = replace(problem, config=replace(config, sieve=((1, 4), (1, 1)), kept=1, batches=1))
     for together in symmetric_groups(problem.model):
         material = turn_segments(problem.model, fit.material, together)
         stiff = try_material(problem, fit.drawn, fit.z, fit.posed, material)
@@ -210,17 +201,14 @@ def pose_on_shape(frame: Posed, state: StateOnShape) -> Posed:
 
 
 def try_jumps(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
-    """One draw anywhere in its range, where that explains the frame better: a wheel by half a turn.
-
-    Only while the cloud is not explained.
-    """
+    """Try single draws anywhere in their range, as a wheel by half a turn, while the cloud is not explained."""
     config = problem.config
     sigma = first_sigma(problem)
     for _ in range(config.jumps):
         if explains_cloud(problem, [fit], config.explained):
             break
-        each = [jump_candidates(problem, fit, int(number), sigma) for number in draws_that_may_jump(problem, fit)]
-        best_first = sorted((place for places in each for place in places), key=lambda place: place[0])
+        each = [find_jumps(problem, fit, int(number), sigma) for number in draws_that_may_jump(problem, fit)]
+        best_first = sorted((jump for jumps in each for jump in jumps), key=lambda jump: jump[0])
         fits = [descend(problem, other, config.first_rounds) for _, other in best_first[: config.kept + 1]]
         best = min(fits, key=by_misfit, default=fit)
         if best.misfit >= fit.misfit:
@@ -229,20 +217,20 @@ def try_jumps(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     return fit
 
 
-def jump_candidates(problem: DrawsProblem, fit: DrawsFit, number: int, sigma: float) -> list[tuple[float, DrawsFit]]:
-    """A state with one draw at other places of its range: all, or the best where there are many draws, with misfits."""
+def find_jumps(problem: DrawsProblem, fit: DrawsFit, number: int, sigma: float) -> list[tuple[float, DrawsFit]]:
+    """Simulate one draw at other positions of its range: all, or the best where draws are many, with misfits."""
     config, candidates = problem.config, list[tuple[float, DrawsFit]]()
-    for turn in range(1, config.places):
+    for turn in range(1, config.jump_steps):
         z = fit.z.copy()
-        z[number] = ndtri(np.clip((ndtr(z[number]) + turn / config.places) % 1.0, SMALLEST, 1 - SMALLEST))
+        z[number] = ndtri(np.clip((ndtr(z[number]) + turn / config.jump_steps) % 1.0, 1e-4, 1 - 1e-4))
         other = simulate(problem, fit.drawn, z, fit.posed)
         if other is not None:
             candidates.append((misfit(problem, other, sigma), other))
-    return sorted(candidates, key=lambda candidate: candidate[0])[: config.places_kept]
+    return sorted(candidates, key=lambda candidate: candidate[0])[: config.jumps_kept]
 
 
 def draws_that_may_jump(problem: DrawsProblem, fit: DrawsFit) -> Int[np.ndarray, " n"]:
-    """Draws that may jump: of many, those that move what they move along its own surface, as a ring on its post.
+    """Choose draws that may jump: of many, those that move a part along its own surface, as a ring on its post.
 
     Only then a state far away may look nearly the same, so that no small step leads there.
     """
@@ -255,27 +243,25 @@ def draws_that_may_jump(problem: DrawsProblem, fit: DrawsFit) -> Int[np.ndarray,
     normal = igl.per_vertex_normals(fit.material[: sum(model.vertex_counts)], model.faces)[index[surface]]
     moved, off = (motion**2).sum(axis=(0, 1)), (np.einsum("ac,acd->ad", normal, motion) ** 2).sum(axis=0)
     farthest = np.sqrt((motion**2).sum(axis=1).max(axis=0, initial=0.0))
-    return smooth[(off < problem.config.sliding * moved) & (farthest > SLIDES * model.half)]
+    return smooth[(off < problem.config.sliding * moved) & (farthest > 0.03 * model.half)]
 
 
 # --- descent on simulated states --------------------------------------------------------------------------------------
 
-# Levenberg and Marquardt's method on played states: from a start to the nearest state that explains the frame.
-#
 # DrawsFit -derivatives-> motion of the played points -normal_equations-> a step of pose and draws -played-> DrawsFit
 
 
 def first_sigma(problem: DrawsProblem) -> float:
     """The cloud's first standard deviation, scene units."""
-    return max(problem.config.start_sigma * problem.model.half, problem.base.config.cloud_sigma)
+    return max(0.03 * problem.model.half, problem.base.config.cloud_sigma)
 
 
 def descend(
     problem: DrawsProblem, fit: DrawsFit, fresh: int, motion: Float32[np.ndarray, "a 3 d"] | None = None
 ) -> DrawsFit:
-    """Levenberg and Marquardt's method on played states, by ``fresh`` sets of differences after the given one."""
+    """Descend by Levenberg and Marquardt's method, with ``fresh`` sets of differences after the given one."""
     config, least = problem.config, problem.base.config.cloud_sigma
-    index, sigma, damping = problem.states.played.index, first_sigma(problem), config.damping
+    index, sigma, damping = problem.states.played.index, first_sigma(problem), 0.03
     for number in range(fresh + (motion is not None)):
         if number or motion is None:
             motion = derivatives(problem.states, fit.drawn, fit.z, fit.material[index])
@@ -284,10 +270,10 @@ def descend(
             before = misfit(problem, fit, sigma)
             fit, motion, damping = lower(problem, fit, motion, sigma, damping)
             gain = before - misfit(problem, fit, sigma)
-            if gain == 0 or (gain < config.gain * before and sigma <= least):
+            if gain == 0 or (gain < GAIN * before and sigma <= least):
                 break
-            sigma = max(sigma * config.cooling, least)
-        if sigma <= least and start - fit.misfit < config.gain * start:
+            sigma = max(sigma * 0.6, least)
+        if sigma <= least and start - fit.misfit < GAIN * start:
             break
         damping = min(damping, 1.0)
     return replace(fit, motion=motion)
@@ -298,7 +284,7 @@ def lower(
 ) -> tuple[DrawsFit, Float32[np.ndarray, "a 3 d"], float]:
     """A state of lower misfit, or the same; what was learnt of the motion; the next damping."""
     index, least = problem.states.played.index, misfit(problem, fit, sigma)
-    for _ in range(problem.config.tries):
+    for _ in range(3):
         step = normal_equations(problem, fit, motion, sigma).step(damping)
         tried = simulate(problem, fit.drawn, fit.z + step[POSE:], fit.posed.moved(step[:POSE]))
         if tried is not None:
@@ -311,18 +297,14 @@ def lower(
 
 # --- other discrete choices -------------------------------------------------------------------------------------------
 
-# States that differ from another in discrete draws: how many corners of a sheet are folded, and which.
+# Discrete draws are such as how many corners of a sheet are folded, and which.
 #
 # Derivatives do not reach across them, and random states hold one combination too seldom to be near everything else.
-# So a state that is right but for such a choice keeps all that it has drawn; the choice, and what it asks for, is drawn
-# anew.
-
-MORE_CALLS = 12
-"""Calls that another choice may ask for in addition; a scene that asks for more has thrown its first attempt away."""
+# So a state that is right but for such a choice keeps all other draws; the choice, and what depends on it, is redrawn.
 
 
 def redraw_choices(scene: Scene, drawn: Drawn, count: int) -> list[Drawn]:
-    """States with some of the discrete draws, and what they ask for, drawn anew; fewer than ``count`` where refused.
+    """Redraw some of the discrete draws of a state, and what depends on them; fewer than ``count`` where refused.
 
     Nothing where the scene has no discrete draws. The same state gives the same ones.
     """
@@ -331,8 +313,8 @@ def redraw_choices(scene: Scene, drawn: Drawn, count: int) -> list[Drawn]:
     if not discrete:
         return []
     rng = np.random.default_rng(drawn.seed)
-    found = [_drawn_anew(scene, calls, _some(discrete, rng), int(rng.integers(2**31))) for _ in range(count)]
-    return [one for one in found if one is not None]
+    redrawn = [_redraw(scene, calls, _some(discrete, rng), int(rng.integers(2**31))) for _ in range(count)]
+    return [drawn for drawn in redrawn if drawn is not None]
 
 
 def _some(numbers: Sequence[int], rng: np.random.Generator) -> set[int]:
@@ -342,9 +324,10 @@ def _some(numbers: Sequence[int], rng: np.random.Generator) -> set[int]:
     return {number for number, take in zip(numbers, taken, strict=True) if take}
 
 
-def _drawn_anew(scene: Scene, calls: Sequence[Call], left_out: set[int], seed: int) -> Drawn | None:
+def _redraw(scene: Scene, calls: Sequence[Call], left_out: set[int], seed: int) -> Drawn | None:
     given = {call.key: call.shares for number, call in enumerate(calls) if number not in left_out}
-    recorder = Recorder(seed, given, len(calls) + MORE_CALLS)
+    # a scene that asks for more calls than these has thrown its first attempt away
+    recorder = Recorder(seed, given, len(calls) + 12)
     try:
         play(scene, recorder)
     except (OutOfDraws, ValueError):
@@ -354,18 +337,11 @@ def _drawn_anew(scene: Scene, calls: Sequence[Call], left_out: set[int], seed: i
 
 # --- segments turned by their symmetries ------------------------------------------------------------------------------
 
-# Shapes in which segments that look alike turned are turned together, as a target for the draws.
-#
-#     rest shapes, joints -find_symmetries-> Symmetry -symmetric_groups-> groups -turn_segments-> a shape to be fitted
-#
 # An arm looks the same with the forearm half a turn round, the wrist bent the other way and the hand turned back. No
 # small step leads there, and no jump of one draw: several change at once. But the shape is known, so that the draws can
 # be drawn towards it as towards that of the modes. Lengths are scene units.
 #
 # Notation: m material points.
-
-NEXT = np.deg2rad(15.0)
-"""Turns that are no farther apart than this are one: the angles asked about are 10 degrees apart."""
 
 Twins = tuple[tuple[Symmetry, float], ...]
 """Segments that hang on each other, and the angle by which each is turned."""
@@ -394,9 +370,9 @@ def symmetric_groups(model: StatisticalModel) -> tuple[Twins, ...]:
 
 
 def _only_angle(turn: Symmetry) -> tuple[Symmetry, float | None]:
-    """The middle of a turn's angles where these are one run no wider than ``NEXT`` on either side, else None."""
+    """The middle of a turn's angles, which are 10 degrees apart, where these are one run of two or three; else None."""
     middle = float(turn.angles.mean())
-    return turn, middle if np.abs(turn.angles - middle).max() <= NEXT else None
+    return turn, middle if np.abs(turn.angles - middle).max() <= np.deg2rad(15.0) else None
 
 
 def turn_segments(
@@ -405,8 +381,6 @@ def turn_segments(
     """Material points of a state with some segments turned, each stiffly about its own axis."""
     moved = material.copy()
     for turn, angle in together:
-        rows = np.flatnonzero(model.labels == turn.label)
-        T = fit_rigid(model.rest_points[rows], material[rows])
-        center, axis = T[:3, :3] @ turn.center + T[:3, 3], T[:3, :3] @ turn.axis
+        rows, center, axis = turn.posed(model, material)
         moved[rows] = Rotation.from_rotvec(angle * axis).apply(material[rows] - center) + center
     return moved

@@ -1,4 +1,4 @@
-"""A scene's own random numbers as coordinates of its states.
+"""Use a scene's own random numbers as coordinates of its states.
 
 Every number that a scene draws is a share of its distribution, uniform in 0..1; as ``z = Phi^-1(share)`` it is standard
 normal. Played back in the order of the calls, the same shares give the same state, and others its neighbours.
@@ -27,21 +27,6 @@ STATES_SEED = 400_000
 
 MOST_DRAWS = 120
 """Scenes with more free numbers are left to the modes."""
-
-MOST = 2.0
-"""Standard deviations of a draw that is guessed."""
-
-RIDGE = 1e-3
-"""Ridge of the regression of draws on modes, relative to the states' own spread."""
-
-PROJECTED = 400
-"""Material points by which many states are expressed in modes."""
-
-PLAYED = 400
-"""Material points of all segments together whose motion is played for derivatives; the others follow them."""
-
-LEAST_PLAYED = 24
-"""The same of each segment at least."""
 
 LARGEST = 4.0
 """Standard deviations; farther out a share is 0 or 1."""
@@ -135,31 +120,24 @@ class Played:
     @classmethod
     def of(cls, model: StatisticalModel) -> "Played":
         """Evenly spread points of a model's anchors."""
-        each = max(LEAST_PLAYED, PLAYED // len(model.anchors))
+        each = max(24, 400 // len(model.anchors))
         chosen = [anchors[spread(model.rest_points[anchors], each)] for anchors in model.anchors]
         counts = tuple(len(part) for part in chosen)
-        places = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
-        few = tuple(Anchors(at, model.rest_points[part]) for at, part in zip(places, chosen, strict=True))
+        positions = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
+        few = tuple(Anchors(at, model.rest_points[part]) for at, part in zip(positions, chosen, strict=True))
         follow = as_sparse(following(few, model.rest_points, model.labels), sum(counts))
         index = np.concatenate(chosen)
         return cls(model.rest_points[index], index, counts, follow)
 
     def moved(self, deformations: tuple[Deformation, ...]) -> Float[np.ndarray, "a 3"]:
         """Positions to which a state moves the points; a map that several segments share is called once."""
-        return moved_together(deformations, self.points, self.counts)
-
-
-def moved_together(
-    deformations: tuple[Deformation, ...], points: Float[np.ndarray, "n 3"], counts: tuple[int, ...]
-) -> Float[np.ndarray, "n 3"]:
-    """Positions to which points go, ``counts`` of each segment one after the other."""
-    owner = np.repeat([id(deformation) for deformation in deformations], counts)
-    result = np.empty_like(points)
-    for deformation in {id(deformation): deformation for deformation in deformations}.values():
-        rows = np.flatnonzero(owner == id(deformation))
-        if len(rows):
-            result[rows] = deformation(points[rows])
-    return result
+        owner = np.repeat([id(deformation) for deformation in deformations], self.counts)
+        result = np.empty_like(self.points)
+        for deformation in {id(deformation): deformation for deformation in deformations}.values():
+            rows = np.flatnonzero(owner == id(deformation))
+            if len(rows):
+                result[rows] = deformation(self.points[rows])
+        return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,26 +184,26 @@ class DrawnStates:
         z = np.stack([z if len(z) == fewest else np.full(fewest, np.nan) for z in draws])
         return cls(scene, seeds, np.stack(material), z, coefficients(model, np.stack(material)), Played.of(model))
 
-    def guess(self, modes: Float[np.ndarray, " k"], motion: Float[np.ndarray, " k"], count: int) -> Drawn:
+    def guess(self, modes: Float[np.ndarray, " k"], motion: Float[np.ndarray, " k"]) -> Drawn:
         """Draws of a state of these coefficients: ridge regression on states, those near it counting more.
 
-        ``motion`` is how far a standard deviation of each mode moves, ``count`` how many states count as near.
+        ``motion`` is how far a standard deviation of each mode moves; 100 states count as near.
         """
         usable = np.flatnonzero(np.isfinite(self.z).all(axis=1))
         apart = (((self.modes[usable] - modes) * motion) ** 2).sum(axis=1)
-        weight = 1.0 / (1.0 + apart / np.sort(apart)[min(count, len(apart)) - 1])
+        weight = 1.0 / (1.0 + apart / np.sort(apart)[min(100, len(apart)) - 1])
         basis = np.concatenate([np.ones((len(usable), 1)), (self.modes[usable] - modes) * motion], axis=1)
         weighted = basis * weight[:, None]
-        ridge = RIDGE * weight.sum() * float((motion**2).mean()) * np.eye(basis.shape[1])
+        ridge = 1e-3 * weight.sum() * float((motion**2).mean()) * np.eye(basis.shape[1])
         ridge[0, 0] = 0.0
         answer = np.linalg.solve(weighted.T @ basis + ridge, weighted.T @ self.z[usable])[0]
         like = self.drawn(self.seeds[usable[0]])
-        return replace(like, z=np.where(like.smooth, np.clip(answer, -MOST, MOST), like.z))
+        return replace(like, z=np.where(like.smooth, np.clip(answer, -2.0, 2.0), like.z))
 
 
 def coefficients(model: StatisticalModel, material: Float32[np.ndarray, "n m 3"]) -> Float[np.ndarray, "n k"]:
     """Coefficients of many states at once, by a few rounds of alignment and least squares on a few material points."""
-    few = spread(model.rest_points, PROJECTED)
+    few = spread(model.rest_points, 400)
     flat = model.modes[few].reshape(-1, model.count).astype(np.float64)
     normal = flat.T @ flat + 1e-6 * np.trace(flat.T @ flat) / model.count * np.eye(model.count)
     states = material[:, few].astype(np.float64)

@@ -1,7 +1,7 @@
-"""States of a scene as explanations of a frame: playing them, judging them, and their linear neighbourhood.
+"""Explain a frame by states of a scene: simulate them, score them, and linearize around them.
 
 Around a state the material points are linear in the draws, so its neighbourhood is a linear model like that of the
-modes, fitted by the same code.
+modes; the residuals are those of the modes' fit.
 """
 
 from dataclasses import dataclass, replace
@@ -12,23 +12,23 @@ from jaxtyping import Bool, Float, Float32, Int
 from scipy.sparse import csr_array
 
 from mereo.deformation.moving_least_squares import PointWeights
-from mereo.fitting.config import MANY_DRAWS, DrawsConfig
+from mereo.fitting.config import FEW_DRAWS, MANY_DRAWS, DrawsConfig
 from mereo.fitting.draws.playback import Drawn, DrawnStates, as_sparse, material_moved
 from mereo.fitting.problem.correspondences import Correspondences
-from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, Rows, along, geman_mcclure, in_space
-from mereo.fitting.problem.posterior import Terms
+from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, geman_mcclure, in_space
 from mereo.fitting.problem.problem import Problem
 from mereo.fitting.problem.residuals import (
-    MOST_VIOLATIONS,
-    ROBUST,
     SILHOUETTE_WEIGHT,
     NetworkTerm,
     Surface,
+    Terms,
+    add_silhouette,
+    cloud_rows,
     robust_square,
+    silhouette_losses,
 )
 from mereo.geometry.mesh import barycentric
 from mereo.geometry.transforms import best_rotations
-from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel
 
 
@@ -37,17 +37,17 @@ class DrawsProblem:
     """A frame to be explained by the states of a scene.
 
     Attributes:
-        base: the same frame, explained by modes, with the worths that the draws are fitted by.
+        base: the same frame, explained by modes, with the weights that the draws are fitted by.
         states: random states of the scene.
-        found: correspondences, scene units.
+        correspondences: correspondences, scene units.
         weights: how their rest positions follow the material points.
         config: constants.
-        by_sight: whether observed points are compared with what their lines of sight meet, or with the nearest places.
+        by_sight: whether observed points are compared with what their lines of sight meet, or with the nearest points.
     """
 
     base: Problem
     states: DrawnStates
-    found: Correspondences
+    correspondences: Correspondences
     weights: PointWeights
     config: DrawsConfig
     by_sight: bool = False
@@ -62,42 +62,30 @@ class DrawsProblem:
         """``base`` with the points of the last descent."""
         return self.base.by_every_point if self.config.every_point else self.base
 
-    @property
-    def scene(self) -> Scene:
-        """Scene whose draws are played."""
-        return self.states.scene
-
     @classmethod
     def of(
-        cls, base: Problem, states: DrawnStates, found: Correspondences, config: DrawsConfig | None = None
+        cls, base: Problem, states: DrawnStates, correspondences: Correspondences, config: DrawsConfig | None = None
     ) -> "DrawsProblem":
         """Problem with the constants for as many draws as the scene has, where none are given."""
         model = base.model
         if config is None:
-            config = DrawsConfig() if states.z.shape[1] <= DrawsConfig().few else MANY_DRAWS
-        worths = replace(base.config, cloud_weight=config.cloud_weight, network_weight=(config.network_weight,) * 2)
-        base = replace(base, config=worths)
-        return cls(base, states, found, model.weights(found.rest, found.labels), config)
-
-    def around(self, mean: Float[np.ndarray, "m 3"], modes: Float32[np.ndarray, "m 3 d"]) -> Problem:
-        """The problem in the linear neighbourhood of a state."""
-        model = self.model.around(mean, modes)
-        network = NetworkTerm(self.found.points, self.weights(mean), self.weights(modes), self.found.confidence)
-        return replace(self.base, model=model, network=network)
+            config = DrawsConfig() if states.z.shape[1] <= FEW_DRAWS else MANY_DRAWS
+        network_weight = config.network_weight, config.network_weight
+        fit_config = replace(base.config, cloud_weight=config.cloud_weight, network_weight=network_weight)
+        base = replace(base, config=fit_config)
+        return cls(base, states, correspondences, model.weights(correspondences.rest, correspondences.labels), config)
 
     def network(self, fit: "DrawsFit", modes: Float32[np.ndarray, "n 3 d"] | None = None) -> NetworkTerm:
         """Correspondences in the neighbourhood of a state."""
-        modes = np.zeros((len(self.found.labels), 3, 0), dtype=np.float32) if modes is None else modes
-        return NetworkTerm(self.found.points, self.weights(fit.material), modes, self.found.confidence)
+        modes = np.zeros((len(self.correspondences.labels), 3, 0), dtype=np.float32) if modes is None else modes
+        return NetworkTerm(
+            self.correspondences.points, self.weights(fit.material), modes, self.correspondences.confidence
+        )
 
     @cached_property
-    def followed(self) -> csr_array:
+    def following_played(self) -> csr_array:
         """How the rest positions of the correspondences follow the played points."""
         return as_sparse(self.weights, len(self.model.rest_points)) @ self.states.played.spread
-
-    def rigid(self, material: Float[np.ndarray, "m 3"]) -> Problem:
-        """Problem of one state's pose alone."""
-        return self.around(material, np.zeros((len(material), 3, 0), dtype=np.float32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +97,7 @@ class DrawsFit:
         posed: rigid pose; its ``z`` is empty.
         material: material points, unposed.
         surface: the posed surface.
-        distance, face, place: of what each observed sample is compared with.
+        distance, face, position: of what each observed sample is compared with.
         misfit: with the prior of the draws, the cloud by its last sigma.
         motion: of the played points for a standard deviation of each draw, where it is known.
     """
@@ -121,7 +109,7 @@ class DrawsFit:
     surface: Surface
     distance: Float[np.ndarray, " p"]
     face: Int[np.ndarray, " p"]
-    place: Float[np.ndarray, "p 3"]
+    position: Float[np.ndarray, "p 3"]
     misfit: float
     motion: Float32[np.ndarray, "a 3 d"] | None = None
 
@@ -131,11 +119,11 @@ class DrawsFit:
 
 
 def simulate(problem: DrawsProblem, drawn: Drawn, z: Float[np.ndarray, " d"], posed: Posed) -> DrawsFit | None:
-    """The state of these draws and how badly it explains the frame; None where the scene refuses it."""
-    deformations = drawn.deformations(problem.scene, z)
+    """Simulate the state of these draws and score it; None where the scene refuses it."""
+    deformations = drawn.deformations(problem.states.scene, z)
     if deformations is None:
         return None
-    material = material_moved(problem.scene, problem.model, deformations)
+    material = material_moved(problem.states.scene, problem.model, deformations)
     return try_material(problem, drawn, z, posed, material)
 
 
@@ -146,7 +134,7 @@ def try_material(
     posed: Posed,
     material: Float[np.ndarray, "m 3"],
 ) -> DrawsFit | None:
-    """Material points beside the frame as those of a state; None where no face of them is seen."""
+    """Score material points as those of a state; None where no face of them is seen."""
     rigid = replace(posed, z=np.empty(0))
     surface = Surface.through(problem.model, rigid.place(material))
     if len(surface.facing) == 0:
@@ -162,9 +150,8 @@ def misfit(problem: DrawsProblem, fit: DrawsFit, sigma: float) -> float:
     base = problem.base
     cloud = base.config.cloud_weight * float(robust_square(fit.distance, sigma).mean())
     network = base.config.network_weight[1] * problem.network(fit).energy(fit.posed, base.network_sigma)
-    amount = base.evidence.violations(fit.surface.material[base.silhouette_vertices], ROBUST * sigma)[1]
-    silhouette_vertices = SILHOUETTE_WEIGHT * float(robust_square(amount, sigma, 4 * ROBUST).sum())
-    return cloud + network + silhouette_vertices + float(fit.z @ fit.z)
+    losses = silhouette_losses(fit.surface.material[base.model.silhouette_vertices], base.evidence, sigma)
+    return cloud + network + SILHOUETTE_WEIGHT * float(losses.sum()) + float(fit.z @ fit.z)
 
 
 def narrowing(problem: DrawsProblem, fit: DrawsFit) -> float:
@@ -182,49 +169,39 @@ def normal_equations(
 
 
 def terms(problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3 d"], sigma: float) -> Terms:
-    """Terms of ``normal_equations``."""
-    base, posed, config = problem.base, fit.posed, problem.base.config
-    flat, count = motion.reshape(len(motion), -1), len(fit.z)
+    """Terms of ``normal_equations``: those of the modes, with the played points' motion in the place of modes."""
+    base, posed, config, surface = problem.base, fit.posed, problem.base.config, fit.surface
+    samples, spread, count = base.evidence.observed_samples, problem.states.played.spread, len(fit.z)
+    flat, vertices = motion.reshape(len(motion), -1), base.model.silhouette_vertices
+
+    def modes_of(follow: csr_array) -> Float32[np.ndarray, "n 3 d"]:
+        return (follow @ flat).reshape(-1, 3, count)
+
     nothing, state = NormalEquations.nothing(POSE + count), replace(posed, z=np.zeros(count))
-    network = problem.network(fit, (problem.followed @ flat).reshape(-1, 3, count))
+    network = problem.network(fit, modes_of(problem.following_played))
+    planes = fit.position, surface.normals[fit.face], modes_of(surface_weights(fit, spread.shape[0]) @ spread)
     return Terms(
         known=prior_of_draws(fit.z, motion, posed.log_scale, base.scale_std),
         network=network.add_to(nothing, state, base.network_sigma, config.network_weight[1], robust=True),
-        cloud=cloud_rows(problem, fit, motion, sigma),
-        observed_samples=base.evidence.observed_samples,
-        ruled_out=ruled_out(problem, fit, motion, sigma),
+        cloud=cloud_rows(posed, samples, planes, sigma, config.cloud_weight),
+        observed_samples=samples,
+        ruled_out=add_silhouette(
+            nothing,
+            posed,
+            surface.material[vertices],
+            lambda rows: modes_of(spread[vertices[rows]]),
+            base.evidence,
+            sigma,
+        ),
     )
 
 
-def cloud_rows(problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3 d"], sigma: float) -> Rows:
-    """Each observed sample's distance to its plane of the surface, its derivatives, and its weight."""
-    base, spread = problem.base, problem.states.played.spread
-    corners = problem.model.faces[fit.surface.facing[fit.face]]
-    within = barycentric(fit.surface.material[corners], fit.place).astype(np.float32)
+def surface_weights(fit: DrawsFit, count: int) -> csr_array:
+    """Weights of all ``count`` material points by which the positions on the surface follow them."""
+    corners = fit.surface.model.faces[fit.surface.facing[fit.face]]
+    within = barycentric(fit.surface.material[corners], fit.position).astype(np.float32)
     rows = np.repeat(np.arange(len(corners)), 3)
-    at_places = csr_array((within.ravel(), (rows, corners.ravel())), shape=(len(corners), spread.shape[0])) @ spread
-    modes = (at_places @ motion.reshape(len(motion), -1)).reshape(-1, 3, len(fit.z))
-    direction = fit.surface.normals[fit.face]
-    residual = np.einsum("pi,pi->p", direction, fit.place - base.evidence.observed_samples)
-    weight = geman_mcclure(residual, ROBUST * sigma) * (base.config.cloud_weight / len(residual) / sigma**2)
-    return along(fit.posed, fit.place, modes, direction), residual, weight
-
-
-def ruled_out(
-    problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3 d"], sigma: float
-) -> NormalEquations:
-    """Normal equations of the vertices that are outside the silhouette or in free space."""
-    base, spread, nothing = problem.base, problem.states.played.spread, NormalEquations.nothing(POSE + len(fit.z))
-    chosen = base.silhouette_vertices
-    direction, amount = base.evidence.violations(fit.surface.material[chosen], ROBUST * sigma)
-    rows = np.flatnonzero(amount > 0)
-    if len(rows) == 0:
-        return nothing
-    rows = rows[:: max(1, -(-len(rows) // MOST_VIOLATIONS))]
-    modes = (spread[chosen[rows]] @ motion.reshape(len(motion), -1)).reshape(-1, 3, len(fit.z))
-    jacobian = along(fit.posed, fit.surface.material[chosen[rows]], modes, direction[rows])
-    weight = SILHOUETTE_WEIGHT / sigma**2 * geman_mcclure(amount[rows], 4 * ROBUST * sigma)
-    return nothing.add(jacobian, -amount[rows], weight)
+    return csr_array((within.ravel(), (rows, corners.ravel())), shape=(len(corners), count))
 
 
 # --- the state of a given shape ---------------------------------------------------------------------------------------
@@ -234,29 +211,17 @@ def ruled_out(
 # The fit of the modes is dense and smooth, so the draws of a state like it are found from far away. Playing few
 # points of a state costs milliseconds; one set of differences serves for several steps (Broyden's rule).
 
+SHAPE_WEIGHT = 500.0
+"""How many independent points a shape is worth."""
+
 SHAPE_ROBUST = 2.5
 """Points farther off than this many standard deviations count for little."""
-
-DIFFERENCE = 0.02
-"""Step of finite differences, in standard deviations of a draw."""
-
-STEPS = 6
-"""Steps at most with one set of differences."""
-
-TRIES = 5
-"""Dampings at most in one step."""
 
 ENOUGH = 0.02
 """Relative gain of a step below which nothing more is tried."""
 
 HELD = 1e6
-"""Precision of draws that move nothing here: they stay."""
-
-SAME = 1e-4
-"""Distance, in scene units, below which two plays are of one state; rest points are in single precision."""
-
-STILL = 1e-9
-"""Motion, in scene units for a standard deviation, below which a draw moves nothing."""
+"""Precision of draws that move nothing at a state: they stay."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,12 +245,11 @@ class Shape:
         cls,
         points: Float[np.ndarray, "n 3"],
         std: float,
-        worth: float,
         confidence: Float[np.ndarray, " n"],
         follow: csr_array | None = None,
     ) -> "Shape":
-        """Shape worth ``worth`` points."""
-        return cls(points, std, confidence / confidence.sum() * (worth / std**2), follow)
+        """Shape worth ``SHAPE_WEIGHT`` points."""
+        return cls(points, std, confidence / confidence.sum() * (SHAPE_WEIGHT / std**2), follow)
 
     def at(self, values: Float[np.ndarray, "a *c"]) -> Float[np.ndarray, "n *c"]:
         """Values at the points, from values at the played points."""
@@ -317,7 +281,7 @@ class StateOnShape:
 
 
 def lay_on_shape(states: DrawnStates, shape: Shape, drawn: Drawn, z: Float[np.ndarray, " d"]) -> StateOnShape | None:
-    """The state of these draws, laid robustly onto the shape; None where the scene refuses it."""
+    """Lay the state of these draws robustly onto the shape; None where the scene refuses it."""
     deformations = drawn.deformations(states.scene, z)
     if deformations is None:
         return None
@@ -336,29 +300,31 @@ def lay_on_shape(states: DrawnStates, shape: Shape, drawn: Drawn, z: Float[np.nd
 
 
 def derivatives(
-    states: DrawnStates, drawn: Drawn, z: Float[np.ndarray, " d"], here: Float[np.ndarray, "a 3"]
+    states: DrawnStates, drawn: Drawn, z: Float[np.ndarray, " d"], positions: Float[np.ndarray, "a 3"]
 ) -> Float32[np.ndarray, "a 3 d"]:
-    """Motion of the played points, which are ``here``, for a standard deviation of each draw.
+    """Motion of the played points, which are ``positions``, for a standard deviation of each draw.
 
     Neighbours are played without the scene's own test where this state is the same without it: it is not where a scene
     refuses and draws again in a way that ``Drawn`` does not see through.
     """
-    change = np.zeros((*here.shape, len(z)), dtype=np.float32)
+    change = np.zeros((*positions.shape, len(z)), dtype=np.float32)
     untested = drawn.deformations(states.scene, z, checked=False)
-    checked = untested is None or float(np.abs(states.played.moved(untested) - here).max()) > SAME
+    checked = (
+        untested is None or float(np.abs(states.played.moved(untested) - positions).max()) > 1e-4
+    )  # rest points are in single precision
     for number in np.flatnonzero(drawn.smooth):
-        step = DIFFERENCE * (-1.0 if z[number] > 0 else 1.0)
+        step = 0.02 * (-1.0 if z[number] > 0 else 1.0)
         other = z.copy()
         other[number] += step
         moved = drawn.deformations(states.scene, other, checked)
         if moved is not None:
-            change[:, :, number] = (states.played.moved(moved) - here) / step
+            change[:, :, number] = (states.played.moved(moved) - positions) / step
     return change
 
 
 def unmoving(motion: Float32[np.ndarray, "a 3 d"]) -> Bool[np.ndarray, " d"]:
     """Which draws move nothing here."""
-    return np.asarray(np.abs(motion).max(axis=(0, 1)) < STILL)
+    return np.asarray(np.abs(motion).max(axis=(0, 1)) < 1e-9)  # scene units
 
 
 def prior_of_draws(
@@ -379,12 +345,12 @@ def secant(
 
 
 def approach(states: DrawnStates, shape: Shape, state: StateOnShape, fresh: int) -> StateOnShape:
-    """The state near the shape, by ``fresh`` sets of differences."""
+    """Approach the shape from a state, by ``fresh`` sets of differences."""
     damping = 0.1
     for _ in range(fresh):
         motion = derivatives(states, state.drawn, state.z, state.points)
         before = state.misfit
-        for _ in range(STEPS):
+        for _ in range(6):
             nearer, motion, damping = _step(states, shape, state, motion, damping)
             gain, state = state.misfit - nearer.misfit, nearer
             if gain < ENOUGH * state.misfit:
@@ -398,9 +364,18 @@ def approach(states: DrawnStates, shape: Shape, state: StateOnShape, fresh: int)
 def _step(
     states: DrawnStates, shape: Shape, state: StateOnShape, motion: Float32[np.ndarray, "a 3 d"], damping: float
 ) -> tuple[StateOnShape, Float32[np.ndarray, "a 3 d"], float]:
-    """The next state, or the same; what was learnt of the motion; the next damping."""
-    for _ in range(TRIES):
-        step = _solved(shape, state, motion, damping)
+    """Take Levenberg and Marquardt's step of the draws, the pose free.
+
+    Returns the next state, or the same; what was learnt of the motion; the next damping.
+    """
+    posed = Posed(state.rotation, state.translation, np.zeros(len(state.z)))
+    points = posed.place(shape.at(state.points))
+    offset = points - shape.points
+    weight = shape.weight * geman_mcclure(np.linalg.norm(offset, axis=1), 2 * SHAPE_ROBUST * shape.std)
+    for _ in range(5):
+        normal = prior_of_draws(state.z, motion, 0.0, 1e-6)
+        jacobian = in_space(posed, points, shape.at(motion))
+        step = normal.add(jacobian, offset.ravel(), np.repeat(weight, 3)).step(damping)[POSE:]
         tried = lay_on_shape(states, shape, state.drawn, state.z + step)
         if tried is not None:
             motion = secant(motion, step, tried.points - state.points)
@@ -408,16 +383,3 @@ def _step(
                 return tried, motion, max(damping / 4.0, 1e-3)
         damping *= 5.0
     return state, motion, damping
-
-
-def _solved(
-    shape: Shape, state: StateOnShape, motion: Float32[np.ndarray, "a 3 d"], damping: float
-) -> Float[np.ndarray, " d"]:
-    """Levenberg and Marquardt's step of the draws, the pose free."""
-    normal = prior_of_draws(state.z, motion, 0.0, 1e-6)
-    posed = Posed(state.rotation, state.translation, np.zeros(len(state.z)))
-    points = posed.place(shape.at(state.points))
-    offset = points - shape.points
-    weight = shape.weight * geman_mcclure(np.linalg.norm(offset, axis=1), 2 * SHAPE_ROBUST * shape.std)
-    jacobian = in_space(posed, points, shape.at(motion))
-    return normal.add(jacobian, offset.ravel(), np.repeat(weight, 3)).step(damping)[POSE:]

@@ -1,8 +1,8 @@
-"""Correspondences between what a camera sees and the rest pose, as a trained network states them.
+"""Predict correspondences between what a camera sees and the rest pose with a trained network.
 
-Every point of the object lies on a line of sight through an observed point, at it or behind it. So the network is asked
-at the observed points and along the lines of sight behind them: where it finds a segment, it says where that place was
-at rest. It is right on what is seen and vague on what is hidden.
+Every point of the object lies on a line of sight through an observed point, at it or behind it. So the network is
+evaluated at the observed points and along the lines of sight behind them: where it finds a segment, it predicts the
+rest position of that point. It is right on what is seen and vague on what is hidden.
 """
 
 from dataclasses import dataclass, replace
@@ -14,25 +14,19 @@ from mereo.deformation.moving_least_squares import spread
 from mereo.models.trained import EncodedCloud, Trained
 from mereo.scenes.statistical_model import StatisticalModel
 
-SIGHT_LINES = 256
-"""Lines of sight along which the hidden inside is asked for."""
+OBSERVED, SIGHT_LINES = 400, 256
+"""Observed points at which the network is evaluated, and lines of sight behind them."""
 
 DEPTHS = np.concatenate([np.arange(0.04, 0.6, 0.08), np.arange(0.6, 2.4, 0.15)])
 """Depths behind the observed point, in half longest sides of the visible part."""
 
-OBSERVED = 400
-"""Observed points that are asked for."""
-
 CLIPPED = 0.5
-"""Largest distance of one place that counts in ``Correspondences.displaced``."""
-
-EACH = 125
-"""Correspondences kept of the observed points, and of the inside."""
+"""Largest distance of a point that counts in ``Correspondences.displaced``."""
 
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
-    """Places of the object in the camera frame and at rest.
+    """Positions of points of the object in the camera frame and at rest.
 
     Attributes:
         points: in the camera frame, input unit.
@@ -75,7 +69,7 @@ class Correspondences:
         apart = np.linalg.norm(model.weights(self.rest, self.labels)(material) - self.points, axis=1) / model.half
         return float(np.sqrt((np.minimum(apart, CLIPPED) ** 2).mean()))
 
-    def evenly(self, each: int = EACH) -> "Correspondences":
+    def evenly(self, each: int = 125) -> "Correspondences":
         """Even subset: at most ``each`` observed and as many inside, evenly spread in space."""
         chosen = [np.empty(0, dtype=np.int64)]
         for rows in (np.flatnonzero(self.observed), np.flatnonzero(~self.observed)):
@@ -85,7 +79,7 @@ class Correspondences:
 
 
 def nothing() -> Correspondences:
-    """No correspondences, of a frame of which no network was asked."""
+    """No correspondences, of a frame without a network."""
     none = np.empty((0, 3))
     return Correspondences(none, none, np.empty(0, np.uint8), np.empty(0), np.empty(0, dtype=bool))
 
@@ -93,7 +87,7 @@ def nothing() -> Correspondences:
 def find_correspondences(
     model: Trained, code: EncodedCloud, center: Float[np.ndarray, "3"], half: float
 ) -> Correspondences | None:
-    """Correspondences: all that the network says about observed points and the lines of sight behind them.
+    """Predict correspondences at observed points and along the lines of sight behind them.
 
     Args:
         model: the trained network.
@@ -107,10 +101,10 @@ def find_correspondences(
     lines = seen[:SIGHT_LINES]
     behind = DEPTHS / code.normalizer.scale / np.linalg.norm(lines, axis=1)[:, None]
     inner = (lines[:, None] * (1.0 + behind[..., None])).reshape(-1, 3)
-    found = model.correspond(code, np.concatenate([seen, inner]))
-    if found is None:
+    predicted = model.correspond(code, np.concatenate([seen, inner]))
+    if predicted is None:
         return None
-    probability, rest = found
+    probability, rest = predicted
     probability[: len(seen), 0] = 0.0  # an observed point is on the object, whatever the network thinks
     probability[: len(seen)] /= np.maximum(probability[: len(seen)].sum(axis=1, keepdims=True), 1e-12)
     labels = probability.argmax(axis=1).astype(np.uint8)
@@ -122,31 +116,26 @@ def find_correspondences(
 
 # --- length of a scene unit -------------------------------------------------------------------------------------------
 
-# Length of a scene unit in a frame's unit, as the network's correspondences tell it.
-
 UNIT_TOLERANCE = 0.15
 """Difference of a stated unit from the correspondences' own up to which it is believed: they are off by less in 258 of
 264 training views, and no two units that are mistaken for each other are nearer than a factor of 2.5."""
 
-SCALE_PAIRS = 4000
-"""Pairs of correspondences whose distances, there and at rest, tell an unknown unit."""
 
-
-def agree(one: float, other: float) -> bool:
+def agree(first: float, second: float) -> bool:
     """Whether two units differ by no more than ``UNIT_TOLERANCE``."""
-    return abs(float(np.log(one / other))) < float(np.log1p(UNIT_TOLERANCE))
+    return abs(float(np.log(first / second))) < float(np.log1p(UNIT_TOLERANCE))
 
 
-def estimate_unit(found: Correspondences) -> float:
-    """Length of a scene unit in the unit of the correspondences: distances within a segment hardly change."""
+def estimate_unit(correspondences: Correspondences) -> float:
+    """Estimate a scene unit's length in the correspondences' unit: distances within a segment hardly change."""
     rng = np.random.default_rng(0)
-    first, second = rng.integers(len(found.labels), size=(2, SCALE_PAIRS))
-    rest = np.linalg.norm(found.rest[first] - found.rest[second], axis=1)
-    seen = np.linalg.norm(found.points[first] - found.points[second], axis=1)
-    usable = (found.labels[first] == found.labels[second]) & (rest > np.median(rest[rest > 0]) / 4)
+    first, second = rng.integers(len(correspondences.labels), size=(2, 4000))
+    rest = np.linalg.norm(correspondences.rest[first] - correspondences.rest[second], axis=1)
+    seen = np.linalg.norm(correspondences.points[first] - correspondences.points[second], axis=1)
+    usable = (correspondences.labels[first] == correspondences.labels[second]) & (rest > np.median(rest[rest > 0]) / 4)
     if not usable.any():
         raise ValueError(
-            f"the network finds only {len(found.labels)} points of the object, too few to tell its size: name the "
-            "unit with scene_unit, or isolate the object first"
+            f"the network finds only {len(correspondences.labels)} points of the object, too few to tell its size: "
+            "name the unit with scene_unit, or isolate the object first"
         )
     return float(np.median(seen[usable] / rest[usable]))

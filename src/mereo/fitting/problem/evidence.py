@@ -1,11 +1,10 @@
-"""What a frame shows, and what it rules out: observed points, the silhouette, and the free space in front of them.
+"""The evidence of a frame: observed points, and what silhouette and free space rule out. The camera is at the origin.
 
-A frame is a cloud seen from one place, and what is known of the lines of sight beside it (``geometry.camera``). A
-vertex of a fitted model may lie neither on a line of sight that went past the object, before what that met (outside the
-silhouette), nor in front of the observed points around its own line of sight (free space). Nothing is ruled out along
+A frame is a cloud seen from one position, and what is known of the lines of sight beside it (``geometry.sight_lines``).
+A vertex of a fitted model may lie neither on a line of sight that went past the object, before what that met (outside
+the silhouette), nor in front of the observed points around its line of sight (free space). Nothing is ruled out along
 lines of sight on which nothing is known. Lines of sight are compared by their angles, so a depth image and a cloud
 without one are the same, and so is any axis or unit.
-The camera is at the origin.
 """
 
 from dataclasses import dataclass, replace
@@ -162,15 +161,15 @@ class Evidence:
         distance = np.linalg.norm(vertices, axis=1)
         toward = vertices / distance[:, None]
         angle, near = self.sight.query(toward)
-        beside = angle > SILHOUETTE_PITCHES * self.pitch
+        is_past = angle > SILHOUETTE_PITCHES * self.pitch
         sideways = self.sight.data[near] * distance[:, None] - vertices
         length = np.sqrt(np.einsum("ni,ni->n", sideways, sideways))
         out = sideways / np.maximum(length, 1e-12)[:, None]
         ahead = self.front[near] - slack - distance
-        direction = np.where(beside[:, None], out, toward)
-        amount = np.maximum(np.where(beside, length - self.pitch * distance, ahead), 0.0)
+        direction = np.where(is_past[:, None], out, toward)
+        amount = np.maximum(np.where(is_past, length - self.pitch * distance, ahead), 0.0)
         if self.past is not None or self.other_lines == "unknown":
-            rows = np.flatnonzero(beside)
+            rows = np.flatnonzero(is_past)
             nearest = np.where(near[rows] < len(self.points), np.inf, angle[rows])
             amount[rows[distance[rows] > self._free(toward[rows], nearest) - slack]] = 0.0
         return direction, amount
@@ -178,7 +177,7 @@ class Evidence:
     def along(
         self, toward: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """What each line of sight says, as ``violations`` takes it.
+        """Look up lines of sight, as ``violations`` takes them.
 
         Returns the unit vector of the nearest one that met the object or of which nothing is known, the distance before
         which that is free, and the distance up to which a line of sight beside it is free; -1 where it is not beside.

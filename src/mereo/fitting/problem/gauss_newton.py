@@ -18,6 +18,9 @@ from scipy.spatial.transform import Rotation
 POSE = 7
 """Parameters before the coefficients."""
 
+DAMPING = 1e-3
+"""Damping of a step of the modes, relative to the diagonal."""
+
 Rows = tuple[Float[np.ndarray, "p q"], Float[np.ndarray, " p"], Float[np.ndarray, " p"]]
 """Derivatives of residuals by the q parameters, the residuals, and their weights, as ``NormalEquations.add`` takes."""
 
@@ -109,7 +112,7 @@ def along(
     modes: Float[np.ndarray, "n 3 k"],
     direction: Float[np.ndarray, "n 3"],
 ) -> Float[np.ndarray, "n p"]:
-    """Derivatives of ``direction . y`` at posed ``points`` whose modes are given."""
+    """Derivatives of ``direction . y`` at posed points with their modes."""
     arm = points - posed.translation
     local = (np.exp(posed.log_scale) * (direction @ posed.rotation)).astype(modes.dtype)
     result = np.empty((len(points), POSE + modes.shape[2]), dtype=modes.dtype)
@@ -124,14 +127,20 @@ def in_space(
     posed: Posed, points: Float[np.ndarray, "n 3"], modes: Float[np.ndarray, "n 3 k"]
 ) -> Float[np.ndarray, "m p"]:
     """Derivatives of y at posed points, three rows for each point: x, y, z."""
-    arm = points - posed.translation
-    result = np.zeros((len(points), 3, POSE + modes.shape[2]), dtype=modes.dtype)
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        result[:, i, j], result[:, i, k] = arm[:, k], -arm[:, j]
-        result[:, i, 3 + i] = 1.0
-    result[:, :, 6] = arm
+    result = np.empty((len(points), 3, POSE + modes.shape[2]), dtype=modes.dtype)
+    result[:, :, :POSE] = rigid_motion((points - posed.translation).astype(modes.dtype))
     result[:, :, POSE:] = np.matmul((np.exp(posed.log_scale) * posed.rotation).astype(modes.dtype), modes)
     return result.reshape(3 * len(points), -1)
+
+
+def rigid_motion(arm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 7"]:
+    """Derivatives of points by a turn, a shift and the scale, from their positions relative to the pose's centre."""
+    rigid = np.zeros((len(arm), 3, POSE), dtype=arm.dtype)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        rigid[:, i, j], rigid[:, i, k] = arm[:, k], -arm[:, j]
+        rigid[:, i, 3 + i] = 1.0
+    rigid[:, :, 6] = arm
+    return rigid
 
 
 def cross(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

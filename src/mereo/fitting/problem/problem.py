@@ -1,4 +1,4 @@
-"""One frame to be explained by one object: all terms of the fit, and how badly a state explains them."""
+"""The problem of explaining one frame by one object: all terms of the fit, and the misfit of a state."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -10,39 +10,34 @@ from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.evidence import MORE_SAMPLES, OBSERVED_SAMPLES, Evidence
 from mereo.fitting.problem.gauss_newton import NormalEquations, Posed, Rows
-from mereo.fitting.problem.joints import Joints
 from mereo.fitting.problem.residuals import (
     ROBUST,
     SILHOUETTE_WEIGHT,
     NetworkTerm,
     PairTerm,
+    PosedSamples,
     Prior,
     SampledSurface,
     Surface,
-    add_cloud,
     add_silhouette,
     cloud_rows,
     robust_square,
+    silhouette_losses,
 )
+from mereo.fitting.problem.segments import Joints
 from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
 
 COARSE = 3
 """How many times fewer observed samples and correspondences a choice among many states needs."""
 
-BESIDE = 1.0
-"""Share of the samples' spacing: an observed sample so far beside one is still on its plane."""
+PAIR_WEIGHT = 100.0
+"""How many independent points the distances that the states keep are worth."""
 
 KNOWN_SCALE_STD = 1e-6
 """``Problem.scale_std`` of a frame whose unit is known."""
 
-FAR = 1.0
-"""Scene units beyond the tolerance by which a vertex is ruled out for good."""
-
 UNEXPLAINED = 0.3
 """The cloud's misfit, in squared standard deviations of an observed sample, above which a fit is likely wrong."""
-
-TAILS = 1.5
-"""The same, in those of normal noise as great as what the fit leaves over."""
 
 
 @dataclass(frozen=True)
@@ -93,10 +88,15 @@ class Problem:
 
     @classmethod
     def of(
-        cls, model: StatisticalModel, found: Correspondences, evidence: Evidence, scale_std: float, config: FitConfig
+        cls,
+        model: StatisticalModel,
+        correspondences: Correspondences,
+        evidence: Evidence,
+        scale_std: float,
+        config: FitConfig,
     ) -> "Problem":
         """Problem of one frame: what the network found, and what the frame shows."""
-        return cls(model, NetworkTerm.of(model, found), evidence, scale_std, config)
+        return cls(model, NetworkTerm.of(model, correspondences), evidence, scale_std, config)
 
     @property
     def is_scale_open(self) -> bool:
@@ -109,11 +109,6 @@ class Problem:
         return PairTerm.of(self.model)
 
     @property
-    def silhouette_vertices(self) -> Int[np.ndarray, " w"]:
-        """Surface vertices that are compared with silhouette and free space."""
-        return self.model.silhouette_vertices
-
-    @property
     def network_sigma(self) -> float:
         """Standard deviation of a correspondence, scene units."""
         return self.config.start_sigma * self.model.half
@@ -121,9 +116,9 @@ class Problem:
     def known(self, posed: Posed, prior: Prior, slack: float) -> NormalEquations:
         """Normal equations of what is known without the frame: prior, scale, kept distances up to ``slack``."""
         normal = NormalEquations.prior(posed.z, prior.center, prior.precision, posed.log_scale, self.scale_std)
-        return self.pairs.add_to(normal, posed.z, self.config.pair_weight, slack)
+        return self.pairs.add_to(normal, posed.z, PAIR_WEIGHT, slack)
 
-    def noise_beside(self, surface: Surface) -> float:
+    def residual_noise(self, surface: Surface) -> float:
         """Noise of the frame, in scene units, as a fit with this surface leaves it over."""
         return noise_of(surface.offsets(self.evidence.points), self.evidence.around)
 
@@ -134,19 +129,19 @@ class Problem:
             surface: the fit's.
             is_shared: take for noise what neighbours share too.
         """
-        noise = noise_with_shared(surface.offsets(self.evidence.points)) if is_shared else self.noise_beside(surface)
+        noise = noise_with_shared(surface.offsets(self.evidence.points)) if is_shared else self.residual_noise(surface)
         config = constants_for(noise, self.config)
         if config is self.config:
             return None
         return replace(self, config=config, evidence=self.evidence.with_more_samples, noisy=True)
 
     def wants_turns(self, cloud: float, surface: Surface) -> bool:
-        """Whether a misfit of the cloud, much greater than its noise, says that the fit is likely wrong."""
+        """Whether a misfit of the cloud, much greater than its noise, shows that the fit is likely wrong."""
         if cloud < UNEXPLAINED:
             return False
         if self.config.turned_anyway:
             return not self.leaves_noise(surface)
-        return cloud > TAILS * (self.noise_beside(surface) / self.config.cloud_sigma) ** 2
+        return cloud > 1.5 * (self.residual_noise(surface) / self.config.cloud_sigma) ** 2
 
     @property
     def by_every_point(self) -> "Problem":
@@ -156,9 +151,9 @@ class Problem:
             return self
         return replace(self, evidence=evidence.with_more_samples)
 
-    def with_network(self, found: Correspondences) -> "Problem":
+    def with_network(self, correspondences: Correspondences) -> "Problem":
         """The problem with other correspondences."""
-        return replace(self, network=NetworkTerm.of(self.model, found))
+        return replace(self, network=NetworkTerm.of(self.model, correspondences))
 
     def leaves_noise(self, surface: Surface, is_shared: bool = False) -> bool:
         """Whether what a fit leaves over is noise, and not its own error; ``is_shared`` as in ``as_noisy_as``."""
@@ -176,7 +171,7 @@ class Problem:
 
     @property
     def far(self) -> float:
-        """Distance, in scene units, beyond which a place along a line of sight is of another surface than was seen."""
+        """Distance, in scene units, beyond which a point along a line of sight is of another surface than was seen."""
         return ROBUST * self.config.cloud_sigma
 
     def met(self, surface: Surface) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
@@ -202,10 +197,10 @@ class Problem:
         """Problem with fewer points, for the choice among many states."""
         config = replace(
             self.config,
-            samples=self.config.coarse_samples,
+            samples=1000,
             silhouette_vertices=self.config.silhouette_vertices // COARSE,
         )
-        if self.noisy:  # its sigma would ask the faces in all steps
+        if self.noisy:  # its sigma would use the faces in all steps
             config = replace(config, exact_steps=0)
         some = slice(None, None, COARSE)
         network = NetworkTerm(*(part[some] for part in vars(self.network).values()))
@@ -217,28 +212,36 @@ class Problem:
     def screen(self, posed: Posed, sigma: float) -> Misfit:
         """Misfit by the samples alone: good enough to choose among states, and ten times as fast."""
         samples = self.samples.posed(posed)
-        place, normal, _ = samples.planes(self.evidence.observed_samples)
-        offset = self.evidence.observed_samples - place
+        position, normal, _ = samples.planes(self.evidence.observed_samples)
+        offset = self.evidence.observed_samples - position
         across = np.einsum("pi,pi->p", offset, normal)
-        beside = np.sqrt(np.maximum((offset**2).sum(axis=1) - across**2, 0.0))
-        distance = np.hypot(across, np.maximum(beside - BESIDE * self.samples.spacing, 0.0))
-        amount = self.evidence.violations(samples.few(self.config.silhouette_vertices).place, ROBUST * sigma)[1]
+        tangential = np.sqrt(np.maximum((offset**2).sum(axis=1) - across**2, 0.0))
+        # an observed sample up to one spacing beside a sample is still on its plane
+        distance = np.hypot(across, np.maximum(tangential - self.samples.spacing, 0.0))
+        few = samples.few(self.config.silhouette_vertices).position
         return self.total(
             float(robust_square(distance, sigma).mean()),
             self.network.energy(posed, self.network_sigma),
-            float(robust_square(amount, sigma, 4 * ROBUST).mean()),
+            float(silhouette_losses(few, self.evidence, sigma).mean()),
             posed.z,
         )
 
     def seen(
         self, normal: NormalEquations, posed: Posed, sigma: float, network_weight: float, exact: bool
     ) -> NormalEquations:
-        """Sum with cloud, silhouette and correspondences; ``exact`` asks the faces and not the samples."""
+        """Sum with cloud, silhouette and correspondences; ``exact`` uses the faces and not the samples."""
         samples, observed = self.samples.posed(posed), self.evidence.observed_samples
         planes = Surface.of(self.model, posed).planes(observed, self.far) if exact else samples.planes(observed)
         normal = self.network.add_to(normal, posed, self.network_sigma, network_weight, robust=True)
-        normal = add_cloud(normal, posed, observed, planes, sigma, self.config.cloud_weight)
-        return add_silhouette(normal, posed, samples.few(self.config.silhouette_vertices), self.evidence, sigma)
+        normal = normal.add(*cloud_rows(posed, observed, planes, sigma, self.config.cloud_weight))
+        return self.add_silhouette(normal, posed, samples, sigma)
+
+    def add_silhouette(
+        self, normal: NormalEquations, posed: Posed, samples: PosedSamples, sigma: float
+    ) -> NormalEquations:
+        """Sum with the samples of a state's surface that the frame rules out."""
+        few = samples.few(self.config.silhouette_vertices)
+        return add_silhouette(normal, posed, few.points, few.modes_at, self.evidence, sigma)
 
     def cloud_rows(self, posed: Posed) -> Rows:
         """Residuals of the observed samples from the faces, as the last steps of a fit have them."""
@@ -258,36 +261,33 @@ class Problem:
 
     def _silhouette_square(self, surface: Surface) -> float:
         """Mean square of how far a vertex is ruled out, in standard deviations."""
-        sigma = self.config.cloud_sigma
-        amount = self.evidence.violations(surface.material[self.silhouette_vertices], ROBUST * sigma)[1]
-        return float(robust_square(amount, sigma, 4 * ROBUST).mean())
+        vertices = surface.material[self.model.silhouette_vertices]
+        return float(silhouette_losses(vertices, self.evidence, self.config.cloud_sigma).mean())
 
     def ruled_out(self, surface: Surface) -> float:
-        """Share of a surface's vertices that the frame rules out by more than ``FAR``."""
-        amount = self.evidence.violations(surface.material[self.silhouette_vertices], self.config.tolerance)[1]
-        return float((amount > FAR).mean())
+        """Share of a surface's vertices that the frame rules out by more than a scene unit beyond the tolerance."""
+        amount = self.evidence.violations(surface.material[self.model.silhouette_vertices], self.config.tolerance)[1]
+        return float((amount > 1.0).mean())
 
     def total(self, cloud: float, network: float, silhouette: float, z: Float[np.ndarray, " k"]) -> Misfit:
         """Misfit from the mean squares of one observed sample, one correspondence and one silhouette vertex."""
         network = network * self.config.network_weight[1]
         silhouette = silhouette * SILHOUETTE_WEIGHT * SILHOUETTE_VERTICES
-        prior, pairs = float(z @ z), self.config.pair_weight * self.pairs.energy(z)
+        prior, pairs = float(z @ z), PAIR_WEIGHT * self.pairs.energy(z)
         total = self.config.cloud_weight * cloud + network + silhouette + prior + pairs
         return Misfit(cloud, network, silhouette, prior, pairs, total)
 
     def unposed(self, z: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 3"]:
-        """The correspondences' places in the model's frame."""
+        """The correspondences' positions in the model's frame."""
         return self.network.mean + self.network.modes @ z.astype(np.float32)
 
 
 # --- noise of a frame -------------------------------------------------------------------------------------------------
 
-# Noise of a frame, told by what a first fit leaves over, and the constants of a fit to such a frame.
-#
 # Depth cameras are off by a twentieth of a scene unit or by half of one, depending on their principle, the distance and
-# the slant. Differences between neighbouring pixels do not tell, as edges and curvature look like noise too; a fitted
-# model takes these away. What it leaves over is noise where every pixel has its own; where neighbours have the same,
-# the model is wrong.
+# the slant. Differences between neighbouring pixels do not show that, as edges and curvature look like noise too; a
+# fitted model takes these away. What it leaves over is noise where every pixel differs; where neighbours share it, the
+# model is wrong.
 
 TO_STD = 1.4826
 """Standard deviation of normal numbers over the median of their absolute values."""
@@ -318,16 +318,16 @@ SHARED = 1.05
 Fits to noisy training views that other states do not improve have 1.02 to 1.15, those that they do mostly more."""
 
 ACCEPTED = 0.75
-"""Share of a noisy frame's points that a fit must explain to be believed: what remains are strays that nothing tells.
+"""Share of a noisy frame's points that a fit must explain to be believed: the rest are outliers that nothing reveals.
 
 Of 13 noisy training views that explain .76 to .95, the network was better in one, that with .76."""
 
 
 def unshared(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
     """What each point's offset does not share with those around it, as large as its noise alone would be."""
-    own = offset - np.median(offset[around], axis=1)
+    unshared_offset = offset - np.median(offset[around], axis=1)
     # the median of k neighbours is itself off by pi / 2k of their variance
-    return own / np.sqrt(1.0 + np.pi / (2 * around.shape[1]))
+    return unshared_offset / np.sqrt(1.0 + np.pi / (2 * around.shape[1]))
 
 
 def noise_of(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"]) -> float:
@@ -366,8 +366,8 @@ def is_noise(offset: Float[np.ndarray, " n"], noise: float) -> bool:
 
 def shared(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"], sigma: float) -> float:
     """Misfit of a cloud, in misfits of what its points' offsets do not share with those around them."""
-    own = unshared(offset, around)
-    return float(robust_square(offset, sigma).mean() / max(robust_square(own, sigma).mean(), 1e-12))
+    unshared_offset = unshared(offset, around)
+    return float(robust_square(offset, sigma).mean() / max(robust_square(unshared_offset, sigma).mean(), 1e-12))
 
 
 def constants_for(noise: float, config: FitConfig) -> FitConfig:

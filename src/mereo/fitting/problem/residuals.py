@@ -1,9 +1,10 @@
-"""Terms of the fit: what the network said, the observed points, and what the frame rules out.
+"""Terms of the fit: the network's correspondences, the observed points, and what the frame rules out.
 
 Every term gives normal equations near a state; lengths in scene units, camera frame. Notation: n correspondences, p
 observed samples, k modes.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -23,15 +24,13 @@ from mereo.scenes.statistical_model import StatisticalModel
 
 # --- the surface as samples -------------------------------------------------------------------------------------------
 
-# A model's surface as evenly spread points that carry their planes: the nearest of them is found in no time.
-#
 # A search among all faces is exact and slow. Samples are as good while the model is farther from the cloud than they
-# are from each other; the last steps of a fit ask the faces themselves.
+# are from each other; the last steps of a fit use the faces themselves.
 #
-# Notation: s samples, k modes. A frame is three vectors: the sample's place and two edges of its face.
+# Notation: s samples, k modes. A frame is three vectors: the sample's position and two edges of its face.
 
 Planes = tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"], Float32[np.ndarray, "p 3 k"]]
-"""Planes that observed points are compared with: a place on each, its normal, and the modes there."""
+"""Planes that observed points are compared with: a position on each, its normal, and the modes there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,10 +74,10 @@ class SampledSurface:
         flat = self.modes.reshape(9 * len(self.mean), -1) @ posed.z.astype(np.float32)
         turn = (np.exp(posed.log_scale) * posed.rotation.T).astype(np.float32)
         frame = ((self.mean + flat.reshape(self.mean.shape)).reshape(-1, 3) @ turn).reshape(self.mean.shape)
-        place = frame[:, 0] + posed.translation.astype(np.float32)
+        position = frame[:, 0] + posed.translation.astype(np.float32)
         normal = cross(frame[:, 1], frame[:, 2])
         normal /= np.maximum(np.sqrt(np.einsum("si,si->s", normal, normal)), 1e-30)[:, None]
-        return PosedSamples(self, place, normal, np.einsum("si,si->s", normal, place) < 0)
+        return PosedSamples(self, position, normal, np.einsum("si,si->s", normal, position) < 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,28 +86,37 @@ class PosedSamples:
 
     Attributes:
         surface: of which they are.
-        place: of each.
+        position: of each.
         normal: outward.
         facing: whether the camera sees their outside.
     """
 
     surface: SampledSurface
-    place: Float32[np.ndarray, "s 3"]
+    position: Float32[np.ndarray, "s 3"]
     normal: Float32[np.ndarray, "s 3"]
     facing: Bool[np.ndarray, " s"]
 
+    @property
+    def points(self) -> Float[np.ndarray, "s 3"]:
+        """Positions of the samples, in double precision."""
+        return self.position.astype(np.float64)
+
+    def modes_at(self, rows: Int[np.ndarray, " r"]) -> Float32[np.ndarray, "r 3 k"]:
+        """Modes of some of the samples."""
+        return self.surface.modes[rows, 0]
+
     def few(self, count: int) -> "PosedSamples":
         """About ``count`` samples, as evenly spread."""
-        step = max(1, len(self.place) // count)
-        return PosedSamples(self.surface.every(step), self.place[::step], self.normal[::step], self.facing[::step])
+        step = max(1, len(self.position) // count)
+        return PosedSamples(self.surface.every(step), self.position[::step], self.normal[::step], self.facing[::step])
 
     def planes(self, points: Float[np.ndarray, "p 3"]) -> Planes:
         """Place, normal and modes of the facing sample nearest to each point."""
         rows = np.flatnonzero(self.facing)
-        rows = rows if len(rows) else np.arange(len(self.place))
-        tree = cKDTree(self.place[rows], balanced_tree=False, compact_nodes=False)
+        rows = rows if len(rows) else np.arange(len(self.position))
+        tree = cKDTree(self.position[rows], balanced_tree=False, compact_nodes=False)
         near = rows[tree.query(points)[1]]
-        return self.place[near].astype(np.float64), self.normal[near].astype(np.float64), self.surface.modes[near, 0]
+        return self.position[near].astype(np.float64), self.normal[near].astype(np.float64), self.surface.modes[near, 0]
 
 
 # --- residuals --------------------------------------------------------------------------------------------------------
@@ -166,34 +174,34 @@ class Surface:
     def nearest(
         self, points: Float[np.ndarray, "p 3"]
     ) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
-        """Distance, face among the facing ones, and place of the nearest point of the facing surface."""
+        """Distance, face among the facing ones, and position of the nearest point of the facing surface."""
         tree, vertices, faces = self._tree
-        squared, face, place = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
-        return np.sqrt(squared), face.astype(np.int64), place
+        squared, face, position = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
+        return np.sqrt(squared), face.astype(np.int64), position
 
     def along_sight(
         self, points: Float[np.ndarray, "p 3"], far: float
     ) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
-        """Like ``nearest``, but of the place that each point's line of sight meets, and of the distance from its plane.
+        """Like ``nearest``, but of the point that each line of sight meets, and of the distance from its plane.
 
-        A depth camera is off along the line of sight. The nearest place is another one: of a surface that bulges, it
+        A depth camera is off along the line of sight. The nearest position is another one: of a surface that bulges, it
         has a noisy cloud a little in front, and noise across an edge pulls that edge along. Where nothing is met, or
-        only a plane farther than ``far`` from the point, it is the nearest place all the same.
+        only a plane farther than ``far`` from the point, it is the nearest position all the same.
         """
         rows, met = first_faces(self._rays, self._center, points)
         toward, normal = points[rows], self.normals[met]
         corner = self.material[self.model.faces[self.facing[met], 0]]
         shares = np.einsum("pi,pi->p", normal, corner) / np.einsum("pi,pi->p", normal, toward)
-        there = toward * shares[:, None]
-        off = np.abs(np.einsum("pi,pi->p", normal, toward - there))
+        met_position = toward * shares[:, None]
+        off = np.abs(np.einsum("pi,pi->p", normal, toward - met_position))
         near = off <= far
         other = np.ones(len(points), dtype=bool)
         other[rows[near]] = False
-        distance, face, place = np.empty(len(points)), np.empty(len(points), dtype=np.int64), np.empty_like(points)
-        distance[~other], face[~other], place[~other] = off[near], met[near], there[near]  # rows are in order
+        distance, face, position = np.empty(len(points)), np.empty(len(points), dtype=np.int64), np.empty_like(points)
+        distance[~other], face[~other], position[~other] = off[near], met[near], met_position[near]  # rows are in order
         if other.any():
-            distance[other], face[other], place[other] = self.nearest(points[other])
-        return distance, face, place
+            distance[other], face[other], position[other] = self.nearest(points[other])
+        return distance, face, position
 
     @cached_property
     def _center(self) -> Float[np.ndarray, "3"]:
@@ -206,16 +214,16 @@ class Surface:
 
     def offsets(self, points: Float[np.ndarray, "p 3"], far: float | None = None) -> Float[np.ndarray, " p"]:
         """Signed distance of each point from the facing surface, negative behind it; with ``far``, ``along_sight``."""
-        distance, face, place = self.nearest(points) if far is None else self.along_sight(points, far)
-        return np.copysign(distance, np.einsum("pi,pi->p", points - place, self.normals[face]))
+        distance, face, position = self.nearest(points) if far is None else self.along_sight(points, far)
+        return np.copysign(distance, np.einsum("pi,pi->p", points - position, self.normals[face]))
 
     def planes(self, points: Float[np.ndarray, "p 3"], far: float) -> Planes:
         """Place of the facing surface along each point's line of sight, its normal and its modes."""
-        _, face, place = self.along_sight(points, far)
+        _, face, position = self.along_sight(points, far)
         corners = self.model.faces[self.facing[face]]
-        weight = barycentric(self.material[corners], place).astype(np.float32)
+        weight = barycentric(self.material[corners], position).astype(np.float32)
         modes = np.matmul(weight[:, None], self.model.modes[corners].reshape(len(points), 3, -1))
-        return place, self.normals[face], modes.reshape(len(points), 3, -1)
+        return position, self.normals[face], modes.reshape(len(points), 3, -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,10 +242,10 @@ class NetworkTerm:
     confidence: Float[np.ndarray, " n"]
 
     @classmethod
-    def of(cls, model: StatisticalModel, found: Correspondences) -> "NetworkTerm":
-        """Term of correspondences, whose rest places follow the model."""
-        weights = model.weights(found.rest, found.labels)
-        return cls(found.points, weights(model.mean), weights(model.modes), found.confidence)
+    def of(cls, model: StatisticalModel, correspondences: Correspondences) -> "NetworkTerm":
+        """Term of correspondences, whose rest positions follow the model."""
+        weights = model.weights(correspondences.rest, correspondences.labels)
+        return cls(correspondences.points, weights(model.mean), weights(model.modes), correspondences.confidence)
 
     @classmethod
     def none(cls, model: StatisticalModel) -> "NetworkTerm":
@@ -257,57 +265,57 @@ class NetworkTerm:
         return float(self.confidence / self.confidence.sum() @ robust_square(distance, sigma))
 
     def add_to(
-        self, normal: NormalEquations, posed: Posed, sigma: float, worth: float, robust: bool
+        self, normal: NormalEquations, posed: Posed, sigma: float, total_weight: float, robust: bool
     ) -> NormalEquations:
-        """Sum with the squared distances, together worth as many independent points as ``worth``."""
+        """Sum with the squared distances, together worth as many independent points as ``total_weight``."""
         if len(self.target) == 0:
             return normal
         points = self.place(posed)
         offset = points - self.target
-        weight = self.confidence / self.confidence.sum() * (worth / sigma**2)
+        weight = self.confidence / self.confidence.sum() * (total_weight / sigma**2)
         if robust:
             weight = weight * geman_mcclure(np.linalg.norm(offset, axis=1), ROBUST * sigma)
         return normal.add(in_space(posed, points, self.modes), offset.ravel(), np.repeat(weight, 3))
 
 
-def add_cloud(
-    normal: NormalEquations,
-    posed: Posed,
-    points: Float[np.ndarray, "p 3"],
-    planes: Planes,
-    sigma: float,
-    worth: float,
-) -> NormalEquations:
-    """Sum with each point's distance to its plane of the facing surface."""
-    return normal.add(*cloud_rows(posed, points, planes, sigma, worth))
-
-
-def cloud_rows(posed: Posed, points: Float[np.ndarray, "p 3"], planes: Planes, sigma: float, worth: float) -> Rows:
+def cloud_rows(
+    posed: Posed, points: Float[np.ndarray, "p 3"], planes: Planes, sigma: float, total_weight: float
+) -> Rows:
     """Each point's distance to its plane of the facing surface, its derivatives, and its weight."""
-    place, across, modes = planes
-    residual = np.einsum("pi,pi->p", across, place - points)
-    weight = geman_mcclure(residual, ROBUST * sigma) * (worth / len(points) / sigma**2)
-    return along(posed, place, modes, across), residual, weight
+    position, across, modes = planes
+    residual = np.einsum("pi,pi->p", across, position - points)
+    weight = geman_mcclure(residual, ROBUST * sigma) * (total_weight / len(points) / sigma**2)
+    return along(posed, position, modes, across), residual, weight
 
 
 def add_silhouette(
-    normal: NormalEquations, posed: Posed, samples: PosedSamples, evidence: Evidence, sigma: float
+    normal: NormalEquations,
+    posed: Posed,
+    points: Float[np.ndarray, "n 3"],
+    modes_at: Callable[[Int[np.ndarray, " r"]], Float32[np.ndarray, "r 3 k"]],
+    evidence: Evidence,
+    sigma: float,
 ) -> NormalEquations:
-    """Sum with the samples of the surface that are outside the silhouette or in free space."""
-    place = samples.place.astype(np.float64)
-    direction, amount = evidence.violations(place, ROBUST * sigma)
+    """Sum with those points of the surface that are outside the silhouette or in free space.
+
+    ``modes_at`` gives the modes of some of the points, by their rows.
+    """
+    direction, amount = evidence.violations(points, ROBUST * sigma)
     rows = np.flatnonzero(amount > 0)
     if len(rows) == 0:
         return normal
     rows = rows[:: max(1, -(-len(rows) // MOST_VIOLATIONS))]
-    jacobian = along(posed, place[rows], samples.surface.modes[rows, 0], direction[rows])
+    jacobian = along(posed, points[rows], modes_at(rows), direction[rows])
     weight = SILHOUETTE_WEIGHT / sigma**2 * geman_mcclure(amount[rows], 4 * ROBUST * sigma)
     return normal.add(jacobian, -amount[rows], weight)
 
 
-# --- priors -----------------------------------------------------------------------------------------------------------
+def silhouette_losses(points: Float[np.ndarray, "n 3"], evidence: Evidence, sigma: float) -> Float[np.ndarray, " n"]:
+    """Loss of each point of the surface by how far the frame rules it out, in squared sigmas."""
+    return robust_square(evidence.violations(points, ROBUST * sigma)[1], sigma, 4 * ROBUST)
 
-# What is known of the coefficients before a frame is seen: Gaussians of all states or of some, and kept distances.
+
+# --- priors -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -357,19 +365,46 @@ class PairTerm:
         return vector, np.linalg.norm(vector, axis=1)
 
     def add_to(
-        self, normal: NormalEquations, z: Float[np.ndarray, " k"], worth: float, slack: float
+        self, normal: NormalEquations, z: Float[np.ndarray, " k"], weight: float, slack: float
     ) -> NormalEquations:
-        """Sum with squared errors of all lengths, together worth ``worth`` points; ``slack`` is added to their std."""
+        """Sum with squared errors of all lengths, together worth ``weight`` points; ``slack`` is added to their std."""
         if len(self.std) == 0:
             return normal
         vector, length = self._vectors(z)
         direction = (vector / np.maximum(length, 1e-12)[:, None]).astype(np.float32)
         jacobian = np.zeros((len(length), POSE + len(z)), dtype=np.float32)
         jacobian[:, POSE:] = np.matmul(direction[:, None], self.modes)[:, 0]
-        return normal.add(jacobian, length - self.distance, worth / len(length) / (self.std**2 + slack**2))
+        return normal.add(jacobian, length - self.distance, weight / len(length) / (self.std**2 + slack**2))
 
     def energy(self, z: Float[np.ndarray, " k"]) -> float:
         """Mean squared error of the lengths, in standard deviations; 0 without pairs."""
         if len(self.std) == 0:
             return 0.0
         return float((((self._vectors(z)[1] - self.distance) / self.std) ** 2).mean())
+
+
+# --- all of them ---
+
+
+@dataclass(frozen=True, eq=False)
+class Terms:
+    """What a fit's normal equations at its optimum are made of.
+
+    Attributes:
+        known: without the frame: prior, scale, kept distances.
+        network: the correspondences.
+        cloud: distances of the observed samples from the surface, as rows.
+        observed_samples: the observed samples, camera frame, scene units.
+        ruled_out: silhouette and free space.
+    """
+
+    known: NormalEquations
+    network: NormalEquations
+    cloud: Rows
+    observed_samples: Float[np.ndarray, "n 3"]
+    ruled_out: NormalEquations
+
+    @cached_property
+    def total(self) -> NormalEquations:
+        """All of them together."""
+        return self.known.plus(self.network).add(*self.cloud).plus(self.ruled_out)

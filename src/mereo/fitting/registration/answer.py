@@ -1,18 +1,14 @@
-"""What is known of a frame once it is answered: the fits to it, and the answer, whose surfaces are made when asked for.
-
-``answer_frame`` makes it, a tracker too.
-"""
+"""The answer to a frame and the fits that led to it; its surfaces are made on first use."""
 
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from mereo.fitting.config import FoundBy, Tracking
-from mereo.fitting.registration.fit import ModesFit
 from mereo.fitting.registration.recognition import NOT_ASKED, Recognition
-from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.register import ModesFit, Registrar
 from mereo.fitting.registration.registration import Registration, nearest_labels
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import SegmentedMesh
@@ -64,10 +60,10 @@ class Candidate:
         return float((self.off_surface <= tolerance).mean())
 
     def displaced(self, registration: Registration) -> float | None:
-        """How far apart network and registration have the same places (``Signs.displaced``); None without a fit."""
+        """How far apart network and registration have the same points (``Signs.displaced``); None without a fit."""
         if self.modes is None:
             return None
-        return self.modes.found.displaced(registration.model, registration.material / self.modes.unit)
+        return self.modes.correspondences.displaced(registration.model, registration.material / self.modes.unit)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -86,10 +82,10 @@ class Answer:
         recognition: whether the frame shows the object, in a state that was learned; whoever answers.
         likelier: the hypothesis that is likelier without a fit, encoded: from it the network answers.
         resolution: cells along the longest side of the object's box in ``reconstruction``.
-        label_points: whether ``reconstruction`` also says on which segment each observed point lies.
+        label_points: whether ``reconstruction`` also labels the observed points by segment.
         seconds: that it took, without ``reconstruction``.
         found_by: who found the object; of a tracked answer, when it began to be followed.
-        tracking: of a tracked object; what is lost has no pose, and ``recognition`` says why.
+        tracking: of a tracked object; a lost one has no pose, and ``recognition`` has the reason.
     """
 
     seen: Observation
@@ -113,17 +109,17 @@ class Answer:
 
     @property
     def error(self) -> ValueError | None:
-        """Why no registration was found, where one was wanted, as it was raised."""
+        """Error of the registration, where one was wanted and none was found."""
         return None if self.candidate is None else self.candidate.error
 
     @property
     def refusal(self) -> str | None:
-        """Why no registration was found, where one was wanted."""
+        """Message of ``error``."""
         return None if self.error is None else str(self.error)
 
     @property
     def tracked(self) -> bool:
-        """Whether the last frame's state led to the answer, so that the network was not asked."""
+        """Whether the last frame's state led to the answer, without the network."""
         return self.tracking == "followed"
 
     @property
@@ -138,8 +134,8 @@ class Answer:
             return "lost"
         if self.registration is None:
             return "network alone" if self.refusal is None else f"network alone: {self.refusal}"
-        told = self.registration.told
-        return told if self.taken else f"network alone: the {told}, too few"
+        phrase = self.registration.told
+        return phrase if self.taken else f"network alone: the {phrase}, too few"
 
     @cached_property
     def registered(self) -> Registration | None:
@@ -171,17 +167,13 @@ class Answer:
 
     @property
     def encoded(self) -> EncodedFrame:
-        """Observed points of the registered model, and what the network makes of them; asked now where it was not."""
+        """Observed points of the registered model, encoded by the network, now where they were not before."""
         if self.candidate is not None and (self.model is None or self.candidate.encoded.code is not None):
             return self.candidate.encoded
         return encode_frame(self.hypothesis, self.model, self.seen.frame.axes)
 
 
 # --- surfaces ---------------------------------------------------------------------------------------------------------
-
-# Surfaces, label grid and figures of a registered model: the same that the network's answer has.
-#
-# EncodedFrame, Registration -registered_reconstruction-> Reconstruction
 
 
 def registered_reconstruction(
@@ -191,7 +183,7 @@ def registered_reconstruction(
     resolution: int = 128,
     label_points: bool = False,
 ) -> Reconstruction:
-    """Reconstruction that is the registered model itself, in the input's frame.
+    """Make the reconstruction that is the registered model itself, in the input's frame.
 
     Confidence stays the network's: its mean probability of a segment over the voxels that the registration gives it;
     NaN without a network.
@@ -199,8 +191,7 @@ def registered_reconstruction(
     seconds = {**seen.timings_s, "fit": registration.seconds}
     mesh = registration.mesh
     with timed(seconds, "label"):
-        low, high = mesh.bounds
-        grid = padded_label_grid(mesh, float((high - low).max()) / resolution)
+        grid = _label_grid(mesh, resolution)
     with timed(seconds, "measure"):
         segments = measure(Extraction(mesh, grid, 0), model, seen.code)
     observed = None
@@ -223,6 +214,16 @@ def registered_reconstruction(
     return result if seen.axes == "camera" else turned_back(result)
 
 
+def _label_grid(mesh: SegmentedMesh, resolution: int) -> LabelGrid:
+    """Labels of a mesh on a grid of so many cells along its longest side, with one empty voxel around it."""
+    low, high = mesh.bounds
+    spacing = float((high - low).max()) / resolution
+    counts = np.ceil((high - low) / spacing).astype(int) + 3
+    origin = (low + high - (counts - 1) * spacing) / 2
+    labels = label_grid(mesh, *(origin[axis] + np.arange(counts[axis]) * spacing for axis in range(3)))
+    return LabelGrid(labels, origin, np.full(3, spacing), mesh.names)
+
+
 def _observed(seen: EncodedFrame, registration: Registration, model: Trained | None) -> SegmentedCloud:
     """Segment of each observed point by the registration, with a network's probabilities of it, or NaN."""
     points = seen.seen.points
@@ -232,13 +233,3 @@ def _observed(seen: EncodedFrame, registration: Registration, model: Trained | N
         return SegmentedCloud(seen.points, labels, unknown, unknown, rest.names, rest.colors)
     logits = model.logits(seen.code, points)
     return segment_points(logits, seen.points, model.names, model.colors, model.calibration, labels)
-
-
-def padded_label_grid(mesh: SegmentedMesh, spacing: float) -> LabelGrid:
-    """Labels of a mesh on a grid with one empty voxel around it."""
-    low, high = mesh.bounds
-    counts = np.ceil((high - low) / spacing).astype(int) + 3
-    origin = (low + high - (counts - 1) * spacing) / 2
-    x, y, z = (origin[axis] + np.arange(counts[axis]) * spacing for axis in range(3))
-    labels: UInt8[np.ndarray, "x y z"] = label_grid(mesh, x, y, z)
-    return LabelGrid(labels, origin, np.full(3, spacing), mesh.names)

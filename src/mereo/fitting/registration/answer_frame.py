@@ -1,4 +1,4 @@
-"""The answer to one frame: the one way that every command and every public function goes.
+"""Answer one frame: the one way that every command and every public function goes.
 
 Observation -find-> Candidate (by network, by search, or the better of both) -fit draws-> Registration
 -recognize-> Recognition -> Answer
@@ -11,18 +11,16 @@ import numpy as np
 from jaxtyping import Float
 
 from mereo.fitting.config import FitConfig
-from mereo.fitting.modes.fit import fit_rest, is_at_rest
+from mereo.fitting.modes import fit_rest, is_at_rest
 from mereo.fitting.problem.correspondences import nothing
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.problem import Problem
 from mereo.fitting.problem.residuals import NetworkTerm, Surface
 from mereo.fitting.registration.answer import Answer, Candidate
-from mereo.fitting.registration.fit import CloudToFit, ModesFit
 from mereo.fitting.registration.recognition import Recognition, recognize
-from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.register import CloudToFit, ModesFit, Registrar
 from mereo.fitting.registration.registration import Registration
-from mereo.fitting.search.screening import Screen, tables_of
-from mereo.fitting.search.search import WHOLE, rotations, search
+from mereo.fitting.search import WHOLE, Screen, rotations, search, tables_of
 from mereo.geometry.camera import SightLines
 from mereo.geometry.transforms import transform_points
 from mereo.io.cores import one_blas_thread
@@ -34,19 +32,19 @@ from mereo.reconstruction.pipeline import EncodedFrame, encode_frame
 from mereo.scenes.statistical_model import StatisticalModel
 
 FORCED = 350.0
-"""Misfit of prior and ruled-out surface together from which a search is asked too.
+"""Misfit of prior and ruled-out surface together from which a search follows.
 
 Fits to whole clean training views have at most 150; fits that take a view whose half is hidden for a whole one have 400
 and more, although they explain its points."""
 
 ASTRAY = 0.25
-"""Distance between network and fit, in half lengths, from which a search is asked too: the network is no start there.
+"""Distance between network and fit, in half lengths, from which a search follows: the network is no start there.
 
 Of 48 clean training views of six shipped objects none has more than .1, under a camera's noise one in six has; weights
 after 40 seconds of training have .3 to .5 in each view, where their fits explain the points by chance at most."""
 
 HIDDEN = 0.12
-"""Share of the silhouette beside which nothing is known from which a search is asked too, as a part is hidden.
+"""Share of the silhouette beside which nothing is known from which a search follows, as a part is hidden.
 
 Whole clean views have at most .03, those of which a tool hides 30 % .01 to .32, others that are cut .15 to .57."""
 
@@ -61,7 +59,7 @@ def answer_frame(
     resolution: int = 128,
     label_points: bool = False,
 ) -> Answer:
-    """Answer to a frame, wherever it comes from.
+    """Answer a frame, wherever it comes from.
 
     Args:
         seen: the object in the frame, outliers among its points.
@@ -73,7 +71,7 @@ def answer_frame(
         scene_unit: length of a scene unit in the frame's unit, where it is known for certain. Otherwise it follows
             from the frame's unit (where a network's estimate agrees), or is found together with the pose.
         resolution: cells along the longest side of the object's box in ``Answer.reconstruction``.
-        label_points: let ``Answer.reconstruction`` also say on which segment each observed point lies.
+        label_points: let ``Answer.reconstruction`` also label the observed points by segment.
 
     Raises ``ValueError`` for unusable clouds, and where nothing is found and no network can answer.
     """
@@ -99,7 +97,7 @@ def answer_of(
     likelier: EncodedFrame,
     registration: Registration | None,
 ) -> Answer:
-    """Answer from the best candidate and its registration: recognize the object, and choose who answers."""
+    """Make the answer of the best candidate: recognize the object, and choose between registration and network."""
     displaced = None if registration is None else candidate.displaced(registration)
     stated = None if registrar is None else registrar.stated_scene_unit(seen.frame.unit_m)
     refusal = None if candidate.error is None else str(candidate.error)
@@ -107,7 +105,7 @@ def answer_of(
     taken = registrar is not None and registration is not None and registrar.takes(registration)
     hypothesis = candidate.hypothesis if taken else likelier.reading
     if taken and registrar is not None and registration is not None:
-        seen = in_found_unit(seen, registrar, registration, recognition)
+        seen = in_registered_unit(seen, registrar, registration, recognition)
     return Answer(
         seen=seen.read_as(hypothesis),
         model=model,
@@ -123,7 +121,7 @@ def answer_of(
     )
 
 
-def in_found_unit(
+def in_registered_unit(
     seen: Observation, registrar: Registrar, registration: Registration, recognition: Recognition
 ) -> Observation:
     """Observation in the unit that a registration finds, where the frame knows none; another object's says nothing."""
@@ -136,26 +134,27 @@ def in_found_unit(
 def find(
     seen: Observation, model: Trained | None, registrar: Registrar | None, keep_all: bool, scene_unit: float | None
 ) -> tuple[Candidate, EncodedFrame]:
-    """Best fit to a frame by itself, and the hypothesis on its points that is likelier without a fit.
+    """Find the best fit to a frame by itself, and the hypothesis on its points that is likelier without a fit.
 
-    A network starts the fit where there is one, in tenths of a second; where that does not explain the frame, or only
-    with an unlikely state, or far from where the network has the object, and where a part of the object is hidden, a
-    search is asked too, and the fit with the greater evidence is taken. Takes the arguments of ``answer_frame``, and
-    raises as it does for unusable clouds.
+    A network starts the fit where there is one, in tenths of a second; where that is doubtful (``is_doubtful``), a
+    search follows, and the fit with the greater evidence is taken. Takes the arguments of ``answer_frame``, and raises
+    as it does for unusable clouds.
     """
     if registrar is not None and not registrar.asks_network:
         return search_hypotheses(seen, registrar, keep_all, scene_unit)
     assert model is not None
-    found, likelier = fit_hypotheses(seen, model, registrar, keep_all, scene_unit)
-    if registrar is None or not registrar.asks_search or not is_doubtful(seen, found):
-        return found, likelier
+    candidate, likelier = fit_hypotheses(seen, model, registrar, keep_all, scene_unit)
+    if registrar is None or not registrar.asks_search or not is_doubtful(seen, candidate):
+        return candidate, likelier
     searched, _ = search_hypotheses(seen, registrar, keep_all, scene_unit)
-    return more_evident(found, searched), likelier
+    return more_evident(candidate, searched), likelier
 
 
-def is_doubtful(seen: Observation, found: Candidate) -> bool:
+def is_doubtful(seen: Observation, candidate: Candidate) -> bool:
     """Whether a search may find the object where the network's fit has not."""
-    return not found.is_accepted or is_forced(found) or is_astray(found) or is_hidden_in_part(seen, found)
+    return (
+        not candidate.is_accepted or is_forced(candidate) or is_astray(candidate) or is_hidden_in_part(seen, candidate)
+    )
 
 
 def is_forced(candidate: Candidate) -> bool:
@@ -192,8 +191,7 @@ def more_evident(first: Candidate, second: Candidate) -> Candidate:
         return first if second.modes is None else second
     if second.is_accepted and not first.is_accepted:
         return second
-    one, other = first.modes.problem.evidence.other_lines, second.modes.problem.evidence.other_lines
-    if one == other:
+    if first.modes.problem.evidence.other_lines == second.modes.problem.evidence.other_lines:
         return second if misfit_in(first.modes, second.modes) < misfit_in(first.modes, first.modes) else first
     cost = [
         misfit_in(each, each) + (WHOLE if each.problem.evidence.other_lines == "unknown" else 0.0)
@@ -213,15 +211,9 @@ def misfit_in(frame: ModesFit, fitted: ModesFit) -> float:
 
 # --- outlier hypotheses -----------------------------------------------------------------------------------------------
 
-# Which of a frame's points belong to the object: each hypothesis is fitted, and the fits decide.
-#
-#     Observation -hypotheses-> which points belong to the object -encode, fit modes-> Candidate of each hypothesis
-#         -choose-> the best candidate
-#
 # Outliers move the box that the network's frame is made from, thin parts of the object look like outliers, and geometry
-# alone cannot tell them apart (``reconstruction.isolation``). A model that explains the points can. A network is quick,
-# and is asked about every hypothesis; a search takes seconds, and goes on to the next where the first explains too
-# little.
+# alone cannot tell them apart (``reconstruction.isolation``), so a fit to each hypothesis decides. A network is quick,
+# and starts a fit to each; a search takes seconds, and goes on to the next where the first explains too little.
 
 CLEARLY = 0.05
 """Share of all points that the hypothesis with every point must explain beyond the others: outliers pull its fit
@@ -233,9 +225,6 @@ point is kept. The fit to all explains .86 and more of them on clean views, and 
 
 SMALLEST, LARGEST = 0.05, 3.0
 """Longest side of a view, in those of the object at rest, beyond which a unit is wrong or the cloud another thing's."""
-
-AS_WELL = 0.01
-"""Share of all points that a fit with points given back may explain less."""
 
 
 def fit_hypotheses(
@@ -265,7 +254,7 @@ def fit_hypotheses(
 
     if len(hypotheses) == 1:
         return fit(likelier, registrar), likelier
-    # beside outliers much stays unexplained in any case, which is no reason to ask again
+    # with outliers much stays unexplained in any case, which is no reason to turn the camera
     quick = registrar.without_retries
     pair = fit(likelier, quick), fit(encode_frame(hypotheses[1], model, axes), quick)
     everything, surfaces = sorted(pair, key=lambda candidate: candidate.hypothesis.dropped)
@@ -293,7 +282,7 @@ def search_hypotheses(
     the likelier hypothesis.
     """
     unit, axes = registrar.stated_scene_unit(seen.frame.unit_m) if scene_unit is None else scene_unit, seen.frame.axes
-    likelier, *others = (encode_frame(one, None, axes) for one in readings(seen.cloud, axes, keep_all))
+    likelier, *others = (encode_frame(reading, None, axes) for reading in readings(seen.cloud, axes, keep_all))
     best = _searched(likelier, registrar, unit, seen.lines)
     for other in others:
         if best.is_accepted:
@@ -302,11 +291,11 @@ def search_hypotheses(
     return best, likelier
 
 
-def _searched(frame: EncodedFrame, registrar: Registrar, scene_unit: float | None, beside: SightLines) -> Candidate:
-    """Candidate of one hypothesis by a search; ``beside`` are the lines of sight beside the object."""
+def _searched(frame: EncodedFrame, registrar: Registrar, scene_unit: float | None, lines: SightLines) -> Candidate:
+    """Candidate of one hypothesis by a search; ``lines`` are the lines of sight beside the object."""
     try:
         check_size(frame, registrar.model, scene_unit)
-        modes = search_modes(cloud_to_fit(frame, beside, scene_unit), registrar.model, registrar.config)
+        modes = search_modes(cloud_to_fit(frame, lines, scene_unit), registrar.model, registrar.config)
     except ValueError as error:
         return Candidate(frame, error=error, found_by="search")
     return Candidate(frame, modes, found_by="search")
@@ -339,8 +328,10 @@ def check_size(frame: EncodedFrame, model: StatisticalModel, scene_unit: float |
 def _are_object(everything: Candidate, surfaces: Candidate) -> bool:
     """Whether the points that one hypothesis drops are the object's: either fit explains them."""
     dropped = ~surfaces.hypothesis.keep
-    fits = [(one, one.modes) for one in (everything, surfaces) if one.modes is not None]
-    return bool(max((one.off_surface[dropped] <= modes.tolerance).mean() for one, modes in fits) > GIVEN_BACK)
+    fits = [(candidate, candidate.modes) for candidate in (everything, surfaces) if candidate.modes is not None]
+    return bool(
+        max((candidate.off_surface[dropped] <= modes.tolerance).mean() for candidate, modes in fits) > GIVEN_BACK
+    )
 
 
 def _with_explained_given_back(surfaces: Candidate) -> Reading | None:
@@ -353,11 +344,11 @@ def _with_explained_given_back(surfaces: Candidate) -> Reading | None:
 def _most_explained(everything: Candidate, surfaces: Candidate, again: Candidate) -> Candidate:
     """Choose among every point, the points on surfaces, and these with explained points given back."""
     candidates = everything, surfaces, again
-    tolerance = min(one.modes.tolerance for one in candidates if one.modes is not None)
-    by_all, by_surfaces, by_again = (one.explained(tolerance) for one in candidates)
+    tolerance = min(candidate.modes.tolerance for candidate in candidates if candidate.modes is not None)
+    by_all, by_surfaces, by_again = (candidate.explained(tolerance) for candidate in candidates)
     if by_all >= max(by_surfaces, by_again) + CLEARLY:
         return everything
-    return again if by_again >= by_surfaces - AS_WELL else surfaces
+    return again if by_again >= by_surfaces - 0.01 else surfaces
 
 
 def better(first: Candidate, second: Candidate) -> Candidate:
@@ -370,20 +361,13 @@ def better(first: Candidate, second: Candidate) -> Candidate:
 
 # --- the search -------------------------------------------------------------------------------------------------------
 
-# Fit of the modes to a frame, found by search instead of from a network's correspondences.
-#
-# cloud, lines of sight, statistical model -search-> ModesFit
-
-ROTATIONS = 200
-"""Rotations by which the size of an object is guessed from its cloud."""
-
 
 def search_modes(
     cloud: CloudToFit,
     model: StatisticalModel,
     config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
 ) -> ModesFit:
-    """Fit of the modes to a cloud, found by search; where it leaves open what is beside it, the fits decide."""
+    """Fit the modes to a cloud by search; where it leaves open what lies beside it, the fits decide."""
     started = time.perf_counter()
     with one_blas_thread():
         unit = size_of(cloud.points, model) if cloud.scene_unit is None else cloud.scene_unit
@@ -391,21 +375,16 @@ def search_modes(
         evidence = cloud.evidence(unit)
         whole = Problem(model, NetworkTerm.none(model), evidence, cloud.scale_std(config), config)
         partial = replace(whole, evidence=replace(evidence, other_lines="unknown")) if is_open else None
-        found = search(whole, partial)
-        problem, modes = found.problem, found.best
+        outcome = search(whole, partial)
+        problem, modes = outcome.problem, outcome.best
         rest = fit_rest(problem, nothing(), modes.posed)
         at_rest = is_at_rest(problem, modes, rest)
     seconds = time.perf_counter() - started
-    return ModesFit(problem, nothing(), unit, modes.posed, seconds, rest if at_rest else None, alike=found.alike)
+    return ModesFit(problem, nothing(), unit, modes.posed, seconds, rest if at_rest else None, alike=outcome.alike)
 
 
 def size_of(points: Float[np.ndarray, "n 3"], model: StatisticalModel) -> float:
-    """Length of a scene unit by the cloud's extent: the median over all rotations of the mean state.
-
-    Args:
-        points: the cloud, seen from the origin, any unit.
-        model: the statistical model.
-    """
+    """Guess a scene unit's length from a cloud seen from the origin: the median over rotations of the mean state."""
     evidence = Evidence.of(points)
-    poses = Screen.of(tables_of(model, 0), evidence, model.half, scaled=True).starts(rotations(ROTATIONS))
+    poses = Screen.of(tables_of(model, 0), evidence, model.half, scaled=True).starts(rotations(200))
     return float(np.exp(np.median(poses.log_scale)))

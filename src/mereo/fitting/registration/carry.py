@@ -1,4 +1,4 @@
-"""Carry: what is defined in the rest model comes to where the object is, its inside included.
+"""Carry what is defined in the rest model to where the object is, its inside included.
 
 Attachment -place-> Placed (rest model, scene units) -carry-> Carried (frame and unit of a registration)
 
@@ -27,18 +27,13 @@ from mereo.scenes.statistical_model import StatisticalModel
 
 # --- volumes ----------------------------------------------------------------------------------------------------------
 
-# Volumes along a registration: each voxel of a grid around the object asks what was there at rest.
-#
 # output voxel -to_rest-> rest model, scene units -T_index_scene-> voxel index of the source -interpolation-> value
 #
-# ``Registration.to_rest`` takes a minute for a million points, so it is asked at the corners of cells of 4 voxels, then
-# of 2, and linearly interpolated in those at whose centre that is right; in all others every voxel is asked.
+# ``Registration.to_rest`` takes a minute for a million points, so it is called at the corners of cells of 4 voxels,
+# then of 2, and linearly interpolated in those at whose centre that is right; in all others it is called everywhere.
 
 Interpolation = Literal["auto", "linear", "nearest"]
 """Linear for intensities, nearest for labels; "auto" tells them apart (``is_labels``)."""
-
-MOST_VOXELS = 16_000_000
-"""Voxels of a grid at most; with more its spacing is widened."""
 
 MARGIN = 0.05
 """Width of what is carried around the object, of half the rest box's longest side."""
@@ -50,14 +45,11 @@ TOLERANCE = 0.04
 """Voxels of the source by which that may be off at a cell's centre. Elsewhere in it, where the nearest material points
 change, it is up to twice as much: inside the object less than 0.1."""
 
-ASKED_AT_ONCE = 2000
-"""Points that ``to_rest`` is asked about at once: of more its weights leave the cache, and it takes twice as long."""
+QUERIES_AT_ONCE = 2000
+"""Points in one call of ``to_rest``: of more its weights leave the cache, and it takes twice as long."""
 
 CELLS_AT_ONCE = 1024
 POINTS_AT_ONCE = 500_000
-
-SAMPLES = 24
-"""Places along each axis of a volume at which it is asked whether it lies in the object."""
 
 CUBE = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
 
@@ -80,40 +72,29 @@ class Resampled:
 
 
 def resampled(
-    source: Volume,
-    registration: Registration,
-    interpolation: Interpolation = "auto",
-    background: float | None = None,
-    spacing: float | None = None,
-    most: int = MOST_VOXELS,
+    source: Volume, registration: Registration, interpolation: Interpolation = "auto", most: int = 16_000_000
 ) -> Resampled:
-    """A volume that was defined in the rest model, on a grid around the registered object.
+    """Resample a volume that was defined in the rest model on a grid around the registered object.
 
     Voxels inside the object have the source's value where they were at rest, and so have those around it, up to
-    ``MARGIN``, as if they moved along with the nearest segment. All others have the background's value.
+    ``MARGIN``, as if they moved along with the nearest segment. All others have the source's least value, in its own
+    meaning (after its slope and intercept).
 
     Args:
         source: its ``T_world_index`` leads to scene units of the rest model.
         registration: of the object.
         interpolation: "linear", "nearest", or "auto": nearest for labels, linear for all else.
-        background: value elsewhere, in the source's own meaning (after its slope and intercept); by default its least.
-        spacing: between voxel centres, in the registration's unit; by default the source's finest, widened where the
-            grid would have more than ``most`` voxels.
-        most: voxels of the grid.
-
-    Raises ``ValueError`` for a background that the source's type cannot hold.
+        most: voxels of the grid; its spacing is the source's finest, widened where the grid would have more.
     """
-    wanted = float(source.spacing.min()) * registration.scene_unit if spacing is None else spacing
     margin = MARGIN * registration.model.half * registration.scene_unit
-    grid = _Grid.around(registration.mesh.bounds, margin, wanted, most)
+    grid = _Grid.around(registration.mesh.bounds, margin, float(source.spacing.min()) * registration.scene_unit, most)
     owner, inside = grid.owners(registration.solids, margin)
     if interpolation == "auto":
         interpolation = "nearest" if is_labels(source) else "linear"
-    sampler = _Sampler(source, interpolation, _stored(source, background))
-    values = np.full(grid.shape, sampler.background, dtype=source.values.dtype)
-    within = 0
-    for label in range(1, len(registration.mesh.segments) + 1):
-        within += _fill(values, owner == label, label, inside, grid, registration, sampler)
+    background = (source.values.max() if source.slope < 0 else source.values.min()).item()
+    values = np.full(grid.shape, background, dtype=source.values.dtype)
+    fill = _Fill(source, interpolation, background, grid, registration, values, inside)
+    within = sum(fill.segment(label, owner == label) for label in range(1, len(registration.mesh.segments) + 1))
     volume = replace(source, values=values, T_world_index=grid.T_world_index)
     return Resampled(volume, int(inside.sum()), within, interpolation)
 
@@ -124,18 +105,18 @@ def check_overlap(
     """Raise ``ValueError`` for a volume, in scene units, without any voxel in the object."""
     if volume.holds(volume.index_of(model.rest_points)).any():
         return
-    ticks = [np.linspace(-0.5, n - 0.5, SAMPLES) for n in volume.values.shape]
+    ticks = [np.linspace(-0.5, n - 0.5, 24) for n in volume.values.shape]
     sample = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
     if solids.label(transform_points(volume.T_world_index, sample)).any():
         return
-    there, own = (
+    volume_extent, object_extent = (
         " to ".join(str(corner.round(2).tolist()) for corner in _box(np.linalg.inv(T_scene_file), bounds))
         for bounds in (volume.bounds, model.rest.bounds)
     )
     raise ValueError(
-        f"{name} holds nothing of the object: in RAS its voxels lie from {there}, and the object's own files from "
-        f"{own}; both must have one frame and unit: export the volume in that of the object's own files, or say "
-        "--carry-frame scene if it is in scene units"
+        f"{name} holds nothing of the object: in RAS its voxels lie from {volume_extent}, and the object's own files "
+        f"from {object_extent}; both must have one frame and unit: export the volume in that of the object's own "
+        "files, or say --carry-frame scene if it is in scene units"
     )
 
 
@@ -143,23 +124,6 @@ def _box(T: Float[np.ndarray, "4 4"], bounds: Float[np.ndarray, "2 3"]) -> Float
     """Axis-aligned box around a transformed box."""
     corners = transform_points(T, np.stack(np.meshgrid(*bounds.T, indexing="ij"), axis=-1).reshape(-1, 3))
     return np.stack([corners.min(axis=0), corners.max(axis=0)])
-
-
-def _stored(source: Volume, background: float | None) -> float | int:
-    """Value of the background as it is stored; by default that of the least value."""
-    if background is None:
-        return (source.values.max() if source.slope < 0 else source.values.min()).item()
-    value = (background - source.intercept) / source.slope
-    if source.values.dtype.kind == "f":
-        return value
-    limits = np.iinfo(source.values.dtype)
-    if not limits.min <= round(value) <= limits.max:
-        raise ValueError(
-            f"the background is {background:g}; the volume's type {source.values.dtype} holds "
-            f"{source.slope * limits.min + source.intercept:g} to {source.slope * limits.max + source.intercept:g}: "
-            "choose a value between them"
-        )
-    return round(value)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,6 +163,10 @@ class _Grid:
         """Positions of voxel indices, which may have fractions."""
         return self.origin + self.spacing * index
 
+    def at_rows(self, rows: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+        """Positions of voxels by their rows in the flattened grid."""
+        return self.at(np.stack(np.unravel_index(rows, self.shape), axis=1))
+
     def owners(self, solids: Solids, margin: float) -> tuple[UInt8[np.ndarray, "x y z"], Bool[np.ndarray, "x y z"]]:
         """Label of the segment that each voxel moves along with, 0 beyond the margin, and whether it is inside it."""
         x, y, z = (self.origin[axis] + self.spacing * np.arange(self.shape[axis]) for axis in range(3))
@@ -212,89 +180,85 @@ class _Grid:
         rows = rows[owner.ravel()[rows] == 0]
         for first in range(0, len(rows), POINTS_AT_ONCE):
             part = rows[first : first + POINTS_AT_ONCE]
-            found = solids.nearest(self.at(np.stack(np.unravel_index(part, self.shape), axis=1)))
-            owner.reshape(-1)[part] = np.where(found.distance <= margin, found.owner + 1, 0)
+            nearest = solids.nearest(self.at_rows(part))
+            owner.reshape(-1)[part] = np.where(nearest.distance <= margin, nearest.owner + 1, 0)
         return owner, inside
 
 
 @dataclass(frozen=True, eq=False)
-class _Sampler:
-    """Values of a source between its voxels; outside them the background."""
+class _Fill:
+    """Fills the voxels of a grid around the registered object with the values of a source.
+
+    Attributes:
+        source, interpolation, background: what is resampled, how, and the value outside its voxels.
+        grid, registration: where the voxels are, and where the object is.
+        values: of the voxels, filled in place.
+        inside: which of them lie in a segment.
+    """
 
     source: Volume
     interpolation: Interpolation
     background: float | int
+    grid: _Grid
+    registration: Registration
+    values: Shaped[np.ndarray, "x y z"]
+    inside: Bool[np.ndarray, "x y z"]
 
-    def __call__(self, index: Float[np.ndarray, "n 3"]) -> tuple[Shaped[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-        """Values at indices with fractions, as they are stored, and whether these lie in a voxel."""
-        values, held = self.source.values, self.source.holds(index)
+    def segment(self, label: int, todo: Bool[np.ndarray, "x y z"]) -> int:
+        """Fill one segment's voxels, ``todo``; returns how many of them inside the object were within the source."""
+        open_, within, shape = todo.reshape(-1), 0, self.grid.shape
+        for side in CELLS:
+            cells = np.argwhere(todo.reshape([part for n in shape for part in (n // side, side)]).any(axis=(1, 3, 5)))
+            corners, right = self._corners(cells, side, label)
+            share = _offsets(side)[:, None] / side
+            weights = np.where(CUBE, share, 1 - share).prod(axis=2)  # trilinear
+            cells, corners = cells[right], corners[right]
+            for first in range(0, len(cells), CELLS_AT_ONCE):
+                part = slice(first, first + CELLS_AT_ONCE)
+                rows = _flat(side * cells[part, None] + _offsets(side), shape)
+                wanted = open_[rows]
+                within += self._put(rows[wanted], (weights @ corners[part])[wanted], open_)
+        left = np.flatnonzero(open_)
+        for first in range(0, len(left), POINTS_AT_ONCE):
+            rows = left[first : first + POINTS_AT_ONCE]
+            index = _source_index(self.grid.at_rows(rows), label, self.registration, self.source)
+            within += self._put(rows, index, open_)
+        return within
+
+    def _put(self, rows: Int[np.ndarray, " n"], index: Float[np.ndarray, "n 3"], open_: Bool[np.ndarray, " v"]) -> int:
+        """Fill voxels with the source's values at indices with fractions, and close them."""
+        source, held = self.source.values, self.source.holds(index)
         if self.interpolation == "nearest":
-            nearest = np.clip(np.rint(index).astype(np.int64), 0, np.array(values.shape) - 1)
-            found = values[tuple(nearest.T)]
+            nearest = np.clip(np.rint(index).astype(np.int64), 0, np.array(source.shape) - 1)
+            sampled = source[tuple(nearest.T)]
         else:
-            smooth = map_coordinates(values, index.T, order=1, mode="nearest", output=np.float64)
-            found = (np.rint(smooth) if values.dtype.kind in "iu" else smooth).astype(values.dtype)
-        found[~held] = self.background
-        return found, held
-
-
-def _fill(
-    values: Shaped[np.ndarray, "x y z"],
-    todo: Bool[np.ndarray, "x y z"],
-    label: int,
-    inside: Bool[np.ndarray, "x y z"],
-    grid: _Grid,
-    registration: Registration,
-    sampler: _Sampler,
-) -> int:
-    """Put the values of one segment's voxels, ``todo``, in place; returns how many inside were within the source."""
-    flat, open_, of_object = values.reshape(-1), todo.reshape(-1), inside.reshape(-1)
-    within = 0
-
-    def put(rows: Int[np.ndarray, " n"], index: Float[np.ndarray, "n 3"]) -> int:
-        flat[rows], held = sampler(index)
+            smooth = map_coordinates(source, index.T, order=1, mode="nearest", output=np.float64)
+            sampled = (np.rint(smooth) if source.dtype.kind in "iu" else smooth).astype(source.dtype)
+        sampled[~held] = self.background
+        self.values.reshape(-1)[rows] = sampled
         open_[rows] = False
-        return int((held & of_object[rows]).sum())
+        return int((held & self.inside.reshape(-1)[rows]).sum())
 
-    for side in CELLS:
-        blocks = todo.reshape([part for n in grid.shape for part in (n // side, side)]).any(axis=(1, 3, 5))
-        cells = np.argwhere(blocks)
-        corners, right = _corners(cells, side, label, grid, registration, sampler.source)
-        weights = _trilinear(side)
-        cells, corners = cells[right], corners[right]
-        for first in range(0, len(cells), CELLS_AT_ONCE):
-            part = slice(first, first + CELLS_AT_ONCE)
-            rows = _flat(side * cells[part, None] + _offsets(side), grid.shape)
-            wanted = open_[rows]
-            within += put(rows[wanted], (weights @ corners[part])[wanted])
-    left = np.flatnonzero(open_)
-    for first in range(0, len(left), POINTS_AT_ONCE):
-        rows = left[first : first + POINTS_AT_ONCE]
-        places = grid.at(np.stack(np.unravel_index(rows, grid.shape), axis=1))
-        within += put(rows, _source_index(places, label, registration, sampler.source))
-    return within
-
-
-def _corners(
-    cells: Int[np.ndarray, "n 3"], side: int, label: int, grid: _Grid, registration: Registration, source: Volume
-) -> tuple[Float[np.ndarray, "n 8 3"], Bool[np.ndarray, " n"]]:
-    """Indices in the source of cells' corners, and whether they may be interpolated, judged by the cells' centres."""
-    shape = [n // side + 1 for n in grid.shape]
-    nodes, place = np.unique(_flat(cells[:, None] + CUBE, shape), return_inverse=True)
-    at_nodes = side * np.stack(np.unravel_index(nodes, shape), axis=1)
-    corners = _source_index(grid.at(at_nodes), label, registration, source)[place.reshape(-1, 8)]
-    centers = _source_index(grid.at(side * (cells + 0.5)), label, registration, source)
-    return corners, np.linalg.norm(corners.mean(axis=1) - centers, axis=1) <= TOLERANCE
+    def _corners(
+        self, cells: Int[np.ndarray, "n 3"], side: int, label: int
+    ) -> tuple[Float[np.ndarray, "n 8 3"], Bool[np.ndarray, " n"]]:
+        """Indices in the source of cells' corners, and whether they may be interpolated, by the cells' centres."""
+        shape = [n // side + 1 for n in self.grid.shape]
+        nodes, row = np.unique(_flat(cells[:, None] + CUBE, shape), return_inverse=True)
+        at_nodes = side * np.stack(np.unravel_index(nodes, shape), axis=1)
+        corners = _source_index(self.grid.at(at_nodes), label, self.registration, self.source)[row.reshape(-1, 8)]
+        centers = _source_index(self.grid.at(side * (cells + 0.5)), label, self.registration, self.source)
+        return corners, np.linalg.norm(corners.mean(axis=1) - centers, axis=1) <= TOLERANCE
 
 
 def _source_index(
-    places: Float[np.ndarray, "n 3"], label: int, registration: Registration, source: Volume
+    points: Float[np.ndarray, "n 3"], label: int, registration: Registration, source: Volume
 ) -> Float[np.ndarray, "n 3"]:
-    """Voxel indices, with fractions, of where places were at rest that move along with a segment."""
-    rest = np.empty_like(places)
-    for first in range(0, len(places), ASKED_AT_ONCE):
-        part = places[first : first + ASKED_AT_ONCE]
-        rest[first : first + ASKED_AT_ONCE] = registration.to_rest(part, np.full(len(part), label, dtype=np.uint8))
+    """Voxel indices, with fractions, of where points that move along with a segment were at rest."""
+    rest = np.empty_like(points)
+    for first in range(0, len(points), QUERIES_AT_ONCE):
+        part = points[first : first + QUERIES_AT_ONCE]
+        rest[first : first + QUERIES_AT_ONCE] = registration.to_rest(part, np.full(len(part), label, dtype=np.uint8))
     return source.index_of(rest)
 
 
@@ -303,30 +267,12 @@ def _offsets(side: int) -> Int[np.ndarray, "v 3"]:
     return np.argwhere(np.ones((side, side, side), dtype=bool))
 
 
-def _trilinear(side: int) -> Float[np.ndarray, "v 8"]:
-    """Weights of a cell's corners at its voxels."""
-    share = _offsets(side)[:, None] / side
-    return np.where(CUBE, share, 1 - share).prod(axis=2)
-
-
-def _flat(index: Int[np.ndarray, "*n 3"], shape: "tuple[int, int, int] | list[int]") -> Int[np.ndarray, "*n"]:
-    """Positions in the flattened array."""
+def _flat(index: Int[np.ndarray, "*n 3"], shape: Sequence[int]) -> Int[np.ndarray, "*n"]:
+    """Rows in the flattened array."""
     return np.ravel_multi_index(tuple(np.moveaxis(index, -1, 0)), tuple(shape))
 
 
 # --- carry ------------------------------------------------------------------------------------------------------------
-
-LONGEST_EDGE = 0.05
-"""Longest edge of a carried mesh, of half the rest box's longest side: with longer ones a plane could not bend."""
-
-MOST_FACES = 2_000_000
-
-LEAST_SHARE = 1e-3
-TINY = 1e-6
-"""Distance in scene units below which a point is on the surface."""
-
-STEP = 1e-3
-"""Step of the map's Jacobian, of half the rest box's longest side."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -418,7 +364,7 @@ class CarriedVolume(Carried):
 
 
 def place(attachments: Sequence[Attachment], registrar: Registrar, frame: CarryFrame = "source") -> tuple[Placed, ...]:
-    """Attachments in the rest model.
+    """Bring attachments into the rest model.
 
     Args:
         attachments: in the frame and unit that ``frame`` names.
@@ -430,25 +376,19 @@ def place(attachments: Sequence[Attachment], registrar: Registrar, frame: CarryF
     """
     T_scene_file = np.eye(4) if frame == "scene" else _source_frame(registrar).T_scene_source
     solids = Solids(registrar.model.rest)
-    return tuple(_placed(one, T_scene_file, registrar.model, solids) for one in attachments)
+    return tuple(_placed(attachment, T_scene_file, registrar.model, solids) for attachment in attachments)
 
 
 def carry(placed: Placed, registration: Registration, interpolation: Interpolation = "auto") -> Carried:
-    """An attachment where the registered object is: points move along with their segments, poses turn as they do.
+    """Carry an attachment to where the registered object is: points move along with their segments, poses turn so too.
 
     A volume is resampled around the object, with this interpolation (``resampled``).
     """
     content = placed.content
     if isinstance(content, Volume):
-        found, around = resampled(content, registration, interpolation), MARGIN * registration.model.half
-        return CarriedVolume(
-            placed.name,
-            found.volume,
-            found.inside,
-            around * registration.scene_unit,
-            found.within,
-            found.interpolation,
-        )
+        result, margin = resampled(content, registration, interpolation), MARGIN * registration.model.half
+        farthest = margin * registration.scene_unit
+        return CarriedVolume(placed.name, result.volume, result.inside, farthest, result.within, result.interpolation)
     points = moved(registration, content.points, placed.shares)
     rotations = None
     if content.rotations is not None:
@@ -460,7 +400,7 @@ def carry(placed: Placed, registration: Registration, interpolation: Interpolati
 def moved(
     registration: Registration, points: Float[np.ndarray, "n 3"], shares: Float[np.ndarray, "n s"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Positions where the registered object is of points at rest that move along with segments by ``shares``."""
+    """Move points at rest, which go along with segments by ``shares``, to where the registered object is."""
     result = np.zeros_like(points)
     for index, share in enumerate(shares.T):
         rows = np.flatnonzero(share > 0)
@@ -473,14 +413,8 @@ def moved(
 def local_rotations(
     registration: Registration, points: Float[np.ndarray, "n 3"], shares: Float[np.ndarray, "n s"]
 ) -> Float[np.ndarray, "n 3 3"]:
-    """Rotation of the surroundings of points at rest: the polar factor of the map's Jacobian there.
-
-    Args:
-        registration: of the object.
-        points: rest pose, scene units.
-        shares: of the segments in their motion.
-    """
-    step = STEP * registration.model.half
+    """Return the rotation of the surroundings of points at rest: the polar factor of the map's Jacobian."""
+    step = 1e-3 * registration.model.half
     columns = [
         moved(registration, points + along, shares) - moved(registration, points - along, shares)
         for along in step * np.eye(3)
@@ -489,15 +423,15 @@ def local_rotations(
 
 
 def _source_frame(registrar: Registrar) -> SourceFrame:
-    found = registrar.model.source_frame
-    if found is None and registrar.given is not None:
-        found = registrar.given.source_frame
-    if found is None:
+    frame = registrar.model.source_frame
+    if frame is None and registrar.given is not None:
+        frame = registrar.given.source_frame
+    if frame is None:
         raise ValueError(
             f"the weights of {', '.join(registrar.model.rest.names)} do not say how the object's own files lie in the "
             "scene: name the object's scene file with --scene, or carry files in scene units with --carry-frame scene"
         )
-    return found
+    return frame
 
 
 def _placed(
@@ -511,12 +445,12 @@ def _placed(
     content = _transformed(attachment.content, T_scene_file)
     _check_near(attachment.name, _shares(solids, content.points)[1], 2 * model.half)
     if isinstance(content, Surfaces):
-        content = _bendable(content, LONGEST_EDGE * model.half)
+        content = _bendable(content, 0.05 * model.half)  # with longer edges a plane could not bend
     return Placed(attachment.name, content, *_shares(solids, content.points))
 
 
 def _transformed(content: Placeable, T: Float[np.ndarray, "4 4"]) -> Placeable:
-    """Content after a similarity, which turns orientations and does not scale them."""
+    """Transform content by a similarity, which turns orientations and does not scale them."""
     turn = T[:3, :3] / np.cbrt(np.linalg.det(T[:3, :3]))
     rotations = None if content.rotations is None else turn @ content.rotations
     return content.at(transform_points(T, content.points), rotations)
@@ -525,10 +459,10 @@ def _transformed(content: Placeable, T: Float[np.ndarray, "4 4"]) -> Placeable:
 def _shares(
     solids: Solids, points: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n s"], Float[np.ndarray, " n"]]:
-    """Share of each segment in the motion of points, and their distance from the nearest one, 0 inside.
+    """Share of each segment in the motion of points, and their distance from the nearest segment, 0 inside.
 
-    Inside a segment the share is its alone. Outside it falls with the fourth power of the distance, so that a surface
-    does not tear where another segment comes nearer.
+    Outside the share falls with the fourth power of the distance, so that a surface does not tear where another
+    segment comes nearer.
     """
     labels, away = solids.label(points), np.zeros(len(points))
     shares = np.eye(solids.count)[np.maximum(labels, 1) - 1]
@@ -536,8 +470,8 @@ def _shares(
     if len(outside):
         distance = np.stack([solids.segment_distance(i, points[outside]) for i in range(solids.count)], axis=1)
         away[outside] = distance.min(axis=1)
-        closeness = (np.maximum(away[outside, None], TINY) / np.maximum(distance, TINY)) ** 4
-        shares[outside] = np.maximum(closeness - LEAST_SHARE, 0.0)
+        closeness = (np.maximum(away[outside, None], 1e-6) / np.maximum(distance, 1e-6)) ** 4
+        shares[outside] = np.maximum(closeness - 1e-3, 0.0)
     return shares / shares.sum(axis=1, keepdims=True), away
 
 
@@ -556,6 +490,6 @@ def _bendable(content: Surfaces, longest: float) -> Surfaces:
     """Surfaces with edges up to ``longest``."""
     parts = []
     for part in content.mesh.segments:
-        vertices, faces = split_long_edges(part.vertices, part.faces, longest, MOST_FACES)
+        vertices, faces = split_long_edges(part.vertices, part.faces, longest, 2_000_000)
         parts.append(replace(part, vertices=vertices, faces=faces))
     return Surfaces(SegmentedMesh(tuple(parts)))

@@ -1,15 +1,14 @@
-"""Is it my object, in a state that I know? One answer from what a fit and the network leave unexplained.
+"""Recognize whether a frame shows the object in a learned state, from what a fit and the network leave unexplained.
 
     Registration, correspondences, stated scene unit -Signs.of-> Signs -recognize-> Recognition (known or not, and why)
 
-A sign is a number that is small for the object in states that were learned, and grows with what is wrong. Views of the
-object say how large it usually is, clean and under a camera's noise (``Calibration.recognizing``; conservative values
-here for weights that were not calibrated). How far the logarithms of all signs lie above the usual, in standard
-deviations and together, is the frame's strangeness; two limits make three answers of it. The sign that is strangest
-gives the reason, so there is one voice.
+A sign is a number that is small for the object in learned states, and grows with what is wrong. Views of the object
+tell how large it usually is, clean and under a camera's noise (``Calibration.recognizing``; conservative values for
+weights that were not calibrated). How far the logarithms of all signs lie above the usual, in standard deviations and
+together, is the frame's strangeness; two limits make three answers of it. The strangest sign gives the reason.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -36,34 +35,22 @@ LEAST: Mapping[SignName, float] = {
 SIZE = Usual(mean=float(np.log(LEAST["size"] + 0.03)), std=0.5)
 """Usual logarithm of how far sizes are off, of all weights: by 3 %, and by 15 % at most where the unit is right."""
 
-WRONG_UNIT = float(np.log(2.0))
-"""Logarithm of the ratio of sizes above which the frame's unit, or its object, is another one: a factor of two."""
 
-WIDE = 0.5
-"""Standard deviations of logarithms for weights that were not calibrated: those of single objects are smaller."""
+def _usual(unexplained: float, ruled_out: float, beyond: float, displaced: float) -> dict[SignName, Usual]:
+    """Usual values of the signs, with wider spreads of their logarithms than single objects have."""
+    return {
+        "unexplained": Usual(mean=float(np.log(unexplained)), std=0.5),
+        "ruled_out": Usual(mean=float(np.log(ruled_out)), std=0.5),
+        "beyond": Usual(mean=float(np.log(beyond)), std=0.5),
+        "unusual": Usual(mean=float(np.log(0.6)), std=0.5),
+        "displaced": Usual(mean=float(np.log(displaced)), std=0.4),
+    }
+
 
 CONSERVATIVE = Recognizing(
-    clean={
-        "unexplained": Usual(mean=float(np.log(0.3)), std=WIDE),
-        "ruled_out": Usual(mean=float(np.log(0.015)), std=WIDE),
-        "beyond": Usual(mean=float(np.log(0.15)), std=WIDE),
-        "unusual": Usual(mean=float(np.log(0.6)), std=WIDE),
-        "displaced": Usual(mean=float(np.log(0.06)), std=0.4),
-    },
-    noisy={
-        "unexplained": Usual(mean=float(np.log(0.6)), std=WIDE),
-        "ruled_out": Usual(mean=float(np.log(0.03)), std=WIDE),
-        "beyond": Usual(mean=float(np.log(0.2)), std=WIDE),
-        "unusual": Usual(mean=float(np.log(0.6)), std=WIDE),
-        "displaced": Usual(mean=float(np.log(0.09)), std=0.4),
-    },
-    unsure=4.0,
-    refused=8.0,
+    clean=_usual(0.3, 0.015, 0.15, 0.06), noisy=_usual(0.6, 0.03, 0.2, 0.09), unsure=4.0, refused=8.0
 )
 """For weights that were not calibrated."""
-
-LEAST_LEFT = 0.01
-"""Smallest share of the points that a believed fit may leave unexplained, whatever a caller has set."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +66,7 @@ class Signs:
         beyond: how far the state lies outside all that were learned, scene units; None at rest.
         unusual: mean square of the state's coefficients; None at rest.
         displaced: how far apart network and registered model have the same places of the object, as a share of half its
-            length (``Correspondences.displaced``); None where the network was not asked.
+            length (``Correspondences.displaced``); None without correspondences.
     """
 
     size: float | None = None
@@ -97,7 +84,7 @@ class Signs:
         at_rest, z = registration.method == "rest", registration.modes_z  # at rest it is known, whatever was learned
         return cls(
             size=None if stated_scene_unit is None else abs(float(np.log(registration.scene_unit / stated_scene_unit))),
-            unexplained=(1.0 - registration.explained) / max(1.0 - registration.needed, LEAST_LEFT),
+            unexplained=(1.0 - registration.explained) / max(1.0 - registration.needed, 0.01),
             ruled_out=registration.ruled_out,
             beyond=None if at_rest else registration.beyond_states,
             unusual=None if at_rest or not len(z) else float((z**2).mean()),
@@ -107,8 +94,8 @@ class Signs:
     @property
     def logarithms(self) -> dict[SignName, float]:
         """Logarithms of the signs that are known."""
-        found = {name: getattr(self, name) for name in LEAST}
-        return {name: float(np.log(value + LEAST[name])) for name, value in found.items() if value is not None}
+        signs = {name: getattr(self, name) for name in LEAST}
+        return {name: float(np.log(value + LEAST[name])) for name, value in signs.items() if value is not None}
 
     def strange(self, usual: Mapping[SignName, Usual]) -> dict[SignName, float]:
         """Standard deviations by which each sign lies above what is usual; 0 where it does not."""
@@ -151,7 +138,11 @@ class Recognition:
     @property
     def told(self) -> str | None:
         """Sentence for people; None where the object is known."""
-        return None if self.reason is None else told_of(self.known, self.reason)
+        if self.reason is None:
+            return None
+        return (
+            f"{'doubtful' if self.known == 'unsure' else 'not the object in a state that was learned'}: {self.reason}"
+        )
 
     def facts(self) -> dict[str, Any]:
         """Content of ``recognition`` in a result's summary."""
@@ -162,11 +153,6 @@ class Recognition:
             "calibrated": self.calibrated,
             "signs": None if self.signs is None else asdict(self.signs),
         }
-
-
-def told_of(known: Known, reason: str) -> str:
-    """Sentence for people about a frame that is not known for sure."""
-    return f"{'doubtful' if known == 'unsure' else 'not the object in a state that was learned'}: {reason}"
 
 
 NOT_ASKED = Recognition("unsure", "the network alone cannot tell its object from others: use --method auto", 0.0)
@@ -183,93 +169,64 @@ def recognize(
     """Whether a frame shows the object, in a state that was learned.
 
     Args:
-        registration: of the object's model to the frame; None where none was found or none was asked for.
+        registration: of the object's model to the frame; None where none was found or none was wanted.
         calibration: of the weights, with what is usual.
         displaced: as in ``Signs``.
         stated_scene_unit: length of a scene unit in the frame's unit, where the input states that.
-        refusal: why no registration was found; None where none was asked for, and then it cannot be told.
+        refusal: why no registration was found; None where none was wanted, and then recognition is not possible.
     """
     if registration is None:
         return NOT_ASKED if refusal is None else Recognition(False, refusal, MOST)
-    own = None if calibration is None else calibration.recognizing
-    limits = CONSERVATIVE if own is None else own
+    calibrated = None if calibration is None else calibration.recognizing
+    limits = CONSERVATIVE if calibrated is None else calibrated
     signs = Signs.of(registration, displaced, stated_scene_unit)
     each = signs.strange(limits.noisy if is_noisy(registration) else limits.clean)
     total = strangeness(each)
-    is_unit_wrong = signs.size is not None and signs.size > WRONG_UNIT
+    is_unit_wrong = signs.size is not None and signs.size > float(np.log(2.0))  # a factor of two
     if total <= limits.unsure and not is_unit_wrong:
-        return Recognition(True, None, total, signs, own is not None)
+        return Recognition(True, None, total, signs, calibrated is not None)
     known: Known = False if total >= limits.refused or is_unit_wrong else "unsure"
-    reason = REASONS["size" if is_unit_wrong else max(each, key=lambda name: each[name])](registration, signs)
-    return Recognition(known, reason, total, signs, own is not None)
+    reason = _reason("size" if is_unit_wrong else max(each, key=lambda name: each[name]), registration, signs)
+    return Recognition(known, reason, total, signs, calibrated is not None)
 
 
 # --- reasons ----------------------------------------------------------------------------------------------------------
 
-HARDLY = 0.5
-"""Share of the observed points below which it is probably another object, or no camera frame."""
-
-BEYOND = 0.5
-"""Scene units outside all states that were learned from which on they are worth telling."""
-
 LOOK = "look at the result before you rely on it"
-
 WIDEN = f"{LOOK}, or name the weights of what it is; if it is this object, widen the scene's ranges and learn it anew"
 
 
-def _size(registration: Registration, signs: Signs) -> str:
-    return (
-        f"its size differs by a factor of {np.exp(signs.size or 0.0):.3g} from the object's in the frame's unit: "
-        "correct the unit (--unit-m, --depth-scale), or name the object's own weights"
-    )
-
-
-def _unexplained(registration: Registration, signs: Signs) -> str:
-    if registration.explained < HARDLY:
+def _reason(sign: SignName, registration: Registration, signs: Signs) -> str:
+    """Sentence about the sign that is strangest, with what to do."""
+    if sign == "size":
+        return (
+            f"its size differs by a factor of {np.exp(signs.size or 0.0):.3g} from the object's in the frame's unit: "
+            "correct the unit (--unit-m, --depth-scale), or name the object's own weights"
+        )
+    if sign == "unexplained" and registration.explained < 0.5:
         return (
             f"only {registration.explained:.0%} of the points can be the model's: this is probably another object, "
             "not the object alone, or no camera frame: leave out what is not the object, turn the cloud (--frame), or "
             "name the object's own weights"
         )
-    return (
-        f"{1 - registration.explained:.0%} of the points are not the model's: {LOOK}, or leave out of the cloud what "
-        "is not the object"
-    )
-
-
-def _ruled_out(registration: Registration, signs: Signs) -> str:
-    return (
-        f"{registration.ruled_out:.0%} of the model's surface lies where the frame shows none of it, beside or in "
-        f"front of what was seen: {LOOK}, or take the frame from nearer"
-    )
-
-
-def _beyond(registration: Registration, signs: Signs) -> str:
-    return (
-        f"the state lies {registration.beyond_states:.1f} scene units outside those that were learned, and rigid parts "
-        f"may be bent: {WIDEN}"
-    )
-
-
-def _unusual(registration: Registration, signs: Signs) -> str:
-    if registration.beyond_states > BEYOND:
-        return _beyond(registration, signs)
-    return f"the object would be bent farther than in the states that were learned: {WIDEN}"
-
-
-def _displaced(registration: Registration, signs: Signs) -> str:
+    if sign == "unexplained":
+        return (
+            f"{1 - registration.explained:.0%} of the points are not the model's: {LOOK}, or leave out of the cloud "
+            "what is not the object"
+        )
+    if sign == "ruled_out":
+        return (
+            f"{registration.ruled_out:.0%} of the model's surface lies where the frame shows none of it, beside or in "
+            f"front of what was seen: {LOOK}, or take the frame from nearer"
+        )
+    if sign == "beyond" or (sign == "unusual" and registration.beyond_states > 0.5):
+        return (
+            f"the state lies {registration.beyond_states:.1f} scene units outside those that were learned, and rigid "
+            f"parts may be bent: {WIDEN}"
+        )
+    if sign == "unusual":
+        return f"the object would be bent farther than in the states that were learned: {WIDEN}"
     return (
         f"network and registered model have the same places of the object {signs.displaced or 0.0:.0%} of half its "
         f"length apart: {LOOK}, or name the object's own weights"
     )
-
-
-REASONS: Mapping[SignName, Callable[[Registration, Signs], str]] = {
-    "size": _size,
-    "unexplained": _unexplained,
-    "ruled_out": _ruled_out,
-    "beyond": _beyond,
-    "unusual": _unusual,
-    "displaced": _displaced,
-}
-"""Sentences by the sign that is strangest."""

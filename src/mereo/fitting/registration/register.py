@@ -1,26 +1,317 @@
-"""The object's own deformation model, registered to frames: set up once for an object, asked for every frame.
+"""The object's own deformation model, fitted to frames: set up once for an object, then used for every frame.
 
-EncodedFrame -Registrar-> Registration
+CloudToFit, correspondences -fit_frame-> ModesFit -Registrar.finish-> Registration
 """
 
+import time
 import warnings
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
+from jaxtyping import Float
+
 from mereo.fitting.config import AnswerMethod, FitConfig
+from mereo.fitting.draws.fit import fit_draws
 from mereo.fitting.draws.playback import MOST_DRAWS, DrawnStates, number_of_draws
-from mereo.fitting.registration.fit import CloudToFit, ModesFit, fit_frame
-from mereo.fitting.registration.registration import Registration
+from mereo.fitting.draws.problem import DrawsFit, DrawsProblem
+from mereo.fitting.draws.problem import narrowing as draws_narrowing
+from mereo.fitting.modes import (
+    PredictCorrespondences,
+    ScoredFit,
+    as_noisy,
+    fit_modes,
+    fit_rest,
+    is_at_rest,
+    of_rest,
+    with_turned_camera,
+)
+from mereo.fitting.modes import narrowing as modes_narrowing
+from mereo.fitting.problem.correspondences import Correspondences, agree, estimate_unit, find_correspondences
+from mereo.fitting.problem.evidence import Evidence
+from mereo.fitting.problem.gauss_newton import Posed
+from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
+from mereo.fitting.problem.residuals import Surface
+from mereo.fitting.registration.registration import Method, Registration
+from mereo.fitting.uncertainty import DrawsOptimum, ModesOptimum, Optimum
 from mereo.geometry.brief import listed
+from mereo.geometry.camera import PointCloud, SightLines
+from mereo.io.cores import one_blas_thread
 from mereo.io.progress import stage
+from mereo.models.calibration import Calibration
 from mereo.models.trained import EncodedCloud, Trained
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES, AssetUnavailable, Scene
 from mereo.scenes.statistical_model import StatisticalModel
 
-ROUNDING = 1e-6
-"""Relative difference up to which a unit that was known is exactly the metre."""
+# --- the fit to one frame ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class CloudToFit:
+    """Cloud to which a model is fitted, seen from the origin of the camera frame, in any unit.
+
+    Attributes:
+        points: observed points of the object.
+        scene_unit: length of a scene unit in the cloud's unit; found together with the pose where None.
+        is_unit_certain: whether that is known for certain; else it is believed where the network's correspondences
+            agree with it.
+        outliers: points that were left out: along their lines of sight nothing is known.
+        lines: what is known of the lines of sight beside the cloud; None of a bare cloud.
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    scene_unit: float | None = None
+    is_unit_certain: bool = True
+    outliers: Float[np.ndarray, "o 3"] | None = None
+    lines: SightLines | None = None
+
+    def evidence(self, unit: float) -> Evidence:
+        """Evidence in scene units, of which one has this length in the cloud's unit."""
+        outliers = None if self.outliers is None else self.outliers / unit
+        lines = None if self.lines is None else self.lines.scaled(1 / unit)
+        return Evidence.of(self.points / unit, outliers, lines=lines)
+
+    def scale_std(self, config: FitConfig) -> float:
+        """``Problem.scale_std``."""
+        return config.scale_std if self.scene_unit is None else KNOWN_SCALE_STD
+
+
+@dataclass(frozen=True, eq=False)
+class ModesFit:
+    """Frame to which the modes are fitted, and to which the scene's own draws can be fitted as well.
+
+    Attributes:
+        problem: everything the fit works on, scene units.
+        correspondences: of the network, scene units.
+        unit: length of a scene unit in the cloud's unit, before the fit's own scale.
+        posed: coefficients and pose.
+        seconds: that it took.
+        rest: pose of the rest model, where the frame speaks for an object at rest; then that is the answer.
+        calibration: the network's, by which radii are scaled.
+        alike: number of states that a search found to explain the frame alike, this included; 1 without a search.
+    """
+
+    problem: Problem
+    correspondences: Correspondences
+    unit: float
+    posed: Posed
+    seconds: float
+    rest: ScoredFit | None = None
+    calibration: Calibration | None = None
+    alike: int = 1
+
+    @classmethod
+    def of(
+        cls,
+        cloud: CloudToFit,
+        correspondences: Correspondences,
+        model: StatisticalModel,
+        config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
+        predict: PredictCorrespondences | None = None,
+    ) -> "ModesFit":
+        """Fit the modes to a cloud, with correspondences in its unit.
+
+        Where much is unexplained, the network predicts again with the camera turned (``with_turned_camera``); where
+        what is left is noise, the frame is fitted once more as a noisy one.
+
+        Args:
+            cloud: its lines of sight went past the object where it leaves that open.
+            correspondences: of the network, or others.
+            model: the statistical model.
+            config: constants.
+            predict: the network, about points of the camera frame in the cloud's unit; None without one.
+        """
+        started = time.perf_counter()
+        unit = estimate_unit(correspondences) if cloud.scene_unit is None else cloud.scene_unit
+        correspondences = correspondences.scaled(1 / unit)
+
+        def predict_in_scene_units(seen: Float[np.ndarray, "s 3"]) -> Correspondences:
+            assert predict is not None
+            return predict(seen * unit).scaled(1 / unit)
+
+        with one_blas_thread():
+            problem = Problem.of(model, correspondences, cloud.evidence(unit), cloud.scale_std(config), config)
+            fit = problem, correspondences, fit_modes(problem)
+            predict_scaled = None if predict is None else predict_in_scene_units
+            fit = with_turned_camera(fit, predict_scaled)
+            problem, correspondences, modes = as_noisy(fit, cloud.points / unit, predict_scaled)
+            rest = fit_rest(problem, correspondences, modes.posed)
+            at_rest = is_at_rest(problem, modes, rest)
+        return cls(
+            problem, correspondences, unit, modes.posed, time.perf_counter() - started, rest if at_rest else None
+        )
+
+    @property
+    def may_take_draws(self) -> bool:
+        """Whether draws may be the answer: beside the rest model only under noise, where modes may miss what moved."""
+        return self.rest is None or self.problem.noisy
+
+    @property
+    def tolerance(self) -> float:
+        """Distance in scene units up to which an observed point lies on the surface, by the frame's noise."""
+        return self.problem.config.tolerance
+
+    def off_surface(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """Distances, in scene units, of points of the camera frame in the cloud's unit from the facing surface."""
+        return self.surface.nearest(points / self.unit)[0]
+
+    @cached_property
+    def surface(self) -> Surface:
+        """The posed model in scene units: by its modes, or at rest where the frame speaks for that."""
+        model = self.problem.model
+        if self.rest is None:
+            return Surface.of(model, self.posed)
+        return Surface.through(model, self.rest.posed.place(model.rest_points))
+
+    def registration(self) -> Registration:
+        """Return the registration of the modes, or of the rest model where the frame speaks for that."""
+        return self._registered
+
+    @cached_property
+    def _registered(self) -> Registration:
+        if self.rest is not None:
+            bent = self.posed.place(self.problem.model.material(self.posed.z))
+            end = ModesOptimum(of_rest(self.problem, self.correspondences), self.rest.posed, self.unit, bent)
+            return self._registration("rest", self.problem.model.rest_z, end, self.rest.posed, self.surface)
+        end = ModesOptimum(self.problem, self.posed, self.unit)
+        return self._registration("modes", self.posed.z, end, self.posed, self.surface)
+
+    def with_draws(self, states: DrawnStates) -> Registration:
+        """Fit the scene's draws too, and return them where their misfit is lower or their evidence greater.
+
+        Modes can imitate what they do not hold, with more of them than a scene has draws; the evidence counts that.
+        It does not speak against draws, which have the states that there really are.
+        """
+        if not self.may_take_draws:
+            return self.registration()
+        started = time.perf_counter()
+        with one_blas_thread():
+            problem = DrawsProblem.of(self.problem, states, self.correspondences)
+            drawn = fit_draws(problem, self.posed)
+            taken = drawn is not None and is_drawn(problem, drawn, self.posed, self.rest)
+        seconds = self.seconds + time.perf_counter() - started
+        if drawn is None or not taken:
+            return replace(self.registration(), seconds=seconds)
+        end = DrawsOptimum(problem, drawn, self.unit)
+        registration = self._registration("draws", drawn.z, end, drawn.posed, drawn.surface)
+        return replace(registration, drawn=replace(drawn.drawn, z=drawn.z), seconds=seconds)
+
+    def _registration(
+        self, method: Method, z: Float[np.ndarray, " k"], optimum: Optimum, posed: Posed, surface: Surface
+    ) -> Registration:
+        distance = surface.nearest(self.problem.evidence.observed_samples)[0]
+        explained = float((distance <= self.tolerance).mean())
+        scale, extra_radius = self._radius_factors(method, surface)
+        return Registration(
+            model=self.problem.model,
+            material=surface.material * self.unit,
+            method=method,
+            z=z,
+            scene_unit=self.unit * float(np.exp(posed.log_scale)),
+            unit_known=not self.problem.is_scale_open,
+            explained=explained,
+            accepted=self._is_believed(explained, surface),
+            seconds=self.seconds,
+            residual=float(np.sqrt((distance**2).mean())) * self.unit,
+            ruled_out=self.problem.ruled_out(surface),
+            needed=self.problem.config.accepted,
+            optimum=optimum,
+            radius_scale=scale,
+            extra_radius=extra_radius,
+            alike=self.alike,
+        )
+
+    def _radius_factors(self, method: Method, surface: Surface) -> tuple[float | None, float]:
+        """``Registration.radius_scale`` and ``extra_radius``."""
+        if self.calibration is None:
+            return None, 0.0
+        factors, model = self.calibration.radii(draws=method == "draws", noisy=self.problem.noisy), self.problem.model
+        scale = factors.scale if factors.misfit is None else factors.scale_at(self.problem.cloud_misfit(surface))
+        displaced = None if factors.displaced is None else self.correspondences.displaced(model, surface.material)
+        return scale, model.half * factors.beside(displaced)
+
+    def _is_believed(self, explained: float, surface: Surface) -> bool:
+        """Whether a fit explains enough of the points; less is enough where the network sees the same segments there.
+
+        On clean training views the fit was better than the network in each that the second rule adds.
+        """
+        config = self.problem.config
+        least = min(config.accepted, 0.85)
+        return explained >= config.accepted or (explained >= least and self._agreement(surface) >= 0.8)
+
+    def _agreement(self, surface: Surface) -> float:
+        """Share of the correspondences on the object whose segment is that of the nearest position of the surface."""
+        seen = self.correspondences.rows(self.correspondences.observed)
+        if len(seen.points) == 0:  # a tracked frame, without correspondences
+            return 0.0
+        face = surface.nearest(seen.points)[1]
+        model = self.problem.model
+        return float((model.labels[model.faces[surface.facing[face], 0]] == seen.labels).mean())
+
+
+def is_drawn(problem: DrawsProblem, drawn: DrawsFit, modes: Posed, rest: ScoredFit | None = None) -> bool:
+    """Whether a state of the draws is to be preferred to the modes, or to the rest model, where that is given.
+
+    By the points that the answer was fitted to.
+    """
+    if rest is not None:
+        unbent = of_rest(problem.last, problem.correspondences).misfit(rest.posed).total
+        return drawn.misfit + draws_narrowing(problem, drawn) < unbent
+    gain = drawn.misfit - problem.last.misfit(modes).total
+    return gain < 0 or gain < modes_narrowing(problem.base, modes) - draws_narrowing(problem, drawn)
+
+
+def fit_frame(
+    cloud: CloudToFit,
+    network: Trained,
+    model: StatisticalModel,
+    config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
+    code: EncodedCloud | None = None,
+) -> ModesFit:
+    """Fit the modes to a cloud from the network's correspondences.
+
+    Args:
+        cloud: the observed points, with what is known of their unit and surroundings.
+        network: trained on this object, with rest coordinates.
+        model: statistical model of the same object.
+        config: constants.
+        code: of the cloud, where it is known already.
+
+    Raises ``ValueError`` for a network without rest coordinates or of other segments, and where it finds too little.
+    """
+    started = time.perf_counter()
+    if network.names != model.rest.names:
+        raise ValueError(
+            f"the weights know the segments {', '.join(network.names)} but the statistical model has "
+            f"{', '.join(model.rest.names)}; they must be of one object: build the model from the weights' own scene"
+        )
+    code = network.encode(PointCloud(cloud.points)) if code is None else code
+    correspondences = predict_correspondences(network, model, code)
+    unit = cloud.scene_unit
+    if unit is not None and not cloud.is_unit_certain and not agree(estimate_unit(correspondences), unit):
+        cloud = replace(cloud, scene_unit=None)
+    encoding_s = time.perf_counter() - started
+
+    def predict(points: Float[np.ndarray, "s 3"]) -> Correspondences:
+        return predict_correspondences(network, model, network.encode(PointCloud(points)))
+
+    fitted = ModesFit.of(cloud, correspondences, model, config, predict)
+    return replace(fitted, seconds=fitted.seconds + encoding_s, calibration=network.calibration)
+
+
+def predict_correspondences(network: Trained, model: StatisticalModel, code: EncodedCloud) -> Correspondences:
+    """Predict correspondences of a cloud with the network, and return an even subset."""
+    correspondences = find_correspondences(network, code, model.rest_center, model.half)
+    if correspondences is None:
+        raise ValueError(
+            "the weights predict no rest coordinates, from which a fit starts; train with a dataset that has a template"
+        )
+    return correspondences.evenly()
+
+
+# --- the registrar of an object ---------------------------------------------------------------------------------------
 
 
 class ChangedSceneWarning(UserWarning):
@@ -49,21 +340,16 @@ class Registrar:
 
     @classmethod
     def of(cls, network: Trained, method: AnswerMethod = "auto", scene: Scene | str | None = None) -> "Registrar":
-        """Registrar of the model that the weights carry.
+        """Make the registrar of the model that the weights carry.
 
-        Args:
-            network: the weights.
-            method: which description of the states is fitted.
-            scene: the object's scene, its name or its file, where it is not the built-in one of the weights.
-
-        Raises ``ValueError`` where the weights carry no statistical model, and where ``method`` is "full" without a
-        scene or with one of another object.
+        ``scene`` is the object's scene, its name or its file, where it is not the built-in one of the weights. Raises
+        ``ValueError`` where the weights carry no statistical model, and as ``checked`` does.
         """
         given = load_scene(scene) if isinstance(scene, str) else scene
         return cls(network, statistical_model_of(network), method, given).checked()
 
     def checked(self) -> "Registrar":
-        """Itself; raises ``ValueError`` where ``method`` is "full" without a scene or with one of another object."""
+        """Return itself; raise ``ValueError`` where ``method`` is "full" without the object's scene."""
         if self.method == "full" and self.scene is None:
             raise ValueError(
                 f"the weights were trained on {self.trained_scene!r}, which is no built-in scene; the fit "
@@ -87,9 +373,8 @@ class Registrar:
     def scene(self) -> Scene | None:
         """Scene whose draws can be played: the given one, or the built-in one of the weights; None where neither is.
 
-        Also None, with a ``ChangedSceneWarning``, where the scene that the weights were trained on has other meshes
-        since, unless ``method`` is "full". Raises ``ValueError`` for such a scene with "full" and for a given scene
-        of another object, and ``AssetUnavailable`` where its mesh cannot be had.
+        Where the weights' own scene has other meshes since, it is None with a ``ChangedSceneWarning``, and with "full"
+        a ``ValueError``, as a given scene of another object is. Raises ``AssetUnavailable`` where its mesh is missing.
         """
         name = self.trained_scene
         scene = self.given if self.given is not None else load_scene(name) if name in SCENES else None
@@ -106,22 +391,11 @@ class Registrar:
             return None
         raise ValueError(f"{fault}, so its draws move other points: {CURE}, or use --method modes")
 
-    @cached_property
-    def states(self) -> DrawnStates | None:
-        """Random states of the scene, among which a fit of its draws starts; they take seconds once.
-
-        None without a scene, and for one with more than ``MOST_DRAWS``, which is left to the modes.
-        """
-        if self.scene is None or number_of_draws(self.scene) > MOST_DRAWS:
-            return None
-        with stage("simulate random states of the scene, once for an object"):
-            return DrawnStates.of(self.scene, self.model)
-
     @property
     def asks_search(self) -> bool:
-        """Whether a search is asked too where the network's fit does not explain the frame: seconds a frame."""
-        is_one = self.network is not None and self.network.names == self.model.rest.names
-        return self.method == "auto" and self.config.turned and is_one
+        """Whether a search follows where the network's fit does not explain the frame: seconds a frame."""
+        is_same_object = self.network is not None and self.network.names == self.model.rest.names
+        return self.method == "auto" and self.config.turned and is_same_object
 
     @property
     def fits_draws(self) -> bool:
@@ -129,25 +403,22 @@ class Registrar:
         return self.method != "modes"
 
     def prepare(self) -> None:
-        """Do once what all frames need: simulate the states in which a fit of draws begins, where draws are fitted.
-
-        Raises as ``states_or_none`` does.
-        """
+        """Simulate once the states in which a fit of draws begins, where draws are fitted; raises as that does."""
         if self.fits_draws:
             _ = self.states_or_none
 
     @property
     def without_retries(self) -> "Registrar":
-        """The same without the patience to ask about a frame again with the camera turned."""
+        """The same without predictions with the camera turned."""
         return replace(self, config=replace(self.config, turned=False))
 
     @property
     def with_retries(self) -> "Registrar":
-        """The same, which asks about a frame with the camera turned however noisy it may be."""
+        """The same with predictions with the camera turned, however noisy a frame may be."""
         return replace(self, config=replace(self.config, turned_anyway=True))
 
     def asking(self, network: Trained | None) -> "Registrar":
-        """The same, asking the same weights on another device; scene and states that are known stay so."""
+        """The same with the same weights on another device; scene and states that are known stay so."""
         if network is self.network:
             return self
         moved = copy(self)
@@ -165,7 +436,7 @@ class Registrar:
         if frame is None or frame.unit_m is None:
             return None
         unit_m = frame.unit_m / registration.scene_unit
-        return 1.0 if registration.unit_known and abs(unit_m - 1.0) < ROUNDING else unit_m
+        return 1.0 if registration.unit_known and abs(unit_m - 1.0) < 1e-6 else unit_m
 
     def fit_modes(self, cloud: CloudToFit, code: EncodedCloud | None = None) -> ModesFit:
         """Fit of the modes from the network, with ``fit_frame``'s arguments; raises ``ValueError`` as that does."""
@@ -173,21 +444,18 @@ class Registrar:
         return fit_frame(cloud, self.network, self.model, self.config, code)
 
     def register(self, cloud: CloudToFit, code: EncodedCloud | None = None) -> Registration:
-        """Registration of the model to a cloud, as ``method`` says; ``code`` is what ``network`` made of it, if known.
-
-        Raises ``ValueError`` as ``fit_frame`` does.
-        """
+        """Register the model to a cloud, as ``method`` says; takes ``fit_frame``'s arguments and raises as it does."""
         return self.finish(self.fit_modes(cloud, code))
 
     def finish(self, fitted: ModesFit) -> Registration:
-        """The answer from a fit of the modes: the draws too where ``method`` asks for them.
+        """Return the registration from a fit of the modes, with the draws too where ``method`` wants them.
 
         Unless that is "full", not where the modes do not explain the frame: the draws, which begin there and take
         longest on such frames, did not explain one of them either (experiments, entry 62).
         """
         modes = fitted.registration()
         hopeless = self.method != "full" and not modes.accepted
-        states = None if not self.fits_draws or hopeless or not fitted.asks_draws else self.states_or_none
+        states = None if not self.fits_draws or hopeless or not fitted.may_take_draws else self.states_or_none
         return modes if states is None else fitted.with_draws(states)
 
     def takes(self, registration: Registration) -> bool:
@@ -196,12 +464,16 @@ class Registrar:
 
     @cached_property
     def states_or_none(self) -> DrawnStates | None:
-        """``states``, but None where the scene's mesh cannot be had: the weights carry all that the modes need.
+        """Random states of the scene, among which a fit of its draws starts; they take seconds once.
 
-        With "full" that raises ``AssetUnavailable``.
+        None without a scene, for one with more than ``MOST_DRAWS`` draws, and where the scene's mesh cannot be had: the
+        weights carry all that the modes need. With "full" that raises ``AssetUnavailable``.
         """
         try:
-            return self.states
+            if self.scene is None or number_of_draws(self.scene) > MOST_DRAWS:
+                return None
+            with stage("simulate random states of the scene, once for an object"):
+                return DrawnStates.of(self.scene, self.model)
         except AssetUnavailable:
             if self.method != "full":
                 return None
@@ -224,16 +496,14 @@ def other_mesh(scene: Scene, model: StatisticalModel) -> str | None:
 
     Places of a statistical model mean nothing on another mesh.
     """
-    said = f"the scene {scene.name!r} has other segments or meshes than the weights' own model"
+    difference = f"the scene {scene.name!r} has other segments or meshes than the weights' own model"
     if scene.rest.names != model.rest.names:
-        return f"{said} ({listed(scene.rest.names)}; theirs: {listed(model.rest.names)})"
+        return f"{difference} ({listed(scene.rest.names)}; theirs: {listed(model.rest.names)})"
     for now, then in zip(scene.rest.segments, model.rest.segments, strict=True):
-        for count, before, what in (
-            (len(now.vertices), len(then.vertices), "vertices"),
-            (len(now.faces), len(then.faces), "faces"),
-        ):
+        for what in ("vertices", "faces"):
+            count, before = len(getattr(now, what)), len(getattr(then, what))
             if count != before:
-                return f"{said} (its segment {now.name!r} has {count} {what}, theirs {before})"
+                return f"{difference} (its segment {now.name!r} has {count} {what}, theirs {before})"
     return None
 
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from mereo.deformation.maps import newton
 from mereo.deformation.moving_least_squares import Anchors
 from mereo.fitting.draws.playback import Drawn
-from mereo.fitting.uncertainty.uncertainty import Explanation, Optimum, Uncertainty
+from mereo.fitting.uncertainty import Explanation, Optimum, Uncertainty
 from mereo.geometry.brief import counted
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids, owned_centroids, signed_distance_and_direction
@@ -48,18 +48,6 @@ class Located:
 
 
 @dataclass(frozen=True, eq=False)
-class SegmentMotion:
-    """Motion from rest to the frame, for points of one segment. Satisfies ``Deformation``."""
-
-    rest: Anchors
-    moved: Float[np.ndarray, "m 3"]
-
-    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Positions in the frame of points at rest."""
-        return self.rest.weights(points)(self.moved)
-
-
-@dataclass(frozen=True, eq=False)
 class Registration:
     """A state of the object's own deformation model, in the frame of an observed cloud.
 
@@ -79,11 +67,11 @@ class Registration:
         ruled_out: share of the surface's vertices that the frame rules out, by more than a scene unit: they lie beside
             all that was seen of the object or in front of it; None where the registration was read from a file.
         needed: least ``explained`` of a frame of this noise to be believed.
-        optimum: where the fit ended, from which uncertainty and explanations are made when they are asked for; None
+        optimum: where the fit ended, from which uncertainty and explanations are made on first use; None
             where the registration was read from a file.
         radius_scale: factor of the radii by the weights' calibration of such fits to such frames; None without one.
-        extra_radius: radius that every place has beside that, as ``Uncertainty.beside``; scene units.
-        alike: number of states, each elsewhere, that a search found to explain the frame alike, this one included.
+        extra_radius: radius that every position has beside that, as ``Uncertainty.beside``; scene units.
+        alike: number of different states that a search found to explain the frame alike, this one included.
     """
 
     model: StatisticalModel
@@ -132,16 +120,16 @@ class Registration:
 
     @cached_property
     def solids(self) -> Solids:
-        """Segments in the camera frame, to be asked what is inside and how far."""
+        """Segments in the camera frame, for queries of labels and distances."""
         return Solids(self.mesh)
 
     @cached_property
     def rest_solids(self) -> Solids:
-        """Segments at rest, to be asked the same."""
+        """Segments at rest, for the same queries."""
         return Solids(self.model.rest)
 
     def to_camera(self, points: ArrayLike, labels: UInt8[np.ndarray, " n"] | None = None) -> Float[np.ndarray, "n 3"]:
-        """Positions of points of the rest model in the camera frame.
+        """Map points of the rest model to the camera frame.
 
         Args:
             points: n x 3, rest pose, scene units.
@@ -164,9 +152,9 @@ class Registration:
         result = guess.copy()
         for label in np.unique(labels):
             rows = np.flatnonzero(labels == label)
-            motion = SegmentMotion(self.model.rest_anchors[label - 1], self.material)
-            found, converged = newton(motion, points[rows], guess[rows])
-            result[rows[converged]] = found[converged]
+            anchors = self.model.rest_anchors[label - 1]
+            inverted, converged = newton(lambda at: anchors.weights(at)(self.material), points[rows], guess[rows])  # noqa: B023 (called at once)
+            result[rows[converged]] = inverted[converged]
         return result
 
     def query(self, points: ArrayLike) -> Located:
@@ -179,7 +167,7 @@ class Registration:
 
     @cached_property
     def uncertainty(self) -> Uncertainty | None:
-        """How far the true places may be from the registered ones; None where the registration was read from a file."""
+        """How far the true positions may be from the registered ones; None where it was read from a file."""
         if self.optimum is None:
             return None
         return Uncertainty(self.optimum, self.model, self.radius_scale, self.extra_radius)
@@ -187,10 +175,10 @@ class Registration:
     def radius95(
         self, points: ArrayLike, labels: UInt8[np.ndarray, " n"] | None = None, *, at: Literal["camera", "rest"]
     ) -> Float[np.ndarray, " n"] | None:
-        """Radius around each point that holds its true place with probability 0.95, in the input's unit.
+        """Radius around each point that holds its true position with probability 0.95, in the input's unit.
 
-        The point is one of the object: that which the registration has at the given place of the camera frame, or
-        that which was at the given place of the rest model. ``uncertainty`` has the radii of all vertices, and says
+        The point is one of the object: that which the registration has at the given position of the camera frame, or
+        that which was at the given position of the rest model. ``uncertainty`` has the radii of all vertices, and says
         whether they are calibrated. None where the registration was read from a file.
 
         Args:
@@ -230,10 +218,10 @@ class Registration:
             rest = self.to_rest(point, label) if at == "camera" else point
             place = self.to_camera(rest, label)[0]
             decided = self.uncertainty.decided_point(rest, label)
-        return Explanation.of(place, decided, self.uncertainty.optimum, self._T_here_fit)
+        return Explanation.of(place, decided, self.uncertainty, self._T_registration_fit)
 
     @cached_property
-    def _T_here_fit(self) -> Float[np.ndarray, "4 4"]:
+    def _T_registration_fit(self) -> Float[np.ndarray, "4 4"]:
         """From the camera frame of the fit, in the input's unit, to that in which this registration is."""
         assert self.optimum is not None
         return fit_rigid(self.optimum.unit * self.optimum.posterior.material, self.material)

@@ -1,9 +1,9 @@
-"""Registrations and their states: the same material points again, from the weights and, for draws, the scene.
+"""Store a registration as a small state file, and restore the same material points from it.
 
     Registration -state_of-> RegistrationState -save_state, load_state-> Registration
 
-A state holds coefficients or draws, and the pose; neither meshes nor anything of the frame. A digest of the statistical
-model tells weights apart, and a few witnesses tell a scene that has changed since.
+A state holds coefficients or draws, and the pose; neither meshes nor anything of the frame. It needs the weights and,
+for draws, the scene. A digest tells statistical models apart, a few witness points a scene that has changed since.
 """
 
 import hashlib
@@ -33,25 +33,16 @@ from mereo.scenes.statistical_model import StatisticalModel
 
 # --- the file ---------------------------------------------------------------------------------------------------------
 
-# State of a registration as a small JSON file: what it holds, and how it is read and written.
-#
-# ``fitting.registration.state`` makes it of a registration, and a registration of it.
-
 STATE = "state.json"
 """Name of the file in a folder of results."""
 
 FORMAT = 1
 """Version of the file's format; others are not read."""
 
-MOST_BYTES = 2**20
-"""Size above which a file is no state: 160 coefficients take 4 kB."""
-
+MOST_BYTES = 2**20  # 160 coefficients take 4 kB
 MOST_NUMBERS = 100_000
 WITNESSES = 8
-"""Number of material points whose places are in the file."""
-
-SHOWN = 60
-"""Characters of a wrong value that are shown."""
+"""Number of material points whose positions are in the file."""
 
 STATE_CURE = "give the state.json of a `mereo reconstruct`"
 
@@ -59,8 +50,8 @@ STATE_CURE = "give the state.json of a `mereo reconstruct`"
 def _rigid(rows: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...]:
     T = np.array(rows)
     rotation, last = T[:3, :3], T[3].tolist()
-    turns = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) and np.linalg.det(rotation) > 0
-    if not turns or last != [0, 0, 0, 1]:
+    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) and np.linalg.det(rotation) > 0
+    if not is_rotation or last != [0, 0, 0, 1]:
         raise ValueError("it must be a rigid transform: a rotation, a translation, and 0 0 0 1 below")
     return rows
 
@@ -146,18 +137,13 @@ class RegistrationState(Block):
         return self
 
 
-def is_state(path: Path | None) -> bool:
-    """Whether a path names a state: a JSON file, or a folder with ``state.json``."""
-    return path is not None and (path.suffix.lower() == ".json" or (path / STATE).is_file())
-
-
 def save_state(path: str | Path, state: RegistrationState) -> None:
     """Write a state, whole or not at all."""
     write_json(path, state.model_dump())
 
 
 def read_state(path: str | Path) -> RegistrationState:
-    """State from its file, or from a folder of results that has one.
+    """Read a state from its file, or from a folder of results that has one.
 
     Raises ``FileNotFoundError`` where there is none, and ``ValueError`` where it is no such state.
     """
@@ -174,37 +160,30 @@ def read_state(path: str | Path) -> RegistrationState:
         raise ValueError(
             f"{path} has more than {MOST_BYTES // 1024} kB; the state of a registration has a few: {STATE_CURE}"
         )
-    return parse_state(content, str(path))
-
-
-def parse_state(content: str | bytes, name: str) -> RegistrationState:
-    """State from the content of the file ``name``; raises ``ValueError`` where it is no such state."""
     try:
         return RegistrationState.model_validate_json(content)
     except ValidationError as error:
-        raise ValueError(f"{name} is no state of a registration: {said(error.errors()[0])}: {STATE_CURE}") from None
+        problem = describe_error(error.errors()[0])
+        raise ValueError(f"{path} is no state of a registration: {problem}: {STATE_CURE}") from None
 
 
-def said(problem: ErrorDetails) -> str:
-    """What is wrong first, and its value."""
-    place = ".".join(str(step) for step in problem["loc"])
+def describe_error(problem: ErrorDetails) -> str:
+    """Say what is wrong first in a file, and its value."""
+    key = ".".join(str(step) for step in problem["loc"])
     rule = problem["msg"].removeprefix("Value error, ").replace("Input should", "it must").replace("should", "must")
     rule = rule[:1].lower() + rule[1:]
     if problem["type"] == "json_invalid":
         return "it is not JSON"
-    if not place:
+    if not key:
         return rule
     if problem["type"] == "missing":
-        return f"`{place}` is missing"
+        return f"`{key}` is missing"
     if problem["type"] == "extra_forbidden":
-        return f"{place[:SHOWN]!r} means nothing here"
-    return f"`{place}` is {repr(problem['input'])[:SHOWN]}; {rule}"
+        return f"{key[:60]!r} means nothing here"
+    return f"`{key}` is {repr(problem['input'])[:60]}; {rule}"
 
 
 # --- state ------------------------------------------------------------------------------------------------------------
-
-AGREE = 1e-3
-"""Distance, of half the rest box's longest side, up to which a state that is played again is the same."""
 
 Rows = tuple[tuple[float, ...], ...]
 
@@ -228,7 +207,7 @@ def state_of(
     unit_m: float | None = None,
     T_camera_input: Float[np.ndarray, "4 4"] | None = None,
 ) -> RegistrationState:
-    """State of a registration.
+    """Make the state of a registration.
 
     Args:
         registration: in the camera frame and the input's unit.
@@ -293,7 +272,7 @@ def write_state(directory: Path, answer: Answer) -> None:
 
 
 def load_state(path: str | Path, model: StatisticalModel, scene: Scene | None = None) -> Registration:
-    """Registration from its state, in the camera frame and the input's unit.
+    """Load a registration from its state, in the camera frame and the input's unit.
 
     Args:
         path: the file, or the folder of results that has it.
@@ -310,7 +289,7 @@ def load_state(path: str | Path, model: StatisticalModel, scene: Scene | None = 
 
 
 def restored(state: RegistrationState, model: StatisticalModel, scene: Scene | None = None) -> Registration:
-    """Registration of a state; raises ``ValueError`` for another model, and for draws as ``played_state`` does."""
+    """Restore a registration; raises ``ValueError`` for another model, and for draws as ``played_state`` does."""
     if model_digest(model) != state.model:
         raise ValueError(
             f"the state belongs to the statistical model of other weights (scene {state.scene!r}, weights "
@@ -319,7 +298,7 @@ def restored(state: RegistrationState, model: StatisticalModel, scene: Scene | N
     unposed, drawn = _unposed(state, model, scene)
     material = transform_points(np.array(state.T_camera_model), state.scene_unit * unposed)
     off = float(np.abs(material[witnesses(model)] - np.array(state.witness)).max()) / state.scene_unit
-    if off > AGREE * model.half:
+    if off > 1e-3 * model.half:
         raise ValueError(
             f"the state leads {off:.2g} scene units away from where mereo {state.mereo} found it: the scene "
             f"{state.scene!r} has changed since, or the file: register the frame again"
@@ -341,7 +320,7 @@ def restored(state: RegistrationState, model: StatisticalModel, scene: Scene | N
 
 
 def played_state(state: RegistrationState, scene: Scene) -> Played:
-    """State of the scene that the draws lead to.
+    """Play the draws of a state in their scene.
 
     Raises ``ValueError`` for a state of modes, for another scene, and where the scene does not take the draws.
     """
@@ -353,7 +332,7 @@ def played_state(state: RegistrationState, scene: Scene) -> Played:
 
 
 def scene_of(state: RegistrationState) -> Scene:
-    """Scene of a state where it is built in; ``ValueError`` for others: a name from a file never runs another one."""
+    """Load the built-in scene of a state; ``ValueError`` for others: a name from a file never runs another one."""
     if state.scene not in SCENES:
         raise ValueError(
             f"the state belongs to the scene {state.scene!r}, which is not built in: name its file with --scene"

@@ -1,16 +1,18 @@
-"""Many poses at once, compared with a frame and drawn towards it by rigid steps, in single array operations.
+"""Search for the pose and the state of an object in a frame, without a network.
 
-    poses -aligned-> poses nearer to the frame, with their costs
+    cloud, lines of sight, statistical model -search-> the state that explains the frame, and how many explain it alike
 
-Each pose takes some observed points into the frame of its state, whose table names the nearest sample of the surface;
-some samples are looked up in a table of what the frame rules out. A Gauss-Newton step turns, shifts and scales.
-
-Notation: n poses, p observed points, w samples that are looked up.
+1. Rotations, evenly over all, of the mean state, with its visible side on the cloud; rigid steps draw each towards the
+   frame (``Screen``).
+2. The best that differ are bent towards the frame by few points, from wide to narrow.
+3. The best of these are fitted as a frame always is, as long as they may be better or as good.
+4. While the frame is not explained, the same again from other states of the library, more and more of them.
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from itertools import permutations
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32
@@ -18,26 +20,26 @@ from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from mereo.fitting.modes import PAIR_SLACK, ScoredFit, explored, fit_cloud, fit_wide, refined
 from mereo.fitting.problem.evidence import Evidence
-from mereo.fitting.problem.gauss_newton import cross
-from mereo.fitting.problem.residuals import ROBUST, SILHOUETTE_WEIGHT, SampledSurface
+from mereo.fitting.problem.gauss_newton import DAMPING, Posed, cross
+from mereo.fitting.problem.problem import UNEXPLAINED, Problem
+from mereo.fitting.problem.residuals import ROBUST, SILHOUETTE_WEIGHT, Prior, SampledSurface
+from mereo.fitting.problem.segments import corner_positions, diverse_rows, rms_distance
 from mereo.geometry.transforms import rotation_along
 from mereo.io.cores import cores
 from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
 
 # --- table of lines of sight ------------------------------------------------------------------------------------------
 
-# What a frame rules out as a table, in which many places are looked up at once.
-#
-# Notation: n poses, w places of each, c cells.
-
-SIDE = 96
-"""Cells along each side of the table of what a frame rules out; about as many as a depth image has pixels there."""
+# Notation: n poses, w positions of each, c cells.
 
 
-def clipped(place: Float32[np.ndarray, "n w d"], count: int) -> Int32[np.ndarray, "n w d"]:
+def clipped(position: Float32[np.ndarray, "n w d"], count: int) -> Int32[np.ndarray, "n w d"]:
     """Index of a cell along each axis, of ``count``: that at the border for what lies beyond, or nowhere."""
-    index: Int32[np.ndarray, "n w d"] = np.fmax(np.fmin(place, np.float32(count - 1)), np.float32(0)).astype(np.int32)
+    index: Int32[np.ndarray, "n w d"] = np.fmax(np.fmin(position, np.float32(count - 1)), np.float32(0)).astype(
+        np.int32
+    )
     return index
 
 
@@ -64,7 +66,7 @@ class SightTable:
 
     @classmethod
     def of(cls, evidence: Evidence) -> "SightTable":
-        """Table around the cloud, three times as wide; beyond, the nearest cell of the border stands for a place."""
+        """Table around the cloud, three times as wide; beyond, the nearest cell of the border stands for a position."""
         direction = evidence.sight.data[: len(evidence.points)]
         T = rotation_along(direction.mean(axis=0) / np.linalg.norm(direction.mean(axis=0))).T
         turned = evidence.points @ T.T
@@ -72,7 +74,7 @@ class SightTable:
         low, high = slope.min(axis=0), slope.max(axis=0)
         side = 3.0 * float((high - low).max()) + 4 * evidence.pitch
         corner = (low + high - side) / 2
-        cells = min(SIDE, max(16, int(side / evidence.pitch)))
+        cells = min(96, max(16, int(side / evidence.pitch)))
         across = corner + (np.stack(np.meshgrid(*(np.arange(cells) + 0.5,) * 2, indexing="ij"), -1)) * side / cells
         sight = np.concatenate([across.reshape(-1, 2), np.ones((cells * cells, 1))], axis=1) @ T
         sight /= np.linalg.norm(sight, axis=1, keepdims=True)
@@ -88,44 +90,33 @@ class SightTable:
         )
 
     def violations(
-        self, place: Float32[np.ndarray, "n w 3"], slack: float
+        self, position: Float32[np.ndarray, "n w 3"], slack: float
     ) -> tuple[Float32[np.ndarray, "n w 3"], Float32[np.ndarray, "n w"]]:
-        """``Evidence.violations`` of many places, up to a cell."""
+        """``Evidence.violations`` of many positions, up to a cell."""
         cells = round(np.sqrt(len(self.front)))
-        turned = place @ self.T.T
+        turned = position @ self.T.T
         slope = turned[..., :2] / np.maximum(turned[..., 2:], 1e-6)
         index = clipped((slope - self.low) / self.cell, cells)
         row = index[..., 0] * cells + index[..., 1]
-        distance = np.sqrt(np.einsum("nwi,nwi->nw", place, place))
+        distance = np.sqrt(np.einsum("nwi,nwi->nw", position, position))
         toward, free = self.toward[row], self.free[row]
-        beside = free > distance - slack
-        sideways = toward * distance[..., None] - place
+        is_past = free > distance - slack
+        sideways = toward * distance[..., None] - position
         length = np.sqrt(np.einsum("nwi,nwi->nw", sideways, sideways))
-        direction = np.where(beside[..., None], sideways / np.maximum(length, 1e-9)[..., None], toward)
+        direction = np.where(is_past[..., None], sideways / np.maximum(length, 1e-9)[..., None], toward)
         ahead = np.where(free < 0, self.front[row] - slack - distance, 0.0)
-        amount = np.where(beside, length - self.pitch * distance, ahead)
+        amount = np.where(is_past, length - self.pitch * distance, ahead)
         return direction, np.maximum(amount, 0.0).astype(np.float32)
 
 
 # --- tables of shapes -------------------------------------------------------------------------------------------------
 
-# Some states of an object as tables: evenly spread samples of the surface, and the nearest of them to every place.
-#
 # A table is made once for an object. With it, thousands of poses are compared with a cloud in single array operations.
 #
 # Notation: q states, s samples, r cells along each side of a table.
 
-SAMPLES = 512
-"""Samples of the surface: they are 2 to 4 % of half its longest side apart, far less than the first sigma."""
-
 CELLS = 32
 """Cells along each side of a table."""
-
-MARGIN = 0.5
-"""By so much of its half length is a table larger than its state on each side; beyond, all points are outliers."""
-
-MODELS = 4
-"""Objects whose tables are kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,13 +125,13 @@ class ShapeTables:
 
     Attributes:
         z: coefficients of each state.
-        place, normal: of its samples.
+        position, normal: of its samples.
         low, cell: corner of each table's box, and the length of a cell.
         nearest: index of the sample nearest to the centre of each cell.
     """
 
     z: Float32[np.ndarray, "q k"]
-    place: Float32[np.ndarray, "q s 3"]
+    position: Float32[np.ndarray, "q s 3"]
     normal: Float32[np.ndarray, "q s 3"]
     low: Float32[np.ndarray, "q 3"]
     cell: Float32[np.ndarray, " q"]
@@ -151,21 +142,21 @@ class ShapeTables:
         """Tables of states with the coefficients ``z``."""
         flat = z @ surface.modes.reshape(-1, model.count).T
         frame = surface.mean + flat.reshape(len(z), *surface.mean.shape)
-        place = np.ascontiguousarray(frame[:, :, 0])
+        position = np.ascontiguousarray(frame[:, :, 0])
         normal = cross(frame[:, :, 1].reshape(-1, 3), frame[:, :, 2].reshape(-1, 3))
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-        margin = np.float32(MARGIN * model.half)
-        low, high = place.min(axis=1) - margin, place.max(axis=1) + margin
+        margin = np.float32(0.5 * model.half)  # beyond, all points are outliers
+        low, high = position.min(axis=1) - margin, position.max(axis=1) + margin
         cell = (high - low).max(axis=1) / CELLS
         low = (low + high - CELLS * cell[:, None]) / 2
         steps = np.stack(np.meshgrid(*(np.arange(CELLS, dtype=np.float32) + 0.5,) * 3, indexing="ij"), axis=-1)
         nearest = [
-            cKDTree(place[i], balanced_tree=False, compact_nodes=False).query(low[i] + cell[i] * steps.reshape(-1, 3))[
-                1
-            ]
+            cKDTree(position[i], balanced_tree=False, compact_nodes=False).query(
+                low[i] + cell[i] * steps.reshape(-1, 3)
+            )[1]
             for i in range(len(z))
         ]
-        return cls(z, place, normal.reshape(place.shape), low, cell, np.stack(nearest).astype(np.int32))
+        return cls(z, position, normal.reshape(position.shape), low, cell, np.stack(nearest).astype(np.int32))
 
 
 def medoids(model: StatisticalModel, count: int) -> Int[np.ndarray, " q"]:
@@ -181,10 +172,10 @@ def medoids(model: StatisticalModel, count: int) -> Int[np.ndarray, " q"]:
     return rows
 
 
-@lru_cache(maxsize=MODELS)
+@lru_cache(maxsize=4)
 def tables_of(model: StatisticalModel, count: int) -> ShapeTables:
     """Tables of the mean state (``count`` 0), or of ``count`` medoids of the library; those of few models are kept."""
-    surface = SampledSurface.of(model, SAMPLES)
+    surface = SampledSurface.of(model, 512)  # far nearer to each other than the first sigma
     z = np.zeros((1, model.count), dtype=np.float32) if count == 0 else model.library[medoids(model, count)]
     return ShapeTables.of(model, z, surface)
 
@@ -192,10 +183,7 @@ def tables_of(model: StatisticalModel, count: int) -> ShapeTables:
 # --- screening --------------------------------------------------------------------------------------------------------
 
 POINTS = 128
-"""Observed points that a pose is compared with."""
-
-LOOKED_UP = 128
-"""Samples of the surface that are looked up."""
+"""Observed points that a pose is compared with, and samples of the surface that are looked up."""
 
 BLOCK = 150
 """Poses in one array operation: their arrays fit a core's cache, where 3,600 at once take seven times as long each."""
@@ -203,14 +191,8 @@ BLOCK = 150
 OUTSIDE = SILHOUETTE_WEIGHT * SILHOUETTE_VERTICES / 3000.0
 """Weight of what the frame rules out beside that of the cloud: as in the fit."""
 
-DAMPING = 1e-3
-"""Damping of a step, relative to the diagonal."""
-
 FARTHEST = 0.5
 """Largest turn of one step, rad, and largest change of the scale's logarithm."""
-
-ALONG = 0.2
-"""Weight of the distance along the surface in a step: with planes alone, poses far away slide past each other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +226,7 @@ class Poses:
     @classmethod
     def of_all(cls, parts: "list[Poses]") -> "Poses":
         """All of several."""
-        return cls(*(np.concatenate(part) for part in zip(*(vars(one).values() for one in parts), strict=True)))
+        return cls(*(np.concatenate(part) for part in zip(*(vars(part).values() for part in parts), strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,7 +268,7 @@ class Screen:
         parts = [visible]
         if self.in_part:
             for axis in rotation_along(ahead)[:, :2].T.astype(np.float32):
-                across = self.tables.place @ (rotations.transpose(0, 2, 1) @ axis).T
+                across = self.tables.position @ (rotations.transpose(0, 2, 1) @ axis).T
                 middle = (across * visible).sum(axis=1, keepdims=True) / np.maximum(
                     visible.sum(axis=1, keepdims=True), 1e-9
                 )
@@ -302,14 +284,14 @@ class Screen:
         """Every state at every rotation, with the centre of its weighted samples on that of the cloud."""
         center = self.points.mean(axis=0)
         weight = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-9)
-        middle = np.matmul(weight.transpose(0, 2, 1), self.tables.place)  # q r 3
+        middle = np.matmul(weight.transpose(0, 2, 1), self.tables.position)  # q r 3
         state, turn = np.divmod(np.arange(len(middle) * len(rotations)), len(rotations))
         rotation, middle = rotations[turn], middle[state, turn]
         log_scale = np.zeros(len(state), dtype=np.float32)
         if self.scaled:
-            place = np.matmul(self.tables.place[state] - middle[:, None], rotation.transpose(0, 2, 1))
+            position = np.matmul(self.tables.position[state] - middle[:, None], rotation.transpose(0, 2, 1))
             across = np.eye(3, dtype=np.float32) - ahead[:, None] * ahead
-            spread = np.einsum("nsi,nsi,ns->n", place @ across, place, weight.transpose(0, 2, 1)[state, turn])
+            spread = np.einsum("nsi,nsi,ns->n", position @ across, position, weight.transpose(0, 2, 1)[state, turn])
             seen = ((self.points - center) @ across * (self.points - center)).sum(axis=1).mean()
             log_scale = (0.5 * np.log(seen / np.maximum(spread, 1e-9))).astype(np.float32)
         shift = np.exp(log_scale)[:, None] * np.einsum("nij,nj->ni", rotation, middle)
@@ -320,7 +302,7 @@ class Screen:
         """Poses after a rigid step, with the costs that they had before; ``sigma`` is a share of ``half``."""
         return self._in_blocks(poses, sigma, True)
 
-    def judged(self, poses: Poses, sigma: float) -> Poses:
+    def scored(self, poses: Poses, sigma: float) -> Poses:
         """Poses with their costs for a sigma in shares of ``half``."""
         return self._in_blocks(poses, sigma, False)
 
@@ -336,13 +318,13 @@ class Screen:
         seen = np.matmul(self.points - poses.translation[:, None], poses.rotation) / size
         index = clipped((seen - tables.low[state]) / tables.cell[state][..., None], CELLS)
         sample = tables.nearest[state, (index[..., 0] * CELLS + index[..., 1]) * CELLS + index[..., 2]]
-        place, normal = tables.place[state, sample], tables.normal[state, sample]
-        offset, narrow = seen - place, sigma / size[..., 0]
+        position, normal = tables.position[state, sample], tables.normal[state, sample]
+        offset, narrow = seen - position, sigma / size[..., 0]
         camera = -np.matmul(inverse, poses.translation[..., None]).transpose(0, 2, 1) / size
-        facing = np.einsum("npi,npi->np", camera - place, normal) > 0
+        facing = np.einsum("npi,npi->np", camera - position, normal) > 0
         squared = np.einsum("npi,npi->np", offset, offset) / narrow**2
         squared = np.where(facing, squared, squared + ROBUST**2)
-        few = tables.place[poses.state, :: max(1, tables.place.shape[1] // LOOKED_UP)]
+        few = tables.position[poses.state, :: max(1, tables.position.shape[1] // POINTS)]
         direction, amount = self.sight.violations(poses.place(few), ROBUST * sigma)
         outside, robust = (amount / sigma) ** 2, (4 * ROBUST) ** 2
         cost = (squared / (1.0 + squared / ROBUST**2)).mean(axis=1)
@@ -364,7 +346,8 @@ class Screen:
             )
         )
         matrix, gradient = _normal_equations(rows, residual, weight)
-        near, pulled = _along(seen, offset, ALONG * weight[:, : len(self.points)])
+        # with planes alone, poses far away would slide past each other
+        near, pulled = _along(seen, offset, 0.2 * weight[:, : len(self.points)])
         return _moved(poses, matrix + near, gradient + pulled, self.scaled)
 
 
@@ -388,7 +371,7 @@ def _along(
 
 
 def _moved(poses: Poses, matrix: Float[np.ndarray, "n 7 7"], gradient: Float[np.ndarray, "n 7"], scaled: bool) -> Poses:
-    """Poses after the step that the normal equations ask for."""
+    """Poses after the step of the normal equations."""
     count = 7 if scaled else 6
     matrix, gradient = matrix[:, :count, :count].astype(np.float64), gradient[:, :count].astype(np.float64)
     diagonal = np.einsum("nkk->nk", matrix)
@@ -407,3 +390,209 @@ def _moved(poses: Poses, matrix: Float[np.ndarray, "n 7 7"], gradient: Float[np.
         translation=(poses.translation - shift).astype(np.float32),
         log_scale=log_scale.astype(np.float32),
     )
+
+
+# --- the search -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SearchRound:
+    """One round of the search.
+
+    Attributes:
+        states: medoids of the library that are tried; 0 tries the mean state.
+        rotations: tried with each of them.
+        bent: candidates that are bent towards the frame by few points.
+        fitted: how many of these are fitted at most.
+    """
+
+    states: int
+    rotations: int
+    bent: int
+    fitted: int
+
+
+ROUNDS = (SearchRound(0, 400, 12, 4), SearchRound(12, 200, 24, 6), SearchRound(40, 150, 40, 8))
+"""Rounds of the search, one after the other while the frame is not explained."""
+
+SIGMAS = (
+    *((0.15, 1.0), (0.15, 0.7), (0.12, 0.6), (0.1, 0.6), (0.08, 0.6), (0.06, 0.7)),
+    *((0.05, 1.0), (0.05, 1.0), (0.05, 1.0)),
+)
+"""The cloud's standard deviation in each rigid step, in half lengths, and which share of the poses go on after it."""
+
+APART = 0.15
+"""Distance between two poses' samples, as a share of the half length, up to which they are one."""
+
+BENT_APART = 0.05
+"""The same of candidates that are bent already."""
+
+BENDING = ((0.12, 5, 0.05), (0.05, 8, 0.02))
+"""First sigma, steps, and the sigma of the choice, of the two stages in which few points bend a candidate."""
+
+RIVAL = 1.5
+"""Misfit by few points, in misfits of the best, up to which a candidate may still be as good.
+
+Of 65 candidates with more, of 25 training views that others explain, none ended lower by a cloud's misfit of .01."""
+
+ALIKE = 0.05
+"""Difference of the cloud's misfit up to which two states explain a frame alike."""
+
+WHOLE = 150.0
+"""Misfit by which an object that is seen whole may be explained worse than one that something hides in part.
+
+The silhouette only adds to the misfit, so the hypothesis without it has a lower one: by more than this on 4 of 40 whole
+training views, and on all of 40 of which 30 % are hidden."""
+
+
+@dataclass(frozen=True, eq=False)
+class SearchOutcome:
+    """Outcome of a search.
+
+    Attributes:
+        problem: the frame, with the constants of its noise.
+        best: the candidate that explains the frame best.
+        alike: number of candidates that explain it alike and differ from each other, the best included.
+        tried: number of candidates that were fitted.
+    """
+
+    problem: Problem
+    best: ScoredFit
+    alike: int
+    tried: int
+
+
+def rotations(count: int) -> Float[np.ndarray, "n 3 3"]:
+    """Return rotations, evenly over all (super-Fibonacci spirals; Alexa, CVPR 2022)."""
+    step = np.arange(count) + 0.5
+    inner, outer = np.sqrt(step / count), np.sqrt(1 - step / count)
+    first, second = 2 * np.pi * step / np.sqrt(2), 2 * np.pi * step / 1.533751168755204288118041
+    spiral = (inner * np.sin(first), inner * np.cos(first), outer * np.sin(second), outer * np.cos(second))
+    matrices: Float[np.ndarray, "n 3 3"] = Rotation.from_quat(np.stack(spiral, axis=1)).as_matrix()
+    return matrices
+
+
+@dataclass(eq=False)
+class _Trail:
+    """Search under one hypothesis on the lines of sight beside the cloud, as far as it has come."""
+
+    problem: Problem
+    handicap: float = 0.0
+    fitted: list[ScoredFit] = field(default_factory=list)
+
+    @property
+    def best(self) -> ScoredFit:
+        return min(self.fitted, key=_total)
+
+    @property
+    def is_explained(self) -> bool:
+        return self.best.explains(self.problem)
+
+    def go_on(self, stage: SearchRound) -> None:
+        self.fitted += fit_candidates(self.problem, candidates(self.problem, stage), stage.fitted)
+        if not self.is_explained:
+            self.fitted.append(explored(self.problem, self.best))
+
+    def as_noisy(self) -> "_Trail | None":
+        """The same with the constants for what the best fit leaves over, where that is noise and not the fit's error.
+
+        Only after other states were tried: a wrong state may leave over what looks like noise.
+        """
+        states = [scored.posed for scored in sorted(self.fitted, key=_total)]
+        for is_shared in (False, True):
+            noisy = self.problem.as_noisy_as(self.best.surface, is_shared)
+            if noisy is None:
+                continue
+            rows = differing(noisy, states, BENT_APART)[:4]
+            trail = _Trail(noisy, 0.0, [explored(noisy, refined(noisy, fit_wide(noisy, states[row]))) for row in rows])
+            if noisy.leaves_noise(trail.best.surface, is_shared):
+                return trail
+        return None
+
+    def outcome(self) -> SearchOutcome:
+        best = self.best
+        rivals = [scored for scored in self.fitted if scored.misfit.cloud < best.misfit.cloud + ALIKE]
+        alike = differing(self.problem, [scored.posed for scored in sorted(rivals, key=_total)], APART)
+        return SearchOutcome(self.problem, best, len(alike), len(self.fitted))
+
+
+def search(whole: Problem, partial: Problem | None = None) -> SearchOutcome:
+    """Search for the state that explains a frame.
+
+    Args:
+        whole: the frame, without correspondences.
+        partial: the same where it is open whether the object is seen whole: with nothing known beside the cloud. It is
+            taken where it explains the frame better by more than ``WHOLE``.
+    """
+    trails = [_Trail(whole)] if partial is None else [_Trail(whole), _Trail(partial, WHOLE)]
+    for number, stage in enumerate(ROUNDS[: whole.config.search_rounds]):
+        for trail in trails:
+            trail.go_on(stage)
+        for trail, other in permutations(trails, 2):  # either may have found what the other has missed
+            trail.fitted.append(refined(trail.problem, other.best.posed))
+        chosen = min(trails, key=lambda trail: trail.best.misfit.total + trail.handicap)
+        if chosen.is_explained or (number > 0 and chosen.best.misfit.cloud < UNEXPLAINED):
+            break
+        if number > 0:
+            noisy = chosen.as_noisy()
+            if noisy is not None:
+                return noisy.outcome()
+            trails = [chosen]
+    return chosen.outcome()
+
+
+def _total(scored: ScoredFit) -> float:
+    return scored.misfit.total
+
+
+def fit_candidates(problem: Problem, candidates: list[tuple[float, Posed]], most: int) -> list[ScoredFit]:
+    """Fit the candidates that may be the best, given with their misfits by few points, the lowest first."""
+    fitted: list[ScoredFit] = []
+    for cost, posed in candidates[:most]:
+        if fitted and cost > RIVAL * candidates[0][0] and min(fitted, key=_total).explains(problem):
+            break
+        fitted.append(refined(problem, fit_wide(problem, posed)))
+    return fitted
+
+
+def candidates(problem: Problem, stage: SearchRound) -> list[tuple[float, Posed]]:
+    """Find candidates in a round, with their misfits by few points, the lowest first."""
+    coarse, whole = problem.coarse, Prior.whole(problem.model)
+    bent, cost = screen_poses(problem, stage), list[float]()
+    for start, steps, sigma in BENDING:
+        bent = [fit_cloud(coarse, posed, whole, start, steps, PAIR_SLACK) for posed in bent]
+        cost = [coarse.screen(posed, sigma * problem.model.half).without_network for posed in bent]
+        order = np.argsort(cost)
+        bent, cost = [bent[index] for index in order], [cost[index] for index in order]
+        rows = differing(problem, bent, BENT_APART)[: max(stage.fitted, len(bent) // 2)]
+        bent, cost = [bent[row] for row in rows], [cost[row] for row in rows]
+    return list(zip(cost, bent, strict=True))
+
+
+def differing(problem: Problem, states: list[Posed], apart: float) -> list[int]:
+    """Rows of the states of which each differs from all before it by ``apart`` half lengths in the mean."""
+    return diverse_rows(corner_positions(problem.model, states), apart * problem.model.half, rms_distance)
+
+
+def screen_poses(problem: Problem, stage: SearchRound) -> list[Posed]:
+    """Choose diverse poses from which bending goes on."""
+    tables = tables_of(problem.model, stage.states)
+    screen = Screen.of(tables, problem.evidence, problem.model.half, problem.is_scale_open)
+    poses = screen.starts(rotations(stage.rotations))
+    for sigma, share in SIGMAS:
+        poses = screen.aligned(poses, sigma)
+        count = max(round(share * len(poses)), 2 * stage.bent)
+        poses = poses if count >= len(poses) else poses.rows(np.argpartition(poses.cost, count)[:count])
+    poses = screen.scored(poses, SIGMAS[-1][0])
+    poses = poses.rows(np.argsort(poses.cost))
+    positions = poses.place(tables.position[poses.state, ::16])
+    return [
+        _posed(screen, poses, row)
+        for row in diverse_rows(positions, APART * problem.model.half, rms_distance)[: stage.bent]
+    ]
+
+
+def _posed(screen: Screen, poses: Poses, row: int) -> Posed:
+    z = screen.tables.z[poses.state[row]].astype(np.float64)
+    rotation = Rotation.from_matrix(poses.rotation[row]).as_matrix()
+    return Posed(rotation, poses.translation[row].astype(np.float64), z, float(poses.log_scale[row]))

@@ -1,0 +1,334 @@
+"""Fit pose and coefficients of the statistical model to a frame.
+
+1. From the mean state, the network's correspondences alone, from wide to narrow.
+2. Cloud, silhouette, free space, and less and less the correspondences.
+3. The same again under the Gaussian of the library's states near the answer: states lie on curved sets, of which it is
+   the tangent.
+4. While the cloud is not explained, other states of the library, where the states lie on a curved set at all.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import islice
+
+import numpy as np
+from jaxtyping import Float, Float32
+from scipy.spatial.transform import Rotation
+
+from mereo.fitting.problem.correspondences import Correspondences
+from mereo.fitting.problem.evidence import MOST_POINTS
+from mereo.fitting.problem.gauss_newton import DAMPING, Posed
+from mereo.fitting.problem.problem import UNEXPLAINED, Misfit, Problem
+from mereo.fitting.problem.residuals import NetworkTerm, Prior, Surface
+from mereo.fitting.problem.segments import corner_positions, different, diverse_rows, largest_distance
+from mereo.geometry.downsampling import means_along_sight
+from mereo.geometry.surface_patches import smoothed
+from mereo.geometry.transforms import best_rotations, fit_rigid, robust_rigid, rotation_along
+
+REFINE_SIGMA = 0.02
+"""The cloud's first standard deviation in a refinement, as all sigmas of this module a share of ``half``."""
+
+PAIR_SLACK = 0.05
+"""How far the kept distances may be off at first; it falls in each step."""
+
+
+def fit_modes(problem: Problem) -> "ScoredFit":
+    """Fit from the correspondences, refine, and try other states while the frame is not explained."""
+    return explored(problem, refined(problem, fit_whole(problem)))
+
+
+def refined(problem: Problem, posed: Posed) -> "ScoredFit":
+    """Return the better of a state and its refinement."""
+    return ScoredFit.of(problem, posed).better(problem, refine(problem, posed))
+
+
+def explored(problem: Problem, best: "ScoredFit") -> "ScoredFit":
+    """Try states that agree with a fit or the network, while the best does not explain the cloud.
+
+    Only where many distances are kept: smooth bending has one optimum.
+    """
+    for number in range(2 if len(problem.model.pairs) >= 300 else 0):
+        if best.explains(problem):
+            break
+        before = best
+        for other in find_candidates(problem, best.posed, number):
+            best = best.better(problem, refine(problem, other, 1.0, 8))
+        if best is before:
+            break
+    return best
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredFit:
+    """A state, its misfit and its surface."""
+
+    posed: Posed
+    misfit: Misfit
+    surface: Surface
+
+    @classmethod
+    def of(cls, problem: Problem, posed: Posed) -> "ScoredFit":
+        """Score a state."""
+        surface = Surface.of(problem.model, posed)
+        return cls(posed, problem.misfit(posed, surface), surface)
+
+    def explains(self, problem: Problem) -> bool:
+        """Whether the state explains the cloud, noise aside."""
+        return problem.explained(self.misfit.cloud, self.surface, problem.config.explained)
+
+    def better(self, problem: Problem, other: Posed) -> "ScoredFit":
+        """Return this fit, or another state where its misfit is lower."""
+        scored = ScoredFit.of(problem, other)
+        return scored if scored.misfit.total < self.misfit.total else self
+
+
+def find_candidates(problem: Problem, best: Posed, number: int) -> list[Posed]:
+    """Find two other states that may explain the frame: screen by few points, refine a little, screen again."""
+    coarse, sigma = problem.coarse, REFINE_SIGMA * problem.model.half
+    library = similar_states(problem, best, 12) + (states_like_network(problem, 2) if number == 0 else [])
+    screened = [
+        group[index]
+        for group in (library, problem.joints.others(best, 4))
+        for index in np.argsort([coarse.screen(other, sigma).total for other in group])[:8]
+    ]
+    # those that differ from ``best`` and from all before them: from alike starts a fit ends alike
+    drawn = [best, *(refine(coarse, other, 2.0, 4) for other in screened)]
+    rows = diverse_rows(corner_positions(problem.model, drawn), ALIKE * problem.model.half, largest_distance)[1:]
+    order = np.argsort([problem.screen(drawn[row], sigma).total for row in rows])
+    return [drawn[rows[index]] for index in order[:2]]
+
+
+def fit_whole(problem: Problem) -> Posed:
+    """Fit stages 1 and 2 from the mean state, under the prior of all states."""
+    prior = Prior.whole(problem.model)
+    z = np.zeros(problem.model.count)
+    T = robust_rigid(problem.unposed(z), problem.network.target, problem.network.confidence, problem.network_sigma)
+    return fit_wide(problem, fit_network(problem, Posed(T[:3, :3], T[:3, 3], z), prior))
+
+
+def fit_wide(problem: Problem, posed: Posed) -> Posed:
+    """Fit stage 2 from a state that may be far off, under the prior of all states."""
+    return fit_cloud(problem, posed, Prior.whole(problem.model), problem.config.start_sigma, 15, PAIR_SLACK)
+
+
+def refine(problem: Problem, posed: Posed, widening: float = 1.0, steps: int = 10) -> Posed:
+    """Fit from nearby, under the prior of the library's 50 states nearest to ``posed``."""
+    prior = Prior.near(problem.model, posed.z, 50, 0.17)
+    return fit_cloud(problem, posed, prior, widening * REFINE_SIGMA, steps, 0.0)
+
+
+def fit_network(problem: Problem, posed: Posed, prior: Prior) -> Posed:
+    """Fit the correspondences alone, from wide to narrow; robust from a third of the steps on."""
+    steps = 8
+    for step in range(steps):
+        sigma = problem.network_sigma * 2.5 ** (1.0 - step / (steps - 1))
+        normal = problem.known(posed, prior, PAIR_SLACK * problem.model.half)
+        normal = problem.network.add_to(normal, posed, sigma, 500.0, robust=3 * step >= steps)
+        posed = posed.moved(normal.step(DAMPING))
+    return posed
+
+
+def fit_cloud(problem: Problem, posed: Posed, prior: Prior, start: float, steps: int, slack: float) -> Posed:
+    """Fit everything that the frame shows; ``start`` (the cloud's first sigma) and ``slack`` are shares of ``half``."""
+    config, half = problem.config, problem.model.half
+    for step in range(steps):
+        share = step / max(1, steps - 1)
+        sigma = max(start * half * 0.75**step, config.cloud_sigma)
+        weight = config.network_weight[0] * (1 - share) + config.network_weight[1] * share
+        normal = problem.known(posed, prior, slack * half * 0.7**step)
+        exact = steps - step <= config.exact_steps and sigma <= 2 * config.cloud_sigma
+        posed = posed.moved(problem.seen(normal, posed, sigma, weight, exact).step(DAMPING))
+    return posed
+
+
+# --- states of the library from which a fit may start -----------------------------------------------------------------
+
+SEARCHED = 700
+"""States of the library that are compared with a fit or the network's correspondences."""
+
+FEWER = 64
+"""Correspondences, and material points, that rank them."""
+
+ALIKE = 0.03
+"""Tolerance, of half the rest box's longest side: points nearer than this agree."""
+
+
+def robust_poses(
+    states: Float32[np.ndarray, "n p 3"],
+    target: Float32[np.ndarray, "p 3"],
+    weight: Float32[np.ndarray, " p"],
+    sigma: float,
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
+    """Fit robust rigid poses of many shapes at once to the same points: cost in 0..1, rotations, translations."""
+    share = np.broadcast_to(weight / weight.sum(), states.shape[:2])
+    for _ in range(4):
+        center, goal = np.matmul(share[:, None], states), (share @ target)[:, None]
+        covariance = np.matmul((states - center).transpose(0, 2, 1) * share[:, None], target - goal)
+        rotation = best_rotations(covariance)
+        squared = ((np.matmul(states - center, rotation.transpose(0, 2, 1)) + goal - target) ** 2).sum(axis=2)
+        scale = np.maximum(np.median(squared, axis=1, keepdims=True), sigma**2)
+        share = weight / (1.0 + squared / scale)
+        share = share / share.sum(axis=1, keepdims=True)
+    cost = squared / (sigma**2 + squared) @ (weight / weight.sum())
+    translation = goal - np.matmul(center, rotation.transpose(0, 2, 1))
+    return cost, rotation.astype(np.float64), translation[:, 0].astype(np.float64)
+
+
+def states_like_network(problem: Problem, count: int) -> list[Posed]:
+    """Return the states of the library that explain the correspondences best, posed on them."""
+    network, library = problem.network, problem.model.library
+    if len(network.target) == 0:
+        return []
+    few = np.arange(0, len(network.target), max(1, len(network.target) // FEWER))
+    library = library[:: max(1, len(library) // SEARCHED)]
+    motion = library @ network.modes[few].reshape(-1, library.shape[1]).T
+    states = network.mean[few].astype(np.float32) + motion.reshape(len(library), -1, 3)
+    target, weight = network.target[few].astype(np.float32), network.confidence[few].astype(np.float32)
+    cost, rotation, translation = robust_poses(states, target, weight, problem.network_sigma)
+    best = np.argsort(cost)[:count]
+    return [Posed(rotation[i], translation[i], library[i].astype(np.float64)) for i in best]
+
+
+def similar_states(problem: Problem, posed: Posed, count: int) -> list[Posed]:
+    """Return states of the library that agree with a fit in most points and differ from each other in the rest.
+
+    A wheel that is seen on one side only may be half a turn off, or a finger taken for the other: everything else is
+    right already.
+    """
+    model = problem.model
+    goal = model.material(posed.z)[model.sparse].astype(np.float32)
+    equal = np.ones(len(goal), dtype=np.float32)
+    step = max(1, len(model.library) // SEARCHED)
+    few = model.sparse_library[::step, :FEWER]
+    alike = step * np.argsort(robust_poses(few, goal[:FEWER], equal[:FEWER], ALIKE * model.half)[0])[:80]
+    _, rotation, translation = robust_poses(model.sparse_library[alike], goal, equal, ALIKE * model.half)
+    shapes = np.matmul(model.sparse_library[alike], rotation.transpose(0, 2, 1)) + translation[:, None]
+    shapes = shapes.reshape(len(alike), -1)
+    chosen = [0, *different(shapes, shapes[0], min(count, len(shapes)) - 1)]
+    shift, z = posed.place(translation), model.library[alike].astype(np.float64)
+    return [Posed(posed.rotation @ rotation[i], shift[i], z[i], posed.log_scale) for i in chosen]
+
+
+# --- the object at rest -----------------------------------------------------------------------------------------------
+
+# The object at rest: the hypothesis that nothing is bent, compared with the modes by its evidence.
+#
+# Modes can imitate noise, so their misfit is always lower; a hypothesis with fewer free numbers is right when the
+# difference is smaller than what that freedom buys. By Laplace's approximation (MacKay, Neural Computation 1992) that
+# is the logarithm of how much the frame narrows the coefficients, ``log det`` of their posterior precision, as the
+# prior is N(0, 1) each.
+
+
+def fit_rest(problem: Problem, correspondences: Correspondences, modes: Posed) -> ScoredFit:
+    """Fit the rest model's pose from that of the modes; its ``posed.z`` is empty."""
+    model, rest = problem.model, of_rest(problem, correspondences)
+    T = fit_rigid(model.rest_points, modes.place(model.material(modes.z)))
+    start = Posed(T[:3, :3], T[:3, 3], np.empty(0), modes.log_scale)
+    prior = Prior(np.empty(0), np.empty((0, 0)))
+    posed = fit_cloud(rest, start, prior, REFINE_SIGMA, 10, 0.0)
+    return ScoredFit.of(rest, posed)
+
+
+def of_rest(problem: Problem, correspondences: Correspondences) -> Problem:
+    """Return the problem of the rest model's pose alone."""
+    model = problem.model
+    rigid = model.around(model.rest_points, np.zeros((len(model.rest_points), 3, 0), dtype=np.float32))
+    return replace(problem, model=rigid, network=NetworkTerm.of(rigid, correspondences))
+
+
+def is_at_rest(problem: Problem, modes: ScoredFit, rest: ScoredFit) -> bool:
+    """Whether the evidence of the rest model is greater than that of the modes."""
+    return rest.misfit.total - modes.misfit.total < narrowing(problem, modes.posed)
+
+
+def narrowing(problem: Problem, modes: Posed) -> float:
+    """``NormalEquations.narrowing`` of the modes at a state."""
+    config = problem.config
+    known = problem.known(modes, Prior.whole(problem.model), 0.0)
+    return problem.seen(known, modes, config.cloud_sigma, config.network_weight[1], True).narrowing()
+
+
+# --- noisy frames -----------------------------------------------------------------------------------------------------
+
+PredictCorrespondences = Callable[[Float[np.ndarray, "n 3"]], Correspondences]
+"""Predicts correspondences of points of the camera frame, in their unit."""
+
+NetworkFit = tuple[Problem, Correspondences, ScoredFit]
+"""A frame, the network's correspondences, and the fit to both."""
+
+
+def as_noisy(start: NetworkFit, points: Float[np.ndarray, "n 3"], predict: PredictCorrespondences | None) -> NetworkFit:
+    """Fit a noisy frame once more where what the second fit leaves over is noise; else return the first fit.
+
+    The second fit decides, since noise throws the first off by more than it is itself.
+
+    Args:
+        start: the frame, taken for a clean one.
+        points: its cloud, scene units.
+        predict: the network, which also sees the smoothed cloud.
+    """
+    problem, correspondences, modes = start
+    noisy = problem.as_noisy_as(modes.surface)
+    if noisy is None:
+        return start
+    others = [] if predict is None else [predict(smoothed(means_along_sight(points, MOST_POINTS)))]
+    candidates = [(noisy, correspondences), *((noisy.with_network(other), other) for other in others)]
+    fits = [(*candidate, fit_modes(candidate[0])) for candidate in candidates]
+    best = min(fits, key=lambda fit: fit[2].misfit.without_network)
+    return best if best[0].leaves_noise(best[2].surface) else start
+
+
+# --- the camera turned ------------------------------------------------------------------------------------------------
+
+# A camera that turns about its own centre sees the same points along the same lines of sight, so the correspondences
+# may only turn along with it. A network's do so where it recognizes what it sees; where it does not, each turn gives
+# another guess, and the fit decides which is right.
+
+ROLL = np.pi / 4
+"""Angle between two turns about the line of sight to the object, rad."""
+
+TILTS = np.deg2rad([0.0, 15.0, 15.0, 25.0])
+"""Angles by which the camera is tilted away from the object, each with all rolls, rad."""
+
+
+def turns(axis: Float[np.ndarray, "3"]) -> Iterator[Float[np.ndarray, "3 3"]]:
+    """Generate rotations of the camera frame: rolls about a line of sight, without and with tilts away from it."""
+    axis = axis / np.linalg.norm(axis)
+    across = rotation_along(axis)[:, :2]
+    count = round(2 * np.pi / ROLL)
+    for number in range(1, count * len(TILTS)):
+        toward = 2.0 * number  # rad: so far apart are the directions of two tilts in a row
+        tilt = across @ np.array([np.cos(toward), np.sin(toward)]) * TILTS[number // count]
+        yield (Rotation.from_rotvec(tilt) * Rotation.from_rotvec(number * ROLL * axis)).as_matrix()
+
+
+def with_turned_camera(start: NetworkFit, predict: PredictCorrespondences | None) -> NetworkFit:
+    """Return a fit, or where it leaves much unexplained the best of it and of fits with the camera turned.
+
+    Args:
+        start: the fit to the frame as it is.
+        predict: the network, in scene units.
+    """
+    problem, _, modes = start
+    if predict is None or not problem.config.turned or not problem.wants_turns(modes.misfit.cloud, modes.surface):
+        return start
+    points, anyway = problem.evidence.points, problem.config.turned_anyway
+    best, waiting = start, turns(points.mean(axis=0))
+    while rotations := list(islice(waiting, 8)):
+        predicted = [predict(points @ turn.T).turned(turn.T) for turn in rotations]
+        frames = [(problem.with_network(correspondences), correspondences) for correspondences in predicted]
+        costs = [_coarse_misfit(frame) for frame, _ in frames]
+        for index in np.argsort(costs)[:2]:
+            frame, correspondences = frames[index]
+            modes = ScoredFit.of(frame, refine(frame, fit_whole(frame)))
+            if modes.misfit.without_network < best[2].misfit.without_network:
+                best = frame, correspondences, modes
+        if best[2].misfit.cloud < UNEXPLAINED or (anyway and best[0].leaves_noise(best[2].surface)):
+            break
+    return best if best is start else (best[0], best[1], explored(best[0], best[2]))
+
+
+def _coarse_misfit(problem: Problem) -> float:
+    """Misfit, without the network's term, of a fit by few points."""
+    posed = refine(problem.coarse, fit_whole(problem.coarse), 2.0, 4)
+    return problem.screen(posed, problem.config.cloud_sigma).without_network

@@ -1,0 +1,358 @@
+"""Segments of an object: the joints between them, and their turns that a frame cannot tell apart.
+
+Both are learned from the states of the statistical model, without code of a scene. Lengths are scene units.
+
+Notation: s segments, c corners of each (a few anchors), n states, k modes, m material points, a angles.
+"""
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from functools import lru_cache
+
+import igl
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from mereo.deformation.moving_least_squares import spread
+from mereo.fitting.problem.gauss_newton import Posed
+from mereo.fitting.problem.residuals import robust_square
+from mereo.geometry.mesh import Segment
+from mereo.geometry.transforms import best_rotations, fit_rigid
+from mereo.scenes.statistical_model import StatisticalModel
+
+# --- joints -----------------------------------------------------------------------------------------------------------
+
+# Segments that touch form a tree. One branch of it is moved as the library moves it there, and the rest stays: a hand
+# half a turn round, with the arm as it is. A library of random states hardly ever holds such a state.
+
+
+@dataclass(frozen=True, eq=False)
+class Joints:
+    """Joints of an object: which segments hang on which, and how states move them.
+
+    Attributes:
+        model: the statistical model.
+        corners: material points, ``c`` of each segment.
+        branches: pairs of a segment, the one that hangs on it, and which segments go along with that.
+        rotation, translation: of each segment in some states, from the mean: ``y = R x + t``.
+    """
+
+    model: StatisticalModel
+    corners: Int[np.ndarray, "s c"]
+    branches: tuple[tuple[int, int, Bool[np.ndarray, " s"]], ...]
+    rotation: Float[np.ndarray, "n s 3 3"]
+    translation: Float[np.ndarray, "n s 3"]
+
+    @classmethod
+    def of(cls, model: StatisticalModel) -> "Joints":
+        """Joints of a model's library."""
+        corners = corners_of(model)
+        rotation, translation = segment_poses(model.mean[corners], sampled_positions(model, corners))
+        return cls(model, corners, branches(model), rotation, translation)
+
+    def others(self, posed: Posed, each: int) -> list[Posed]:
+        """Make states that differ from one in a single joint, ``each`` of every joint, as different as there are."""
+        corners = positions(self.model, self.corners, posed.z[None].astype(np.float32))
+        rotation, translation = segment_poses(self.model.mean[self.corners], corners)
+        shapes_of_branches = []
+        for fixed, hanging, moving in self.branches:
+            # the hanging segment's pose in the fixed one's frame, in each state of the library and here
+            inverse = self.rotation[:, fixed].transpose(0, 2, 1)
+            turn = rotation[0, fixed] @ inverse @ self.rotation[:, hanging] @ rotation[0, hanging].T
+            offset = self.translation[:, hanging] - self.translation[:, fixed]
+            shift = (rotation[0, fixed] @ inverse @ offset[..., None])[..., 0] + translation[0, fixed]
+            shift = shift - (turn @ translation[0, hanging])
+            shapes = np.broadcast_to(corners, (len(turn), *corners.shape[1:])).copy()
+            branch = corners[0, moving].reshape(-1, 3)
+            moved = branch @ turn.transpose(0, 2, 1) + shift[:, None]
+            shapes[:, moving] = moved.reshape(len(turn), -1, *corners.shape[2:])
+            apart = different(moved.reshape(len(turn), -1), branch.ravel(), each)
+            shapes_of_branches.append(shapes[apart])
+        return (
+            self._expressed(np.concatenate(shapes_of_branches).reshape(-1, self.corners.size, 3), posed)
+            if shapes_of_branches
+            else []
+        )
+
+    def _expressed(self, shapes: Float[np.ndarray, "n p 3"], posed: Posed) -> list[Posed]:
+        """Find the states nearest to shapes of the corners in the frame of ``posed``'s modes."""
+        flat = self.model.modes[self.corners.ravel()].reshape(-1, self.model.count).astype(np.float64)
+        normal = flat.T @ flat
+        normal += 1e-3 * np.trace(normal) / max(1, len(normal)) * np.eye(len(normal))
+        solve = np.linalg.solve(normal, flat.T)
+        mean = self.model.mean[self.corners.ravel()]
+        fitted = np.broadcast_to(mean, shapes.shape)
+        goal = shapes.mean(axis=1, keepdims=True)
+        for _ in range(3):
+            middle = fitted.mean(axis=1, keepdims=True)
+            rotation = best_rotations(np.matmul((fitted - middle).transpose(0, 2, 1), shapes - goal))
+            unposed = np.matmul(shapes - goal, rotation) + middle
+            z = (unposed - mean).reshape(len(shapes), -1) @ solve.T
+            fitted = mean + (z @ flat.T).reshape(shapes.shape)
+        translation = (goal - middle @ rotation.transpose(0, 2, 1))[:, 0]
+        shift = posed.place(translation)
+        return [Posed(posed.rotation @ rotation[i], shift[i], z[i], posed.log_scale) for i in range(len(z))]
+
+
+def corners_of(model: StatisticalModel) -> Int[np.ndarray, "s c"]:
+    """A few anchors of each segment, as many of each."""
+    least = min(len(anchors) for anchors in model.anchors)
+    return np.stack([anchors[: min(12, least)] for anchors in model.anchors])
+
+
+def positions(
+    model: StatisticalModel, corners: Int[np.ndarray, "s c"], z: Float32[np.ndarray, "n k"]
+) -> Float[np.ndarray, "n s c 3"]:
+    """Positions of the corners in states."""
+    motion = z @ model.modes[corners.ravel()].reshape(-1, model.count).T
+    return model.mean[corners] + motion.reshape(len(z), *corners.shape, 3).astype(np.float64)
+
+
+def sampled_positions(model: StatisticalModel, corners: Int[np.ndarray, "s c"]) -> Float[np.ndarray, "n s c 3"]:
+    """Positions of the corners in about 60 states of the library."""
+    return positions(model, corners, model.library[:: max(1, len(model.library) // 60)])
+
+
+def corner_positions(model: StatisticalModel, states: list[Posed]) -> Float[np.ndarray, "n p 3"]:
+    """Positions of the corners of all segments in the camera frame, by which states are compared."""
+    z = np.stack([posed.z for posed in states]).astype(np.float32)
+    unposed = positions(model, corners_of(model), z).reshape(len(z), -1, 3)
+    return np.stack([posed.place(points) for posed, points in zip(states, unposed, strict=True)])
+
+
+def segment_poses(
+    mean: Float[np.ndarray, "s c 3"], states: Float[np.ndarray, "n s c 3"]
+) -> tuple[Float[np.ndarray, "n s 3 3"], Float[np.ndarray, "n s 3"]]:
+    """Rigid motion of each segment from the mean to each state."""
+    middle, goal = mean.mean(axis=1, keepdims=True), states.mean(axis=2, keepdims=True)
+    covariance = np.matmul((mean - middle).transpose(0, 2, 1), states - goal)
+    rotation = best_rotations(covariance)
+    return rotation, (goal[:, :, 0] - np.matmul(rotation, middle[:, 0, :, None])[..., 0])
+
+
+def branches(model: StatisticalModel) -> tuple[tuple[int, int, Bool[np.ndarray, " s"]], ...]:
+    """Every joint: the larger side, the segment that hangs on it, and all segments on the smaller side."""
+    count = len(model.anchors)
+    if count < 2:
+        return ()
+    trees = [cKDTree(model.rest_points[anchors]) for anchors in model.anchors]
+    distance = np.zeros((count, count))
+    for a in range(count):
+        for b in range(a + 1, count):
+            distance[a, b] = trees[a].query(model.rest_points[model.anchors[b]])[0].min() + 1e-6
+    tree = minimum_spanning_tree(distance).toarray()
+    result = []
+    for a, b in zip(*np.nonzero(tree), strict=True):
+        cut = tree.copy()
+        cut[a, b] = 0.0
+        beyond = np.zeros(count, dtype=bool)
+        beyond[breadth_first_order(cut, b, directed=False, return_predecessors=False)] = True
+        volume = [sum(model.vertex_counts[i] for i in np.flatnonzero(side)) for side in (beyond, ~beyond)]
+        result.append((int(a), int(b), beyond) if volume[0] <= volume[1] else (int(b), int(a), ~beyond))
+    return tuple(result)
+
+
+def diverse_rows(
+    positions: Float[np.ndarray, "n p 3"], apart: float, measure: Callable[[Float[np.ndarray, "m p 3"]], np.ndarray]
+) -> list[int]:
+    """Rows of which each is farther than ``apart`` from all before it, by a measure of the points' offsets."""
+    kept: list[int] = []
+    for row, points in enumerate(positions):
+        if not kept or measure(positions[kept] - points).min() > apart:
+            kept.append(row)
+    return kept
+
+
+def largest_distance(offset: Float[np.ndarray, "m p 3"]) -> Float[np.ndarray, " m"]:
+    """Length of the longest offset of each row."""
+    longest: np.ndarray = np.linalg.norm(offset, axis=2).max(axis=1)
+    return longest
+
+
+def rms_distance(offset: Float[np.ndarray, "m p 3"]) -> Float[np.ndarray, " m"]:
+    """Root mean square length of the offsets of each row."""
+    return np.sqrt((offset**2).sum(axis=2).mean(axis=1))
+
+
+def different(shapes: Float[np.ndarray, "n q"], first: Float[np.ndarray, " q"], count: int) -> Int[np.ndarray, " m"]:
+    """Rows farthest from ``first``, then each time the one farthest from all before it."""
+    distance, chosen = ((shapes - first) ** 2).sum(axis=1), []
+    for _ in range(min(count, len(shapes))):
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, ((shapes - shapes[chosen[-1]]) ** 2).sum(axis=1))
+    return np.array(chosen, dtype=np.int64)
+
+
+# --- symmetries -------------------------------------------------------------------------------------------------------
+
+ANGLES = np.deg2rad(np.arange(30, 331, 10))
+"""Turns that are compared; smaller ones belong to the Gaussian around an optimum."""
+
+ALIKE = 0.06
+"""Root mean square distance of a turned segment from itself up to which it looks the same, in mean distances from the
+axis. Of the robot's segments, which a view cannot tell half a turn round, .04 is the largest; its base has .08."""
+
+BINS = 36
+"""Bins of the angle by which states turn a segment against its neighbour."""
+
+COUNTED = 0.03
+"""Share of the loss of a turned segment that counts: it is turned stiffly here, and a fit from there takes most of that
+back. On training views of the shapes 78 % of the positions lay within the radii with all of it, 91 % with a tenth, 96 %
+with this."""
+
+
+@dataclass(frozen=True, eq=False)
+class Symmetry:
+    """Turns of a segment about an axis of its own which hardly change its shape.
+
+    Attributes:
+        label: of the segment.
+        center, axis: at rest.
+        angles: of the turns, rad.
+        plausible: how often states are so far apart in this turn, in how often they are alike.
+    """
+
+    label: int
+    center: Float[np.ndarray, "3"]
+    axis: Float[np.ndarray, "3"]
+    angles: Float[np.ndarray, " a"]
+    plausible: Float[np.ndarray, " a"]
+
+    def posed(
+        self, model: StatisticalModel, material: Float[np.ndarray, "m 3"]
+    ) -> tuple[Int[np.ndarray, " v"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+        """Rows of the segment's material points, and the centre and the axis of its turns in a state."""
+        rows = np.flatnonzero(model.labels == self.label)
+        T = fit_rigid(model.rest_points[rows], material[rows])
+        return rows, T[:3, :3] @ self.center + T[:3, 3], T[:3, :3] @ self.axis
+
+
+@lru_cache(maxsize=8)
+def find_symmetries(model: StatisticalModel) -> tuple[Symmetry, ...]:
+    """Find all such turns of an object that its states make, once for a model; none without states."""
+    if model.count == 0:
+        return ()
+    corners, symmetries = corners_of(model), list[Symmetry]()
+    # from the rest pose, not from the mean, in which a part that spins is crushed
+    rotation = segment_poses(model.rest_points[corners], sampled_positions(model, corners))[0]
+    joints = branches(model)
+    for index, segment in enumerate(model.rest.segments):
+        center, axes = principal_axes(segment)
+        for axis in axes:
+            alike = ANGLES[self_distances(segment, center, axis) <= ALIKE]
+            neighbors = {b if a == index else a for a, b, _ in joints if index in (a, b)}
+            plausible = plausibility(rotation, index, neighbors, axis, alike)
+            kept = plausible > 0.02
+            if kept.any():
+                symmetries.append(Symmetry(index + 1, center, axis, alike[kept], plausible[kept]))
+    return tuple(symmetries)
+
+
+def principal_axes(segment: Segment) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    """Centroid of a segment's surface, and its principal axes as rows."""
+    corners = segment.vertices[segment.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    middle = corners.mean(axis=1)
+    center = area @ middle / area.sum()
+    covariance = ((middle - center) * area[:, None]).T @ (middle - center)
+    return center, np.linalg.eigh(covariance)[1].T
+
+
+def self_distances(
+    segment: Segment, center: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, " a"]:
+    """Distance of a segment, turned by each of ``ANGLES``, from itself, in mean distances from the axis."""
+    arm = segment.vertices[spread(segment.vertices, 150)] - center
+    turned = Rotation.from_rotvec(ANGLES[:, None] * axis).as_matrix()
+    points = (arm @ turned.transpose(0, 2, 1)).reshape(-1, 3) + center
+    squared = igl.point_mesh_squared_distance(points, segment.vertices, segment.faces)[0]
+    mean_arm = float(np.linalg.norm(np.cross(arm, axis), axis=1).mean())
+    off: np.ndarray = np.sqrt(squared.reshape(len(ANGLES), -1).mean(axis=1)) / mean_arm
+    return off
+
+
+def plausibility(
+    rotation: Float[np.ndarray, "n s 3 3"],
+    index: int,
+    neighbors: Collection[int],
+    axis: Float[np.ndarray, "3"],
+    angles: Float[np.ndarray, " a"],
+) -> Float[np.ndarray, " a"]:
+    """``Symmetry.plausible`` against that neighbour of a segment against which it turns most; 1 for all without any.
+
+    It counts pairs of states in which the segment leans alike against the neighbour (.2 rad), so that the turn is a
+    freedom of its own: a rope that bends twists too, but never by itself. ``rotation`` is that of each segment in some
+    states, from rest.
+    """
+    plausible = np.zeros(len(angles)) if neighbors else np.ones(len(angles))
+    for other in neighbors:
+        relative = Rotation.from_matrix(rotation[:, other].transpose(0, 2, 1) @ rotation[:, index])
+        turn = relative.as_quat()
+        roll = 2.0 * np.arctan2(turn[:, :3] @ axis, turn[:, 3])  # the twist of a swing and a twist
+        lean = (relative * Rotation.from_rotvec(-roll[:, None] * axis)).as_rotvec()
+        first, second = np.nonzero(np.linalg.norm(lean[:, None] - lean, axis=2) + np.eye(len(lean)) < 0.2)
+        apart = np.rint(np.mod(roll[second] - roll[first], 2 * np.pi) * BINS / (2 * np.pi)).astype(int) % BINS
+        count = np.bincount(apart, minlength=BINS)
+        steps = np.rint(angles * BINS / (2 * np.pi)).astype(int) % BINS
+        plausible = np.maximum(plausible, np.minimum(count[steps] / max(30, count[0]), 1.0))
+    return plausible
+
+
+def left_open(
+    model: StatisticalModel,
+    material: Float[np.ndarray, "m 3"],
+    observed_samples: Float[np.ndarray, "n 3"],
+    sigma: float,
+    total_weight: float,
+) -> Float32[np.ndarray, "m 3 e"]:
+    """Motion of each material point with e independent standard normal numbers, of the second moments of its turns.
+
+    ``observed_samples`` are in the frame of the registered material, ``sigma`` is the cloud's, ``total_weight`` how
+    many independent points all observed samples are worth.
+    """
+    turns = find_symmetries(model)
+    motion = np.zeros((len(material), 3, 2 * len(turns)), dtype=np.float32)
+    if not turns:
+        return motion
+    vertices = sum(model.vertex_counts)
+    owner = model.labels[cKDTree(material[:vertices]).query(observed_samples)[1]]
+    segments = model.mesh(material).segments
+    for number, turn in enumerate(turns):
+        rows, center, axis = turn.posed(model, material)
+        seen = observed_samples[owner == turn.label]
+        worse = (
+            _worse(segments[turn.label - 1], turn.angles, seen, center, axis, sigma)
+            * total_weight
+            / len(observed_samples)
+        )
+        weight = np.append(turn.plausible * np.exp(-0.5 * COUNTED * np.maximum(worse, 0.0)), 1.0)
+        angle = np.append(turn.angles, 0.0)
+        steps = np.stack([np.sin(angle), 1.0 - np.cos(angle)])
+        second = (steps * (weight / weight.sum())) @ steps.T
+        values, vectors = np.linalg.eigh(second)
+        across = np.cross(axis, material[rows] - center)
+        directions = np.stack([across, np.cross(axis, across)], axis=2)
+        motion[rows, :, 2 * number : 2 * number + 2] = directions @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    return motion
+
+
+def _worse(
+    segment: Segment,
+    angles: Float[np.ndarray, " a"],
+    seen: Float[np.ndarray, "n 3"],
+    center: Float[np.ndarray, "3"],
+    axis: Float[np.ndarray, "3"],
+    sigma: float,
+) -> Float[np.ndarray, " a"]:
+    """By how much more the points seen on a segment are off where it is turned, in the loss of a fit."""
+    if len(seen) == 0:
+        return np.zeros(len(angles))
+    back = Rotation.from_rotvec(-np.append(0.0, angles)[:, None] * axis).as_matrix()
+    points = ((seen - center) @ back.transpose(0, 2, 1)).reshape(-1, 3) + center
+    squared = igl.point_mesh_squared_distance(points, segment.vertices, segment.faces)[0]
+    loss = robust_square(np.sqrt(squared), sigma).reshape(len(back), -1).sum(axis=1)
+    worse: np.ndarray = loss[1:] - loss[0]
+    return worse

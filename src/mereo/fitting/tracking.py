@@ -1,0 +1,600 @@
+"""Follow an object from frame to frame: each fit starts where the last ended; network or search find a lost object.
+
+    Observation, time -Tracker.follow-> Answer (found, followed or lost)
+
+What can be seen of a lost object: few points lie near where it was expected, the model explains fewer of them than it
+must, or the frame rules out much of it. Then, and at first, a network fits the frame by itself, as `mereo reconstruct`
+does, and the better of both is continued. Where that explains nothing, or there is no network, the answer says that
+the object is lost, and a search goes on in the background; its state, fitted to the newest frame, begins a new track.
+"""
+
+import time
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from mereo.fitting.config import FitConfig, FoundBy, TrackConfig, Tracking
+from mereo.fitting.problem.correspondences import nothing
+from mereo.fitting.problem.evidence import Evidence
+from mereo.fitting.problem.gauss_newton import DAMPING, POSE, NormalEquations, Posed, in_space
+from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem, constants_for
+from mereo.fitting.problem.residuals import NetworkTerm, Prior
+from mereo.fitting.registration.answer import Answer, Candidate
+from mereo.fitting.registration.answer_frame import answer_of, find, in_registered_unit, search_hypotheses
+from mereo.fitting.registration.recognition import MOST, Recognition, recognize
+from mereo.fitting.registration.register import ModesFit, Registrar
+from mereo.fitting.registration.registration import Registration
+from mereo.fitting.search import WHOLE
+from mereo.geometry.brief import counted
+from mereo.geometry.camera import SightKind, SightLines
+from mereo.geometry.conventions import MIN_POINTS
+from mereo.geometry.downsampling import means_along_sight
+from mereo.geometry.transforms import transform_points
+from mereo.io.cores import one_blas_thread
+from mereo.models.calibration import Calibration
+from mereo.reconstruction.isolation import Reading
+from mereo.reconstruction.observation import Observation
+
+# --- one frame's fit from the state of the frame before ---------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """State of an object at a time, from which the next frame is fitted.
+
+    Attributes:
+        problem: of that frame, without correspondences: the model, and constants by the frame's noise.
+        unit: length of a scene unit in the clouds' unit.
+        posed: the state, scene units, without a scale.
+        time_s: of the frame.
+        velocity: of the parameters, in the order of ``gauss_newton``, a second.
+        unsure: how far the velocity may be off because little is known yet, scene units per second.
+        noise: of the frames, smoothed, scene units.
+        clean: constants of frames without noise; ``problem`` has those for ``noise``.
+        other_lines: kind of the lines of sight of which a frame says nothing, as it was when the track began.
+        area: greatest area of the object that was seen (``seen_area``).
+        calibration: as ``ModesFit`` has it.
+    """
+
+    problem: Problem
+    unit: float
+    posed: Posed
+    time_s: float
+    velocity: Float[np.ndarray, " p"]
+    unsure: float
+    noise: float
+    clean: FitConfig
+    other_lines: SightKind
+    area: float
+    calibration: Calibration | None = None
+
+    @classmethod
+    def of(
+        cls,
+        fitted: ModesFit,
+        time_s: float,
+        config: TrackConfig,
+        clean: FitConfig = FitConfig(),  # noqa: B008 (frozen)
+    ) -> "Track":
+        """Track that begins with a frame's own fit."""
+        posed, scale = without_scale(fitted.posed)
+        base, model = fitted.problem, fitted.problem.model
+        scale_std = config.scale_std if base.is_scale_open else KNOWN_SCALE_STD
+        problem = replace(base, network=NetworkTerm.none(model), scale_std=scale_std)
+        share_surfaces(base, problem)
+        still, noise = np.zeros(POSE + model.count), fitted.problem.residual_noise(fitted.surface)
+        unit, unsure, seen = fitted.unit * scale, config.first_speed, base.evidence
+        area, kind = seen_area(seen), seen.other_lines
+        return cls(problem, unit, posed, time_s, still, unsure, noise, clean, kind, area, fitted.calibration)
+
+    def expected(self, time_s: float, config: TrackConfig) -> Posed:
+        """State that is expected at a time."""
+        if config.motion == "pose":
+            return self.posed
+        # James and Stein's estimate of a mean, positive part: small motion may be noise alone, large motion is not
+        counted = max(1.0 - (config.dead / max(self.speed, 1e-9)) ** 2, 0.0)
+        return self.posed.moved(counted * self.velocity * (time_s - self.time_s))
+
+    @cached_property
+    def squared(self) -> Float[np.ndarray, "p p"]:
+        """Mean square of a material point's way, as a form of the parameters' step."""
+        model = self.problem.model
+        rows = model.sparse
+        modes = model.modes[rows]
+        position = self.posed.place(model.mean[rows] + modes @ self.posed.z.astype(np.float32))
+        jacobian = in_space(self.posed, position, modes).astype(np.float64)
+        form: Float[np.ndarray, "p p"] = jacobian.T @ jacobian / len(rows)
+        return form
+
+    @property
+    def speed(self) -> float:
+        """Speed that the object seems to have: root mean square of its points, scene units per second."""
+        return float(np.sqrt(self.velocity @ self.squared @ self.velocity))
+
+
+def without_scale(posed: Posed) -> tuple[Posed, float]:
+    """Return a state in the unit that its scale makes of the scene's, and that scale."""
+    scale = float(np.exp(posed.log_scale))
+    return replace(posed, translation=posed.translation / scale, log_scale=0.0), scale
+
+
+def share_surfaces(base: Problem, other: Problem) -> None:
+    """Give a problem of the same model what another has prepared of the model's surface."""
+    vars(other).update({"pairs": base.pairs, "samples": base.samples})
+
+
+def gated(track: Track, points: Float[np.ndarray, "n 3"], time_s: float, config: TrackConfig) -> Bool[np.ndarray, " n"]:
+    """Mark the points, in the cloud's unit, near the expected surface; others are outliers, or the object is lost."""
+    samples = track.problem.samples.every(2)
+    position = samples.posed(track.expected(time_s, config)).position
+    most = config.gate * track.problem.model.half + samples.spacing
+    distance = cKDTree(position).query(points / track.unit, distance_upper_bound=most)[0]
+    return np.isfinite(distance)
+
+
+def next_fit(
+    track: Track,
+    points: Float[np.ndarray, "n 3"],
+    outliers: Float[np.ndarray, "d 3"],
+    time_s: float,
+    config: TrackConfig,
+    lines: SightLines,
+) -> tuple[ModesFit, Track]:
+    """Fit the modes to a frame, and return the fit with the track that ends with it.
+
+    Args:
+        track: up to the frame before.
+        points: of the object, camera frame, the clouds' unit.
+        outliers: points that are none of it (``Evidence.of``).
+        time_s: of the frame.
+        config: constants.
+        lines: what is known of the lines of sight beside the points, in the same frame and unit. Where they leave it
+            open, the object is seen whole or in part as it was when the track began; where it was seen whole and the
+            frame rules that out by more than ``WHOLE``, it is fitted as seen in part too, and the better fit is taken.
+    """
+    started = time.perf_counter()
+    with one_blas_thread():
+        few = means_along_sight(points / track.unit, config.points)
+        start = track.expected(time_s, config)
+        expectation = Expectation.of(track, start, max(time_s - track.time_s, 0.0), config)
+
+        def fit(other_lines: SightKind) -> ModesFit:
+            sight_lines = replace(lines.scaled(1 / track.unit), other_lines=other_lines)
+            evidence = Evidence.of(few, outliers / track.unit, config.observed_samples, sight_lines)
+            problem = replace(track.problem, evidence=evidence)
+            share_surfaces(track.problem, problem)
+            posed = descend(problem, start, expectation, config)
+            return ModesFit(problem, nothing(), track.unit, posed, 0.0, calibration=track.calibration)
+
+        fitted = fit(lines.other_lines or track.other_lines)
+        if lines.other_lines is None and fitted.problem.silhouette_misfit(fitted.surface) > WHOLE:
+            partial = fit("unknown")
+            whole_misfit, misfit = (end.problem.misfit(end.posed, end.surface).total for end in (fitted, partial))
+            fitted = partial if misfit + WHOLE < whole_misfit else fitted
+    fitted = replace(fitted, seconds=time.perf_counter() - started)
+    return fitted, followed(track, fitted, time_s, config)
+
+
+def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig) -> Track:
+    """Track with a further frame."""
+    posed, scale = without_scale(fitted.posed)
+    passed = max(time_s - track.time_s, 1e-3)
+    velocity = track.velocity + config.smoothing * (between(track.posed, posed) / passed - track.velocity)
+    unsure = track.unsure * (1 - config.smoothing)
+    noise = track.noise + config.smoothing * (fitted.problem.residual_noise(fitted.surface) - track.noise)
+    problem = replace(fitted.problem, config=constants_for(noise, track.clean))
+    share_surfaces(fitted.problem, problem)
+    return replace(
+        track,
+        problem=problem,
+        unit=track.unit * scale,
+        posed=posed,
+        time_s=time_s,
+        velocity=velocity,
+        unsure=unsure,
+        noise=noise,
+        area=max(track.area, seen_area(problem.evidence)),
+    )
+
+
+def seen_area(evidence: Evidence) -> float:
+    """Area of the surface that was seen, across the lines of sight: that of a pixel for each point, scene units."""
+    return float(((evidence.pitch * evidence.ranges) ** 2).sum())
+
+
+def between(first: Posed, second: Posed) -> Float[np.ndarray, " p"]:
+    """Step of the parameters from one state to another: ``first.moved(step)`` is ``second``."""
+    turn = Rotation.from_matrix(second.rotation @ first.rotation.T).as_rotvec()
+    scale = [second.log_scale - first.log_scale]
+    return np.concatenate([turn, second.translation - first.translation, scale, second.z - first.z])
+
+
+@dataclass(frozen=True, eq=False)
+class Expectation:
+    """Expectation of where material points are: a Gaussian of the parameters around a state.
+
+    Attributes:
+        state: the expected one.
+        precision: of the step from it.
+    """
+
+    state: Posed
+    precision: Float[np.ndarray, "p p"]
+
+    @classmethod
+    def of(cls, track: Track, state: Posed, passed_s: float, config: TrackConfig) -> "Expectation":
+        """Expectation after a time: each point is where ``state`` has it, up to its speeds times that."""
+        speed = config.speed + max(config.gain * max(track.speed - config.dead, 0.0), track.unsure)
+        # noisy frames weigh less, and a moving object must not lag behind for that
+        coarser = track.problem.config.cloud_sigma / track.clean.cloud_sigma
+        sigma = coarser * (speed * passed_s + config.least)
+        return cls(state, track.squared * (config.motion_weight / sigma**2))
+
+    def add_to(self, normal: NormalEquations, posed: Posed) -> NormalEquations:
+        """Sum with the squared distance from the expectation."""
+        gradient = self.precision @ between(self.state, posed)
+        return NormalEquations(normal.matrix + self.precision, normal.gradient + gradient)
+
+
+def descend(problem: Problem, start: Posed, expectation: Expectation, config: TrackConfig) -> Posed:
+    """State that explains cloud, silhouette, prior and expectation, from nearby."""
+    constants, half = problem.config, problem.model.half
+    prior = Prior.whole(problem.model)
+    posed, steps = start, config.steps + config.exact_steps
+    for step in range(steps):
+        sigma = max(config.first_sigma * half * config.cooling**step, constants.cloud_sigma)
+        normal = expectation.add_to(problem.known(posed, prior, 0.0), posed)
+        normal = problem.seen(normal, posed, sigma, 0.0, exact=step >= config.steps)
+        posed = posed.moved(normal.step(DAMPING))
+    return posed
+
+
+# --- search in the background -----------------------------------------------------------------------------------------
+
+# TrackedFrame -BackgroundSearch.start-> (seconds later) -BackgroundSearch.take-> Searched
+#
+# A search takes a second to several, and frames come 30 times a second. NumPy lets go of the interpreter in most of a
+# search, so a thread is enough.
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedFrame:
+    """Frame of a sequence, with what is known of it.
+
+    Attributes:
+        seen: the object in the frame.
+        time_s: of the frame.
+        scene_unit: length of a scene unit in the frame's unit, where it is known for certain.
+        keep_all: take every point for the object's.
+    """
+
+    seen: Observation
+    time_s: float
+    scene_unit: float | None = None
+    keep_all: bool = False
+
+
+class Searched(NamedTuple):
+    """Frame in which a lost object was searched for, and its best candidate, which may not explain it."""
+
+    frame: TrackedFrame
+    candidate: Candidate
+
+
+class SynchronousExecutor(Executor):
+    """Executor that does the work at once, in the caller's thread: for recordings, and for tests."""
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Do the work, and return what has come of it."""
+        future = Future[Any]()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as problem:  # as an executor does
+            future.set_exception(problem)
+        return future
+
+
+class BackgroundSearch:
+    """Searches of one object, one at a time; used by one thread.
+
+    Attributes:
+        registrar: of the object.
+        executor: what does the searches, the caller's to end; None for a thread of its own, which starts when the
+            first search does and ends with ``close``.
+    """
+
+    def __init__(self, registrar: Registrar, executor: Executor | None = None) -> None:
+        # a newer frame is worth more than the last round, which takes as long as the two before and longer
+        self.registrar = replace(registrar, config=replace(registrar.config, search_rounds=2))
+        self.executor = executor
+        self._thread: ThreadPoolExecutor | None = None
+        self._running: Future[Searched] | None = None
+
+    def start(self, frame: TrackedFrame) -> None:
+        """Search a frame, unless one is being searched, or was and has not been taken."""
+        if self._running is None:
+            if self.executor is None and self._thread is None:
+                self._thread = ThreadPoolExecutor(1, "mereo-search")
+            executor = self.executor or self._thread
+            assert executor is not None
+            self._running = executor.submit(_search, self.registrar, frame)
+
+    def take(self) -> Searched | None:
+        """What the last search has found; None while it goes on, and where nothing was searched or could be.
+
+        Raises what a search does, but for the ``ValueError`` of an unusable frame.
+        """
+        if self._running is None or not self._running.done():
+            return None
+        ended, self._running = self._running, None
+        try:
+            return ended.result()
+        except ValueError:
+            return None
+
+    def drop(self) -> None:
+        """Forget the frame that is being searched."""
+        if self._running is not None:
+            self._running.cancel()
+            self._running = None
+
+    def close(self, wait: bool) -> None:
+        """Forget it, and let its thread end with the search, which ``wait`` waits for."""
+        self.drop()
+        if self._thread is not None:
+            self._thread.shutdown(wait, cancel_futures=True)
+            self._thread = None
+
+
+def _search(registrar: Registrar, frame: TrackedFrame) -> Searched:
+    return Searched(frame, search_hypotheses(frame.seen, registrar, frame.keep_all, frame.scene_unit)[0])
+
+
+# --- the tracker ------------------------------------------------------------------------------------------------------
+
+
+class Tracker:
+    """Follows one object through a sequence of frames; not safe for use by several threads at once.
+
+    Draws and rest model are not fitted: they take longer than the time between two frames.
+    """
+
+    def __init__(
+        self,
+        registrar: Registrar,
+        config: TrackConfig = TrackConfig(),  # noqa: B008 (frozen)
+        executor: Executor | None = None,
+    ) -> None:
+        """Follow an object.
+
+        Args:
+            registrar: of the object; its ``method`` says whether a registration that does not explain its frame is
+                taken.
+            config: constants.
+            executor: what searches for a lost object (``BackgroundSearch``); None for a thread of its own.
+        """
+        # a frame that nothing explains comes 30 times a second while the object is away
+        self.registrar = registrar.without_retries
+        self.config = config
+        self._search = BackgroundSearch(registrar, executor)
+        self.forget()
+
+    def __enter__(self) -> "Tracker":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def forget(self) -> None:
+        """Forget the track: the next frame is fitted by itself; a search that goes on is given up."""
+        self._search.close(wait=False)
+        self._track: Track | None = None
+        self._T_camera_input, self._axes = np.eye(4), "camera"
+        self._best = 0.0
+        self._located_by: FoundBy = "network"
+        self._has_begun = False
+
+    def close(self) -> None:
+        """Give up the search that goes on, if one does, and wait until its thread has ended."""
+        self._search.close(wait=True)
+
+    def follow(
+        self, seen: Observation, time_s: float, *, scene_unit: float | None = None, keep_all: bool = False
+    ) -> Answer:
+        """Answer the next frame.
+
+        Args:
+            seen: the object in the frame, any density, in one unit throughout the sequence.
+            time_s: of the frame, from any zero; what is expected of the object depends on the time since the last one.
+            scene_unit: length of a scene unit in the frame's unit, where it is known for certain.
+            keep_all: take every point for the object's.
+
+        The first frame is waited for, however long a search takes. Raises ``ValueError`` for unusable clouds and,
+        unless a network or a track can answer, where a frame that is fitted by itself finds too little. The track is
+        kept: the object may come again.
+        """
+        started, frame = time.perf_counter(), TrackedFrame(seen, time_s, scene_unit, keep_all)
+        tracked, why = self._tracked(self._track, frame, self.config.longest_s)
+        if tracked is not None and self._is_believed(tracked):
+            return self._gone_on(frame, tracked, started)
+        alone = None
+        if self.registrar.asks_network or not self._has_begun:
+            alone = self._by_itself(frame, tracked, started)
+            if alone.tracking != "lost":
+                return alone
+        again = self._searched(frame)
+        if again is None:
+            self._search.start(frame)
+            again = self._searched(frame)  # some executors have done it now
+        if again is not None:
+            return self._gone_on(frame, again, started, "found")
+        return self._lost(frame, alone, why if tracked is None else self._doubt(tracked), started)
+
+    def _tracked(self, track: Track | None, frame: TrackedFrame, longest_s: float) -> "tuple[_Tracked | None, str]":
+        """Fit the frame from an earlier state; None, and why, without one that leads to it."""
+        seen, time_s = frame.seen, frame.time_s
+        if track is None or seen.frame.axes != self._axes:
+            return None, "nothing explains what is seen"
+        passed_s = time_s - track.time_s
+        if not 0 <= passed_s <= longest_s:
+            return None, f"it was last followed {passed_s:.1f} s before"
+        points = transform_points(self._T_camera_input, seen.cloud.points)
+        keep = np.ones(len(points), dtype=bool) if frame.keep_all else gated(track, points, time_s, self.config)
+        if keep.sum() < MIN_POINTS:
+            return None, f"{counted(int(keep.sum()), 'point')} of at least {MIN_POINTS} lie near where it was expected"
+        lines = seen.lines.transformed(self._T_camera_input)
+
+        def fit(config: TrackConfig) -> _Tracked:
+            fitted, after = next_fit(track, points[keep], points[~keep], time_s, config, lines)
+            return _Tracked(fitted, after, Reading(seen.cloud, keep))
+
+        tracked = fit(self.config)
+        if not tracked.registration.accepted and not self.registrar.asks_network:  # it may have moved far
+            tracked = max(tracked, fit(self.config.patient), key=lambda fit_: fit_.score)
+        return tracked, ""
+
+    def _searched(self, frame: TrackedFrame) -> "_Tracked | None":
+        """Fit the frame from the state that a search has found in an earlier one; None where that explains none."""
+        searched = self._search.take()
+        if searched is None or searched.candidate.modes is None:
+            return None
+        before = self._T_camera_input, self._axes
+        self._T_camera_input, self._axes = searched.candidate.encoded.T_camera_input, searched.frame.seen.frame.axes
+        begun = _Tracked.of_frame(searched.candidate, searched.frame.time_s, self.config, self.registrar.config)
+        area = 0.0 if self._track is None else self._track.area
+        tracked, _ = self._tracked(replace(begun.track, area=max(area, begun.track.area)), frame, np.inf)
+        if tracked is not None and self._takes(tracked):
+            self._located_by = "search"
+            return tracked
+        self._T_camera_input, self._axes = before
+        return None
+
+    def _by_itself(self, frame: TrackedFrame, tracked: "_Tracked | None", started: float) -> Answer:
+        """Answer a frame by itself, which begins a track, or by the track that went on, where that is better.
+
+        The object is lost where neither explains the frame, and then the track is kept.
+        """
+        seen, registrar, config = frame.seen, self.registrar, self.config
+        candidate, likelier = find(seen, registrar.network, registrar, frame.keep_all, frame.scene_unit)
+        must_register = registrar.method != "auto" or registrar.network is None
+        if candidate.modes is None and tracked is None and must_register:
+            assert candidate.error is not None
+            raise candidate.error
+        self._has_begun = True
+        alone = (
+            None if candidate.modes is None else _Tracked.of_frame(candidate, frame.time_s, config, registrar.config)
+        )
+        if (
+            tracked is not None
+            and self._takes(tracked)
+            and (alone is None or alone.score <= tracked.score + config.margin)
+        ):
+            return self._gone_on(frame, tracked, started, restart=True)
+        if alone is None or not self._takes(alone):
+            registration = None if alone is None else alone.registration
+            answer = answer_of(seen, registrar.network, None, candidate, likelier, registration)
+            return replace(answer, registrar=registrar, tracking="lost")
+        self._search.drop()
+        self._track, self._best, self._located_by = alone.track, alone.score, candidate.found_by
+        self._T_camera_input, self._axes = candidate.encoded.T_camera_input, seen.frame.axes
+        answer = answer_of(seen, registrar.network, registrar, candidate, likelier, alone.registration)
+        return replace(answer, seconds=time.perf_counter() - started)
+
+    def _is_believed(self, tracked: "_Tracked") -> bool:
+        """Whether the frame need not be fitted by itself."""
+        if not self._takes(tracked):
+            return False
+        return not self.registrar.asks_network or tracked.score >= self._best - self.config.drop
+
+    def _takes(self, candidate: "_Tracked") -> bool:
+        """Whether a fit is the answer to a frame; with "modes" any is."""
+        if not self.registrar.takes(candidate.registration):
+            return False
+        return self.registrar.method == "modes" or not self._doubt(candidate)
+
+    def _doubt(self, tracked: "_Tracked") -> str:
+        """What speaks against a fit, by the frame alone, in a clause; "" where nothing does."""
+        registration, config = tracked.registration, self.config
+        if tracked.area < config.least_area:
+            return f"only {tracked.area:.0%} as much of it as before can be seen"
+        if not registration.accepted:
+            return f"only {registration.explained:.0%} of the points near where it was expected can be its own"
+        if registration.ruled_out is not None and registration.ruled_out > config.most_ruled_out:
+            return f"{registration.ruled_out:.0%} of it would lie where the frame shows none of it"
+        return ""
+
+    def _gone_on(
+        self,
+        frame: TrackedFrame,
+        tracked: "_Tracked",
+        started: float,
+        tracking: Tracking = "followed",
+        restart: bool = False,
+    ) -> Answer:
+        """Answer a frame by a fit that an earlier frame's state led to."""
+        self._track = tracked.track
+        self._best = tracked.score if restart or tracking == "found" else max(self._best, tracked.score)
+        self._search.drop()
+        model = self.registrar.network
+        stated = self.registrar.stated_scene_unit(frame.seen.frame.unit_m)
+        calibration = None if model is None else model.calibration
+        recognition = recognize(tracked.registration, calibration, stated_scene_unit=stated)
+        seen = in_registered_unit(frame.seen, self.registrar, tracked.registration, recognition)
+        return Answer(
+            seen=seen.read_as(tracked.hypothesis),
+            model=model,
+            registrar=self.registrar,
+            hypothesis=tracked.hypothesis,
+            T_camera_input=self._T_camera_input,
+            registration=tracked.registration,
+            taken=True,
+            recognition=recognition,
+            found_by=self._located_by,
+            tracking=tracking,
+            seconds=time.perf_counter() - started,
+        )
+
+    def _lost(self, frame: TrackedFrame, alone: Answer | None, why: str, started: float) -> Answer:
+        """Answer a frame in which the object is lost: by the network alone, or by nothing."""
+        reason = f"the object is lost: {why}; it is being searched for, so keep it in view, or start again with it"
+        if alone is None or alone.model is None:
+            hypothesis = Reading.of_all(frame.seen.cloud)
+            alone = Answer(frame.seen, None, self.registrar, hypothesis, self._T_camera_input, found_by="search")
+        recognition = Recognition(False, reason, MOST)
+        return replace(alone, recognition=recognition, tracking="lost", seconds=time.perf_counter() - started)
+
+
+@dataclass(frozen=True, eq=False)
+class _Tracked:
+    """Fit that may be a frame's answer, the track that goes on from it, and the points that it is of."""
+
+    fitted: ModesFit
+    track: Track
+    hypothesis: Reading
+
+    @classmethod
+    def of_frame(cls, candidate: Candidate, time_s: float, config: TrackConfig, clean: FitConfig) -> "_Tracked":
+        """Candidate of a frame that was fitted by itself."""
+        assert candidate.modes is not None
+        fitted = replace(candidate.modes, rest=None)
+        return cls(fitted, Track.of(fitted, time_s, config, clean), candidate.hypothesis)
+
+    @cached_property
+    def registration(self) -> Registration:
+        return self.fitted.registration()
+
+    @property
+    def score(self) -> float:
+        """Share of all points of the frame that are explained."""
+        return self.registration.explained * float(self.hypothesis.keep.mean())
+
+    @cached_property
+    def area(self) -> float:
+        """Area of the object that was seen, as a share of the greatest ever."""
+        return seen_area(self.fitted.problem.evidence) / self.track.area

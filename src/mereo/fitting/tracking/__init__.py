@@ -1,1 +1,0 @@
-"""An object followed from frame to frame, each fit from the last one."""

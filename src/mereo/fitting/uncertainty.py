@@ -1,0 +1,543 @@
+"""Uncertainty of a fit: its optimum as a Gaussian, the radii and intervals that follow, and what decided them.
+
+    normal equations at the optimum -> Posterior (Gaussian of pose, scale and state) -> Uncertainty (radii of 95 %)
+
+Laplace's approximation (MacKay, Neural Computation 1992): around the optimum the misfit is quadratic, so pose, scale
+and state are Gaussian with the inverse of the normal equations' matrix as covariance, and every point of the object,
+which is linear in them, is Gaussian too. Lengths are scene units, those of ``Uncertainty`` the input's unit.
+
+Notation: m material points, n queried ones, k coefficients, p = 7 + k parameters as in ``gauss_newton``.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Float32, Int, UInt8
+from scipy.linalg import eigh
+from scipy.special import chdtri
+from scipy.stats import norm
+
+from mereo.deformation.moving_least_squares import PointWeights
+from mereo.fitting.draws.problem import DrawsFit, DrawsProblem
+from mereo.fitting.draws.problem import terms as terms_of_draws
+from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, rigid_motion
+from mereo.fitting.problem.problem import Problem
+from mereo.fitting.problem.residuals import Prior, Surface, Terms
+from mereo.fitting.problem.segments import left_open
+from mereo.geometry.brief import counted
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.radii import Radii
+from mereo.geometry.solids import owned_gradients
+from mereo.geometry.transforms import transform_points
+from mereo.io.cores import one_blas_thread
+from mereo.scenes.statistical_model import StatisticalModel
+
+# --- posterior --------------------------------------------------------------------------------------------------------
+
+LEVEL = 0.95
+"""Probability with which a true position lies within a radius, and a true number in an interval."""
+
+WITHIN = float(norm.ppf(0.5 + LEVEL / 2))
+"""Standard deviations of one Gaussian number on either side that hold it with this probability: 1.96."""
+
+_FREEDOM = np.linspace(1.0, 3.0, 201)
+_QUANTILE = chdtri(_FREEDOM, 1.0 - LEVEL)
+"""Quantile of chi square by its degrees of freedom, between which it is nearly straight."""
+
+
+def radius95(covariance: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
+    """Return the radius of the ball around the mean that holds a Gaussian point with probability 0.95.
+
+    By a chi square of the same mean and variance as the squared distance (Satterthwaite, Biometrics Bulletin 1946):
+    exact where one direction alone is unsure or all are alike, within 2 % between.
+    """
+    first = np.trace(covariance, axis1=1, axis2=2)
+    second = np.einsum("nij,nij->n", covariance, covariance)
+    freedom = np.clip(first**2 / np.maximum(second, np.finfo(np.float64).tiny), 1.0, 3.0)
+    squared: np.ndarray = first / freedom * np.interp(freedom, _FREEDOM, _QUANTILE)
+    return np.sqrt(squared)
+
+
+@dataclass(frozen=True, eq=False)
+class RadiusParts:
+    """Radii of 95 % in two parts, whose squares add: views of the object calibrate the first.
+
+    Attributes:
+        gaussian: by the Gaussian around the optimum, which a calibration scales.
+        open: by what else the frame leaves open, far from it (``Posterior.open``), which is as it is.
+    """
+
+    gaussian: Float[np.ndarray, " n"]
+    open: Float[np.ndarray, " n"]
+
+    def radii(self, scale: float = 1.0, extra_radius: float = 0.0) -> Float[np.ndarray, " n"]:
+        """Radii with a scale of the Gaussian, and a radius that all points have beside; in the parts' unit."""
+        result: np.ndarray = np.sqrt((scale * self.gaussian) ** 2 + self.open**2 + extra_radius**2)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Gaussian around a registered state, as factors of its covariance.
+
+    Attributes:
+        posed: pose of the optimum; its coefficients do not matter.
+        material: posed material points.
+        modes: how each of them moves with the coefficients, before the pose.
+        factor: p x p, ``factor factor^T`` is the covariance of the parameters.
+        residue: root mean square distance of the object's states from what the coefficients can express.
+        open: motion of the material points with further standard normal numbers, by the second moments of what is far
+            from Gaussian (``find_symmetries``, a state beside rest), in the camera's axes; None without.
+    """
+
+    posed: Posed
+    material: Float[np.ndarray, "m 3"]
+    modes: Float32[np.ndarray, "m 3 k"]
+    factor: Float[np.ndarray, "p p"]
+    residue: float = 0.0
+    open: Float32[np.ndarray, "m 3 e"] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        normal: NormalEquations,
+        posed: Posed,
+        material: Float[np.ndarray, "m 3"],
+        modes: Float32[np.ndarray, "m 3 k"],
+        residue: float = 0.0,
+        open: Float32[np.ndarray, "m 3 e"] | None = None,
+    ) -> "Posterior":
+        """Posterior whose precision is the matrix of the normal equations at the optimum."""
+        return cls(posed, material, modes, covariance_factor(normal.matrix), residue, open)
+
+    @cached_property
+    def _local(self) -> tuple[Float32[np.ndarray, "r p"], Float32[np.ndarray, "k p"]]:
+        """Factor in axes that turn with the object: its rows of the pose, and of the coefficients with the scale."""
+        turned, rotation = self.factor.copy(), self.posed.rotation
+        turned[:3], turned[3:6] = rotation.T @ self.factor[:3], rotation.T @ self.factor[3:6]
+        turned[POSE:] *= np.exp(self.posed.log_scale)
+        return turned[:POSE].astype(np.float32), turned[POSE:].astype(np.float32)
+
+    @cached_property
+    def _arm(self) -> Float32[np.ndarray, "m 3"]:
+        """Material points from the pose's centre, in axes that turn with the object."""
+        return ((self.material - self.posed.translation) @ self.posed.rotation).astype(np.float32)
+
+    @cached_property
+    def motion(self) -> Float32[np.ndarray, "m 3 p"]:
+        """Motion of each material point with each of p independent standard normal numbers, in the object's axes."""
+        return self._motion(slice(None))
+
+    def _motion(self, rows: slice | Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n 3 p"]:
+        pose, state = self._local
+        moved = rigid_motion(self._arm[rows]).reshape(-1, POSE) @ pose
+        if len(state):
+            moved += self.modes[rows].reshape(-1, len(state)) @ state
+        return moved.reshape(-1, 3, moved.shape[1])
+
+    def radii(self, follow: PointWeights | None = None) -> "RadiusParts":
+        """Radii of 95 % of all material points, or of points that follow them; scene units."""
+        with one_blas_thread():
+            motion, open_motion = self.motion, self._open(slice(None))
+            if follow is not None:
+                motion, open_motion = follow(motion), follow(open_motion)
+            return self._radii(motion, open_motion)
+
+    def radii_of(self, rows: Int[np.ndarray, " n"]) -> "RadiusParts":
+        """Radii of 95 % of some material points alone, which cost as little as they are few."""
+        with one_blas_thread():
+            return self._radii(self._motion(rows), self._open(rows))
+
+    def _open(self, rows: slice | Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n 3 e"]:
+        """``open`` in the object's axes."""
+        if self.open is None:
+            return np.zeros((len(self._arm[rows]), 3, 0), dtype=np.float32)
+        return np.matmul(self.posed.rotation.T.astype(np.float32), self.open[rows])
+
+    def _radii(self, motion: Float32[np.ndarray, "n 3 p"], open_motion: Float32[np.ndarray, "n 3 e"]) -> "RadiusParts":
+        gaussian, open_ = (
+            np.matmul(part, part.transpose(0, 2, 1)).astype(np.float64) for part in (motion, open_motion)
+        )
+        gaussian[:, range(3), range(3)] += self.residue**2 / 3
+        return RadiusParts(radius95(gaussian), radius95(open_))
+
+    def motion_of(self, gradient: Float[np.ndarray, "c v 3"]) -> Float[np.ndarray, "c p"]:
+        """Change of c numbers with each of p independent standard normal ones.
+
+        ``gradient`` is theirs by the first v material points, in the camera's axes. What the coefficients cannot
+        express (``residue``) is left out: over a segment it averages out.
+        """
+        pose, state = self._local
+        turned, count = (gradient @ self.posed.rotation).astype(np.float32), gradient.shape[1]
+        flat = turned.reshape(len(turned), -1)
+        each: np.ndarray = flat @ rigid_motion(self._arm[:count]).reshape(-1, POSE) @ pose
+        if len(state):
+            each = each + flat @ self.modes[:count].reshape(-1, len(state)) @ state
+        return each.astype(np.float64)
+
+    def motion_at(self, follow: PointWeights) -> Float[np.ndarray, "n 3 p"]:
+        """Motion of points that follow the material points, in the camera's axes."""
+        moved: np.ndarray = np.matmul(self.posed.rotation, follow(self.motion).astype(np.float64))
+        return moved
+
+
+def covariance_factor(precision: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
+    """Factor F of an inverse, ``F F^T = precision^-1``; unlike units of the parameters do no harm.
+
+    Precisions are sums of products in single precision: what these leave open (a scale that nobody knows, beside
+    states that grow) is as unsure as their rounding can tell, and may come out below zero.
+    """
+    unit = 1.0 / np.sqrt(np.diag(precision))
+    values, vectors = eigh(precision * unit[:, None] * unit)
+    least = 4 * float(np.finfo(np.float32).eps) * float(values[-1])  # smaller ones are rounding
+    factor: np.ndarray = unit[:, None] * vectors / np.sqrt(np.maximum(values, least))
+    return factor
+
+
+# --- the optimum and its posterior ------------------------------------------------------------------------------------
+
+# ModesOptimum, DrawsOptimum -> Terms of the normal equations -> Posterior
+
+
+@dataclass(frozen=True, eq=False)
+class ModesOptimum:
+    """End of a fit of the modes, or, with a model that has none, of the pose alone.
+
+    Attributes:
+        problem: everything the fit worked on.
+        posed: coefficients and pose.
+        unit: length of a scene unit in the input's unit, before the fit's own scale.
+        bent: positions of the material points by a fit of the modes, where the answer is the rest model: an object that
+            is hardly bent may pass for one at rest. None else.
+    """
+
+    problem: Problem
+    posed: Posed
+    unit: float
+    bent: Float[np.ndarray, "m 3"] | None = None
+
+    @property
+    def frame(self) -> Problem:
+        """The frame, explained by modes."""
+        return self.problem
+
+    @cached_property
+    def terms(self) -> Terms:
+        """Terms under the prior of all states; that of states near the answer is too sure (docs/registration.md)."""
+        problem, posed, config = self.problem, self.posed, self.problem.config
+        nothing = NormalEquations.nothing(POSE + len(posed.z))
+        with one_blas_thread():
+            return Terms(
+                known=problem.known(posed, Prior.whole(problem.model), 0.0),
+                network=problem.network.add_to(
+                    nothing, posed, problem.network_sigma, config.network_weight[1], robust=True
+                ),
+                cloud=problem.cloud_rows(posed),
+                observed_samples=problem.evidence.observed_samples,
+                ruled_out=problem.add_silhouette(nothing, posed, problem.samples.posed(posed), config.cloud_sigma),
+            )
+
+    @cached_property
+    def surface(self) -> Surface:
+        """The posed surface."""
+        return Surface.of(self.problem.model, self.posed)
+
+    @cached_property
+    def posterior(self) -> Posterior:
+        """Posterior of pose, scale and coefficients."""
+        model = self.problem.model
+        material = self.posed.place(model.material(self.posed.z))
+        with one_blas_thread():
+            open_motion = turns_left_open(self.problem, material)
+            if self.bent is not None:
+                bending = (self.bent - material)[:, :, None].astype(np.float32)
+                open_motion = np.concatenate([open_motion, bending], axis=2)
+            return Posterior.of(self.terms.total, self.posed, material, model.modes, model.residue, open_motion)
+
+
+@dataclass(frozen=True, eq=False)
+class DrawsOptimum:
+    """End of a fit of a scene's draws.
+
+    Attributes:
+        problem: everything the fit worked on.
+        fit: the played state.
+        unit: length of a scene unit in the input's unit, before the fit's own scale.
+    """
+
+    problem: DrawsProblem
+    fit: DrawsFit
+    unit: float
+
+    @property
+    def frame(self) -> Problem:
+        """The frame, explained by modes."""
+        return self.problem.base
+
+    @cached_property
+    def terms(self) -> Terms:
+        """Terms of the neighbourhood in which the scene is linear in its draws."""
+        assert self.fit.motion is not None
+        with one_blas_thread():
+            return terms_of_draws(self.problem, self.fit, self.fit.motion, self.problem.base.config.cloud_sigma)
+
+    @property
+    def surface(self) -> Surface:
+        """The posed surface."""
+        return self.fit.surface
+
+    @cached_property
+    def posterior(self) -> Posterior:
+        """Posterior of pose, scale and draws."""
+        motion, spread = self.fit.motion, self.problem.states.played.spread
+        assert motion is not None
+        modes: Float32[np.ndarray, "m 3 d"] = (spread @ motion.reshape(len(motion), -1)).reshape(
+            spread.shape[0], *motion.shape[1:]
+        )
+        material: Float[np.ndarray, "m 3"] = self.fit.placed()
+        with one_blas_thread():
+            turns = turns_left_open(self.problem.base, material)
+            return Posterior.of(self.terms.total, self.fit.posed, material, modes, open=turns)
+
+
+def turns_left_open(problem: Problem, material: Float[np.ndarray, "m 3"]) -> Float32[np.ndarray, "m 3 e"]:
+    """How far turns of single segments that the frame does not tell apart may have moved the material points."""
+    samples, config = problem.evidence.observed_samples, problem.config
+    return left_open(problem.model, material, samples, config.cloud_sigma, config.cloud_weight)
+
+
+Optimum = ModesOptimum | DrawsOptimum
+"""Where a fit has ended, with all that it worked on."""
+
+
+# --- what decides a point ---------------------------------------------------------------------------------------------
+
+# At the optimum a point of the object is ``x = A u`` for parameters u of covariance S. Where an observed point moves by
+# d along its surface's normal, x moves by ``A S J_i^T w_i d``: its leverage. Each term of the fit adds its part H_t to
+# the precision ``S^-1``, so that the variance of x is a sum over the terms of what the error of each contributes to it:
+#
+#     A S A^T = sum_t A S H_t S A^T
+#
+# Notation: n observed samples, p parameters, J_i and w_i derivatives and weight of an observed sample's residual.
+
+Evidence = Literal["points", "network", "silhouette", "states"]
+"""What leaves a position unsure by its errors: the observed points, the network's correspondences, what the frame
+rules out, and what was known of the object's states before the frame was seen."""
+
+Decided = tuple[dict[Evidence, float], Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]
+"""Shares of each kind of evidence in what is unsure; weight of each observed sample, and its influence in the camera's
+axes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """What decides where a point of the object is; frame and unit of the registration.
+
+    Attributes:
+        place: of the point.
+        shares: of each kind of evidence in the variance that is left; they sum to one. What a hidden point is unsure by
+            comes largely from ``states``: from how far the object's own state may be from the likely ones.
+        points: observed points that the surface was fitted to, evenly spread.
+        influence: how the position moves, in multiples of its motion, when one of them moves along the normal.
+        weights: how much each of them decides the place: the length of its influence over the sum of all.
+        unexplained: observed points, of all that were seen, that are farther from the registered surface than the
+            tolerance.
+    """
+
+    place: Float[np.ndarray, "3"]
+    shares: dict[Evidence, float]
+    points: Float[np.ndarray, "n 3"]
+    weights: Float[np.ndarray, " n"]
+    influence: Float[np.ndarray, "n 3"]
+    unexplained: Float[np.ndarray, "k 3"]
+
+    @classmethod
+    def of(
+        cls,
+        place: Float[np.ndarray, "3"],
+        decided: Decided,
+        uncertainty: "Uncertainty",
+        T_registration_fit: Float[np.ndarray, "4 4"],
+    ) -> "Explanation":
+        """Explanation in the frame to which ``T_registration_fit`` leads from the fit's, both in the input's unit."""
+        optimum, unit, (shares, weights, influence) = uncertainty.optimum, uncertainty.optimum.unit, decided
+        return cls(
+            place=place,
+            shares=shares,
+            points=transform_points(T_registration_fit, unit * optimum.terms.observed_samples),
+            weights=weights,
+            influence=influence @ T_registration_fit[:3, :3].T,
+            unexplained=transform_points(T_registration_fit, unit * uncertainty.unexplained),
+        )
+
+    def __repr__(self) -> str:
+        shares = ", ".join(f"{name} {share:.0%}" for name, share in self.shares.items())
+        return f"Explanation(unsure by {shares}; {counted(len(self.unexplained), 'point')} unexplained)"
+
+
+# --- uncertainty ------------------------------------------------------------------------------------------------------
+
+AT_ONCE = 20_000
+"""Points whose motion is in memory at once."""
+
+OUTLINE = 300
+"""Vertices that stand for all of them where time is short."""
+
+
+@dataclass(frozen=True)
+class SegmentUncertainty:
+    """How sure the position and the size of a segment are.
+
+    Attributes:
+        name: of the segment.
+        centroid_radius95: radius around its centroid within which the true one lies with probability 0.95, input unit.
+        volume95: least and greatest volume that its own is with that probability, input unit cubed.
+    """
+
+    name: str
+    centroid_radius95: float
+    volume95: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """How far the true positions may be from where a registration has them; lengths in the input's unit.
+
+    A ``radius95`` is that of the ball around a point that holds its true position with probability 0.95: by the
+    posterior of the fit, times ``scale`` where the weights were calibrated. It does not cover another object, nor a fit
+    that ended in a wrong state (``fitting.registration.recognition`` detects both).
+
+    Attributes:
+        optimum: where the fit has ended.
+        model: statistical model of the object.
+        scale: factor by which views of training seeds showed the posterior's radii to be too small, in frames like
+            this; None where that was not measured, and then they are as the posterior has them.
+        beside: radius added in quadrature at every position where network and fit disagree; scene units.
+    """
+
+    optimum: Optimum
+    model: StatisticalModel
+    scale: float | None = None
+    beside: float = 0.0
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether the radii were calibrated on training views of the object."""
+        return self.scale is not None
+
+    @property
+    def posterior(self) -> Posterior:
+        """Posterior of pose, scale and state, in scene units."""
+        return self.optimum.posterior
+
+    @property
+    def _scale(self) -> float:
+        return 1.0 if self.scale is None else self.scale
+
+    def _of(self, parts: RadiusParts) -> Float[np.ndarray, " n"]:
+        return self.optimum.unit * parts.radii(self._scale, self.beside)
+
+    @cached_property
+    def parts(self) -> RadiusParts:
+        """Parts of the ``radius95`` of all material points, as the posterior has them; scene units."""
+        return self.posterior.radii()
+
+    @cached_property
+    def material(self) -> Float[np.ndarray, " m"]:
+        """``radius95`` of all material points of the model: vertices of all segments, then interior points."""
+        return self._of(self.parts)
+
+    @cached_property
+    def outline(self) -> Float[np.ndarray, " w"]:
+        """``radius95`` of a few hundred vertices, evenly spread: quicker than of all."""
+        rows = self.model.silhouette_vertices[:: max(1, len(self.model.silhouette_vertices) // OUTLINE)]
+        return self._of(self.posterior.radii_of(rows))
+
+    @property
+    def vertices(self) -> tuple[Float[np.ndarray, " v"], ...]:
+        """``radius95`` of the vertices of each segment."""
+        ends = np.cumsum(self.model.vertex_counts)
+        return tuple(np.split(self.material[: ends[-1]], ends[:-1]))
+
+    def radii(self, material: Float[np.ndarray, "m 3"]) -> Radii:
+        """Radii as files and pictures take them, of material points at these positions, in the input's unit."""
+        counts = self.model.vertex_counts
+        return Radii(material, self.model.labels, self.material, counts, self.calibrated)
+
+    def of_rest(self, points: Float[np.ndarray, "n 3"], labels: UInt8[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """``radius95`` of the positions to which points at rest, of the segments ``labels``, are registered."""
+        result = np.empty(len(points))
+        for first in range(0, len(points), AT_ONCE):
+            rows = slice(first, first + AT_ONCE)
+            result[rows] = self._of(self.posterior.radii(self.model.weights(points[rows], labels[rows])))
+        return result
+
+    @cached_property
+    def _owned(self) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, "s 4 p"]]:
+        """Volume that belongs to each segment, and the motion of it and of its centroid; scene units, camera's axes."""
+        mesh: SegmentedMesh = self.model.mesh(self.posterior.material)
+        gradients = owned_gradients(mesh)
+        motion = self.posterior.motion_of(gradients.reshape(-1, *gradients.shape[2:]))
+        return mesh.owned_volumes, motion.reshape(*gradients.shape[:2], -1)
+
+    @cached_property
+    def segments(self) -> tuple[SegmentUncertainty, ...]:
+        """Each segment's, of the volume that belongs to it, without that of segments nested in it."""
+        unit, scale = self.optimum.unit, self._scale
+        result = []
+        for name, volume, motion in zip(self.model.rest.names, *self._owned, strict=True):
+            off = WITHIN * scale * float(np.linalg.norm(motion[0]))
+            radius = unit * float(np.hypot(scale * radius95((motion[1:] @ motion[1:].T)[None])[0], self.beside))
+            between = (max(float(volume) - off, 0.0) * unit**3, (float(volume) + off) * unit**3)
+            result.append(SegmentUncertainty(name, radius, between))
+        return tuple(result)
+
+    @cached_property
+    def _whitened(
+        self,
+    ) -> tuple[Float[np.ndarray, "n p"], Float[np.ndarray, " n"], dict[Evidence, Float[np.ndarray, "p p"]]]:
+        """Terms of the fit in parameters that are independent and standard normal after it (u = F v, ``F F^T = S``).
+
+        Derivatives and weights of the observed samples' residuals, and the parts of all other kinds of evidence in the
+        unit matrix that is the sum of all.
+        """
+        terms, factor = self.optimum.terms, self.posterior.factor
+        others: dict[Evidence, Float[np.ndarray, "p p"]] = {
+            "network": terms.network.matrix,
+            "silhouette": terms.ruled_out.matrix,
+            "states": terms.known.matrix,
+        }
+        parts = {name: factor.T @ matrix @ factor for name, matrix in others.items()}
+        return terms.cloud[0].astype(np.float64) @ factor, terms.cloud[2], parts
+
+    def _decided(self, motion: Float[np.ndarray, "3 p"]) -> Decided:
+        """What decides a position that moves so."""
+        (rows, weight, parts), motion = self._whitened, motion.astype(np.float64)
+        whole, leverage = float((motion**2).sum()), rows @ motion.T
+        shares: dict[Evidence, float] = {"points": float((weight[:, None] * leverage**2).sum()) / whole}
+        shares |= {name: float(((motion @ part) * motion).sum()) / whole for name, part in parts.items()}
+        influence = weight[:, None] * leverage
+        length = np.linalg.norm(influence, axis=1)
+        return shares, length / max(float(length.sum()), np.finfo(np.float64).tiny), influence
+
+    @cached_property
+    def unexplained(self) -> Float[np.ndarray, "k 3"]:
+        """Observed points farther from the surface than the tolerance; the fit's camera frame, scene units."""
+        frame = self.optimum.frame
+        points = frame.evidence.points
+        return points[self.optimum.surface.nearest(points)[0] > frame.config.tolerance]
+
+    def decided_centroid(self, index: int) -> Decided:
+        """What decides where the centroid of a segment is."""
+        return self._decided(self._owned[1][index, 1:])
+
+    def decided_point(self, point: Float[np.ndarray, "1 3"], label: UInt8[np.ndarray, "1"]) -> Decided:
+        """What decides where a point of the rest model is, which moves along with the segment ``label``."""
+        return self._decided(self.posterior.motion_at(self.model.weights(point, label))[0])
+
+    def summary(self, radii: Float[np.ndarray, " n"] | None = None) -> dict[str, float | bool]:
+        """Median and greatest ``radius95`` of the vertices, or of the given radii, and whether they are calibrated."""
+        radii = np.concatenate(self.vertices) if radii is None else radii
+        return {"median": float(np.median(radii)), "max": float(radii.max()), "calibrated": self.calibrated}
