@@ -21,7 +21,7 @@ from mereo.geometry.overlap import overlaps
 from mereo.geometry.subdivision import TooManyFaces, split_edges
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.mesh_formats import read_segmented_mesh
-from mereo.learning.object_files import told_of
+from mereo.learning.object_files import describe_scene_file
 from mereo.scenes.files.build import TOLERANCE, refined
 from mereo.scenes.files.check import check_scene
 from mereo.scenes.files.defaults import MOTION, UNPLACED, default_deformations, material_points, motion, random_motion
@@ -259,7 +259,7 @@ def test_the_pliers_hinge_is_proposed_and_valid(written: Path, capsys: pytest.Ca
     assert (
         "#  - type: joint  # turns on the round contact, radius 4.98, of pin and lower\n#    segments: [lower]" in text
     )
-    assert "Its parts touch like 2 joints, which that file proposes in comments" in told_of(written)
+    assert "Its parts touch like 2 joints, which that file proposes in comments" in describe_scene_file(written)
     head, tail = text.split("deformations:", 1)
     path = written.with_name("hinges.yaml")
     path.write_text(head + "deformations:" + re.sub("^#  ", "  ", tail.split("  - type: bend")[0], flags=re.MULTILINE))

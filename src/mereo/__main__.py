@@ -20,11 +20,8 @@ from tyro.conf import subcommand
 
 from mereo.api.words import option_words
 from mereo.cli import answers, scenes, tools, training, weights
-from mereo.cli.config_file import read_options, with_options
 from mereo.cli.demo import Demo
-from mereo.cli.doctor import Doctor
-from mereo.cli.options import Outcome
-from mereo.cli.view_command import ViewCommand
+from mereo.cli.options import Outcome, read_options, with_options
 from mereo.io.bounds import check_bounds
 from mereo.io.cores import use_threads
 from mereo.io.foreseen import is_foreseen, printable_line, words_of
@@ -38,7 +35,7 @@ TRACEBACK_VARIABLE = "MEREO_TRACEBACK"
 
 COMMANDS: dict[str, Any] = {
     "demo": Demo,
-    "doctor": Doctor,
+    "doctor": tools.Doctor,
     "learn": training.LearnCommand,
     "scene": (
         "List, write, check, draw, record or export scenes.",
@@ -75,7 +72,7 @@ COMMANDS: dict[str, Any] = {
     "calibrate": weights.CalibrateCommand,
     "reconstruct": answers.ReconstructCommand,
     "align": tools.Align,
-    "view": ViewCommand,
+    "view": answers.ViewCommand,
     "stream": answers.StreamCommand,
     "serve": answers.ServeCommand,
     "export": training.Export,

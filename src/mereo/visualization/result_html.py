@@ -10,7 +10,7 @@ from jaxtyping import Float
 from PIL import Image
 
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.reconstruction.segment_statistics import FoundSegment
+from mereo.reconstruction.pipeline import FoundSegment
 from mereo.visualization.contact_sheets import Picture
 from mereo.visualization.previews import CAMERA_VIEWS, seen_on_found
 from mereo.visualization.report_words import confidence_title
