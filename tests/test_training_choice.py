@@ -106,7 +106,7 @@ def test_time_ends_the_views_but_not_before_the_least_and_begun_ones_are_kept(
 ) -> None:
     made: list[int] = []
 
-    def scored(scene: object, registrar: object, seed: int, cells: int, index: int) -> tuple[np.ndarray, bool, float]:
+    def scored(scene: object, registrar: object, cells: int, index: int) -> tuple[np.ndarray, bool, float]:
         made.append(index)
         return np.eye(9, dtype=int), True, 0.1
 

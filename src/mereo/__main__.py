@@ -54,13 +54,8 @@ COMMANDS: dict[str, Any] = {
         {"list": scenes.AssetsList, "get": scenes.AssetsGet},
     ),
     "weights": (
-        "List, show, publish or fetch weights.",
-        {
-            "list": weights.WeightsList,
-            "show": weights.WeightsShow,
-            "push": weights.WeightsPush,
-            "pull": weights.WeightsPull,
-        },
+        "List or show weights.",
+        {"list": weights.WeightsList, "show": weights.WeightsShow},
     ),
     "generate": training.Generate,
     "dataset": (

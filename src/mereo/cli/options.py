@@ -9,7 +9,6 @@ WEIGHTS  a shipped name, or a file
 INPUT    what a sensor has seen: depth image, cloud, recording, or a folder of such
 SCAN     a cloud that truth is made for
 ASSET    a name from `mereo assets list`
-REPOSITORY   weights on a model hub
 """
 
 import json
@@ -84,9 +83,8 @@ InputOrNone = Annotated[Positional[Path | None], arg(metavar="[INPUT]", help_beh
 InputName = Annotated[Positional[str], arg(metavar="INPUT")]
 ScanCloud = Annotated[Positional[Path], arg(metavar="SCAN")]
 AssetNames = Annotated[Positional[tuple[str, ...]], arg(metavar="[ASSET ...]", help_behavior_hint="")]
-RepositoryName = Annotated[Positional[str], arg(metavar="REPOSITORY")]
 
-METAVARS = ("SCENE", "OBJECT", "DATASET", "WEIGHTS", "INPUT", "SCAN", "ASSET", "REPOSITORY")
+METAVARS = ("SCENE", "OBJECT", "DATASET", "WEIGHTS", "INPUT", "SCAN", "ASSET")
 """The words; an experiment is chosen from a list, which is shown in the place of one."""
 
 MeshUnits = Literal["mm", "cm", "m", "in"] | None

@@ -8,9 +8,9 @@ import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from mereo.cli.options import ScanCloud
 from mereo.io.bounds import Count, CountOrNone, PositiveOrUnknown, Threads, Workers
@@ -36,7 +36,7 @@ class Align:
         unit: of the scan.
         scene_unit_mm: millimetres per scene unit, where the scene does not say.
         frame: axes of the scan: camera is x right, y down, z forward; scanner is y up, z toward the scanner.
-        as_one: the object is rigid: place it as a whole.
+        is_rigid: the object is rigid: place it as a whole.
         hold: segments to leave at their start or at their neighbour, whatever the scan shows.
         drop_invalid: leave out NaN, infinite and all-zero points instead of refusing the file.
         force: replace an existing output folder that mereo wrote, and nothing else is in.
@@ -50,7 +50,7 @@ class Align:
     unit: Literal["m", "cm", "mm", "in"] = "m"
     scene_unit_mm: PositiveOrUnknown = None
     frame: Literal["camera", "scanner"] = "camera"
-    as_one: bool = False
+    is_rigid: Annotated[bool, arg(name="as-one")] = False
     hold: tuple[str, ...] = ()
     drop_invalid: bool = False
     force: bool = False
@@ -87,7 +87,7 @@ class Align:
                 start = read_start(self.start, rest, scale)
             else:
                 start = start_from_model(load_model(str(self.weights)), cloud.points, self.frame, rest, scale)
-            placement = place(rest, cloud.points, start, self.frame, as_one=self.as_one, hold=self.hold)
+            placement = place(rest, cloud.points, start, self.frame, as_one=self.is_rigid, hold=self.hold)
             write_truth(directory, self.output, scan, self.scene, rest, placement, start.how)
             write_segments_glb(
                 directory / "segments.glb", placement.mesh, viewer_rotation(self.frame), UNITS_M[self.unit]
@@ -116,11 +116,12 @@ def print_placement(placement: "Placement", title: str, mm: float) -> None:
         table.add_column(column, no_wrap=True)
     for column in ("points", "median", "RMS", "95 %", "moved", "turned", "held"):
         table.add_column(column, justify="right")
-    for one in placement.segments:
-        fit = [f"{mm * value:.3f}" if one.points else "-" for value in (one.median, one.rms, one.p95)]
-        by = one.placed_by if one.seen else f"unseen: {one.placed_by}"
-        held = str(one.held) if one.held else ""
-        table.add_row(one.name, by, str(one.points), *fit, f"{mm * one.shift:.2f}", f"{one.turn_deg:.1f}", held)
+    for segment in placement.segments:
+        residuals = (segment.median, segment.rms, segment.p95)
+        fit = [f"{mm * value:.3f}" if segment.points else "-" for value in residuals]
+        by = segment.placed_by if segment.seen else f"unseen: {segment.placed_by}"
+        motion = f"{mm * segment.shift:.2f}", f"{segment.turn_deg:.1f}"
+        table.add_row(segment.name, by, str(segment.points), *fit, *motion, str(segment.held or ""))
     console = Console(markup=False, emoji=False)
     console.print(table)
     console.print(
@@ -128,11 +129,11 @@ def print_placement(placement: "Placement", title: str, mm: float) -> None:
         highlight=False,
         soft_wrap=True,
     )
-    for one in placement.segments:
-        if one.held:
+    for segment in placement.segments:
+        if segment.held:
             console.print(
-                f"{one.name}: the scan leaves {one.held} of 6 directions open (it could turn or slide); there it "
-                "stays where it was placed together with the others",
+                f"{segment.name}: the scan leaves {segment.held} of 6 directions open (it could turn or slide); there "
+                "it stays where it was placed together with the others",
                 highlight=False,
                 soft_wrap=True,
             )
@@ -187,7 +188,7 @@ class BenchCommand:
         precision: of the network's products; auto takes bfloat16 on CUDA and on CPUs that are much faster in it.
         repeats: of each stage.
         rival: time the straightforward implementation too (minutes on a CPU), and check that it gives the same labels.
-        beside: processes that never rest, beside which 40,000 queries are timed again on a CPU; 0 leaves that out.
+        busy: processes that never rest, beside which 40,000 queries are timed again on a CPU; 0 leaves that out.
         threads: of torch and all else that computes; 0 means one per core.
         output: a JSON file for the figures.
         force: replace an existing file, unless the weights are read from it.
@@ -199,7 +200,7 @@ class BenchCommand:
     precision: Precision = "float32"
     repeats: Count = 7
     rival: bool = False
-    beside: CountOrNone = 1
+    busy: Annotated[CountOrNone, arg(name="beside")] = 1
     threads: Threads = 0
     output: Path | None = None
     force: bool = False
@@ -217,7 +218,7 @@ class BenchCommand:
             self.precision,
             self.repeats,
             self.rival,
-            self.beside,
+            self.busy,
             self.output,
             self.force,
         )
@@ -236,7 +237,6 @@ PURPOSES: dict[str, str] = {
     "medical": "NIfTI and NRRD volumes",
     "sensors": "ROS bags, EXR depth images and Zivid clouds",
     "simulation": "states from finite elements",
-    "hub": "weights on a model hub",
     "storage": "datasets in S3 and what speaks it",
     "gcs": "datasets in Google Cloud Storage",
     "cluster": "generation, scoring, frames and learning on Ray clusters",

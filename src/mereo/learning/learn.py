@@ -81,15 +81,10 @@ PASSES = 3.0
 MARGIN = 0.93
 """Share of the time for training that is planned: the machine may have more to do by then."""
 
-LEAST_EXAMPLES, MOST_EXAMPLES = 60, 48_000
-
-HOLDOUT = 32
-"""Examples of the validation curve, at most; it has 20 scores, each of all of them."""
+LEAST_EXAMPLES, MOST_EXAMPLES, LEAST_TESTS, MOST_TESTS = 60, 48_000, 4, 64
 
 OFFSET_EXAMPLES = 128
 """Training examples from which class offsets are chosen."""
-
-LEAST_TESTS, MOST_TESTS = 4, 64
 
 
 @dataclass(frozen=True)
@@ -149,8 +144,8 @@ def epochs_for(
 
 
 def holdout(examples: int) -> int:
-    """Examples held out of so many."""
-    return min(HOLDOUT, examples // 10)
+    """Examples held out of so many for the validation curve, which has 20 scores, each of all of them."""
+    return min(32, examples // 10)
 
 
 def views_for(left_s: float, each_s: float) -> int:
@@ -179,12 +174,6 @@ DATA, RUN, TEST = "data", "run", "test"
 
 SEED = 1
 """Of examples and training. What is learnt from another one differs by chance alone."""
-
-COMPILED_FROM_MIN = 60.0
-"""Minutes from which compiling the network, which takes one or two, is left to ``compiling_pays``."""
-
-CHECKPOINT_S = 60.0
-"""Seconds between checkpoints: what a stopped run loses at most."""
 
 CALIBRATION_SHARE = 0.25
 """Of the time for the scores: what is then said of them, and of every later frame, rests on it."""
@@ -269,14 +258,14 @@ def learn(
         print(f"it is trained: {training_reason(train, reasons, is_begun)}", flush=True)
         _train(scene, output, clock, config, searched.median_s)
         test = read_metrics(output / TEST / "metrics.json")
-        metrics = comparison(scores_of_views(output, loaded, named, test["examples"]).summary(), test)
+        metrics = _comparison(scores_of_views(output, loaded, named, test["examples"]).summary(), test)
         advice = advice_after_training(metrics, test["per_segment"], config.minutes)
     else:
         metrics = {"trained": False, "method": "search", **searched.summary(), "search": searched.summary()}
-        advice = advice_without_training(reasons, repeated_command(files, output, config))
+        advice = _advice_without_training(reasons, _repeated_command(files, output, config))
     write_json(output / METRICS, metrics)
     frame = write_example_frame(loaded, output / FRAME)
-    show_outcome(metrics, advice, output, scene, frame, (time.monotonic() - clock.started) / 60)
+    _show_outcome(metrics, advice, output, scene, frame, (time.monotonic() - clock.started) / 60)
     return metrics
 
 
@@ -297,7 +286,7 @@ def _train(scene: str, output: Path, clock: Clock, config: LearnConfig, search_s
     recipe = replace(
         recipe, init=plan.init, epochs=plan.epochs, holdout=holdout(plan.examples), offset_examples=offsets
     )
-    weights = train_network(output / DATA, output / RUN, recipe, checkpoint_every_s=CHECKPOINT_S)
+    weights = train_network(output / DATA, output / RUN, recipe, checkpoint_every_s=60.0)
     clock.stage(6, "calibrate, and evaluate on views that training has not seen")
     is_evaluated = (output / TEST / MARKER).is_file()
     if not is_evaluated or not (output / WEIGHTS).is_file():
@@ -311,7 +300,8 @@ def _train(scene: str, output: Path, clock: Clock, config: LearnConfig, search_s
 def recipe_for(minutes: float) -> TrainConfig:
     """Recipe for a budget, but for what the plan decides."""
     base = PRESETS["base"]
-    return replace(base, compile=base.compile if minutes >= COMPILED_FROM_MIN else "off", seed=SEED)
+    # compiling takes a minute or two; in an hour that is left to ``compiling_pays``
+    return replace(base, compile=base.compile if minutes >= 60 else "off", seed=SEED)
 
 
 # --- what is kept between runs of the command -------------------------------------------------------------------------
@@ -392,27 +382,18 @@ MADE_AS = GenerateConfig(sampling=SamplingConfig(uniform_fraction=0.15))
 EXAMPLES = 48
 """Examples that are measured; they are of the seed of training, and are made again with the others."""
 
-PARALLEL = 0.8
-"""What another process adds: cores share memory and caches."""
-
 
 def measure(scene: str, folder: Path, recipe: TrainConfig, *, init: str, workers: int) -> tuple[Rates, str]:
-    """Seconds that examples take, and the weights to start from.
+    """Seconds that examples take, and the weights to start from: ``init``, or those of the shipped that adapt fastest.
 
-    Args:
-        scene: name or file of what is learnt.
-        folder: in which a small dataset and short runs are made; the caller removes it.
-        recipe: of the training.
-        init: weights to start from; empty compares the shipped ones.
-        workers: processes that will make the examples.
-
-    Raises ``ValueError`` where an example cannot be made, or the weights do not fit the recipe.
+    A small dataset and short runs are made in ``folder``, which the caller removes. Raises ``ValueError`` where an
+    example cannot be made, or the weights do not fit the recipe.
     """
     started = time.monotonic()
     with redirect_stdout(StringIO()):  # nobody waits for these few
         generate(scene, folder / "data", DatasetConfig(MADE_AS, EXAMPLES, SEED))
-    # with the template and 100 states, so a little too long
-    generate_s = (time.monotonic() - started) / EXAMPLES / (1 + PARALLEL * (workers - 1))
+    # with the template and 100 states, so a little too long; another process adds 0.8, as cores share memory and caches
+    generate_s = (time.monotonic() - started) / EXAMPLES / (1 + 0.8 * (workers - 1))
     data = small_dataset(folder / "data")
     with progress("measure", trial_steps(compared=not init), "steps") as shown:
         losses = {} if init else nearest(data, recipe, folder, shown)
@@ -434,13 +415,8 @@ GOOD = 0.7
 TITLES = {"search": "search alone", "network": "network alone", "both": "both: network first, search where unexplained"}
 
 
-def comparison(search: Mapping[str, Any], test: Mapping[str, Any]) -> dict[str, Any]:
-    """Content of ``metrics.json`` of an object that was trained: the answers, each with its scores, and the best.
-
-    Args:
-        search: summary of the search alone, on the views of ``test``.
-        test: metrics of the weights.
-    """
+def _comparison(search: Mapping[str, Any], test: Mapping[str, Any]) -> dict[str, Any]:
+    """Content of ``metrics.json`` of an object that was trained: the answers, each with its scores, and the best."""
     slowest = next(test[name] for name in ("full", "modes", "network") if name in test)
     both = {
         "iou": test["iou"],
@@ -463,43 +439,26 @@ def comparison(search: Mapping[str, Any], test: Mapping[str, Any]) -> dict[str, 
     }
 
 
-def show_outcome(
+def _show_outcome(
     metrics: Mapping[str, Any], advice: Sequence[str], output: Path, scene: str, frame: str, took_min: float
 ) -> None:
-    """Print the scores, which answer to use, the files, and the command that uses them.
-
-    Args:
-        metrics: content of ``metrics.json``.
-        advice: lines on what the scores mean.
-        output: the folder of what was learnt.
-        scene: its name or file.
-        frame: what the example frame is.
-        took_min: minutes of this run of the command.
-    """
+    """Print the scores, which answer to use, the files, and the command that uses them."""
     print(
         f"\n{metrics['examples']} test views, which training has not seen  {'IoU':>6} {'mIoU':>6} explained  s a frame"
     )
     for name, title in TITLES.items():
         if name in metrics:
-            print(_row(title, metrics[name]))
-    if metrics["trained"]:
-        print(metrics["reason"])
-    for line in advice:
-        print(line)
-    print()
+            scores = metrics[name]
+            explained = f"{scores['explained']:.0%}" if "explained" in scores else "-"
+            figures = f"{format_score(scores['iou'])}  {format_score(scores['miou']):>5} {explained:>9}"
+            print(f"{title:<45} {figures} {scores['seconds']:10.2f}")
+    print(*([metrics["reason"]] if metrics["trained"] else []), *advice, "", sep="\n")
     if metrics["trained"]:
         print(f"report   {output / 'test' / 'report.html'}")
         print(f"weights  {output / WEIGHTS}")
     print(f"frame    {output / FRAME}: {frame}")
     print(f"this run took {took_min:.1f} min; to find the object in a frame:\n")
     print(f"  {command(output, scene, metrics['trained'], metrics['method'])}")
-
-
-def _row(title: str, scores: Mapping[str, Any]) -> str:
-    explained = f"{scores['explained']:.0%}" if "explained" in scores else "-"
-    return f"{title:<45} {format_score(scores['iou'])}  {format_score(scores['miou']):>5} {explained:>9} " + (
-        f"{scores['seconds']:10.2f}"
-    )
 
 
 def command(output: Path, scene: str, is_trained: bool = True, method: str = "auto") -> str:
@@ -516,7 +475,7 @@ def command(output: Path, scene: str, is_trained: bool = True, method: str = "au
     return shlex.join(map(str, [*words, "--output", output / "result"]))
 
 
-def repeated_command(files: Sequence[Path], output: Path, config: LearnConfig) -> str:
+def _repeated_command(files: Sequence[Path], output: Path, config: LearnConfig) -> str:
     """Command that goes on in the folder with training."""
     words = ["mereo", "learn", *files, "--output", output]
     words += [] if config.minutes == 10 else ["--minutes", f"{config.minutes:g}"]
@@ -525,13 +484,8 @@ def repeated_command(files: Sequence[Path], output: Path, config: LearnConfig) -
     return shlex.join(map(str, [*words, "--train", "always"]))
 
 
-def advice_without_training(reasons: Sequence[str], training: str) -> list[str]:
-    """Why nothing was trained, and what would train it.
-
-    Args:
-        reasons: shortcomings of the search alone.
-        training: command that trains.
-    """
+def _advice_without_training(reasons: Sequence[str], training: str) -> list[str]:
+    """Why nothing was trained, with the shortcomings of the search alone, and the command that would train it."""
     if reasons:
         return [
             f"nothing is trained, as --train is never; the search alone is not good enough: {', '.join(reasons)}.",

@@ -32,11 +32,8 @@ SCENE = "scene.yaml"
 SEARCH = "search.json"
 """File of a folder of ``mereo learn`` with the scores of the search alone, and the scene's name or file."""
 
-STATES = 24
-"""Random states from which it is seen how far an object deforms."""
-
-HARDLY = 0.005
-"""Mean way of the surface from its mean place, as a share of the object's length, below which it hardly deforms."""
+FRAME = "frame.ply"
+"""File of a frame to try the object on."""
 
 Learnable = tuple[str, list[Path]]
 """Name and files of an object."""
@@ -170,7 +167,7 @@ def check(files: Sequence[Path], units: str | None) -> None:
             raise ValueError(_refusal(files)) from None
         loaded = load_scene(scene)
     way = deformation(loaded)
-    if way < HARDLY:
+    if way < 0.005:
         place = f" in {files[0]}" if names_scene(files) and is_yaml(files[0]) else ""
         print(
             f"warning: {loaded.name} hardly deforms: by {way:.2%} of its length; if it does more than that, widen its "
@@ -192,17 +189,10 @@ def _refusal(files: Sequence[Path]) -> str:
 
 def deformation(scene: Scene) -> float:
     """Mean distance of vertices from their mean place over random states, as a share of the object's longest side."""
-    states = np.stack([scene.sample_state(example_rng(0, index)).mesh.merged()[0] for index in range(STATES)])
+    states = np.stack([scene.sample_state(example_rng(0, index)).mesh.merged()[0] for index in range(24)])
     states -= states.mean(axis=1, keepdims=True)
     low, high = scene.rest.bounds
     return float(np.linalg.norm(states - states.mean(axis=0), axis=-1).mean() / (high - low).max())
-
-
-# --- an example frame -------------------------------------------------------------------------------------------------
-
-# A frame to try weights on: a test view of the scene as a point cloud in metres, as `mereo reconstruct` reads it.
-
-FRAME = "frame.ply"
 
 
 def write_example_frame(scene: Scene, path: Path) -> str:
