@@ -1,6 +1,5 @@
 """``mereo`` and ``python -m mereo``: run one command, and answer what a user can cause with one line."""
 
-import importlib.metadata
 import io
 import os
 import signal
@@ -13,11 +12,12 @@ from dataclasses import MISSING, fields
 from itertools import pairwise
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any, Protocol, TypeVar, Union, runtime_checkable
+from typing import Annotated, Any, Protocol, TypeVar, Union
 
 import tyro
 from tyro.conf import subcommand
 
+from mereo import __version__
 from mereo.api.words import option_words
 from mereo.cli import answers, scenes, tools, training, weights
 from mereo.cli.demo import Demo
@@ -90,7 +90,6 @@ USER_ERROR, FAULT, INTERRUPTED, BROKEN_PIPE = 2, 70, 130, 141
 """Exit codes; 70 is EX_SOFTWARE of sysexits.h, the last two are 128 plus the signal's number, as shells report them."""
 
 
-@runtime_checkable
 class Command(Protocol):
     """Command that arguments are read into: a dataclass, its fields the options.
 
@@ -105,7 +104,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line, and return the exit code. With MEREO_TRACEBACK=1 errors are raised as they are."""
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments in (["--version"], ["-V"]):
-        print(f"mereo {version()}")
+        print(f"mereo {__version__}")
         return 0
     warnings.formatwarning = _warning_line
     if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal that lacks a character gets another one, and no error
@@ -145,14 +144,6 @@ def _run(command: Command) -> int:
 
         print(json_text(outcome.facts), end="")
     return outcome.status
-
-
-def version() -> str:
-    """Version of the installed package, or that there is none."""
-    try:
-        return importlib.metadata.version("mereo")
-    except importlib.metadata.PackageNotFoundError:
-        return "(not installed)"
 
 
 def _warning_line(message: Warning | str, *_: Any, **__: Any) -> str:
@@ -228,15 +219,11 @@ def _command(arguments: list[str]) -> str:
     words = next((n for n, word in enumerate(arguments) if not word.isalpha()), len(arguments))
     named = arguments[:1] if words < 2 or not isinstance(COMMANDS.get(arguments[0]), tuple) else arguments[:2]
     values = [word.partition("=")[2] if word.startswith("--") else word for word in arguments[len(named) :]]
-    files = [value for value in values if value and _is_there(value)]
+    files = []
+    for value in filter(None, values):
+        with suppress(OSError, ValueError):  # a name that is too long, or has a zero in it
+            files += [value] if Path(value).exists() else []
     return " ".join(["mereo", *named, *(["on", ", ".join(files)] if files else [])])
-
-
-def _is_there(value: str) -> bool:
-    try:
-        return Path(value).exists()
-    except (OSError, ValueError):  # a name that is too long, or has a zero in it
-        return False
 
 
 # --- from arguments to a command --------------------------------------------------------------------------------------

@@ -107,19 +107,18 @@ class ReconstructCommand:
 
 @dataclass(frozen=True)
 class ViewCommand:
-    """Look at a frame and its reconstruction in a browser, or try an object (--scene): needs the extra `view`.
+    """Look at a frame and its reconstruction in a browser, or try an object (--object): needs the extra `view`.
 
     Only this machine reaches the page; from another one use a tunnel: ssh -L 8080:127.0.0.1:8080 HOST.
 
     Attributes:
         input: a point cloud or depth image, as for `mereo reconstruct`, or the folder of a result of it; a GLB file;
-            without it (and --scene, --object) a shipped frame.
+            without it (and --object) a shipped frame.
         object: what is looked for in the frame, as for `mereo reconstruct`: its meshes or its scene. Without a frame
-            the laboratory of this object is opened.
+            the laboratory of this object is opened: states of its are shown to a simulated camera, and what is found in
+            its image beside the truth.
         weights: a shipped name or a file; by default those of the shipped frame, or none.
         units: of the object's meshes; guessed where not given.
-        scene: open the laboratory of this scene: its name, or a scene file of your own (.yaml, .py). States of its are
-            shown to a simulated camera, and what is found in its image beside the truth.
         port: where the page is; 0 takes any that is free.
         resolution: grid cells along the longest side.
         reading: how the frame is read.
@@ -131,7 +130,6 @@ class ViewCommand:
     object: tuple[str, ...] = ()
     weights: str | None = None
     units: MeshUnits = None
-    scene: str | None = None
     port: Port = 8080
     resolution: Cells = 128
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
@@ -142,27 +140,24 @@ class ViewCommand:
         """Open a page, and keep it until Ctrl-C."""
         from mereo.api.view import view
         from mereo.evaluation.sample_views import shipped_views
+        from mereo.io.progress import shown_stages
         from mereo.visualization.viewer.server import import_viser
 
         import_viser()  # its absence is better said before the work
-        input, object = self.input, self.object
-        if self.scene is not None:
-            if input is not None or object:
-                raise ValueError(
-                    f"both {input or '--object'} and --scene {self.scene} are given; one can be shown: drop one"
-                )
-            object = (self.scene,)
-        elif input is None and not object and self.weights is not None:
+        input, known = self.input, None
+        if input is None and not self.object and self.weights is not None:
             if self.weights not in shipped_views():
                 raise ValueError(
                     f"there is no frame to show and none is shipped for {self.weights!r}; name a depth image or a "
                     f"point cloud, or take the weights of a shipped frame: {', '.join(shipped_views())}"
                 )
             input = Path(self.weights)
-        is_named = object or self.weights is not None
+        if self.object or self.weights is not None:
+            with shown_stages():
+                known = loaded_object(self.object, self.weights, None, self.units, self.inference)
         view(
             input,
-            loaded_object(object, self.weights, None, self.units, self.inference) if is_named else None,
+            known,
             reading=self.reading,
             isolation=self.isolation,
             resolution=self.resolution,
