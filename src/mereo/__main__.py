@@ -12,7 +12,7 @@ from dataclasses import MISSING, fields
 from itertools import pairwise
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any, Protocol, TypeVar, Union
+from typing import Annotated, Any, Protocol, TypeVar, Union, runtime_checkable
 
 import tyro
 from tyro.conf import subcommand
@@ -90,6 +90,7 @@ USER_ERROR, FAULT, INTERRUPTED, BROKEN_PIPE = 2, 70, 130, 141
 """Exit codes; 70 is EX_SOFTWARE of sysexits.h, the last two are 128 plus the signal's number, as shells report them."""
 
 
+@runtime_checkable
 class Command(Protocol):
     """Command that arguments are read into: a dataclass, its fields the options.
 
