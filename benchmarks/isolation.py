@@ -17,7 +17,7 @@ from mereo.evaluation.scoring import predict_grid, trained_scene
 from mereo.models.weights import load_model
 from mereo.models.weights_place import shipped_names
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.isolation import isolate
+from mereo.reconstruction.observation import find_object, observe
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis.config import SENSORS, GenerateConfig
@@ -44,7 +44,7 @@ def measure(weights: str, sensor: str, views: int, cells: int) -> None:
         cloud, truth = view.depth.to_points(), truth_grid(view.mesh, cells)
         for way, config in WAYS.items():
             start = time.process_time()
-            left, _ = isolate(cloud, config)
+            left = find_object(observe(cloud).frame, config).cloud
             spent[way] += time.process_time() - start
             kept[way].append(len(left) / len(cloud))
             confusion[way] += grid_confusion(truth, predict_grid(model, left, truth), len(model.names))

@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from mereo.api.frames import load_frame
+from mereo.api.reconstruct import load_frame
 from mereo.io.atomic_files import check_file_place, write_json
 from mereo.io.config import InputConfig
 from mereo.models.config import InferenceConfig

@@ -25,8 +25,8 @@ from mereo.io.config import InputConfig
 from mereo.io.sensor_frame import read_frame
 from mereo.models.weights import load_model
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.isolation import isolate, readings
-from mereo.reconstruction.observation import find_object
+from mereo.reconstruction.isolation import readings
+from mereo.reconstruction.observation import find_object, observe
 from mereo.visualization.contact_sheets import cloud_picture, contact_sheet, save_png
 from mereo.visualization.renderer import Viewpoint
 
@@ -60,14 +60,13 @@ def crowded_bunny(output: Path, force: bool) -> None:
     crowded = PointCloud(crowd(scan.points, np.random.default_rng(0)))
     near, far = scan.points[:, 2].min() - 0.05, scan.points[:, 2].max() + 0.05
     config = IsolationConfig(depth_range=(near, far), remove_plane=True, largest_cluster=True, cluster_gap=0.05)
-    isolated, steps = isolate(crowded, config)
-    for step in steps:
-        print(f"  {step}")
+    isolated = find_object(observe(crowded, unit_m=1.0).frame, config)
+    print(isolated)
     model = load_model("bunny")
-    for name, cloud in (("alone", scan), ("crowded", crowded), ("isolated", isolated)):
+    for name, cloud in (("alone", scan), ("crowded", crowded), ("isolated", isolated.cloud)):
         scores = grid_scores(model, cloud, truth, cells=64)
         print(f"{name:<9} {len(cloud):>7} points  IoU {scores.iou:.3f}  mIoU {scores.miou:.3f}")
-    draw(output, {"crowded": crowded, "isolated": isolated}, force)
+    draw(output, {"crowded": crowded, "isolated": isolated.cloud}, force)
 
 
 def draw(path: Path, clouds: dict[str, PointCloud], force: bool) -> None:

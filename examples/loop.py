@@ -20,7 +20,7 @@ from PIL import Image, ImageDraw
 from scipy.spatial import cKDTree
 
 from mereo.api.objects import load_object
-from mereo.api.tracker import Tracker
+from mereo.api.reconstruct import Tracker
 from mereo.deformation.maps import turn
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.mesh import Segment, SegmentedMesh

@@ -12,17 +12,17 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mereo.api.frames import load_frame as load_frame
     from mereo.api.generate import generate as generate
     from mereo.api.objects import Object as Object
     from mereo.api.objects import load_object as load_object
+    from mereo.api.reconstruct import Tracker as Tracker
+    from mereo.api.reconstruct import load_frame as load_frame
     from mereo.api.reconstruct import reconstruct as reconstruct
     from mereo.api.result import Result as Result
     from mereo.api.steps import evaluate as evaluate
     from mereo.api.steps import export as export
     from mereo.api.steps import learn as learn
     from mereo.api.steps import train as train
-    from mereo.api.tracker import Tracker as Tracker
     from mereo.api.view import view as view
     from mereo.geometry.camera import Camera as Camera
     from mereo.geometry.camera import DepthImage as DepthImage
@@ -59,13 +59,13 @@ _HOME = {
     "Result": "api.result",
     "Segment": "geometry.mesh",
     "SegmentedMesh": "geometry.mesh",
-    "Tracker": "api.tracker",
+    "Tracker": "api.reconstruct",
     "TrainConfig": "training.config",
     "evaluate": "api.steps",
     "export": "api.steps",
     "generate": "api.generate",
     "learn": "api.steps",
-    "load_frame": "api.frames",
+    "load_frame": "api.reconstruct",
     "load_model": "models.weights",
     "load_object": "api.objects",
     "load_scene": "scenes.registry",

@@ -1,6 +1,5 @@
 """``mereo`` and ``python -m mereo``: run one command, and answer what a user can cause with one line."""
 
-import importlib.metadata
 import io
 import os
 import signal
@@ -18,13 +17,11 @@ from typing import Annotated, Any, Protocol, TypeVar, Union, runtime_checkable
 import tyro
 from tyro.conf import subcommand
 
+from mereo import __version__
 from mereo.api.words import option_words
 from mereo.cli import answers, scenes, tools, training, weights
-from mereo.cli.config_file import read_options, with_options
 from mereo.cli.demo import Demo
-from mereo.cli.doctor import Doctor
-from mereo.cli.options import Outcome
-from mereo.cli.view_command import ViewCommand
+from mereo.cli.options import Outcome, read_options, with_options
 from mereo.io.bounds import check_bounds
 from mereo.io.cores import use_threads
 from mereo.io.errors import is_foreseen, printable_line, words_of
@@ -38,7 +35,7 @@ TRACEBACK_VARIABLE = "MEREO_TRACEBACK"
 
 COMMANDS: dict[str, Any] = {
     "demo": Demo,
-    "doctor": Doctor,
+    "doctor": tools.Doctor,
     "learn": training.LearnCommand,
     "scene": (
         "List, write, check, draw, record or export scenes.",
@@ -57,13 +54,8 @@ COMMANDS: dict[str, Any] = {
         {"list": scenes.AssetsList, "get": scenes.AssetsGet},
     ),
     "weights": (
-        "List, show, publish or fetch weights.",
-        {
-            "list": weights.WeightsList,
-            "show": weights.WeightsShow,
-            "push": weights.WeightsPush,
-            "pull": weights.WeightsPull,
-        },
+        "List or show weights.",
+        {"list": weights.WeightsList, "show": weights.WeightsShow},
     ),
     "generate": training.Generate,
     "dataset": (
@@ -75,7 +67,7 @@ COMMANDS: dict[str, Any] = {
     "calibrate": weights.CalibrateCommand,
     "reconstruct": answers.ReconstructCommand,
     "align": tools.Align,
-    "view": ViewCommand,
+    "view": answers.ViewCommand,
     "stream": answers.StreamCommand,
     "serve": answers.ServeCommand,
     "export": training.Export,
@@ -113,7 +105,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line, and return the exit code. With MEREO_TRACEBACK=1 errors are raised as they are."""
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments in (["--version"], ["-V"]):
-        print(f"mereo {version()}")
+        print(f"mereo {__version__}")
         return 0
     warnings.formatwarning = _warning_line
     if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal that lacks a character gets another one, and no error
@@ -153,14 +145,6 @@ def _run(command: Command) -> int:
 
         print(json_text(outcome.facts), end="")
     return outcome.status
-
-
-def version() -> str:
-    """Version of the installed package, or that there is none."""
-    try:
-        return importlib.metadata.version("mereo")
-    except importlib.metadata.PackageNotFoundError:
-        return "(not installed)"
 
 
 def _warning_line(message: Warning | str, *_: Any, **__: Any) -> str:
@@ -236,15 +220,11 @@ def _command(arguments: list[str]) -> str:
     words = next((n for n, word in enumerate(arguments) if not word.isalpha()), len(arguments))
     named = arguments[:1] if words < 2 or not isinstance(COMMANDS.get(arguments[0]), tuple) else arguments[:2]
     values = [word.partition("=")[2] if word.startswith("--") else word for word in arguments[len(named) :]]
-    files = [value for value in values if value and _is_there(value)]
+    files = []
+    for value in filter(None, values):
+        with suppress(OSError, ValueError):  # a name that is too long, or has a zero in it
+            files += [value] if Path(value).exists() else []
     return " ".join(["mereo", *named, *(["on", ", ".join(files)] if files else [])])
-
-
-def _is_there(value: str) -> bool:
-    try:
-        return Path(value).exists()
-    except (OSError, ValueError):  # a name that is too long, or has a zero in it
-        return False
 
 
 # --- from arguments to a command --------------------------------------------------------------------------------------

@@ -286,5 +286,5 @@ def test_a_result_is_viewed_as_it_is(result: Result, monkeypatch: pytest.MonkeyP
     assert content.mesh is result.reconstruction.surfaces
     assert (content.title, content.unit, content.depth) == ("cloud", Unit(1.0), None)
     assert content.facts.startswith("1,200 points")
-    with pytest.raises(ValueError, match="both .* and scene rope are given; one can be shown: drop one"):
-        mereo.view("frame.ply", scene="rope", block=False)
+    with pytest.raises(ValueError, match="frame.ply is given without its object: name the object's meshes"):
+        mereo.view("frame.ply", block=False)

@@ -38,7 +38,7 @@ def test_segments_are_had_by_their_names(result: Result) -> None:
         found = result[name]
         np.testing.assert_allclose(found.centroid, center, atol=0.003)
         assert found.volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.05)
-        assert found.name == name and found.label == NAMES.index(name) + 1 and found.is_found
+        assert found.name == name and found.label == NAMES.index(name) + 1 and found.is_present
         assert 0.5 < found.confidence <= 1 and found.error_radius is None and found.pose is None
         assert found.mesh is result.surfaces.segments[found.label - 1]
     assert result["big"] is result["big"]
@@ -46,7 +46,7 @@ def test_segments_are_had_by_their_names(result: Result) -> None:
 
 def test_an_absent_segment_is_there_and_says_so(result: Result) -> None:
     absent = result["absent"]
-    assert not absent.is_found and absent.volume == 0 and np.isnan(absent.confidence) and len(absent.mesh.faces) == 0
+    assert not absent.is_present and absent.volume == 0 and np.isnan(absent.confidence) and len(absent.mesh.faces) == 0
     assert repr(absent) == "SegmentResult('absent', not found)" and "volume" in repr(result["big"])
 
 

@@ -13,6 +13,7 @@ from analytic import untrained
 
 import mereo
 from mereo.api import steps
+from mereo.learning.learn import LearnConfig
 from mereo.scenes.registry import load_scene
 from mereo.synthesis import shards
 from mereo.synthesis.config import GenerateConfig
@@ -40,20 +41,22 @@ def test_generate_and_train_are_the_commands(tmp_path: Path, monkeypatch: pytest
 def test_evaluate_scores_with_and_without_a_folder(tmp_path: Path) -> None:
     model = untrained(load_scene("rope").rest.names)
     alone = mereo.evaluate(model, examples=1, cells=8, method="network", progress=False)
-    written = mereo.evaluate(model, load_scene("rope"), output=tmp_path / "out", examples=1, cells=8, method="network")
+    written = mereo.evaluate(
+        model, scene=load_scene("rope"), output=tmp_path / "out", examples=1, cells=8, method="network"
+    )
     np.testing.assert_array_equal(alone.confusion, written.confusion)
     assert len(alone.seconds) == 1
     assert json.loads((tmp_path / "out/metrics.json").read_text())["scene"] == "rope"
     with pytest.raises(ValueError, match="scans are real and take no simulated camera"):
-        mereo.evaluate(model, scans=(), settings=GenerateConfig())
+        mereo.evaluate(model, scans=(), settings=GenerateConfig(image_size=48))
 
 
 def test_learn_and_export_return_what_they_leave(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[Any] = []
     scores = {"iou": 0.9, "miou": 0.8, "trained": True, "method": "auto"}
-    monkeypatch.setattr(steps.learning, "learn", lambda files, output, **named: calls.append((files, named)) or scores)
+    monkeypatch.setattr(steps.learning, "learn", lambda files, output, config: calls.append((files, config)) or scores)
     learned = mereo.learn("rope", tmp_path, minutes=3)
-    assert calls == [([Path("rope")], {"minutes": 3, "init": "", "units": None, "workers": 1, "train": "auto"})]
+    assert calls == [([Path("rope")], LearnConfig(minutes=3))]
     assert learned.weights == tmp_path / "weights.safetensors" and learned.scene == "rope" and learned.miou == 0.8
     assert repr(learned) == f"Learned({str(tmp_path)!r}: trained, method auto, IoU 0.900, mIoU 0.800)"
     scores |= {"trained": False, "method": "search"}

@@ -110,7 +110,7 @@ def test_a_command_that_needs_torch_says_which_extra(tmp_path: Path) -> None:
 
 
 def test_the_doctor_speaks_without_torch(tmp_path: Path) -> None:
-    ran = hidden("from mereo.cli.doctor import Doctor\nDoctor().run()\nHidden.asked.clear()", tmp_path)
+    ran = hidden("from mereo.cli.tools import Doctor\nDoctor().run()\nHidden.asked.clear()", tmp_path)
     assert ran.returncode == 0 and "objects are found by search" in ran.stdout
 
 

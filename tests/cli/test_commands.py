@@ -10,6 +10,7 @@ import mereo.__main__ as command_line
 from mereo.cli.answers import ReconstructCommand
 from mereo.cli.options import Outcome
 from mereo.cli.reconstruct import FrameJob
+from mereo.evaluation.scoring import EvaluationConfig
 from mereo.io.config import InputConfig
 from mereo.models.config import InferenceConfig
 from mereo.synthesis.config import GenerateConfig
@@ -40,9 +41,9 @@ from mereo.training.config import PRESETS
         ),
         (
             "evaluate bunny --output out --examples 4 --seed 1000001",
-            "mereo.api.steps",
-            "evaluate",
-            {"model": "bunny", "output": Path("out"), "examples": 4, "seed": 1_000_001, "scene": None},
+            "mereo.visualization.evaluation_report",
+            "evaluate_weights",
+            {"weights": "bunny", "output": Path("out"), "config": EvaluationConfig(None, 4, 1_000_001), "workers": 1},
         ),
         (
             "reconstruct a.png --weights rope --output out --intrinsics k.json --depth-scale 5000 --mask m.png --force",

@@ -10,7 +10,7 @@ import pytest
 from two_balls import scene
 
 from mereo import __main__ as command_line
-from mereo.cli.config_file import options_of
+from mereo.cli.options import options_of
 from mereo.synthesis.config import SENSORS
 from mereo.training.config import PRESETS
 

@@ -5,7 +5,7 @@ import sys
 import pytest
 import torch
 
-from mereo.cli import doctor
+from mereo.cli import tools as doctor
 from mereo.models import device
 
 

@@ -17,7 +17,7 @@ from mereo.evaluation.metrics import truth_grid
 from mereo.models.calibration import Calibration
 from mereo.models.model import Model, scaled_logits
 from mereo.models.weights import load_model, save_model, with_calibration
-from mereo.reconstruction.segment_statistics import segment_points
+from mereo.reconstruction.pipeline import segment_points
 from mereo.scenes.registry import load_scene
 
 NAMES = ("one", "two")

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from analytic import AnalyticModel, untrained
 
-from mereo.api.frames import load_frame
 from mereo.api.objects import Object
+from mereo.api.reconstruct import load_frame
 from mereo.cli import demo
 from mereo.evaluation.cases import PICTURE_MARGIN, Evaluation, TestCase, grid_confusion
 from mereo.evaluation.metrics import confusion_matrix, format_score, intersection_over_union, truth_grid

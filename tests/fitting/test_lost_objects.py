@@ -12,8 +12,7 @@ import pytest
 from tracked_views import CAMERA, bare, lump_model, mesh_of, rms, view
 
 from mereo.api.result import Result
-from mereo.cli.stream import SurfaceFolder, line
-from mereo.cli.stream_answers import Answering, Seen
+from mereo.cli.stream import Answering, Seen, SurfaceFolder, line
 from mereo.fitting import tracking
 from mereo.fitting.registration.answer import Candidate
 from mereo.fitting.registration.answer_frame import search_hypotheses

@@ -16,10 +16,8 @@ from answers import answer_to
 from scipy.spatial import cKDTree
 
 from mereo.cli.answers import ReconstructCommand
-from mereo.cli.explain import explain, wish_of
-from mereo.cli.reconstruct import FrameJob
-from mereo.cli.stream import line
-from mereo.cli.stream_answers import FrameAnswer
+from mereo.cli.reconstruct import FrameJob, explain, target_of
+from mereo.cli.stream import FrameAnswer, line
 from mereo.evaluation.sample_views import load_view
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import CloudToFit, Registrar
@@ -208,7 +206,7 @@ def test_a_stream_says_it_where_it_is_asked_to(model: Model, cloud: PointCloud) 
     tracker = Tracker(Registrar.of(model, "modes"))
     followed = [tracker.follow(observe(cloud), 0.05 * number) for number in range(2)]
     assert followed[1].tracked
-    silent, told = FrameAnswer.of_registration(followed[1]), FrameAnswer.of_registration(followed[1], True)
+    silent, told = FrameAnswer.of(followed[1]), FrameAnswer.of(followed[1], True)
     words = line(Outcome("frame", 0.0, told, "", 0.0, 0.0, 0))
     assert "radius95" not in line(Outcome("frame", 0.0, silent, "", 0.0, 0.0, 0))
     assert set(words["radius95"]) == {"median", "max", "calibrated"} and words["radius95"]["median"] > 0
@@ -246,7 +244,7 @@ def test_the_command_explains_segments_and_places(
 ) -> None:
     assert found.registered is not None
     place = found.registered.material[cKDTree(cloud.points).query(found.registered.material)[0].argmin()]  # a seen one
-    wishes = [wish_of(text, ("liver", "gallbladder")) for text in ("gallbladder", ",".join(map(str, place)))]
+    wishes = [target_of(text, ("liver", "gallbladder")) for text in ("gallbladder", ",".join(map(str, place)))]
     explain(found.registered, wishes, tmp_path, cloud.points, 10.0, Unit(1.0))
     lines = capsys.readouterr().out.splitlines()
     assert re.match(r"the centre of gallbladder is at .* ± [\d.,]+ mm \(95 %, not calibrated\); what leaves", lines[0])
@@ -263,7 +261,7 @@ def test_the_command_explains_segments_and_places(
 def test_what_cannot_be_explained_is_said_in_one_sentence(cloud: PointCloud, tmp_path: Path) -> None:
     for text in ("nose", "1,2", "1,2,nan", "1,2,x"):
         with pytest.raises(ValueError, match=r"it must be a segment \(liver, gallbladder\) or a place x,y,z"):
-            wish_of(text, ("liver", "gallbladder"))
+            target_of(text, ("liver", "gallbladder"))
     with pytest.raises(ValueError, match="--explain needs a registration, whose fit is explained"):
         explain(None, ["liver"], tmp_path, cloud.points, 1.0, Unit(1.0))
     with pytest.raises(ValueError, match="--method is network, but --explain needs a registration"):

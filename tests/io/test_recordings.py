@@ -13,7 +13,7 @@ from mereo.io.intrinsics import CameraWarning, read_intrinsics
 from mereo.io.ros_recordings import recorded_frame, recorded_frames
 from mereo.io.sensor_frame import read_frame
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.stream_sources import frames_of
+from mereo.reconstruction.stream import frames_of
 
 pytest.importorskip("rosbags", reason="rosbags comes with the extra sensors")
 

@@ -160,7 +160,7 @@ def test_its_result_shows_itself(
     assert command_line.main(["view", str(tmp_path / "out"), "--port", "0"]) == 0
     opened[0].close()
     assert command_line.main(["view", str(tmp_path / "out"), "--object", "rope"]) == 2
-    assert "is shown as it is, and --object is not asked: leave it out" in capsys.readouterr().err
+    assert "is shown as it is, and no object is looked for: leave out --object and --weights" in capsys.readouterr().err
 
 
 def test_without_a_frame_its_laboratory_opens(meshes: list[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,7 +19,7 @@ from mereo.io.config import InputConfig
 from mereo.io.sensor_frame import read_frame
 from mereo.learning import learn as learning
 from mereo.learning import search_stage
-from mereo.learning.learn import Plan, Rates, epochs_for, holdout, learn, plan_for, views_for
+from mereo.learning.learn import LearnConfig, Plan, Rates, epochs_for, holdout, learn, plan_for, views_for
 from mereo.learning.object_files import check, deformation, scene_for, write_example_frame
 from mereo.models.weights import load_model
 from mereo.reconstruction.config import IsolationConfig
@@ -124,7 +124,7 @@ def test_a_faulty_object_is_refused_with_what_may_mend_it(tmp_path: Path, monkey
 def test_arguments_bind_once_something_is_made_of_them(tmp_path: Path) -> None:
     scene, out = write_bar(tmp_path), tmp_path / "out"
     with pytest.raises(FileNotFoundError, match="there are no weights 'bunnny'"):
-        learn([scene], out, init="bunnny")
+        learn([scene], out, LearnConfig(init="bunnny"))
     assert not out.exists()
     learning._claim(out, {"object": "a", "minutes": 1.0})
     learning._claim(out, {"object": "b", "minutes": 2.0})
@@ -221,7 +221,7 @@ def test_one_command_and_the_same_again(
     small: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene, out = write_bar(tmp_path), tmp_path / "out"
-    scores = learn([scene], out, minutes=0.05, init="rope", train="always")
+    scores = learn([scene], out, LearnConfig(minutes=0.05, init="rope", train="always"))
     printed = capsys.readouterr()
     said = printed.out
     assert re.findall(r"\[(\d)/6\]", said) == list("123456")
@@ -239,7 +239,7 @@ def test_one_command_and_the_same_again(
     found = load_model(out / "weights.safetensors").calibration
     assert found is not None and found.temperature is not None and found.views == 4
     monkeypatch.setattr(learning, "evaluate_weights", None)  # all is there
-    assert learn([scene], out, minutes=0.05, init="rope", train="always") == scores
+    assert learn([scene], out, LearnConfig(minutes=0.05, init="rope", train="always")) == scores
     assert (out / "weights.safetensors").read_bytes() == calibrated
     assert before == {path: path.stat().st_mtime_ns for path in (out / "data").glob("shard-*")}
     for arguments, message in (
@@ -250,11 +250,11 @@ def test_one_command_and_the_same_again(
         ({"minutes": 0.05, "init": "skull"}, "was begun with init = 'rope', not 'skull'"),
     ):
         with pytest.raises(ValueError, match=message):
-            learn([scene], out, **arguments)  # type: ignore[arg-type]
+            learn([scene], out, LearnConfig(**arguments))  # type: ignore[arg-type]
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("mine")
     with pytest.raises(FileExistsError, match="is not empty and holds no config.json"):
-        learn([scene], tmp_path / "full", minutes=0.05)
+        learn([scene], tmp_path / "full", LearnConfig(minutes=0.05))
 
 
 def _stop(*_: object, **__: object) -> None:
@@ -266,7 +266,7 @@ def test_the_nearest_weights_are_those_that_adapt_fastest(
     small: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(trial, "shipped_names", lambda: ("rope", "skull"))
-    _, name = learning.measure(str(write_bar(tmp_path)), tmp_path, LIGHT, init="", seed=1, workers=1)
+    _, name = learning.measure(str(write_bar(tmp_path)), tmp_path, LIGHT, init="", workers=1)
     printed = capsys.readouterr()
     assert f"measure: {trial.trial_steps(compared=True)} steps in" in printed.err
     losses = re.findall(r"(rope|skull) (\d+\.\d+)", printed.out)
@@ -276,7 +276,7 @@ def test_the_nearest_weights_are_those_that_adapt_fastest(
 @pytest.mark.slow
 def test_killed_at_any_stage_it_ends_with_the_same_weights(small: None, tmp_path: Path) -> None:
     scene, whole, parts = write_bar(tmp_path), tmp_path / "whole", tmp_path / "parts"
-    learn([scene], whole, minutes=0.05, init="rope", train="always")
+    learn([scene], whole, LearnConfig(minutes=0.05, init="rope", train="always"))
     stops: list[tuple[object, str, Callable[..., None]]] = [
         (learning, "search_scores", _stop),
         (learning, "measure", _stop),
@@ -289,8 +289,8 @@ def test_killed_at_any_stage_it_ends_with_the_same_weights(small: None, tmp_path
     for owner, name, stop in stops:
         with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
             patch.setattr(owner, name, stop)
-            learn([scene], parts, minutes=0.05, init="rope", train="always")
+            learn([scene], parts, LearnConfig(minutes=0.05, init="rope", train="always"))
         assert not [place for place in parts.rglob(".*") if place.name.endswith(".mereo")]
-    learn([scene], parts, minutes=0.05, init="rope", train="always")
+    learn([scene], parts, LearnConfig(minutes=0.05, init="rope", train="always"))
     ours, theirs = learnt(whole), learnt(parts)
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)

@@ -17,7 +17,7 @@ from mereo.cli.options import loaded_object
 from mereo.learning import learn as learning
 from mereo.learning import search_stage
 from mereo.learning import search_stage as scoring
-from mereo.learning.learn import learn
+from mereo.learning.learn import LearnConfig, learn
 from mereo.learning.object_files import scene_of_folder
 from mereo.learning.search_stage import SearchScores, best_method, is_to_train, shortcomings
 from mereo.scenes.files import check
@@ -106,7 +106,7 @@ def test_time_ends_the_views_but_not_before_the_least_and_begun_ones_are_kept(
 ) -> None:
     made: list[int] = []
 
-    def scored(scene: object, registrar: object, seed: int, cells: int, index: int) -> tuple[np.ndarray, bool, float]:
+    def scored(scene: object, registrar: object, cells: int, index: int) -> tuple[np.ndarray, bool, float]:
         made.append(index)
         return np.eye(9, dtype=int), True, 0.1
 
@@ -154,12 +154,12 @@ def test_the_scores_decide_whether_anything_is_trained(
     scored.append(scores_of([100, 10], [True, False]))
     assert learn([scene], out) == metrics  # what was scored is kept
     with pytest.raises(InterruptedError):
-        learn([scene], out, train="always")
+        learn([scene], out, LearnConfig(train="always"))
     assert "it is trained: --train is always" in capsys.readouterr().out
     with pytest.raises(InterruptedError):
         learn([scene], tmp_path / "bad")
     assert "the search alone is not good enough, 1 of 2 views are not explained, mIoU 0.5" in capsys.readouterr().out
-    assert not learn([scene], tmp_path / "bad", train="never")["trained"]
+    assert not learn([scene], tmp_path / "bad", LearnConfig(train="never"))["trained"]
     said = capsys.readouterr().out
     assert "nothing is trained, as --train is never; the search alone is not good enough: 1 of 2 views" in said
     assert "A network may help: mereo learn" in said
@@ -170,7 +170,7 @@ def test_what_is_begun_with_other_words_is_refused(scored: list[SearchScores], t
     learn([scene], out)
     (out / "plan.json").write_text("{}")
     with pytest.raises(ValueError, match=r"was trained, or begun to be, but --train is never: leave it out"):
-        learn([scene], out, train="never")
+        learn([scene], out, LearnConfig(train="never"))
     (out / "plan.json").unlink()
     write_bar(tmp_path, "deformations:\n  - {type: squash, factor: [0.5, 0.9]}\n")
     with pytest.raises(ValueError, match=r"was begun with another object or other deformations than bar has now"):

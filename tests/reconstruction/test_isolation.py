@@ -13,7 +13,8 @@ from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.downsampling import spacing, thin_to_grid
 from mereo.models.weights import load_model
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.isolation import clusters, isolate, largest_plane
+from mereo.reconstruction.isolation import IsolationStep, clusters, largest_plane
+from mereo.reconstruction.observation import find_object, observe
 
 
 def half_ball(count: int = 3000, center: tuple[float, float, float] = (0.0, 0.0, 0.8)) -> np.ndarray:
@@ -32,6 +33,15 @@ def wall(count: int = 6000, z: float = 1.5) -> np.ndarray:
 BALL, WALL = half_ball(), wall()
 STRAYS = np.random.default_rng(3).uniform((-0.5, -0.5, 0.5), (0.5, 0.5, 1.2), (40, 3))
 EVERYTHING = np.concatenate([BALL, WALL, STRAYS])
+
+
+def isolate(
+    seen: PointCloud | DepthImage, config: IsolationConfig, unit_m: float = 1.0
+) -> tuple[PointCloud, tuple[IsolationStep, ...]]:
+    """Points of the object, and what each step left out."""
+    cloud = seen.to_points() if isinstance(seen, DepthImage) else seen
+    found = find_object(observe(cloud, unit_m=unit_m).frame, config)
+    return found.cloud, found.steps
 
 
 def kept(points: np.ndarray, config: IsolationConfig, unit_m: float = 1.0) -> np.ndarray:

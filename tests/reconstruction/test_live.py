@@ -11,6 +11,7 @@ import pytest
 from camera_files import write_camera
 from PIL import Image
 
+from mereo.cli.answers import StreamCommand
 from mereo.cli.stream import stream_reconstructions
 from mereo.evaluation.sample_views import load_view
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
@@ -18,8 +19,7 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import inverse_rigid
 from mereo.io.config import InputConfig
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.stream import StreamFrame
-from mereo.reconstruction.stream_sources import frames_of
+from mereo.reconstruction.stream import StreamFrame, frames_of
 from mereo.scenes.parameters import parameters, random_state, set_value
 from mereo.scenes.registry import load_scene
 from mereo.synthesis.depth_sensor import add_depth_noise, render_depth
@@ -65,9 +65,10 @@ def test_every_frame_is_answered_but_the_bad_one(
     sequence: tuple[Path, list[SegmentedMesh]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder, truth = sequence
-    summary = stream_reconstructions(
-        str(folder), "rope", resolution=24, every_frame=True, reading=read(folder), surfaces=tmp_path / "glb"
+    command = StreamCommand(
+        str(folder), weights="rope", resolution=24, every_frame=True, reading=read(folder), surfaces=tmp_path / "glb"
     )
+    summary = stream_reconstructions(command)
     assert (summary.answered, summary.failed, summary.dropped) == (FRAMES - 1, 1, 0)
     out, err = capsys.readouterr()
     lines = [json.loads(text) for text in out.splitlines()]
@@ -85,7 +86,9 @@ def test_at_its_recorded_pace_the_latest_frame_wins(
     sequence: tuple[Path, list[SegmentedMesh]], capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder, _ = sequence
-    summary = stream_reconstructions(str(folder), "rope", resolution=24, rate_hz=RATE_HZ, reading=read(folder))
+    summary = stream_reconstructions(
+        StreamCommand(str(folder), weights="rope", resolution=24, rate=RATE_HZ, reading=read(folder))
+    )
     assert summary.answered + summary.failed + summary.dropped == FRAMES
     lines = [json.loads(text) for text in capsys.readouterr().out.splitlines()]
     assert lines[-1]["frame"] == f"{FRAMES - 1:03}.png"
@@ -129,7 +132,7 @@ def test_no_damaged_frame_ends_a_stream(tmp_path: Path, capsys: pytest.CaptureFi
     np.save(tmp_path / "0.npy", cloud)
     np.save(tmp_path / "2.npy", cloud)
     bad = damaged_clouds(tmp_path, cloud)
-    summary = stream_reconstructions(str(tmp_path), "rope", resolution=24, every_frame=True)
+    summary = stream_reconstructions(StreamCommand(str(tmp_path), weights="rope", resolution=24, every_frame=True))
     assert (summary.answered, summary.failed) == (2, len(bad))
     lines = [json.loads(text) for text in capsys.readouterr().out.splitlines()]
     assert {one["frame"] for one in lines if "error" in one} == bad
@@ -140,7 +143,7 @@ def test_a_file_is_no_place_for_surfaces(tmp_path: Path) -> None:
     """Which is said before the weights are loaded and any frame is answered."""
     (tmp_path / "file").touch()
     with pytest.raises(FileExistsError, match="file is a file; surfaces are written into a folder: choose another"):
-        stream_reconstructions(str(tmp_path), "no such weights", surfaces=tmp_path / "file")
+        stream_reconstructions(StreamCommand(str(tmp_path), weights="none", surfaces=tmp_path / "file"))
 
 
 def test_a_sequence_that_breaks_off_is_told_after_its_frames_and_their_summary(
@@ -152,7 +155,7 @@ def test_a_sequence_that_breaks_off_is_told_after_its_frames_and_their_summary(
 
     monkeypatch.setattr("mereo.cli.stream.frames_of", frames)
     with pytest.raises(ValueError, match="^it is cut off$"):
-        stream_reconstructions(str(tmp_path), "rope")
+        stream_reconstructions(StreamCommand(str(tmp_path), weights="rope"))
     out, err = capsys.readouterr()
     assert json.loads(out)["frame"] == "first" and "1 bad" in err
 
@@ -169,4 +172,4 @@ def test_sources_that_are_none_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="the rate is 0"):
         frames_of(str(tmp_path), reading, isolation, 0)
     with pytest.raises(ValueError, match="none of the 1 frames could be answered"):
-        stream_reconstructions(str(tmp_path), "rope")
+        stream_reconstructions(StreamCommand(str(tmp_path), weights="rope"))

@@ -16,7 +16,7 @@ from two_balls import BIG, NAMES, SMALL, front, scene, two_balls
 
 import mereo
 from mereo.api.result import Result
-from mereo.cli.answers import ReconstructCommand
+from mereo.cli.answers import ReconstructCommand, StreamCommand
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.cli.stream import stream_reconstructions
 from mereo.fitting.registration.answer import Answer
@@ -226,7 +226,9 @@ def test_a_stream_drops_strays_and_counts_them(
     np.save(tmp_path / "cloud.npy", cloud)
     monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: model)
     isolation = IsolationConfig(keep_all=keep_all)
-    stream_reconstructions(str(tmp_path), "any", resolution=16, every_frame=True, isolation=isolation)
+    stream_reconstructions(
+        StreamCommand(str(tmp_path), weights="any", resolution=16, every_frame=True, isolation=isolation)
+    )
     assert json.loads(capsys.readouterr().out)["strays"] == strays
 
 

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mereo.cli.stream import stream_reconstructions
-from mereo.cli.stream_answers import FrameAnswer
-from mereo.cli.stream_rerun import CURVES, RerunTarget, messages, series
+from mereo.cli.answers import StreamCommand
+from mereo.cli.stream import CURVES, FrameAnswer, RerunTarget, messages, series, stream_reconstructions
 from mereo.fitting.registration.recognition import Recognition
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
@@ -181,7 +180,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_stream_is_recorded_as_it_is_printed(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("rerun", reason=RERUN)
     path = tmp_path / "walk.rrd"
-    summary = stream_reconstructions(str(walk), "engine", every_frame=True, rerun=str(path))
+    summary = stream_reconstructions(StreamCommand(str(walk), weights="engine", every_frame=True, rerun=str(path)))
     lines = [json.loads(text) for text in capsys.readouterr().out.splitlines()]
     assert summary.answered == 3 and "error" in lines[2]
     rows, good = read_rows(path), [line for line in lines if "error" not in line]
@@ -208,7 +207,9 @@ def test_where_nothing_is_answered_nothing_is_recorded(walk: Path, tmp_path: Pat
     for name in ("a", "b"):
         (tmp_path / f"{name}.ply").write_bytes(b"no cloud")
     with pytest.raises(ValueError, match="none of the 2 frames could be answered"):
-        stream_reconstructions(str(tmp_path), "engine", every_frame=True, rerun=str(tmp_path / "log" / "walk.rrd"))
+        stream_reconstructions(
+            StreamCommand(str(tmp_path), weights="engine", every_frame=True, rerun=str(tmp_path / "log" / "walk.rrd"))
+        )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.ply", "b.ply"]
 
 

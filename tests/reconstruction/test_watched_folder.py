@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mereo.cli.answers import StreamCommand
 from mereo.cli.stream import stream_reconstructions
 from mereo.io.config import InputConfig
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import Observation
-from mereo.reconstruction.stream import stream
-from mereo.reconstruction.stream_sources import PATIENCE_S, WatchedFolder, watched_frames
+from mereo.reconstruction.stream import PATIENCE_S, WatchedFolder, stream, watched_frames
 
 
 def points_of(seen: Observation) -> int:
@@ -92,8 +92,9 @@ def test_watching_ends_with_ctrl_c(
         raise KeyboardInterrupt
 
     np.save(tmp_path / "a.npy", np.random.default_rng(0).uniform(1, 2, (500, 3)))
-    monkeypatch.setattr("mereo.cli.stream_answers.answer_frame", interrupted)
-    assert stream_reconstructions(str(tmp_path), "rope", watch=True, method="network").answered == 0
+    monkeypatch.setattr("mereo.cli.stream.answer_frame", interrupted)
+    command = StreamCommand(str(tmp_path), weights="rope", watch=True, method="network")
+    assert stream_reconstructions(command).answered == 0
     assert capsys.readouterr().err.startswith("stopped\n0 frames answered")
 
 

@@ -15,6 +15,7 @@ from safetensors.numpy import load_file
 
 import mereo.__main__ as command_line
 from mereo.__main__ import STOPPING, Stopped, stop_signals
+from mereo.cli.answers import StreamCommand
 from mereo.cli.stream import stream_reconstructions
 from mereo.io.atomic_files import atomic_file
 
@@ -95,7 +96,7 @@ def test_a_stream_ends_with_its_summary(
         patched.setattr("mereo.cli.stream.loaded_object", lambda *_: nothing)
         patched.setattr("mereo.cli.stream.Answering", lambda *_: SimpleNamespace(close=lambda: None))
         patched.setattr("mereo.cli.stream.stream", lambda *_, **__: iter(lambda: os.kill(os.getpid(), STOPPING[0]), 1))
-        assert run(lambda: stream_reconstructions(str(tmp_path), "rope") and None, patched) == 0
+        assert run(lambda: stream_reconstructions(StreamCommand(str(tmp_path), weights="rope")) and None, patched) == 0
     assert capsys.readouterr().err.startswith("stopped\n0 frames answered")
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cad_objects import write_pliers
+from manifold3d import Manifold
 from scene_files import write_bar, write_mesh
 from shapes import ball, box
 
@@ -14,13 +15,15 @@ from mereo.deformation.maps import Rigid
 from mereo.deformation.samplers import cubic_cells
 from mereo.deformation.warps import Squash
 from mereo.geometry.camera import Camera
-from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.mesh_check import overlaps
+from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.mesh_check import mesh_of, overlaps
 from mereo.geometry.subdivision import TooManyFaces, split_edges
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.mesh_formats import read_segmented_mesh
+from mereo.learning.object_files import describe_scene_file
 from mereo.scenes.files.build import TOLERANCE, refined
 from mereo.scenes.files.check import check_scene
+from mereo.scenes.files.joints import contacts
 from mereo.scenes.files.template import (
     MOTION,
     UNPLACED,
@@ -251,3 +254,49 @@ def test_a_spacing_that_does_not_fit_is_explained(tmp_path: Path) -> None:
     ):
         with pytest.raises(ValueError, match=message):
             load_scene(write_bar(tmp_path, f"deformations:\n  - {{type: lattice, {keys}}}\n"))
+
+
+# --- joints -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_pliers_hinge_is_proposed_and_valid(written: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = written.read_text()
+    assert (
+        "#  - type: joint  # turns on the round contact, radius 4.98, of pin and lower\n#    segments: [lower]" in text
+    )
+    assert "Its parts touch like 2 joints, which that file proposes in comments" in describe_scene_file(written)
+    head, tail = text.split("deformations:", 1)
+    path = written.with_name("hinges.yaml")
+    path.write_text(head + "deformations:" + re.sub("^#  ", "  ", tail.split("  - type: bend")[0], flags=re.MULTILINE))
+    check_scene(str(path))
+    assert "fault" not in capsys.readouterr().out
+    scene = load_scene(path)
+    scale, middle = scene.T_scene_source[0, 0], scene.T_scene_source[:3, 3]
+    for _, deform in zip(range(2), scene.sample_deformations(np.random.default_rng(0)), strict=False):
+        assert np.linalg.norm((deform(middle[None]) - middle)[0, :2]) < 0.05 * scale  # the pin's axis stays
+
+
+def test_planes_cylinders_and_other_contacts() -> None:
+    """A lid on a box is a plane, a shaft in it a cylinder, a ball in a socket neither."""
+    turn = Rigid(np.array([0.3, -0.5, 0.2]), np.zeros(3), np.zeros(3))
+    shaft = Manifold.cylinder(6, 1, 1, 32)
+    body = Manifold.cube((8, 4, 4), True) - shaft.translate((2, 0, -1))
+    lid = Manifold.cube((2, 4, 1), True).translate((-2, 0, 2.5))
+    pit = Manifold.cube((4, 4, 4), True).translate((-6, 0, 0)) - Manifold.sphere(1.5, 48).translate((-8, 0, 0))
+    parts = (body, shaft.translate((2, 0, -1)), lid, pit, Manifold.sphere(1.5, 48).translate((-8, 0, 0)))
+    meshes = [mesh_of(part) for part in parts]
+    names = ("body", "shaft", "lid", "pit", "ball")
+    mesh = SegmentedMesh(tuple(Segment(n, (0, 0, 0), turn(v), f) for n, (v, f) in zip(names, meshes, strict=True)))
+    found = {frozenset((names[c.first], names[c.second])): c for c in contacts(mesh)}
+    assert {key: c.kind for key, c in found.items()} == {
+        frozenset(("body", "shaft")): "cylinder",
+        frozenset(("body", "lid")): "plane",
+        frozenset(("body", "pit")): "plane",
+        frozenset(("pit", "ball")): "other",
+    }
+    round_one = found[frozenset(("body", "shaft"))]
+    axis = turn(np.array([[0.0, 0, 1]]))[0]
+    assert abs(round_one.axis @ axis) > 0.9999 and round_one.radius == pytest.approx(1, abs=0.02)
+    away = round_one.point - turn(np.array([[2.0, 0, 0]]))[0]
+    assert np.linalg.norm(away - (away @ axis) * axis) < 0.02
+    assert abs(found[frozenset(("body", "lid"))].axis @ axis) > 0.9999

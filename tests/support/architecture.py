@@ -41,7 +41,7 @@ DATA_FOLDERS = ("frames", "states", "weights")
 ROOT_MODULES = ("__init__", "__main__")
 """The public names and the entry point, which may import every room."""
 
-MAY_IMPORT_TORCH = ("models/", "training/", "cli/doctor.py")
+MAY_IMPORT_TORCH = ("models/", "training/", "cli/tools.py")
 
 HEAVY = ("numpy", "torch", "scipy", "trimesh", "matplotlib")
 """What settings must not load, so that ``--help`` is instant: the two, and libraries that bring them."""

@@ -19,8 +19,7 @@ from mereo.geometry.mesh import PALETTE
 from mereo.io.config import FilesConfig
 from mereo.io.writers.formats import WRITERS, Results, chosen_formats, write_formats
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
-from mereo.reconstruction.pipeline import Reconstruction
-from mereo.reconstruction.segment_statistics import segment_points
+from mereo.reconstruction.pipeline import Reconstruction, segment_points
 from mereo.visualization.result_files import write_answer
 
 NAMES = ("big", "small")

@@ -172,7 +172,7 @@ def test_a_page_is_on_this_machine_only_and_a_taken_port_is_said(server: object)
 @needs_viser
 @pytest.mark.slow
 def test_the_command_prints_where_the_page_is_and_ends_cleanly(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "mereo", "view", "--scene", "robot", "--port", "0"]
+    command = [sys.executable, "-m", "mereo", "view", "--object", "robot", "--port", "0"]
     variables = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=variables) as process:
         try:
@@ -195,7 +195,6 @@ def test_the_command_prints_where_the_page_is_and_ends_cleanly(tmp_path: Path) -
     [
         (("--weights", "lizard"), "none is shipped for 'lizard'; name a depth image or a point cloud"),
         (("cloud.ply",), "cloud.ply is given without its object: name the object's meshes or scene with --object"),
-        (("cloud.ply", "--scene", "rope"), "both cloud.ply and --scene rope are given; one can be shown: drop one"),
     ],
 )
 def test_what_cannot_be_shown_is_said_in_one_sentence(

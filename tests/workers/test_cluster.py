@@ -13,8 +13,9 @@ from object_work import folder_of_objects
 
 from mereo import __main__ as command_line
 from mereo.io.cores import THREAD_VARIABLES
-from mereo.learning import object_folders
-from mereo.learning.object_folders import learn_objects, list_objects
+from mereo.learning import learn as learning
+from mereo.learning.learn import LearnConfig, learn_objects
+from mereo.learning.object_files import list_objects
 from mereo.models.config import InferenceConfig
 from mereo.models.model import Model
 from mereo.models.remote import settings_for, to_cpu
@@ -212,19 +213,19 @@ def test_a_failed_object_stops_no_other_and_the_same_call_continues(
 ) -> None:
     learnt: list[str] = []
 
-    def learn(files: list[Path], output: Path, **settings: object) -> dict[str, object]:
+    def learn(files: list[Path], output: Path, config: LearnConfig) -> dict[str, object]:
         learnt.append(output.name)
-        assert settings == {"minutes": 2.0}
+        assert config == LearnConfig(minutes=2.0)
         if output.name == "bar" and len(learnt) < 3:
             raise ValueError("the bar is bent: straighten it")
         return {"iou": 0.9, "miou": None, "trained": True, "method": "auto"}
 
-    monkeypatch.setattr(object_folders, "learn", learn)
+    monkeypatch.setattr(learning, "learn", learn)
     folder, out = folder_of_objects(tmp_path), tmp_path / "out"
     with pytest.raises(ValueError, match=r"1 of 2 objects could not be learnt \(bar\)"):
-        learn_objects(folder, out, {"minutes": 2.0})
+        learn_objects(folder, out, LearnConfig(minutes=2.0))
     printed = capsys.readouterr()
     assert printed.err == "mereo: error: bar: the bar is bent: straighten it\n"
     assert printed.out.endswith(f"\n{out}/pole: IoU 0.900, mIoU -, method auto\n")
-    learn_objects(folder, out, {"minutes": 2.0})
+    learn_objects(folder, out, LearnConfig(minutes=2.0))
     assert learnt == ["bar", "pole", "bar", "pole"]

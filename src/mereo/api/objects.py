@@ -16,8 +16,7 @@ from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.register import Registrar, other_mesh, registrar_for, statistical_model_of
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.mesh_formats import MESH_SUFFIXES
-from mereo.io.volume_files import is_volume
-from mereo.learning.object_files import SCENE, names_scene, scene_of_folder, scene_of_meshes
+from mereo.learning.object_files import SCENE, names_scene, scene_of_folder, scene_of_meshes, shapes_in
 from mereo.models.config import Device, InferenceConfig, Precision
 from mereo.models.trained import Trained
 from mereo.models.weights_place import is_weights, load_weights, shipped_names
@@ -110,7 +109,10 @@ class Object:
 
     def asking(self, network: Trained | None) -> "Object":
         """The same with the same weights on another device; registrars that are set up stay so."""
-        moved = {name: None if one is None else one.asking(network) for name, one in self._registrars.items()}
+        moved = {
+            method: None if registrar is None else registrar.asking(network)
+            for method, registrar in self._registrars.items()
+        }
         return Object(network, self.scene, moved, self.model)
 
 
@@ -142,23 +144,25 @@ def load_object(
     other files and for meshes without volume, ``ImportError`` for weights without the extra `network`.
     """
     inference = InferenceConfig(device, precision)
-    own = weights if source is None else _own_weights(source)
-    if own is not None:
+    network = weights if source is None else source
+    if isinstance(network, Trained) or (isinstance(network, str | Path) and (source is None or is_weights(network))):
         if source is not None and weights is not None:
             raise ValueError(f"{source} has weights, and weights are named too: name one of them")
-        named = _learned_scene(own) if scene is None else scene
-        return Object(load_weights(own, inference), _scene_of(named))
+        scene = _learned_scene(network) if scene is None else scene
+        return Object(
+            load_weights(network, inference), load_scene(str(scene)) if isinstance(scene, str | Path) else scene
+        )
     if source is None:
         raise ValueError("no object is given; name its meshes, its scene or its weights")
     if scene is not None:
         raise ValueError(f"{source} is no weights and has its own scene, but another one is named: leave it out")
-    found = _scene(source, units)
+    scene = _scene(source, units)
     if weights is None:
-        return Object(None, found, model=kept_model(found))
-    network = load_weights(weights, inference)
-    if network.statistical_model is not None and (fault := other_mesh(found, network.statistical_model)):
+        return Object(None, scene, model=kept_model(scene))
+    loaded = load_weights(weights, inference)
+    if loaded.statistical_model is not None and (fault := other_mesh(scene, loaded.statistical_model)):
         raise ValueError(f"{fault}; both must be of one object: name the weights of this one, or leave them out")
-    return Object(network, found)
+    return Object(loaded, scene)
 
 
 def object_of(given: Object | Source) -> Object:
@@ -166,21 +170,10 @@ def object_of(given: Object | Source) -> Object:
     return given if isinstance(given, Object) else load_object(given)
 
 
-def _own_weights(source: Source) -> Trained | str | Path | None:
-    """Weights that a source is, or holds; None where it has none."""
-    if isinstance(source, Trained):
-        return source
-    return source if isinstance(source, str | Path) and is_weights(source) else None
-
-
-def _learned_scene(source: Trained | str | Path) -> str | None:
+def _learned_scene(weights: Trained | str | Path) -> str | None:
     """Scene of the folder of weights that ``mereo learn`` has written, as far as its file is still there."""
-    scene = scene_of_folder(Path(source)) if isinstance(source, str | Path) else None
+    scene = None if isinstance(weights, Trained) else scene_of_folder(Path(weights))
     return scene if scene is not None and (scene in SCENES or Path(scene).is_file()) else None
-
-
-def _scene_of(scene: Scene | str | Path | None) -> Scene | None:
-    return load_scene(str(scene)) if isinstance(scene, str | Path) else scene
 
 
 def _scene(source: Source, units: str | None) -> Scene:
@@ -188,10 +181,15 @@ def _scene(source: Source, units: str | None) -> Scene:
     if isinstance(source, Scene):
         return source
     assert not isinstance(source, Trained)
-    files = [Path(one) for one in ([source] if isinstance(source, str | Path) else source)]
+    files = [Path(file) for file in ([source] if isinstance(source, str | Path) else source)]
     if len(files) == 1 and files[0].is_dir():
-        learned = scene_of_folder(files[0])
-        files = [Path(learned)] if learned is not None else _shapes_in(files[0])
+        folder, learned = files[0], scene_of_folder(files[0])
+        files = [Path(learned)] if learned is not None else shapes_in(folder)
+        if not files:
+            raise ValueError(
+                f"{folder} holds no meshes ({', '.join(sorted(MESH_SUFFIXES))}), no label volume, no {SCENE} and no "
+                "weights: name the folder of an object, or its files"
+            )
     if not files:
         raise ValueError("no object is given; name its meshes, one file for each segment, or its scene file")
     if names_scene(files):
@@ -204,14 +202,3 @@ def _scene(source: Source, units: str | None) -> Scene:
             f"built-in scene ({', '.join(SCENES)}), or weights ({', '.join(shipped_names())}, or a .safetensors file)"
         )
     return scene_of_meshes(files, units)
-
-
-def _shapes_in(folder: Path) -> list[Path]:
-    """Meshes, or the label volume, in a folder; raises ``ValueError`` where there are none."""
-    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in MESH_SUFFIXES or is_volume(path))
-    if not found:
-        raise ValueError(
-            f"{folder} holds no meshes ({', '.join(sorted(MESH_SUFFIXES))}), no label volume, no {SCENE} and no "
-            "weights: name the folder of an object, or its files"
-        )
-    return found

@@ -1,22 +1,38 @@
-"""Find an object in frames: what ``mereo reconstruct`` does with files.
+"""Find an object in frames, each by itself or one after the other: ``mereo reconstruct`` and ``mereo stream``.
 
-frame -load_frame-> SensorFrame -find_object-> Observation -answer_frame-> Answer -> Result
+    source -load_frame-> SensorFrame -find_object-> Observation -answer_frame-> Result
+    frame, time -Tracker.follow-> Result (found, followed or lost)
+
+A source is whatever holds a frame: a file, a shipped name, arrays, the clouds and messages of other libraries.
 """
 
 import warnings
-from functools import partial
+from concurrent.futures import Executor
+from dataclasses import replace
+from pathlib import Path
 from typing import Any, overload
 
-from mereo.api.frames import load_frame
+import numpy as np
+from jaxtyping import Num
+
 from mereo.api.objects import Object, Source, object_of
 from mereo.api.result import Result
-from mereo.api.words import SPEAKS_OPTIONS, in_python, python_words
+from mereo.api.words import in_callers_words, python_words
+from mereo.evaluation.sample_views import shipped_frame, shipped_frames
+from mereo.fitting import tracking
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.answer_frame import answer_frame
-from mereo.io.point_arrays import is_frame_list
-from mereo.io.sensor_frame import SensorFrame
+from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.conventions import CloudAxes
+from mereo.io.config import InputConfig
+from mereo.io.intrinsics import read_intrinsics
+from mereo.io.point_arrays import is_frame_list, points_of
+from mereo.io.readers import depth_of, usable_depth
+from mereo.io.ros_recordings import is_recording
+from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import (
+    CLOUD,
     ClustersWarning,
     Observation,
     SizeWarning,
@@ -25,31 +41,109 @@ from mereo.reconstruction.observation import (
     size_warning,
 )
 
+# --- frames -----------------------------------------------------------------------------------------------------------
+
+
+@python_words()
+def load_frame(
+    source: object,
+    *,
+    axes: CloudAxes | None = None,
+    intrinsics: Camera | str | Path | None = None,
+    mask: str | Path | None = None,
+    **options: Any,
+) -> SensorFrame:
+    """Load one frame of a depth camera or scanner.
+
+    Args:
+        source: a file (depth image, point cloud, ROS recording) or the name of a shipped frame (``shipped_frames``);
+            or points as n x 3 numbers, as a cloud of Open3D or trimesh, as a structured array or a ROS ``PointCloud2``;
+            or a depth image, as ``DepthImage`` or as an array of h x w pixels with ``intrinsics``.
+        axes: of points: "camera" (default) is x right, y down, z forward; "scanner" is y up, z toward the scanner.
+        intrinsics: of a depth image: a camera, or a file of one.
+        mask: file of an image that is not 0 where the object is.
+        options: the other fields of ``InputConfig``: ``unit_m``, metres per unit of points (0.001 for millimetres;
+            without it the fit finds the unit); ``depth_scale``, stored values per metre of a depth image;
+            ``drop_invalid``, to leave out points without a measurement, which are refused otherwise; ``topic`` of a
+            recording; ``frame_index`` of a recording's frames, or of an entry of the intrinsics.
+
+    Raises ``FileNotFoundError`` where there is no such file or name; ``ValueError`` for what is damaged or no frame,
+    and for options that do not belong to this kind of frame; ``TypeError`` for an option that there is none of.
+    """
+    reading = InputConfig(frame=axes or "camera", mask=None if mask is None else Path(mask), **options)
+    if not isinstance(source, str | Path):
+        return _frame_in_memory(source, axes, intrinsics, reading)
+    path = Path(source)
+    if str(source) in shipped_frames() and not (path.is_file() or is_recording(path)):
+        if axes is not None or intrinsics is not None or replace(reading, drop_invalid=False) != InputConfig():
+            raise ValueError(f"the shipped frame {str(source)!r} is in metres and needs no options: leave them out")
+        return shipped_frame(str(source))
+    if not path.exists() and path.suffix == "":
+        known = ", ".join(shipped_frames())
+        raise FileNotFoundError(f"there is no frame {str(source)!r}; give a file or one of the shipped: {known}")
+    if isinstance(intrinsics, Camera):
+        raise ValueError(f"{source} is a file; its intrinsics are read from one as well: give the path of that")
+    return read_frame(source, replace(reading, intrinsics=None if intrinsics is None else Path(intrinsics)))
+
+
+def _frame_in_memory(
+    source: object, axes: CloudAxes | None, intrinsics: Camera | str | Path | None, reading: InputConfig
+) -> SensorFrame:
+    for name in ("mask", "topic", "frame_index"):
+        if getattr(reading, name) is not None and not (name == "mask" and intrinsics is not None):
+            raise ValueError(f"{name} is given for a frame that is no file's: leave it out, or name the file")
+    unit_m = reading.unit_m
+    if intrinsics is not None:
+        if axes == "scanner" or unit_m is not None:
+            raise ValueError("a depth image is in metres and in the camera's axes: leave out axes and unit_m")
+        return _depth_frame(np.asarray(source), intrinsics, reading)
+    if reading.depth_scale is not None:
+        raise ValueError("depth_scale is given without intrinsics; a depth image needs both: give intrinsics=...")
+    observed, invalid = points_of(source, reading.drop_invalid)
+    if isinstance(observed, DepthImage):
+        if axes == "scanner":
+            raise ValueError("a depth image is in the camera's axes: leave out axes")
+        return SensorFrame(CLOUD, observed.to_points(), unit_m, "camera", observed, whole=observed)
+    return SensorFrame(CLOUD, observed, unit_m, reading.frame, invalid=invalid)
+
+
+def _depth_frame(raw: Num[np.ndarray, "h w"], intrinsics: Camera | str | Path, reading: InputConfig) -> SensorFrame:
+    """Frame of a depth image that is an array of stored values."""
+    if raw.ndim != 2:
+        raise ValueError(f"the depth image has the shape {raw.shape}; it must be rows of pixels: give h x w values")
+    path, camera, scale = Path("depth image"), intrinsics, reading.depth_scale
+    if not isinstance(camera, Camera):
+        entry = read_intrinsics(camera, (raw.shape[1], raw.shape[0]))
+        camera = entry.camera
+        scale = entry.depth_scale if scale is None and raw.dtype.kind != "f" else scale
+    image = depth_of(path, raw, scale, camera)
+    usable = usable_depth(image, path, reading.mask)
+    return SensorFrame(path, usable.to_points(), 1.0, "camera", usable, whole=image)
+
+
+def observation_of(frame: Any, isolation: IsolationConfig, reading: dict[str, Any]) -> Observation:
+    """Object in a frame, whatever holds it."""
+    if not isinstance(frame, SensorFrame | Observation):
+        frame = load_frame(frame, **reading)
+    elif reading:
+        raise ValueError(
+            f"{', '.join(reading)} is given for a frame that is read already: give it where the frame is read, "
+            "load_frame(..., axes='scanner', unit_m=0.001)"
+        )
+    return frame if isinstance(frame, Observation) else find_object(frame, isolation)
+
+
+# --- single frames ----------------------------------------------------------------------------------------------------
+
 
 @overload
 def reconstruct(
-    frame: list[Any] | tuple[Any, ...],
-    object: Object | Source,
-    method: AnswerMethod = ...,
-    *,
-    resolution: int = ...,
-    isolation: IsolationConfig | None = ...,
-    label_points: bool = ...,
-    **reading: Any,
+    frame: list[Any] | tuple[Any, ...], object: Object | Source, method: AnswerMethod = ..., **options: Any
 ) -> list[Result]: ...
 
 
 @overload
-def reconstruct(
-    frame: Any,
-    object: Object | Source,
-    method: AnswerMethod = ...,
-    *,
-    resolution: int = ...,
-    isolation: IsolationConfig | None = ...,
-    label_points: bool = ...,
-    **reading: Any,
-) -> Result: ...
+def reconstruct(frame: Any, object: Object | Source, method: AnswerMethod = ..., **options: Any) -> Result: ...
 
 
 def reconstruct(
@@ -79,20 +173,20 @@ def reconstruct(
     ``ClustersWarning`` where the cloud may be two objects. Raises ``ValueError`` for unusable frames,
     where nothing is found, and for methods other than "auto" where the model cannot be registered.
     """
-    isolation = isolation or IsolationConfig()
+    isolation, results = isolation or IsolationConfig(), list[Result]()
+    are_many = is_frame_list(frame) or (
+        isinstance(frame, list | tuple) and any(isinstance(each, SensorFrame | Observation) for each in frame)
+    )
     with python_words():
-        answer = partial(
-            reconstruct_observation,
-            object=object_of(object),
-            method=method,
-            resolution=resolution,
-            isolation=isolation,
-            label_points=label_points,
-        )
-        if not _are_many(frame):
-            return answer(observation_of(frame, isolation, reading))
-        seen = (observation_of(one, isolation, reading) for one in frame)
-        return list(map(answer, seen))  # not a comprehension: a warning names the caller's line
+        known = object_of(object)
+        for each in frame if are_many else [frame]:  # not a comprehension: a warning names the caller's line
+            observation = observation_of(each, isolation, reading)
+            results.append(
+                reconstruct_observation(
+                    observation, known, method, resolution=resolution, isolation=isolation, label_points=label_points
+                )
+            )
+    return results if are_many else results[0]
 
 
 def reconstruct_observation(
@@ -109,7 +203,7 @@ def reconstruct_observation(
     Takes its arguments, raises and warns as it does. Of ``isolation`` it matters whether every point is kept.
     """
     if object.network is None and (warning := clusters_warning(seen)) is not None:
-        warnings.warn(_said(warning), ClustersWarning, stacklevel=3)
+        warnings.warn(in_callers_words(warning), ClustersWarning, stacklevel=3)
     answer = answer_frame(
         seen,
         object.network,
@@ -125,28 +219,78 @@ def reconstruct_observation(
     if object.network is not None:
         warning = size_warning(seen.read_as(answer.hypothesis), object.network.provenance)
         if warning is not None:
-            warnings.warn(_said(warning), SizeWarning, stacklevel=3)
+            warnings.warn(in_callers_words(warning), SizeWarning, stacklevel=3)
     return result
 
 
-def _said(text: str) -> str:
-    """A warning in the words of whoever called."""
-    return text if SPEAKS_OPTIONS.get() else in_python(text)
+# --- sequences of frames ----------------------------------------------------------------------------------------------
 
 
-def _are_many(frame: Any) -> bool:
-    """Whether this is a list of frames; those that are read already count as such."""
-    read = SensorFrame | Observation
-    return is_frame_list(frame) or (isinstance(frame, list | tuple) and any(isinstance(one, read) for one in frame))
+class Tracker:
+    """Follow one object through a sequence of frames; not safe for use by several threads at once.
 
+    Each frame is fitted from the last one's state, in milliseconds, also where a hand or a tool hides a part of the
+    object. ``Result.tracking`` says how it went:
 
-def observation_of(frame: Any, isolation: IsolationConfig, reading: dict[str, Any]) -> Observation:
-    """Object in a frame, whatever holds it."""
-    if isinstance(frame, SensorFrame | Observation):
-        if reading:
+    - "found": the frame was fitted by itself, as the first one is: by a network, or, without weights, by a search, for
+      which it waits some seconds; or it was found again by a search in the background.
+    - "followed": the last frame's state led to it.
+    - "lost": the object has left the view, is covered, or has moved too far; ``known`` is False and
+      ``recognition.reason`` says why. No registration is the answer: ``surfaces`` are a network's, which was asked at
+      once but does not explain the frame; without weights they raise ``ValueError``. A search goes on in a thread of
+      its own, while frames are answered in milliseconds, until the object is found.
+
+    ``close``, or leaving a ``with`` block, ends that thread.
+    """
+
+    def __init__(
+        self, object: Object | Source, method: AnswerMethod = "auto", *, executor: Executor | None = None
+    ) -> None:
+        """Follow an object.
+
+        Args:
+            object: from ``load_object``, or whatever that takes.
+            method: "auto", or "modes" to take the registered model even where it does not explain the frame.
+            executor: what searches for a lost object; by default a thread of the tracker's own.
+
+        Raises ``ValueError`` for other methods, and for weights without a deformation model.
+        """
+        with python_words():
+            registrar = None if method == "network" else object_of(object).registrar(method)
+        if registrar is None or method == "full":
             raise ValueError(
-                f"{', '.join(reading)} is given for a frame that is read already: give it where the frame is read, "
-                "load_frame(..., axes='scanner', unit_m=0.001)"
+                f'the method is {method!r}, and only the modes of a deformation model can be followed: take "auto" '
+                "with weights that carry one"
             )
-        return frame if isinstance(frame, Observation) else find_object(frame, isolation)
-    return find_object(load_frame(frame, **reading), isolation)
+        self._tracker = tracking.Tracker(registrar, executor=executor)
+
+    def follow(self, frame: Any, time_s: float, *, isolation: IsolationConfig | None = None, **reading: Any) -> Result:
+        """Find the object in the next frame.
+
+        Args:
+            frame: whatever ``load_frame`` takes, or what it has returned; in one unit throughout the sequence.
+            time_s: of the frame, seconds from any zero, later than the last one's.
+            isolation: what of the frame is left out.
+            reading: arguments of ``load_frame``.
+
+        Raises ``ValueError`` for unusable frames, after which the sequence may go on. Surfaces, labels and figures are
+        made when they are asked for.
+        """
+        isolation = isolation or IsolationConfig()
+        with python_words():
+            seen = observation_of(frame, isolation, reading)
+            return Result.of(self._tracker.follow(seen, time_s, keep_all=isolation.keep_all))
+
+    def forget(self) -> None:
+        """Start again: the next frame is fitted by itself; a search that goes on is given up."""
+        self._tracker.forget()
+
+    def close(self) -> None:
+        """Give up a search that goes on, and wait until its thread has ended, for seconds at most."""
+        self._tracker.close()
+
+    def __enter__(self) -> "Tracker":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

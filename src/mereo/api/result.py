@@ -3,6 +3,7 @@
 Result[name] -> SegmentResult
 -save-> a folder as of ``mereo reconstruct``, or one file
 -show-> a page in the browser
+-carry-> what is defined in the object's own files, in the frame's axes and unit
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,7 +20,7 @@ from jaxtyping import Float
 
 from mereo.api.words import python_words
 from mereo.fitting.registration.answer import Answer
-from mereo.fitting.registration.carry import Carried, carry, place
+from mereo.fitting.registration.carry import carry, place
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud, camera_axes
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
@@ -37,12 +38,10 @@ from mereo.visualization.result_files import write_answer, write_answer_file
 from mereo.visualization.result_html import result_html
 from mereo.visualization.units import Unit
 
-# --- one segment ------------------------------------------------------------------------------------------------------
-
-# One segment of a result: its surface, and its figures.
-
 if TYPE_CHECKING:
     import trimesh
+
+    from mereo.visualization.viewer.server import OpenPage
 
 Pose = Float[np.ndarray, "4 4"]
 
@@ -74,7 +73,7 @@ class SegmentResult:
     pose: Pose | None
 
     @property
-    def is_found(self) -> bool:
+    def is_present(self) -> bool:
         """Whether the frame shows it, or the registered model has it."""
         return len(self.mesh.faces) > 0
 
@@ -100,16 +99,9 @@ class SegmentResult:
 
     def __repr__(self) -> str:
         sure = "" if np.isnan(self.confidence) else f", confidence {self.confidence:.2f}"
-        found = f"volume {self.volume:.3g}{sure}" if self.is_found else "not found"
-        return f"SegmentResult({self.name!r}, {found})"
+        figures = f"volume {self.volume:.3g}{sure}" if self.is_present else "not found"
+        return f"SegmentResult({self.name!r}, {figures})"
 
-
-# --- the result -------------------------------------------------------------------------------------------------------
-
-if TYPE_CHECKING:
-    import trimesh
-
-    from mereo.visualization.viewer.server import OpenPage
 
 SINGLE = (".glb", ".ply", ".npz", ".vti", ".nii.gz", ".seg.nrrd", ".json", ".html", ".png")
 """Suffixes of the files that ``Result.save`` writes alone."""
@@ -185,7 +177,7 @@ class Result(Answer):
 
         scene = trimesh.Scene()
         for segment in self:
-            if segment.is_found:
+            if segment.is_present:
                 scene.add_geometry(segment.to_trimesh(), node_name=segment.name, geom_name=segment.name)
         return scene
 
@@ -194,24 +186,24 @@ class Result(Answer):
 
         Raises ``ImportError`` without Open3D.
         """
-        return {segment.name: segment.to_open3d() for segment in self if segment.is_found}
+        return {segment.name: segment.to_open3d() for segment in self if segment.is_present}
 
     @cached_property
     def _segments(self) -> dict[str, SegmentResult]:
         sure = None if self.registered is None else self.registered.uncertainty
-        radii = {} if sure is None else {one.name: one.centroid_radius95 for one in sure.segments}
+        radii = {} if sure is None else {segment.name: segment.centroid_radius95 for segment in sure.segments}
         return {
-            found.name: SegmentResult(
-                name=found.name,
-                label=found.label,
+            figures.name: SegmentResult(
+                name=figures.name,
+                label=figures.label,
                 mesh=mesh,
-                centroid=found.centroid,
-                volume=found.volume,
-                confidence=found.confidence,
-                error_radius=radii.get(found.name),
-                pose=self._pose(None if self.registered is None else self.registered.model.labels == found.label),
+                centroid=figures.centroid,
+                volume=figures.volume,
+                confidence=figures.confidence,
+                error_radius=radii.get(figures.name),
+                pose=self._pose(None if self.registered is None else self.registered.model.labels == figures.label),
             )
-            for found, mesh in zip(self.reconstruction.segments, self.surfaces.segments, strict=True)
+            for figures, mesh in zip(self.reconstruction.segments, self.surfaces.segments, strict=True)
         }
 
     def _pose(self, rows: Any) -> Pose | None:
@@ -284,8 +276,9 @@ class Result(Answer):
     def __repr__(self) -> str:
         if self.is_missing:
             return f"Result({self.seen.frame.source!r}: {self.recognition.reason})"
-        found = f"{sum(len(one.faces) > 0 for one in self.surfaces.segments)} of {len(self)} segments"
-        return f"Result({self.seen.frame.source!r}: {found}; {self.source}; {self.seconds:.1f} s)"
+        present = sum(len(segment.faces) > 0 for segment in self.surfaces.segments)
+        segments = f"{present} of {len(self)} segments"
+        return f"Result({self.seen.frame.source!r}: {segments}; {self.source}; {self.seconds:.1f} s)"
 
     def _repr_html_(self) -> str:
         """What a notebook shows: the points seen on what was found, from two sides, and the segments in figures."""
@@ -294,10 +287,10 @@ class Result(Answer):
         to_camera = camera_axes(self.seen.frame.axes)
         points = transform_points(to_camera, self.seen.cloud.points)
         surfaces = self.reconstruction.surfaces.transformed(to_camera)
-        told = self.recognition.told
-        lines = [self.source, *([] if told is None or self.registrar is None else [told])]
-        found, title = self.reconstruction, self.seen.frame.source
-        return result_html(title, lines, points, surfaces, found.segments, Unit(self.unit_m), found.calibrated)
+        doubt = None if self.registrar is None else self.recognition.told
+        lines = [self.source, *([] if doubt is None else [doubt])]
+        segments, calibrated = self.reconstruction.segments, self.reconstruction.calibrated
+        return result_html(self.seen.frame.source, lines, points, surfaces, segments, Unit(self.unit_m), calibrated)
 
 
 def free_folder(name: str = "result") -> Path:
@@ -323,10 +316,6 @@ def file_suffix(path: Path) -> str:
 
 
 # --- carried files ----------------------------------------------------------------------------------------------------
-
-# Carry what is defined in the object's own files to where a frame shows the object, its inside included.
-#
-# points, mesh or file -carry_to-> the same in the frame's axes and unit
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -383,37 +372,37 @@ def carry_to(answer: Answer, what: Any, files: CarryFrame = "source") -> Any:
     what lies too far from the object to belong to it.
     """
     if isinstance(what, str | Path):
-        carried = _carried(answer, read_attachments([what])[0], files)
-        return CarriedFile(carried.name, carried.content, carried.inside, carried.farthest, answer.seen.frame)
-    if isinstance(what, SegmentedMesh):
-        return _moved(answer, what, files)
-    if isinstance(what, Segment):
-        return _moved(answer, SegmentedMesh((what,)), files).segments[0]
-    if hasattr(what, "vertices") and hasattr(what, "faces"):
-        vertices, faces = np.asarray(what.vertices, dtype=np.float64), np.asarray(what.faces, dtype=np.int64)
-        part = _moved(answer, SegmentedMesh((Segment("mesh", PALETTE[0], vertices, faces, solid=False),)), files)
-        return type(what)(part.segments[0].vertices, part.segments[0].faces, process=False)
-    return _points(answer, what, files)
-
-
-def _points(answer: Answer, what: Any, files: CarryFrame) -> Float[np.ndarray, "n 3"]:
-    cloud, _ = points_of(what)
-    if not isinstance(cloud, PointCloud):
-        raise ValueError("a depth image is no part of an object's files: carry points, a mesh or a file")
-    return _carried(answer, Attachment("the points", Positions(cloud.points)), files).content.points  # type: ignore[union-attr]
-
-
-def _moved(answer: Answer, mesh: SegmentedMesh, files: CarryFrame) -> SegmentedMesh:
-    content = _carried(answer, Attachment("the mesh", Surfaces(mesh)), files).content
-    assert isinstance(content, Surfaces)
-    return content.mesh
-
-
-def _carried(answer: Answer, attachment: Attachment, files: CarryFrame) -> Carried:
+        attachment = read_attachments([what])[0]
+    elif isinstance(what, SegmentedMesh | Segment) or (hasattr(what, "vertices") and hasattr(what, "faces")):
+        attachment = Attachment("the mesh", Surfaces(_segmented(what)))
+    else:
+        cloud, _ = points_of(what)
+        if not isinstance(cloud, PointCloud):
+            raise ValueError("a depth image is no part of an object's files: carry points, a mesh or a file")
+        attachment = Attachment("the points", Positions(cloud.points))
     registered = registration_of(answer)
     assert answer.registrar is not None
     (placed,) = place([attachment], answer.registrar, files)
-    return carry(placed, registered)
+    carried = carry(placed, registered)
+    if isinstance(what, str | Path):
+        return CarriedFile(carried.name, carried.content, carried.inside, carried.farthest, answer.seen.frame)
+    if isinstance(carried.content, Positions):
+        return carried.content.points
+    assert isinstance(carried.content, Surfaces)
+    if isinstance(what, SegmentedMesh):
+        return carried.content.mesh
+    (segment,) = carried.content.mesh.segments
+    return segment if isinstance(what, Segment) else type(what)(segment.vertices, segment.faces, process=False)
+
+
+def _segmented(mesh: Any) -> SegmentedMesh:
+    """A mesh of any of these kinds as one of segments."""
+    if isinstance(mesh, SegmentedMesh):
+        return mesh
+    if not isinstance(mesh, Segment):
+        vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+        mesh = Segment("mesh", PALETTE[0], vertices, faces, solid=False)
+    return SegmentedMesh((mesh,))
 
 
 def registration_of(answer: Answer) -> Registration:

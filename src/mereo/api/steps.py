@@ -8,7 +8,7 @@ They print their progress as the commands do, and raise the sentences that those
 """
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -17,6 +17,7 @@ from mereo.api.words import python_words
 from mereo.evaluation import scoring
 from mereo.evaluation.cases import Evaluation
 from mereo.evaluation.metrics import format_score
+from mereo.evaluation.scoring import EvaluationConfig
 from mereo.fitting.config import AnswerMethod
 from mereo.io.object_storage import ObjectPath, place_of
 from mereo.learning import learn as learning
@@ -28,13 +29,10 @@ from mereo.models.model import Model
 from mereo.models.remote import settings_for
 from mereo.models.weights import load_for
 from mereo.models.weights_place import WEIGHTS
-from mereo.scenes.scene import Scene
-from mereo.scenes.seeds import TEST_SEED_START
-from mereo.synthesis.config import GenerateConfig
 from mereo.training import trainer
 from mereo.training.config import PRESETS, PresetName, TrainConfig
 from mereo.visualization.evaluation_report import evaluate_weights
-from mereo.workers.spread import Cluster, choose_cluster
+from mereo.workers.spread import choose_cluster
 
 
 def train(
@@ -67,64 +65,37 @@ def train(
 
 def evaluate(
     model: Model | str | Path,
-    scene: Scene | str | Path | None = None,
+    config: EvaluationConfig = EvaluationConfig(),  # noqa: B008 (frozen)
     *,
     output: str | Path | None = None,
-    examples: int = 128,
-    seed: int = TEST_SEED_START,
-    scans: Sequence[str | Path] | None = None,
-    settings: GenerateConfig | None = None,
-    method: AnswerMethod = "auto",
     inference: InferenceConfig = EXACT,
-    cells: int = scoring.CELLS,
     progress: bool = True,
-    ray: str | Cluster | None = None,
+    ray: str | None = None,
     overwrite: bool = False,
-    options: Mapping[str, Any] | None = None,
+    **changes: Any,
 ) -> Evaluation:
     """Scores of weights on test examples of their scene, or on real scans: `mereo evaluate`.
 
     Args:
         model: the weights, or their shipped name or file.
-        scene: a scene, its name or its file, where it is not the built-in one that the weights were trained on.
+        config: what they are scored on, and whose answer is scored.
         output: folder to create with metrics.json, table.md, errors.png and report.html; None writes nothing.
-        examples: how many.
-        seed: test seeds start at 1,000,000.
-        scans: truth files, or their folders, of `mereo align`; none of them means the four range scans of the bunny.
-        settings: the camera of rendered views (image size, noise, sensor); by default the paper's.
-        method: whose answer is scored: "auto" what a user gets by default, with all others beside it.
         inference: where and how exactly the network computes, for weights that are loaded here.
-        cells: of the grid along each axis, on which answers are compared with the truth; 100 is the paper's.
         progress: show the time left, where nothing is written.
         ray: score each view in a task of one CPU of a Ray cluster, as in ``generate``; "local" has one for each core.
-            Or a cluster that is described already.
         overwrite: replace an output folder that mereo wrote, and nothing else is in.
-        options: content of config.json in the output folder; None writes none.
+        changes: fields of ``EvaluationConfig`` to be changed in it, such as ``scene="mine.yaml"`` or ``examples=16``.
 
-    Raises ``ValueError`` for a training seed, no examples, another object than the model's, and settings with scans,
-    which are real; ``FileExistsError`` for an output with content.
+    Raises ``ValueError`` for a training seed, no examples, another object than the model's, and a simulated camera for
+    scans, which are real; ``FileExistsError`` for an output with content; ``TypeError`` for an unknown field.
     """
-    if scans is not None and settings is not None:
-        raise ValueError("scans are real and take no simulated camera: leave out the settings")
-    config = scoring.EvaluationConfig(
-        scene=str(scene) if isinstance(scene, Path) else scene,
-        examples=examples,
-        seed=seed,
-        scans=scans,
-        settings=settings or GenerateConfig(),
-        method=method,
-        cells=cells,
-    )
+    changes = {name: str(value) if isinstance(value, Path) else value for name, value in changes.items()}
     with python_words():
-        workers = (ray if isinstance(ray, Cluster) else choose_cluster(ray)) or 1
-        if scans is not None and isinstance(workers, Cluster):
-            raise ValueError("--scans are few and are scored here: leave out --ray")
-        if output is None:
-            loaded = model if isinstance(model, Model) else load_for(model, settings_for(inference, workers))
-            return scoring.evaluate(loaded, config, progress=progress, workers=workers)
-        return evaluate_weights(
-            model, output, config, inference=inference, workers=workers, force=overwrite, options=options
-        )
+        config, workers = replace(config, **changes), choose_cluster(ray) or 1
+        if output is not None:
+            return evaluate_weights(model, output, config, inference=inference, workers=workers, force=overwrite)
+        loaded = model if isinstance(model, Model) else load_for(model, settings_for(inference, workers))
+        return scoring.evaluate(loaded, config, progress=progress, workers=workers)
 
 
 def export(
@@ -216,7 +187,7 @@ def learn(
         raise ValueError(f"train is {train!r}; it must be one of {known}: correct the spelling")
     processes = workers or os.cpu_count() or 1
     with python_words():
-        metrics = learning.learn(files, folder, minutes=minutes, init=init, units=units, workers=processes, train=train)
+        metrics = learning.learn(files, folder, learning.LearnConfig(minutes, init, units, processes, train))
     return Learned(
         folder=folder,
         weights=folder / WEIGHTS if metrics["trained"] else None,

@@ -25,20 +25,25 @@ ARGUMENTS = {
 }
 """Arguments that are not called as their options are."""
 
-VALUE = r"(?: (?=[0-9A-Z])([\w./]+\w|\w))?"
-"""A value behind an option, as messages show it: a number, or a word in capitals."""
+OPTION = re.compile(r"--([a-z][a-z-]*)(?: (?=[0-9A-Z])([\w./]+\w|\w))?")
+"""An option, and a value behind it as messages show it: a number, or a word in capitals."""
 
 
 def in_python(text: str) -> str:
     """Text in which options are the arguments of Python functions: ``--unit-m 0.001`` is ``unit_m=0.001``."""
     for option in sorted(ARGUMENTS, key=len, reverse=True):
         text = re.sub(rf"{option}(?![\w-])", ARGUMENTS[option], text)
-    return re.sub(rf"--([a-z][a-z-]*){VALUE}", _argument, text)
+    return OPTION.sub(_argument, text)
 
 
-def _argument(found: re.Match[str]) -> str:
-    name = found[1].replace("-", "_")
-    return name if found[2] is None else f"{name}={found[2].lower() if found[2].isupper() else found[2]}"
+def _argument(option: re.Match[str]) -> str:
+    name, value = option[1].replace("-", "_"), option[2]
+    return name if value is None else f"{name}={value.lower() if value.isupper() else value}"
+
+
+def in_callers_words(text: str) -> str:
+    """Text as it is where the command line calls, else in the words of Python."""
+    return text if SPEAKS_OPTIONS.get() else in_python(text)
 
 
 @contextmanager
@@ -57,6 +62,6 @@ def python_words() -> Iterator[None]:
     try:
         yield
     except (ValueError, OSError, ImportError, TypeError) as error:
-        if not SPEAKS_OPTIONS.get() and error.args and isinstance(error.args[0], str):
-            error.args = (in_python(error.args[0]), *error.args[1:])
+        if error.args and isinstance(error.args[0], str):
+            error.args = (in_callers_words(error.args[0]), *error.args[1:])
         raise

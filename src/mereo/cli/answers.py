@@ -1,4 +1,4 @@
-"""The commands that answer frames: reconstruct, stream, serve."""
+"""The commands that answer frames: reconstruct, view, stream, serve."""
 
 import os
 from dataclasses import dataclass, field
@@ -8,8 +8,7 @@ from typing import Annotated
 
 from tyro.conf import UseAppendAction, arg
 
-from mereo.cli.config_file import ConfigFile
-from mereo.cli.options import InputName, Inputs, MeshUnits, Outcome
+from mereo.cli.options import ConfigFile, InputName, InputOrNone, Inputs, MeshUnits, Outcome, loaded_object
 from mereo.fitting.config import AnswerMethod, StreamMethod
 from mereo.io.bounds import Cells, Port, Positive, Threads, Workers
 from mereo.io.config import CarryFrame, FilesConfig, InputConfig
@@ -106,6 +105,67 @@ class ReconstructCommand:
 
 
 @dataclass(frozen=True)
+class ViewCommand:
+    """Look at a frame and its reconstruction in a browser, or try an object (--object): needs the extra `view`.
+
+    Only this machine reaches the page; from another one use a tunnel: ssh -L 8080:127.0.0.1:8080 HOST.
+
+    Attributes:
+        input: a point cloud or depth image, as for `mereo reconstruct`, or the folder of a result of it; a GLB file;
+            without it (and --object) a shipped frame.
+        object: what is looked for in the frame, as for `mereo reconstruct`: its meshes or its scene. Without a frame
+            the laboratory of this object is opened: states of its are shown to a simulated camera, and what is found in
+            its image beside the truth.
+        weights: a shipped name or a file; by default those of the shipped frame, or none.
+        units: of the object's meshes; guessed where not given.
+        port: where the page is; 0 takes any that is free.
+        resolution: grid cells along the longest side.
+        reading: how the frame is read.
+        isolation: what of the frame is left out.
+        inference: where and how exactly the network computes.
+    """
+
+    input: InputOrNone = None
+    object: tuple[str, ...] = ()
+    weights: str | None = None
+    units: MeshUnits = None
+    port: Port = 8080
+    resolution: Cells = 128
+    reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
+    isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
+    inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
+
+    def run(self) -> None:
+        """Open a page, and keep it until Ctrl-C."""
+        from mereo.api.view import view
+        from mereo.evaluation.sample_views import shipped_views
+        from mereo.io.progress import shown_stages
+        from mereo.visualization.viewer.server import import_viser
+
+        import_viser()  # its absence is better said before the work
+        input, known = self.input, None
+        if input is None and not self.object and self.weights is not None:
+            if self.weights not in shipped_views():
+                raise ValueError(
+                    f"there is no frame to show and none is shipped for {self.weights!r}; name a depth image or a "
+                    f"point cloud, or take the weights of a shipped frame: {', '.join(shipped_views())}"
+                )
+            input = Path(self.weights)
+        if self.object or self.weights is not None:
+            with shown_stages():
+                known = loaded_object(self.object, self.weights, None, self.units, self.inference)
+        view(
+            input,
+            known,
+            reading=self.reading,
+            isolation=self.isolation,
+            resolution=self.resolution,
+            port=self.port,
+            block=True,
+        )
+
+
+@dataclass(frozen=True)
 class StreamCommand:
     """Reconstruct frames as they come: the latest one wins, a bad one is reported and passed over.
 
@@ -161,24 +221,7 @@ class StreamCommand:
         os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "4")
         from mereo.cli.stream import stream_reconstructions
 
-        stream_reconstructions(
-            self.input,
-            self.weights,
-            looked_for=self.object,
-            units=self.units,
-            resolution=self.resolution,
-            rate_hz=self.rate,
-            every_frame=self.every_frame,
-            watch=self.watch,
-            surfaces=self.surfaces,
-            rerun=self.rerun,
-            force=self.force,
-            reading=self.reading,
-            isolation=self.isolation,
-            inference=self.inference,
-            method=self.method,
-            uncertainty=self.uncertainty,
-        )
+        stream_reconstructions(self)
 
 
 @dataclass(frozen=True)

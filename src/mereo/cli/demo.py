@@ -72,8 +72,8 @@ def _inputs(output: Path) -> "Iterator[tuple[str, str, Object, SensorFrame, Trut
     """Name, title, object, frame and truth of each input; the bunny's meshes are written: a user has such files."""
     import numpy as np
 
-    from mereo.api.frames import load_frame
     from mereo.api.objects import load_object
+    from mereo.api.reconstruct import load_frame
     from mereo.evaluation.metrics import truth_grid
     from mereo.evaluation.sample_views import SHIPPED_SCAN, load_view
     from mereo.evaluation.scans import BUNNY_SCAN_POSES

@@ -11,7 +11,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, redirect_stdout
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,77 +21,51 @@ from rich.console import Console
 from rich.table import Table
 
 from mereo.api.words import option_words
-from mereo.cli import options as command
-from mereo.cli.reconstruct import FrameJob, answer_frame, outcome_of, print_segments, reconstruct_file, written
+from mereo.cli.options import NOT_RECOGNIZED, Outcome
+from mereo.cli.reconstruct import FrameJob, print_segments, reconstruct_file, reconstruct_frame, written
 from mereo.fitting.registration.answer import Answer
-from mereo.fitting.registration.recognition import Known
 from mereo.io.atomic_files import MARKER, check_new_directory, check_place, new_directory
 from mereo.io.config import InputConfig
 from mereo.io.progress import duration
 from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.reconstruction.observation import FrameWarning
-from mereo.reconstruction.stream import frame_error
-from mereo.reconstruction.stream_sources import frames_in
+from mereo.reconstruction.stream import frame_error, frames_in
 from mereo.visualization.result_files import summary_of
 from mereo.workers.spread import Cluster, spread
-
-KNOWN: Mapping[Known, str] = {True: "yes", False: "no", "unsure": "unsure"}
-"""Words of a table for whether a frame shows the object."""
 
 
 @dataclass(frozen=True)
 class FrameRow:
-    """Row of the table about a frame, but for its name and folder.
+    """Row of the table about a frame.
 
     Attributes:
-        answer: who answers.
-        explained: share of the cloud that the registered model explains; "" without one.
-        known: whether it shows the object.
-        segments: how many of them were found.
+        cells: who answers, the share of the cloud that a registered model explains, whether the frame shows the object,
+            how many segments were found, seconds.
         seconds: that the answer took.
         summary: content of its summary.json.
     """
 
-    answer: str
-    explained: str
-    known: str
-    segments: str
+    cells: tuple[str, ...]
     seconds: float
-    summary: Mapping[str, Any] = field(compare=False, repr=False)
+    summary: Mapping[str, Any]
 
     @classmethod
-    def of(cls, found: Answer) -> "FrameRow":
+    def of(cls, answer: Answer) -> "FrameRow":
         """Row about an answer."""
-        registration, segments = found.registration, found.reconstruction.segments
-        return cls(
-            answer="registered model" if found.taken else "network",
-            explained="" if registration is None else f"{registration.explained:.1%}",
-            known=KNOWN[found.recognition.known],
-            segments=f"{sum(segment.voxels > 0 for segment in segments)} of {len(segments)}",
-            seconds=found.reconstruction.seconds,
-            summary=summary_of(found),
+        registration, segments = answer.registration, answer.reconstruction.segments
+        seconds = answer.reconstruction.seconds
+        cells = (
+            "registered model" if answer.taken else "network",
+            "" if registration is None else f"{registration.explained:.1%}",
+            {True: "yes", False: "no", "unsure": "unsure"}[answer.recognition.known],
+            f"{sum(segment.voxels > 0 for segment in segments)} of {len(segments)}",
+            f"{seconds:.1f}",
         )
+        return cls(cells, seconds, summary_of(answer))
 
 
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """What became of one frame.
-
-    Attributes:
-        path: its file.
-        folder: of its results.
-        row: what the table says of it; None for a frame that could not be answered.
-    """
-
-    path: Path
-    folder: Path
-    row: FrameRow | None
-
-
-def reconstruct_inputs(
-    inputs: Sequence[Path], output: Path, job: FrameJob, cluster: Cluster | None = None
-) -> command.Outcome:
+def reconstruct_inputs(inputs: Sequence[Path], output: Path, job: FrameJob, cluster: Cluster | None = None) -> Outcome:
     """Reconstruct one frame into ``output``, or several, or folders of them, into ``output``/NAME each.
 
     Several are tasks of ``cluster``, where one is given; ``ValueError`` for a single one then.
@@ -100,14 +74,13 @@ def reconstruct_inputs(
     """
     if not inputs:
         raise ValueError("no input is given; name a frame, several, or a folder of them: mereo reconstruct FRAME ...")
-    if len(inputs) == 1 and not is_folder_of_frames(inputs[0]):
-        if cluster is not None:
-            raise ValueError("--ray is for several frames, each of which is a task: name more, or leave it out")
-        return outcome_of(reconstruct_file(inputs[0], output, job), output)
-    found = reconstruct_frames(list_frames(inputs, job.command.reading), output, job, cluster)
-    frames = [{"output": str(one.folder), **one.row.summary} for one in found if one.row is not None]
-    unknown = any(one.row is not None and one.row.known == KNOWN[False] for one in found)
-    return command.Outcome({"output": str(output), "frames": frames}, command.NOT_RECOGNIZED if unknown else 0)
+    if len(inputs) > 1 or is_folder_of_frames(inputs[0]):
+        return reconstruct_frames(list_frames(inputs, job.command.reading), output, job, cluster)
+    if cluster is not None:
+        raise ValueError("--ray is for several frames, each of which is a task: name more, or leave it out")
+    result = reconstruct_file(inputs[0], output, job)
+    facts = {"output": str(output), **summary_of(result)}
+    return Outcome(facts, NOT_RECOGNIZED if result.known is False else 0)
 
 
 def is_folder_of_frames(path: Path) -> bool:
@@ -140,15 +113,13 @@ def folder_names(files: Sequence[Path]) -> list[str]:
     raise ValueError(f"{alike[0]} and {alike[1]} would both be written to {names[0]!r}: reconstruct them one at a time")
 
 
-def reconstruct_frames(
-    files: Sequence[Path], output: Path, job: FrameJob, cluster: Cluster | None = None
-) -> list[Outcome]:
+def reconstruct_frames(files: Sequence[Path], output: Path, job: FrameJob, cluster: Cluster | None = None) -> Outcome:
     """Reconstruct each file into ``output``/NAME, print a table at the end; a bad frame is said and passed over.
 
     Raises ``ValueError`` at the end where a frame could not be answered, and before the work as ``FrameJob.check`` and
     loading do; ``FileExistsError`` where ``output`` is itself a folder of results.
     """
-    names = folder_names(files)
+    frames = [(file, output / name) for file, name in zip(files, folder_names(files), strict=True)]
     check_place(output, may_be_link=True)
     if output.exists() and not output.is_dir():
         raise FileExistsError(f"{output} is a file; a folder for each frame is written there: choose another --output")
@@ -158,44 +129,29 @@ def reconstruct_frames(
         )
     job.check()
     _ = job.object, job.placed  # what is wrong with them is no frame's fault
-    folders = [output / name for name in names]
-    rows: list[FrameRow | None] = []
-    outcomes: dict[Path, Outcome] = {}
+    rows: dict[Path, FrameRow | None] = {}
     started = time.monotonic()
-    frames = zip(files, folders, strict=True)
-    finishing: Iterator[_Finishing] = (
-        ((file, folder, partial(_answer_here, file, folder, job)) for file, folder in frames)
-        if cluster is None
-        else _answer_in_tasks(frames, job, cluster)
-    )
     with warnings.catch_warnings():
         warnings.filterwarnings("always", category=FrameWarning)  # for each frame, also in the same words
-        for file, folder, finish in finishing:
-            left = _left(rows, len(files), time.monotonic() - started)
+        for file, finish in _finishing(frames, job, cluster):
+            left = _left(list(rows.values()), len(files), time.monotonic() - started)
             print(f"\n[{len(rows) + 1}/{len(files)}] {file}{left}", flush=True)
             try:
-                rows.append(finish())
+                rows[file] = finish()
             except Exception as problem:
-                _say(file, problem)
-                rows.append(None)
-            outcomes[file] = Outcome(file, folder, rows[-1])
-    ordered = [outcomes[file] for file in files]
-    _show(ordered, output)
-    failed = rows.count(None)
-    if failed:
+                if os.environ.get("MEREO_TRACEBACK") == "1":
+                    raise
+                print(f"mereo: error: {frame_error(problem, file.name)}", file=sys.stderr, flush=True)
+                rows[file] = None
+    _print_table(frames, rows, output)
+    if failed := list(rows.values()).count(None):
         raise ValueError(
             f"{failed} of {len(files)} frames could not be reconstructed, each for the reason given with it; the "
             "others are written: correct them, and name only those again"
         )
-    return ordered
-
-
-_Finishing = tuple[Path, Path, Callable[[], FrameRow]]
-"""A frame's file, its folder of results, and what writes that, or raises why not."""
-
-
-def _answer_here(file: Path, folder: Path, job: FrameJob) -> FrameRow:
-    return FrameRow.of(reconstruct_file(file, folder, job))
+    summaries = [{"output": str(folder), **row.summary} for file, folder in frames if (row := rows[file]) is not None]
+    unknown = any(summary["recognition"]["known"] is False for summary in summaries)
+    return Outcome({"output": str(output), "frames": summaries}, NOT_RECOGNIZED if unknown else 0)
 
 
 def _left(done: Sequence[FrameRow | None], count: int, seconds: float) -> str:
@@ -204,33 +160,33 @@ def _left(done: Sequence[FrameRow | None], count: int, seconds: float) -> str:
     return f", {duration(seconds / answered * (count - len(done)))} left" if answered else ""
 
 
-def _say(file: Path, problem: Exception) -> None:
-    """Say on standard error what is wrong with a frame."""
-    if os.environ.get("MEREO_TRACEBACK") == "1":
-        raise problem
-    print(f"mereo: error: {frame_error(problem, file.name)}", file=sys.stderr, flush=True)
-
-
-def _show(outcomes: Sequence[Outcome], output: Path) -> None:
-    """Table of all frames."""
+def _print_table(frames: Sequence[tuple[Path, Path]], rows: Mapping[Path, FrameRow | None], output: Path) -> None:
     print()
-    table = Table(title=f"{len(outcomes)} frames, results in {output}", title_justify="left")
+    table = Table(title=f"{len(frames)} frames, results in {output}", title_justify="left")
     table.add_column("frame")
     table.add_column("answer")
     for column in ("explained", "known", "segments", "seconds"):
         table.add_column(column, justify="right")
     table.add_column("folder", overflow="fold")
-    for outcome in outcomes:
-        table.add_row(outcome.path.name, *_row(outcome))
-    console = Console(markup=False, emoji=False)
-    console.print(table)
+    for file, folder in frames:
+        row = rows[file]
+        table.add_row(file.name, *(["none"] if row is None else [*row.cells, folder.name]))
+    Console(markup=False, emoji=False).print(table)
 
 
-def _row(outcome: Outcome) -> tuple[str, ...]:
-    row = outcome.row
-    if row is None:
-        return "none", "", "", "", "", ""
-    return row.answer, row.explained, row.known, row.segments, f"{row.seconds:.1f}", outcome.folder.name
+def _finishing(
+    frames: Sequence[tuple[Path, Path]], job: FrameJob, cluster: Cluster | None
+) -> Iterator[tuple[Path, Callable[[], FrameRow]]]:
+    """Each frame's file, with what writes its folder of results, or raises why not."""
+    if cluster is not None:
+        yield from _answer_in_tasks(frames, job, cluster)
+        return
+    for file, folder in frames:
+        yield file, partial(_answer_alone, file, folder, job)
+
+
+def _answer_alone(file: Path, folder: Path, job: FrameJob) -> FrameRow:
+    return FrameRow.of(reconstruct_file(file, folder, job))
 
 
 # --- a cluster --------------------------------------------------------------------------------------------------------
@@ -282,16 +238,18 @@ class _Answering:
         ):
             warnings.simplefilter("always", FrameWarning)
             folder = Path(name)
-            found = answer_frame(frame.content, folder, self.moved, frame.path.absolute())
-            print_segments(found)
+            result = reconstruct_frame(frame.content, folder, self.moved, frame.path.absolute())
+            print_segments(result)
             files = {
                 file.relative_to(folder).as_posix(): file.read_bytes() for file in folder.rglob("*") if file.is_file()
             }
-        texts = [str(one.message) for one in warned if issubclass(one.category, FrameWarning)]
-        return _Answered(FrameRow.of(found), files, printed.getvalue(), texts)
+        texts = [str(warning.message) for warning in warned if issubclass(warning.category, FrameWarning)]
+        return _Answered(FrameRow.of(result), files, printed.getvalue(), texts)
 
 
-def _answer_in_tasks(frames: Iterable[tuple[Path, Path]], job: FrameJob, cluster: Cluster) -> Iterator[_Finishing]:
+def _answer_in_tasks(
+    frames: Iterable[tuple[Path, Path]], job: FrameJob, cluster: Cluster
+) -> Iterator[tuple[Path, Callable[[], FrameRow]]]:
     """Answer frames in tasks of a cluster; yields each as it is there, in any order."""
     if job.object.network is not None:
         from mereo.models.remote import to_cpu
@@ -307,21 +265,21 @@ def _answer_in_tasks(frames: Iterable[tuple[Path, Path]], job: FrameJob, cluster
         except Exception as problem:
             return _Frame(path, folder, problem)
 
-    work, sent = _Answering(job, cluster.gpus > 0), (read(*frame) for frame in frames)
-    with closing(spread(work, sent, cluster, lambda _, error: error)) as answers:
-        for frame, found in answers:
-            yield frame.path, frame.folder, partial(_write_answer, frame, found, job)
+    work, contents = _Answering(job, cluster.gpus > 0), (read(*frame) for frame in frames)
+    with closing(spread(work, contents, cluster, lambda _, error: error)) as answers:
+        for frame, answered in answers:
+            yield frame.path, partial(_write_answer, frame, answered, job)
 
 
-def _write_answer(frame: _Frame, found: _Answered | Exception, job: FrameJob) -> FrameRow:
-    if isinstance(found, Exception):
-        raise found
-    print(found.printed, end="")
-    for text in found.warned:
+def _write_answer(frame: _Frame, answered: _Answered | Exception, job: FrameJob) -> FrameRow:
+    if isinstance(answered, Exception):
+        raise answered
+    print(answered.printed, end="")
+    for text in answered.warned:
         warnings.warn(text, FrameWarning, stacklevel=2)
     with new_directory(frame.folder, job.command.force, [frame.path, *job.read]) as directory:
-        for name, content in found.files.items():
+        for name, content in answered.files.items():
             (directory / name).parent.mkdir(parents=True, exist_ok=True)
             (directory / name).write_bytes(content)
-    print(written(frame.folder, found.row.seconds), flush=True)
-    return found.row
+    print(written(frame.folder, answered.row.seconds), flush=True)
+    return answered.row

@@ -1,10 +1,16 @@
-"""The commands for one tool each: align, experiment, bench."""
+"""The commands for one tool each: align, experiment, bench, doctor."""
 
+import importlib.metadata
+import os
+import platform
+import re
+import shlex
+import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from mereo.cli.options import ScanCloud
 from mereo.io.bounds import Count, CountOrNone, PositiveOrUnknown, Threads, Workers
@@ -30,7 +36,7 @@ class Align:
         unit: of the scan.
         scene_unit_mm: millimetres per scene unit, where the scene does not say.
         frame: axes of the scan: camera is x right, y down, z forward; scanner is y up, z toward the scanner.
-        as_one: the object is rigid: place it as a whole.
+        is_rigid: the object is rigid: place it as a whole.
         hold: segments to leave at their start or at their neighbour, whatever the scan shows.
         drop_invalid: leave out NaN, infinite and all-zero points instead of refusing the file.
         force: replace an existing output folder that mereo wrote, and nothing else is in.
@@ -44,7 +50,7 @@ class Align:
     unit: Literal["m", "cm", "mm", "in"] = "m"
     scene_unit_mm: PositiveOrUnknown = None
     frame: Literal["camera", "scanner"] = "camera"
-    as_one: bool = False
+    is_rigid: Annotated[bool, arg(name="as-one")] = False
     hold: tuple[str, ...] = ()
     drop_invalid: bool = False
     force: bool = False
@@ -81,7 +87,7 @@ class Align:
                 start = read_start(self.start, rest, scale)
             else:
                 start = start_from_model(load_model(str(self.weights)), cloud.points, self.frame, rest, scale)
-            placement = place(rest, cloud.points, start, self.frame, as_one=self.as_one, hold=self.hold)
+            placement = place(rest, cloud.points, start, self.frame, as_one=self.is_rigid, hold=self.hold)
             write_truth(directory, self.output, scan, self.scene, rest, placement, start.how)
             write_segments_glb(
                 directory / "segments.glb", placement.mesh, viewer_rotation(self.frame), UNITS_M[self.unit]
@@ -110,11 +116,12 @@ def print_placement(placement: "Placement", title: str, mm: float) -> None:
         table.add_column(column, no_wrap=True)
     for column in ("points", "median", "RMS", "95 %", "moved", "turned", "held"):
         table.add_column(column, justify="right")
-    for one in placement.segments:
-        fit = [f"{mm * value:.3f}" if one.points else "-" for value in (one.median, one.rms, one.p95)]
-        by = one.placed_by if one.seen else f"unseen: {one.placed_by}"
-        held = str(one.held) if one.held else ""
-        table.add_row(one.name, by, str(one.points), *fit, f"{mm * one.shift:.2f}", f"{one.turn_deg:.1f}", held)
+    for segment in placement.segments:
+        residuals = (segment.median, segment.rms, segment.p95)
+        fit = [f"{mm * value:.3f}" if segment.points else "-" for value in residuals]
+        by = segment.placed_by if segment.seen else f"unseen: {segment.placed_by}"
+        motion = f"{mm * segment.shift:.2f}", f"{segment.turn_deg:.1f}"
+        table.add_row(segment.name, by, str(segment.points), *fit, *motion, str(segment.held or ""))
     console = Console(markup=False, emoji=False)
     console.print(table)
     console.print(
@@ -122,11 +129,11 @@ def print_placement(placement: "Placement", title: str, mm: float) -> None:
         highlight=False,
         soft_wrap=True,
     )
-    for one in placement.segments:
-        if one.held:
+    for segment in placement.segments:
+        if segment.held:
             console.print(
-                f"{one.name}: the scan leaves {one.held} of 6 directions open (it could turn or slide); there it "
-                "stays where it was placed together with the others",
+                f"{segment.name}: the scan leaves {segment.held} of 6 directions open (it could turn or slide); there "
+                "it stays where it was placed together with the others",
                 highlight=False,
                 soft_wrap=True,
             )
@@ -181,7 +188,7 @@ class BenchCommand:
         precision: of the network's products; auto takes bfloat16 on CUDA and on CPUs that are much faster in it.
         repeats: of each stage.
         rival: time the straightforward implementation too (minutes on a CPU), and check that it gives the same labels.
-        beside: processes that never rest, beside which 40,000 queries are timed again on a CPU; 0 leaves that out.
+        busy: processes that never rest, beside which 40,000 queries are timed again on a CPU; 0 leaves that out.
         threads: of torch and all else that computes; 0 means one per core.
         output: a JSON file for the figures.
         force: replace an existing file, unless the weights are read from it.
@@ -193,7 +200,7 @@ class BenchCommand:
     precision: Precision = "float32"
     repeats: Count = 7
     rival: bool = False
-    beside: CountOrNone = 1
+    busy: Annotated[CountOrNone, arg(name="beside")] = 1
     threads: Threads = 0
     output: Path | None = None
     force: bool = False
@@ -211,7 +218,89 @@ class BenchCommand:
             self.precision,
             self.repeats,
             self.rival,
-            self.beside,
+            self.busy,
             self.output,
             self.force,
         )
+
+
+# --- doctor -----------------------------------------------------------------------------------------------------------
+
+PURPOSES: dict[str, str] = {
+    "network": "weights: training them, and fits that start from them",
+    "view": "the pages of `mereo view`",
+    "rerun": "streams as Rerun recordings",
+    "track": "training curves in TensorBoard",
+    "plots": "curves of training runs, charts of experiments and of modes",
+    "onnx": "networks for other runtimes",
+    "cad": "3MF files",
+    "medical": "NIfTI and NRRD volumes",
+    "sensors": "ROS bags, EXR depth images and Zivid clouds",
+    "simulation": "states from finite elements",
+    "storage": "datasets in S3 and what speaks it",
+    "gcs": "datasets in Google Cloud Storage",
+    "cluster": "generation, scoring, frames and learning on Ray clusters",
+    "align": "ground truth from scans",
+    "serve": "answers over HTTP",
+    "docs": "the documentation as pages",
+    "dev": "tests and checks",
+}
+"""Purpose of each extra of pyproject.toml; which packages it means is read from the installed metadata."""
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Show versions, device, threads and extras, and how to install what is missing."""
+
+    def run(self) -> None:
+        """Print what is installed and what this machine offers, one fact a line."""
+        facts = {
+            "mereo": _version("mereo") or "not installed",
+            "python": f"{platform.python_version()} ({sys.executable})",
+            "system": f"{platform.system()} {platform.machine()}",
+        }
+        for requirement in requirements(""):
+            facts[_name(requirement)] = _version(_name(requirement)) or f"missing: {_install([requirement])}"
+        try:
+            import torch
+        except ModuleNotFoundError:
+            facts["device"] = "cpu; objects are found by search, as the extra `network` is not installed"
+        else:
+            device = (
+                f"{torch.cuda.get_device_name()}, CUDA {torch.version.cuda}" if torch.cuda.is_available() else "cpu"
+            )
+            facts |= {"torch": torch.__version__, "device": device}
+            facts["threads"] = f"{torch.get_num_threads()} of {os.cpu_count()} cores"
+        for extra, purpose in PURPOSES.items():
+            missing = [each for each in requirements(extra) if _version(_name(each)) is None]
+            facts[extra] = f"missing, for {purpose}: {_install(missing)}" if missing else f"installed, for {purpose}"
+        for name, fact in facts.items():
+            print(f"{name:<14} {fact}")
+
+
+def requirements(extra: str) -> list[str]:
+    """Requirements that pyproject.toml declares for an extra, such as ``tensorboard>=2.18``; ``""`` is mereo itself."""
+    try:
+        declared = importlib.metadata.requires("mereo") or []
+    except importlib.metadata.PackageNotFoundError:
+        return []
+    entries = [entry.partition(";") for entry in declared]
+    extras = [re.search(r"extra == ['\"](.+?)['\"]", marker) for _, _, marker in entries]
+    return [
+        entry[0].strip() for entry, named in zip(entries, extras, strict=True) if (named[1] if named else "") == extra
+    ]
+
+
+def _install(missing: list[str]) -> str:
+    return shlex.join([sys.executable, "-m", "pip", "install", *missing])
+
+
+def _name(requirement: str) -> str:
+    return re.split(r"[^A-Za-z0-9._-]", requirement)[0]
+
+
+def _version(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None

@@ -1,13 +1,23 @@
 """The commands that make and use networks: generate, dataset ..., train, evaluate, learn, export."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from tyro.conf import arg
 
-from mereo.cli.config_file import ConfigFile, flat_options, options_of
-from mereo.cli.options import DatasetFolder, MeshUnits, ObjectFiles, Outcome, PlaceOption, SceneName, WeightsName
+from mereo.cli.options import (
+    ConfigFile,
+    DatasetFolder,
+    MeshUnits,
+    ObjectFiles,
+    Outcome,
+    PlaceOption,
+    SceneName,
+    WeightsName,
+    flat_options,
+    options_of,
+)
 from mereo.fitting.config import AnswerMethod
 from mereo.geometry.conventions import WorkspaceName
 from mereo.io.bounds import Count, CountOrNone, ImageSize, NotNegative, Positive, Threads, Workers
@@ -215,29 +225,20 @@ class Evaluate:
 
     def run(self) -> Outcome:
         """Write scores and pictures of their errors, and print the table."""
-        from mereo.api.steps import evaluate
+        from mereo.evaluation.scoring import EvaluationConfig
         from mereo.evaluation.tables import read_metrics
+        from mereo.visualization.evaluation_report import evaluate_weights
 
         settings = GenerateConfig(
             image_size=self.image_size, noise_std=self.noise_std, sensor=self.terms, workspace=self.workspace
         )
-        if self.scans is not None and settings != GenerateConfig():
-            raise ValueError(
-                "--scans are real and take no simulated camera: leave out --sensor, --image-size, --noise-std and "
-                "--workspace"
-            )
-        evaluate(
+        evaluate_weights(
             self.weights,
-            self.scene,
-            output=self.output,
-            examples=self.examples,
-            seed=self.seed,
-            scans=self.scans,
-            settings=None if self.scans is not None else settings,
-            method=self.method,
+            self.output,
+            EvaluationConfig(self.scene, self.examples, self.seed, self.scans, settings, self.method),
             inference=self.inference,
-            ray=choose_cluster(self.ray, self.threads, self.task),
-            overwrite=self.force,
+            workers=choose_cluster(self.ray, self.threads, self.task) or 1,
+            force=self.force,
             options=options_of(self, "evaluate"),
         )
         return Outcome(read_metrics(self.output / "metrics.json") if self.json else {})
@@ -288,27 +289,20 @@ class LearnCommand:
 
     def run(self) -> None:
         """Learn, and print the scores and how to use the object."""
-        from mereo.api.steps import learn
-        from mereo.learning.object_folders import learn_objects
-        from mereo.workers.spread import choose_cluster
+        from mereo.learning.learn import LearnConfig, learn, learn_objects
 
-        shared: dict[str, Any] = {
-            "minutes": self.minutes,
-            "init": self.init,
-            "units": self.units,
-            "workers": workers_for(self.workers, self.threads),
-            "train": self.train,
-        }
+        workers = workers_for(self.workers, self.threads)
+        config = LearnConfig(self.minutes, self.init, self.units, workers, self.train)
         if len(self.object) == 1 and self.object[0].is_dir():
             task = ONE_CPU if self.ray is None else TaskResources(self.cpus_per_object, self.gpus_per_object)
             cluster = choose_cluster(self.ray, self.threads, task)
             if cluster is not None:
-                shared["workers"] = cluster.cpus
-            learn_objects(self.object[0], self.output, shared, cluster)
+                config = replace(config, workers=cluster.cpus)
+            learn_objects(self.object[0], self.output, config, cluster)
         elif self.ray is not None:
             raise ValueError("--ray is for a folder of objects, each of which is a task: name one, or leave it out")
         else:
-            learn(self.object, self.output, **shared)
+            learn(self.object, self.output, config)
 
 
 @dataclass(frozen=True)

@@ -1,24 +1,15 @@
-"""The commands of weights: list, show, push and pull, calibrate, release."""
+"""The commands of weights: list, show, calibrate, release."""
 
-import os
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
-from typing import Any
 
-from mereo.cli.options import Outcome, RepositoryName, WeightsFiles, WeightsName
+from mereo.cli.options import Outcome, WeightsFiles, WeightsName
 from mereo.io.bounds import Count, CountOrNone, Threads
 
 SCORES = re.compile(r"^\| ([\d.-]+) \| ([\d.-]+) \|", re.MULTILINE)
 """IoU and mIoU in a row of a model card."""
-
-REPOSITORY = re.compile(r"(?P<repo>[\w.-]+/[\w.-]+)(@(?P<revision>[\w./-]+?))?(/(?P<file>[\w.-]+\.safetensors))?")
-
-PAGE_HEAD = "---\nlibrary_name: mereo\ntags: [point-cloud, 3d-reconstruction, segmentation]\n---\n\n"
-"""What a hub reads of a repository's page before its text."""
 
 
 @dataclass(frozen=True)
@@ -101,138 +92,14 @@ def _weights_in(place: Path) -> list[Path]:
         return [place]
     from mereo.models.weights_place import read_facts
 
-    found = []
+    files = []
     for file in sorted(place.rglob("*.safetensors")):
         with suppress(ValueError):
             read_facts(file)
-            found.append(file)
-    if not found:
+            files.append(file)
+    if not files:
         raise ValueError(f"{place} holds no weights; name a .safetensors file of mereo train, or a folder of such")
-    return found
-
-
-@dataclass(frozen=True)
-class WeightsPush:
-    """Put released weights and their model card into a repository of a model hub (Hugging Face, or HF_ENDPOINT).
-
-    Log in before with `hf auth login`, or set HF_TOKEN.
-
-    Attributes:
-        weights: a shipped name, or a file of `mereo release` with its card beside it.
-        repository: OWNER/NAME, OWNER/NAME@BRANCH, and /FILE.safetensors behind it for another name of the file.
-        private: where the repository is new, only its owner sees it.
-    """
-
-    weights: WeightsName
-    repository: RepositoryName
-    private: bool = False
-
-    def run(self) -> None:
-        """Check the weights, upload both files in one commit, and print where they are."""
-        from mereo.models.weights import load_model
-        from mereo.models.weights_place import find_weights
-
-        (repo, revision, file), path = _repository(self.repository), find_weights(self.weights)
-        load_model(path)
-        card = path.with_suffix(".md")
-        if not card.is_file():
-            raise FileNotFoundError(
-                f"{path} has no card {card.name} beside it; write both with `mereo release`, which leaves out the "
-                "places of this machine, and push those"
-            )
-        name = file or path.name
-        files = {name: path.read_bytes(), Path(name).with_suffix(".md").name: card.read_bytes()}
-        with _hub(self.repository) as (hub, api):
-            api.create_repo(repo, private=self.private, exist_ok=True)
-            if not api.file_exists(repo, "README.md", revision=revision):
-                files["README.md"] = PAGE_HEAD.encode() + card.read_bytes()
-            added = [hub.CommitOperationAdd(each, content) for each, content in files.items()]
-            api.create_commit(repo, added, commit_message=f"Add {name}", revision=revision)
-        print(f"pushed {', '.join(files)} to {repo}; anyone who may read it: mereo weights pull {self.repository}")
-
-
-@dataclass(frozen=True)
-class WeightsPull:
-    """Fetch weights and their model card from a repository of a model hub (Hugging Face, or HF_ENDPOINT).
-
-    The file is read whole before it is put in place, and nothing that a repository holds is ever run.
-
-    Attributes:
-        repository: OWNER/NAME, OWNER/NAME@REVISION (branch, tag, commit), and /FILE.safetensors where it holds several.
-        output: folder for both files.
-        force: replace existing files.
-    """
-
-    repository: RepositoryName
-    output: Path = Path()
-    force: bool = False
-
-    def run(self) -> None:
-        """Download, check, and print what was written."""
-        from tempfile import TemporaryDirectory
-
-        from mereo.io.atomic_files import atomic_file, check_file_place
-        from mereo.io.errors import check_bytes
-        from mereo.models.weights import load_model
-
-        repo, revision, file = _repository(self.repository)
-        with TemporaryDirectory() as folder:
-            with _hub(self.repository) as (_, api):
-                info = api.model_info(repo, revision=revision, files_metadata=True)
-                sizes = {each.rfilename: each.size or 0 for each in info.siblings or ()}
-                names = sorted(name for name in sizes if name.endswith(".safetensors") and file in (None, name))
-                if len(names) != 1:
-                    raise ValueError(
-                        f"{self.repository} holds {', '.join(names) or 'no such weights'}; name one file of the "
-                        f"repository: {repo}/FILE.safetensors"
-                    )
-                wanted = [name for name in (Path(names[0]).with_suffix(".md").name, names[0]) if name in sizes]
-                for name in wanted:
-                    check_file_place(self.output / name, force=self.force)
-                    check_bytes(f"{repo}/{name}", sizes[name])
-                for name in wanted:
-                    api.hf_hub_download(repo, name, revision=info.sha, local_dir=folder)
-            load_model(Path(folder) / names[0])
-            for name in wanted:
-                with atomic_file(self.output / name, force=self.force) as partial:
-                    partial.write_bytes((Path(folder) / name).read_bytes())
-        print(f"wrote {' and '.join(str(self.output / name) for name in wanted)} ({repo}, commit {str(info.sha)[:12]})")
-
-
-def _repository(text: str) -> tuple[str, str | None, str | None]:
-    """Name, revision and file of ``OWNER/NAME[@REVISION][/FILE.safetensors]``; ``ValueError`` for another text."""
-    match = REPOSITORY.fullmatch(text)
-    if match is None:
-        raise ValueError(
-            f"{text!r} names no repository; write OWNER/NAME, OWNER/NAME@REVISION or OWNER/NAME/FILE.safetensors"
-        )
-    return match["repo"], match["revision"], match["file"]
-
-
-@contextmanager
-def _hub(repository: str) -> Iterator[tuple[Any, Any]]:
-    """huggingface_hub and a client of it; what it raises in the block is one sentence."""
-    from mereo.io.errors import reason
-
-    try:
-        hub = import_module("huggingface_hub")
-    except ImportError:
-        raise ImportError("huggingface_hub is needed for model hubs: pip install 'mereo[hub]'") from None
-    errors = import_module("huggingface_hub.errors")  # it names errors of its HTTP client that it does not export
-    import_module("huggingface_hub.utils").disable_progress_bars()
-    try:
-        yield hub, hub.HfApi(endpoint=os.environ.get("HF_ENDPOINT") or None, library_name="mereo")
-    except (
-        errors.HTTPError,
-        errors.HFValidationError,
-        errors.LocalEntryNotFoundError,
-        ConnectionError,
-        RuntimeError,
-    ) as error:
-        raise OSError(
-            f"{repository} cannot be reached on its hub ({type(error).__name__}: {reason(error)}): check its name, the "
-            "network and HF_ENDPOINT, and log in with `hf auth login` or set HF_TOKEN"
-        ) from None
+    return files
 
 
 @dataclass(frozen=True)
@@ -275,7 +142,7 @@ class CalibrateCommand:
         path = find_weights(self.weights)
         output = self.output or path
         with atomic_file(output, force=self.force, inputs=files_of(self.scene) if self.scene else []) as partial:
-            found = calibrate(
+            calibration = calibrate(
                 load_model(self.weights),
                 self.scene,
                 views=self.views,
@@ -283,8 +150,8 @@ class CalibrateCommand:
                 radius_views=self.radius_views,
                 quiet=False,
             )
-            partial.write_bytes(with_calibration(path, found))
-        for title, value in calibration_rows(found):
+            partial.write_bytes(with_calibration(path, calibration))
+        for title, value in calibration_rows(calibration):
             print(f"{title:<14} {value}")
         print(f"wrote {output}")
 

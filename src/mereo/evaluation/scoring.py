@@ -73,6 +73,13 @@ class EvaluationConfig:
     method: AnswerMethod = "auto"
     cells: int = CELLS
 
+    def __post_init__(self) -> None:
+        if self.scans is not None and self.settings != GenerateConfig():
+            raise ValueError(
+                "--scans are real and take no simulated camera: leave out --sensor, --image-size, --noise-std and "
+                "--workspace"
+            )
+
 
 # --- one cloud -------------------------------------------------------------------------------------------------------
 
@@ -121,6 +128,8 @@ def evaluate(
     ``FileNotFoundError`` for a missing file, and ``AssetUnavailable`` where a scan of the bunny cannot be had.
     """
     if config.scans is not None:
+        if isinstance(workers, Cluster):
+            raise ValueError("--scans are few and are scored here: leave out --ray")
         return _evaluate_scans(model, config, config.scans, progress)
     seed, method = config.seed, config.method
     if seed < TEST_SEED_START:

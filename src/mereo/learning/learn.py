@@ -9,11 +9,14 @@ numbers.
 
 import json
 import math
+import os
 import shlex
+import sys
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import redirect_stdout
-from dataclasses import asdict, dataclass, replace
+from contextlib import closing, nullcontext, redirect_stderr, redirect_stdout
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -22,14 +25,17 @@ from mereo.evaluation.calibrate import LEAST_VIEWS, VIEWS, calibrate
 from mereo.evaluation.metrics import format_score
 from mereo.evaluation.scoring import EvaluationConfig, evaluate
 from mereo.evaluation.tables import read_metrics
-from mereo.io.atomic_files import MARKER, atomic_file, claim_directory, scratch_folder, write_json
+from mereo.io.atomic_files import MARKER, atomic_file, check_place, claim_directory, scratch_folder, write_json
 from mereo.io.config import CONFIG
+from mereo.io.errors import words_of
 from mereo.io.progress import progress
 from mereo.learning.object_files import (
     FRAME,
     SCENE,
     SEARCH,
+    Learnable,
     check,
+    list_objects,
     place_of_scene,
     scene_for,
     scene_of_folder,
@@ -59,6 +65,7 @@ from mereo.training.trainer import VALIDATIONS
 from mereo.training.trainer import train as train_network
 from mereo.training.trial import STEPS, nearest, small_dataset, timed, trial_steps
 from mereo.visualization.evaluation_report import evaluate_weights
+from mereo.workers.spread import Cluster, spread
 
 # --- schedule ---------------------------------------------------------------------------------------------------------
 
@@ -73,26 +80,15 @@ PASSES = 3.0
 MARGIN = 0.93
 """Share of the time for training that is planned: the machine may have more to do by then."""
 
-LEAST_EXAMPLES, MOST_EXAMPLES = 60, 48_000
-
-HOLDOUT = 32
-"""Examples of the validation curve, at most; it has 20 scores, each of all of them."""
+LEAST_EXAMPLES, MOST_EXAMPLES, LEAST_TESTS, MOST_TESTS = 60, 48_000, 4, 64
 
 OFFSET_EXAMPLES = 128
 """Training examples from which class offsets are chosen."""
 
-LEAST_TESTS, MOST_TESTS = 4, 64
-
 
 @dataclass(frozen=True)
 class Rates:
-    """Seconds that an example takes, measured.
-
-    Attributes:
-        generate_s: to be made, by all processes together.
-        train_s: in a step of training.
-        score_s: to be answered at all its queries.
-    """
+    """Seconds that an example takes to be made by all processes together, to be learnt from, and to be answered."""
 
     generate_s: float
     train_s: float
@@ -101,15 +97,9 @@ class Rates:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is made of the time.
+    """Use of the time: the weights to start from, examples and passes over them, and the seconds of each stage.
 
-    Attributes:
-        init: weights from which training starts.
-        examples: to be made.
-        epochs: passes over those that are not held out.
-        generation_s: expected.
-        training_s: expected, with all that is scored meanwhile.
-        evaluation_s: kept for the scores.
+    ``training_s`` is with all that is scored meanwhile; ``evaluation_s`` is kept for the scores.
     """
 
     init: str
@@ -153,8 +143,8 @@ def epochs_for(
 
 
 def holdout(examples: int) -> int:
-    """Examples held out of so many."""
-    return min(HOLDOUT, examples // 10)
+    """Examples held out of so many for the validation curve, which has 20 scores, each of all of them."""
+    return min(32, examples // 10)
 
 
 def views_for(left_s: float, each_s: float) -> int:
@@ -175,22 +165,14 @@ def _scored_s(examples: int, rates: Rates) -> float:
 
 # --- learn ------------------------------------------------------------------------------------------------------------
 
-SETTINGS, PLAN = CONFIG, "plan.json"
-"""What was asked for, and what was decided, with the measurements behind it."""
+PLAN, METRICS = "plan.json", "metrics.json"
+"""What was decided, with the measurements behind it; scores of the search alone and, where there are weights, of the
+network alone and of both, and which to use."""
 
 DATA, RUN, TEST = "data", "run", "test"
 
-METRICS = "metrics.json"
-"""Scores of the search alone and, where there are weights, of the network alone and of both, and which to use."""
-
 SEED = 1
 """Of examples and training. What is learnt from another one differs by chance alone."""
-
-COMPILED_FROM_MIN = 60.0
-"""Minutes from which compiling the network, which takes one or two, is left to ``compiling_pays``."""
-
-CHECKPOINT_S = 60.0
-"""Seconds between checkpoints: what a stopped run loses at most."""
 
 CALIBRATION_SHARE = 0.25
 """Of the time for the scores: what is then said of them, and of every later frame, rests on it."""
@@ -199,17 +181,32 @@ TIMED = 2
 """Test views that are timed, to know how many there is time for."""
 
 
+@dataclass(frozen=True)
+class LearnConfig:
+    """Settings of learning an object.
+
+    Attributes:
+        minutes: the budget of all stages together.
+        init: weights to start from; empty compares the shipped ones.
+        units: of the meshes; guessed where not given.
+        workers: processes that make examples.
+        train: "auto" trains where the search alone is not good enough (``search_stage.shortcomings``), or where that
+            was begun in the folder; "always" in any case; "never" not at all.
+    """
+
+    minutes: float = 10.0
+    init: str = ""
+    units: str | None = None
+    workers: int = 1
+    train: TrainChoice = "auto"
+
+
 @dataclass
 class Clock:
     """Time of one run of the command, out of its budget."""
 
     budget_s: float
-    started: float
-
-    @classmethod
-    def of(cls, minutes: float) -> "Clock":
-        """Clock that starts now."""
-        return cls(60 * minutes, time.monotonic())
+    started: float = field(default_factory=time.monotonic)
 
     @property
     def left_s(self) -> float:
@@ -225,36 +222,25 @@ class Clock:
 def learn(
     files: Sequence[Path],
     output: Path,
-    *,
-    minutes: float = 10.0,
-    init: str = "",
-    units: str | None = None,
-    workers: int = 1,
-    train: TrainChoice = "auto",
+    config: LearnConfig = LearnConfig(),
 ) -> dict[str, Any]:
     """Learn an object in about so many minutes, where it needs that; returns the scores as ``metrics.json`` has them.
 
     Args:
         files: a scene's name or file, or the object's meshes, as ``mereo scene new`` takes them.
         output: folder to create; one that the same call has begun is continued.
-        minutes: the budget of all stages together.
-        init: weights to start from; empty compares the shipped ones.
-        units: of the meshes; guessed where not given.
-        workers: processes that make examples.
-        train: "auto" trains where the search alone is not good enough (``training_choice.shortcomings``), or where that
-            was begun in the folder; "always" in any case; "never" not at all.
+        config: the settings.
 
-    Raises ``ValueError`` for other arguments than the folder was begun with, and as the stages do.
+    Raises ``ValueError`` for other settings than the folder was begun with, and as the stages do.
     """
-    clock = Clock.of(minutes)
-    if init:
-        find_weights(init)  # a name that is none is better said before the work
+    clock, units, train = Clock(60 * config.minutes), config.units, config.train
+    if config.init:
+        find_weights(config.init)  # a name that is none is better said before the work
     if not (output / PLAN).is_file() and not (output / SEARCH).is_file():
         clock.stage(1, "check the object")
         check(files, units)
-    _claim(
-        output, {"object": [place_of_scene(file) for file in files], "minutes": minutes, "init": init, "units": units}
-    )
+    paths = [place_of_scene(file) for file in files]
+    _claim(output, {"object": paths, "minutes": config.minutes, "init": config.init, "units": units})
     is_begun = (output / PLAN).is_file()
     if is_begun and train == "never":
         raise ValueError(
@@ -269,41 +255,42 @@ def learn(
     print(search_line(searched), flush=True)
     if is_begun or is_to_train(train, reasons):
         print(f"it is trained: {training_reason(train, reasons, is_begun)}", flush=True)
-        _train(scene, output, clock, init, workers, searched.median_s)
+        _train(scene, output, clock, config, searched.median_s)
         test = read_metrics(output / TEST / "metrics.json")
-        metrics = comparison(scores_of_views(output, loaded, named, test["examples"]).summary(), test)
-        advice = advice_after_training(metrics, test["per_segment"], minutes)
+        metrics = _comparison(scores_of_views(output, loaded, named, test["examples"]).summary(), test)
+        advice = advice_after_training(metrics, test["per_segment"], config.minutes)
     else:
         metrics = {"trained": False, "method": "search", **searched.summary(), "search": searched.summary()}
-        advice = advice_without_training(reasons, repeated_command(files, output, minutes, init, units))
+        advice = _advice_without_training(reasons, _repeated_command(files, output, config))
     write_json(output / METRICS, metrics)
     frame = write_example_frame(loaded, output / FRAME)
-    show_outcome(metrics, advice, output, scene, frame, (time.monotonic() - clock.started) / 60)
+    _show_outcome(metrics, advice, output, scene, frame, (time.monotonic() - clock.started) / 60)
     return metrics
 
 
-def _train(scene: str, output: Path, clock: Clock, init: str, workers: int, search_s: float) -> None:
+def _train(scene: str, output: Path, clock: Clock, config: LearnConfig, search_s: float) -> None:
     """Measure, generate, train, calibrate and evaluate; the search will take ``search_s`` seconds of each test view."""
     recipe = recipe_for(clock.budget_s / 60)
-    plan = _decided(output)
-    fresh = plan is None
-    if plan is None:
-        clock.stage(3, "measure this machine, and choose weights to start from")
-        plan = _measured(scene, output, recipe, clock, init, workers)
+    begun = _decided(output)
+    plan = _measured(scene, output, recipe, clock, config) if begun is None else begun
     clock.stage(4, f"generate {plan.examples} examples, about {_duration(plan.generation_s)}")
-    generate(scene, output / DATA, DatasetConfig(MADE_AS, plan.examples, SEED), workers=workers, resume=True)
-    if fresh:
+    dataset = DatasetConfig(MADE_AS, plan.examples, SEED)
+    generate(scene, output / DATA, dataset, workers=config.workers, resume=True)
+    if begun is None:
         plan = _revised(output, plan, clock, recipe.batch)
     clock.stage(
         5, f"train from the weights of {plan.init}, {plan.epochs:.1f} passes, about {_duration(plan.training_s)}"
     )
-    weights = train_network(output / DATA, output / RUN, trained(recipe, plan), checkpoint_every_s=CHECKPOINT_S)
+    offsets = min(OFFSET_EXAMPLES, plan.examples)
+    recipe = replace(
+        recipe, init=plan.init, epochs=plan.epochs, holdout=holdout(plan.examples), offset_examples=offsets
+    )
+    weights = train_network(output / DATA, output / RUN, recipe, checkpoint_every_s=60.0)
     clock.stage(6, "calibrate, and evaluate on views that training has not seen")
-    evaluated = (output / TEST / MARKER).is_file()
-    if not evaluated or not (output / WEIGHTS).is_file():
-        left_s = max(clock.left_s, plan.evaluation_s)
-        each_s = _calibrated(weights, output, scene, left_s)
-        if not evaluated:
+    is_evaluated = (output / TEST / MARKER).is_file()
+    if not is_evaluated or not (output / WEIGHTS).is_file():
+        each_s = _calibrated(weights, output, scene, max(clock.left_s, plan.evaluation_s))
+        if not is_evaluated:
             left_s = max(clock.left_s, (1 - CALIBRATION_SHARE) * plan.evaluation_s)
             examples = views_for(left_s, each_s + search_s)
             evaluate_weights(output / WEIGHTS, output / TEST, EvaluationConfig(scene, examples))
@@ -312,13 +299,8 @@ def _train(scene: str, output: Path, clock: Clock, init: str, workers: int, sear
 def recipe_for(minutes: float) -> TrainConfig:
     """Recipe for a budget, but for what the plan decides."""
     base = PRESETS["base"]
-    return replace(base, compile=base.compile if minutes >= COMPILED_FROM_MIN else "off", seed=SEED)
-
-
-def trained(recipe: TrainConfig, plan: Plan) -> TrainConfig:
-    """Recipe with what the plan decides."""
-    offsets = min(OFFSET_EXAMPLES, plan.examples)
-    return replace(recipe, init=plan.init, epochs=plan.epochs, holdout=holdout(plan.examples), offset_examples=offsets)
+    # compiling takes a minute or two; in an hour that is left to ``compiling_pays``
+    return replace(base, compile=base.compile if minutes >= 60 else "off", seed=SEED)
 
 
 # --- what is kept between runs of the command -------------------------------------------------------------------------
@@ -326,7 +308,7 @@ def trained(recipe: TrainConfig, plan: Plan) -> TrainConfig:
 
 def _claim(output: Path, settings: dict[str, Any]) -> None:
     """Take the folder, or check that it was begun with the same arguments: they bind once something is made of them."""
-    before = claim_directory(output, SETTINGS, settings, "what is learnt")
+    before = claim_directory(output, CONFIG, settings, "what is learnt")
     planned, written = (output / PLAN).is_file(), (output / SCENE).is_file()
     for name, value in settings.items():
         binds = planned or (written and name in ("object", "units"))
@@ -336,7 +318,7 @@ def _claim(output: Path, settings: dict[str, Any]) -> None:
                 "arguments: repeat those, or choose another --output"
             )
     if before not in (None, settings):
-        write_json(output / SETTINGS, settings)
+        write_json(output / CONFIG, settings)
 
 
 def _decided(output: Path) -> Plan | None:
@@ -350,11 +332,12 @@ def _decided(output: Path) -> Plan | None:
         raise ValueError(f"{path} holds no plan; remove it, and it is made again") from None
 
 
-def _measured(scene: str, output: Path, recipe: TrainConfig, clock: Clock, init: str, workers: int) -> Plan:
+def _measured(scene: str, output: Path, recipe: TrainConfig, clock: Clock, config: LearnConfig) -> Plan:
     """The plan by what is measured, which is written down."""
+    clock.stage(3, "measure this machine, and choose weights to start from")
     with scratch_folder(output / "measured") as scratch:
-        rates, start = measure(scene, scratch, recipe, init=init, seed=SEED, workers=workers)
-    plan = plan_for(clock.left_s, rates, start, recipe.batch)
+        rates, init = measure(scene, scratch, recipe, init=config.init, workers=config.workers)
+    plan = plan_for(clock.left_s, rates, init, recipe.batch)
     expected_s = plan.generation_s + plan.training_s + plan.evaluation_s
     if expected_s > 1.1 * max(clock.left_s, 0.0):
         print(f"warning: the least that can be learnt from takes {_duration(expected_s)} from here, more than is left")
@@ -364,11 +347,10 @@ def _measured(scene: str, output: Path, recipe: TrainConfig, clock: Clock, init:
 
 def _revised(output: Path, plan: Plan, clock: Clock, batch: int) -> Plan:
     """The plan with as much training as there is time for, now that the examples are there."""
-    found = json.loads((output / PLAN).read_text("utf-8"))
-    rates = Rates(**found["rates"])
-    again = epochs_for(clock.left_s - plan.evaluation_s, rates, plan.init, plan.examples, batch)
+    rates = json.loads((output / PLAN).read_text("utf-8"))["rates"]
+    again = epochs_for(clock.left_s - plan.evaluation_s, Rates(**rates), plan.init, plan.examples, batch)
     plan = replace(plan, epochs=again.epochs, training_s=again.training_s)
-    write_json(output / PLAN, {**found, "plan": asdict(plan)})
+    write_json(output / PLAN, {"plan": asdict(plan), "rates": rates})
     return plan
 
 
@@ -379,9 +361,9 @@ def _calibrated(weights: Path, output: Path, scene: str, left_s: float) -> float
     each_s = (time.monotonic() - started) / TIMED
     views = min(max(views_for(CALIBRATION_SHARE * left_s, each_s), LEAST_VIEWS), VIEWS)
     # other things than the object would take as long again, and only place the second limit of recognition
-    found = calibrate(load_model(weights), scene, views=views, strangers=False, quiet=False)
-    with atomic_file(output / WEIGHTS) as partial:
-        partial.write_bytes(with_calibration(weights, found))
+    calibration = calibrate(load_model(weights), scene, views=views, strangers=False, quiet=False)
+    with atomic_file(output / WEIGHTS) as scratch:
+        scratch.write_bytes(with_calibration(weights, calibration))
     return each_s
 
 
@@ -399,36 +381,26 @@ MADE_AS = GenerateConfig(sampling=SamplingConfig(uniform_fraction=0.15))
 EXAMPLES = 48
 """Examples that are measured; they are of the seed of training, and are made again with the others."""
 
-PARALLEL = 0.8
-"""What another process adds: cores share memory and caches."""
 
+def measure(scene: str, folder: Path, recipe: TrainConfig, *, init: str, workers: int) -> tuple[Rates, str]:
+    """Seconds that examples take, and the weights to start from: ``init``, or those of the shipped that adapt fastest.
 
-def measure(scene: str, folder: Path, recipe: TrainConfig, *, init: str, seed: int, workers: int) -> tuple[Rates, str]:
-    """Seconds that examples take, and the weights to start from.
-
-    Args:
-        scene: name or file of what is learnt.
-        folder: in which a small dataset and short runs are made; the caller removes it.
-        recipe: of the training.
-        init: weights to start from; empty compares the shipped ones.
-        seed: of the examples.
-        workers: processes that will make them.
-
-    Raises ``ValueError`` where an example cannot be made, or the weights do not fit the recipe.
+    A small dataset and short runs are made in ``folder``, which the caller removes. Raises ``ValueError`` where an
+    example cannot be made, or the weights do not fit the recipe.
     """
     started = time.monotonic()
     with redirect_stdout(StringIO()):  # nobody waits for these few
-        generate(scene, folder / "data", DatasetConfig(MADE_AS, EXAMPLES, seed))
-    # with the template and 100 states, so a little too long
-    generate_s = (time.monotonic() - started) / EXAMPLES / (1 + PARALLEL * (workers - 1))
+        generate(scene, folder / "data", DatasetConfig(MADE_AS, EXAMPLES, SEED))
+    # with the template and 100 states, so a little too long; another process adds 0.8, as cores share memory and caches
+    generate_s = (time.monotonic() - started) / EXAMPLES / (1 + 0.8 * (workers - 1))
     data = small_dataset(folder / "data")
     with progress("measure", trial_steps(compared=not init), "steps") as shown:
-        found = {} if init else nearest(data, recipe, folder, shown)
-        init = init or next(iter(found))
+        losses = {} if init else nearest(data, recipe, folder, shown)
+        init = init or next(iter(losses))
         rates = Rates(generate_s, *timed(data, replace(recipe, init=init), folder, shown))
-    if found:
-        told = ", ".join(f"{name} {loss:.2f}" for name, loss in found.items())
-        print(f"loss after {STEPS} steps from the weights of {told}", flush=True)
+    if losses:
+        listed = ", ".join(f"{name} {loss:.2f}" for name, loss in losses.items())
+        print(f"loss after {STEPS} steps from the weights of {listed}", flush=True)
     return rates, init
 
 
@@ -442,13 +414,8 @@ GOOD = 0.7
 TITLES = {"search": "search alone", "network": "network alone", "both": "both: network first, search where unexplained"}
 
 
-def comparison(search: Mapping[str, Any], test: Mapping[str, Any]) -> dict[str, Any]:
-    """Content of ``metrics.json`` of an object that was trained: the answers, each with its scores, and the best.
-
-    Args:
-        search: summary of the search alone, on the views of ``test``.
-        test: metrics of the weights.
-    """
+def _comparison(search: Mapping[str, Any], test: Mapping[str, Any]) -> dict[str, Any]:
+    """Content of ``metrics.json`` of an object that was trained: the answers, each with its scores, and the best."""
     slowest = next(test[name] for name in ("full", "modes", "network") if name in test)
     both = {
         "iou": test["iou"],
@@ -471,43 +438,26 @@ def comparison(search: Mapping[str, Any], test: Mapping[str, Any]) -> dict[str, 
     }
 
 
-def show_outcome(
+def _show_outcome(
     metrics: Mapping[str, Any], advice: Sequence[str], output: Path, scene: str, frame: str, took_min: float
 ) -> None:
-    """Print the scores, which answer to use, the files, and the command that uses them.
-
-    Args:
-        metrics: content of ``metrics.json``.
-        advice: lines on what the scores mean.
-        output: the folder of what was learnt.
-        scene: its name or file.
-        frame: what the example frame is.
-        took_min: minutes of this run of the command.
-    """
+    """Print the scores, which answer to use, the files, and the command that uses them."""
     print(
         f"\n{metrics['examples']} test views, which training has not seen  {'IoU':>6} {'mIoU':>6} explained  s a frame"
     )
     for name, title in TITLES.items():
         if name in metrics:
-            print(_row(title, metrics[name]))
-    if metrics["trained"]:
-        print(metrics["reason"])
-    for line in advice:
-        print(line)
-    print()
+            scores = metrics[name]
+            explained = f"{scores['explained']:.0%}" if "explained" in scores else "-"
+            figures = f"{format_score(scores['iou'])}  {format_score(scores['miou']):>5} {explained:>9}"
+            print(f"{title:<45} {figures} {scores['seconds']:10.2f}")
+    print(*([metrics["reason"]] if metrics["trained"] else []), *advice, "", sep="\n")
     if metrics["trained"]:
         print(f"report   {output / 'test' / 'report.html'}")
         print(f"weights  {output / WEIGHTS}")
     print(f"frame    {output / FRAME}: {frame}")
     print(f"this run took {took_min:.1f} min; to find the object in a frame:\n")
     print(f"  {command(output, scene, metrics['trained'], metrics['method'])}")
-
-
-def _row(title: str, scores: Mapping[str, Any]) -> str:
-    explained = f"{scores['explained']:.0%}" if "explained" in scores else "-"
-    return f"{title:<45} {format_score(scores['iou'])}  {format_score(scores['miou']):>5} {explained:>9} " + (
-        f"{scores['seconds']:10.2f}"
-    )
 
 
 def command(output: Path, scene: str, is_trained: bool = True, method: str = "auto") -> str:
@@ -524,22 +474,17 @@ def command(output: Path, scene: str, is_trained: bool = True, method: str = "au
     return shlex.join(map(str, [*words, "--output", output / "result"]))
 
 
-def repeated_command(files: Sequence[Path], output: Path, minutes: float, init: str, units: str | None) -> str:
+def _repeated_command(files: Sequence[Path], output: Path, config: LearnConfig) -> str:
     """Command that goes on in the folder with training."""
     words = ["mereo", "learn", *files, "--output", output]
-    words += [] if minutes == 10 else ["--minutes", f"{minutes:g}"]
-    words += ["--init", init] if init else []
-    words += ["--units", units] if units else []
+    words += [] if config.minutes == 10 else ["--minutes", f"{config.minutes:g}"]
+    words += ["--init", config.init] if config.init else []
+    words += ["--units", config.units] if config.units else []
     return shlex.join(map(str, [*words, "--train", "always"]))
 
 
-def advice_without_training(reasons: Sequence[str], training: str) -> list[str]:
-    """Why nothing was trained, and what would train it.
-
-    Args:
-        reasons: shortcomings of the search alone.
-        training: command that trains.
-    """
+def _advice_without_training(reasons: Sequence[str], training: str) -> list[str]:
+    """Why nothing was trained, with the shortcomings of the search alone, and the command that would train it."""
     if reasons:
         return [
             f"nothing is trained, as --train is never; the search alone is not good enough: {', '.join(reasons)}.",
@@ -566,3 +511,45 @@ def advice_after_training(
         f"  more time: the same command with --minutes {3 * minutes:g} and another --output",
         "  narrower deformations, or a camera that stands where yours will (aperture), in the scene file",
     ]
+
+
+# --- a folder of objects ----------------------------------------------------------------------------------------------
+
+
+def learn_objects(folder: Path, output: Path, config: LearnConfig, cluster: Cluster | None = None) -> None:
+    """Learn each object of a folder into ``output``/NAME, in turn or in tasks of a cluster; one that fails is passed.
+
+    The same call continues what was stopped. All nodes of a cluster must see the files and ``output``.
+    Raises ``ValueError`` at the end where an object could not be learnt, before the work as ``list_objects``.
+    """
+    objects = list_objects(folder.absolute())
+    check_place(output, may_be_link=True)
+    output.mkdir(parents=True, exist_ok=True)
+    work = partial(_learn_in_folder, output.absolute(), config, cluster is not None)
+    lines, failed = list[str](), list[str]()
+    with closing(spread(work, objects, cluster or 1, lambda _, error: error)) as results:
+        for (name, _), result in results:
+            if isinstance(result, Exception):
+                if os.environ.get("MEREO_TRACEBACK") == "1":
+                    raise result
+                failed.append(name)
+                print(f"mereo: error: {name}: {words_of(result)}", file=sys.stderr, flush=True)
+                continue
+            scores = f"IoU {format_score(result['iou'])}, mIoU {format_score(result['miou'])}"
+            lines.append(f"{output / name}: {scores}, method {result['method']}")
+    print("", *lines, sep="\n", flush=True)
+    if failed:
+        raise ValueError(
+            f"{len(failed)} of {len(objects)} objects could not be learnt ({', '.join(failed)}), each for the reason "
+            "given with it; the others are written: correct them, and repeat the command"
+        )
+
+
+def _learn_in_folder(output: Path, config: LearnConfig, in_task: bool, item: Learnable) -> Any:
+    if in_task and not output.is_dir():
+        raise FileNotFoundError(f"a node does not see {output}: put objects and --output where all nodes see them")
+    name, files = item
+    print(f"\n{name}: {', '.join(map(str, files))}", flush=True)
+    log = (output / f"{name}.log").open("a", encoding="utf-8") if in_task else nullcontext(sys.stdout)
+    with log as out, redirect_stdout(out), redirect_stderr(out if in_task else sys.stderr):
+        return learn(files, output / name, config)

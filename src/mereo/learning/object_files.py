@@ -1,4 +1,4 @@
-"""What is learnt: a scene, or meshes for which a scene file is written; and what is wrong with it before any work."""
+"""What is learnt: a scene, meshes for which a scene file is written, or a folder of these; and faults of it."""
 
 import json
 import shlex
@@ -11,12 +11,14 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from mereo.geometry.brief import counted
 from mereo.geometry.mesh_check import examine
-from mereo.io.mesh_formats import read_segmented_mesh
+from mereo.io.mesh_formats import MESH_SUFFIXES, read_segmented_mesh
 from mereo.io.volume_files import is_volume
 from mereo.io.writers.meshes import write_positions_ply
 from mereo.scenes.files.build import MeshWarning
 from mereo.scenes.files.check import check_scene
+from mereo.scenes.files.joints import SLIDES_ALONG, TURNS_ON
 from mereo.scenes.files.template import write_scene_file
 from mereo.scenes.registry import is_yaml, load_scene
 from mereo.scenes.scene import SCENES, Scene
@@ -30,11 +32,37 @@ SCENE = "scene.yaml"
 SEARCH = "search.json"
 """File of a folder of ``mereo learn`` with the scores of the search alone, and the scene's name or file."""
 
-STATES = 24
-"""Random states from which it is seen how far an object deforms."""
+FRAME = "frame.ply"
+"""File of a frame to try the object on."""
 
-HARDLY = 0.005
-"""Mean way of the surface from its mean place, as a share of the object's length, below which it hardly deforms."""
+Learnable = tuple[str, list[Path]]
+"""Name and files of an object."""
+
+
+def list_objects(folder: Path) -> list[Learnable]:
+    """Names and files of objects: each scene file (.yaml, .py) in it, each subfolder with one, or with meshes.
+
+    Raises ``ValueError`` for a folder without objects, with two of one name, or with meshes of its own.
+    """
+    objects: list[Learnable] = []
+    if loose := shapes_in(folder):
+        raise ValueError(f"{loose[0]} lies loose in a folder of objects: put the meshes of each into a subfolder")
+    for path in sorted(folder.glob("[!.]*")):
+        files = sorted(path.glob("[!.]*")) if path.is_dir() else [path]
+        if content := [file for file in files if is_yaml(file) or file.suffix == ".py"] or shapes_in(path):
+            objects.append((path.name if path.is_dir() else path.stem, content))
+    names = [name.casefold() for name, _ in objects]  # some systems ignore case
+    if not objects or len({*names}) < len(names):
+        raise ValueError(
+            f"{folder} has {f'two objects of one name among {names}' if objects else 'no objects'}; each is a scene "
+            "file (.yaml, .py) in it, or a subfolder with a scene file, meshes, or a label volume: add or rename some"
+        )
+    return objects
+
+
+def shapes_in(folder: Path) -> list[Path]:
+    """Meshes and label volumes that lie in a folder, in the order of their names."""
+    return sorted(file for file in folder.glob("[!.]*") if file.suffix.lower() in MESH_SUFFIXES or is_volume(file))
 
 
 def names_scene(files: Sequence[Path]) -> bool:
@@ -78,12 +106,8 @@ def scene_for(files: Sequence[Path], folder: Path, units: str | None, quiet: boo
     path = folder / SCENE
     if not path.is_file():
         write_scene_file(files, path, units, name=files[0].name.split(".")[0])
-        if quiet:
-            return str(path)
-        print(
-            f"wrote {path}: the object bends as if it were of rubber; where it has joints or moves in other ways, say "
-            "so in that file (docs/own-object.md), and learn it anew: mereo learn FILE --output ANOTHER"
-        )
+        if not quiet:
+            print(describe_scene_file(path))
     return str(path)
 
 
@@ -102,14 +126,30 @@ def scene_of_meshes(files: Sequence[Path], units: str | None = None) -> Scene:
                 solid = "name a file of its whole, closed surface" + (f", or {cure}" if health.mendable else "")
                 fault = f"segment {part.name!r} of {file} {health.hopeless[0]}"
                 raise ValueError(f"{fault}; an object's parts are solids: {solid}")
-    with TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as told:
+    with TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", MeshWarning)
         path = write_scene_file(files, Path(folder) / SCENE, units, name=files[0].name.split(".")[0])
         scene = load_scene(path)
-    for one in told:  # which name the file that is gone
-        text = str(one.message).replace(f"{path}: ", "")
-        warnings.warn(text.replace(f"repair it with `mereo scene check {path} --repair`", cure), one.category, 2)
+    for warning in caught:  # which name the file that is gone
+        text = str(warning.message).replace(f"{path}: ", "")
+        warnings.warn(text.replace(f"repair it with `mereo scene check {path} --repair`", cure), warning.category, 2)
     return replace(scene, file=None)
+
+
+def describe_scene_file(path: Path) -> str:
+    """What a user should know of the scene file that was written for their meshes, before minutes go by."""
+    joints = sum(line.startswith((TURNS_ON, SLIDES_ALONG)) for line in path.read_text("utf-8").splitlines())
+    start = f"wrote {path}: the object bends as if it were of rubber"
+    if joints == 0:
+        return (
+            f"{start}; where it has joints or moves in other ways, say so in that file (docs/own-object.md), and learn "
+            "it anew: mereo learn FILE --output ANOTHER"
+        )
+    return (
+        f"{start}. Its parts touch like {counted(joints, 'joint')}, which that file proposes in comments: if it has "
+        "them, stop with Ctrl-C, take the # away from them and the rubber out (docs/own-object.md), and mereo learn "
+        "FILE --output ANOTHER"
+    )
 
 
 def check(files: Sequence[Path], units: str | None) -> None:
@@ -127,7 +167,7 @@ def check(files: Sequence[Path], units: str | None) -> None:
             raise ValueError(_refusal(files)) from None
         loaded = load_scene(scene)
     way = deformation(loaded)
-    if way < HARDLY:
+    if way < 0.005:
         place = f" in {files[0]}" if names_scene(files) and is_yaml(files[0]) else ""
         print(
             f"warning: {loaded.name} hardly deforms: by {way:.2%} of its length; if it does more than that, widen its "
@@ -149,17 +189,10 @@ def _refusal(files: Sequence[Path]) -> str:
 
 def deformation(scene: Scene) -> float:
     """Mean distance of vertices from their mean place over random states, as a share of the object's longest side."""
-    states = np.stack([scene.sample_state(example_rng(0, index)).mesh.merged()[0] for index in range(STATES)])
+    states = np.stack([scene.sample_state(example_rng(0, index)).mesh.merged()[0] for index in range(24)])
     states -= states.mean(axis=1, keepdims=True)
     low, high = scene.rest.bounds
     return float(np.linalg.norm(states - states.mean(axis=0), axis=-1).mean() / (high - low).max())
-
-
-# --- an example frame -------------------------------------------------------------------------------------------------
-
-# A frame to try weights on: a test view of the scene as a point cloud in metres, as `mereo reconstruct` reads it.
-
-FRAME = "frame.ply"
 
 
 def write_example_frame(scene: Scene, path: Path) -> str:

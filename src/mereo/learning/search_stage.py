@@ -30,10 +30,6 @@ from mereo.synthesis.config import GenerateConfig
 
 # --- scores of the search ---------------------------------------------------------------------------------------------
 
-# Scores of an object without weights on synthetic views: each is answered by the search, and nothing is trained.
-#
-# scene -kept_model-> statistical model -search in each view-> SearchScores
-
 
 @dataclass(frozen=True, eq=False)
 class SearchScores:
@@ -75,7 +71,7 @@ class SearchScores:
             "examples": len(self),
             "iou": scores.iou,
             "miou": scores.miou,
-            "lowest_miou": min(intersection_over_union(one).miou for one in self.confusions),
+            "lowest_miou": min(intersection_over_union(view).miou for view in self.confusions),
             "explained": float(self.explained.mean()),
             "seconds": self.median_s,
         }
@@ -111,10 +107,9 @@ def score_search(
     least: int = 1,
     budget_s: float = float("inf"),
     cells: int = CELLS,
-    seed: int = TEST_SEED_START,
     begun: SearchScores | None = None,
 ) -> SearchScores:
-    """Score the search alone on the views that ``scoring.evaluate`` takes, in their order.
+    """Score the search alone on the test views that ``scoring.evaluate`` takes, in their order.
 
     Args:
         scene: the object's.
@@ -122,7 +117,6 @@ def score_search(
         least: how many at least, whatever time they take.
         budget_s: seconds after which no further view is begun.
         cells: cells of the grid along each axis.
-        seed: of the views; at least ``TEST_SEED_START``, where training shall not have seen them.
         begun: scores of the first views, which are not made again.
     """
     registrar = Registrar(None, kept_model(scene), given=scene)
@@ -133,17 +127,15 @@ def score_search(
         rows += zip(begun.confusions, begun.explained.tolist(), begun.seconds.tolist(), strict=True)
     with progress("score the search", views - len(rows), "views") as shown:
         while len(rows) < views and (len(rows) < least or time.monotonic() - started < budget_s):
-            rows.append(_scored(scene, registrar, seed, cells, len(rows)))
+            rows.append(_scored(scene, registrar, cells, len(rows)))
             shown.advance()
     confusions, explained, seconds = zip(*rows, strict=True)
     return SearchScores(names, np.stack(confusions), np.array(explained), np.array(seconds))
 
 
-def _scored(
-    scene: Scene, registrar: Registrar, seed: int, cells: int, index: int
-) -> tuple[Int[np.ndarray, "c c"], bool, float]:
+def _scored(scene: Scene, registrar: Registrar, cells: int, index: int) -> tuple[Int[np.ndarray, "c c"], bool, float]:
     """Confusion matrix, whether the view is explained, and seconds; a view in which nothing is found scores 0."""
-    case = scene_case(scene, GenerateConfig(), seed, cells, index)
+    case = scene_case(scene, GenerateConfig(), TEST_SEED_START, cells, index)
     started = time.perf_counter()
     labels, explained = np.zeros_like(case.truth.grid.labels), False
     try:
@@ -168,12 +160,7 @@ SEARCH_SHARE = 0.1
 def search_scores(output: Path, scene: Scene, named: str, budget_s: float, cells: int = CELLS) -> SearchScores:
     """Scores of the search alone: those in ``output``, or else of as many views as there is time for.
 
-    Args:
-        output: the folder of what is learnt.
-        scene: the object's.
-        named: the scene's name or absolute file, by which ``load_object`` will know the folder's object.
-        budget_s: seconds for all views.
-        cells: cells of the grid along each axis.
+    ``named`` is the scene's name or absolute file, by which ``load_object`` will know the folder's object.
 
     Raises ``ValueError`` where the folder has scores of another object, or a file that holds none.
     """
@@ -229,10 +216,6 @@ def _read(output: Path, scene: Scene) -> SearchScores:
 
 # --- whether to train -------------------------------------------------------------------------------------------------
 
-# Whether an object is trained, by the scores of the search alone, and at the end which of the answers to use.
-#
-# Arithmetic on scores, without files or clocks.
-
 TrainChoice = Literal["auto", "always", "never"]
 """When to train: where the search alone is not good enough, in any case, or not at all."""
 
@@ -247,11 +230,7 @@ LOWEST = 0.5
 
 
 def shortcomings(search: Mapping[str, Any]) -> list[str]:
-    """Reasons why the search alone is not good enough; none where it is.
-
-    Args:
-        search: ``SearchScores.summary``.
-    """
+    """Reasons why the search alone is not good enough, by its ``SearchScores.summary``; none where it is."""
     views, missed = search["examples"], round((1 - search["explained"]) * search["examples"])
     reasons = []
     if missed:

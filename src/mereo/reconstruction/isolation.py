@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mereo.geometry.brief import counted
-from mereo.geometry.camera import DepthImage, PointCloud, into_camera
+from mereo.geometry.camera import PointCloud, into_camera
 from mereo.geometry.conventions import MIN_POINTS, CloudAxes
 from mereo.geometry.downsampling import MAX_POINTS, spacing, thin_to_grid
 from mereo.geometry.surface_patches import STRETCH, stretch, surface_patches
@@ -65,10 +65,9 @@ class IsolationStep:
 
 
 Keep = tuple[Bool[np.ndarray, " n"], str]
-"""Points that a step keeps, and what it found in words."""
+"""Points that a step keeps, and why in words."""
 
 Step = Callable[[Float[np.ndarray, "_ 3"]], Keep]
-"""Function from points to those it keeps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,41 +97,23 @@ class Selection:
         return whole
 
 
-def isolate(
-    seen: PointCloud | DepthImage,
-    config: IsolationConfig,
-    unit_m: float = 1.0,
-    frame: CloudAxes = "camera",
-    rng: np.random.Generator | None = None,
-) -> tuple[PointCloud, tuple[IsolationStep, ...]]:
-    """Points of the object, and what each step left out.
+def select_object(
+    cloud: PointCloud, config: IsolationConfig, unit_m: float = 1.0, frame: CloudAxes = "camera"
+) -> Selection:
+    """Select the object's points of a cloud.
 
     Args:
-        seen: everything that was seen, any unit.
+        cloud: everything that was seen, any unit.
         config: the steps. Before one that compares neighbours, a cloud of more than ``MAX_POINTS`` is thinned evenly
             in space.
-        unit_m: metres per unit of ``seen``.
+        unit_m: metres per unit of ``cloud``.
         frame: its axes. In a camera's the noise is taken to grow with distance squared, as that of depth cameras does.
-        rng: draws the planes that are tried; by default always the same ones.
 
     Raises ``ValueError`` where fewer than ``MIN_POINTS`` points are left, naming the step and its cure.
     """
-    cloud = seen.to_points() if isinstance(seen, DepthImage) else seen
-    selection = select_object(cloud, config, unit_m, frame, rng)
-    return cloud if selection.keep.all() else PointCloud(cloud.points[selection.keep]), selection.steps
-
-
-def select_object(
-    cloud: PointCloud,
-    config: IsolationConfig,
-    unit_m: float = 1.0,
-    frame: CloudAxes = "camera",
-    rng: np.random.Generator | None = None,
-) -> Selection:
-    """Select the object's points of a cloud; takes the arguments of ``isolate`` and raises as it does."""
     points, rows, done = cloud.points, np.arange(len(cloud)), list[IsolationStep]()
     thinned, compared = np.zeros(len(cloud), dtype=bool), np.ones(len(cloud), dtype=bool)
-    for name, step in _steps(config, unit_m, frame, np.random.default_rng(0) if rng is None else rng):
+    for name, step in _steps(config, unit_m, frame):
         keep, detail = step(points)
         left = int(keep.sum())
         if left < MIN_POINTS:
@@ -166,9 +147,7 @@ def _numbers(position: Float[np.ndarray, "3"]) -> str:
     return f"({', '.join(f'{value:.3g}' for value in position)})"
 
 
-def _steps(
-    config: IsolationConfig, unit_m: float, frame: CloudAxes, rng: np.random.Generator
-) -> Iterator[tuple[str, Step]]:
+def _steps(config: IsolationConfig, unit_m: float, frame: CloudAxes) -> Iterator[tuple[str, Step]]:
     """Steps that are on, in their order: what is cheap and sure comes first."""
     if config.depth_range is not None:
         near, far = (limit / unit_m for limit in config.depth_range)
@@ -177,7 +156,7 @@ def _steps(
         low, high = np.array(config.box).reshape(2, 3) / unit_m
         yield "box", lambda points: (((points >= low) & (points <= high)).all(axis=1), "")
     if config.remove_plane:
-        yield "plane", lambda points: _off_plane(points, unit_m, frame, rng)
+        yield "plane", lambda points: _off_plane(points, unit_m, frame)
     if config.remove_outliers or config.largest_cluster:
         yield "thinning", _thinned
     if config.largest_cluster:
@@ -189,12 +168,12 @@ def _steps(
 # --- steps -----------------------------------------------------------------------------------------------------------
 
 
-def _off_plane(points: Float[np.ndarray, "n 3"], unit_m: float, frame: CloudAxes, rng: np.random.Generator) -> Keep:
+def _off_plane(points: Float[np.ndarray, "n 3"], unit_m: float, frame: CloudAxes) -> Keep:
     tolerance = np.full(len(points), PLANE_SPACINGS * spacing(points))
     middle = np.median(points[:, 2])
     if frame == "camera" and middle > 0:  # what lies behind the camera is refused later
         tolerance *= np.maximum(points[:, 2] / middle, 1.0) ** 2
-    plane = largest_plane(points, tolerance, rng)
+    plane = largest_plane(points, tolerance, np.random.default_rng(0))
     off = np.ones(len(points), dtype=bool) if plane is None else plane.distance(points) > tolerance
     share = 1.0 - off.mean()
     if plane is None or share < PLANE_SHARE:

@@ -200,8 +200,8 @@ def _contradicted(
     largest, smallest = np.zeros_like(labels), np.full_like(labels, 255)
     largest[place] = smallest[place] = labels[place]
     largest, smallest = _over_neighbors(largest, np.maximum), _over_neighbors(smallest, np.minimum)
-    found: np.ndarray = skipped & ((largest > labels) | (smallest < labels))
-    return found
+    contradicted: np.ndarray = skipped & ((largest > labels) | (smallest < labels))
+    return contradicted
 
 
 def _over_neighbors(values: np.ndarray, combine: np.ufunc) -> np.ndarray:
@@ -278,8 +278,8 @@ def extract(
         _surface(sampled, grid, [index + 1, *(inner + 1 for inner, outer in empty.nesting if outer == index)])
         for index in range(len(names))
     ]
-    found = (replace(s, vertices=v, faces=f) for s, (v, f) in zip(empty.segments, surfaces, strict=True))
-    return Extraction(replace(empty, segments=tuple(found)), grid, len(sampled.logits))
+    segments = (replace(s, vertices=v, faces=f) for s, (v, f) in zip(empty.segments, surfaces, strict=True))
+    return Extraction(replace(empty, segments=tuple(segments)), grid, len(sampled.logits))
 
 
 def _grid(
@@ -313,7 +313,7 @@ def locate(field: Field, box: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "2 
         if not touched.any():
             break
         box = _grown(box, touched, 0.25)
-    _check_found(grid)
+    _check_occupied(grid)
     occupied = np.argwhere(grid.labels > 0)
     low, high = grid.positions(occupied.min(axis=0) - 2), grid.positions(occupied.max(axis=0) + 2)
     return np.stack([np.maximum(low, box[0]), np.minimum(high, box[1])])
@@ -331,18 +331,18 @@ def extract_whole(
 
     It grows at most ``GROWTHS`` times. Raises ``ValueError`` where the field knows only empty space.
     """
-    found = extract(field, box, resolution, names, colors, nested)
+    extraction = extract(field, box, resolution, names, colors, nested)
     for _ in range(GROWTHS):
-        touched = found.grid.touched_sides()
+        touched = extraction.grid.touched_sides()
         if not touched.any():
             break
         box = _grown(box, touched, 0.1)
-        found = extract(field, box, resolution, names, colors, nested)
-    _check_found(found.grid)
-    return found
+        extraction = extract(field, box, resolution, names, colors, nested)
+    _check_occupied(extraction.grid)
+    return extraction
 
 
-def _check_found(grid: LabelGrid) -> None:
+def _check_occupied(grid: LabelGrid) -> None:
     if not grid.labels.any():
         raise ValueError(
             "the model finds no segment near the cloud, only empty space; the cloud must show the object it was "
@@ -387,10 +387,10 @@ def _margin(
     """
     known = rows >= 0
     values = logits[rows[known]].astype(np.float64)
-    own = values[:, held].max(axis=1)
+    largest = values[:, held].max(axis=1)
     values[:, held] = -np.inf
     margin = np.where(np.isin(labels, held), 1.0, -1.0)
     sign = margin[known]
-    least = 1e-6 * np.abs(own).max(initial=1e-6)
-    margin[known] = sign * np.maximum(sign * (own - values.max(axis=1)), least)
+    least = 1e-6 * np.abs(largest).max(initial=1e-6)
+    margin[known] = sign * np.maximum(sign * (largest - values.max(axis=1)), least)
     return margin

@@ -297,8 +297,7 @@ def lines_of_image(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SightLi
     past &= _agrees(np.where(past, depth - near, 0.0))
     hides = (depth > 0) & ~is_object & (distance <= RIM) & (near - depth > step * near)
     past &= (depth > (1 + step) * near.max()) | ~_surfaces_with(hides, np.where(is_object, 0.0, depth), step)
-    beside = inside & (distance > RIM)
-    silent = past.sum() < max(SILENT * beside.sum(), 1)
+    silent = past.sum() < max(SILENT * (inside & (distance > RIM)).sum(), 1)
     unknown = ~is_object & ~past & ((inside & ((depth > 0) | (not silent))) | (~inside & cut))
     v, u = np.nonzero(past | unknown)
     kept = _evenly(u, v, distance[v, u], MOST_LINES)
@@ -344,8 +343,8 @@ def _surfaces_with(
     number = np.arange(depth.size).reshape(depth.shape)
     pairs = []
     for first, second in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        one, other = depth[first], depth[second]
-        joined = (one > 0) & (other > 0) & (np.abs(one - other) < step * np.minimum(one, other))
+        near, far = depth[first], depth[second]
+        joined = (near > 0) & (far > 0) & (np.abs(near - far) < step * np.minimum(near, far))
         pairs.append(np.stack([number[first][joined], number[second][joined]]))
     row, column = np.concatenate(pairs, axis=1)
     edges = coo_matrix((np.ones(len(row), dtype=np.int8), (row, column)), shape=(depth.size, depth.size))
@@ -412,16 +411,16 @@ def lines_of_points(points: Float[np.ndarray, "n 3"], is_object: Bool[np.ndarray
     others = np.flatnonzero(~is_object & (points[:, 2] > 0))
     if len(others) == 0 or not is_object.any():
         return SightLines.of_cloud()
-    tree, own = cKDTree(sight[is_object]), points[is_object, 2]
+    tree, depth = cKDTree(sight[is_object]), points[is_object, 2]
     # the fourth neighbour of a pixel is one pitch away, as the first is
-    pitch = float(np.median(tree.query(tree.data, k=[min(len(own), 5)])[0]))
+    pitch = float(np.median(tree.query(tree.data, k=[min(len(depth), 5)])[0]))
     size = float(np.ptp(tree.data, axis=0).max())
     angle = tree.query(sight[others], distance_upper_bound=max(size, pitch))[0]
     # along a line that met the object, nothing else is said
-    there = (angle > 0.5 * pitch) & np.isfinite(angle)
-    others, angle = others[there], angle[there]
-    nearest = tree.query(sight[others], k=range(1, min(len(own), AROUND) + 1))[1]
-    near = np.median(own[nearest], axis=1)
+    is_free = (angle > 0.5 * pitch) & np.isfinite(angle)
+    others, angle = others[is_free], angle[is_free]
+    nearest = tree.query(sight[others], k=range(1, min(len(depth), AROUND) + 1))[1]
+    near = np.median(depth[nearest], axis=1)
     past = (points[others, 2] - near > STEEPEST * pitch * near) & (angle > RIM * pitch)
     ahead = tree.data.mean(axis=0)
     across = np.linalg.svd(ahead[None])[2][1:]

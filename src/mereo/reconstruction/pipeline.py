@@ -14,21 +14,58 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
+from scipy import ndimage
+from scipy.special import expit, logsumexp, softmax
 
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud, into_camera
 from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.downsampling import random_subset
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
-from mereo.geometry.mesh import PALETTE, Color, SegmentedMesh
+from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
 from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.models.calibration import Calibration
 from mereo.models.trained import EncodedCloud, Trained, checked_points
 from mereo.reconstruction.isolation import Reading
-from mereo.reconstruction.isosurfaces import Field, extract_whole, locate
-from mereo.reconstruction.segment_statistics import FoundSegment, measure, segment_points
+from mereo.reconstruction.isosurfaces import Extraction, Field, extract_whole, locate
 
 SEARCH_BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 2.5]])
 """Box in which segments are looked for first, normalized: the visible part fills [-1, 1], the hidden one is behind."""
+
+
+CONFIDENCE_VOXELS = 2000
+"""Most voxels of a segment over which its confidence is a mean."""
+
+
+@dataclass(frozen=True, eq=False)
+class FoundSegment:
+    """Segment in numbers, in the input's frame and units.
+
+    Attributes:
+        name, label: of the segment.
+        volume: inside its surface, less what is nested in it; 0 where it was not found.
+        centroid: mean of its voxels, NaN where it was not found.
+        box: lower and upper corner of its surface, NaN where it was not found.
+        confidence: mean probability that the network gives it over its voxels; NaN where it was not found, and
+            without a network.
+        voxels: how many of the label grid it has.
+        components: connected groups of voxels (over faces); more than one may be a fleck, and nothing is removed.
+    """
+
+    name: str
+    label: int
+    volume: float
+    centroid: Float[np.ndarray, "3"]
+    box: Float[np.ndarray, "2 3"]
+    confidence: float
+    voxels: int
+    components: int
+
+    def __repr__(self) -> str:
+        sure = "" if np.isnan(self.confidence) else f", confidence {self.confidence:.2f}"
+        figures = f"volume {self.volume:.3g}{sure}" if self.voxels else "not found"
+        return f"FoundSegment({self.name!r}, {figures})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,10 +106,10 @@ class Reconstruction:
         return sum(self.timings_s.values())
 
     def __repr__(self) -> str:
-        found = sum(segment.voxels > 0 for segment in self.segments)
+        present = sum(segment.voxels > 0 for segment in self.segments)
         segments = f"{counted(len(self.segments), 'segment')} found: {listed(s.name for s in self.segments)}"
         points = counted(len(self.reading.cloud), "point")
-        return f"Reconstruction({found} of {segments}; {points}, {self.seconds:.1f} s)"
+        return f"Reconstruction({present} of {segments}; {points}, {self.seconds:.1f} s)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,20 +176,20 @@ def extract(seen: EncodedFrame, model: Trained, resolution: int = 128, label_poi
     with timed(seconds, "locate"):
         box = locate(field, code.normalizer.invert(SEARCH_BOX))
     with timed(seconds, "extract"):
-        found = extract_whole(field, box, resolution, names, colors, model.nested if model.segmented else ())
+        extraction = extract_whole(field, box, resolution, names, colors, model.nested if model.segmented else ())
     with timed(seconds, "measure"):
-        segments = measure(found, model, code)
+        segments = measure(extraction, model, code)
     observed = None
     if label_points:
         with timed(seconds, "points"):
             observed = segment_points(field(seen.seen.points), seen.points, names, colors, model.calibration)
     result = Reconstruction(
-        surfaces=found.surfaces,
-        labels=found.grid,
+        surfaces=extraction.surfaces,
+        labels=extraction.grid,
         segments=segments,
         timings_s=seconds,
-        evaluated=found.evaluated,
-        clipped=bool(found.grid.touched_sides().any()),
+        evaluated=extraction.evaluated,
+        clipped=bool(extraction.grid.touched_sides().any()),
         code=code,
         T_camera_input=seen.T_camera_input,
         reading=seen.reading,
@@ -195,3 +232,75 @@ def turned_back(result: Reconstruction) -> Reconstruction:
         for segment in result.segments
     )
     return replace(result, surfaces=result.surfaces.transformed(T_scanner_camera), labels=labels, segments=segments)
+
+
+# --- segments in numbers ----------------------------------------------------------------------------------------------
+
+
+def segment_points(
+    logits: Float[np.ndarray, "n c"],
+    points: Float[np.ndarray, "n 3"],
+    names: tuple[str, ...],
+    colors: tuple[Color, ...],
+    calibration: Calibration | None = None,
+    labels: UInt8[np.ndarray, " n"] | None = None,
+) -> SegmentedCloud:
+    """Segment of each point from the model's logits there, and the model's probability of it.
+
+    Args:
+        logits: of empty space and each segment.
+        points: in the input's frame and unit.
+        names: of the segments.
+        colors: of the segments.
+        calibration: of the weights, by which probabilities are made of logits; labels do not depend on it.
+        labels: of the points, 1 or more, where another than the network says them.
+    """
+    labels = (logits[:, 1:].argmax(axis=1) + 1).astype(np.uint8) if labels is None else labels
+    scaled = logits
+    if calibration is not None:
+        from mereo.models.model import scaled_array
+
+        scaled = scaled_array(calibration.scaling, logits)
+    parts = scaled[:, 1:].astype(np.float64)
+    return SegmentedCloud(
+        points=points,
+        labels=labels,
+        confidence=np.take_along_axis(softmax(parts, axis=1), labels[:, None].astype(np.int64) - 1, axis=1)[:, 0],
+        occupancy=expit(logsumexp(parts, axis=1) - scaled[:, 0]),
+        names=names,
+        colors=colors,
+    )
+
+
+def measure(extraction: Extraction, model: Trained | None, code: EncodedCloud | None) -> tuple[FoundSegment, ...]:
+    """Every segment of an extraction in numbers; ``code`` is what ``model`` made of the cloud, None without one."""
+    owned = zip(extraction.surfaces.segments, extraction.surfaces.owned_volumes, strict=True)
+    return tuple(
+        _measure(extraction.grid, label, segment, float(volume), model, code)
+        for label, (segment, volume) in enumerate(owned, start=1)
+    )
+
+
+def _measure(
+    grid: LabelGrid, label: int, segment: Segment, volume: float, model: Trained | None, code: EncodedCloud | None
+) -> FoundSegment:
+    voxels = np.argwhere(grid.labels == label)
+    if len(voxels) == 0:
+        nothing = np.full((2, 3), np.nan)
+        return FoundSegment(segment.name, label, 0.0, nothing[0], nothing, float("nan"), 0, 0)
+    confidence = float("nan")
+    if model is not None and code is not None:
+        chosen = random_subset(voxels, CONFIDENCE_VOXELS)
+        confidence = float(model.query(code, grid.positions(chosen)).probability[:, label].mean())
+    low, high = voxels.min(axis=0), voxels.max(axis=0) + 1
+    part = grid.labels[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+    return FoundSegment(
+        name=segment.name,
+        label=label,
+        volume=volume,
+        centroid=grid.positions(voxels).mean(axis=0),
+        box=segment.bounds,
+        confidence=confidence,
+        voxels=len(voxels),
+        components=int(ndimage.label(part == label)[1]),
+    )

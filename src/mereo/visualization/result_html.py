@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.reconstruction.segment_statistics import FoundSegment
+from mereo.reconstruction.pipeline import FoundSegment
 from mereo.visualization.contact_sheets import data_url
 from mereo.visualization.previews import CAMERA_VIEWS, points_on_segments
 from mereo.visualization.report_words import confidence_title

@@ -19,8 +19,16 @@ from mereo.models.trained import Trained
 from mereo.reconstruction.isolation import Reading
 from mereo.reconstruction.isosurfaces import Extraction
 from mereo.reconstruction.observation import Observation
-from mereo.reconstruction.pipeline import EncodedFrame, Reconstruction, encode_frame, extract, timed, turned_back
-from mereo.reconstruction.segment_statistics import measure, segment_points
+from mereo.reconstruction.pipeline import (
+    EncodedFrame,
+    Reconstruction,
+    encode_frame,
+    extract,
+    measure,
+    segment_points,
+    timed,
+    turned_back,
+)
 
 
 @dataclass(frozen=True, eq=False)

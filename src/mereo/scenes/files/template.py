@@ -24,6 +24,7 @@ from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.volume_files import is_volume, read_label_volume, segment_surfaces
 from mereo.scenes.files.deformation_blocks import BendBlock, DeformationBlock, LatticeBlock, Target
+from mereo.scenes.files.joints import SLIDES_ALONG, TURNS_ON, proposed_joints
 from mereo.scenes.scene import SCENES, Workspace
 from mereo.scenes.seeds import example_rng
 
@@ -214,7 +215,10 @@ LABEL_CELLS = 64
 
 @dataclass(frozen=True, eq=False)
 class _Source:
-    """Segments of files in their unit, the lines that name them, and the likely unit and upward axis, with reasons."""
+    """Segments of files in their unit, the lines that name them, and the likely unit and upward axis, with reasons.
+
+    ``assembly`` is whether the segments are parts, which may have joints, and not regions of one body.
+    """
 
     block: str
     mesh: SegmentedMesh
@@ -222,6 +226,7 @@ class _Source:
     reason: str
     up: int
     up_reason: str
+    assembly: bool = True
 
 
 def write_scene_file(
@@ -309,7 +314,7 @@ def _from_volume(file: Path, relative: str) -> _Source:
     lines = [f"labels: {quoted(relative)}", "names:  # of the volume's values; delete what is not wanted"]
     lines += [f"  {value}: {quoted(name)}" for value, name in names.items()]
     lines.append(f"cells: {LABEL_CELLS}  # of the grid along the longest side on which surfaces are found")
-    return _Source("\n".join(lines), mesh, "mm", "the convention of NIfTI and NRRD", 2, "z is to the head")
+    return _Source("\n".join(lines), mesh, "mm", "the convention of NIfTI and NRRD", 2, "z is to the head", False)
 
 
 def _unit_of(file: Path, bounds: Float[np.ndarray, "2 3"]) -> tuple[str, str]:
@@ -362,11 +367,29 @@ def _text(name: str, source: _Source, units: str | None) -> str:
         axis=[int(value) for value in bend.axis],
         length=f"{bend.length:g}",
         angle=f"{bend.angle[1]:g}",
-        part=quoted(source.mesh.names[-1]),
-        center=_numbers(source.mesh.bounds.mean(axis=0)),
+        joints=_joints(source.mesh, source.assembly),
         push=f"{0.1 * sides.min():.3g}",
         reach=f"{0.5 * sides.min():.3g}",
     )
+
+
+def _joints(mesh: SegmentedMesh, assembly: bool) -> str:
+    """Comments: the joints that the parts seem to have, and what each was derived from; else an example."""
+    lines = list[str]()
+    for joint in proposed_joints(mesh) if assembly else ():
+        contact = joint.contact
+        kind = f"the round contact, radius {contact.radius:.3g}," if joint.hinge else "the flat contact"
+        lines += [
+            f"{TURNS_ON if joint.hinge else SLIDES_ALONG} {kind} of {mesh.names[contact.first]} and "
+            f"{mesh.names[contact.second]}",
+            f"#    segments: [{', '.join(quoted(mesh.names[index]) for index in joint.moved)}]",
+            f"#    pivot: {_numbers(contact.point)}",
+            f"#    axis: {_numbers(joint.axis)}",
+            f"#    {'angle' if joint.hinge else 'slide'}: [{joint.most[0]:.4g}, {joint.most[1]:.4g}]",
+        ]
+    if not lines:
+        return EXAMPLE_JOINT.format(part=quoted(mesh.names[-1]), center=_numbers(mesh.bounds.mean(axis=0)))
+    return "".join(line + "\n" for line in (JOINTS, *lines))
 
 
 def _color(number: int) -> str:
@@ -384,6 +407,16 @@ def _numbers(values: Float[np.ndarray, "3"]) -> str:
     largest = max(float(np.abs(values).max()), 1e-12)  # what is nothing beside it is rounding
     return "[" + ", ".join(f"{value if abs(value) > 1e-4 * largest else 0.0:.4g}" for value in values) + "]"
 
+
+JOINTS = "# Joints that the contacts suggest, in ranges without collisions; remove the '#'. The tip comes first:"
+
+EXAMPLE_JOINT = """\
+#  - type: joint  # rigid, and before what bends the whole; in a chain, the joint at the tip comes first
+#    segments: [{part}]
+#    pivot: {center}
+#    axis: [0, 0, 1]
+#    angle: [-30, 30]
+"""
 
 TEMPLATE = """\
 # A scene for mereo: what the object is, how it may deform, and from where it is seen.
@@ -411,12 +444,7 @@ camera:
 # Segments that touch should move by the same deformations, so that they stay in contact. These bend the object as if it
 # were of rubber, as far as suits soft things: for what has joints, drop them and say how its parts move.
 deformations:
-#  - type: joint  # rigid, and before what bends the whole; in a chain, the joint at the tip comes first
-#    segments: [{part}]
-#    pivot: {center}
-#    axis: [0, 0, 1]
-#    angle: [-30, 30]
-  - type: bend  # along the longest side, to any side
+{joints}  - type: bend  # along the longest side, to any side
     origin: {end}
     axis: {axis}
     length: {length}

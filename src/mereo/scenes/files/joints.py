@@ -1,0 +1,330 @@
+"""Joints that an assembly seems to have, for a new scene file: hinges on round contacts, slides on flat ones.
+
+A joint moves all that hangs on its smaller side: what is still connected to it once the contacts are taken away that
+the motion leaves closed. Its range is as far as nothing collides, up to a limit.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import igl
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from mereo.deformation.maps import Rigid
+from mereo.geometry.mesh import Segment, SegmentedMesh, surface_points
+from mereo.geometry.mesh_check import overlaps
+
+# --- contacts ---------------------------------------------------------------------------------------------------------
+
+# Where parts of an assembly touch, and along which shape: a cylinder, on which they can turn, or a plane, to slide on.
+#
+# Points of one part's surface that are near the other, with normals against its normals, are the contact. Planes are
+# taken out of it first, as clusters of one normal and offset. What is left is a cylinder where its normals are all
+# across one axis, and then centre and radius are linear in points p and normals n: ``p - radius n = center``.
+
+CLEARANCE = 0.005
+"""Largest gap that counts as contact, in longest sides of the object: fits have some."""
+
+POINTS = 1500
+"""Places of a part's surface that are tried."""
+
+LEAST_POINTS = 12
+
+AGAINST = -0.8
+"""Largest cosine of two normals of a contact."""
+
+PLANE_SHARE = 0.1
+"""Share of a contact that has one normal before it counts as a plane; facets of a round face have less from 11 on."""
+
+SAME_NORMAL = float(np.cos(np.deg2rad(3.0)))
+
+FLATTEST = 0.02
+"""Mean square cosine of a cylinder's normals with its axis."""
+
+LEAST_ARC = 0.1
+"""Mean square of a cylinder's normals across their main direction: an arc of 80 degrees or so."""
+
+MISFIT = 0.05
+"""Root mean square distance of the points from the cylinder, in radii."""
+
+Points = Float[np.ndarray, "n 3"]
+Vector = Float[np.ndarray, "3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Contact:
+    """Shape along which two segments touch.
+
+    Attributes:
+        first, second: indices of the segments, the one of the smaller surface first.
+        kind: "cylinder", "plane", or "other", along which nothing is assumed to move.
+        point: the middle of the contact, on a cylinder's axis.
+        axis: unit vector along a cylinder, or a plane's normal; zero for others.
+        along: the longest direction of the contact; for a cylinder its axis.
+        radius: of a cylinder; 0 for others.
+        extent: of the contact along ``along``.
+    """
+
+    first: int
+    second: int
+    kind: str
+    point: Vector
+    axis: Vector
+    along: Vector
+    radius: float
+    extent: float
+
+
+def contacts(mesh: SegmentedMesh) -> tuple[Contact, ...]:
+    """All contacts between segments, which need not be solids. Lengths are in the mesh's unit."""
+    reach = CLEARANCE * float((mesh.bounds[1] - mesh.bounds[0]).max())
+    areas = [float(np.linalg.norm(_crossed(segment), axis=1).sum()) for segment in mesh.segments]
+    found: list[Contact] = []
+    for pair in combinations(range(len(mesh.segments)), 2):
+        first, second = sorted(pair, key=lambda index: areas[index])
+        points, normals = _touching(mesh.segments[first], mesh.segments[second], reach)
+        if len(points) >= LEAST_POINTS:
+            found += _shapes(first, second, points, normals, reach)
+    return tuple(found)
+
+
+def _crossed(segment: Segment) -> Float[np.ndarray, "f 3"]:
+    a, b, c = (segment.vertices[segment.faces[:, k]] for k in range(3))
+    return np.cross(b - a, c - a)
+
+
+def _normals(segment: Segment, face: Int[np.ndarray, " n"]) -> Points:
+    """Unit normals of faces."""
+    crossed = _crossed(segment)[face]
+    return crossed / np.maximum(np.linalg.norm(crossed, axis=1, keepdims=True), 1e-30)
+
+
+def distance(points: Points, segment: Segment) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+    """Distance of points to a surface, and the nearest face."""
+    vertices, faces = np.array(segment.vertices), np.array(segment.faces, dtype=np.int64)
+    tree = igl.AABB()
+    tree.init(vertices, faces)
+    squared, face, _ = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
+    return np.sqrt(squared), face.astype(np.int64)
+
+
+def _touching(first: Segment, second: Segment, reach: float) -> tuple[Points, Points]:
+    """Points of the first surface that lie against the second one, and their normals."""
+    low, high = second.bounds[0] - reach, second.bounds[1] + reach
+    if (first.bounds[1] < low).any() or (first.bounds[0] > high).any():
+        return np.empty((0, 3)), np.empty((0, 3))
+    points, face = surface_points(first.vertices, first.faces, POINTS)
+    near = ((points >= low) & (points <= high)).all(axis=1)
+    points, normals = points[near], _normals(first, face[near])
+    if len(points) == 0:
+        return points, normals
+    gap, opposite = distance(points, second)
+    other = _normals(second, opposite)
+    against = (gap < reach) & (np.einsum("ni,ni->n", normals, other) < AGAINST)
+    return points[against], normals[against]
+
+
+def _shapes(first: int, second: int, points: Points, normals: Points, reach: float) -> list[Contact]:
+    """Planes of a contact, largest first, and what is left of it."""
+    found, count = [], len(points)
+    while len(points) >= LEAST_POINTS:
+        flat = _largest_plane(points, normals, reach)
+        if flat.sum() < max(PLANE_SHARE * count, LEAST_POINTS):
+            break
+        axis, along, extent = normals[flat].mean(axis=0), *_longest(points[flat])
+        axis /= np.linalg.norm(axis)
+        found.append(Contact(first, second, "plane", points[flat].mean(axis=0), axis, along, 0.0, extent))
+        points, normals = points[~flat], normals[~flat]
+    if len(points) >= LEAST_POINTS:
+        found.append(_cylinder(first, second, points, normals) or _other(first, second, points))
+    return found
+
+
+def _largest_plane(points: Points, normals: Points, reach: float) -> Bool[np.ndarray, " n"]:
+    """The largest set of points of one normal and offset."""
+    offsets = normals @ points.T  # of all points along each one's normal
+    alike = (normals @ normals.T > SAME_NORMAL) & (np.abs(offsets - np.diag(offsets)[:, None]) < reach)
+    best: Bool[np.ndarray, " n"] = alike[alike.sum(axis=1).argmax()]
+    return best
+
+
+def _longest(points: Points) -> tuple[Vector, float]:
+    """Direction in which points spread most, and how far."""
+    along = np.linalg.eigh(np.cov(points.T))[1][:, -1]
+    return along, float(np.ptp(points @ along))
+
+
+def _cylinder(first: int, second: int, points: Points, normals: Points) -> Contact | None:
+    """Cylinder through points with its normals; None where they are of none."""
+    values, vectors = np.linalg.eigh(normals.T @ normals / len(normals))
+    if values[0] > FLATTEST or values[1] < LEAST_ARC:
+        return None
+    axis, across = vectors[:, 0], vectors[:, 1:]
+    flat, outward = points @ across, normals @ across
+    # two equations per point: flat - radius * outward = center
+    system = np.zeros((2 * len(points), 3))
+    system[0::2, 0] = system[1::2, 1] = 1.0
+    system[:, 2] = outward.ravel()
+    solution = np.linalg.lstsq(system, flat.ravel(), rcond=None)[0]
+    center, radius = solution[:2], abs(float(solution[2]))
+    misfit = np.linalg.norm(flat - center, axis=1) - radius
+    if not np.sqrt(np.mean(misfit**2)) < MISFIT * radius:
+        return None
+    height = points @ axis
+    middle = across @ center + axis * (height.min() + height.max()) / 2
+    return Contact(first, second, "cylinder", middle, axis, axis, radius, float(np.ptp(height)))
+
+
+def _other(first: int, second: int, points: Points) -> Contact:
+    along, extent = _longest(points)
+    return Contact(first, second, "other", points.mean(axis=0), np.zeros(3), along, 0.0, extent)
+
+
+# --- joints -----------------------------------------------------------------------------------------------------------
+
+ANGLES_DEG = (30.0, 20.0, 10.0, 5.0)
+"""Ranges of a hinge that are tried, to either side."""
+
+SLIDES = (0.5, 0.25, 0.1)
+"""Ranges of a slide that are tried, in lengths of the contact."""
+
+COLLIDES = 0.01
+"""Share of a segment that another may overlap within a joint's range."""
+
+PARALLEL = float(np.cos(np.deg2rad(3.0)))
+
+ROUND_TEST_RAD = 0.7
+"""A part that such a turn brings onto itself does not show that it turns."""
+
+TURNS_ON, SLIDES_ALONG = "#  - type: joint  # turns on", "#  - type: joint  # slides along"
+"""Beginnings of the joints that a scene file proposes in comments."""
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """Proposed joint.
+
+    Attributes:
+        contact: what it was found from.
+        hinge: whether it turns about ``axis``, else it slides along it.
+        moved: indices of the segments that it moves.
+        axis: unit vector.
+        most: least and most angle in degrees, or way in the mesh's unit.
+    """
+
+    contact: Contact
+    hinge: bool
+    moved: tuple[int, ...]
+    axis: Float[np.ndarray, "3"]
+    most: tuple[float, float]
+
+
+def proposed_joints(mesh: SegmentedMesh) -> tuple[Joint, ...]:
+    """Joints of an assembly at rest, those that move least first, as a chain wants it."""
+    found = contacts(mesh)
+    reach = CLEARANCE * float((mesh.bounds[1] - mesh.bounds[0]).max())
+    joints: list[Joint] = []
+    for contact in sorted(found, key=lambda each: each.kind):  # cylinders before planes
+        if contact.kind == "other" or _held(contact, joints):
+            continue
+        joint = _joint(mesh, found, contact, reach)
+        if joint is not None and not any(_same(joint, other) for other in joints):
+            joints.append(joint)
+    return tuple(sorted(joints, key=lambda joint: len(joint.moved)))
+
+
+def _held(contact: Contact, joints: Sequence[Joint]) -> bool:
+    """Whether a flat contact lies across a hinge that turns its two parts on each other: it is part of that."""
+    return contact.kind == "plane" and any(
+        joint.hinge
+        and abs(joint.axis @ contact.axis) > PARALLEL
+        and len({contact.first, contact.second} & set(joint.moved)) == 1
+        for joint in joints
+    )
+
+
+def _same(first: Joint, second: Joint) -> bool:
+    return first.moved == second.moved and first.hinge == second.hinge and abs(first.axis @ second.axis) > PARALLEL
+
+
+def _joint(mesh: SegmentedMesh, found: Sequence[Contact], contact: Contact, reach: float) -> Joint | None:
+    """The joint of a contact; None where its sides hang together elsewhere, look alike in it, or collide at once."""
+    hinge = contact.kind == "cylinder"
+    axis = contact.axis if hinge else contact.along
+    axis = axis * np.sign(axis[np.abs(axis).argmax()])
+    side = _sides(len(mesh.segments), [each for each in found if not _allows(each, contact, hinge, axis, reach)])
+    if side[contact.first] == side[contact.second]:
+        return None
+    groups = [tuple(np.flatnonzero(side == side[index]).tolist()) for index in (contact.first, contact.second)]
+    for moved in sorted(groups, key=lambda group: sum(abs(mesh.segments[index].volume) for index in group)):
+        if hinge and all(_is_round(mesh, index, contact.point, axis, reach) for index in moved):
+            continue
+        steps = ANGLES_DEG if hinge else tuple(contact.extent * share for share in SLIDES)
+        least, most = (
+            _free(mesh, moved, contact.point, axis, hinge, [sign * step for step in steps]) for sign in (-1, 1)
+        )
+        if most > least:
+            return Joint(contact, hinge, moved, axis, (least, most))
+    return None
+
+
+def _sides(count: int, held: Sequence[Contact]) -> np.ndarray:
+    """For each segment the number of the group that contacts hold together."""
+    rows = np.array([(each.first, each.second) for each in held], dtype=np.int64).reshape(-1, 2)
+    graph = coo_array((np.ones(len(rows)), rows.T), shape=(count, count))
+    return np.asarray(connected_components(graph, directed=False)[1])
+
+
+def _allows(contact: Contact, joint: Contact, hinge: bool, axis: Float[np.ndarray, "3"], reach: float) -> bool:
+    """Whether a contact stays closed in a turn about, or a slide along, the axis of a joint."""
+    aligned = abs(contact.axis @ axis)
+    if contact.kind == "other":
+        return False
+    if contact.kind == "plane":
+        return bool(aligned > PARALLEL if hinge else aligned < np.sqrt(1 - PARALLEL**2))
+    away = contact.point - joint.point
+    coaxial = np.linalg.norm(away - (away @ axis) * axis) < reach
+    return bool(aligned > PARALLEL and (coaxial or not hinge))
+
+
+def _is_round(
+    mesh: SegmentedMesh, index: int, point: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"], reach: float
+) -> bool:
+    """Whether a turn about the axis brings a segment onto itself."""
+    segment = mesh.segments[index]
+    points = surface_points(segment.vertices, segment.faces, 200)[0]
+    turned = Rigid(ROUND_TEST_RAD * axis, np.zeros(3), point)(points)
+    return bool(distance(turned, segment)[0].max() < reach)
+
+
+def _free(
+    mesh: SegmentedMesh,
+    moved: tuple[int, ...],
+    point: Float[np.ndarray, "3"],
+    axis: Float[np.ndarray, "3"],
+    hinge: bool,
+    steps: Sequence[float],
+) -> float:
+    """First of the steps, from the farthest to the nearest, over which nothing collides; 0 where there is none."""
+    for step in steps:
+        ways = [step * share for share in (0.5, 1.0)]
+        if not any(_collides(mesh, moved, _motion(point, axis, hinge, way)) for way in ways):
+            return step
+    return 0.0
+
+
+def _motion(point: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"], hinge: bool, way: float) -> Rigid:
+    turn, shift = (np.deg2rad(way) * axis, np.zeros(3)) if hinge else (np.zeros(3), way * axis)
+    return Rigid(turn, shift, point)
+
+
+def _collides(mesh: SegmentedMesh, moved: tuple[int, ...], motion: Rigid) -> bool:
+    """Whether moved segments overlap others by more than they do at rest."""
+    places = [motion(s.vertices) if index in moved else s.vertices for index, s in enumerate(mesh.segments)]
+    inside = {mesh.names[index] for index in moved}
+    found = overlaps(mesh.with_vertices(places), COLLIDES)
+    return any(len({each.small, each.large} & inside) == 1 for each in found)
