@@ -109,7 +109,7 @@ def measured(name: str, condition: str, finder: str, seed: int, index: int) -> l
     fit = answer.registration
     assert fit is not None
     seconds = time.perf_counter() - started
-    return [*scored(truth_grid(mesh, CELLS), fit.mesh), seconds, fit.accepted, answer.found_by == "search", fit.alike]
+    return [*scored(truth_grid(mesh, CELLS), fit.mesh), seconds, fit.accepted, answer.located_by == "search", fit.alike]
 
 
 def row(name: str, condition: str, finders: list[str], seed: int, views: int) -> dict[str, Any]:

@@ -19,9 +19,8 @@ from mereo_serving.app import Service, make_app
 from mereo_serving.config import ServeConfig
 from mereo_serving.dispatcher import Dispatcher
 from mereo_serving.gate import LOOPBACK, Entry, bound_socket
-from mereo_serving.messages import Setup
+from mereo_serving.messages import Served, Setup
 from mereo_serving.metrics import Metrics
-from mereo_serving.names import served_objects
 from mereo_serving.workers import WorkerProcess
 
 CONNECTIONS = 256
@@ -29,14 +28,11 @@ CONNECTIONS = 256
 
 
 def serve(
-    weights: Sequence[str],
+    served: Sequence[Served],
     *,
-    objects: Sequence[str] = (),
-    scenes: Sequence[str] = (),
     method: AnswerMethod = "auto",
     resolution: int = 128,
-    host: str = LOOPBACK,
-    port: int = 8000,
+    address: tuple[str, int] = (LOOPBACK, 8000),
     workers: int = 1,
     config: ServeConfig | None = None,
     inference: InferenceConfig | None = None,
@@ -44,13 +40,11 @@ def serve(
     """Serve objects until Ctrl-C, TERM or HUP: then what is begun is answered, and the rest refused.
 
     Args:
-        weights: shipped names or files, each as it is or as NAME=FILE.
-        objects: scenes, or meshes joined by commas, each as it is or as NAME=FILE.
-        scenes: NAME=FILE of the scenes whose draws are fitted, where they are not the weights' built-in ones.
+        served: the objects, from ``served_objects``.
         method: source of the answers.
         resolution: cells along the longest side where a request does not say.
-        host: address of this machine; others than its own need the token of the printed address.
-        port: 0 takes any that is free.
+        address: host and port. Hosts other than this machine need the token of the printed address; port 0 takes any
+            that is free.
         workers: processes that answer.
         config: limits.
         inference: where and how exactly the networks compute.
@@ -59,19 +53,18 @@ def serve(
     taken or not this machine's.
     """
     config = config or ServeConfig()
-    served = served_objects(weights, scenes, objects)
-    setup = Setup(served, method, inference or InferenceConfig(), config.max_points, config.max_body)
-    entry, metrics = Entry.of(host), Metrics()
+    setup = Setup(tuple(served), method, inference or InferenceConfig(), config.max_points, config.max_body)
+    entry, metrics = Entry.of(address[0]), Metrics()
     with ExitStack() as stack:
-        socket = stack.enter_context(bound_socket(host, port))
+        socket = stack.enter_context(bound_socket(*address))
         processes = stack.enter_context(started(setup, workers))
         root = stack.enter_context(private_folder())
         dispatcher = Dispatcher(processes, config, metrics)
         service = Service(dispatcher, metrics, config, root, processes[0].ready.facts, resolution, entry)
         names = ", ".join(service.names)
-        address = entry.address(socket.getsockname()[1])
+        url = entry.address(socket.getsockname()[1])
         many = "1 process" if workers == 1 else f"{workers} processes"
-        greeting = f"serving {names} at {address} ({many}; /docs says how to ask); Ctrl-C ends"
+        greeting = f"serving {names} at {url} ({many}; /docs says how to ask); Ctrl-C ends"
         settings = uvicorn.Config(
             make_app(service),
             http="h11",

@@ -12,7 +12,7 @@ from multiprocessing.connection import Connection
 from typing import Any, Protocol, runtime_checkable
 
 from mereo.io.errors import LIMIT_VARIABLE
-from mereo.workers.spread import exit_with_parent, one_thread_each, start_resource_tracker
+from mereo.workers.spread import exit_with_parent, limit_child_threads, start_resource_tracker
 from mereo_serving.messages import FrameRequest, Ready, Reply, Setup
 
 POINT_BYTES = 2048
@@ -109,7 +109,7 @@ class WorkerProcess:
         self.process = context.Process(target=answer_frames, args=(theirs, self.setup), daemon=True)
         # read when torch is loaded; clouds of ever other sizes would fill it with products that do not come again
         os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "4")
-        with one_thread_each():
+        with limit_child_threads():
             self.process.start()
         theirs.close()  # so that this process sees the other end close
 

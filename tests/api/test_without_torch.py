@@ -64,7 +64,7 @@ found = mereo.reconstruct(frame, known, resolution=24)
 found.save("hidden", overwrite=True)
 found.save("hidden.html", overwrite=True)
 found.carry("long.stl").save("carried.stl", overwrite=True)
-print(mereo.Tracker(known).follow(frame, 0.0).found_by, found.found_by)
+print(mereo.Tracker(known).follow(frame, 0.0).located_by, found.located_by)
 import mereo.api.view
 """
     ran = hidden(program, folder)
@@ -83,7 +83,7 @@ assert main(["generate", "rope", "--output", "examples", "--examples", "1"]) == 
 """
     ran = hidden(program, folder)
     assert ran.returncode == 0, ran.stderr
-    assert "found by search" in ran.stdout and '"found_by": "search"' in ran.stdout
+    assert "found by search" in ran.stdout and '"located_by": "search"' in ran.stdout
     assert (folder / "command/summary.json").is_file()
 
 

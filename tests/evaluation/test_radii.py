@@ -77,9 +77,9 @@ def test_a_frame_that_is_misfitted_or_where_the_network_is_elsewhere_has_wider_r
     assert plain > 4.0
     assert factors.widening(0.2) == pytest.approx(4.0) and factors.widening(0.05) == 1.0
     assert (
-        factors.beside(0.04) == 0.0
-        and factors.beside(None) == 0.0
-        and factors.beside(0.4) == pytest.approx(0.398, 1e-2)
+        factors.extra_radius(0.04) == 0.0
+        and factors.extra_radius(None) == 0.0
+        and factors.extra_radius(0.4) == pytest.approx(0.398, 1e-2)
     )
     widened = lost[1].widened(factors)
     assert (widened.radii > 5.0).all() and (widened.ratios == 0.0).all()

@@ -78,7 +78,7 @@ def test_as_one_moves_all_by_one_motion(points: np.ndarray) -> None:
     rest = SegmentedMesh((object_at_rest().segments[0], object_at_rest().segments[2]))
     mine = scan_of(moved(rest, true_poses()[[0, 2]]), NOISE)
     rough = Start(start().poses[[0, 2]], np.zeros(2, bool), "")
-    base, peg = place(rest, mine, rough, as_one=True).segments
+    base, peg = place(rest, mine, rough, is_rigid=True).segments
     assert base.placed_by == peg.placed_by == "object"
     np.testing.assert_array_equal(base.T_scan_segment, peg.T_scan_segment)
     assert pose_error(base.T_scan_segment, true_poses()[0], middles()[0])[0] < 0.05

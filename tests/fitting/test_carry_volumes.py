@@ -208,7 +208,7 @@ def test_a_file_comes_back_in_its_format_and_overlays_the_labels(
 def test_what_is_told_of_a_volume(registrar: Registrar, bent: Registration) -> None:
     found = carry(place([Attachment("ct.nii.gz", ramp())], registrar, "scene")[0], bent)
     sides = " x ".join(map(str, found.content.values.shape))  # type: ignore[union-attr]
-    assert found.told == f"carried ct.nii.gz: {sides} voxels 7 apart (linear), {found.inside} inside"
+    assert found.description == f"carried ct.nii.gz: {sides} voxels 7 apart (linear), {found.inside} inside"
     assert found.facts() == {
         "file": "ct.nii.gz",
         "voxels": list(found.content.values.shape),  # type: ignore[union-attr]

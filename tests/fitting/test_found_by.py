@@ -58,13 +58,13 @@ def test_a_network_that_understands_is_not_doubted(
     liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(f"{HYPOTHESES}.search_modes", None)
-    assert answer(liver, cloud).found_by == "network"
+    assert answer(liver, cloud).located_by == "network"
 
 
 @pytest.mark.usefixtures("confused", "without_turns")
 def test_a_search_is_asked_too_where_the_network_is_lost(liver: Model, cloud: PointCloud) -> None:
     found = answer(liver, cloud)
-    assert found.found_by == "search" and found.taken and found.registration is not None
+    assert found.located_by == "search" and found.taken and found.registration is not None
     assert found.registration.accepted and found.recognition.known is True
     assert all(0 < segment.confidence <= 1 for segment in found.reconstruction.segments)  # the network's, all the same
 
@@ -76,13 +76,13 @@ def test_other_methods_ask_nobody_else(
 ) -> None:
     monkeypatch.setattr(f"{HYPOTHESES}.search_modes", None)
     registrar = None if method == "network" else Registrar.of(liver, method)
-    assert answer_to(cloud, liver, registrar, 24).found_by == "network"
+    assert answer_to(cloud, liver, registrar, 24).located_by == "network"
 
 
 def test_the_network_is_left_out_on_request(liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mereo.fitting.registration.register.find_correspondences", None)
     found = answer(liver, cloud, "search")
-    assert found.found_by == "search" and found.taken
+    assert found.located_by == "search" and found.taken
 
 
 def test_the_state_with_the_greater_evidence_is_taken_whatever_its_unit(liver: Model, cloud: PointCloud) -> None:
@@ -92,7 +92,7 @@ def test_the_state_with_the_greater_evidence_is_taken_whatever_its_unit(liver: M
     assert by_network is not None and by_network.modes is not None
     right = by_network.modes
     astray = replace(right, posed=replace(right.posed, translation=right.posed.translation + 3.0))
-    wrong = replace(by_network, modes=astray, found_by="search")
+    wrong = replace(by_network, modes=astray, located_by="search")
     assert misfit_in(right, astray) > misfit_in(right, right)
     assert more_evident(by_network, wrong) is by_network and more_evident(wrong, by_network) is by_network
     assert more_evident(replace(by_network, modes=None), wrong) is wrong
@@ -147,7 +147,7 @@ def test_a_fit_that_alone_explains_the_frame_is_taken(liver: Model, cloud: Point
     strict = replace(by_network.modes.problem, config=replace(by_network.modes.problem.config, tolerance=1e-3))
     refused = replace(by_network, modes=replace(by_network.modes, problem=strict))
     astray = replace(by_network.modes.posed, translation=by_network.modes.posed.translation + 0.05)
-    searched = replace(by_network, modes=replace(by_network.modes, posed=astray), found_by="search")
+    searched = replace(by_network, modes=replace(by_network.modes, posed=astray), located_by="search")
     assert searched.is_accepted and not refused.is_accepted
     assert more_evident(refused, searched) is searched
 

@@ -165,7 +165,7 @@ def test_it_is_searched_in_the_latest_lost_frame_one_at_a_time(
     held.work()
     assert searches == [frames["thing"], frames["there"]]
     found = begun.follow(frames["there"], 5.0, scene_unit=1.0)
-    assert found.tracking == "found" and found.found_by == "search" and found.taken and not found.tracked
+    assert found.tracking == "found" and found.located_by == "search" and found.taken and not found.tracked
     assert rms(found, there) < 0.7 and len(held.held) == 2
     assert begun.follow(frames["there"], 5.03, scene_unit=1.0).tracking == "followed"
 

@@ -22,7 +22,7 @@ from mereo.fitting.problem.problem import ACCEPTED
 from mereo.fitting.registration.recognition import (
     CONSERVATIVE,
     MOST,
-    NOT_ASKED,
+    NOT_EVALUATED,
     Recognition,
     Signs,
     recognize,
@@ -68,7 +68,7 @@ def registration() -> Registration:
 
 def test_the_object_in_a_learned_state_is_known(registration: Registration) -> None:
     said = recognize(registration, displaced=0.03, stated_scene_unit=1.01)
-    assert said.known is True and said.reason is None and said.told is None and not said.calibrated
+    assert said.known is True and said.reason is None and said.description is None and not said.calibrated
     assert said.strangeness < 1.0
 
 
@@ -92,7 +92,7 @@ def test_each_sign_has_its_say(
         changes["z"] = registration.z + change["z"]
     said = recognize(replace(registration, **changes), **options)
     assert said.known is not True and said.reason is not None and sentence in said.reason
-    assert said.told is not None and said.told.endswith(said.reason)
+    assert said.description is not None and said.description.endswith(said.reason)
 
 
 def test_the_more_is_wrong_the_less_is_known(registration: Registration) -> None:
@@ -117,7 +117,7 @@ def test_the_object_at_rest_is_known_whatever_was_learned(registration: Registra
 
 
 def test_what_was_not_found_is_not_the_object_and_what_was_not_asked_is_unsure() -> None:
-    assert recognize(None) is NOT_ASKED and NOT_ASKED.known == "unsure"
+    assert recognize(None) is NOT_EVALUATED and NOT_EVALUATED.known == "unsure"
     said = recognize(None, refusal="the network finds only 3 points of the object")
     assert said.known is False and said.strangeness == MOST and said.reason is not None and "3 points" in said.reason
 

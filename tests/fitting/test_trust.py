@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from mereo.fitting.registration.recognition import MOST, NOT_ASKED, Recognition, Signs
+from mereo.fitting.registration.recognition import MOST, NOT_EVALUATED, Recognition, Signs
 from mereo.visualization.report_words import VERDICTS, trust
 
 SIGNS = Signs(size=0.01, unexplained=0.2)
@@ -80,7 +80,7 @@ def recognized(known: bool | str, reason: str | None) -> Recognition:
             "Doubtful: the model explains only 70.0 % of the points.",
             None,
         ),
-        (NOT_ASKED, None, "alone", "Network alone: nothing says whether this is the object.", None),
+        (NOT_EVALUATED, None, "alone", "Network alone: nothing says whether this is the object.", None),
         (None, None, "alone", "Network alone: nothing says whether this is the object.", None),
         (
             None,

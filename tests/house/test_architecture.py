@@ -9,11 +9,14 @@ from architecture import (
     HEAVY,
     MAY_IMPORT_TORCH,
     ROOMS,
+    SATELLITES,
     SUBROOMS,
     bad_init_files,
+    banned_names,
     cycles,
     differences,
     heavy_settings,
+    long_signatures,
     misplaced,
     misplaced_tests,
     over_budget,
@@ -81,6 +84,19 @@ def test_the_core_does_without_its_satellites(mereo: Package) -> None:
 
 def test_tests_lie_in_the_rooms_they_test() -> None:
     assert_none(misplaced_tests(TOP / "tests"))
+
+
+@pytest.fixture(scope="module", params=["mereo", *SATELLITES])
+def each_package(request: pytest.FixtureRequest) -> Package:
+    return read_package(TOP / "src" / request.param)
+
+
+def test_names_are_nouns_and_verbs(each_package: Package) -> None:
+    assert_none(banned_names(each_package))
+
+
+def test_public_functions_have_few_parameters(each_package: Package) -> None:
+    assert_none(long_signatures(each_package))
 
 
 def test_the_house_keeps_its_budget() -> None:
@@ -286,3 +302,37 @@ def test_a_test_outside_of_the_rooms_is_found(tmp_path: Path) -> None:
         "tests/odd/test_e.py",
         "tests/test_d.py",
     ]
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "found = 1",
+        "def f(one): pass",
+        "for own_name in (): pass",
+        "class FoundBy: pass",
+        "import os as there",
+        "def told(): pass",
+        "def f(x):\n    x.said_so = 1",
+        "def f():\n    with g() as at_hand: pass",
+    ],
+)
+def test_a_banned_word_is_found_in_each_kind_of_name(code: str, tmp_path: Path) -> None:
+    assert len(banned_names(package_of(tmp_path, {"geometry/mesh.py": code}))) == 1
+
+
+def test_names_of_others_are_free(tmp_path: Path) -> None:
+    code = "def f(x):\n    raise FileNotFoundError(x.own_data_is_not_used, __file__)\nbone = owner = phone = 1"
+    assert banned_names(package_of(tmp_path, {"geometry/mesh.py": code})) == []
+
+
+def test_the_eighth_parameter_is_found(tmp_path: Path) -> None:
+    code = """
+def most(a, b, c, d, e, f, *, g): pass
+def more(a, b, c, d, e, f, *, g, h): pass
+def _hidden(a, b, c, d, e, f, *, g, h): pass
+class A:
+    def method(self, a, b, c, d, e, f, g): pass
+"""
+    faults = long_signatures(package_of(tmp_path, {"geometry/mesh.py": code}))
+    assert faults == ["geometry/mesh.py:3 more has 8 parameters, more than 7"]

@@ -9,7 +9,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from mereo.io import cores
-from mereo.io.cores import THREAD_VARIABLES, one_blas_thread, use_threads, workers_for
+from mereo.io.cores import THREAD_VARIABLES, limit_blas_threads, use_threads, workers_for
 
 
 @pytest.mark.parametrize(
@@ -75,7 +75,7 @@ def test_one_blas_thread_lasts_until_the_last_thread_lets_go() -> None:
 
     with threadpool_limits(2, "blas"):
         before = counts()
-        first, second = one_blas_thread(), one_blas_thread()
+        first, second = limit_blas_threads(), limit_blas_threads()
         first.__enter__()
         second.__enter__()
         assert counts() == {1}

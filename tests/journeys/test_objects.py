@@ -81,7 +81,7 @@ def test_meshes_are_found_with_their_hidden_side(found: mereo.Result, scene: Sce
     truth = truth_grid(view.mesh.with_vertices([scene.unit_m * part.vertices for part in view.mesh.segments]), 40)
     scores = intersection_over_union(grid_confusion(truth, labels_on(found.surfaces, truth.grid), 2))
     assert scores.iou > 0.9 and scores.miou > 0.85
-    assert found.found_by == "search" and found.taken and found.known is True and found.model is None
+    assert found.located_by == "search" and found.taken and found.known is True and found.model is None
 
 
 def test_it_has_names_and_colours_of_the_meshes_and_no_confidence(found: mereo.Result, angle: mereo.Object) -> None:
@@ -94,7 +94,7 @@ def test_it_has_names_and_colours_of_the_meshes_and_no_confidence(found: mereo.R
 def test_what_is_written_leaves_out_what_nobody_knows(found: mereo.Result, tmp_path: Path) -> None:
     found.save(tmp_path / "out", formats=["json", "points"])
     summary = json.loads((tmp_path / "out/summary.json").read_text())
-    assert summary["weights"] is None and summary["registration"]["found_by"] == "search"
+    assert summary["weights"] is None and summary["registration"]["located_by"] == "search"
     assert [one["confidence"] for one in summary["segments"]] == [None, None] and "device" not in summary
     assert summary["recognition"]["signs"]["displaced"] is None
     written = (tmp_path / "out/points.ply").read_bytes()
@@ -124,7 +124,7 @@ def test_a_tracker_begins_with_a_search_and_follows(angle: mereo.Object, points:
     tracker = mereo.Tracker(angle)
     first, second = (tracker.follow(points, 0.03 * step, unit_m=1.0) for step in range(2))
     assert (first.tracked, second.tracked) == (False, True)
-    assert first.found_by == second.found_by == "search"
+    assert first.located_by == second.located_by == "search"
 
 
 def test_what_is_defined_in_the_meshes_is_carried(found: mereo.Result, scene: Scene) -> None:
@@ -139,7 +139,7 @@ def test_it_is_served_without_weights(folder: Path, meshes: list[str], points: n
     assert [segment["name"] for segment in facts["segments"]] == ["long", "short"]
     asked = FrameRequest("angle", folder, "frame.npy", InputConfig(unit_m=1.0), IsolationConfig(), 24, JSON)
     reply = answerer(asked)
-    assert reply.status == 200 and json.loads(reply.body)["registration"]["found_by"] == "search"
+    assert reply.status == 200 and json.loads(reply.body)["registration"]["located_by"] == "search"
 
 
 def test_its_page_opens(folder: Path, meshes: list[str], points: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:

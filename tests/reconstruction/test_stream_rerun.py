@@ -145,7 +145,7 @@ def test_numbers_and_sentences_are_those_of_the_answers(rows: Rows) -> None:
     texts = [(time, text) for time, (text,) in rows["/log TextLog:text"]]
     assert texts == [
         (0.0, "0.png: the object was found; the answer is by modes"),
-        (0.125, f"1.png: {UNSURE.told}"),
+        (0.125, f"1.png: {UNSURE.description}"),
         (0.25, "2.png: 2.png is damaged: record it again"),
     ]
     assert [level for _, (level,) in rows["/log TextLog:level"]] == ["INFO", "WARN", "ERROR"]

@@ -113,7 +113,7 @@ def facts_of(name: str, frame: Frame) -> dict[str, Any]:
         "iou": round(scores.iou, 4),
         "miou": round(scores.miou, 4),
         "known": found.recognition.known,
-        "recognition": found.recognition.told,
+        "recognition": found.recognition.description,
         "confidence": [round(float(segment.confidence), 3) for segment in found.reconstruction.segments],
         "surfaces": digest(*(segment.vertices for segment in surfaces.segments)),
     }

@@ -113,7 +113,7 @@ def test_a_page_that_is_damaged_or_another_one_is_none(folder: Path, old: str, n
 
 def test_our_own_glb_is_in_the_frame_of_the_input(folder: Path) -> None:
     scene = read_glb(folder / "segments.glb")
-    assert scene.is_own and scene.unit_m == pytest.approx(0.001) and scene.colors == (None, None)
+    assert scene.is_ours and scene.unit_m == pytest.approx(0.001) and scene.colors == (None, None)
     np.testing.assert_allclose(scene.rotation, GLTF_CAMERA_ROTATION, atol=1e-12)
     assert scene.mesh.names == ("head", "tail") and scene.mesh.colors == found().colors
     for shown, segment in zip(scene.mesh.segments, found().segments, strict=True):
@@ -145,7 +145,7 @@ def write_strange(path: Path) -> None:
 def test_any_glb_is_read_with_its_places_and_colours(tmp_path: Path) -> None:
     write_strange(tmp_path / "s.glb")
     scene = read_glb(tmp_path / "s.glb")
-    assert not scene.is_own and scene.radii is None and scene.unit_m == 1.0
+    assert not scene.is_ours and scene.radii is None and scene.unit_m == 1.0
     parts = {segment.name: (segment, colors) for segment, colors in zip(scene.mesh.segments, scene.colors, strict=True)}
     assert set(parts) == {"painted", "plain", "round"}
     painted, colors = parts["painted"]

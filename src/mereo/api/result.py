@@ -287,7 +287,7 @@ class Result(Answer):
         to_camera = camera_axes(self.seen.frame.axes)
         points = transform_points(to_camera, self.seen.cloud.points)
         surfaces = self.reconstruction.surfaces.transformed(to_camera)
-        doubt = None if self.registrar is None else self.recognition.told
+        doubt = None if self.registrar is None else self.recognition.description
         lines = [self.source, *([] if doubt is None else [doubt])]
         segments, calibrated = self.reconstruction.segments, self.reconstruction.calibrated
         return result_html(self.seen.frame.source, lines, points, surfaces, segments, Unit(self.unit_m), calibrated)

@@ -14,7 +14,7 @@ from mereo.io.bounds import Cells, Port, Positive, Threads, Workers
 from mereo.io.config import CarryFrame, FilesConfig, InputConfig
 from mereo.models.config import InferenceConfig
 from mereo.reconstruction.config import IsolationConfig
-from mereo.workers.spread import ONE_CPU, RayAddress, TaskResources
+from mereo.workers.spread import DEFAULT_TASK, RayAddress, TaskResources
 from mereo_serving.config import ServeConfig
 
 SERVE_MODULES = ("fastapi", "uvicorn", "prometheus_client", "python_multipart")
@@ -84,7 +84,7 @@ class ReconstructCommand:
     force: bool = False
     threads: Threads = 0
     ray: RayAddress = None
-    task: Annotated[TaskResources, arg(name="")] = ONE_CPU
+    task: Annotated[TaskResources, arg(name="")] = DEFAULT_TASK
     json: bool = False
     options_from: ConfigFile = None
 
@@ -265,16 +265,14 @@ class ServeCommand:
         if missing := [name for name in SERVE_MODULES if find_spec(name) is None]:
             raise ImportError(f"{missing[0]} is not installed; `mereo serve` needs it: run pip install 'mereo[serve]'")
         from mereo.io.cores import cores
+        from mereo_serving.names import served_objects
         from mereo_serving.server import serve
 
         serve(
-            self.weights,
-            objects=self.object,
-            scenes=self.scene,
+            served_objects(self.weights, self.scene, self.object),
             method=self.method,
             resolution=self.resolution,
-            host=self.host,
-            port=self.port,
+            address=(self.host, self.port),
             workers=self.workers or cores(),
             config=self.limits,
             inference=self.inference,

@@ -23,7 +23,7 @@ from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.carry import Placed, carry, place
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
-from mereo.geometry.radii import level_told
+from mereo.geometry.radii import describe_level
 from mereo.io.atomic_files import new_directory, write_json
 from mereo.io.attachments import Attachment, read_attachments
 from mereo.io.config import CONFIG
@@ -160,7 +160,7 @@ def reconstruct_frame(frame: SensorFrame, directory: Path, job: FrameJob, path: 
         print_uncertainty(result.registered, unit)
     carried = tuple(carry(each, registration_of(result)) for each in placed)
     for each in carried:
-        print(each.told)
+        print(each.description)
     with stage("write the files"):
         write_answer(directory, result, command.files, carried)
     factor = MM_PER_M * result.seen.frame.metres if command.files.millimetres else 1.0
@@ -183,14 +183,14 @@ def print_source(answer: Answer) -> None:
     if registration is None:
         print(f"the network's answer, as no registration was found: {answer.refusal}")
         return
-    by = "; found by search" if answer.taken and answer.found_by == "search" else ""
+    by = "; found by search" if answer.taken and answer.located_by == "search" else ""
     explained = f"the registered model explains {registration.explained:.1%} of the cloud ({registration.method}{by})"
     print(explained if answer.taken else f"{explained}: too little, the network's answer is kept")
     if answer.taken and not registration.accepted:
         cure = "look at the result" if answer.model is None else "--method auto keeps the network's answer"
         print(f"that is too little to believe it: {cure}")
-    if answer.recognition.told is not None:
-        print(answer.recognition.told)
+    if answer.recognition.description is not None:
+        print(answer.recognition.description)
 
 
 def print_uncertainty(registered: Registration | None, unit: Unit) -> None:
@@ -199,7 +199,7 @@ def print_uncertainty(registered: Registration | None, unit: Unit) -> None:
         return
     radii = registered.uncertainty.summary()
     middle, most = (f"{rounded(radii[key] * unit.length_factor)} {unit.length_name}" for key in ("median", "max"))
-    level = level_told(registered.uncertainty.calibrated)
+    level = describe_level(registered.uncertainty.calibrated)
     print(f"its points are within {middle} of their true places in the median, {most} where it is least sure ({level})")
 
 
@@ -283,7 +283,7 @@ def explain(
             title, radius = "the object's point", float(radii[0])
         explanation = registered.explain(target)
         assert explanation is not None
-        position = f"{unit.place(explanation.place, radius)} {unit.length_name} ({level_told(sure.calibrated)})"
+        position = f"{unit.place(explanation.place, radius)} {unit.length_name} ({describe_level(sure.calibrated)})"
         text = f"{title} is at {position}; what leaves it unsure: {describe_shares(explanation)}"
         lost = len(explanation.unexplained)
         print(f"{text}; {lost} points are not the model's" if lost else text)

@@ -28,10 +28,10 @@ from jaxtyping import Float
 
 from mereo.cli.answers import StreamCommand
 from mereo.cli.options import check_named, loaded_object
-from mereo.fitting.config import FoundBy, Tracking
+from mereo.fitting.config import LocatedBy, Tracking
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.answer_frame import answer_frame
-from mereo.fitting.registration.recognition import NOT_ASKED, Recognition
+from mereo.fitting.registration.recognition import NOT_EVALUATED, Recognition
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.tracking import SynchronousExecutor, Tracker
 from mereo.geometry.camera import Camera, DepthImage
@@ -150,7 +150,7 @@ def line(outcome: Outcome["FrameAnswer"]) -> dict[str, Any]:
         "known": answer.recognition.known,
         "reason": answer.recognition.reason,
     }
-    optional = {"found_by": answer.found_by, "radius95": answer.radius95}
+    optional = {"located_by": answer.located_by, "radius95": answer.radius95}
     facts |= {name: value for name, value in optional.items() if value is not None}
     return {**facts, "strays": answer.strays, "segments": answer.segments}
 
@@ -191,7 +191,7 @@ class FrameAnswer:
             where it was not asked for, or not known.
         observation: what was answered.
         seconds: of the answer alone, without decoding the frame.
-        found_by: who found the object when it began to be followed; None where the answer is the network's own.
+        located_by: who found the object when it began to be followed; None where the answer is the network's own.
     """
 
     surfaces: SegmentedMesh | None
@@ -200,11 +200,11 @@ class FrameAnswer:
     method: str | None
     tracking: Tracking
     explained: float | None
-    recognition: Recognition = NOT_ASKED
+    recognition: Recognition = NOT_EVALUATED
     radius95: dict[str, float | bool] | None = None
     observation: Observation | None = None
     seconds: float = 0.0
-    found_by: FoundBy | None = None
+    located_by: LocatedBy | None = None
 
     @property
     def tracked(self) -> bool:
@@ -250,7 +250,7 @@ class FrameAnswer:
             segments=segments,
             method=registration.method,
             radius95=radius95,
-            found_by=answer.found_by,
+            located_by=answer.located_by,
         )
 
 
@@ -563,7 +563,7 @@ def series(outcome: Outcome[FrameAnswer]) -> dict[str, float]:
         facts["answer/tracked"] = float(answer.tracked)
         if answer.explained is not None:
             facts["answer/explained"] = answer.explained
-        if answer.recognition is not NOT_ASKED:
+        if answer.recognition is not NOT_EVALUATED:
             facts["answer/known"] = 0.5 if answer.recognition.known == "unsure" else float(answer.recognition.known)
         if answer.radius95 is not None:
             facts |= {f"radius95/{name}": float(answer.radius95[name]) for name in ("median", "max")}
@@ -576,7 +576,7 @@ def messages(outcome: Outcome[FrameAnswer]) -> Iterator[tuple[str, str]]:
     if answer is None:
         yield "ERROR", f"{outcome.name}: {outcome.error}"
         return
-    if answer.recognition.told is not None and answer.recognition is not NOT_ASKED:
-        yield "WARN", f"{outcome.name}: {answer.recognition.told}"
+    if answer.recognition.description is not None and answer.recognition is not NOT_EVALUATED:
+        yield "WARN", f"{outcome.name}: {answer.recognition.description}"
     if answer.tracking == "found" and answer.explained is not None:  # else a network alone is asked for every frame
         yield "INFO", f"{outcome.name}: the object was found; the answer is by {answer.method}"

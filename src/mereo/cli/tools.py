@@ -50,7 +50,7 @@ class Align:
     unit: Literal["m", "cm", "mm", "in"] = "m"
     scene_unit_mm: PositiveOrUnknown = None
     frame: Literal["camera", "scanner"] = "camera"
-    is_rigid: Annotated[bool, arg(name="as-one")] = False
+    is_rigid: Annotated[bool, arg(name="rigid")] = False
     hold: tuple[str, ...] = ()
     drop_invalid: bool = False
     force: bool = False
@@ -87,7 +87,7 @@ class Align:
                 start = read_start(self.start, rest, scale)
             else:
                 start = start_from_model(load_model(str(self.weights)), cloud.points, self.frame, rest, scale)
-            placement = place(rest, cloud.points, start, self.frame, as_one=self.is_rigid, hold=self.hold)
+            placement = place(rest, cloud.points, start, self.frame, is_rigid=self.is_rigid, hold=self.hold)
             write_truth(directory, self.output, scan, self.scene, rest, placement, start.how)
             write_segments_glb(
                 directory / "segments.glb", placement.mesh, viewer_rotation(self.frame), UNITS_M[self.unit]
@@ -207,21 +207,18 @@ class BenchCommand:
 
     def run(self) -> None:
         """Print the times of all stages of an answer."""
+        from mereo.io.atomic_files import check_file_place
         from mereo.models.device import find_device
         from mereo_experiments.speed.report import benchmark
 
+        if self.output is not None:
+            check_file_place(self.output, force=self.force, inputs=[self.weights] if self.weights else [])
         device = find_device(self.device)
-        benchmark(
-            self.weights,
-            self.preset,
-            device,
-            self.precision,
-            self.repeats,
-            self.rival,
-            self.busy,
-            self.output,
-            self.force,
-        )
+        measured = benchmark(self.weights, self.preset, device, self.precision, self.repeats, self.rival, self.busy)
+        measured.print()
+        if self.output is not None:
+            measured.write(self.output, self.force)
+            print(f"wrote {self.output}")
 
 
 # --- doctor -----------------------------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ from mereo.io.cores import workers_for
 from mereo.models.config import EXACT, Device, InferenceConfig
 from mereo.synthesis.config import GenerateConfig, Sensor, SensorConfig
 from mereo.training.config import PresetName, TrainConfig
-from mereo.workers.spread import ONE_CPU, RayAddress, TaskResources, choose_cluster
+from mereo.workers.spread import DEFAULT_TASK, RayAddress, TaskResources, choose_cluster
 
 
 @dataclass(frozen=True)
@@ -219,7 +219,7 @@ class Evaluate:
     force: bool = False
     threads: Threads = 0
     ray: RayAddress = None
-    task: Annotated[TaskResources, arg(name="")] = ONE_CPU
+    task: Annotated[TaskResources, arg(name="")] = DEFAULT_TASK
     json: bool = False
     options_from: ConfigFile = None
 
@@ -294,7 +294,7 @@ class LearnCommand:
         workers = workers_for(self.workers, self.threads)
         config = LearnConfig(self.minutes, self.init, self.units, workers, self.train)
         if len(self.object) == 1 and self.object[0].is_dir():
-            task = ONE_CPU if self.ray is None else TaskResources(self.cpus_per_object, self.gpus_per_object)
+            task = DEFAULT_TASK if self.ray is None else TaskResources(self.cpus_per_object, self.gpus_per_object)
             cluster = choose_cluster(self.ray, self.threads, task)
             if cluster is not None:
                 config = replace(config, workers=cluster.cpus)

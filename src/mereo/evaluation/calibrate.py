@@ -295,7 +295,7 @@ class MeasuredRadii:
 
     def widened(self, factors: RadiusFactors) -> RegistrationErrors:
         """Errors with the radii that a calibration makes wider; its scale is left out."""
-        extra_radius = self.half * factors.beside(self.displaced)
+        extra_radius = self.half * factors.extra_radius(self.displaced)
         return self.errors.scaled(factors.widening(self.misfit)).with_extra_radius(extra_radius)
 
 

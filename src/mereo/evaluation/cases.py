@@ -55,7 +55,7 @@ class RegistrationErrors:
         ratios: factor of the posterior's Gaussian radius with which the true position lies on the rim of the whole one;
             0 where it lies within in any case.
         gaussian: these radii, scene units.
-        other: radii of the other parts, whose squares add to theirs (``RadiusParts.open`` and ``Uncertainty.beside``).
+        other: radii of the other parts, whose squares add: ``RadiusParts.open``, ``Uncertainty.extra_radius``.
         seen: which of the points the cloud shows.
         calibrated: whether the radii are.
     """
@@ -92,7 +92,10 @@ class RegistrationErrors:
         count, unit = len(truth), sure.optimum.unit / registration.scene_unit
         distances = np.linalg.norm(registration.material[:count] - truth, axis=1)
         off = distances / registration.scene_unit
-        gaussian, other = unit * sure.parts.gaussian[:count], unit * np.hypot(sure.parts.open[:count], sure.beside)
+        gaussian, other = (
+            unit * sure.parts.gaussian[:count],
+            unit * np.hypot(sure.parts.open[:count], sure.extra_radius),
+        )
         ratios = np.sqrt(np.maximum(off**2 - other**2, 0.0)) / gaussian
         errors = cls(distances / scene_unit, ratios, gaussian, other, seen, registration.radius_scale is not None)
         return errors.scaled(sure.scale)

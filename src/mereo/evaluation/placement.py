@@ -118,7 +118,7 @@ def place(
     start: Start,
     frame: CloudAxes = "camera",
     *,
-    as_one: bool = False,
+    is_rigid: bool = False,
     hold: Collection[str] = (),
 ) -> Placement:
     """Place every segment of ``rest`` on a scan.
@@ -128,7 +128,7 @@ def place(
         points: points of the scan, any unit.
         start: rough poses; the object's segments may be off by 20 degrees and a tenth of its size.
         frame: axes of the scan, as in ``mereo reconstruct``.
-        as_one: whether the object is rigid; then only the first stage is done.
+        is_rigid: whether the object is rigid; then only the first stage is done.
         hold: names of segments that are placed as if the scan did not show them.
 
     Raises ``ValueError`` when the result cannot be right: most of the scan lies elsewhere, or a segment ran away.
@@ -147,7 +147,7 @@ def place(
     whole = register(shown, scan, start.poses, [together, *alone] if together else alone, WHOLE_LIMITS)
     _check_explained(whole, scan)
     _check_runaway(rest, start.poses, whole, diagonal(rest))
-    if as_one:
+    if is_rigid:
         return _measured(rest, shown, points, scan, start, whole, ["object"] * len(held))
     others = [[index] for index in range(len(held)) if not held[index]]
     each = register(shown, scan, whole.poses, others, SEGMENT_LIMITS, hold=True)
@@ -163,7 +163,7 @@ def place(
             nearest = neighbour(rest, int(index), each.fitted, counts)
             poses[index], placed_by[index] = each.poses[nearest], f"with {rest.names[nearest]}"
         else:
-            raise ValueError("the scan shows no segment well enough to place it: check the start, or give --as-one")
+            raise ValueError("the scan shows no segment well enough to place it: check the start, or give --rigid")
     return _measured(rest, shown, points, scan, start, replace(each, poses=poses), placed_by)
 
 

@@ -8,7 +8,7 @@ AnswerMethod = Literal["auto", "network", "search", "modes", "full"]
 alone; the registered model in any case, found by a search without the network, or by its modes or the draws of its
 scene as well."""
 
-FoundBy = Literal["search", "network"]
+LocatedBy = Literal["search", "network"]
 """Who found the object in a frame: a search over poses and states, or a trained network."""
 
 Tracking = Literal["found", "followed", "lost"]

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from mereo.fitting.config import FitConfig, FoundBy, TrackConfig, Tracking
+from mereo.fitting.config import FitConfig, LocatedBy, TrackConfig, Tracking
 from mereo.fitting.problem.correspondences import nothing
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import DAMPING, POSE, NormalEquations, Posed, in_space
@@ -36,7 +36,7 @@ from mereo.geometry.camera import SightKind, SightLines
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.downsampling import means_along_sight
 from mereo.geometry.transforms import transform_points
-from mereo.io.cores import one_blas_thread
+from mereo.io.cores import limit_blas_threads
 from mereo.models.calibration import Calibration
 from mereo.reconstruction.isolation import Reading
 from mereo.reconstruction.observation import Observation
@@ -159,7 +159,7 @@ def next_fit(
             frame rules that out by more than ``WHOLE``, it is fitted as seen in part too, and the better fit is taken.
     """
     started = time.perf_counter()
-    with one_blas_thread():
+    with limit_blas_threads():
         few = means_along_sight(points / track.unit, config.points)
         start = track.expected(time_s, config)
         expectation = Expectation.of(track, start, max(time_s - track.time_s, 0.0), config)
@@ -397,7 +397,7 @@ class Tracker:
         self._track: Track | None = None
         self._T_camera_input, self._axes = np.eye(4), "camera"
         self._best = 0.0
-        self._located_by: FoundBy = "network"
+        self._located_by: LocatedBy = "network"
         self._has_begun = False
 
     def close(self) -> None:
@@ -501,7 +501,7 @@ class Tracker:
             answer = answer_of(seen, registrar.network, None, candidate, likelier, registration)
             return replace(answer, registrar=registrar, tracking="lost")
         self._search.drop()
-        self._track, self._best, self._located_by = alone.track, alone.score, candidate.found_by
+        self._track, self._best, self._located_by = alone.track, alone.score, candidate.located_by
         self._T_camera_input, self._axes = candidate.encoded.T_camera_input, seen.frame.axes
         answer = answer_of(seen, registrar.network, registrar, candidate, likelier, alone.registration)
         return replace(answer, seconds=time.perf_counter() - started)
@@ -555,7 +555,7 @@ class Tracker:
             registration=tracked.registration,
             taken=True,
             recognition=recognition,
-            found_by=self._located_by,
+            located_by=self._located_by,
             tracking=tracking,
             seconds=time.perf_counter() - started,
         )
@@ -565,7 +565,7 @@ class Tracker:
         reason = f"the object is lost: {why}; it is being searched for, so keep it in view, or start again with it"
         if alone is None or alone.model is None:
             hypothesis = Reading.of_all(frame.seen.cloud)
-            alone = Answer(frame.seen, None, self.registrar, hypothesis, self._T_camera_input, found_by="search")
+            alone = Answer(frame.seen, None, self.registrar, hypothesis, self._T_camera_input, located_by="search")
         recognition = Recognition(False, reason, MOST)
         return replace(alone, recognition=recognition, tracking="lost", seconds=time.perf_counter() - started)
 

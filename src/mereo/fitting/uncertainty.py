@@ -31,7 +31,7 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.radii import Radii
 from mereo.geometry.solids import owned_gradients
 from mereo.geometry.transforms import transform_points
-from mereo.io.cores import one_blas_thread
+from mereo.io.cores import limit_blas_threads
 from mereo.scenes.statistical_model import StatisticalModel
 
 # --- posterior --------------------------------------------------------------------------------------------------------
@@ -139,7 +139,7 @@ class Posterior:
 
     def radii(self, follow: PointWeights | None = None) -> "RadiusParts":
         """Radii of 95 % of all material points, or of points that follow them; scene units."""
-        with one_blas_thread():
+        with limit_blas_threads():
             motion, open_motion = self.motion, self._open(slice(None))
             if follow is not None:
                 motion, open_motion = follow(motion), follow(open_motion)
@@ -147,7 +147,7 @@ class Posterior:
 
     def radii_of(self, rows: Int[np.ndarray, " n"]) -> "RadiusParts":
         """Radii of 95 % of some material points alone, which cost as little as they are few."""
-        with one_blas_thread():
+        with limit_blas_threads():
             return self._radii(self._motion(rows), self._open(rows))
 
     def _open(self, rows: slice | Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n 3 e"]:
@@ -228,7 +228,7 @@ class ModesOptimum:
         """Terms under the prior of all states; that of states near the answer is too sure (docs/registration.md)."""
         problem, posed, config = self.problem, self.posed, self.problem.config
         nothing = NormalEquations.nothing(POSE + len(posed.z))
-        with one_blas_thread():
+        with limit_blas_threads():
             return Terms(
                 known=problem.known(posed, Prior.whole(problem.model), 0.0),
                 network=problem.network.add_to(
@@ -249,7 +249,7 @@ class ModesOptimum:
         """Posterior of pose, scale and coefficients."""
         model = self.problem.model
         material = self.posed.place(model.material(self.posed.z))
-        with one_blas_thread():
+        with limit_blas_threads():
             open_motion = turns_left_open(self.problem, material)
             if self.bent is not None:
                 bending = (self.bent - material)[:, :, None].astype(np.float32)
@@ -280,7 +280,7 @@ class DrawsOptimum:
     def terms(self) -> Terms:
         """Terms of the neighbourhood in which the scene is linear in its draws."""
         assert self.fit.motion is not None
-        with one_blas_thread():
+        with limit_blas_threads():
             return terms_of_draws(self.problem, self.fit, self.fit.motion, self.problem.base.config.cloud_sigma)
 
     @property
@@ -297,7 +297,7 @@ class DrawsOptimum:
             spread.shape[0], *motion.shape[1:]
         )
         material: Float[np.ndarray, "m 3"] = self.fit.placed()
-        with one_blas_thread():
+        with limit_blas_threads():
             turns = turns_left_open(self.problem.base, material)
             return Posterior.of(self.terms.total, self.fit.posed, material, modes, open=turns)
 
@@ -414,13 +414,13 @@ class Uncertainty:
         model: statistical model of the object.
         scale: factor by which views of training seeds showed the posterior's radii to be too small, in frames like
             this; None where that was not measured, and then they are as the posterior has them.
-        beside: radius added in quadrature at every position where network and fit disagree; scene units.
+        extra_radius: radius added in quadrature at every position where network and fit disagree; scene units.
     """
 
     optimum: Optimum
     model: StatisticalModel
     scale: float | None = None
-    beside: float = 0.0
+    extra_radius: float = 0.0
 
     @property
     def calibrated(self) -> bool:
@@ -437,7 +437,7 @@ class Uncertainty:
         return 1.0 if self.scale is None else self.scale
 
     def _of(self, parts: RadiusParts) -> Float[np.ndarray, " n"]:
-        return self.optimum.unit * parts.radii(self._scale, self.beside)
+        return self.optimum.unit * parts.radii(self._scale, self.extra_radius)
 
     @cached_property
     def parts(self) -> RadiusParts:
@@ -489,7 +489,7 @@ class Uncertainty:
         result = []
         for name, volume, motion in zip(self.model.rest.names, *self._owned, strict=True):
             off = WITHIN * scale * float(np.linalg.norm(motion[0]))
-            radius = unit * float(np.hypot(scale * radius95((motion[1:] @ motion[1:].T)[None])[0], self.beside))
+            radius = unit * float(np.hypot(scale * radius95((motion[1:] @ motion[1:].T)[None])[0], self.extra_radius))
             between = (max(float(volume) - off, 0.0) * unit**3, (float(volume) + off) * unit**3)
             result.append(SegmentUncertainty(name, radius, between))
         return tuple(result)

@@ -76,7 +76,7 @@ class Radii:
         return result
 
 
-def level_told(calibrated: bool) -> str:
+def describe_level(calibrated: bool) -> str:
     """Words for the probability with which a place lies within its radius, and on whose word that is."""
     return "95 %" if calibrated else "95 %, not calibrated"
 

@@ -79,7 +79,7 @@ PositiveOrUnknown = Annotated[float | None, *_within(0, above=True)]
 NotNegative = Annotated[float, *_within(0)]
 Multiple = Annotated[float, *_within(0, 1000)]
 Probability = Annotated[float, *_within(0, 1)]
-BelowOne = Annotated[float, *_within(0, 1, below=True)]
+ProperFraction = Annotated[float, *_within(0, 1, below=True)]
 Share = Annotated[float, *_within(0, 1, above=True)]
 ShareRange = Annotated[tuple[float, float], *_within(0, 1, above=True)]
 

@@ -83,7 +83,7 @@ def _blas_limit() -> AbstractContextManager[object]:
 _BLAS_LIMIT = SharedLimit(_blas_limit)
 
 
-def one_blas_thread() -> AbstractContextManager[object]:
+def limit_blas_threads() -> AbstractContextManager[object]:
     """Hold BLAS to one thread: its sums come out the same on any number of cores.
 
     And where products are small it is faster than two, on busy cores 20 times. The limit is the whole process's, and

@@ -272,7 +272,7 @@ class GlbScene:
         radii: how sure the surfaces are, where our own file says it.
         rotation: from the vertices' frame to glTF's.
         unit_m: metres per unit of the vertices.
-        is_own: whether mereo wrote the file.
+        is_ours: whether mereo wrote the file.
     """
 
     mesh: SegmentedMesh
@@ -280,7 +280,7 @@ class GlbScene:
     radii: Radii | None
     rotation: Float[np.ndarray, "3 3"]
     unit_m: float
-    is_own: bool
+    is_ours: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,9 +306,9 @@ def read_glb(path: str | Path) -> GlbScene:
     path = Path(path)
     with readable(path, "GLB file"):
         scene: Any = trimesh.load_scene(path, process=False)
-        is_own = VIEWER_ROOT in scene.graph.nodes
-        base = VIEWER_ROOT if is_own else scene.graph.base_frame
-        root = np.asarray(scene.graph.get(VIEWER_ROOT)[0] if is_own else np.eye(4), dtype=np.float64)[:3, :3]
+        is_ours = VIEWER_ROOT in scene.graph.nodes
+        base = VIEWER_ROOT if is_ours else scene.graph.base_frame
+        root = np.asarray(scene.graph.get(VIEWER_ROOT)[0] if is_ours else np.eye(4), dtype=np.float64)[:3, :3]
         nodes = _nodes_with_faces(scene)
         if not nodes:
             raise ValueError("it has no faces")
@@ -317,7 +317,7 @@ def read_glb(path: str | Path) -> GlbScene:
         if not unit_m > 0:
             raise ValueError("its root node has a scale of 0")
         mesh = SegmentedMesh(_renamed([part.segment for part in parts]))
-        return GlbScene(mesh, tuple(part.colors for part in parts), _radii(parts), root / unit_m, unit_m, is_own)
+        return GlbScene(mesh, tuple(part.colors for part in parts), _radii(parts), root / unit_m, unit_m, is_ours)
 
 
 def _glb_part(scene: Any, node: str, base: str, number: int, stem: str) -> _GlbPart:

@@ -73,7 +73,7 @@ class RadiusFactors:
         """Scale in a frame of this misfit."""
         return None if self.scale is None else self.scale * self.widening(misfit)
 
-    def beside(self, displaced: float | None) -> float:
+    def extra_radius(self, displaced: float | None) -> float:
         """Radius that every place has beside, where network and model are so far apart; in half lengths."""
         if self.displaced is None or displaced is None:
             return 0.0

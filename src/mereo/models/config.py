@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal
 from tyro.conf import arg
 
 from mereo.io.bounds import (
-    BelowOne,
     Count,
     CountOrNone,
     Depth,
@@ -21,6 +20,7 @@ from mereo.io.bounds import (
     NotNegative,
     Points,
     Positive,
+    ProperFraction,
     Share,
     Width,
     Widths,
@@ -165,7 +165,7 @@ class DecoderConfig:
     width: Width = 512
     depth: Depth = 7
     skip_after: Count = 4
-    dropout: BelowOne = 0.0
+    dropout: ProperFraction = 0.0
     encode_positions: bool = True
     lowest_exponent: Exponent = -4
     highest_exponent: Exponent = 5

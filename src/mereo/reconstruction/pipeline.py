@@ -39,7 +39,7 @@ CONFIDENCE_VOXELS = 2000
 
 
 @dataclass(frozen=True, eq=False)
-class FoundSegment:
+class SegmentFacts:
     """Segment in numbers, in the input's frame and units.
 
     Attributes:
@@ -65,7 +65,7 @@ class FoundSegment:
     def __repr__(self) -> str:
         sure = "" if np.isnan(self.confidence) else f", confidence {self.confidence:.2f}"
         figures = f"volume {self.volume:.3g}{sure}" if self.voxels else "not found"
-        return f"FoundSegment({self.name!r}, {figures})"
+        return f"SegmentFacts({self.name!r}, {figures})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,7 @@ class Reconstruction:
 
     surfaces: SegmentedMesh
     labels: LabelGrid
-    segments: tuple[FoundSegment, ...]
+    segments: tuple[SegmentFacts, ...]
     timings_s: dict[str, float]
     evaluated: int
     clipped: bool
@@ -272,7 +272,7 @@ def segment_points(
     )
 
 
-def measure(extraction: Extraction, model: Trained | None, code: EncodedCloud | None) -> tuple[FoundSegment, ...]:
+def measure(extraction: Extraction, model: Trained | None, code: EncodedCloud | None) -> tuple[SegmentFacts, ...]:
     """Every segment of an extraction in numbers; ``code`` is what ``model`` made of the cloud, None without one."""
     owned = zip(extraction.surfaces.segments, extraction.surfaces.owned_volumes, strict=True)
     return tuple(
@@ -283,18 +283,18 @@ def measure(extraction: Extraction, model: Trained | None, code: EncodedCloud | 
 
 def _measure(
     grid: LabelGrid, label: int, segment: Segment, volume: float, model: Trained | None, code: EncodedCloud | None
-) -> FoundSegment:
+) -> SegmentFacts:
     voxels = np.argwhere(grid.labels == label)
     if len(voxels) == 0:
         nothing = np.full((2, 3), np.nan)
-        return FoundSegment(segment.name, label, 0.0, nothing[0], nothing, float("nan"), 0, 0)
+        return SegmentFacts(segment.name, label, 0.0, nothing[0], nothing, float("nan"), 0, 0)
     confidence = float("nan")
     if model is not None and code is not None:
         chosen = random_subset(voxels, CONFIDENCE_VOXELS)
         confidence = float(model.query(code, grid.positions(chosen)).probability[:, label].mean())
     low, high = voxels.min(axis=0), voxels.max(axis=0) + 1
     part = grid.labels[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
-    return FoundSegment(
+    return SegmentFacts(
         name=segment.name,
         label=label,
         volume=volume,

@@ -13,7 +13,7 @@ from mereo.deformation.moving_least_squares import spread
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import align_all, fit_rigid
-from mereo.io.cores import one_blas_thread
+from mereo.io.cores import limit_blas_threads
 from mereo.io.progress import stage, tracked
 from mereo.scenes.rest_pose import rest_frame
 from mereo.scenes.scene import Scene, State
@@ -97,7 +97,7 @@ def scene_model(scene: Scene, count: int = STATES, seed: int = STATES_SEED, *, q
     frame, scene = scene.source_frame, scene.for_seed(seed)
     nodes, labels = interior_nodes(scene.rest)
     states = sample_states(scene, nodes, labels, count, seed, quiet)
-    with one_blas_thread():
+    with limit_blas_threads():
         model = build_model(scene.rest, nodes, labels, states)
     return replace(model, source_frame=frame)
 

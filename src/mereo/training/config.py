@@ -11,11 +11,11 @@ from typing import Any, Literal, get_args
 
 from mereo.io.bounds import (
     Batch,
-    BelowOne,
     CountOrNone,
     NotNegative,
     Positive,
     Probability,
+    ProperFraction,
     Seed,
     ShareRange,
     check_bounds,
@@ -97,9 +97,9 @@ class TrainConfig:
     code_length: Positive = 1.0
     weight_decay: NotNegative = 0.0
     schedule: Literal["constant", "cosine"] = "constant"
-    warmup: BelowOne = 0.0
+    warmup: ProperFraction = 0.0
     clip_norm: NotNegative = 0.0
-    ema_decay: BelowOne = 0.0
+    ema_decay: ProperFraction = 0.0
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     learned_box: bool = False
     offset_examples: CountOrNone = 0

@@ -8,7 +8,7 @@ from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
 from mereo.geometry.mesh import Color, Segment, SegmentedMesh, vertex_normals
-from mereo.geometry.radii import STOPS, Radii, between_stops, level_told
+from mereo.geometry.radii import STOPS, Radii, between_stops, describe_level
 from mereo.models.trained import Answer
 
 Ask = Callable[[Float[np.ndarray, "n 3"]], Answer]
@@ -94,7 +94,7 @@ def distance_scale(values: Sequence[Float[np.ndarray, " _"]], unit: str) -> Colo
 
 def radius_scale(radii: Radii, unit: str) -> ColorScale:
     """Scale for radii of 95 % in the unit that is named."""
-    title = f"true places are within ({level_told(radii.calibrated)})"
+    title = f"true places are within ({describe_level(radii.calibrated)})"
     return ColorScale(title, 0.0, max(radii.high, 1e-9), STOPS, (f"0{unit}, sure", f"{radii.high:.3g}{unit}"))
 
 

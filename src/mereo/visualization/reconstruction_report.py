@@ -28,7 +28,7 @@ from mereo.fitting.uncertainty import Explanation
 from mereo.geometry.camera import DepthImage, PointCloud
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.mesh import Color, Segment, SegmentedMesh
-from mereo.geometry.radii import STOPS, Radii, between_stops, level_told
+from mereo.geometry.radii import STOPS, Radii, between_stops, describe_level
 from mereo.geometry.subdivision import split_at_creases
 from mereo.io.atomic_files import atomic_file
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
@@ -135,7 +135,7 @@ class Report:
                 "weights": [list(color) for color in WEIGHTS],
                 "unexplained": list(RED),
                 "ends": ["0", f"{rounded(radii.high * self.unit.length_factor)} {self.unit.length_name}"],
-                "title": f"the true place is so far away at most ({level_told(radii.calibrated)})",
+                "title": f"the true place is so far away at most ({describe_level(radii.calibrated)})",
                 "centroids": [
                     {"name": name, "marks": _base64(marks[name]), "shares": describe_shares(explanation)}
                     for name, explanation in centroids.items()

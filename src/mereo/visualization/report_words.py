@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from mereo.geometry.radii import level_told
+from mereo.geometry.radii import describe_level
 from mereo.visualization.units import Unit, rounded
 
 # --- trust ------------------------------------------------------------------------------------------------------------
@@ -167,7 +167,7 @@ def _facts(summary: Mapping[str, Any], unit: Unit, verdict: Trust) -> list[str]:
         facts.append(f"from {source}")
     if isinstance(radius95, Mapping):
         middle, most = (rounded(float(radius95[key]) * unit.length_factor) for key in ("median", "max"))
-        level = level_told(bool(radius95.get("calibrated")))
+        level = describe_level(bool(radius95.get("calibrated")))
         facts.append(f"surface within {middle} {unit.length_name} in the median, {most} at most ({level})")
     if spacing is not None:
         facts.append(f"voxels of {rounded(spacing * unit.length_factor)} {unit.length_name}")
@@ -184,7 +184,7 @@ def _answer(registration: Mapping[str, Any], verdict: Trust) -> str:
     explained = _number(registration.get("explained"))
     if registration.get("answer") != "registration":
         return "the network's own answer"
-    how = "found by a search" if registration.get("found_by") == "search" else "registered"
+    how = "found by a search" if registration.get("located_by") == "search" else "registered"
     # two of the verdicts say themselves how much it explains
     share = "" if explained is None or verdict.level in ("yes", "unchecked") else f"{explained:.1%}"
     return f"your model, {how}" + (share and f": it explains {share} of the points")

@@ -78,7 +78,7 @@ def frame_facts(answer: Answer, carried: Sequence[Carried] = ()) -> dict[str, ob
         "points": len(seen.cloud),
     }
     if registrar is not None:
-        source = {"answer": "registration" if answer.taken else "network", "found_by": answer.found_by}
+        source = {"answer": "registration" if answer.taken else "network", "located_by": answer.located_by}
         fit = answer.registration
         facts["registration"] = source | ({"refusal": answer.refusal} if fit is None else describe(fit))
     facts["recognition"] = answer.recognition.facts()

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.reconstruction.pipeline import FoundSegment
+from mereo.reconstruction.pipeline import SegmentFacts
 from mereo.visualization.contact_sheets import data_url
 from mereo.visualization.previews import CAMERA_VIEWS, points_on_segments
 from mereo.visualization.report_words import confidence_title
@@ -24,7 +24,7 @@ def result_html(
     lines: Sequence[str],
     points: Float[np.ndarray, "n 3"],
     surfaces: SegmentedMesh,
-    segments: Sequence[FoundSegment],
+    segments: Sequence[SegmentFacts],
     unit: Unit,
     calibrated: bool = False,
 ) -> str:
@@ -56,7 +56,7 @@ def result_html(
     )
 
 
-def _table(segments: Sequence[FoundSegment], surfaces: SegmentedMesh, unit: Unit, calibrated: bool) -> str:
+def _table(segments: Sequence[SegmentFacts], surfaces: SegmentedMesh, unit: Unit, calibrated: bool) -> str:
     has_confidence = not all(np.isnan(segment.confidence) for segment in segments)
     sure = [confidence_title(calibrated)] if has_confidence else []
     heads = ("segment", f"volume, {unit.volume_name}", *sure, f"centre, {unit.length_name}")

@@ -54,7 +54,7 @@ class TaskResources:
     gpus_per_task: NotNegative = 0
 
 
-ONE_CPU = TaskResources()
+DEFAULT_TASK = TaskResources()
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ def process_pool(function: Function, workers: int) -> Iterator[Callable[[Any], F
     start_resource_tracker()
     end, parent_end = context.Pipe(duplex=False)
     executor = ProcessPoolExecutor(workers, context, _start_worker, (function, end))
-    with end, parent_end, one_thread_each(), executor as pool:
+    with end, parent_end, limit_child_threads(), executor as pool:
         try:
             yield lambda item: pool.submit(_apply, item)
         except BaseException:
@@ -242,7 +242,7 @@ def pickled(function: Function, dumps: Callable[[Function], bytes]) -> bytes:
 
 
 @contextmanager
-def one_thread_each() -> Iterator[None]:
+def limit_child_threads() -> Iterator[None]:
     """Let processes that are started in the block compute in one thread: libraries read this when they are loaded."""
     before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
@@ -259,7 +259,7 @@ def one_thread_each() -> Iterator[None]:
 # --- Ray --------------------------------------------------------------------------------------------------------------
 
 
-def choose_cluster(address: str | None, local_cpus: int = 0, task: TaskResources = ONE_CPU) -> Cluster | None:
+def choose_cluster(address: str | None, local_cpus: int = 0, task: TaskResources = DEFAULT_TASK) -> Cluster | None:
     """Cluster that options name, None where they name none; a wrong address is an error before any work.
 
     Raises:
@@ -267,7 +267,7 @@ def choose_cluster(address: str | None, local_cpus: int = 0, task: TaskResources
         ValueError: resources of tasks without a cluster, or something that is no address.
         ConnectionError: nothing answers at the address.
     """
-    if address is None and task != ONE_CPU:
+    if address is None and task != DEFAULT_TASK:
         raise ValueError("--cpus-per-task and --gpus-per-task are for tasks of a cluster: give --ray local")
     if address is None:
         return None

@@ -10,13 +10,13 @@ import numpy as np
 import torch
 
 from mereo.evaluation.sample_views import SampleView, load_view, shipped_views
-from mereo.io.atomic_files import check_file_place, write_json
+from mereo.io.atomic_files import write_json
 from mereo.io.cores import cores
 from mereo.models.config import Precision
 from mereo.models.device import cpu_features
 from mereo.models.model import Model
 from mereo.models.weights import load_model
-from mereo_experiments.speed.busy import measure_under_load, shares_table
+from mereo_experiments.speed.busy import Share, measure_under_load, shares_table
 from mereo_experiments.speed.fitted_model import fitted_model
 from mereo_experiments.speed.roofline import Machine, measure_machine
 from mereo_experiments.speed.stages import Bench, Stage, random_points
@@ -38,6 +38,36 @@ class Cost:
     distance: float
 
 
+@dataclass(frozen=True)
+class Measured:
+    """Times of all stages, and on what they were measured.
+
+    Attributes:
+        stages: each stage of an answer.
+        facts: of the machine and the network.
+        cost: what a lower precision changes; None in single precision.
+        loads: times while other processes are busy.
+    """
+
+    stages: list[Stage]
+    facts: dict[str, Any]
+    cost: Cost | None
+    loads: list[Share]
+
+    def print(self) -> None:
+        """Print the tables."""
+        print(table(self.stages, self.facts, self.cost))
+        if self.loads:
+            print(shares_table(self.loads, f"{QUERIES:,} queries"))
+
+    def write(self, path: Path, force: bool = False) -> None:
+        """Write all as JSON; raises ``FileExistsError`` as ``atomic_file`` does."""
+        rows = [{**asdict(stage), "ratio": stage.ratio} for stage in self.stages]
+        loads = [{**asdict(share), "fair": share.fair, "times": share.times} for share in self.loads]
+        cost = None if self.cost is None else asdict(self.cost)
+        write_json(path, {**self.facts, "cost": cost, "stages": rows, "busy": loads}, force=force)
+
+
 def benchmark(
     weights: str | None,
     preset: str,
@@ -46,10 +76,8 @@ def benchmark(
     repeats: int,
     rival: bool,
     busy: int,
-    output: Path | None,
-    force: bool = False,
-) -> list[Stage]:
-    """Time all stages, print the tables, and write them as JSON where ``output`` says so.
+) -> Measured:
+    """Time all stages of an answer.
 
     Args:
         weights: a shipped name or a file, with a shipped view of its object; None fits the preset's network first.
@@ -59,13 +87,9 @@ def benchmark(
         repeats: repetitions of each stage.
         rival: whether to time the straightforward implementation too.
         busy: processes that never rest, with which queries are timed again on a CPU; 0 leaves that out.
-        output: a JSON file, or None.
-        force: replace an existing file, unless it is the weights.
 
-    Raises ``FileExistsError`` as ``atomic_file`` does, and ``ValueError`` for weights of an object without a
-    shipped view.
+    Raises ``ValueError`` for weights of an object without a shipped view.
     """
-    check_file_place(output, force=force, inputs=[] if weights is None else [weights])
     load = _load()
     model, view = _subject(weights, preset)
     model.network.to(device)
@@ -73,19 +97,10 @@ def benchmark(
     machine = measure_machine(device, fast.working_dtype)
     bench = Bench(fast, view, machine, repeats, rival)
     stages = bench.run()
-    shares = measure_under_load(bench.ask(QUERIES), busy, repeats) if busy and device.type == "cpu" else []
+    loads = measure_under_load(bench.ask(QUERIES), busy, repeats) if busy and device.type == "cpu" else []
     facts = load | _facts(weights or f"preset {preset}, fitted to one frame", fast, machine)
     cost = _cost(model, fast, view) if fast.working_dtype is not torch.float32 else None
-    print(table(stages, facts, cost))
-    if shares:
-        print(shares_table(shares, f"{QUERIES:,} queries"))
-    if output is not None:
-        rows = [{**asdict(stage), "ratio": stage.ratio} for stage in stages]
-        loads = [{**asdict(share), "fair": share.fair, "times": share.times} for share in shares]
-        report = {**facts, "cost": None if cost is None else asdict(cost), "stages": rows, "busy": loads}
-        write_json(output, report, force=force)
-        print(f"wrote {output}")
-    return stages
+    return Measured(stages, facts, cost, loads)
 
 
 def _subject(weights: str | None, preset: str) -> tuple[Model, SampleView]:

@@ -6,8 +6,8 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
-from mereo.fitting.config import FoundBy, Tracking
-from mereo.fitting.registration.recognition import NOT_ASKED, Recognition
+from mereo.fitting.config import LocatedBy, Tracking
+from mereo.fitting.registration.recognition import NOT_EVALUATED, Recognition
 from mereo.fitting.registration.register import ModesFit, Registrar
 from mereo.fitting.registration.registration import Registration, nearest_labels
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
@@ -39,13 +39,13 @@ class Candidate:
         encoded: these points, and what the network made of them.
         modes: the fit; None where none was wanted or none was found.
         error: why none was found.
-        found_by: who found the object there.
+        located_by: who found the object there.
     """
 
     encoded: EncodedFrame
     modes: ModesFit | None = None
     error: ValueError | None = None
-    found_by: FoundBy = "network"
+    located_by: LocatedBy = "network"
 
     @property
     def hypothesis(self) -> Reading:
@@ -92,7 +92,7 @@ class Answer:
         resolution: cells along the longest side of the object's box in ``reconstruction``.
         label_points: whether ``reconstruction`` also labels the observed points by segment.
         seconds: that it took, without ``reconstruction``.
-        found_by: who found the object; of a tracked answer, when it began to be followed.
+        located_by: who found the object; of a tracked answer, when it began to be followed.
         tracking: of a tracked object; a lost one has no pose, and ``recognition`` has the reason.
     """
 
@@ -104,12 +104,12 @@ class Answer:
     candidate: Candidate | None = None
     registration: Registration | None = None
     taken: bool = False
-    recognition: Recognition = NOT_ASKED
+    recognition: Recognition = NOT_EVALUATED
     likelier: EncodedFrame | None = None
     resolution: int = 128
     label_points: bool = False
     seconds: float = 0.0
-    found_by: FoundBy = "network"
+    located_by: LocatedBy = "network"
     tracking: Tracking = "found"
 
     def __repr__(self) -> str:
@@ -142,7 +142,7 @@ class Answer:
             return "lost"
         if self.registration is None:
             return "network alone" if self.refusal is None else f"network alone: {self.refusal}"
-        phrase = self.registration.told
+        phrase = self.registration.description
         return phrase if self.taken else f"network alone: the {phrase}, too few"
 
     @cached_property

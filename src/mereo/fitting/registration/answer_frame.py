@@ -23,7 +23,7 @@ from mereo.fitting.registration.registration import Registration
 from mereo.fitting.search import WHOLE, Screen, rotations, search, tables_of
 from mereo.geometry.camera import SightLines
 from mereo.geometry.transforms import transform_points
-from mereo.io.cores import one_blas_thread
+from mereo.io.cores import limit_blas_threads
 from mereo.io.progress import stage
 from mereo.models.trained import Trained
 from mereo.reconstruction.isolation import Reading, readings
@@ -117,7 +117,7 @@ def answer_of(
         taken=taken,
         recognition=recognition,
         likelier=likelier,
-        found_by=candidate.found_by if taken else "network",
+        located_by=candidate.located_by if taken else "network",
     )
 
 
@@ -297,8 +297,8 @@ def _searched(frame: EncodedFrame, registrar: Registrar, scene_unit: float | Non
         check_size(frame, registrar.model, scene_unit)
         modes = search_modes(cloud_to_fit(frame, lines, scene_unit), registrar.model, registrar.config)
     except ValueError as error:
-        return Candidate(frame, error=error, found_by="search")
-    return Candidate(frame, modes, found_by="search")
+        return Candidate(frame, error=error, located_by="search")
+    return Candidate(frame, modes, located_by="search")
 
 
 def cloud_to_fit(
@@ -369,7 +369,7 @@ def search_modes(
 ) -> ModesFit:
     """Fit the modes to a cloud by search; where it leaves open what lies beside it, the fits decide."""
     started = time.perf_counter()
-    with one_blas_thread():
+    with limit_blas_threads():
         unit = size_of(cloud.points, model) if cloud.scene_unit is None else cloud.scene_unit
         is_open = cloud.lines is None or cloud.lines.other_lines is None
         evidence = cloud.evidence(unit)

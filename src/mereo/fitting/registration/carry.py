@@ -314,7 +314,7 @@ class Carried:
         return self.content.values.size if isinstance(self.content, Volume) else len(self.content.points)
 
     @property
-    def told(self) -> str:
+    def description(self) -> str:
         """Phrase on what was carried."""
         outside = self.count - self.inside
         away = f"{outside} of them outside, up to {self.farthest:.4g} away" if outside else "all inside"
@@ -342,7 +342,7 @@ class CarriedVolume(Carried):
     interpolation: Interpolation
 
     @property
-    def told(self) -> str:
+    def description(self) -> str:
         """Phrase on what was carried."""
         sides = " x ".join(map(str, self.content.values.shape))
         beyond = self.inside - self.within

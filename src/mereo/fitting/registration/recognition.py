@@ -136,7 +136,7 @@ class Recognition:
     calibrated: bool = False
 
     @property
-    def told(self) -> str | None:
+    def description(self) -> str | None:
         """Sentence for people; None where the object is known."""
         if self.reason is None:
             return None
@@ -155,7 +155,7 @@ class Recognition:
         }
 
 
-NOT_ASKED = Recognition("unsure", "the network alone cannot tell its object from others: use --method auto", 0.0)
+NOT_EVALUATED = Recognition("unsure", "the network alone cannot tell its object from others: use --method auto", 0.0)
 """Recognition of a frame to which no model was registered."""
 
 
@@ -176,7 +176,7 @@ def recognize(
         refusal: why no registration was found; None where none was wanted, and then recognition is not possible.
     """
     if registration is None:
-        return NOT_ASKED if refusal is None else Recognition(False, refusal, MOST)
+        return NOT_EVALUATED if refusal is None else Recognition(False, refusal, MOST)
     calibrated = None if calibration is None else calibration.recognizing
     limits = CONSERVATIVE if calibrated is None else calibrated
     signs = Signs.of(registration, displaced, stated_scene_unit)

@@ -37,7 +37,7 @@ from mereo.fitting.registration.registration import Method, Registration
 from mereo.fitting.uncertainty import DrawsOptimum, ModesOptimum, Optimum
 from mereo.geometry.brief import listed
 from mereo.geometry.camera import PointCloud, SightLines
-from mereo.io.cores import one_blas_thread
+from mereo.io.cores import limit_blas_threads
 from mereo.io.progress import stage
 from mereo.models.calibration import Calibration
 from mereo.models.trained import EncodedCloud, Trained
@@ -131,7 +131,7 @@ class ModesFit:
             assert predict is not None
             return predict(seen * unit).scaled(1 / unit)
 
-        with one_blas_thread():
+        with limit_blas_threads():
             problem = Problem.of(model, correspondences, cloud.evidence(unit), cloud.scale_std(config), config)
             fit = problem, correspondences, fit_modes(problem)
             predict_scaled = None if predict is None else predict_in_scene_units
@@ -187,7 +187,7 @@ class ModesFit:
         if not self.may_take_draws:
             return self.registration()
         started = time.perf_counter()
-        with one_blas_thread():
+        with limit_blas_threads():
             problem = DrawsProblem.of(self.problem, states, self.correspondences)
             drawn = fit_draws(problem, self.posed)
             taken = drawn is not None and is_drawn(problem, drawn, self.posed, self.rest)
@@ -230,7 +230,7 @@ class ModesFit:
         factors, model = self.calibration.radii(draws=method == "draws", noisy=self.problem.noisy), self.problem.model
         scale = factors.scale if factors.misfit is None else factors.scale_at(self.problem.cloud_misfit(surface))
         displaced = None if factors.displaced is None else self.correspondences.displaced(model, surface.material)
-        return scale, model.half * factors.beside(displaced)
+        return scale, model.half * factors.extra_radius(displaced)
 
     def _is_believed(self, explained: float, surface: Surface) -> bool:
         """Whether a fit explains enough of the points; less is enough where the network sees the same segments there.

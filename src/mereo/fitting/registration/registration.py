@@ -70,7 +70,7 @@ class Registration:
         optimum: where the fit ended, from which uncertainty and explanations are made on first use; None
             where the registration was read from a file.
         radius_scale: factor of the radii by the weights' calibration of such fits to such frames; None without one.
-        extra_radius: radius that every position has beside that, as ``Uncertainty.beside``; scene units.
+        extra_radius: radius that every position has beside that, as ``Uncertainty.extra_radius``; scene units.
         alike: number of different states that a search found to explain the frame alike, this one included.
     """
 
@@ -95,10 +95,10 @@ class Registration:
     def __repr__(self) -> str:
         trust = "" if self.accepted else "not believed, "
         unit = f"a scene unit is {self.scene_unit:.4g}"
-        return f"Registration({self.told}, {trust}{unit}; {self.seconds:.1f} s)"
+        return f"Registration({self.description}, {trust}{unit}; {self.seconds:.1f} s)"
 
     @property
-    def told(self) -> str:
+    def description(self) -> str:
         """Phrase on how well the frame is explained."""
         others = f"; {counted(self.alike - 1, 'other state')} would do so too" if self.alike > 1 else ""
         return f"registered model ({self.method}) explains {self.explained:.1%} of the observed points{others}"

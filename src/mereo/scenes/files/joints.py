@@ -83,13 +83,13 @@ def contacts(mesh: SegmentedMesh) -> tuple[Contact, ...]:
     """All contacts between segments, which need not be solids. Lengths are in the mesh's unit."""
     reach = CLEARANCE * float((mesh.bounds[1] - mesh.bounds[0]).max())
     areas = [float(np.linalg.norm(_crossed(segment), axis=1).sum()) for segment in mesh.segments]
-    found: list[Contact] = []
+    touching: list[Contact] = []
     for pair in combinations(range(len(mesh.segments)), 2):
         first, second = sorted(pair, key=lambda index: areas[index])
         points, normals = _touching(mesh.segments[first], mesh.segments[second], reach)
         if len(points) >= LEAST_POINTS:
-            found += _shapes(first, second, points, normals, reach)
-    return tuple(found)
+            touching += _shapes(first, second, points, normals, reach)
+    return tuple(touching)
 
 
 def _crossed(segment: Segment) -> Float[np.ndarray, "f 3"]:
@@ -130,18 +130,18 @@ def _touching(first: Segment, second: Segment, reach: float) -> tuple[Points, Po
 
 def _shapes(first: int, second: int, points: Points, normals: Points, reach: float) -> list[Contact]:
     """Planes of a contact, largest first, and what is left of it."""
-    found, count = [], len(points)
+    touching, count = [], len(points)
     while len(points) >= LEAST_POINTS:
         flat = _largest_plane(points, normals, reach)
         if flat.sum() < max(PLANE_SHARE * count, LEAST_POINTS):
             break
         axis, along, extent = normals[flat].mean(axis=0), *_longest(points[flat])
         axis /= np.linalg.norm(axis)
-        found.append(Contact(first, second, "plane", points[flat].mean(axis=0), axis, along, 0.0, extent))
+        touching.append(Contact(first, second, "plane", points[flat].mean(axis=0), axis, along, 0.0, extent))
         points, normals = points[~flat], normals[~flat]
     if len(points) >= LEAST_POINTS:
-        found.append(_cylinder(first, second, points, normals) or _other(first, second, points))
-    return found
+        touching.append(_cylinder(first, second, points, normals) or _other(first, second, points))
+    return touching
 
 
 def _largest_plane(points: Points, normals: Points, reach: float) -> Bool[np.ndarray, " n"]:
@@ -225,13 +225,13 @@ class Joint:
 
 def proposed_joints(mesh: SegmentedMesh) -> tuple[Joint, ...]:
     """Joints of an assembly at rest, those that move least first, as a chain wants it."""
-    found = contacts(mesh)
+    touching = contacts(mesh)
     reach = CLEARANCE * float((mesh.bounds[1] - mesh.bounds[0]).max())
     joints: list[Joint] = []
-    for contact in sorted(found, key=lambda each: each.kind):  # cylinders before planes
+    for contact in sorted(touching, key=lambda each: each.kind):  # cylinders before planes
         if contact.kind == "other" or _held(contact, joints):
             continue
-        joint = _joint(mesh, found, contact, reach)
+        joint = _joint(mesh, touching, contact, reach)
         if joint is not None and not any(_same(joint, other) for other in joints):
             joints.append(joint)
     return tuple(sorted(joints, key=lambda joint: len(joint.moved)))
@@ -251,12 +251,12 @@ def _same(first: Joint, second: Joint) -> bool:
     return first.moved == second.moved and first.hinge == second.hinge and abs(first.axis @ second.axis) > PARALLEL
 
 
-def _joint(mesh: SegmentedMesh, found: Sequence[Contact], contact: Contact, reach: float) -> Joint | None:
+def _joint(mesh: SegmentedMesh, touching: Sequence[Contact], contact: Contact, reach: float) -> Joint | None:
     """The joint of a contact; None where its sides hang together elsewhere, look alike in it, or collide at once."""
     hinge = contact.kind == "cylinder"
     axis = contact.axis if hinge else contact.along
     axis = axis * np.sign(axis[np.abs(axis).argmax()])
-    side = _sides(len(mesh.segments), [each for each in found if not _allows(each, contact, hinge, axis, reach)])
+    side = _sides(len(mesh.segments), [each for each in touching if not _allows(each, contact, hinge, axis, reach)])
     if side[contact.first] == side[contact.second]:
         return None
     groups = [tuple(np.flatnonzero(side == side[index]).tolist()) for index in (contact.first, contact.second)]
@@ -326,5 +326,5 @@ def _collides(mesh: SegmentedMesh, moved: tuple[int, ...], motion: Rigid) -> boo
     """Whether moved segments overlap others by more than they do at rest."""
     places = [motion(s.vertices) if index in moved else s.vertices for index, s in enumerate(mesh.segments)]
     inside = {mesh.names[index] for index in moved}
-    found = overlaps(mesh.with_vertices(places), COLLIDES)
-    return any(len({each.small, each.large} & inside) == 1 for each in found)
+    collisions = overlaps(mesh.with_vertices(places), COLLIDES)
+    return any(len({each.small, each.large} & inside) == 1 for each in collisions)

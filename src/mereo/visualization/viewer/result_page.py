@@ -93,7 +93,7 @@ def source_of(answer: Answer) -> str:
     """Where an answer comes from, and whether its frame shows the object, in a phrase for people."""
     if answer.registrar is None:
         return "network alone: the weights carry no statistical model"
-    doubt = None if answer.registration is None else answer.recognition.told
+    doubt = None if answer.registration is None else answer.recognition.description
     return answer.source if doubt is None else f"{answer.source}; {doubt}"
 
 
@@ -303,7 +303,7 @@ def content_of_files(path: Path) -> Content:
     if is_glb(path):
         scene, report = read_glb(path), None
         # glTF's metres; a file of ours has the same number where the unit of its input was not known
-        unit = UNKNOWN if scene.is_own and scene.unit_m == 1.0 else Unit(scene.unit_m)
+        unit = UNKNOWN if scene.is_ours and scene.unit_m == 1.0 else Unit(scene.unit_m)
     else:
         surfaces = folder / WRITERS["glb"].file
         if not surfaces.is_file():
@@ -328,9 +328,9 @@ def content_of_files(path: Path) -> Content:
         cloud=cloud,
         depth=None if report is None or report.depth is None else (report.depth, report.ends),
         colorings=colorings,
-        ask=partial(probe_surfaces, Solids(scene.mesh), scene.radii) if scene.is_own else None,
+        ask=partial(probe_surfaces, Solids(scene.mesh), scene.radii) if scene.is_ours else None,
         is_doubtful=report is not None and report.level == "no",
-        first_view="camera" if scene.is_own else "front",
+        first_view="camera" if scene.is_ours else "front",
     )
 
 
@@ -346,7 +346,7 @@ def _nested(mesh: SegmentedMesh, summary: Path) -> SegmentedMesh:
 def _facts(scene: GlbScene, unit: Unit, points: int | None) -> str:
     sides = np.ptp(scene.mesh.bounds, axis=0) * unit.length_factor
     size = f"{' x '.join(rounded(float(side)) for side in sides)} {unit.length_name}"
-    parts = counted(len(scene.mesh.segments), "segment" if scene.is_own else "part")
+    parts = counted(len(scene.mesh.segments), "segment" if scene.is_ours else "part")
     faces = sum(len(segment.faces) for segment in scene.mesh.segments)
     return " · ".join([*([] if points is None else [f"{points:,} points"]), parts, f"{faces:,} faces", size])
 
