@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from fitted_clouds import fit_correspondences
+from answers import fit_correspondences
 from scipy.spatial.transform import Rotation
 from toy_scene import Lift, Shear, toy_scene
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fitted_clouds import fit_correspondences
+from answers import fit_correspondences
 from test_fitting_theorems import IN_FRONT, SCENE, said, seen, shown
 
 from mereo.fitting.config import FitConfig
