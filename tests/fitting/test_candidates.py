@@ -63,7 +63,7 @@ def test_a_registration_is_as_far_off_as_its_points_are(model: Model, view: View
     truth = state_points(state, statistical.nodes, statistical.node_labels)
     truth = transform_points(inverse_rigid(view.T_world_camera), truth)
     cloud = view.depth.to_points()
-    found = Registrar.of(model, "modes").register(CloudToFit(cloud.points, scene_unit=1.0))
+    found = Registrar.of(model, "modes").fit_modes(CloudToFit(cloud.points, scene_unit=1.0)).registration()
     shown = seen_points(truth, cloud, 1.0)
     exact = RegistrationErrors.of(replace(found, material=truth), truth, shown, 1.0)
     assert exact.distances.max() == 0.0 and len(exact.distances) == len(truth) and 0 < exact.seen.sum() < len(truth)

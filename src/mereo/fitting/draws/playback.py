@@ -84,11 +84,6 @@ class Drawn:
             return None
 
 
-def number_of_draws(scene: Scene) -> int:
-    """How many numbers a random state of a scene draws; in a few scenes, states differ in it."""
-    return len(Drawn.of(scene, STATES_SEED).z)
-
-
 def shares_of(z: Float[np.ndarray, " d"], sizes: tuple[int, ...]) -> list[Shares]:
     """Shares of each call, of standard normal draws, as they are played."""
     return np.split(ndtr(np.clip(z, -LARGEST, LARGEST)), np.cumsum(sizes)[:-1])

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from mereo.fitting.config import AnswerMethod, FitConfig
 from mereo.fitting.draws.fit import fit_draws
-from mereo.fitting.draws.playback import MOST_DRAWS, DrawnStates, number_of_draws
+from mereo.fitting.draws.playback import MOST_DRAWS, STATES_SEED, Drawn, DrawnStates
 from mereo.fitting.draws.problem import DrawsFit, DrawsProblem
 from mereo.fitting.draws.problem import narrowing as draws_narrowing
 from mereo.fitting.modes import (
@@ -443,10 +443,6 @@ class Registrar:
         assert self.network is not None
         return fit_frame(cloud, self.network, self.model, self.config, code)
 
-    def register(self, cloud: CloudToFit, code: EncodedCloud | None = None) -> Registration:
-        """Register the model to a cloud, as ``method`` says; takes ``fit_frame``'s arguments and raises as it does."""
-        return self.finish(self.fit_modes(cloud, code))
-
     def finish(self, fitted: ModesFit) -> Registration:
         """Return the registration from a fit of the modes, with the draws too where ``method`` wants them.
 
@@ -470,7 +466,7 @@ class Registrar:
         weights carry all that the modes need. With "full" that raises ``AssetUnavailable``.
         """
         try:
-            if self.scene is None or number_of_draws(self.scene) > MOST_DRAWS:
+            if self.scene is None or len(Drawn.of(self.scene, STATES_SEED).z) > MOST_DRAWS:
                 return None
             with stage("simulate random states of the scene, once for an object"):
                 return DrawnStates.of(self.scene, self.model)
