@@ -21,7 +21,9 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # before the first import of mereo: from here on a wrong shape or dtype is an error
-install_import_hook(["mereo", "mereo_objects", "mereo_experiments", "mereo_serving"], "type_checker.check")
+install_import_hook(
+    ["mereo", "mereo_objects", "mereo_experiments", "mereo_serving", "mereo_viewer"], "type_checker.check"
+)
 
 from mereo_objects import assets  # noqa: E402
 
@@ -130,7 +132,7 @@ def small_previews(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def server() -> Iterator[object]:
     """A viewer's server on a free port, without pages."""
-    from mereo.visualization.viewer.server import start_server, stop_server
+    from mereo_viewer.server import start_server, stop_server
 
     started = start_server(0)
     yield started

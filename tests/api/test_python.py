@@ -30,8 +30,8 @@ from mereo.io.atomic_files import MARKER
 from mereo.reconstruction.observation import SizeWarning
 from mereo.scenes.registry import load_scene
 from mereo.visualization.units import Unit
-from mereo.visualization.viewer import result_page
-from mereo.visualization.viewer.server import OpenPage
+from mereo_viewer import result_page
+from mereo_viewer.server import OpenPage
 
 pytestmark = pytest.mark.usefixtures("small_previews")
 

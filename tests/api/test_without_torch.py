@@ -118,7 +118,7 @@ def test_a_laboratory_without_weights_needs_no_torch(folder: Path) -> None:
     program = """
 import mereo
 from mereo.scenes.parameters import random_state
-from mereo.visualization.viewer.laboratory import Laboratory
+from mereo_viewer.laboratory import Laboratory
 known = mereo.load_object(["long.stl", "short.stl"], units="mm")
 laboratory = Laboratory(known.scene, known.network, known.registrar())
 trial = laboratory.answer(laboratory.look(random_state(known.scene, 0), laboratory.first_place))

@@ -228,7 +228,7 @@ def test_a_calibration_comes_from_the_weights(model: Model, cloud: PointCloud) -
 
 @needs_viser
 def test_the_viewer_colours_it_and_says_it_of_a_place(found: Answer, server: object) -> None:
-    from mereo.visualization.viewer.result_page import SURE, ResultPage, content_of_answer
+    from mereo_viewer.result_page import SURE, ResultPage, content_of_answer
 
     page = ResultPage(server, content_of_answer(replace(found, seen=observe(found.seen.cloud, unit_m=1.0))))
     colors, scale = page.content.colorings[SURE]()

@@ -25,9 +25,9 @@ from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
-from mereo.visualization.viewer.server import OpenPage
 from mereo_serving.answering import Answerer
 from mereo_serving.messages import JSON, FrameRequest, Served, Setup
+from mereo_viewer.server import OpenPage
 
 
 @pytest.fixture(scope="module")

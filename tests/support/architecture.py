@@ -49,11 +49,12 @@ HEAVY = ("numpy", "torch", "scipy", "trimesh", "matplotlib")
 SATELLITES = {
     "mereo_objects": ("cli/", "scenes/registry.py", "evaluation/scans.py"),
     "mereo_serving": ("cli/",),
+    "mereo_viewer": ("api/", "cli/"),
     "mereo_experiments": ("cli/",),
 }
 """Packages beside mereo, in the same wheel, and the modules of mereo that may import each."""
 
-BUDGET = {"src/mereo": (42_950, 188), "tests": (34_900, 251)}
+BUDGET = {"src/mereo": (41_560, 183), "tests": (34_900, 251)}
 """Lines and files that a folder may have at most; they fall to 35,000 and 200, and to 25,000 lines of tests."""
 
 TEST_FOLDERS = ("theorems", "journeys", "robustness", "house", "support")

@@ -14,7 +14,7 @@ from mereo.visualization.color_scales import (
     distance_scale,
     observed_distance,
 )
-from mereo.visualization.viewer.result_page import first_point
+from mereo_viewer.result_page import first_point
 
 GREYS = ColorScale("grey", 1.0, 3.0, ((0, 0, 0), (100, 100, 100), (250, 250, 250)), ("low", "high"))
 

@@ -18,8 +18,8 @@ from mereo.models.weights import load_model
 from mereo.scenes.parameters import random_state
 from mereo.scenes.registry import load_scene
 from mereo.visualization.color_scales import confidence
-from mereo.visualization.viewer.laboratory import Laboratory
-from mereo.visualization.viewer.result_page import ask_network, probe_answer
+from mereo_viewer.laboratory import Laboratory
+from mereo_viewer.result_page import ask_network, probe_answer
 
 
 @pytest.fixture

@@ -41,7 +41,7 @@ from mereo.visualization.units import Unit
 if TYPE_CHECKING:
     import trimesh
 
-    from mereo.visualization.viewer.server import OpenPage
+    from mereo_viewer.server import OpenPage
 
 Pose = Float[np.ndarray, "4 4"]
 
@@ -264,7 +264,7 @@ class Result(Answer):
 
         Raises ``ImportError`` without the extra `view`, and ``OSError`` for a port that is taken.
         """
-        from mereo.visualization.viewer.result_page import open_answer
+        from mereo_viewer.result_page import open_answer
 
         return open_answer(self, port or 0).stay(block)
 

@@ -13,9 +13,9 @@ from mereo.io.sensor_frame import read_frame
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import find_object
 from mereo.scenes.registry import load_scene
-from mereo.visualization.viewer.laboratory import open_laboratory
-from mereo.visualization.viewer.result_page import are_files, open_answer, open_files
-from mereo.visualization.viewer.server import PORT, OpenPage, import_viser, is_interactive
+from mereo_viewer.laboratory import open_laboratory
+from mereo_viewer.result_page import are_files, open_answer, open_files
+from mereo_viewer.server import PORT, OpenPage, import_viser, is_interactive
 
 
 @python_words()

@@ -140,7 +140,7 @@ class ViewCommand:
         from mereo.api.view import view
         from mereo.evaluation.sample_views import shipped_views
         from mereo.io.progress import shown_stages
-        from mereo.visualization.viewer.server import import_viser
+        from mereo_viewer.server import import_viser
 
         import_viser()  # its absence is better said before the work
         input, known = self.input, None

@@ -30,7 +30,7 @@ from mereo.io.writers.glb import GLTF_CAMERA_ROTATION, write_segments_glb
 from mereo.models.model import Model
 from mereo.visualization.reconstruction_report import Report, read_report
 from mereo.visualization.units import UNKNOWN, Unit
-from mereo.visualization.viewer.result_page import (
+from mereo_viewer.result_page import (
     SURE,
     VERTEX,
     Probed,
@@ -287,8 +287,8 @@ def test_what_cannot_be_shown_is_said_in_one_sentence(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    for module in ("visualization.viewer.result_page", "api.view"):
-        monkeypatch.setattr(f"mereo.{module}.import_viser", lambda: None)
+    for module in ("mereo_viewer.result_page", "mereo.api.view"):
+        monkeypatch.setattr(f"{module}.import_viser", lambda: None)
     if content is not None:
         (tmp_path / "s.glb").write_bytes(content)
     assert main(["view", str(tmp_path / "s.glb"), *options]) == 2

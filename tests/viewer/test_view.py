@@ -21,9 +21,9 @@ from mereo.geometry.camera import PointCloud
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
 from mereo.visualization.color_scales import ColorScale
 from mereo.visualization.units import Unit
-from mereo.visualization.viewer import server as viewer_server
-from mereo.visualization.viewer.display import CLOUD_SIZES, POINT_SHARE, chips, heading, message, point_size
-from mereo.visualization.viewer.result_page import Content, Probed, ResultPage, probe_html
+from mereo_viewer import server as viewer_server
+from mereo_viewer.display import CLOUD_SIZES, POINT_SHARE, chips, heading, message, point_size
+from mereo_viewer.result_page import Content, Probed, ResultPage, probe_html
 
 needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
 needs_browser = pytest.mark.skipif(

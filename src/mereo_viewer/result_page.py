@@ -41,7 +41,7 @@ from mereo.visualization.contact_sheets import Picture, depth_ends, depth_pictur
 from mereo.visualization.reconstruction_report import REPORT, read_report
 from mereo.visualization.result_files import radii_of
 from mereo.visualization.units import UNKNOWN, Unit, rounded
-from mereo.visualization.viewer.display import (
+from mereo_viewer.display import (
     BOX,
     SOFT,
     Display,
@@ -55,7 +55,7 @@ from mereo.visualization.viewer.display import (
     heading,
     message,
 )
-from mereo.visualization.viewer.server import OpenPage, import_viser, start_server
+from mereo_viewer.server import OpenPage, import_viser, start_server
 
 EMPTY_COLOR = (150, 156, 168)
 

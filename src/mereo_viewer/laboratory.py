@@ -33,7 +33,7 @@ from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor
 from mereo.synthesis.depth_sensor import observe
 from mereo.synthesis.examples import View
 from mereo.visualization.contact_sheets import depth_picture
-from mereo.visualization.viewer.display import (
+from mereo_viewer.display import (
     Display,
     PointLayer,
     SegmentControls,
@@ -44,8 +44,8 @@ from mereo.visualization.viewer.display import (
     message,
     score_table,
 )
-from mereo.visualization.viewer.result_page import source_of
-from mereo.visualization.viewer.server import OpenPage, import_viser, start_server
+from mereo_viewer.result_page import source_of
+from mereo_viewer.server import OpenPage, import_viser, start_server
 
 CELLS = 64
 """Cells a side on which an answer is scored; the paper takes 100, fewer are faster and a little off."""

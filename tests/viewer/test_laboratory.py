@@ -18,7 +18,7 @@ from mereo.scenes.parameters import parameters, random_state, set_value
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Workspace
 from mereo.scenes.statistical_model import StatisticalModel
-from mereo.visualization.viewer.laboratory import CELLS, CameraPlace, Laboratory, LabPage, Trial, slider_range
+from mereo_viewer.laboratory import CELLS, CameraPlace, Laboratory, LabPage, Trial, slider_range
 
 needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
 needs_browser = pytest.mark.skipif(
