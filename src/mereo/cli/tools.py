@@ -73,7 +73,7 @@ class Align:
         from mereo.scenes.registry import files_of, is_yaml, load_scene
         from mereo.scenes.scene import SCENES
         from mereo.visualization.contact_sheets import save_png
-        from mereo.visualization.previews import overlay
+        from mereo.visualization.error_maps import overlay
 
         load_icp()  # its absence is better said before the work
         scan = ScanFile(self.scan, self.unit, self.frame, self.drop_invalid)
@@ -92,7 +92,7 @@ class Align:
             write_segments_glb(
                 directory / "segments.glb", placement.mesh, viewer_rotation(self.frame), UNITS_M[self.unit]
             )
-            save_png(directory / "overlay.png", overlay(placement, cloud, scan))
+            save_png(directory / "overlay.png", overlay(placement.mesh, placement.limit, cloud, scan))
         print_placement(placement, f"{self.scan.name}, {len(cloud)} points", 1000 * UNITS_M[self.unit])
         # a data file runs no Python scene
         trusted = "" if self.scene in SCENES or is_yaml(self.scene) else f" --scene {self.scene}"

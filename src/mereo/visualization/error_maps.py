@@ -10,7 +10,13 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 
 from mereo.evaluation.cases import EvaluatedView
-from mereo.geometry.mesh import Color
+from mereo.evaluation.scans import ScanFile
+from mereo.geometry.camera import PointCloud, camera_axes
+from mereo.geometry.conventions import UNITS_M
+from mereo.geometry.mesh import Color, SegmentedMesh
+from mereo.geometry.solids import Solids
+from mereo.geometry.transforms import transform_points
+from mereo.visualization.color_scales import viridis
 from mereo.visualization.contact_sheets import (
     Picture,
     cloud_picture,
@@ -20,6 +26,7 @@ from mereo.visualization.contact_sheets import (
     save_png,
     scale_bar,
 )
+from mereo.visualization.previews import CAMERA_VIEWS
 from mereo.visualization.renderer import Canvas, Triangles, Vector, Viewpoint
 
 CAMERA: tuple[Vector, Vector] = ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
@@ -343,3 +350,34 @@ def _way_to(wanted: Bool[np.ndarray, "x y z"], spacing: Float[np.ndarray, "3"]) 
     apart = np.sqrt(((nearest - np.indices(wanted.shape, dtype=np.int32)).astype(np.float32) ** 2).sum(axis=0))
     way: Float[np.ndarray, "x y z"] = away * (1.0 - 0.5 / np.maximum(apart, 1.0))
     return np.where(wanted, 0.0, way)
+
+
+# --- scans on placed segments -----------------------------------------------------------------------------------------
+
+
+def overlay(placed: SegmentedMesh, limit: float, cloud: PointCloud, scan: ScanFile) -> Picture:
+    """Picture of a scan on the placed segments (top) and of its distance from them (bottom), from several sides.
+
+    Distances beyond ``limit``, in the scan's unit, are red.
+    """
+    to_camera = camera_axes(scan.frame)
+    mesh = placed.transformed(to_camera)
+    chosen = np.random.default_rng(0).permutation(len(cloud))[:40_000]  # most points that a picture shows
+    points = transform_points(to_camera, cloud.points[chosen])
+    distance = Solids(mesh).nearest(points).distance
+    views = {name: Viewpoint.along(mesh.bounds, *pair) for name, pair in CAMERA_VIEWS.items()}
+    mm = 1000 * UNITS_M[scan.unit] * limit
+    near = viridis(distance / limit) / 255
+    colors = np.where((distance > limit)[:, None], (0.85, 0.1, 0.1), near)
+    pictures = []
+    for is_solid, ink, radius_px in ((True, np.zeros_like(points), 0.5), (False, colors, 1.2)):
+        for view in views.values():
+            canvas = Canvas.empty(view, (420, 420))
+            if is_solid:
+                canvas.draw_triangles(Triangles.of(mesh))
+            canvas.draw_points(points, ink, radius_px)
+            pictures.append(canvas.picture())
+    captions = [f"scan on segments, {name}" for name in views]
+    captions += [f"distance 0 (dark) to {mm:.2g} mm (bright), red: more"] * len(views)
+    sheet = contact_sheet(pictures, captions, len(views), f"{scan.path.name} on {len(mesh.segments)} segments")
+    return np.concatenate([sheet, legend(mesh.names, mesh.colors, sheet.shape[1])])

@@ -12,12 +12,8 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from mereo.evaluation.placement import Placement
-from mereo.evaluation.scans import ScanFile
-from mereo.geometry.camera import PointCloud, camera_axes
-from mereo.geometry.conventions import UNITS_M
+from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import transform_points
 from mereo.io.extras import has_plots, pyplot
 from mereo.scenes.registry import load_scene
@@ -26,7 +22,6 @@ from mereo.scenes.seeds import example_rng
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import View, sample_view
-from mereo.visualization.color_scales import viridis
 from mereo.visualization.contact_sheets import (
     Picture,
     cloud_picture,
@@ -36,7 +31,7 @@ from mereo.visualization.contact_sheets import (
     legend,
     save_png,
 )
-from mereo.visualization.renderer import Canvas, Triangles, Vector, Viewpoint, shade, shaded_canvas
+from mereo.visualization.renderer import Vector, Viewpoint, shade, shaded_canvas
 
 CAMERA_VIEWS = {
     "as the camera sees it": ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),
@@ -123,31 +118,6 @@ def _with_faces(surfaces: SegmentedMesh) -> SegmentedMesh:
 def _joint_bounds(points: Float[np.ndarray, "n 3"], solid: SegmentedMesh) -> Float[np.ndarray, "2 3"]:
     joint = np.concatenate([points, *(segment.vertices for segment in solid.segments if len(segment.faces))])
     return np.stack([joint.min(axis=0), joint.max(axis=0)])
-
-
-def overlay(placement: Placement, cloud: PointCloud, scan: ScanFile) -> Picture:
-    """Picture of a scan on the placed segments (top) and of its distance from them (bottom), from several sides."""
-    to_camera = camera_axes(scan.frame)
-    mesh = placement.mesh.transformed(to_camera)
-    chosen = np.random.default_rng(0).permutation(len(cloud))[:40_000]  # most points that a picture shows
-    points = transform_points(to_camera, cloud.points[chosen])
-    distance = Solids(mesh).nearest(points).distance
-    views = {name: Viewpoint.along(mesh.bounds, *pair) for name, pair in CAMERA_VIEWS.items()}
-    mm = 1000 * UNITS_M[scan.unit] * placement.limit
-    near = viridis(distance / placement.limit) / 255
-    colors = np.where((distance > placement.limit)[:, None], (0.85, 0.1, 0.1), near)
-    pictures = []
-    for is_solid, ink, radius_px in ((True, np.zeros_like(points), 0.5), (False, colors, 1.2)):
-        for view in views.values():
-            canvas = Canvas.empty(view, (420, 420))
-            if is_solid:
-                canvas.draw_triangles(Triangles.of(mesh))
-            canvas.draw_points(points, ink, radius_px)
-            pictures.append(canvas.picture())
-    captions = [f"scan on segments, {name}" for name in views]
-    captions += [f"distance 0 (dark) to {mm:.2g} mm (bright), red: more"] * len(views)
-    sheet = contact_sheet(pictures, captions, len(views), f"{scan.path.name} on {len(mesh.segments)} segments")
-    return np.concatenate([sheet, legend(mesh.names, mesh.colors, sheet.shape[1])])
 
 
 # --- states of one scene ---------------------------------------------------------------------------------------------
