@@ -11,6 +11,7 @@ is replaced where its content is that list's, unchanged: what somebody has put t
 
 import errno
 import json
+import math
 import os
 import re
 import shutil
@@ -20,8 +21,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 try:
     import fcntl
@@ -423,10 +422,10 @@ def to_json(value: Any) -> Any:
     """Value in terms that JSON knows: arrays become lists, paths text, NaN and infinity null (JSON has neither)."""
     if isinstance(value, dict):
         return {str(key): to_json(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
+    if hasattr(value, "tolist"):  # numpy's; commands that only print their help do not load it
         return to_json(value.tolist())
     if isinstance(value, list | tuple):
         return [to_json(item) for item in value]
-    if isinstance(value, float) and not np.isfinite(value):
+    if isinstance(value, float) and not math.isfinite(value):
         return None
     return str(value) if isinstance(value, Path) else value
