@@ -185,7 +185,8 @@ def test_the_command_prints_where_the_page_is_and_ends_cleanly(tmp_path: Path) -
             process.send_signal(signal.SIGINT)
             assert process.wait(timeout=60) == 0
             assert process.stdout.read() == "closed\n"
-            assert process.stderr.read() == ""
+            progress = process.stderr.read().splitlines()  # of stages that take seconds, on a machine that is busy
+            assert [line for line in progress if not line.endswith("so far")] == []
         finally:
             process.kill()
 
