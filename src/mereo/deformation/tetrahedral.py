@@ -81,6 +81,11 @@ class Tetrahedra:
         total = np.bincount(rows, weights=weight, minlength=len(self.nodes))
         return coo_array((weight / total[rows], (rows, columns)), (len(self.nodes), len(self.elements))).tocsr()
 
+    @property
+    def shape_gradients(self) -> Float[np.ndarray, "m 4 3"]:
+        """Gradients of the linear functions that are 1 at a tetrahedron's corner and 0 at its others."""
+        return np.concatenate([-self._rest_inverse.sum(axis=1, keepdims=True), self._rest_inverse], axis=1)
+
     def volume_ratios(self, nodes: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " m"]:
         """Volume of each tetrahedron at other node positions, of that at rest; 0 or less where it is inverted."""
         return np.linalg.det(_edges(nodes, self.elements)) / (6 * self.volumes)
@@ -97,6 +102,21 @@ class Tetrahedra:
     def locate(self, points: Float[np.ndarray, "p 3"]) -> Int[np.ndarray, " p"]:
         """Tetrahedron around each point at rest, -1 outside."""
         return _locate(self._tree, self.nodes, self.elements, points)
+
+    def embed(self, points: Float[np.ndarray, "p 3"]) -> csr_array:
+        """Weights [p, n] by which points follow the nodes; outside they follow the closest point of the surface."""
+        element = self.locate(points)
+        rows, beyond = np.flatnonzero(element >= 0), np.flatnonzero(element < 0)
+        tetrahedra = element[rows]
+        offset = points[rows] - self.nodes[self.elements[tetrahedra, 0]]
+        weights = np.einsum("pak,pk->pa", self.shape_gradients[tetrahedra], offset)
+        weights[:, 0] += 1
+        corners, outer, _ = self.closest(points[beyond])
+        place = np.concatenate([np.repeat(rows, 4), np.repeat(beyond, 3)])
+        nodes = np.concatenate([self.elements[tetrahedra].ravel(), corners.ravel()])
+        return coo_array(
+            (np.concatenate([weights.ravel(), outer.ravel()]), (place, nodes)), (len(points), len(self.nodes))
+        ).tocsr()
 
     def closest(
         self, points: Float[np.ndarray, "p 3"]
