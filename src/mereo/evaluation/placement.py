@@ -29,14 +29,14 @@ from mereo.evaluation.icp import (
     moved,
     register,
 )
-from mereo.geometry.camera import into_camera
+from mereo.geometry.camera import PointCloud, into_camera
 from mereo.geometry.conventions import LARGEST, CloudAxes
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import fit_rigid, inverse_rigid, rigid, transform_points
 from mereo.io.errors import readable
-from mereo.models.model import Model
+from mereo.models.trained import Trained
 from mereo.scenes.rest_pose import rest_frame
 
 
@@ -402,7 +402,7 @@ def misfit(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -
 
 
 def start_from_model(
-    model: Model, points: Float[np.ndarray, "n 3"], frame: CloudAxes, rest: SegmentedMesh, scale: float | None
+    model: Trained, points: Float[np.ndarray, "n 3"], frame: CloudAxes, rest: SegmentedMesh, scale: float | None
 ) -> Start:
     """Rough poses from a trained network: where it believes the seen points were at rest, fitted segment by segment.
 
@@ -415,15 +415,15 @@ def start_from_model(
             "be the same in the same order: use the weights of this object"
         )
     T_camera_scan = into_camera(points, frame)
-    code = model.encode(transform_points(T_camera_scan, points))
-    guessed = model.rest(code, code.cloud)
-    if guessed is None or not model.segmented:
+    code = model.encode(PointCloud(transform_points(T_camera_scan, points)))
+    correspondences = model.correspond(code, code.cloud)
+    if correspondences is None or not model.segmented:
         raise ValueError(
             "the weights do not predict rest coordinates of segments, from which a start is made; train with the "
             "preset base, or give --start FILE"
         )
     center, half = rest_frame(rest)
-    source, seen = guessed * half + center, transform_points(inverse_rigid(T_camera_scan), code.cloud)
+    source, seen = correspondences[1] * half + center, transform_points(inverse_rigid(T_camera_scan), code.cloud)
     tolerance = 2 * PAIR_ERROR * diagonal(rest)
     common = pose_of_pairs(source, seen, "the object by its weights", scale, tolerance)
     label = model.logits(code, code.cloud)[:, 1:].argmax(axis=1)
