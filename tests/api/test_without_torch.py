@@ -127,3 +127,9 @@ print(trial.scores.iou > 0.7, trial.source.split()[0])
     ran = hidden(program, folder)
     assert ran.returncode == 0, ran.stderr
     assert ran.stdout.split() == ["True", "registered"]
+
+
+def test_what_the_demonstration_loads_before_it_looks_for_torch(tmp_path: Path) -> None:
+    """It reads the truth of a scan, and finds its object by the meshes."""
+    ran = hidden("import mereo.cli.demo, mereo.evaluation.scans, mereo.visualization.result_files", tmp_path)
+    assert ran.returncode == 0, ran.stderr

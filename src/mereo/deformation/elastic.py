@@ -188,8 +188,11 @@ class StateMap:
     Rotation-strain coordinates (Huang et al., "Interactive shape interpolation through controllable dynamic
     deformation", TVCG 2011): each tetrahedron strains, then turns by the exponential of its linear rotation. In linear
     modes a lobe that turns grows; here it keeps its volume nearly. The nodes are those whose gradients are nearest, by
-    a Poisson system that is factorized once. At a motion of .1 half longest sides the volume of a liver stays within
-    4 % and no tetrahedron inverts; at .2 some do in two states of five, which ``Tetrahedra.volume_ratios`` shows.
+    a Poisson system that is factorized once.
+
+    Nothing keeps a tetrahedron from inverting. At a motion of .1 half longest sides the volume of a liver changes by
+    2 %, root mean square, and border cells that are nearly empty invert in a sixth of the states; in shapes with
+    narrow places they do in most (docs/experiments/066.md). ``Tetrahedra.volume_ratios`` shows where.
     """
 
     def __init__(self, solid: ElasticSolid, modes: Float[np.ndarray, "n 3 k"]) -> None:
