@@ -176,7 +176,10 @@ def test_a_wrong_address_is_one_sentence(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_single_frame_or_object_is_no_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_single_frame_or_object_is_no_task(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
     for line, sentence in (
         (f"reconstruct {tmp_path}/a.ply --weights rope --output out --ray local", "--ray is for several frames"),
         (f"learn {tmp_path}/a.stl --output out --ray local", "--ray is for a folder of objects"),

@@ -340,7 +340,8 @@ def secant(
     motion: Float32[np.ndarray, "a 3 d"], step: Float[np.ndarray, " d"], moved: Float[np.ndarray, "a 3"]
 ) -> Float32[np.ndarray, "a 3 d"]:
     """Derivatives that agree with what a step has really moved, otherwise changed least (Broyden's rule)."""
-    missed = (moved - motion @ step.astype(np.float32)).astype(np.float32)
+    with np.errstate(invalid="ignore"):  # OpenBLAS raises the flag for lanes that it loads beyond a short row
+        missed = (moved - motion @ step.astype(np.float32)).astype(np.float32)
     return motion + missed[..., None] * (step / max(float(step @ step), 1e-12)).astype(np.float32)
 
 
