@@ -114,3 +114,14 @@ def half_balls(rng: np.random.Generator, points: int, queries: int) -> dict[str,
         "directions": direction.astype(np.float16),
         "rest": np.where(labels[:, None] > 0, offset, np.nan).astype(np.float16),
     }
+
+
+@pytest.fixture(autouse=True)
+def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
+    make_small_datasets(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four examples in two shards."""
+    return write_small_dataset(tmp_path_factory.mktemp("whole") / "data")

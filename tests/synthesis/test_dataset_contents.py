@@ -5,34 +5,22 @@ import shutil
 from pathlib import Path
 
 import pytest
-from toy_data import SMALL, make_small_datasets, write_small_dataset
+from folder_contents import contents
+from toy_data import SMALL, small_shards, whole
 from toy_scene import toy_scene
 
 from mereo.__main__ import main
 from mereo.api.generate import generate
 from mereo.scenes.seeds import TEST_SEED_START
 
+__all__ = ["small_shards", "whole"]  # fixtures
+
 TOY = toy_scene()
-
-
-@pytest.fixture(autouse=True)
-def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
-    make_small_datasets(monkeypatch)
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four examples in two shards."""
-    return write_small_dataset(tmp_path_factory.mktemp("whole") / "data")
 
 
 @pytest.fixture
 def data(whole: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(whole, tmp_path / "data"))
-
-
-def contents(directory: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in sorted(directory.iterdir())}
 
 
 # --- the commands -----------------------------------------------------------------------------------------------------

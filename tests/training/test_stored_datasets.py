@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from toy_data import SMALL, make_small_datasets, read_all, write_small_dataset
+from toy_data import SMALL, read_all, small_shards, whole
 from toy_scene import toy_scene
 
 import mereo
@@ -16,19 +16,10 @@ from mereo.io.object_storage import ObjectPath, StorageError, names_in, write_wh
 from mereo.training import trainer
 from mereo.training.dataset import Dataset
 
+__all__ = ["small_shards", "whole"]  # fixtures
+
 TOY = toy_scene()
 NUMBERS = count()
-
-
-@pytest.fixture(autouse=True)
-def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
-    make_small_datasets(monkeypatch)
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four examples in two shards, on a disk."""
-    return write_small_dataset(tmp_path_factory.mktemp("whole") / "data")
 
 
 @pytest.fixture
