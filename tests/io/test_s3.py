@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from toy_data import SMALL, make_small_datasets, read_all
+from toy_data import SMALL, read_all, small_shards
 from toy_scene import toy_scene
 
 from mereo.__main__ import main
@@ -20,16 +20,13 @@ from mereo.api.generate import generate
 from mereo.io.object_storage import ObjectPath, StorageError, claim, names_in, write_whole
 from mereo.training.dataset import Dataset
 
+__all__ = ["small_shards"]  # a fixture
+
 s3fs = pytest.importorskip("s3fs")
 moto_server = pytest.importorskip("moto.server")
 
 TOY = toy_scene()
 NUMBERS = count()
-
-
-@pytest.fixture(autouse=True)
-def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
-    make_small_datasets(monkeypatch)
 
 
 @pytest.fixture(scope="module")

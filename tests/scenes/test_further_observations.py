@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
-from toy_data import SMALL, make_small_datasets
+from toy_data import SMALL, make_small_datasets, small_shards
 from toy_scene import toy_scene
 
 import mereo.__main__ as command_line
@@ -21,14 +21,11 @@ from mereo.synthesis.depth_sensor import SimulatedView, observe
 from mereo.synthesis.examples import Example, _sample_view, synthesize
 from mereo.synthesis.shards import example_bytes, pack
 
+__all__ = ["small_shards"]  # a fixture
+
 SEEN = replace(SMALL, observations=("all",))
 TOY = toy_scene()
 SEED, EXAMPLES = 3, 5
-
-
-@pytest.fixture(autouse=True)
-def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
-    make_small_datasets(monkeypatch)
 
 
 @pytest.fixture(scope="module")

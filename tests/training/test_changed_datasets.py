@@ -7,20 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from folder_contents import contents
 from safetensors.numpy import load_file, save_file
-from toy_data import SMALL, make_small_datasets, read_all
+from toy_data import SMALL, make_small_datasets, read_all, small_shards
 from toy_scene import toy_scene
 
 from mereo.api.generate import generate
 from mereo.training.dataset import Dataset
 
+__all__ = ["small_shards"]  # a fixture
+
 TOY = toy_scene()
 FILES = ("shard-00001.safetensors", "template.safetensors", "statistical_model.safetensors")
-
-
-@pytest.fixture(autouse=True)
-def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
-    make_small_datasets(monkeypatch)
 
 
 def make(output: Path, seed: int = 3, resume: bool = False) -> Path:
@@ -40,10 +38,6 @@ def originals(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 @pytest.fixture
 def data(originals: tuple[Path, Path], tmp_path: Path) -> Path:
     return Path(shutil.copytree(originals[0], tmp_path / "data"))
-
-
-def contents(directory: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in sorted(directory.iterdir())}
 
 
 def refused_and_made_again(data: Path, whole: Path, name: str, reason: str) -> str:
