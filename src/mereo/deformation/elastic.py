@@ -6,21 +6,27 @@ white loads make a mode's coefficient a normal number of standard deviation ~ 1 
 exp(-energy), would have 1 / sqrt(lambda); it lets single places give way alone.) The scale of all is the root mean
 square displacement of a material point.
 
-Young's modulus and density cancel: the modes depend on the shape and on Poisson's ratio alone. What this prior
-predicts of a real liver is measured in docs/experiments/066.md.
+Young's modulus and density of the whole cancel: the modes depend on the shape, on Poisson's ratio, on how much stiffer
+some parts are than others, and on what is held. What this prior predicts of a real liver is measured in
+docs/experiments/066.md.
 
 Notation: n nodes, m tetrahedra, k modes; X are node positions at rest.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import permutations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.sparse import coo_array, csc_array, csr_array, diags_array
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
 from scipy.spatial.transform import Rotation
 
+from mereo.deformation.draw_names import named
+from mereo.deformation.samplers import RandomMotion, Surface
 from mereo.deformation.tetrahedral import Tetrahedra, TetrahedralMap
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.read_only import read_only, read_only_view
@@ -67,12 +73,14 @@ class ElasticSolid:
     Attributes:
         mesh: the tetrahedra; lengths in any unit.
         filled: shares, above 0 and at most 1; 1 in a mesh that follows the surface.
+        stiffness: factor of Young's modulus of each, above 0; None where all are alike.
 
     Raises ``ValueError`` for other shares.
     """
 
     mesh: Tetrahedra
     filled: Float[np.ndarray, " m"]
+    stiffness: Float[np.ndarray, " m"] | None = None
 
     def __post_init__(self) -> None:
         if not ((self.filled > 0) & (self.filled <= 1)).all():
@@ -90,11 +98,26 @@ class ElasticSolid:
         corners, shares = self.mesh.elements.ravel(), np.repeat(self.volumes / 4, 4)
         return np.bincount(corners, weights=shares, minlength=len(self.mesh.nodes))
 
+    @property
+    def pieces(self) -> int:
+        """Number of pieces; tetrahedra are of one where a chain of common faces joins them."""
+        faces = np.sort(self.mesh.elements[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
+        number = np.unique(faces, axis=0, return_inverse=True)[1].ravel()
+        rows, count = np.repeat(np.arange(len(self.mesh.elements)), 4), len(self.mesh.elements)
+        incidence = coo_array((np.ones(len(rows)), (rows, number)), (count, int(number.max()) + 1)).tocsr()
+        return int(connected_components(incidence @ incidence.T, directed=False)[0])
 
-def build_lattice(mesh: SegmentedMesh, cells: int = 16) -> ElasticSolid:
+    def most_modes(self, held: Bool[np.ndarray, " n"] | None = None) -> int:
+        """Number of modes that can be found, given which nodes are held."""
+        free = len(self.mesh.nodes) if held is None else int((~held).sum())
+        return 3 * free - 7
+
+
+def build_lattice(mesh: SegmentedMesh, cells: int = 16, stiffness: Sequence[float] | None = None) -> ElasticSolid:
     """Cubic lattice around all segments of a mesh, ``cells`` (2 or more) cubes along its longest side.
 
-    Every vertex of the mesh lies in a cube. A cube without sampled material, at a vertex, counts as half a sample.
+    Every vertex of the mesh lies in a cube. A cube without sampled material, at a vertex, counts as half a sample. The
+    ``stiffness`` of each segment, in that of a soft one, is averaged over the samples of a cube.
 
     Raises ``ValueError`` for too few cells, and for a mesh that has no inside.
     """
@@ -106,10 +129,11 @@ def build_lattice(mesh: SegmentedMesh, cells: int = 16) -> ElasticSolid:
     origin = (low + high) / 2 - shape * size / 2
     places = (np.arange(SAMPLES) + 0.5) / SAMPLES
     x, y, z = (origin[a] + size * (np.arange(shape[a])[:, None] + places).ravel() for a in range(3))
-    sampled = label_grid(mesh, x, y, z) > 0
+    labels = label_grid(mesh, x, y, z).reshape(shape[0], SAMPLES, shape[1], SAMPLES, shape[2], SAMPLES)
+    sampled = labels > 0
     if not sampled.any():
         raise ValueError("the mesh has no inside: turn its faces outward, or take more cells for a thin one")
-    share = sampled.reshape(shape[0], SAMPLES, shape[1], SAMPLES, shape[2], SAMPLES).mean(axis=(1, 3, 5))
+    share = sampled.mean(axis=(1, 3, 5))
     vertices = np.concatenate([segment.vertices for segment in mesh.segments])
     touched = np.zeros(tuple(shape), dtype=bool)
     touched[tuple(np.clip(np.floor((vertices - origin) / size).astype(np.int64), 0, shape - 1).T)] = True
@@ -120,7 +144,12 @@ def build_lattice(mesh: SegmentedMesh, cells: int = 16) -> ElasticSolid:
     used, packed = np.unique(corners, return_inverse=True)
     nodes = origin + size * np.stack(np.unravel_index(used, grid), axis=1)
     elements = packed.reshape(-1, 8)[:, _SPLIT].reshape(-1, 4)
-    return ElasticSolid(Tetrahedra(nodes, elements), np.repeat(filled, len(_SPLIT)))
+    factor = None
+    if stiffness is not None:
+        stiff = np.concatenate([[0.0], stiffness])[labels].mean(axis=(1, 3, 5))
+        mean = np.where(share > 0, stiff / np.maximum(share, 1e-12), 1.0)
+        factor = np.repeat(mean[tuple(cell.T)], len(_SPLIT))
+    return ElasticSolid(Tetrahedra(nodes, elements), np.repeat(filled, len(_SPLIT)), factor)
 
 
 def assemble_stiffness(solid: ElasticSolid, material: Material) -> csc_array:
@@ -129,38 +158,51 @@ def assemble_stiffness(solid: ElasticSolid, material: Material) -> csc_array:
     shear, bulk = material.young / (2 * (1 + nu)), material.young * nu / ((1 + nu) * (1 - 2 * nu))  # Lame's mu, lambda
     blocks = shear * np.einsum("eak,ebk,ij->eaibj", g, g, np.eye(3))
     blocks += shear * np.einsum("eaj,ebi->eaibj", g, g) + bulk * np.einsum("eai,ebj->eaibj", g, g)
-    blocks *= solid.volumes[:, None, None, None, None]
+    weight = solid.volumes if solid.stiffness is None else solid.volumes * solid.stiffness
+    blocks *= weight[:, None, None, None, None]
     rows = (3 * solid.mesh.elements[:, :, None] + np.arange(3)).reshape(-1, 12)
     place = np.repeat(rows, 12, axis=1).ravel(), np.tile(rows, (1, 12)).ravel()
     return coo_array((blocks.ravel(), place), (3 * len(solid.mesh.nodes),) * 2).tocsc()
 
 
 def find_modes(
-    solid: ElasticSolid, count: int, material: Material
+    solid: ElasticSolid, count: int, material: Material, held: Bool[np.ndarray, " n"] | None = None
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "n 3 k"]]:
-    """Eigenvalues, ascending, and modes of the free solid without its rigid motion.
+    """Eigenvalues, ascending, and modes of the free solid without its rigid motion, or of one that is held.
 
     Each mode moves material points by 1 unit of length, root mean square, and any two are orthogonal in the mass.
 
-    Raises ``ValueError`` where there are not so many modes, and for a solid that is not in one piece.
+    Args:
+        solid: n nodes.
+        count: of modes.
+        material: of all tetrahedra.
+        held: nodes that do not move, 3 or more that are not in a line; None where all are free.
+
+    Raises ``ValueError`` where there are not so many modes, for a solid that is not in one piece, and where what is
+    held leaves it free to turn.
     """
     stiffness, mass = assemble_stiffness(solid, material), solid.mass
-    size = stiffness.shape[0]
-    if not 1 <= count < size - 6:
-        raise ValueError(f"{count} modes of {size // 3} nodes; from 1 to {size - 7} exist: take more cells for more")
-    weight = diags_array(np.repeat(mass, 3), format="csc")
+    rigid, free = (6, np.ones(len(mass), dtype=bool)) if held is None else (0, ~held)
+    rows = np.flatnonzero(np.repeat(free, 3))
+    most = solid.most_modes(held)
+    if not 1 <= count <= most:
+        raise ValueError(f"{count} modes of {len(rows) // 3} nodes; from 1 to {most} exist: take more cells for more")
+    stiffness = stiffness[rows][:, rows].tocsc()
+    weight = diags_array(np.repeat(mass[free], 3), format="csc")
     shift = -SHIFT * float(stiffness.diagonal().mean() / weight.diagonal().mean())
     inverse = LinearOperator(stiffness.shape, _factorize(stiffness - shift * weight).solve)
-    start = np.random.default_rng(0).normal(size=size)  # eigsh's own is another in each call
-    values, vectors = eigsh(stiffness, count + 6, M=weight, sigma=shift, OPinv=inverse, tol=1e-5, v0=start)
-    order = np.argsort(values)[6:]
+    start = np.random.default_rng(0).normal(size=len(rows))  # eigsh's own is another in each call
+    values, vectors = eigsh(stiffness, count + rigid, M=weight, sigma=shift, OPinv=inverse, tol=1e-5, v0=start)
+    order = np.argsort(values)[rigid:]
     if values[order[0]] < 0.01 * abs(shift):
-        raise ValueError(
-            "the solid has motions without energy besides the six rigid ones: it is not in one piece, or parts of it "
-            "meet in an edge alone; take more cells, or a lattice for each piece"
-        )
+        cause = "it is not in one piece, or parts of it meet in an edge alone; take more cells, or a lattice for each piece"
+        if held is not None:
+            cause = f"{cause}; or what is held leaves it free to turn: hold more of it"
+        raise ValueError(f"the solid has motions without energy besides the six rigid ones: {cause}")
     signs = np.where(start @ vectors < 0, -1.0, 1.0)  # those of the solver are others on another processor
-    return values[order], (signs * vectors)[:, order].reshape(-1, 3, count) * np.sqrt(mass.sum())
+    modes = np.zeros((3 * len(mass), count))
+    modes[rows] = (signs * vectors)[:, order]
+    return values[order], modes.reshape(-1, 3, count) * np.sqrt(mass.sum())
 
 
 def scale_modes(
@@ -186,13 +228,11 @@ class StateMap:
     """From coefficients of scaled modes to states of large deformation.
 
     Rotation-strain coordinates (Huang et al., "Interactive shape interpolation through controllable dynamic
-    deformation", TVCG 2011): each tetrahedron strains, then turns by the exponential of its linear rotation. In linear
-    modes a lobe that turns grows; here it keeps its volume nearly. The nodes are those whose gradients are nearest, by
-    a Poisson system that is factorized once.
+    deformation", TVCG 2011): each tetrahedron strains by the exponential of its linear strain, then turns by that of
+    its linear rotation. In linear modes a lobe that turns grows; here it keeps its volume nearly. The nodes are those
+    whose gradients are nearest, by a Poisson system that is factorized once.
 
-    Nothing keeps a tetrahedron from inverting. At a motion of .1 half longest sides the volume of a liver changes by
-    2 %, root mean square, and border cells that are nearly empty invert in a sixth of the states; in shapes with
-    narrow places they do in most (docs/experiments/066.md). ``Tetrahedra.volume_ratios`` shows where.
+    ``Tetrahedra.volume_ratios`` shows where a state inverts a tetrahedron; ``ElasticSampler`` takes none of these.
     """
 
     def __init__(self, solid: ElasticSolid, modes: Float[np.ndarray, "n 3 k"]) -> None:
@@ -213,11 +253,75 @@ class StateMap:
         """Map of one state, normal coefficients of variance 1 giving the prior's; the centre of mass stays."""
         linear = self.mesh.gradients(self.mesh.nodes + self.modes @ coefficients)
         mirrored = np.swapaxes(linear, 1, 2)
-        strain, spin = (linear + mirrored) / 2, (linear - mirrored) / 2
+        stretch, axes = np.linalg.eigh((linear + mirrored) / 2)
+        strain = axes * np.exp(stretch - 1)[:, None] @ np.swapaxes(axes, 1, 2)
+        spin = (linear - mirrored) / 2
         turn = Rotation.from_rotvec(np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)).as_matrix()
         gradients = np.swapaxes(turn @ strain, 1, 2).reshape(-1, 3)
         nodes: np.ndarray = self._factors.solve(self._divergence @ gradients)
         return TetrahedralMap(self.mesh, nodes + self._share @ (self.mesh.nodes - nodes))
+
+
+# --- random states ----------------------------------------------------------------------------------------------------
+
+LEAST_RATIO = 0.1
+"""Least volume of a tetrahedron in a drawn state, of that at rest."""
+
+CALMER = 0.8
+"""Factor of the coefficients of a state that would invert a tetrahedron or change the volume, until it does not."""
+
+MOST_SWELLING = 0.02
+"""Largest change of a drawn state's volume, as a share."""
+
+
+@dataclass(frozen=True, eq=False)
+class ElasticSampler:
+    """Random states of an elastic solid: normal coefficients of its modes, the smaller the more it would fold.
+
+    Attributes:
+        solid: what deforms.
+        material: of it.
+        count: of modes.
+        motion: root mean square displacement of the prior, in the nodes' unit.
+        held: nodes that do not move; None where all are free.
+
+    The modes are computed with the first state, in a second or two.
+    """
+
+    solid: ElasticSolid
+    material: Material
+    count: int
+    motion: float
+    held: Bool[np.ndarray, " n"] | None = None
+
+    @cached_property
+    def modes(self) -> Float[np.ndarray, "n 3 k"]:
+        """Displacements of the nodes for coefficients of variance 1."""
+        values, modes = find_modes(self.solid, self.count, self.material, self.held)
+        return scale_modes(values, modes, self.motion)
+
+    @cached_property
+    def _state(self) -> StateMap:
+        return StateMap(self.solid, self.modes)
+
+    def __call__(self, rng: np.random.Generator, surface: Surface) -> TetrahedralMap:
+        """A random state; no tetrahedron of it is inverted, and its volume is that at rest within ``MOST_SWELLING``."""
+        coefficients = named(rng, "coefficients").normal(size=self.count)
+        share = self.solid.volumes / self.solid.volumes.sum()
+        while True:
+            state = self._state(coefficients)
+            ratios = self.solid.mesh.volume_ratios(state.nodes)
+            if ratios.min() >= LEAST_RATIO and abs(share @ ratios - 1) <= MOST_SWELLING:
+                return state
+            coefficients = CALMER * coefficients
+
+
+def elastic_motion(draw: object) -> ElasticSampler | None:
+    """The elastic solid of a scene's random deformations; None where it is not all that moves all segments."""
+    if not isinstance(draw, RandomMotion) or len(draw.steps) != 1:
+        return None
+    sampler, members = draw.steps[0]
+    return sampler if isinstance(sampler, ElasticSampler) and len(members) == len(draw.rest.segments) else None
 
 
 def _factorize(matrix: csc_array) -> SuperLU:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
+from mereo.deformation.elastic import ElasticSampler, elastic_motion
 from mereo.deformation.moving_least_squares import spread
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
@@ -19,6 +20,7 @@ from mereo.scenes.rest_pose import rest_frame
 from mereo.scenes.scene import Scene, State
 from mereo.scenes.seeds import example_rng
 from mereo.scenes.statistical_model import (
+    PairDistances,
     StatisticalModel,
     kept_distances,
     material_points,
@@ -92,14 +94,46 @@ def states_for(examples: int) -> int:
 def scene_model(scene: Scene, count: int = STATES, seed: int = STATES_SEED, *, quiet: bool = True) -> StatisticalModel:
     """Statistical model of a scene, from ``count`` states of a training seed; the same bits on any number of cores.
 
-    The progress of its states is shown unless ``quiet``.
+    That of one elastic solid has its very modes. The progress of its states is shown unless ``quiet``.
     """
     frame, scene = scene.source_frame, scene.for_seed(seed)
     nodes, labels = interior_nodes(scene.rest)
+    solid = elastic_motion(scene.sample_deformations)
+    if solid is not None:
+        states = sample_states(scene, nodes, labels, CHECKED, seed, quiet)
+        return replace(elastic_model(scene.rest, nodes, labels, solid, states, count), source_frame=frame)
     states = sample_states(scene, nodes, labels, count, seed, quiet)
     with limit_blas_threads():
         model = build_model(scene.rest, nodes, labels, states)
     return replace(model, source_frame=frame)
+
+
+CHECKED = 20
+"""States of an elastic solid whose distance from its linear model is the model's residue."""
+
+
+def elastic_model(
+    rest: SegmentedMesh,
+    nodes: Float[np.ndarray, "j 3"],
+    node_labels: UInt8[np.ndarray, " j"],
+    solid: ElasticSampler,
+    states: Float32[np.ndarray, "n m 3"],
+    count: int,
+) -> StatisticalModel:
+    """Statistical model of an elastic solid: the rest pose, its modes, and ``count`` normal draws as the library.
+
+    The residue is the root mean square distance of ``states``, which bend as the modes do not, from the model.
+    """
+    points = material_points(rest, nodes)
+    flat = solid.modes.reshape(len(solid.modes), -1)
+    modes = (solid.solid.mesh.embed(points) @ flat).reshape(len(points), 3, -1).astype(np.float32)
+    library = np.random.default_rng(0).normal(size=(count, modes.shape[2])).astype(np.float32)
+    model = StatisticalModel(rest, nodes, node_labels, points, modes, library, 0.0, PairDistances.none(), None, True)
+    left = []
+    for state in states.astype(np.float64):
+        T, z = model.project(state)
+        left.append(((state - model.material(z) @ T[:3, :3].T - T[:3, 3]) ** 2).sum(axis=1).mean())
+    return replace(model, residue=float(np.sqrt(np.mean(left))))
 
 
 # --- principal components ---------------------------------------------------------------------------------------------

@@ -59,6 +59,11 @@ class PairDistances:
     def __len__(self) -> int:
         return len(self.first)
 
+    @classmethod
+    def none(cls) -> "PairDistances":
+        """No pairs."""
+        return cls(*(np.empty(0, dtype=np.int64),) * 2, *(np.empty(0),) * 2)
+
 
 def kept_distances(
     tried: Int[np.ndarray, " v"],
@@ -135,6 +140,8 @@ class StatisticalModel:
         residue: root mean square distance of held-out states from the model.
         pairs: distances that the states keep, which the linear model alone does not.
         source_frame: frame of the object's own files; None in models from before it was kept.
+        is_normal: whether the states are the normal distribution of the modes itself, as those of an elastic solid, so
+            that a fit's surroundings in the library say nothing more.
     """
 
     rest: SegmentedMesh
@@ -146,6 +153,7 @@ class StatisticalModel:
     residue: float
     pairs: PairDistances
     source_frame: SourceFrame | None = None
+    is_normal: bool = False
 
     def __repr__(self) -> str:
         states = f"{counted(self.count, 'mode')} of {counted(len(self.library), 'state')}"
@@ -225,9 +233,8 @@ class StatisticalModel:
 
     def around(self, mean: Float[np.ndarray, "m 3"], modes: Float32[np.ndarray, "m 3 d"]) -> "StatisticalModel":
         """Another linear model of the same object, without kept distances; what depends on rest alone is shared."""
-        none = PairDistances(*(np.empty(0, dtype=np.int64),) * 2, *(np.empty(0),) * 2)
         library = np.zeros((0, modes.shape[2]), dtype=np.float32)
-        other = replace(self, mean=mean, modes=modes, library=library, pairs=none)
+        other = replace(self, mean=mean, modes=modes, library=library, pairs=PairDistances.none())
         vars(other).update({name: getattr(self, name) for name in OF_REST})
         return other
 
@@ -354,6 +361,7 @@ def pack_model(model: StatisticalModel) -> tuple[dict[str, np.ndarray], dict[str
         "vertices": [len(segment.vertices) for segment in segments],
         "faces": [len(segment.faces) for segment in segments],
         "residue": model.residue,
+        "is_normal": model.is_normal,
         "frame": None if model.source_frame is None else model.source_frame.facts(),
     }
     return {name: np.ascontiguousarray(value) for name, value in tensors.items()}, facts
@@ -373,6 +381,7 @@ def unpack_model(tensors: Tensors, facts: Mapping[str, Any]) -> StatisticalModel
         residue=float(facts["residue"]),
         pairs=PairDistances(index[0], index[1], mean, std),
         source_frame=SourceFrame.of_facts(facts.get("frame")),  # older files have none
+        is_normal=bool(facts.get("is_normal", False)),
     )
 
 

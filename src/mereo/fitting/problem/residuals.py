@@ -332,7 +332,12 @@ class Prior:
 
     @classmethod
     def near(cls, model: StatisticalModel, z: Float[np.ndarray, " k"], count: int, extra_std: float) -> "Prior":
-        """Prior of the ``count`` states of the library nearest in shape, each coefficient ``extra_std`` more unsure."""
+        """Prior of the ``count`` states of the library nearest in shape, each coefficient ``extra_std`` more unsure.
+
+        That of all states where they are normal: the nearest of them lie on no curved set.
+        """
+        if model.is_normal:
+            return cls.whole(model)
         distance = (((model.library - z) * model.motion) ** 2).sum(axis=1)
         near = model.library[np.argsort(distance)[:count]].astype(np.float64)
         center = near.mean(axis=0)

@@ -462,11 +462,11 @@ class Registrar:
     def states_or_none(self) -> DrawnStates | None:
         """Random states of the scene, among which a fit of its draws starts; they take seconds once.
 
-        None without a scene, for one with more than ``MOST_DRAWS`` draws, and where the scene's mesh cannot be had: the
+        None without a scene, for an elastic solid, whose modes are its draws, for more than ``MOST_DRAWS`` draws, and where the scene's mesh cannot be had: the
         weights carry all that the modes need. With "full" that raises ``AssetUnavailable``.
         """
         try:
-            if self.scene is None or len(Drawn.of(self.scene, STATES_SEED).z) > MOST_DRAWS:
+            if self.scene is None or self.model.is_normal or len(Drawn.of(self.scene, STATES_SEED).z) > MOST_DRAWS:
                 return None
             with stage("simulate random states of the scene, once for an object"):
                 return DrawnStates.of(self.scene, self.model)

@@ -21,10 +21,12 @@ from pydantic import (
 )
 
 from mereo.deformation import samplers
+from mereo.deformation.elastic import ElasticSampler, Material, build_lattice
 from mereo.deformation.samplers import DeformationSampler
 from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import Normalizer
+from mereo.io.yaml_document import similar
 from mereo.scenes.scene import Workspace
 
 # --- fields -----------------------------------------------------------------------------------------------------------
@@ -291,7 +293,82 @@ class PushBlock(DeformationBlock):
         return samplers.PushSampler(_lengths(self.distance, target), self.tip * unit, self.reach * unit)
 
 
-AnyDeformation = LatticeBlock | WavesBlock | BendBlock | TwistBlock | TaperBlock | SquashBlock | JointBlock | PushBlock
+class HeldPlace(Block):
+    """Ball of the file's frame in which an elastic solid does not move."""
+
+    center: Point
+    radius: Positive
+
+
+SOFT, STIFF = 0.2, 0.05
+"""``ElasticBlock.motion`` of what is soft, as organs are, and of what is stiff, as hard rubber is."""
+
+
+class ElasticBlock(DeformationBlock):
+    """States of an elastic solid under random loads.
+
+    Attributes:
+        motion: root mean square displacement, as a share of half the longest side.
+        poisson: Poisson's ratio, the same for all segments.
+        stiffness: Young's modulus of segments, in that of those which are not named.
+        held: places that do not move against each other; nothing is held where absent.
+        cells: of the lattice along its longest side; more follow thin parts better, and take longer.
+        modes: how many ways to bend there are.
+    """
+
+    type: Literal["elastic"]
+    motion: Annotated[FiniteFloat, Field(gt=0, le=0.5)] = SOFT
+    poisson: Annotated[FiniteFloat, Field(gt=-1, lt=0.49)] = 0.4
+    stiffness: dict[Name, Annotated[FiniteFloat, Field(ge=1e-3, le=1e3)]] = {}
+    held: Annotated[list[HeldPlace], Field(min_length=1)] | None = None
+    cells: Annotated[int, Field(ge=4, le=64)] = 16
+    modes: Annotated[int, Field(ge=1, le=150)] = 100
+
+    def sampler(self, target: Target) -> DeformationSampler:
+        """Sampler of states of all segments as one solid, in scene units.
+
+        ``Misfit`` for unknown segments, for places that hold nothing, and for segments that are not in one piece.
+        """
+        names, bounds = list(target.moved.names), target.moved.bounds
+        for name in self.stiffness:
+            if name not in names:
+                raise Misfit("stiffness", f"no segment is called {name!r}: {similar(name, names)}")
+        stiffness = [self.stiffness.get(name, 1.0) for name in names] if self.stiffness else None
+        solid = build_lattice(target.moved, self.cells, stiffness)
+        if (pieces := solid.pieces) > 1:
+            raise Misfit(
+                "type",
+                f"the segments are {pieces} pieces that do not touch; an elastic solid is one: give each piece a block "
+                "of its own with `segments`",
+            )
+        held = None
+        for place in self.held or ():
+            away = np.linalg.norm(solid.mesh.nodes - target.point(place.center), axis=1)
+            inside = away <= place.radius * target.unit
+            if inside.sum() < 3:
+                nearest = np.sort(away)[2] / target.unit
+                raise Misfit(
+                    "held",
+                    f"within {place.radius:g} of {list(place.center)} there is too little of the object to hold it: "
+                    f"take a radius above {nearest:.3g}, or more `cells`",
+                )
+            held = inside if held is None else held | inside
+        count = min(self.modes, solid.most_modes(held))
+        motion = self.motion * float((bounds[1] - bounds[0]).max()) / 2
+        return ElasticSampler(solid, Material(self.poisson), count, motion, held)
+
+
+AnyDeformation = (
+    LatticeBlock
+    | WavesBlock
+    | BendBlock
+    | TwistBlock
+    | TaperBlock
+    | SquashBlock
+    | JointBlock
+    | PushBlock
+    | ElasticBlock
+)
 
 Deformations = Annotated[list[Annotated[AnyDeformation, Field(discriminator="type")]], Field(min_length=1)]
 """A list of deformations, told apart by their ``type``."""
