@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Num
 
 from mereo.api.objects import Object, Source, object_of
-from mereo.api.result import Result
+from mereo.api.result import Pose, Result
 from mereo.api.words import in_callers_words, python_words
 from mereo.evaluation.sample_views import shipped_frame, shipped_frames
 from mereo.fitting import tracking
@@ -24,6 +24,7 @@ from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.transforms import checked_pose
 from mereo.io.config import InputConfig
 from mereo.io.intrinsics import read_intrinsics
 from mereo.io.point_arrays import is_frame_list, points_of
@@ -154,6 +155,7 @@ def reconstruct(
     resolution: int = 128,
     isolation: IsolationConfig | None = None,
     label_points: bool = False,
+    initial_pose: Pose | None = None,
     **reading: Any,
 ) -> Result | list[Result]:
     """Find all segments of an object in a frame, hidden side included: what ``mereo reconstruct`` does.
@@ -167,6 +169,8 @@ def reconstruct(
         resolution: cells along the longest side of the object's box.
         isolation: what of the frame is left out; lengths in metres, or in the frame's unit where that is not known.
         label_points: also say on which segment each observed point lies (``Result.reconstruction.observed``).
+        initial_pose: rough pose of the object, as ``Result.pose``, from which the fit starts instead of a search or a
+            network; what the scene holds (``held``) stays there. Both units must be known.
         reading: arguments of ``load_frame``: ``axes``, ``unit_m``, ``intrinsics``, ``drop_invalid`` and others.
 
     Warns with ``SizeWarning`` where the visible part cannot be the object of the weights, and without weights with
@@ -181,6 +185,8 @@ def reconstruct(
         known = object_of(object)
         for each in frame if are_many else [frame]:  # not a comprehension: a warning names the caller's line
             observation = observation_of(each, isolation, reading)
+            if initial_pose is not None:
+                observation = replace(observation, initial_pose=checked_pose(initial_pose))
             results.append(
                 reconstruct_observation(
                     observation, known, method, resolution=resolution, isolation=isolation, label_points=label_points

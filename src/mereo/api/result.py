@@ -24,7 +24,7 @@ from mereo.fitting.registration.carry import carry, place
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud, camera_axes
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
-from mereo.geometry.transforms import fit_rigid, transform_points
+from mereo.geometry.transforms import transform_points
 from mereo.io.atomic_files import atomic_file, new_directory
 from mereo.io.attachments import Attachment, Content, Positions, Surfaces, read_attachments, write_attachment
 from mereo.io.config import DEFAULT_FILES, CarryFrame, FilesConfig, Format
@@ -156,15 +156,12 @@ class Result(Answer):
         coordinates), to the frame's axes: those of the camera, but for frames in a scanner's. Points of the scene where
         the weights do not know the files.
         """
-        return self._pose(slice(None))
+        return None if self.registered is None else self.registered.pose()
 
     @property
     def model_scale(self) -> float | None:
         """Length of a unit of the object's own files, or of its scene, in the frame's unit; None without a fit."""
-        if self.registered is None:
-            return None
-        source = self.registered.model.source_frame
-        return self.registered.scene_unit * (1.0 if source is None else source.scale)
+        return None if self.registered is None else self.registered.model_scale
 
     def carry(self, what: Any, files: CarryFrame = "source") -> Any:
         """Carry points, a mesh or a file of the object's own frame and unit to where it is now (``carry_to``)."""
@@ -201,20 +198,12 @@ class Result(Answer):
                 volume=figures.volume,
                 confidence=figures.confidence,
                 error_radius=radii.get(figures.name),
-                pose=self._pose(None if self.registered is None else self.registered.model.labels == figures.label),
+                pose=None
+                if self.registered is None
+                else self.registered.pose(self.registered.model.labels == figures.label),
             )
             for figures, mesh in zip(self.reconstruction.segments, self.surfaces.segments, strict=True)
         }
-
-    def _pose(self, rows: Any) -> Pose | None:
-        """Best rigid motion of some material points from the object's own files to the frame."""
-        registered, scale = self.registered, self.model_scale
-        if registered is None or scale is None:
-            return None
-        model, rest = registered.model, registered.model.rest_points
-        if model.source_frame is not None:
-            rest = transform_points(np.linalg.inv(model.source_frame.T_scene_source), rest)
-        return fit_rigid(scale * rest[rows], registered.material[rows])
 
     @python_words()
     def save(

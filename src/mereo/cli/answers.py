@@ -49,6 +49,9 @@ class ReconstructCommand:
             explains the frame, if the weights carry one; network leaves the network's answer, search the network out;
             modes and full take the model in any case, full by fitting the draws of the scene as well.
         scene: the scene's name or file, whose draws are fitted, where it is not the built-in one of the weights.
+        initial_pose: file of the object's rough pose, from which the fit starts instead of a search or a network: 4 x 4
+            numbers (text, NPY, or the summary.json of a result) that take the object's own files, in the frame's unit,
+            to the frame. Parts that the scene holds stay there.
         carry: file to bring to where the object is, its inside included; once for each: mesh (STL, PLY, OBJ, GLB),
             points (PLY, XYZ, NPY), CSV (x, y, z; qx, qy, qz, qw for poses) or volume (NIfTI, NRRD), which is
             resampled around the object.
@@ -78,6 +81,7 @@ class ReconstructCommand:
     files: Annotated[FilesConfig, arg(name="")] = field(default_factory=FilesConfig)
     method: AnswerMethod = "auto"
     scene: str | None = None
+    initial_pose: Path | None = None
     carry: UseAppendAction[tuple[Path, ...]] = ()
     carry_frame: CarryFrame = "source"
     explain: UseAppendAction[tuple[str, ...]] = ()

@@ -5,7 +5,7 @@ SensorFrame -reconstruct_frame-> Result, its files in a folder, and what is prin
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from rich.table import Table
 
 from mereo.api.objects import Object
 from mereo.api.reconstruct import reconstruct_observation
-from mereo.api.result import Result, registration_of
+from mereo.api.result import Pose, Result, registration_of
 from mereo.cli.answers import ReconstructCommand
 from mereo.cli.options import check_named, files_read, loaded_object, options_of
 from mereo.fitting.registration.answer import Answer
@@ -28,6 +28,7 @@ from mereo.io.atomic_files import new_directory, write_json
 from mereo.io.attachments import Attachment, read_attachments
 from mereo.io.config import CONFIG
 from mereo.io.progress import shown_stages, stage
+from mereo.io.readers import read_pose
 from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.io.writers.formats import chosen_formats
 from mereo.io.writers.meshes import write_explained_ply
@@ -72,20 +73,25 @@ class FrameJob:
         for option, needs in (("carry", "along which things move"), ("explain", "whose fit is explained")):
             if getattr(command, option) and command.method == "network":
                 raise ValueError(f"--method is network, but --{option} needs a registration, {needs}: use auto")
-        _ = self.attachments  # raises for those that cannot be carried
+        _ = self.attachments, self.initial_pose  # raises for those that cannot be read
 
     @property
     def read(self) -> tuple[str | Path, ...]:
         """Files that are read beside the frames."""
         command = self.command
         scene = () if command.scene is None else files_of(command.scene)
-        given = (command.reading.intrinsics, command.reading.mask, *command.carry)
+        given = (command.reading.intrinsics, command.reading.mask, command.initial_pose, *command.carry)
         return (*files_read(command.object, command.weights), *scene, *(path for path in given if path is not None))
 
     @cached_property
     def attachments(self) -> tuple[Attachment, ...]:
         """Content of the files that are carried."""
         return tuple(read_attachments(self.command.carry))
+
+    @cached_property
+    def initial_pose(self) -> Pose | None:
+        """Rough pose of the object in all frames; None where it is looked for."""
+        return None if self.command.initial_pose is None else read_pose(self.command.initial_pose)
 
     @cached_property
     def object(self) -> Object:
@@ -140,7 +146,7 @@ def reconstruct_frame(frame: SensorFrame, directory: Path, job: FrameJob, path: 
     ``path`` is the frame's own, for the options. Raises and warns as ``reconstruct_file``.
     """
     command = job.command
-    seen = find_object(frame, command.isolation)
+    seen = replace(find_object(frame, command.isolation), initial_pose=job.initial_pose)
     print(seen)
     placed = job.placed  # what is carried is refused before the work
     targets = [target_of(text, job.object.names) for text in command.explain]

@@ -195,7 +195,9 @@ def find_modes(
     values, vectors = eigsh(stiffness, count + rigid, M=weight, sigma=shift, OPinv=inverse, tol=1e-5, v0=start)
     order = np.argsort(values)[rigid:]
     if values[order[0]] < 0.01 * abs(shift):
-        cause = "it is not in one piece, or parts of it meet in an edge alone; take more cells, or a lattice for each piece"
+        cause = (
+            "it is not in one piece, or parts of it meet in an edge alone; take more cells, or a lattice for each piece"
+        )
         if held is not None:
             cause = f"{cause}; or what is held leaves it free to turn: hold more of it"
         raise ValueError(f"the solid has motions without energy besides the six rigid ones: {cause}")

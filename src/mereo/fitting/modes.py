@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.evidence import MOST_POINTS
 from mereo.fitting.problem.gauss_newton import DAMPING, Posed
-from mereo.fitting.problem.problem import UNEXPLAINED, Misfit, Problem
+from mereo.fitting.problem.problem import Misfit, Problem
 from mereo.fitting.problem.residuals import NetworkTerm, Prior, Surface
 from mereo.fitting.problem.segments import corner_positions, different, diverse_rows, largest_distance
 from mereo.geometry.downsampling import means_along_sight
@@ -323,7 +323,7 @@ def with_turned_camera(start: NetworkFit, predict: PredictCorrespondences | None
             modes = ScoredFit.of(frame, refine(frame, fit_whole(frame)))
             if modes.misfit.without_network < best[2].misfit.without_network:
                 best = frame, correspondences, modes
-        if best[2].misfit.cloud < UNEXPLAINED or (anyway and best[0].leaves_noise(best[2].surface)):
+        if best[2].misfit.cloud < best[0].config.unexplained or (anyway and best[0].leaves_noise(best[2].surface)):
             break
     return best if best is start else (best[0], best[1], explored(best[0], best[2]))
 

@@ -311,7 +311,7 @@ class BackgroundSearch:
 
     def __init__(self, registrar: Registrar, executor: Executor | None = None) -> None:
         # a newer frame is worth more than the last round, which takes as long as the two before and longer
-        self.registrar = replace(registrar, config=replace(registrar.config, search_rounds=2))
+        self.registrar = replace(registrar, constants=replace(registrar.config, search_rounds=2))
         self.executor = executor
         self._thread: ThreadPoolExecutor | None = None
         self._running: Future[Searched] | None = None

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 
 def rigid(rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
@@ -17,6 +18,22 @@ def inverse_rigid(transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4
     """Inverse of a rigid transform."""
     rotation = transform[:3, :3].T
     return rigid(rotation, -rotation @ transform[:3, 3])
+
+
+def checked_pose(pose: ArrayLike) -> Float[np.ndarray, "4 4"]:
+    """A rigid pose as numbers; ``ValueError`` for what is none."""
+    T: np.ndarray = np.asarray(pose, dtype=np.float64)
+    cure = "give 4 x 4 numbers, a rotation and a translation, with 0 0 0 1 in the last row"
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise ValueError(f"the pose has the shape {T.shape}, or numbers that are not finite: {cure}")
+    rotation = T[:3, :3]
+    if (
+        np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3
+        or np.linalg.det(rotation) < 0
+        or list(T[3]) != [0, 0, 0, 1]
+    ):
+        raise ValueError(f"the pose {np.round(T, 3).tolist()} scales, shears or mirrors: {cure}")
+    return T
 
 
 def transform_points(

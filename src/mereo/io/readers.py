@@ -6,6 +6,7 @@ Nothing is repaired silently: missing points are refused unless the caller asks 
 centres are explained in ``mereo.io.intrinsics``.
 """
 
+import json
 import re
 from collections.abc import Callable
 from contextlib import suppress
@@ -21,6 +22,7 @@ from PIL import Image
 
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import LARGEST
+from mereo.geometry.transforms import checked_pose
 from mereo.io.errors import check_count, limited_memory, quiet, readable, without_output
 
 PLAUSIBLE_DEPTH_M = (0.05, 20.0)
@@ -521,6 +523,25 @@ CLOUD_READERS: dict[str, Callable[[Path], Float[np.ndarray, "n 3"]]] = {
     ".zdf": _zdf_points,
 }
 """Parser of each suffix of point clouds."""
+
+
+# --- poses ------------------------------------------------------------------------------------------------------------
+
+
+def read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
+    """Rigid pose of a file: 4 x 4 numbers as text or NPY, or ``pose`` of a result's summary.json.
+
+    Raises ``ValueError`` and ``FileNotFoundError`` with the file's name.
+    """
+    with readable(path, "pose"):
+        if path.suffix.lower() == ".npy":
+            content = np.load(path, allow_pickle=False)
+        elif path.suffix.lower() == ".json":
+            content = json.loads(path.read_text("utf-8"))
+            content = content["pose"] if isinstance(content, dict) else content
+        else:
+            content = np.loadtxt(path, ndmin=2)
+        return checked_pose(content)
 
 
 # --- arrays -----------------------------------------------------------------------------------------------------------

@@ -62,6 +62,8 @@ class Observation:
         steps: what isolation left out.
         selection: points of the frame that isolation took for the object's; None means all.
         extent: how much of the object's outline the frame shows, see ``IsolationConfig``.
+        initial_pose: rough ``T_camera_model`` from which a fit starts, as ``Result.pose``; None where a search or a
+            network finds the object.
     """
 
     frame: SensorFrame
@@ -69,6 +71,7 @@ class Observation:
     steps: tuple[IsolationStep, ...] = ()
     selection: Selection | None = None
     extent: Extent = "auto"
+    initial_pose: Float[np.ndarray, "4 4"] | None = None
 
     @cached_property
     def lines(self) -> SightLines:

@@ -128,7 +128,8 @@ def elastic_model(
     flat = solid.modes.reshape(len(solid.modes), -1)
     modes = (solid.solid.mesh.embed(points) @ flat).reshape(len(points), 3, -1).astype(np.float32)
     library = np.random.default_rng(0).normal(size=(count, modes.shape[2])).astype(np.float32)
-    model = StatisticalModel(rest, nodes, node_labels, points, modes, library, 0.0, PairDistances.none(), None, True)
+    model = StatisticalModel(rest, nodes, node_labels, points, modes, library, 0.0, PairDistances.none())
+    model = replace(model, is_normal=True, is_held=solid.held is not None)
     left = []
     for state in states.astype(np.float64):
         T, z = model.project(state)

@@ -142,6 +142,7 @@ class StatisticalModel:
         source_frame: frame of the object's own files; None in models from before it was kept.
         is_normal: whether the states are the normal distribution of the modes itself, as those of an elastic solid, so
             that a fit's surroundings in the library say nothing more.
+        is_held: whether parts of the object at rest do not move in its states, so that a pose of it is that of theirs.
     """
 
     rest: SegmentedMesh
@@ -154,6 +155,7 @@ class StatisticalModel:
     pairs: PairDistances
     source_frame: SourceFrame | None = None
     is_normal: bool = False
+    is_held: bool = False
 
     def __repr__(self) -> str:
         states = f"{counted(self.count, 'mode')} of {counted(len(self.library), 'state')}"
@@ -362,6 +364,7 @@ def pack_model(model: StatisticalModel) -> tuple[dict[str, np.ndarray], dict[str
         "faces": [len(segment.faces) for segment in segments],
         "residue": model.residue,
         "is_normal": model.is_normal,
+        "is_held": model.is_held,
         "frame": None if model.source_frame is None else model.source_frame.facts(),
     }
     return {name: np.ascontiguousarray(value) for name, value in tensors.items()}, facts
@@ -382,6 +385,7 @@ def unpack_model(tensors: Tensors, facts: Mapping[str, Any]) -> StatisticalModel
         pairs=PairDistances(index[0], index[1], mean, std),
         source_frame=SourceFrame.of_facts(facts.get("frame")),  # older files have none
         is_normal=bool(facts.get("is_normal", False)),
+        is_held=bool(facts.get("is_held", False)),
     )
 
 

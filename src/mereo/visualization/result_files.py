@@ -47,8 +47,8 @@ def summary_of(
         }
         for segment, color in zip(result.segments, result.surfaces.colors, strict=True)
     ]
-    radii: dict[str, Any] = {}
-    sure = None if answer.registered is None else answer.registered.uncertainty
+    registered, radii = answer.registered, dict[str, Any]()
+    sure = None if registered is None else registered.uncertainty
     if sure is not None:
         radii["radius95"] = {**sure.summary(), "unit_m": frame.unit_m}
         for row, segment in zip(segments, sure.segments, strict=True):
@@ -58,6 +58,7 @@ def summary_of(
         "unit_m": frame.unit_m,
         **frame_facts(answer, carried),
         **radii,
+        "pose": None if registered is None else registered.pose().tolist(),
         "nested": [list(pair) for pair in result.surfaces.nested],
         "spacing": float(result.labels.spacing[0]),
         "evaluated_points": result.evaluated,

@@ -8,6 +8,7 @@ without one are the same, and so is any axis or unit.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -36,6 +37,9 @@ AROUND_PITCHES = 1.6
 With a pixel's own depth alone, 6 to 13 % of the true surface counted as in front of what was seen."""
 
 AROUND = 9
+
+NORMAL_POINTS = 12
+"""Points by which the surface's direction at an observed one is estimated."""
 
 RIM_PITCHES, EDGE_PITCHES, EDGE_DIRECTIONS = 2.5, 3.5, 8
 """Angles from the observed points, in pixels, between which lines of sight beside the object are sampled, and in how
@@ -131,6 +135,15 @@ class Evidence:
     def with_more_samples(self) -> "Evidence":
         """The same with as many observed samples as a noisy frame needs."""
         return replace(self, observed_samples=self.points[spread(self.points, MORE_SAMPLES)])
+
+    @cached_property
+    def normals(self) -> Float[np.ndarray, "p 3"]:
+        """Unit normals at the observed samples, toward the camera: of the planes through the points around them."""
+        near = cKDTree(self.points).query(self.observed_samples, k=min(NORMAL_POINTS, len(self.points)))[1]
+        patches = self.points[near] - self.points[near].mean(axis=1, keepdims=True)
+        normals = np.linalg.eigh(np.einsum("pki,pkj->pij", patches, patches))[1][:, :, 0]
+        away = np.einsum("pi,pi->p", normals, self.observed_samples) > 0
+        return np.where(away[:, None], -normals, normals)
 
     @property
     def may_be_cut(self) -> bool:

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.evidence import MORE_SAMPLES, OBSERVED_SAMPLES, Evidence
-from mereo.fitting.problem.gauss_newton import NormalEquations, Posed, Rows
+from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, Rows, rigid_motion
 from mereo.fitting.problem.residuals import (
     ROBUST,
     SILHOUETTE_WEIGHT,
@@ -35,9 +35,6 @@ PAIR_WEIGHT = 100.0
 
 KNOWN_SCALE_STD = 1e-6
 """``Problem.scale_std`` of a frame whose unit is known."""
-
-UNEXPLAINED = 0.3
-"""The cloud's misfit, in squared standard deviations of an observed sample, above which a fit is likely wrong."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +64,28 @@ class Misfit:
 
 
 @dataclass(frozen=True, eq=False)
+class GivenPose:
+    """Pose of the object that is known up to an error, as of one that is held.
+
+    Attributes:
+        posed: its rest pose in the camera frame, scene units.
+        std: root mean square error of a material point, scene units.
+    """
+
+    posed: Posed
+    std: float
+
+    def add_to(self, normal: NormalEquations, model: StatisticalModel, posed: Posed) -> NormalEquations:
+        """Sum with the squared distance of the rest pose, turned and shifted as a state is, from the given one."""
+        rest = model.rest_points[model.sparse]
+        place = posed.place(rest)
+        jacobian = np.zeros((3 * len(rest), POSE + len(posed.z)))
+        jacobian[:, :POSE] = rigid_motion(place - posed.translation).reshape(-1, POSE)
+        weight = np.full(3 * len(rest), 1.0 / (len(rest) * self.std**2))
+        return normal.add(jacobian, (place - self.posed.place(rest)).ravel(), weight)
+
+
+@dataclass(frozen=True, eq=False)
 class Problem:
     """Everything a fit of one frame works on; scene units, camera frame.
 
@@ -77,6 +96,7 @@ class Problem:
         scale_std: how far the scale is unsure.
         config: constants.
         noisy: whether they are those of a noisy frame.
+        given: pose that is known; None where the frame alone says it.
     """
 
     model: StatisticalModel
@@ -85,6 +105,7 @@ class Problem:
     scale_std: float
     config: FitConfig
     noisy: bool = False
+    given: GivenPose | None = None
 
     @classmethod
     def of(
@@ -114,8 +135,10 @@ class Problem:
         return self.config.start_sigma * self.model.half
 
     def known(self, posed: Posed, prior: Prior, slack: float) -> NormalEquations:
-        """Normal equations of what is known without the frame: prior, scale, kept distances up to ``slack``."""
+        """Normal equations of what is known without the frame: prior, scale, pose, kept distances up to ``slack``."""
         normal = NormalEquations.prior(posed.z, prior.center, prior.precision, posed.log_scale, self.scale_std)
+        if self.given is not None:
+            normal = self.given.add_to(normal, self.model, posed)
         return self.pairs.add_to(normal, posed.z, PAIR_WEIGHT, slack)
 
     def residual_noise(self, surface: Surface) -> float:
@@ -137,7 +160,7 @@ class Problem:
 
     def wants_turns(self, cloud: float, surface: Surface) -> bool:
         """Whether a misfit of the cloud, much greater than its noise, shows that the fit is likely wrong."""
-        if cloud < UNEXPLAINED:
+        if cloud < self.config.unexplained:
             return False
         if self.config.turned_anyway:
             return not self.leaves_noise(surface)
@@ -205,7 +228,7 @@ class Problem:
         some = slice(None, None, COARSE)
         network = NetworkTerm(*(part[some] for part in vars(self.network).values()))
         evidence = replace(self.evidence, observed_samples=self.evidence.observed_samples[: OBSERVED_SAMPLES // COARSE])
-        coarse = Problem(self.model, network, evidence, self.scale_std, config, self.noisy)
+        coarse = Problem(self.model, network, evidence, self.scale_std, config, self.noisy, self.given)
         vars(coarse)["pairs"] = PairTerm(*(part[some] for part in vars(self.pairs).values()))
         return coarse
 
@@ -231,9 +254,13 @@ class Problem:
     ) -> NormalEquations:
         """Sum with cloud, silhouette and correspondences; ``exact`` uses the faces and not the samples."""
         samples, observed = self.samples.posed(posed), self.evidence.observed_samples
-        planes = Surface.of(self.model, posed).planes(observed, self.far) if exact else samples.planes(observed)
+        normals = self.observed_normals
+        if exact:
+            planes = Surface.of(self.model, posed).planes(observed, self.far)
+        else:
+            planes = samples.planes(observed, normals, self.config.normal_length * self.model.half)
         normal = self.network.add_to(normal, posed, self.network_sigma, network_weight, robust=True)
-        normal = normal.add(*cloud_rows(posed, observed, planes, sigma, self.config.cloud_weight))
+        normal = normal.add(*cloud_rows(posed, observed, planes, sigma, self.config.cloud_weight, normals))
         return self.add_silhouette(normal, posed, samples, sigma)
 
     def add_silhouette(
@@ -247,7 +274,13 @@ class Problem:
         """Residuals of the observed samples from the faces, as the last steps of a fit have them."""
         observed_samples, config = self.evidence.observed_samples, self.config
         planes = Surface.of(self.model, posed).planes(observed_samples, self.far)
-        return cloud_rows(posed, observed_samples, planes, config.cloud_sigma, config.cloud_weight)
+        weight, normals = config.cloud_weight, self.observed_normals
+        return cloud_rows(posed, observed_samples, planes, config.cloud_sigma, weight, normals)
+
+    @property
+    def observed_normals(self) -> Float[np.ndarray, "p 3"] | None:
+        """Normals of the observed samples; None where places alone are compared."""
+        return self.evidence.normals if self.config.normal_length else None
 
     def misfit(self, posed: Posed, surface: Surface | None = None) -> Misfit:
         """Misfit of a state, whose ``surface`` may be there already."""

@@ -110,11 +110,22 @@ class PosedSamples:
         step = max(1, len(self.position) // count)
         return PosedSamples(self.surface.every(step), self.position[::step], self.normal[::step], self.facing[::step])
 
-    def planes(self, points: Float[np.ndarray, "p 3"]) -> Planes:
-        """Place, normal and modes of the facing sample nearest to each point."""
+    def planes(
+        self, points: Float[np.ndarray, "p 3"], normals: Float[np.ndarray, "p 3"] | None = None, length: float = 0.0
+    ) -> Planes:
+        """Place, normal and modes of the facing sample nearest to each point.
+
+        With the points' ``normals``, of the sample that is nearest in place and direction, whether it faces the camera
+        yet or not: a difference of 1 counts as ``length``.
+        """
         rows = np.flatnonzero(self.facing)
-        rows = rows if len(rows) else np.arange(len(self.position))
-        tree = cKDTree(self.position[rows], balanced_tree=False, compact_nodes=False)
+        if len(rows) == 0 or normals is not None:
+            rows = np.arange(len(self.position))
+        places = self.position[rows]
+        if normals is not None:
+            places = np.concatenate([places, length * self.normal[rows]], axis=1)
+            points = np.concatenate([points, length * normals], axis=1)
+        tree = cKDTree(places, balanced_tree=False, compact_nodes=False)
         near = rows[tree.query(points)[1]]
         return self.position[near].astype(np.float64), self.normal[near].astype(np.float64), self.surface.modes[near, 0]
 
@@ -279,12 +290,26 @@ class NetworkTerm:
 
 
 def cloud_rows(
-    posed: Posed, points: Float[np.ndarray, "p 3"], planes: Planes, sigma: float, total_weight: float
+    posed: Posed,
+    points: Float[np.ndarray, "p 3"],
+    planes: Planes,
+    sigma: float,
+    total_weight: float,
+    normals: Float[np.ndarray, "p 3"] | None = None,
 ) -> Rows:
-    """Each point's distance to its plane of the facing surface, its derivatives, and its weight."""
+    """Each point's distance to its plane of the facing surface, its derivatives, and its weight.
+
+    With the points' ``normals``, a point far from its place on the plane or of another direction counts for less.
+    """
     position, across, modes = planes
-    residual = np.einsum("pi,pi->p", across, position - points)
-    weight = geman_mcclure(residual, ROBUST * sigma) * (total_weight / len(points) / sigma**2)
+    offset = position - points
+    residual = np.einsum("pi,pi->p", across, offset)
+    weight = np.full(len(points), total_weight / len(points) / sigma**2)
+    if normals is None:
+        weight *= geman_mcclure(residual, ROBUST * sigma)
+    else:
+        weight *= geman_mcclure(np.linalg.norm(offset, axis=1), ROBUST * sigma)
+        weight *= np.clip(np.einsum("pi,pi->p", across, normals), 0.0, 1.0)
     return along(posed, position, modes, across), residual, weight
 
 

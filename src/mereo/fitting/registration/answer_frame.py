@@ -14,7 +14,8 @@ from mereo.fitting.config import FitConfig
 from mereo.fitting.modes import fit_rest, is_at_rest
 from mereo.fitting.problem.correspondences import nothing
 from mereo.fitting.problem.evidence import Evidence
-from mereo.fitting.problem.problem import Problem
+from mereo.fitting.problem.gauss_newton import Posed
+from mereo.fitting.problem.problem import GivenPose, Problem
 from mereo.fitting.problem.residuals import NetworkTerm, Surface
 from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.recognition import Recognition, recognize
@@ -22,7 +23,7 @@ from mereo.fitting.registration.register import CloudToFit, ModesFit, Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.search import WHOLE, Screen, rotations, search, tables_of
 from mereo.geometry.camera import SightLines
-from mereo.geometry.transforms import transform_points
+from mereo.geometry.transforms import fit_rigid, transform_points
 from mereo.io.cores import limit_blas_threads
 from mereo.io.progress import stage
 from mereo.models.trained import Trained
@@ -140,7 +141,12 @@ def find(
     search follows, and the fit with the greater evidence is taken. Takes the arguments of ``answer_frame``, and raises
     as it does for unusable clouds.
     """
-    if registrar is not None and not registrar.asks_network:
+    if seen.initial_pose is not None and (registrar is None or scene_unit_of(seen, registrar, scene_unit) is None):
+        raise ValueError(
+            "an initial pose is given, and the length of the frame's or of the object's unit is not known, or there is "
+            "no model to place: state the unit of both (--unit-m, --units), and leave the method auto"
+        )
+    if registrar is not None and (not registrar.asks_network or seen.initial_pose is not None):
         return search_hypotheses(seen, registrar, keep_all, scene_unit)
     assert model is not None
     candidate, likelier = fit_hypotheses(seen, model, registrar, keep_all, scene_unit)
@@ -281,24 +287,42 @@ def search_hypotheses(
     Takes the arguments of ``answer_frame``, and raises as it does for unusable clouds. Returns the best candidate and
     the likelier hypothesis.
     """
-    unit, axes = registrar.stated_scene_unit(seen.frame.unit_m) if scene_unit is None else scene_unit, seen.frame.axes
+    unit, axes = scene_unit_of(seen, registrar, scene_unit), seen.frame.axes
     likelier, *others = (encode_frame(reading, None, axes) for reading in readings(seen.cloud, axes, keep_all))
-    best = _searched(likelier, registrar, unit, seen.lines)
+    best = _searched(likelier, registrar, unit, seen)
     for other in others:
         if best.is_accepted:
             break
-        best = better(best, _searched(other, registrar, unit, seen.lines))
+        best = better(best, _searched(other, registrar, unit, seen))
     return best, likelier
 
 
-def _searched(frame: EncodedFrame, registrar: Registrar, scene_unit: float | None, lines: SightLines) -> Candidate:
-    """Candidate of one hypothesis by a search; ``lines`` are the lines of sight beside the object."""
+def scene_unit_of(seen: Observation, registrar: Registrar, certain: float | None) -> float | None:
+    """Length of a scene unit in the frame's unit: what is ``certain``, or as both state theirs; None where unknown."""
+    return registrar.stated_scene_unit(seen.frame.unit_m) if certain is None else certain
+
+
+def _searched(frame: EncodedFrame, registrar: Registrar, scene_unit: float | None, seen: Observation) -> Candidate:
+    """Candidate of one hypothesis by a search, or from the initial pose that is given."""
+    model, start = registrar.model, None
     try:
-        check_size(frame, registrar.model, scene_unit)
-        modes = search_modes(cloud_to_fit(frame, lines, scene_unit), registrar.model, registrar.config)
+        check_size(frame, model, scene_unit)
+        if seen.initial_pose is not None and scene_unit is not None:
+            start = initial_state(frame.T_camera_input @ seen.initial_pose, model, scene_unit)
+        modes = search_modes(cloud_to_fit(frame, seen.lines, scene_unit), model, registrar.config, start)
     except ValueError as error:
         return Candidate(frame, error=error, located_by="search")
     return Candidate(frame, modes, located_by="search")
+
+
+def initial_state(T_camera_model: Float[np.ndarray, "4 4"], model: StatisticalModel, scene_unit: float) -> Posed:
+    """State of the model at rest with a pose as ``Result.pose``, in scene units."""
+    rest, source = model.rest_points, model.source_frame
+    if source is not None:
+        rest = transform_points(source.scale * np.linalg.inv(source.T_scene_source), rest)
+    placed = transform_points(T_camera_model, scene_unit * rest) / scene_unit
+    T = fit_rigid(model.material(model.rest_z), placed)
+    return Posed(T[:3, :3], T[:3, 3], model.rest_z)
 
 
 def cloud_to_fit(
@@ -362,20 +386,29 @@ def better(first: Candidate, second: Candidate) -> Candidate:
 # --- the search -------------------------------------------------------------------------------------------------------
 
 
+HELD_STD = 0.01
+"""Error of the pose of an object that is held, as a share of half the rest box's longest side."""
+
+
 def search_modes(
     cloud: CloudToFit,
     model: StatisticalModel,
     config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
+    start: Posed | None = None,
 ) -> ModesFit:
-    """Fit the modes to a cloud by search; where it leaves open what lies beside it, the fits decide."""
+    """Fit the modes to a cloud by search; where it leaves open what lies beside it, the fits decide.
+
+    With a ``start`` that is known roughly, the fit begins there, and keeps its pose where the object is held.
+    """
     started = time.perf_counter()
     with limit_blas_threads():
         unit = size_of(cloud.points, model) if cloud.scene_unit is None else cloud.scene_unit
         is_open = cloud.lines is None or cloud.lines.other_lines is None
         evidence = cloud.evidence(unit)
-        whole = Problem(model, NetworkTerm.none(model), evidence, cloud.scale_std(config), config)
+        given = None if start is None or not model.is_held else GivenPose(start, HELD_STD * model.half)
+        whole = Problem(model, NetworkTerm.none(model), evidence, cloud.scale_std(config), config, given=given)
         partial = replace(whole, evidence=replace(evidence, other_lines="unknown")) if is_open else None
-        outcome = search(whole, partial)
+        outcome = search(whole, partial, start)
         problem, modes = outcome.problem, outcome.best
         rest = fit_rest(problem, nothing(), modes.posed)
         at_rest = is_at_rest(problem, modes, rest)

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
-from mereo.fitting.config import AnswerMethod, FitConfig
+from mereo.fitting.config import ELASTIC, AnswerMethod, FitConfig
 from mereo.fitting.draws.fit import fit_draws
 from mereo.fitting.draws.playback import MOST_DRAWS, STATES_SEED, Drawn, DrawnStates
 from mereo.fitting.draws.problem import DrawsFit, DrawsProblem
@@ -329,14 +329,19 @@ class Registrar:
             misfit; "auto" does the same where the scene is at hand, and else fits the modes; "search" is "auto"
             without the network.
         given: the object's scene, where it is not the built-in one that the weights were trained on.
-        config: constants of the fit of the modes.
+        constants: of the fit of the modes; None for those that suit the kind of model.
     """
 
     network: Trained | None
     model: StatisticalModel
     method: AnswerMethod = "auto"
     given: Scene | None = None
-    config: FitConfig = FitConfig()  # noqa: RUF009 (frozen)
+    constants: FitConfig | None = None
+
+    @property
+    def config(self) -> FitConfig:
+        """Constants of the fit of the modes."""
+        return self.constants or (ELASTIC if self.model.is_normal else FitConfig())
 
     @classmethod
     def of(cls, network: Trained, method: AnswerMethod = "auto", scene: Scene | str | None = None) -> "Registrar":
@@ -410,12 +415,12 @@ class Registrar:
     @property
     def without_retries(self) -> "Registrar":
         """The same without predictions with the camera turned."""
-        return replace(self, config=replace(self.config, turned=False))
+        return replace(self, constants=replace(self.config, turned=False))
 
     @property
     def with_retries(self) -> "Registrar":
         """The same with predictions with the camera turned, however noisy a frame may be."""
-        return replace(self, config=replace(self.config, turned_anyway=True))
+        return replace(self, constants=replace(self.config, turned_anyway=True))
 
     def asking(self, network: Trained | None) -> "Registrar":
         """The same with the same weights on another device; scene and states that are known stay so."""
@@ -462,8 +467,9 @@ class Registrar:
     def states_or_none(self) -> DrawnStates | None:
         """Random states of the scene, among which a fit of its draws starts; they take seconds once.
 
-        None without a scene, for an elastic solid, whose modes are its draws, for more than ``MOST_DRAWS`` draws, and where the scene's mesh cannot be had: the
-        weights carry all that the modes need. With "full" that raises ``AssetUnavailable``.
+        None without a scene, for an elastic solid, whose modes are its draws, for more than ``MOST_DRAWS`` draws, and
+        where the scene's mesh cannot be had: the weights carry all that the modes need. With "full" that raises
+        ``AssetUnavailable``.
         """
         try:
             if self.scene is None or self.model.is_normal or len(Drawn.of(self.scene, STATES_SEED).z) > MOST_DRAWS:

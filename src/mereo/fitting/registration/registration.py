@@ -5,7 +5,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from numpy.typing import ArrayLike
 
 from mereo.deformation.maps import newton
@@ -15,7 +15,7 @@ from mereo.fitting.uncertainty import Explanation, Optimum, Uncertainty
 from mereo.geometry.brief import counted
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids, owned_centroids, signed_distance_and_direction
-from mereo.geometry.transforms import fit_rigid
+from mereo.geometry.transforms import fit_rigid, transform_points
 from mereo.scenes.statistical_model import StatisticalModel, following
 
 Method = Literal["rest", "modes", "draws"]
@@ -112,6 +112,19 @@ class Registration:
     def beyond_states(self) -> float:
         """How far the state lies outside all that the model has seen (``StatisticalModel.beyond``), scene units."""
         return self.model.beyond(self.modes_z)
+
+    @property
+    def model_scale(self) -> float:
+        """Length of a unit of the object's own files, or of its scene where these are not known, in the input's."""
+        source = self.model.source_frame
+        return self.scene_unit * (1.0 if source is None else source.scale)
+
+    def pose(self, rows: Bool[np.ndarray, " m"] | slice = slice(None)) -> Float[np.ndarray, "4 4"]:
+        """Best rigid motion of some material points, of the object's own files in the input's unit, to the frame."""
+        rest, source = self.model.rest_points, self.model.source_frame
+        if source is not None:
+            rest = transform_points(np.linalg.inv(source.T_scene_source), rest)
+        return fit_rigid(self.model_scale * rest[rows], self.material[rows])
 
     @cached_property
     def mesh(self) -> SegmentedMesh:

@@ -294,10 +294,30 @@ class PushBlock(DeformationBlock):
 
 
 class HeldPlace(Block):
-    """Ball of the file's frame in which an elastic solid does not move."""
+    """Part of an elastic solid that does not move: a ball, or all on one side of a plane.
+
+    Attributes:
+        center: of the ball, or a point of the plane.
+        radius: of the ball.
+        direction: to the side of the plane that is held.
+    """
 
     center: Point
-    radius: Positive
+    radius: Positive | None = None
+    direction: Direction | None = None
+
+    @model_validator(mode="after")
+    def _is_ball_or_side(self) -> "HeldPlace":
+        if (self.radius is None) == (self.direction is None):
+            raise ValueError("a held place has either a radius (a ball) or a direction (a side of a plane): give one")
+        return self
+
+    def depth(self, points: Float[np.ndarray, "n 3"], target: Target) -> Float[np.ndarray, " n"]:
+        """How far points of the scene's frame are inside, scene units; below 0 outside."""
+        offset = points - target.point(self.center)
+        if self.direction is not None:
+            return np.asarray(offset @ samplers.unit(np.array(self.direction)))
+        return np.asarray((self.radius or 0.0) * target.unit - np.linalg.norm(offset, axis=1))
 
 
 SOFT, STIFF = 0.2, 0.05
@@ -343,14 +363,14 @@ class ElasticBlock(DeformationBlock):
             )
         held = None
         for place in self.held or ():
-            away = np.linalg.norm(solid.mesh.nodes - target.point(place.center), axis=1)
-            inside = away <= place.radius * target.unit
-            if inside.sum() < 3:
-                nearest = np.sort(away)[2] / target.unit
+            depth = place.depth(solid.mesh.nodes, target)
+            inside = depth >= 0
+            if not 3 <= inside.sum() < len(inside) - 3:
+                least = float(np.sort(-depth)[2]) / target.unit
                 raise Misfit(
                     "held",
-                    f"within {place.radius:g} of {list(place.center)} there is too little of the object to hold it: "
-                    f"take a radius above {nearest:.3g}, or more `cells`",
+                    f"the place at {list(place.center)} holds {inside.sum()} of {len(inside)} nodes of the lattice; it "
+                    f"must hold 3 or more, and not all: it gets 3 where it reaches {least:.3g} farther",
                 )
             held = inside if held is None else held | inside
         count = min(self.modes, solid.most_modes(held))
