@@ -22,6 +22,7 @@ from pydantic import (
 
 from mereo.deformation import samplers
 from mereo.deformation.elastic import ElasticSampler, Material, build_lattice
+from mereo.deformation.maps import unit
 from mereo.deformation.samplers import DeformationSampler
 from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import SegmentedMesh
@@ -316,7 +317,7 @@ class HeldPlace(Block):
         """How far points of the scene's frame are inside, scene units; below 0 outside."""
         offset = points - target.point(self.center)
         if self.direction is not None:
-            return np.asarray(offset @ samplers.unit(np.array(self.direction)))
+            return np.asarray(offset @ unit(np.array(self.direction)))
         return np.asarray((self.radius or 0.0) * target.unit - np.linalg.norm(offset, axis=1))
 
 
