@@ -1,14 +1,18 @@
 """States from files: every format gives the same motion, and what does not fit is named with its cure."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 from lattice import boxes, lattice, states
 
-from mereo.deformation.tetrahedral import TetrahedralMap
+from mereo.deformation.tetrahedral import Tetrahedra, TetrahedralMap
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.io.simulation_states import TetrahedralRecord, files_of_states, read_states
 from mereo.scenes.recorded_states import load_states
 
 SCALE, SHIFT = 0.5, (1.0, -2.0, 3.0)
@@ -73,7 +77,105 @@ def meshes(suffix: str, rest: bool) -> Callable[[Path], Path]:
     return write
 
 
-FORMATS = {
+# --- other programs' files --------------------------------------------------------------------------------------------
+
+
+def grid(nodes: np.ndarray, **data: np.ndarray) -> Any:
+    """The lattice as pyvista has it, in the files' coordinates."""
+    pyvista = pytest.importorskip("pyvista", reason="pyvista is not installed: pip install 'mereo[dev]'")
+    made = pyvista.UnstructuredGrid({pyvista.CellType.TETRA: lattice().elements}, to_file(nodes))
+    made.point_data.update(data)
+    return made
+
+
+def surface(vertices: np.ndarray) -> Any:
+    """Both boxes as one surface, vertices reversed: no order but that of its own rest."""
+    pyvista = pytest.importorskip("pyvista", reason="pyvista is not installed: pip install 'mereo[dev]'")
+    faces = len(vertices) - 1 - boxes().merged()[1]
+    return pyvista.PolyData.from_regular_faces(to_file(vertices[::-1]), faces)
+
+
+def displacements() -> np.ndarray:
+    return (states() - lattice().nodes) / SCALE
+
+
+def numpy_and_volume(path: Path) -> tuple[Path, Path]:
+    """Positions as PyBullet or a script of SOFA records them, beside the simulated mesh with triangles in it."""
+    np.save(path / "run.npy", to_file(states()).astype(np.float32))
+    mesh = grid(lattice().nodes)
+    (mesh + mesh.extract_surface(algorithm="dataset_surface")).save(path / "volume.vtk")
+    return path / "run.npy", path / "volume.vtk"
+
+
+def numpy_and_surface(path: Path) -> tuple[Path, Path]:
+    moved = np.concatenate(list(moved_vertices().values()), axis=1)
+    np.save(path / "run.npy", to_file(moved[:, ::-1]))
+    surface(boxes().merged()[0]).save(path / "rest.ply")
+    return path / "run.npy", path / "rest.ply"
+
+
+def folder_of_displacements(path: Path) -> Path:
+    for frame, moved in enumerate(displacements()):
+        grid(lattice().nodes, U=moved, velocity=10 * moved).save(path / f"{frame}.vtu")
+    return path
+
+
+def pattern_of_both(path: Path) -> Path:
+    """Points that have moved, by displacements that are stored too; other files lie in the folder."""
+    for frame, (nodes, moved) in enumerate(zip(states(), displacements(), strict=True)):
+        grid(nodes, Displacement=moved).save(path / f"run_{frame}.vtk")
+    grid(lattice().nodes).save(path / "other.vtk")
+    return path / "run_*.vtk"
+
+
+def collection(path: Path) -> tuple[Path, Path]:
+    (path / "parts").mkdir()
+    for frame, nodes in enumerate(states()):
+        grid(nodes).save(path / "parts" / f"{frame}.vtu")
+    steps = [f'<DataSet timestep="{frame / 7}" part="0" file="parts/{frame}.vtu"/>' for frame in range(10)]
+    text = f'<VTKFile type="Collection" version="0.1"><Collection>{"".join(steps)}</Collection></VTKFile>'
+    (path / "run.pvd").write_text(f'<?xml version="1.0"?>{text}', encoding="utf-8")
+    from vtkmodules.vtkIOXdmf2 import vtkXdmfWriter
+
+    writer, folder = vtkXdmfWriter(), os.getcwd()
+    os.chdir(path)  # it names the HDF5 file as it is told
+    try:
+        writer.SetFileName("mesh.xdmf")
+        writer.SetInputData(grid(lattice().nodes))
+        writer.SetLightDataLimit(1)
+        assert writer.Write()
+    finally:
+        os.chdir(folder)
+    assert (path / "mesh.h5").stat().st_size > 0
+    return path / "run.pvd", path / "mesh.xdmf"
+
+
+def fenics(path: Path) -> Path:
+    """As dolfinx lays out a file: the mesh once, and a collection that includes it at each step."""
+
+    def item(array: np.ndarray, kind: str) -> str:
+        size, text = " ".join(map(str, array.shape)), " ".join(map(repr, array.ravel().tolist()))
+        return f'<DataItem Dimensions="{size}" NumberType="{kind}" Precision="8" Format="XML">{text}</DataItem>'
+
+    topology, geometry = item(lattice().elements, "Int"), item(to_file(lattice().nodes), "Float")
+    mesh = "/Xdmf/Domain/Grid[@GridType='Uniform'][1]/*[self::Topology or self::Geometry]"
+    steps = [
+        f'<Grid Name="u" GridType="Uniform"><xi:include xpointer="xpointer({mesh})" /><Time Value="{frame}" />'
+        f'<Attribute Name="u" AttributeType="Vector" Center="Node">{item(moved, "Float")}</Attribute></Grid>'
+        for frame, moved in enumerate(displacements())
+    ]
+    text = f"""<?xml version="1.0"?>
+        <!DOCTYPE Xdmf SYSTEM "Xdmf.dtd" []>
+        <Xdmf Version="3.0" xmlns:xi="https://www.w3.org/2001/XInclude"><Domain>
+        <Grid Name="mesh" GridType="Uniform">
+        <Topology TopologyType="Tetrahedron" NumberOfElements="{len(lattice().elements)}">{topology}</Topology>
+        <Geometry GeometryType="XYZ">{geometry}</Geometry></Grid>
+        <Grid Name="u" GridType="Collection" CollectionType="Temporal">{"".join(steps)}</Grid></Domain></Xdmf>"""
+    (path / "run.xdmf").write_text(text, encoding="utf-8")
+    return path / "run.xdmf"
+
+
+FORMATS: dict[str, Callable[[Path], Path | tuple[Path, Path]]] = {
     "nodes": nodes_npz,
     "displacements": displacements_npz,
     "vertices": vertices_npz,
@@ -81,18 +183,52 @@ FORMATS = {
     "ply": meshes("ply", rest=False),
     "obj": meshes("obj", rest=False),
     "stl": meshes("stl", rest=True),
+    "NPY, VTK": numpy_and_volume,
+    "NPY, PLY": numpy_and_surface,
+    "VTU": folder_of_displacements,
+    "VTK": pattern_of_both,
+    "PVD, XDMF": collection,
+    "XDMF": fenics,
 }
+
+
+ROUNDED = ("ply", "stl", "obj", "NPY, VTK", "NPY, PLY")
+"""Those in single precision or of eight digits."""
 
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_gives_the_same_states(name: str, tmp_path: Path) -> None:
-    split = load_states(FORMATS[name](tmp_path), boxes(), scale=SCALE, shift=SHIFT)
+    written = FORMATS[name](tmp_path)
+    path, mesh = written if isinstance(written, tuple) else (written, None)
+    split = load_states(path, boxes(), mesh=mesh, scale=SCALE, shift=SHIFT)
     frames, truth = split.training.frames, moved_vertices()
     assert frames.count == 10 and (split.training.end, split.testing.first) == (9, 9)
     for frame in range(10):
         for part, deformation in zip(boxes().segments, frames.deformations(frame), strict=True):
-            tolerance = 1e-5 if name in ("ply", "stl", "obj") else 1e-9  # single precision, eight digits
+            tolerance = 1e-9 if name not in ROUNDED else 1e-5
             assert np.abs(deformation(part.vertices) - truth[part.name][frame]).max() < tolerance
+
+
+def test_a_sequence_of_positions_starts_at_rest_and_hexahedra_are_divided(tmp_path: Path) -> None:
+    pyvista = pytest.importorskip("pyvista", reason="pyvista is not installed: pip install 'mereo[dev]'")
+    rest = np.stack(np.meshgrid(np.arange(7.0), *[np.arange(4.0)] * 2, indexing="ij"), axis=-1)
+    matrix = np.array([[1.1, 0.2, 0.0], [-0.1, 0.9, 0.1], [0.0, 0.3, 1.0]])
+    for frame, turn in enumerate((np.eye(3), matrix, matrix @ matrix)):
+        x, y, z = np.moveaxis(rest @ turn.T, -1, 0)
+        pyvista.StructuredGrid(x, y, z).cast_to_unstructured_grid().save(tmp_path / f"{frame}.vtu")
+    frames = load_states(tmp_path, boxes()).training.frames
+    for part, deformation in zip(boxes().segments, frames.deformations(2), strict=True):
+        np.testing.assert_allclose(deformation(part.vertices), part.vertices @ (matrix @ matrix).T, atol=1e-12)
+    record = read_states(tmp_path, ("left", "right"))
+    assert isinstance(record, TetrahedralRecord) and np.abs(record.displacements[0]).max() == 0
+    assert np.abs(Tetrahedra(record.rest_nodes, record.tetrahedra).volumes).sum() == pytest.approx(6 * 3 * 3)
+
+
+def test_positions_alone_are_those_of_the_only_mesh(tmp_path: Path) -> None:
+    left = SegmentedMesh(boxes().segments[:1])
+    np.save(tmp_path / "run.npy", moved_vertices()["left"])
+    deformation = load_states(tmp_path / "run.npy", left).training.frames.deformations(3)[0]
+    np.testing.assert_allclose(deformation(left.segments[0].vertices), moved_vertices()["left"][3], atol=1e-9)
 
 
 # --- what does not fit ------------------------------------------------------------------------------------------------
@@ -160,7 +296,8 @@ def test_states_that_do_not_fit_are_named(case: str, tmp_path: Path) -> None:
 
 def test_directories_that_are_not_states_are_explained(tmp_path: Path) -> None:
     with pytest.raises(
-        ValueError, match=r"one folder of mesh files for each segment \(left, right\): arrange it so, or make one NPZ"
+        ValueError,
+        match=r"one folder of mesh files for each segment \(left, right\), or a mesh for each frame: arrange it so",
     ):
         load_states(tmp_path, boxes())
     meshes("ply", rest=False)(tmp_path)
@@ -168,7 +305,7 @@ def test_directories_that_are_not_states_are_explained(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="10 of 'left', 9 of 'right' frames; all segments need the same number"):
         load_states(tmp_path, boxes())
     trimesh.creation.box().export(tmp_path / "right/10.ply")
-    with pytest.raises(ValueError, match="frame 10.ply of 'right' has 8 vertices but frame 1.ply has 98; the topology"):
+    with pytest.raises(ValueError, match="right: frame 10.ply has 8 vertices but frame 1.ply has 98; the topology"):
         load_states(tmp_path, boxes())
 
 
@@ -179,7 +316,7 @@ def test_paths_that_are_no_states_are_explained(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="cannot be read as a NPZ file"):
         load_states(tmp_path / "s.npz", boxes())
     (tmp_path / "s.csv").write_text("1,2,3")
-    with pytest.raises(ValueError, match="has the suffix '.csv'; states are an NPZ file or a directory"):
+    with pytest.raises(ValueError, match="has the suffix '.csv'; states are an NPZ or NPY file, a PVD"):
         load_states(tmp_path / "s.csv", boxes())
 
 

@@ -1,9 +1,10 @@
 """Frames of a simulation in VTK's formats, read by pyvista in a process of its own.
 
 VTK takes seconds to load, and a damaged file can end the process that reads it. So a child process reads and hands
-arrays over: it is this module, run with a folder for its answer and the files as arguments.
+arrays over: it is this module, run with a folder for its answer and the list of files as input.
 """
 
+import json
 import os
 import re
 import subprocess
@@ -18,7 +19,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from mereo.io.errors import readable, reason
+from mereo.io.errors import limited_memory, printable_line, readable, reason
+from mereo.io.readers import read_arrays
 
 VTK_SUFFIXES = (".vtk", ".vtu", ".vtp")
 """Suffixes of files with one frame each."""
@@ -61,17 +63,18 @@ def read_vtk_frames(files: Sequence[Path]) -> MeshFrames:
     for file in files:
         with readable(file, "mesh"):
             pass
-    with TemporaryDirectory() as folder, readable(files[0], "mesh"):  # the child inherits the limit on memory
-        child = [sys.executable, "-m", __name__, folder, *(str(file.absolute()) for file in files)]
+    with TemporaryDirectory() as folder, limited_memory(place):  # the child inherits the limit
+        # -P: what lies in the working directory is data, and no module
+        child = [sys.executable, "-P", "-m", __name__, folder]
         path = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])])
-        ended = subprocess.run(child, capture_output=True, env={**os.environ, "PYTHONPATH": path})
-        refusal = Path(folder, REFUSAL)
-        if refusal.exists():
-            raise ValueError(refusal.read_text("utf-8"))
-        if ended.returncode:
-            raise ValueError("VTK ended abnormally on it")
-        with np.load(Path(folder, ANSWER)) as answer:
-            arrays = dict(answer)
+        request = json.dumps([str(file.absolute()) for file in files]).encode()
+        subprocess.run(child, input=request, capture_output=True, env={**os.environ, "PYTHONPATH": path})
+        refusal, answer = Path(folder, REFUSAL), Path(folder, ANSWER)
+        if not answer.exists():
+            number, why = refusal.read_text("utf-8").split(" ", 1) if refusal.exists() else ("", "it ends VTK's reader")
+            wrong = files[int(number)] if number else place
+            raise ValueError(f"{wrong} cannot be read as a mesh ({printable_line(why)}): export or download it again")
+        arrays = read_arrays(answer)
     names = tuple(f"frame {name}" for name in arrays["names"].tolist())
     counts = arrays["counts"]
     if (differs := counts != counts[0]).any():
@@ -88,23 +91,25 @@ def read_vtk_frames(files: Sequence[Path]) -> MeshFrames:
 # --- the child --------------------------------------------------------------------------------------------------------
 
 
-def main(folder: str, *files: str) -> None:
-    """Read files and write the arrays of ``MeshFrames``, or why they cannot be read, into a folder."""
+def main(folder: Path, files: Sequence[str]) -> None:
+    """Read files and write the arrays of ``MeshFrames`` into a folder, or the number of a bad file and the reason."""
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
 
-    log = vtkStringOutputWindow()
+    log, read = vtkStringOutputWindow(), list[str]()
     vtkOutputWindow.SetInstance(log)
     try:
-        answer = _answer(files, log)
+        answer = _answer(files, log, read)
     except Exception as error:
         why = ValueError(_complaint(text)) if "ERROR: In" in (text := f"{log.GetOutput()}{error}") else error
-        Path(folder, REFUSAL).write_text(reason(why), "utf-8")
+        (folder / REFUSAL).write_text(f"{len(read)} {reason(why)}", "utf-8")
         return
-    with Path(folder, ANSWER).open("wb") as file:
-        np.savez(file, **answer)  # type: ignore[arg-type]
+    partial = folder / f"partial-{ANSWER}"
+    np.savez(partial, **answer)
+    partial.rename(folder / ANSWER)  # VTK may still crash at its end, but not before all is written
 
 
-def _answer(files: Sequence[str], log: Any) -> dict[str, Any]:
+def _answer(files: Sequence[str], log: Any, read: list[str]) -> dict[str, Any]:
+    """Arrays of all frames; ``read`` grows by each file that is done."""
     names, points, moved = list[str](), list[np.ndarray](), list[np.ndarray]()
     tetrahedra = np.empty((0, 4), dtype=np.int64)
     for file in files:
@@ -120,6 +125,9 @@ def _answer(files: Sequence[str], log: Any) -> dict[str, Any]:
             points.append(np.array(mesh.points, dtype=np.float64))
             if displacement is not None:
                 moved.append(np.array(mesh.point_data[displacement], dtype=np.float64))
+        read.append(file)
+    if not points:
+        raise ValueError("it has no frames")
     return {
         "names": np.array(names),
         "counts": np.array([len(each) for each in points]),
@@ -132,7 +140,7 @@ def _answer(files: Sequence[str], log: Any) -> dict[str, Any]:
 def _complaint(text: str) -> str:
     """First message of VTK's log, which names a line of VTK's source and an address before it."""
     messages = [line for line in text.splitlines() if line.strip() and "ERROR: In" not in line]
-    return re.sub(r"^\w+ \(0x[0-9a-f]+\): ", "", messages[0]) if messages else "VTK reports an error"
+    return re.sub(r"^\w+ \(0x[0-9a-f]+\): | \(0x[0-9a-f]+\)", "", messages[0]) if messages else "VTK reports an error"
 
 
 def _steps(file: str) -> Iterator[Any]:
@@ -204,4 +212,4 @@ def _tetrahedra(mesh: Any) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main(Path(sys.argv[1]), json.load(sys.stdin))

@@ -371,6 +371,13 @@ class CameraBlock(Block):
         )
 
 
+class StatesBlock(Block):
+    """Recorded states: file, directory or pattern of positions, and the file of their mesh at rest."""
+
+    positions: Annotated[str, Field(min_length=1)]
+    mesh: Annotated[str, Field(min_length=1)] | None = None
+
+
 class SceneFile(Block):
     """Content of a scene file. Exactly one of ``segments``, ``model``, ``labels`` says where the segments come from.
 
@@ -400,8 +407,13 @@ class SceneFile(Block):
     size: Positive = 20.0
     camera: CameraBlock = CameraBlock()
     deformations: Deformations | None = None
-    states: str | None = None
+    states: str | StatesBlock | None = None
     held_out: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.1
+
+    @property
+    def recorded(self) -> StatesBlock | None:
+        """Recorded states with their mesh, however the file names them."""
+        return StatesBlock(positions=self.states) if isinstance(self.states, str) else self.states
 
     @model_validator(mode="after")
     def _moves_in_single_way(self) -> "SceneFile":
