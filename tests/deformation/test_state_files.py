@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from lattice import boxes, lattice, states
+from lattice import boxes, lattice, pvd_text, states, xdmf_text
 
 from mereo.deformation.tetrahedral import Tetrahedra, TetrahedralMap
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.io.simulation_states import TetrahedralRecord, files_of_states, read_states
+from mereo.io.simulation_states import TetrahedralRecord, read_states
 from mereo.scenes.recorded_states import load_states
 
 SCALE, SHIFT = 0.5, (1.0, -2.0, 3.0)
@@ -132,9 +132,7 @@ def collection(path: Path) -> tuple[Path, Path]:
     (path / "parts").mkdir()
     for frame, nodes in enumerate(states()):
         grid(nodes).save(path / "parts" / f"{frame}.vtu")
-    steps = [f'<DataSet timestep="{frame / 7}" part="0" file="parts/{frame}.vtu"/>' for frame in range(10)]
-    text = f'<VTKFile type="Collection" version="0.1"><Collection>{"".join(steps)}</Collection></VTKFile>'
-    (path / "run.pvd").write_text(f'<?xml version="1.0"?>{text}', encoding="utf-8")
+    (path / "run.pvd").write_text(pvd_text([f"parts/{frame}.vtu" for frame in range(10)]), encoding="utf-8")
     from vtkmodules.vtkIOXdmf2 import vtkXdmfWriter
 
     writer, folder = vtkXdmfWriter(), os.getcwd()
@@ -151,26 +149,7 @@ def collection(path: Path) -> tuple[Path, Path]:
 
 
 def fenics(path: Path) -> Path:
-    """As dolfinx lays out a file: the mesh once, and a collection that includes it at each step."""
-
-    def item(array: np.ndarray, kind: str) -> str:
-        size, text = " ".join(map(str, array.shape)), " ".join(map(repr, array.ravel().tolist()))
-        return f'<DataItem Dimensions="{size}" NumberType="{kind}" Precision="8" Format="XML">{text}</DataItem>'
-
-    topology, geometry = item(lattice().elements, "Int"), item(to_file(lattice().nodes), "Float")
-    mesh = "/Xdmf/Domain/Grid[@GridType='Uniform'][1]/*[self::Topology or self::Geometry]"
-    steps = [
-        f'<Grid Name="u" GridType="Uniform"><xi:include xpointer="xpointer({mesh})" /><Time Value="{frame}" />'
-        f'<Attribute Name="u" AttributeType="Vector" Center="Node">{item(moved, "Float")}</Attribute></Grid>'
-        for frame, moved in enumerate(displacements())
-    ]
-    text = f"""<?xml version="1.0"?>
-        <!DOCTYPE Xdmf SYSTEM "Xdmf.dtd" []>
-        <Xdmf Version="3.0" xmlns:xi="https://www.w3.org/2001/XInclude"><Domain>
-        <Grid Name="mesh" GridType="Uniform">
-        <Topology TopologyType="Tetrahedron" NumberOfElements="{len(lattice().elements)}">{topology}</Topology>
-        <Geometry GeometryType="XYZ">{geometry}</Geometry></Grid>
-        <Grid Name="u" GridType="Collection" CollectionType="Temporal">{"".join(steps)}</Grid></Domain></Xdmf>"""
+    text = xdmf_text(to_file(lattice().nodes), lattice().elements, displacements())
     (path / "run.xdmf").write_text(text, encoding="utf-8")
     return path / "run.xdmf"
 
@@ -318,6 +297,100 @@ def test_paths_that_are_no_states_are_explained(tmp_path: Path) -> None:
     (tmp_path / "s.csv").write_text("1,2,3")
     with pytest.raises(ValueError, match="has the suffix '.csv'; states are an NPZ or NPY file, a PVD"):
         load_states(tmp_path / "s.csv", boxes())
+
+
+def flat_npy(path: Path) -> tuple[Path, None]:
+    np.save(path / "run.npy", states().reshape(10, -1))
+    return path / "run.npy", None
+
+
+def fewer_nodes(path: Path) -> tuple[Path, Path]:
+    run, mesh = numpy_and_volume(path)
+    np.save(run, to_file(states()[:, 1:]))
+    return run, mesh
+
+
+def without_nodes(path: Path) -> tuple[Path, None]:
+    np.save(path / "run.npy", np.empty((3, 0, 3)))
+    return path / "run.npy", None
+
+
+def unmoved(path: Path) -> tuple[Path, None]:
+    for frame in range(2):
+        grid(states()[0], velocity=states()[frame]).save(path / f"{frame}.vtu")
+    return path, None
+
+
+def remeshed(path: Path) -> tuple[Path, None]:
+    grid(states()[0]).save(path / "0.vtu")
+    grid(states()[1]).extract_cells(range(40)).save(path / "1.vtu")
+    return path, None
+
+
+def single_surface(path: Path) -> tuple[Path, None]:
+    surface(boxes().merged()[0]).save(path / "0.vtp")
+    return path / "*.vtp", None
+
+
+def other_surface(path: Path) -> tuple[Path, Path]:
+    run, mesh = numpy_and_surface(path)
+    surface(1.01 * boxes().merged()[0]).save(mesh)
+    return run, mesh
+
+
+def several_formats(path: Path) -> tuple[Path, None]:
+    surface(boxes().merged()[0]).save(path / "0.vtp")
+    surface(boxes().merged()[0]).save(path / "0.ply")
+    return path, None
+
+
+def cut_short(path: Path) -> tuple[Path, None]:
+    folder_of_displacements(path)
+    (path / "3.vtu").write_bytes((path / "3.vtu").read_bytes()[:600])
+    return path, None
+
+
+def archive_with_mesh(path: Path) -> tuple[Path, Path]:
+    return nodes_npz(path), path / "volume.vtk"
+
+
+UNUSABLE: dict[str, tuple[Callable[[Path], tuple[Path, Path | None]], str]] = {
+    "flat": (flat_npy, r"run.npy: the array has the shape \[10, 288\] .* numbers \[frames, vertices, 3\]: export"),
+    "node count": (
+        fewer_nodes,
+        r"run.npy has 95 nodes a frame but .*volume.vtk 96; both need the same nodes, in one",
+    ),
+    "no nodes": (without_nodes, r"run.npy has no frames, or none with nodes; at least one state is needed"),
+    "unmoved": (unmoved, r"has the same points in all 2 frames and no displacements; .* called displacement, disp"),
+    "remeshed": (remeshed, r"frame 1.vtu has \d+ nodes but frame 0.vtu has 96; the topology must stay the same"),
+    "no tetrahedra": (single_surface, r"no tetrahedra and one surface for 2 segments; .* `states: \{positions: "),
+    "other surface": (other_surface, r"miss a vertex of its mesh by .*; without tetrahedra .* or name a mesh with tet"),
+    "several formats": (
+        several_formats,
+        r"files of the formats .ply, .vtp; all frames must have one: name them by",
+    ),
+    "cut short": (cut_short, r"3.vtu cannot be read as a mesh \(.*\): export or download it again"),
+    "mesh of an archive": (archive_with_mesh, r"an NPZ file, which holds its own rest; `mesh` is not for it: leave it"),
+}
+
+
+@pytest.mark.parametrize("case", UNUSABLE)
+def test_other_programs_files_that_do_not_fit_are_named(case: str, tmp_path: Path) -> None:
+    write, text = UNUSABLE[case]
+    path, mesh = write(tmp_path)
+    with pytest.raises(ValueError, match=text) as caught:
+        load_states(path, boxes(), mesh=mesh, scale=SCALE, shift=SHIFT)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_crash_of_the_reader_and_its_absence_are_sentences(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "run.pvd").write_text(pvd_text([]), encoding="utf-8")
+    monkeypatch.setattr("sys.executable", "/bin/false")
+    with pytest.raises(ValueError, match=r"run.pvd cannot be read as a mesh \(it ends VTK's reader\): export or"):
+        load_states(tmp_path / "run.pvd", boxes())
+    monkeypatch.setattr("mereo.io.vtk_frames.find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=r"run.pvd needs pyvista, .* pip install 'mereo\[simulation\]'"):
+        load_states(tmp_path / "run.pvd", boxes())
 
 
 def test_too_few_frames_to_split_and_bad_settings_are_refused(tmp_path: Path) -> None:

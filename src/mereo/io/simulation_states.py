@@ -77,18 +77,16 @@ def read_states(path: Path, names: tuple[str, ...], mesh: Path | None = None) ->
     Raises ``FileNotFoundError`` and ``ValueError`` naming the file, the array and the frame, ``ImportError`` without
     the extra `simulation` where the format is one of VTK's.
     """
-    record: TetrahedralRecord | SurfaceRecord
     if path.suffix.lower() == ".npz":
         if mesh is not None:
             raise ValueError(f"{path} is an NPZ file, which holds its own rest; `mesh` is not for it: leave it out")
         record = _archive(path, names)
-    elif path.is_dir() and not frame_files(path):
-        record = _folders(path, names)
-    else:
-        record = _sequence(path, names, mesh)
-    if not record.frames:
-        raise ValueError(f"{path} has no frames; at least one state is needed: export some")
-    return record
+        if not record.frames:
+            raise ValueError(f"{path} has no frames; at least one state is needed: export some")
+        return record
+    if path.is_dir() and not frame_files(path):
+        return _folders(path, names)
+    return _sequence(path, names, mesh)
 
 
 def frame_files(path: Path) -> list[Path]:
@@ -121,6 +119,8 @@ def files_of_states(path: Path, mesh: Path | None = None) -> list[Path]:
 def _sequence(path: Path, names: tuple[str, ...], mesh: Path | None) -> TetrahedralRecord | SurfaceRecord:
     """States of one mesh that moves all segments, or of the surface of the only one."""
     frames = _mesh_frames(path)
+    if 0 in frames.points.shape:
+        raise ValueError(f"{path} has no frames, or none with nodes; at least one state is needed: export some")
     tetrahedra, rest = frames.tetrahedra, None
     if mesh is None:
         mesh = _rest_file(path)

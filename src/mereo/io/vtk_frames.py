@@ -20,7 +20,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mereo.io.errors import limited_memory, printable_line, readable, reason
-from mereo.io.readers import read_arrays
 
 VTK_SUFFIXES = (".vtk", ".vtu", ".vtp")
 """Suffixes of files with one frame each."""
@@ -74,7 +73,8 @@ def read_vtk_frames(files: Sequence[Path]) -> MeshFrames:
             number, why = refusal.read_text("utf-8").split(" ", 1) if refusal.exists() else ("", "it ends VTK's reader")
             wrong = files[int(number)] if number else place
             raise ValueError(f"{wrong} cannot be read as a mesh ({printable_line(why)}): export or download it again")
-        arrays = read_arrays(answer)
+        with np.load(answer) as stored:
+            arrays = dict(stored)
     names = tuple(f"frame {name}" for name in arrays["names"].tolist())
     counts = arrays["counts"]
     if (differs := counts != counts[0]).any():
@@ -206,9 +206,10 @@ def _tetrahedra(mesh: Any) -> np.ndarray:
 
     if not isinstance(mesh, pyvista.UnstructuredGrid):
         return np.empty((0, 4), dtype=np.int64)
-    kind = int(pyvista.CellType.TETRA)
+    kind = pyvista.CellType.TETRA
     solid = mesh if kind in mesh.celltypes else mesh.triangulate()
-    return np.asarray(solid.cells_dict.get(kind, np.empty((0, 4))), dtype=np.int64)
+    cells: Any = solid.cells_dict
+    return np.asarray(cells[kind] if kind in cells else np.empty((0, 4)), dtype=np.int64)
 
 
 if __name__ == "__main__":

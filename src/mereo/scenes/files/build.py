@@ -164,9 +164,9 @@ def _recorded(
 
 def _paths_of_states(path: Path, file: SceneFile) -> tuple[Path, Path | None]:
     """Where the recorded states of a scene file at ``path`` are, and their mesh at rest."""
-    block = file.recorded
-    assert block is not None
-    return path.parent / block.positions, None if block.mesh is None else path.parent / block.mesh
+    assert file.states is not None
+    mesh = file.states.mesh
+    return path.parent / file.states.positions, None if mesh is None else path.parent / mesh
 
 
 def _digest(files: Sequence[Path]) -> str:
