@@ -85,6 +85,7 @@ def test_the_scene_is_checked(folder: Path, capsys: pytest.CaptureFixture[str]) 
     assert "organ: 1 segments, closed, outward oriented, without overlap" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_state_that_was_held_out_is_found(folder: Path) -> None:
     assert run_command(folder, "reconstruct", "--unit-m", "1") == 0
     assert json.loads((folder / "result/summary.json").read_text())["registration"]["located_by"] == "search"

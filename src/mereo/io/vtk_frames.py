@@ -1,7 +1,7 @@
 """Frames of a simulation in VTK's formats, read by pyvista in a process of its own.
 
-VTK takes seconds to load, and a damaged file can end the process that reads it. So a child process reads and hands
-arrays over: it is this module, run with a folder for its answer and the list of files as input.
+VTK takes seconds to load, and a damaged file can end the process that reads it. So a child process runs ``main``
+and hands arrays over in a folder.
 """
 
 import json
@@ -29,6 +29,8 @@ COLLECTION_SUFFIXES = (".pvd", ".xdmf", ".pvtu")
 
 DISPLACEMENTS = ("displacement", "displacements", "disp", "u")
 """Names, in small letters, of point data that are displacements, the first first."""
+
+CHILD = f"import sys; sys.path.append(sys.argv[2]); from {__name__} import main; main(sys.argv[1])"
 
 ANSWER, REFUSAL = "frames.npz", "refusal.txt"
 """Files of the child's answer, one of which it writes."""
@@ -64,10 +66,8 @@ def read_vtk_frames(files: Sequence[Path]) -> MeshFrames:
             pass
     with TemporaryDirectory() as folder, limited_memory(place):  # the child inherits the limit
         # -P: what lies in the working directory is data, and no module
-        child = [sys.executable, "-P", "-m", __name__, folder]
-        path = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])])
-        request = json.dumps([str(file.absolute()) for file in files]).encode()
-        subprocess.run(child, input=request, capture_output=True, env={**os.environ, "PYTHONPATH": path})
+        child = [sys.executable, "-P", "-c", CHILD, folder, str(Path(__file__).parents[2])]
+        subprocess.run(child, input=json.dumps([str(file.absolute()) for file in files]).encode(), capture_output=True)
         refusal, answer = Path(folder, REFUSAL), Path(folder, ANSWER)
         if not answer.exists():
             number, why = refusal.read_text("utf-8").split(" ", 1) if refusal.exists() else ("", "it ends VTK's reader")
@@ -91,10 +91,15 @@ def read_vtk_frames(files: Sequence[Path]) -> MeshFrames:
 # --- the child --------------------------------------------------------------------------------------------------------
 
 
-def main(folder: Path, files: Sequence[str]) -> None:
-    """Read files and write the arrays of ``MeshFrames`` into a folder, or the number of a bad file and the reason."""
+def main(place: str) -> None:
+    """Read files and write the arrays of ``MeshFrames`` into a folder, or the number of a bad file and the reason.
+
+    Args:
+        place: the folder. The files are a JSON list on the standard input.
+    """
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
 
+    folder, files = Path(place), json.load(sys.stdin)
     log, read = vtkStringOutputWindow(), list[str]()
     vtkOutputWindow.SetInstance(log)
     try:
@@ -210,7 +215,3 @@ def _tetrahedra(mesh: Any) -> np.ndarray:
     solid = mesh if kind in mesh.celltypes else mesh.triangulate()
     cells: Any = solid.cells_dict
     return np.asarray(cells[kind] if kind in cells else np.empty((0, 4)), dtype=np.int64)
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]), json.load(sys.stdin))
