@@ -23,7 +23,6 @@ from pathlib import Path
 
 import igl
 import numpy as np
-import pyvista
 import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
@@ -32,6 +31,7 @@ from scipy.spatial.transform import Rotation
 from mereo.deformation.elastic import ElasticSolid, Material, build_lattice, find_modes, scale_modes
 from mereo.deformation.tetrahedral import Tetrahedra
 from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.io.vtk_frames import read_vtk_frames
 
 MOTION = 0.2
 """Root mean square displacement of the prior, in half longest sides, as all shares of ``FitConfig``."""
@@ -193,8 +193,8 @@ def models(folder: Path, rest: trimesh.Trimesh, cells: int, count: int) -> dict[
     values, modes = find_modes(lattice, count, material)
     spent = time.perf_counter() - start
     print(f"lattice of {len(lattice.mesh.nodes)} nodes: {made:.1f} s, with {count} modes {spent:.1f} s")
-    grid = pyvista.read(folder / "InitialLowResolutionVolumeModel.vtk")
-    given = Tetrahedra(np.asarray(grid.points, dtype=float), np.asarray(grid.cells).reshape(-1, 5)[:, 1:])
+    volume = read_vtk_frames([folder / "InitialLowResolutionVolumeModel.vtk"])
+    given = Tetrahedra(volume.points[0], volume.tetrahedra)
     follows = ElasticSolid(given, np.ones(len(given.elements)))
     start = time.perf_counter()
     given_values, given_modes = find_modes(follows, count, Material(poisson=0.45))

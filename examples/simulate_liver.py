@@ -16,7 +16,6 @@ metre. MuJoCo's `discrete` integrator is implicit in position, so that the equil
 """
 
 import argparse
-import re
 import time
 from pathlib import Path
 
@@ -26,6 +25,7 @@ from jaxtyping import Float, Int
 from mereo.deformation.tetrahedral import Tetrahedra
 from mereo.geometry.solids import Solids
 from mereo.io.atomic_files import atomic_file, check_file_place
+from mereo.io.vtk_frames import read_vtk_frames
 from mereo.scenes.registry import load_scene
 from mereo_objects import assets
 
@@ -55,22 +55,10 @@ Elements = Int[np.ndarray, "m 4"]
 # --- tetrahedra -------------------------------------------------------------------------------------------------------
 
 
-def read_vtk(path: Path) -> tuple[Nodes, Elements]:
-    """Points and tetrahedra of a legacy binary VTK file: 15 lines instead of a dependency for one old format."""
-    data = path.read_bytes()
-
-    def block(pattern: bytes, values: int | None, kind: str) -> np.ndarray:
-        head = re.search(pattern, data)
-        if head is None:
-            raise ValueError(f"{path} has no section {pattern.decode()}; a binary legacy VTK file is needed")
-        count = int(head[1]) * values if values else int(head[2])
-        return np.frombuffer(data, kind, count, head.end())
-
-    points = block(rb"POINTS (\d+) float\n", 3, ">f4").reshape(-1, 3).astype(np.float64)
-    cells, types = block(rb"CELLS (\d+) (\d+)\n", None, ">i4"), block(rb"CELL_TYPES (\d+)\n", 1, ">i4")
-    starts = np.cumsum([0, *({5: 4, 10: 5}[int(kind)] for kind in types[:-1])])  # 5 is a triangle, 10 a tetrahedron
-    rows = starts[types == 10]
-    return points, cells[rows[:, None] + np.arange(1, 5)].astype(np.int64)
+def coarse_body() -> tuple[Nodes, Elements]:
+    """Nodes and tetrahedra of LapGym's liver, millimetres."""
+    frames = read_vtk_frames([assets.get("liver/lapgym_liver_volumetric.vtk")])
+    return frames.points[0], frames.tetrahedra
 
 
 FIVE = np.array([[0, 4, 2, 1], [6, 4, 7, 2], [5, 4, 1, 7], [3, 2, 7, 1], [4, 2, 1, 7]])
@@ -188,12 +176,11 @@ def main(arguments: list[str] | None = None) -> None:
         check_file_place(options.output, force=options.force)
     except (OSError, ValueError) as error:
         parser.error(str(error))
-    tets = lattice_around_organs() if options.organs else read_vtk(assets.get("liver/lapgym_liver_volumetric.vtk"))
-    mesh = Tetrahedra(*tets)
     try:
+        mesh = Tetrahedra(*(lattice_around_organs() if options.organs else coarse_body()))
         body = SoftBody(mesh)
     except ImportError as error:
-        raise SystemExit("MuJoCo is missing; install it with: pip install 'mereo[simulation]'") from error
+        raise SystemExit("MuJoCo or pyvista is missing: pip install 'mereo[simulation]'") from error
     start = time.monotonic()
     displacements = np.empty((options.frames, *mesh.nodes.shape), dtype=np.float16)
     for frame in range(options.frames):  # state i comes from (seed, i) alone

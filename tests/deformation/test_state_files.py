@@ -1,14 +1,18 @@
 """States from files: every format gives the same motion, and what does not fit is named with its cure."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
-from lattice import boxes, lattice, states
+from lattice import boxes, lattice, pvd_text, states, xdmf_text
 
-from mereo.deformation.tetrahedral import TetrahedralMap
+from mereo.deformation.tetrahedral import Tetrahedra, TetrahedralMap
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.io.simulation_states import TetrahedralRecord, read_states
 from mereo.scenes.recorded_states import load_states
 
 SCALE, SHIFT = 0.5, (1.0, -2.0, 3.0)
@@ -73,7 +77,84 @@ def meshes(suffix: str, rest: bool) -> Callable[[Path], Path]:
     return write
 
 
-FORMATS = {
+# --- other programs' files --------------------------------------------------------------------------------------------
+
+
+def grid(nodes: np.ndarray, **data: np.ndarray) -> Any:
+    """The lattice as pyvista has it, in the files' coordinates."""
+    pyvista = pytest.importorskip("pyvista", reason="pyvista is not installed: pip install 'mereo[dev]'")
+    made = pyvista.UnstructuredGrid({pyvista.CellType.TETRA: lattice().elements}, to_file(nodes))
+    made.point_data.update(data)
+    return made
+
+
+def surface(vertices: np.ndarray) -> Any:
+    """Both boxes as one surface, vertices reversed: no order but that of its own rest."""
+    pyvista = pytest.importorskip("pyvista", reason="pyvista is not installed: pip install 'mereo[dev]'")
+    faces = len(vertices) - 1 - boxes().merged()[1]
+    return pyvista.PolyData.from_regular_faces(to_file(vertices[::-1]), faces)
+
+
+def displacements() -> np.ndarray:
+    return (states() - lattice().nodes) / SCALE
+
+
+def numpy_and_volume(path: Path) -> tuple[Path, Path]:
+    """Positions as PyBullet or a script of SOFA records them, beside the simulated mesh with triangles in it."""
+    np.save(path / "run.npy", to_file(states()).astype(np.float32))
+    mesh = grid(lattice().nodes)
+    (mesh + mesh.extract_surface(algorithm="dataset_surface")).save(path / "volume.vtk")
+    return path / "run.npy", path / "volume.vtk"
+
+
+def numpy_and_surface(path: Path) -> tuple[Path, Path]:
+    moved = np.concatenate(list(moved_vertices().values()), axis=1)
+    np.save(path / "run.npy", to_file(moved[:, ::-1]))
+    surface(boxes().merged()[0]).save(path / "rest.ply")
+    return path / "run.npy", path / "rest.ply"
+
+
+def folder_of_displacements(path: Path) -> Path:
+    for frame, moved in enumerate(displacements()):
+        grid(lattice().nodes, U=moved, velocity=10 * moved).save(path / f"{frame}.vtu")
+    return path
+
+
+def pattern_of_both(path: Path) -> Path:
+    """Points that have moved, by displacements that are stored too; other files lie in the folder."""
+    for frame, (nodes, moved) in enumerate(zip(states(), displacements(), strict=True)):
+        grid(nodes, Displacement=moved).save(path / f"run_{frame}.vtk")
+    grid(lattice().nodes).save(path / "other.vtk")
+    return path / "run_*.vtk"
+
+
+def collection(path: Path) -> tuple[Path, Path]:
+    (path / "parts").mkdir()
+    for frame, nodes in enumerate(states()):
+        grid(nodes).save(path / "parts" / f"{frame}.vtu")
+    (path / "run.pvd").write_text(pvd_text([f"parts/{frame}.vtu" for frame in range(10)]), encoding="utf-8")
+    from vtkmodules.vtkIOXdmf2 import vtkXdmfWriter
+
+    writer, folder = vtkXdmfWriter(), os.getcwd()
+    os.chdir(path)  # it names the HDF5 file as it is told
+    try:
+        writer.SetFileName("mesh.xdmf")
+        writer.SetInputData(grid(lattice().nodes))
+        writer.SetLightDataLimit(1)
+        assert writer.Write()
+    finally:
+        os.chdir(folder)
+    assert (path / "mesh.h5").stat().st_size > 0
+    return path / "run.pvd", path / "mesh.xdmf"
+
+
+def fenics(path: Path) -> Path:
+    text = xdmf_text(to_file(lattice().nodes), lattice().elements, displacements())
+    (path / "run.xdmf").write_text(text, encoding="utf-8")
+    return path / "run.xdmf"
+
+
+FORMATS: dict[str, Callable[[Path], Path | tuple[Path, Path]]] = {
     "nodes": nodes_npz,
     "displacements": displacements_npz,
     "vertices": vertices_npz,
@@ -81,18 +162,52 @@ FORMATS = {
     "ply": meshes("ply", rest=False),
     "obj": meshes("obj", rest=False),
     "stl": meshes("stl", rest=True),
+    "NPY, VTK": numpy_and_volume,
+    "NPY, PLY": numpy_and_surface,
+    "VTU": folder_of_displacements,
+    "VTK": pattern_of_both,
+    "PVD, XDMF": collection,
+    "XDMF": fenics,
 }
+
+
+ROUNDED = ("ply", "stl", "obj", "NPY, VTK", "NPY, PLY")
+"""Those in single precision or of eight digits."""
 
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_gives_the_same_states(name: str, tmp_path: Path) -> None:
-    split = load_states(FORMATS[name](tmp_path), boxes(), scale=SCALE, shift=SHIFT)
+    written = FORMATS[name](tmp_path)
+    path, mesh = written if isinstance(written, tuple) else (written, None)
+    split = load_states(path, boxes(), mesh=mesh, scale=SCALE, shift=SHIFT)
     frames, truth = split.training.frames, moved_vertices()
     assert frames.count == 10 and (split.training.end, split.testing.first) == (9, 9)
     for frame in range(10):
         for part, deformation in zip(boxes().segments, frames.deformations(frame), strict=True):
-            tolerance = 1e-5 if name in ("ply", "stl", "obj") else 1e-9  # single precision, eight digits
+            tolerance = 1e-9 if name not in ROUNDED else 1e-5
             assert np.abs(deformation(part.vertices) - truth[part.name][frame]).max() < tolerance
+
+
+def test_a_sequence_of_positions_starts_at_rest_and_hexahedra_are_divided(tmp_path: Path) -> None:
+    pyvista = pytest.importorskip("pyvista", reason="pyvista is not installed: pip install 'mereo[dev]'")
+    rest = np.stack(np.meshgrid(np.arange(7.0), *[np.arange(4.0)] * 2, indexing="ij"), axis=-1)
+    matrix = np.array([[1.1, 0.2, 0.0], [-0.1, 0.9, 0.1], [0.0, 0.3, 1.0]])
+    for frame, turn in enumerate((np.eye(3), matrix, matrix @ matrix)):
+        x, y, z = np.moveaxis(rest @ turn.T, -1, 0)
+        pyvista.StructuredGrid(x, y, z).cast_to_unstructured_grid().save(tmp_path / f"{frame}.vtu")
+    frames = load_states(tmp_path, boxes()).training.frames
+    for part, deformation in zip(boxes().segments, frames.deformations(2), strict=True):
+        np.testing.assert_allclose(deformation(part.vertices), part.vertices @ (matrix @ matrix).T, atol=1e-12)
+    record = read_states(tmp_path, ("left", "right"))
+    assert isinstance(record, TetrahedralRecord) and np.abs(record.displacements[0]).max() == 0
+    assert np.abs(Tetrahedra(record.rest_nodes, record.tetrahedra).volumes).sum() == pytest.approx(6 * 3 * 3)
+
+
+def test_positions_alone_are_those_of_the_only_mesh(tmp_path: Path) -> None:
+    left = SegmentedMesh(boxes().segments[:1])
+    np.save(tmp_path / "run.npy", moved_vertices()["left"])
+    deformation = load_states(tmp_path / "run.npy", left).training.frames.deformations(3)[0]
+    np.testing.assert_allclose(deformation(left.segments[0].vertices), moved_vertices()["left"][3], atol=1e-9)
 
 
 # --- what does not fit ------------------------------------------------------------------------------------------------
@@ -160,7 +275,8 @@ def test_states_that_do_not_fit_are_named(case: str, tmp_path: Path) -> None:
 
 def test_directories_that_are_not_states_are_explained(tmp_path: Path) -> None:
     with pytest.raises(
-        ValueError, match=r"one folder of mesh files for each segment \(left, right\): arrange it so, or make one NPZ"
+        ValueError,
+        match=r"one folder of mesh files for each segment \(left, right\), or a mesh for each frame: arrange it so",
     ):
         load_states(tmp_path, boxes())
     meshes("ply", rest=False)(tmp_path)
@@ -168,7 +284,7 @@ def test_directories_that_are_not_states_are_explained(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="10 of 'left', 9 of 'right' frames; all segments need the same number"):
         load_states(tmp_path, boxes())
     trimesh.creation.box().export(tmp_path / "right/10.ply")
-    with pytest.raises(ValueError, match="frame 10.ply of 'right' has 8 vertices but frame 1.ply has 98; the topology"):
+    with pytest.raises(ValueError, match="right: frame 10.ply has 8 vertices but frame 1.ply has 98; the topology"):
         load_states(tmp_path, boxes())
 
 
@@ -179,8 +295,102 @@ def test_paths_that_are_no_states_are_explained(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="cannot be read as a NPZ file"):
         load_states(tmp_path / "s.npz", boxes())
     (tmp_path / "s.csv").write_text("1,2,3")
-    with pytest.raises(ValueError, match="has the suffix '.csv'; states are an NPZ file or a directory"):
+    with pytest.raises(ValueError, match="has the suffix '.csv'; states are an NPZ or NPY file, a PVD"):
         load_states(tmp_path / "s.csv", boxes())
+
+
+def flat_npy(path: Path) -> tuple[Path, None]:
+    np.save(path / "run.npy", states().reshape(10, -1))
+    return path / "run.npy", None
+
+
+def fewer_nodes(path: Path) -> tuple[Path, Path]:
+    run, mesh = numpy_and_volume(path)
+    np.save(run, to_file(states()[:, 1:]))
+    return run, mesh
+
+
+def without_nodes(path: Path) -> tuple[Path, None]:
+    np.save(path / "run.npy", np.empty((3, 0, 3)))
+    return path / "run.npy", None
+
+
+def unmoved(path: Path) -> tuple[Path, None]:
+    for frame in range(2):
+        grid(states()[0], velocity=states()[frame]).save(path / f"{frame}.vtu")
+    return path, None
+
+
+def remeshed(path: Path) -> tuple[Path, None]:
+    grid(states()[0]).save(path / "0.vtu")
+    grid(states()[1]).extract_cells(range(40)).save(path / "1.vtu")
+    return path, None
+
+
+def single_surface(path: Path) -> tuple[Path, None]:
+    surface(boxes().merged()[0]).save(path / "0.vtp")
+    return path / "*.vtp", None
+
+
+def other_surface(path: Path) -> tuple[Path, Path]:
+    run, mesh = numpy_and_surface(path)
+    surface(1.01 * boxes().merged()[0]).save(mesh)
+    return run, mesh
+
+
+def several_formats(path: Path) -> tuple[Path, None]:
+    surface(boxes().merged()[0]).save(path / "0.vtp")
+    surface(boxes().merged()[0]).save(path / "0.ply")
+    return path, None
+
+
+def cut_short(path: Path) -> tuple[Path, None]:
+    folder_of_displacements(path)
+    (path / "3.vtu").write_bytes((path / "3.vtu").read_bytes()[:600])
+    return path, None
+
+
+def archive_with_mesh(path: Path) -> tuple[Path, Path]:
+    return nodes_npz(path), path / "volume.vtk"
+
+
+UNUSABLE: dict[str, tuple[Callable[[Path], tuple[Path, Path | None]], str]] = {
+    "flat": (flat_npy, r"run.npy: the array has the shape \[10, 288\] .* numbers \[frames, vertices, 3\]: export"),
+    "node count": (
+        fewer_nodes,
+        r"run.npy has 95 nodes a frame but .*volume.vtk 96; both need the same nodes, in one",
+    ),
+    "no nodes": (without_nodes, r"run.npy has no frames, or none with nodes; at least one state is needed"),
+    "unmoved": (unmoved, r"has the same points in all 2 frames and no displacements; .* called displacement, disp"),
+    "remeshed": (remeshed, r"frame 1.vtu has \d+ nodes but frame 0.vtu has 96; the topology must stay the same"),
+    "no tetrahedra": (single_surface, r"no tetrahedra and one surface for 2 segments; .* `states: \{positions: "),
+    "other surface": (other_surface, r"miss a vertex of its mesh by .*; without tetrahedra .* or name a mesh with tet"),
+    "several formats": (
+        several_formats,
+        r"files of the formats .ply, .vtp; all frames must have one: name them by",
+    ),
+    "cut short": (cut_short, r"3.vtu cannot be read as a mesh \(.*\): export or download it again"),
+    "mesh of an archive": (archive_with_mesh, r"an NPZ file, which holds its own rest; `mesh` is not for it: leave it"),
+}
+
+
+@pytest.mark.parametrize("case", UNUSABLE)
+def test_other_programs_files_that_do_not_fit_are_named(case: str, tmp_path: Path) -> None:
+    write, text = UNUSABLE[case]
+    path, mesh = write(tmp_path)
+    with pytest.raises(ValueError, match=text) as caught:
+        load_states(path, boxes(), mesh=mesh, scale=SCALE, shift=SHIFT)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_crash_of_the_reader_and_its_absence_are_sentences(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "run.pvd").write_text(pvd_text([]), encoding="utf-8")
+    monkeypatch.setattr("sys.executable", "/bin/false")
+    with pytest.raises(ValueError, match=r"run.pvd cannot be read as a mesh \(it ends VTK's reader\): export or"):
+        load_states(tmp_path / "run.pvd", boxes())
+    monkeypatch.setattr("mereo.io.vtk_frames.find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=r"run.pvd needs pyvista, .* pip install 'mereo\[simulation\]'"):
+        load_states(tmp_path / "run.pvd", boxes())
 
 
 def test_too_few_frames_to_split_and_bad_settings_are_refused(tmp_path: Path) -> None:

@@ -31,6 +31,7 @@ COUNT = 10
 """Inputs of a kind in the fast test."""
 
 DEAR = {
+    **{f"frames.{suffix}": 1 for suffix in ("vtk", "vtu", "pvd", "xdmf")},
     "bar.yaml": 3,
     "left.stl": 3,
     "truth.json": 3,

@@ -4,11 +4,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
+from lattice import pvd_text
 from scene_files import write_bar
 
 from mereo.io.mesh_formats import read_segmented_mesh
+from mereo.io.simulation_states import files_of_states
 from mereo.scenes.files.check import check_scene
-from mereo.scenes.registry import load_scene
+from mereo.scenes.registry import files_of, load_scene
 from mereo.scenes.seeds import TEST_SEED_START
 
 FRAMES = 10
@@ -74,6 +77,53 @@ def test_missing_states_are_said_with_their_line(tmp_path: Path) -> None:
     path = write_bar(tmp_path, "states: motion.npz\n")
     with pytest.raises(ValueError, match=r"bar\.yaml:9: `states` is 'motion.npz', and .* does not exist: check"):
         load_scene(path)
+
+
+@pytest.fixture
+def numpy_bar(tmp_path: Path) -> Path:
+    """Positions of both segments' vertices in an array, and the mesh that they are of."""
+    path = write_bar(tmp_path, "states: {positions: run.npy, mesh: rest.obj}\nheld_out: 0.3\n")
+    vertices, faces = read_segmented_mesh(tmp_path / "left.stl", tmp_path / "right.stl").merged()[:2]
+    trimesh.Trimesh(vertices, faces, process=False).export(tmp_path / "rest.obj")
+    np.save(tmp_path / "run.npy", np.stack([frame(vertices, number) for number in range(FRAMES)]))
+    return path
+
+
+def test_positions_in_an_array_are_states_with_their_mesh(numpy_bar: Path) -> None:
+    assert drawn(numpy_bar, 0) == set(range(7))
+    before = load_scene(numpy_bar).definition
+    rest = numpy_bar.with_name("rest.obj")
+    rest.write_text(rest.read_text() + "# another file\n")
+    assert load_scene(numpy_bar).definition != before
+    assert {numpy_bar.with_name("run.npy"), rest} <= set(files_of(numpy_bar))
+
+
+def test_a_mesh_of_states_that_is_missing_or_misspelt_is_said_with_its_line(numpy_bar: Path) -> None:
+    numpy_bar.with_name("rest.obj").unlink()
+    with pytest.raises(ValueError, match=r"bar\.yaml:9: `states` is 'rest.obj', and .* does not exist: check"):
+        load_scene(numpy_bar)
+    text = numpy_bar.read_text()
+    for wrong, message in (
+        ("{positions: run.npy, nodes: rest.obj}", "the key `nodes` means nothing here: known are mesh"),
+        ("{mesh: rest.obj}", "`positions` is missing; it must be given"),
+        ("[run.npy]", "`states` is .*; it must be a path, or a block of the keys positions and mesh: correct it"),
+    ):
+        numpy_bar.write_text(text.replace("{positions: run.npy, mesh: rest.obj}", wrong))
+        with pytest.raises(ValueError, match=message):
+            load_scene(numpy_bar)
+
+
+def test_what_a_collection_names_is_read_and_kept(tmp_path: Path) -> None:
+    path = write_bar(tmp_path, "states: run.pvd\n")
+    (tmp_path / "a b").mkdir()
+    names = ["a b/0.vtu", "1.vtu", "gone.vtu"]
+    (tmp_path / "run.pvd").write_text(pvd_text(names))
+    (tmp_path / "run.xdmf").write_text('<DataItem Format="HDF"> run.h5:/Mesh/0 </DataItem> 1.5 2.5')
+    for name in (*names[:2], "run.h5"):
+        (tmp_path / name).write_bytes(b"x")
+    assert files_of(path)[-3:] == [tmp_path / name for name in ("run.pvd", *names[:2])]
+    assert files_of_states(tmp_path / "run.xdmf") == [tmp_path / "run.xdmf", tmp_path / "run.h5"]
+    assert files_of_states(tmp_path / "*.vtu") == [tmp_path / "1.vtu"]
 
 
 def test_states_and_deformations_exclude_each_other(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 import trimesh
 from camera_files import write_camera
+from lattice import pvd_text, xdmf_text
 from PIL import Image
 from scene_files import write_bar
 from shapes import ball, box
@@ -95,6 +96,25 @@ def array(values: np.ndarray) -> Callable[[Path], object]:
         write_camera(path.parent / "camera.json", CAMERA)
 
     return write
+
+
+NODES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
+FRAMES = np.stack([NODES, NODES * 1.1, NODES + 1])
+
+
+def vtk(path: Path) -> None:
+    """A tetrahedron in VTK's formats, or one that names others of three frames."""
+    import pyvista
+
+    one = pyvista.UnstructuredGrid({pyvista.CellType.TETRA: np.array([[0, 1, 2, 3]])}, NODES)
+    one.point_data["u"] = FRAMES[1] - NODES
+    if path.suffix == ".xdmf":
+        path.write_text(xdmf_text(NODES, np.array([[0, 1, 2, 3]]), FRAMES - NODES), encoding="utf-8")
+    elif path.suffix == ".pvd":
+        one.save(path.with_name("a.vtu"))
+        path.write_text(pvd_text(["a.vtu"]), encoding="utf-8")
+    else:
+        one.save(path)
 
 
 def exr(path: Path) -> None:

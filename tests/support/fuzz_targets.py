@@ -16,7 +16,9 @@ from fuzz_files import (
     BOP,
     CAMERA,
     DEPTH,
+    FRAMES,
     NERF,
+    NODES,
     POINTS,
     ROS_YAML,
     TURNS,
@@ -46,6 +48,7 @@ from fuzz_files import (
     text,
     view,
     volume_scene,
+    vtk,
     weights,
     zdf,
 )
@@ -89,8 +92,6 @@ class Target:
     library: str = "numpy"
 
 
-NODES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
-FRAMES = np.stack([NODES, NODES * 1.1, NODES + 1])
 TRUECOLOR = np.stack([DEPTH.astype(np.uint8)] * 3, axis=-1)
 TETRAHEDRA = {"rest_nodes": NODES, "tetrahedra": np.array([[0, 1, 2, 3]]), "nodes": FRAMES}
 # (name, write, read, read with its folder, library)
@@ -131,6 +132,11 @@ ALL: tuple[Target, ...] = (
     Target("labels.seg.nrrd", lambda p: write_labels_seg_nrrd(p, grid(), COLORS), read_label_volume, library="nrrd"),
     Target("tetrahedra.npz", arrays(**TETRAHEDRA), lambda p: read_states(p, ("a",))),
     Target("surfaces.npz", arrays(a=FRAMES), lambda p: read_states(p, ("a",))),
+    Target("frames.npy", array(FRAMES), lambda p: read_states(p, ("a",))),
+    *(
+        Target(f"frames.{suffix}", vtk, lambda p: read_states(p, ("a",)), library="pyvista")
+        for suffix in ("vtk", "vtu", "pvd", "xdmf")
+    ),
     *(
         Target(f"a/1.{suffix}", exported(suffix), lambda p: read_states(p.parents[1], ("a",)), folder=True)
         for suffix in ("obj", "stl", "ply", "off")

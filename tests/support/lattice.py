@@ -57,3 +57,34 @@ STRENGTHS = np.linspace(-0.9, 0.9, 10)
 def states() -> np.ndarray:
     """Node positions [10, n, 3]."""
     return np.stack([bent(lattice().nodes, strength) for strength in STRENGTHS])
+
+
+# --- its states as other programs write them --------------------------------------------------------------------------
+
+
+def pvd_text(files: list[str]) -> str:
+    """A collection of files, one for each time step."""
+    steps = [f'<DataSet timestep="{step / 7}" part="0" file="{file}"/>' for step, file in enumerate(files)]
+    return f'<?xml version="1.0"?><VTKFile type="Collection"><Collection>{"".join(steps)}</Collection></VTKFile>'
+
+
+def xdmf_text(nodes: np.ndarray, elements: np.ndarray, displacements: np.ndarray) -> str:
+    """As dolfinx lays out a file: the mesh once, and a collection that includes it at each time step."""
+
+    def item(array: np.ndarray, kind: str) -> str:
+        size, text = " ".join(map(str, array.shape)), " ".join(map(repr, array.ravel().tolist()))
+        return f'<DataItem Dimensions="{size}" NumberType="{kind}" Precision="8" Format="XML">{text}</DataItem>'
+
+    mesh = "/Xdmf/Domain/Grid[@GridType='Uniform'][1]/*[self::Topology or self::Geometry]"
+    steps = [
+        f'<Grid Name="u" GridType="Uniform"><xi:include xpointer="xpointer({mesh})" /><Time Value="{step}" />'
+        f'<Attribute Name="u" AttributeType="Vector" Center="Node">{item(moved, "Float")}</Attribute></Grid>'
+        for step, moved in enumerate(displacements)
+    ]
+    return f"""<?xml version="1.0"?>
+        <!DOCTYPE Xdmf SYSTEM "Xdmf.dtd" []>
+        <Xdmf Version="3.0" xmlns:xi="https://www.w3.org/2001/XInclude"><Domain>
+        <Grid Name="mesh" GridType="Uniform">
+        <Topology TopologyType="Tetrahedron" NumberOfElements="{len(elements)}">{item(elements, "Int")}</Topology>
+        <Geometry GeometryType="XYZ">{item(nodes, "Float")}</Geometry></Grid>
+        <Grid Name="u" GridType="Collection" CollectionType="Temporal">{"".join(steps)}</Grid></Domain></Xdmf>"""

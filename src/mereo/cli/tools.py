@@ -233,7 +233,7 @@ PURPOSES: dict[str, str] = {
     "cad": "3MF files",
     "medical": "NIfTI and NRRD volumes",
     "sensors": "ROS bags, EXR depth images and Zivid clouds",
-    "simulation": "states from finite elements",
+    "simulation": "states from finite elements, in VTK's formats too",
     "storage": "datasets in S3 and what speaks it",
     "gcs": "datasets in Google Cloud Storage",
     "cluster": "generation, scoring, frames and learning on Ray clusters",

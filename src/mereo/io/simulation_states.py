@@ -6,6 +6,7 @@ The formats are in docs/own-object.md. This module reads and checks what files s
 
 import re
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,9 @@ from jaxtyping import Float, Int
 
 from mereo.io.errors import readable
 from mereo.io.readers import read_arrays
+from mereo.io.vtk_frames import COLLECTION_SUFFIXES, DISPLACEMENTS, VTK_SUFFIXES, MeshFrames, read_vtk_frames
 
-FRAME_SUFFIXES = (".ply", ".obj", ".stl", ".off")
+FRAME_SUFFIXES = (".ply", ".obj", ".stl", ".off", *VTK_SUFFIXES)
 """Suffixes of meshes that hold a state each."""
 
 TETRAHEDRAL = ("rest_nodes", "tetrahedra", "nodes", "displacements")
@@ -23,6 +25,12 @@ TETRAHEDRAL = ("rest_nodes", "tetrahedra", "nodes", "displacements")
 
 REST = ".rest"
 """End of an array's name that holds a segment at rest."""
+
+STILL = 1e-5
+"""Points are the same where they differ by less than this, of the longest side: single precision leaves as much."""
+
+NAMED = re.compile(r'[^"<>:\s][^"<>:\r\n]*\.(?:vt\w+|h5|hdf5?|bin|raw|xml)(?=["<:\s])')
+"""Names of other files in PVD and XDMF files."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,24 +65,149 @@ class SurfaceRecord:
     frames: tuple[str, ...]
 
 
-def read_states(path: Path, names: tuple[str, ...]) -> TetrahedralRecord | SurfaceRecord:
-    """States in an NPZ file or a directory; ``names`` are the object's segments.
+def read_states(path: Path, names: tuple[str, ...], mesh: Path | None = None) -> TetrahedralRecord | SurfaceRecord:
+    """States in a file, a directory or the files of a pattern.
 
-    Raises ``FileNotFoundError`` and ``ValueError`` naming the file, the array and the frame.
+    Args:
+        path: an NPZ file, an NPY file of positions, a mesh for each frame (by a directory or a pattern such as
+            ``*.vtu``), or a PVD or XDMF file.
+        names: the object's segments.
+        mesh: file of the same nodes at rest, with their tetrahedra where it has some; not for NPZ files.
+
+    Raises ``FileNotFoundError`` and ``ValueError`` naming the file, the array and the frame, ``ImportError`` without
+    the extra `simulation` where the format is one of VTK's.
     """
-    record: TetrahedralRecord | SurfaceRecord
-    if path.is_dir():
-        record = _directory(path, names)
-    elif path.suffix.lower() == ".npz" or not path.exists():
+    if path.suffix.lower() == ".npz":
+        if mesh is not None:
+            raise ValueError(f"{path} is an NPZ file, which holds its own rest; `mesh` is not for it: leave it out")
         record = _archive(path, names)
+        if not record.frames:
+            raise ValueError(f"{path} has no frames; at least one state is needed: export some")
+        return record
+    if path.is_dir() and not frame_files(path):
+        return _folders(path, names)
+    return _sequence(path, names, mesh)
+
+
+def frame_files(path: Path) -> list[Path]:
+    """Files of frames in natural order, 2 before 10.
+
+    They are the path itself, the meshes in a directory but ``rest.*``, or what a pattern in the path's last part names.
+    """
+    if path.is_dir():
+        files = [file for file in path.iterdir() if file.suffix.lower() in FRAME_SUFFIXES and file.stem != "rest"]
+    elif path.exists() or not path.parent.is_dir():
+        return [path] if path.exists() else []
+    else:
+        files = [file for file in path.parent.iterdir() if fnmatchcase(file.name, path.name) and file.is_file()]
+    return sorted(files, key=lambda file: [int(t) if t.isdigit() else t for t in re.split(r"(\d+)", file.name)])
+
+
+def files_of_states(path: Path, mesh: Path | None = None) -> list[Path]:
+    """Every file that ``read_states`` may read, in a fixed order, with those that PVD and XDMF files name."""
+    files = sorted(item for item in path.rglob("*") if item.is_file()) if path.is_dir() else frame_files(path)
+    if mesh is not None:
+        files = [*files, mesh]
+    texts = [file for file in files if file.suffix.lower() in COLLECTION_SUFFIXES and file.is_file()]
+    named = [file.parent / name for file in texts for name in NAMED.findall(file.read_text("utf-8", errors="replace"))]
+    return [*files, *(file for file in dict.fromkeys(named) if file.is_file() and file not in files)]
+
+
+# --- sequences --------------------------------------------------------------------------------------------------------
+
+
+def _sequence(path: Path, names: tuple[str, ...], mesh: Path | None) -> TetrahedralRecord | SurfaceRecord:
+    """States of one mesh that moves all segments, or of the surface of the only one."""
+    frames = _mesh_frames(path)
+    if 0 in frames.points.shape:
+        raise ValueError(f"{path} has no frames, or none with nodes; at least one state is needed: export some")
+    tetrahedra, rest = frames.tetrahedra, None
+    if mesh is None:
+        mesh = _rest_file(path)
+    if mesh is not None:
+        at_rest = _mesh_frames(mesh)
+        rest, tetrahedra = at_rest.points[0], at_rest.tetrahedra
+        if len(rest) != frames.points.shape[1]:
+            raise ValueError(
+                f"{path} has {frames.points.shape[1]} nodes a frame but {mesh} {len(rest)}; both need the same nodes, "
+                "in one order: name the mesh that was simulated"
+            )
+    positions, start = _positions(path, frames, rest)
+    rest = start if rest is None else rest
+    if len(tetrahedra):
+        rest = positions[0] if rest is None else rest
+        return TetrahedralRecord(rest, tetrahedra, positions - rest, frames.frames)
+    if rest is None and len(names) > 1:
+        raise ValueError(
+            f"{path} has no tetrahedra and one surface for {len(names)} segments; it must be known which vertices are "
+            f"whose: name the mesh at rest, as `states: {{positions: {path.name}, mesh: rest.vtk}}`, or give each "
+            "segment a folder"
+        )
+    return SurfaceRecord(
+        dict.fromkeys(names, positions), {} if rest is None else dict.fromkeys(names, rest), frames.frames
+    )
+
+
+def _positions(
+    path: Path, frames: MeshFrames, rest: Float[np.ndarray, "n 3"] | None
+) -> tuple[Float[np.ndarray, "f n 3"], Float[np.ndarray, "n 3"] | None]:
+    """Positions in all frames, and those at rest where displacements say them.
+
+    Points that stay are moved by their displacements. Of points that move, displacements tell the rest, if they agree.
+    """
+    points, moved = frames.points, frames.displacements
+    start = points[0] if rest is None else rest
+    size = float(np.ptp(start, axis=0).max())
+    if np.abs(points - start).max() <= STILL * size:
+        if moved is not None:
+            return points + moved, points[0]
+        if len(points) > 1:
+            raise ValueError(
+                f"{path} has the same points in all {len(points)} frames and no displacements; points must move, or "
+                f"have point data of 3 components called {', '.join(DISPLACEMENTS)}: export or rename them"
+            )
+    elif moved is not None and np.abs((back := points - moved) - back[0]).max() <= STILL * size:
+        return points, back[0]
+    return points, None
+
+
+def _mesh_frames(path: Path) -> MeshFrames:
+    """Frames of the files that a path stands for, all of one format."""
+    files = frame_files(path)
+    if not files:
+        raise FileNotFoundError(f"{path} does not exist; a simulation's frames are needed: check the path")
+    kinds = sorted({file.suffix.lower() for file in files})
+    if len(kinds) > 1:
+        raise ValueError(
+            f"{path} has files of the formats {', '.join(kinds)}; all frames must have one: name them by a pattern, as "
+            f"{path / f'*{kinds[0]}'}"
+        )
+    if kinds[0] in (*VTK_SUFFIXES, *COLLECTION_SUFFIXES):
+        frames = read_vtk_frames(files)
+        for key in ("points", "displacements"):
+            if (array := getattr(frames, key)) is not None:
+                _floats(path, key, array, 3)
+        return frames
+    if kinds == [".npy"] and len(files) == 1:
+        with readable(path, "NPY file"), path.open("rb") as file:
+            points = np.asarray(np.load(file, allow_pickle=False))
+        names = _numbered(len(_floats(path, "the array", points, 3)))
+    elif kinds[0] in FRAME_SUFFIXES:
+        meshes = {f"frame {file.name}": _floats(file, "the mesh", mesh_vertices(file), 2) for file in files}
+        _check_topology(path, meshes)
+        points, names = np.stack(list(meshes.values())), tuple(meshes)
     else:
         raise ValueError(
-            f"{path} has the suffix {path.suffix!r}; states are an NPZ file or a directory with one file per frame: "
-            "convert or rename it"
+            f"{path} has the suffix {kinds[0]!r}; states are an NPZ or NPY file, a PVD or XDMF file, or meshes "
+            f"({', '.join(FRAME_SUFFIXES)}) in a directory or of a pattern: convert or rename it"
         )
-    if not record.frames:
-        raise ValueError(f"{path} has no frames; at least one state is needed: export some")
-    return record
+    return MeshFrames(points, None, np.empty((0, 4), dtype=np.int64), names)
+
+
+def _rest_file(path: Path) -> Path | None:
+    """The mesh ``rest.*`` of a directory of frames."""
+    files = sorted(path.glob("rest.*")) if path.is_dir() else []
+    return next((file for file in files if file.suffix.lower() in FRAME_SUFFIXES), None)
 
 
 # --- NPZ --------------------------------------------------------------------------------------------------------------
@@ -160,51 +293,45 @@ def _numbered(count: int) -> tuple[str, ...]:
 # --- directories ------------------------------------------------------------------------------------------------------
 
 
-def _directory(path: Path, names: tuple[str, ...]) -> SurfaceRecord:
-    """States in a directory: a folder of meshes per segment, or the meshes of the only segment."""
+def _folders(path: Path, names: tuple[str, ...]) -> SurfaceRecord:
+    """States in a directory with a folder of meshes for each segment."""
     folders = {item.name: item for item in path.iterdir() if item.is_dir() and not item.name.startswith(".")}
-    if _frame_files(path) and len(names) == 1:
-        folders = {names[0]: path}
-    elif not folders or _frame_files(path):
+    if not folders:
         raise ValueError(
             f"{path} is no directory of states for {len(names)} segments; it must hold one folder of mesh files for "
-            f"each segment ({', '.join(names)}): arrange it so, or make one NPZ file"
+            f"each segment ({', '.join(names)}), or a mesh for each frame: arrange it so, or make one NPZ file"
         )
     _check_names(path, set(folders), names)
-    vertices, rest, counts = dict[str, np.ndarray](), dict[str, np.ndarray](), dict[str, int]()
-    frames: tuple[str, ...] = ()
-    for name in names:
-        files = _frame_files(folders[name])
-        states = {f"frame {file.name}": _floats(file, name, mesh_vertices(file), 2) for file in files}
-        for file in sorted(folders[name].glob("rest.*")):
-            if file.suffix.lower() in FRAME_SUFFIXES:
-                rest[name] = _floats(file, name, mesh_vertices(file), 2)
-                break
-        reference = {"the rest pose": rest[name]} if name in rest else {}
-        _check_topology(path, name, reference | states)
-        vertices[name] = np.stack(list(states.values())) if states else np.empty((0, 0, 3))
-        frames, counts[name] = frames or tuple(states), len(states)
+    records = {name: _surface(folders[name], name) for name in names}
+    counts = {name: len(record.frames) for name, record in records.items()}
     if len(set(counts.values())) > 1:
         text = ", ".join(f"{count} of {name!r}" for name, count in counts.items())
         raise ValueError(f"{path} has {text} frames; all segments need the same number: export them together")
-    return SurfaceRecord(vertices, rest, frames)
+    vertices = {name: record.vertices[name] for name, record in records.items()}
+    rest = {name: record.rest[name] for name, record in records.items() if name in record.rest}
+    return SurfaceRecord(vertices, rest, records[names[0]].frames)
 
 
-def _check_topology(path: Path, name: str, states: dict[str, np.ndarray]) -> None:
-    """Raise ``ValueError`` where states of a segment have other numbers of vertices than the first of them."""
-    first = next(iter(states), "")
+def _surface(folder: Path, name: str) -> SurfaceRecord:
+    """States of one segment in its own folder; of tetrahedra their nodes are taken for vertices."""
+    if not frame_files(folder):
+        raise ValueError(f"{folder} has no frames; at least one state is needed: export some")
+    record = _sequence(folder, (name,), None)
+    if isinstance(record, SurfaceRecord):
+        return record
+    nodes = record.rest_nodes + record.displacements
+    return SurfaceRecord({name: nodes}, {name: record.rest_nodes}, record.frames)
+
+
+def _check_topology(path: Path, states: dict[str, np.ndarray]) -> None:
+    """Raise ``ValueError`` where states have other numbers of vertices than the first of them."""
+    first = next(iter(states))
     for state, vertices in states.items():
         if len(vertices) != len(states[first]):
             raise ValueError(
-                f"{path}: {state} of {name!r} has {len(vertices)} vertices but {first} has {len(states[first])}; the "
-                "topology must stay the same: export without remeshing"
+                f"{path}: {state} has {len(vertices)} vertices but {first} has {len(states[first])}; the topology must "
+                "stay the same: export without remeshing"
             )
-
-
-def _frame_files(path: Path) -> list[Path]:
-    """Meshes in a directory but ``rest.*``, in natural order: 2 before 10."""
-    files = [file for file in path.iterdir() if file.suffix.lower() in FRAME_SUFFIXES and file.stem != "rest"]
-    return sorted(files, key=lambda file: [int(t) if t.isdigit() else t for t in re.split(r"(\d+)", file.name)])
 
 
 def mesh_vertices(path: Path) -> Float[np.ndarray, "_ 3"]:

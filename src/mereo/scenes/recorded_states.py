@@ -79,6 +79,7 @@ def load_states(
     path: Path,
     rest: SegmentedMesh,
     *,
+    mesh: Path | None = None,
     scale: float = 1.0,
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
     held_out: float = HELD_OUT,
@@ -86,8 +87,9 @@ def load_states(
     """Recorded states of an object.
 
     Args:
-        path: an NPZ file or a directory, see docs/own-object.md.
+        path: a file, a directory or a pattern of files, see docs/own-object.md.
         rest: the object at rest, in scene units.
+        mesh: file of the states' own nodes at rest, and of their tetrahedra, where the frames do not have them.
         scale: ``scene = file * scale + shift`` takes the file's coordinates to those of ``rest``.
         shift: see ``scale``.
         held_out: the share of frames, the last ones, kept for testing: from 0 to less than 1.
@@ -96,11 +98,12 @@ def load_states(
         FileNotFoundError: nothing at ``path``.
         ValueError: damaged files, frames that do not fit ``rest``, or frames that turn something inside out, which are
             named.
+        ImportError: a format of VTK, without the extra `simulation`.
     """
     offset = np.asarray(shift, dtype=np.float64)
     if not (np.isfinite(scale) and scale > 0 and offset.shape == (3,) and np.isfinite(offset).all()):
         raise ValueError(f"scale is {scale} and shift {shift}; they must be finite, scale above 0, shift of 3 numbers")
-    record = read_states(Path(path), rest.names)
+    record = read_states(Path(path), rest.names, mesh)
     frames: Frames
     if isinstance(record, TetrahedralRecord):
         frames = tetrahedral_frames(path, record, rest, scale, offset)
@@ -264,7 +267,7 @@ def _order(
     path: Path, segment: Segment, count: int, known: Float[np.ndarray, "w 3"] | None
 ) -> slice | Int[np.ndarray, " v"]:
     """Which vertex of the states is each of the mesh's: by rest position where the file has it, else one to one."""
-    cure = f"add the rest positions of the states' vertices as '{segment.name}.rest' (in a directory, a file rest.*)"
+    cure = f"name the states' own mesh at rest by the key mesh (in an NPZ file '{segment.name}.rest')"
     if known is None:
         if count != len(segment.vertices):
             raise ValueError(
@@ -282,7 +285,8 @@ def _order(
     if distance.max() > MATCHED * size:
         raise ValueError(
             f"{path}: the rest positions of {segment.name!r} miss a vertex of its mesh by {distance.max():.3g}, of "
-            f"{size:.3g} across; they must be the same pose: check the unit, scale and shift"
+            f"{size:.3g} across; without tetrahedra they must be the same vertices in the same pose: check the unit, "
+            "scale and shift, or name a mesh with tetrahedra"
         )
     return np.asarray(nearest, dtype=np.int64)
 
@@ -295,7 +299,8 @@ def _check_order(path: Path, segment: Segment, vertices: Float[np.ndarray, "v 3"
     if stretch > DOUBTFUL_STRETCH:
         raise ValueError(
             f"{path} makes the edges of {segment.name!r} longer or shorter by a factor of {stretch:.3g}; its vertices "
-            f"seem to be in another order or unit than the mesh's: check scale, or add '{segment.name}.rest'"
+            f"seem to be in another order or unit than the mesh's: check scale, or name their own mesh by the key "
+            f"mesh (in an NPZ file '{segment.name}.rest')"
         )
 
 

@@ -22,6 +22,7 @@ from mereo.geometry.mesh_check import examine, mesh_of, solid_of
 from mereo.geometry.subdivision import TooManyFaces, split_edges
 from mereo.geometry.transforms import Normalizer
 from mereo.io.mesh_formats import read_segmented_mesh
+from mereo.io.simulation_states import files_of_states, frame_files
 from mereo.io.yaml_document import Document, similar
 from mereo.scenes.files.deformation_blocks import (
     AnyDeformation,
@@ -70,8 +71,11 @@ def files_of(path: Path) -> list[Path]:
     """The scene file, the meshes or volume that it names, and its recorded states, whether they exist or not."""
     file = read(Document(path))
     parts = [part.file for part in file.segments or ()]
-    named = [name for name in (*parts, file.model, file.labels, file.states) if name is not None]
-    return [path, *(path.parent / name for name in named)]
+    named = [path.parent / name for name in (*parts, file.model, file.labels) if name is not None]
+    if file.states is not None:
+        states, mesh = _paths_of_states(path, file)
+        named += [states, *files_of_states(states, mesh)]
+    return [path, *named]
 
 
 def with_warnings(document: Document, mesh: SegmentedMesh) -> SegmentedMesh:
@@ -97,7 +101,7 @@ def build(document: Document, file: SceneFile, mesh: SegmentedMesh) -> Scene:
     unit_m, definition = file.units / placement.scale, file.model_dump_json(exclude=SOURCES)
     if file.states is not None:
         scene = _recorded(document, file, rest, placement, workspace)
-        definition += _digest(document.path.parent / file.states)
+        definition += _digest(files_of_states(*_paths_of_states(document.path, file)))
     else:
         blocks = file.deformations
         if blocks is None:
@@ -147,19 +151,28 @@ def _recorded(
     document: Document, file: SceneFile, rest: SegmentedMesh, placement: Normalizer, workspace: Workspace
 ) -> Scene:
     """A scene in the states of ``states``, whose coordinates are those of the meshes."""
-    assert file.states is not None
-    path = document.path.parent / file.states
-    if not path.exists():
-        raise document.error(("states",), f"`states` is {file.states!r}, and {path} does not exist: check the path")
+    path, mesh = _paths_of_states(document.path, file)
+    for place in (path, mesh):
+        if place is not None and not place.exists() and not frame_files(place):
+            name = place.relative_to(document.path.parent)
+            raise document.error(("states",), f"`states` is {str(name)!r}, and {place} does not exist: check the path")
     x, y, z = -placement.scale * placement.center
-    states = load_states(path, rest, scale=placement.scale, shift=(x, y, z), held_out=file.held_out)
+    with document.named_at(("states",)):
+        states = load_states(path, rest, mesh=mesh, scale=placement.scale, shift=(x, y, z), held_out=file.held_out)
     return states.scene(file.name, rest, workspace, file.source)
 
 
-def _digest(path: Path) -> str:
-    """Digest of recorded states, a file or a directory: other states are another scene."""
+def _paths_of_states(path: Path, file: SceneFile) -> tuple[Path, Path | None]:
+    """Where the recorded states of a scene file at ``path`` are, and their mesh at rest."""
+    assert file.states is not None
+    mesh = file.states.mesh
+    return path.parent / file.states.positions, None if mesh is None else path.parent / mesh
+
+
+def _digest(files: Sequence[Path]) -> str:
+    """Digest of the files of recorded states: other states are another scene."""
     digest = hashlib.sha256()
-    for file in [path] if path.is_file() else sorted(item for item in path.rglob("*") if item.is_file()):
+    for file in files:
         with file.open("rb") as content:
             digest.update(file.name.encode() + hashlib.file_digest(content, "sha256").digest())
     return digest.hexdigest()

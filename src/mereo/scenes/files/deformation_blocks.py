@@ -17,6 +17,7 @@ from pydantic import (
     ConfigDict,
     Field,
     FiniteFloat,
+    model_serializer,
     model_validator,
 )
 
@@ -469,6 +470,27 @@ class CameraBlock(Block):
         )
 
 
+class StatesBlock(Block):
+    """Recorded states: file, directory or pattern of positions, and the file of their mesh at rest."""
+
+    positions: Annotated[str, Field(min_length=1)]
+    mesh: Annotated[str, Field(min_length=1)] | None = None
+
+    @model_serializer
+    def _written(self) -> str | dict[str, str]:
+        """The path alone where there is no mesh: an object's identity in datasets is made of it."""
+        return self.positions if self.mesh is None else {"positions": self.positions, "mesh": self.mesh}
+
+
+def _states(value: object) -> object:
+    """A path alone is that of the positions."""
+    if isinstance(value, str):
+        return {"positions": value}
+    if not isinstance(value, dict):
+        raise ValueError("it must be a path, or a block of the keys positions and mesh")
+    return value
+
+
 class SceneFile(Block):
     """Content of a scene file. Exactly one of ``segments``, ``model``, ``labels`` says where the segments come from.
 
@@ -498,7 +520,7 @@ class SceneFile(Block):
     size: Positive = 20.0
     camera: CameraBlock = CameraBlock()
     deformations: Deformations | None = None
-    states: str | None = None
+    states: Annotated[StatesBlock, BeforeValidator(_states)] | None = None
     held_out: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.1
 
     @model_validator(mode="after")
