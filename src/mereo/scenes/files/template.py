@@ -8,10 +8,11 @@ lattices of cubes follow, one after the other, all scaled until the surface move
 import os
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import yaml
 from jaxtyping import Float, Int
 
 from mereo.deformation.maps import Deformation
@@ -265,6 +266,9 @@ def identifier(text: str) -> str:
 
 def _source(files: list[Path], folder: Path) -> _Source:
     relative = [Path(os.path.relpath(file, folder)).as_posix() for file in files]
+    for file, text in zip(files, relative, strict=True):
+        if text != text.encode("utf-8", "replace").decode():
+            raise ValueError(f"{file} has a name that is not UTF-8; a scene file is text in UTF-8: rename it")
     if any(is_volume(file) for file in files):
         if len(files) > 1:
             raise ValueError(
@@ -279,15 +283,26 @@ def _source(files: list[Path], folder: Path) -> _Source:
 
 def _from_meshes(files: Sequence[Path], relative: Sequence[str]) -> _Source:
     """One segment for each file, called after it, with all of its parts."""
-    names = tuple(re.sub(r"[^\w. -]+", "_", file.stem) for file in files)
-    if repeated := sorted({name for name in names if names.count(name) > 1}):
-        raise ValueError(f"two files are called {repeated[0]!r}; segments are named after them: rename one of them")
+    names = _segment_names([file.stem for file in files], "files")
     mesh = SegmentedMesh(tuple(_whole_file(name, file) for name, file in zip(names, files, strict=True)))
     lines = ["segments:  # one closed mesh for each; their order is that of the labels"]
     for number, (name, file) in enumerate(zip(names, relative, strict=True)):
         lines += [f"  - name: {quoted(name)}", f"    file: {quoted(file)}", f"    color: {_color(number)}"]
     lines.append("    # nested_in: NAME  # for a segment that lies inside another one, which has to come after it")
     return _Source("\n".join(lines), mesh, *_unit_of(files[0], mesh.bounds), *_up_of(files[0]))
+
+
+def _segment_names(names: Sequence[str], kind: str) -> tuple[str, ...]:
+    """Names of segments after those of files or parts; raises ``ValueError`` where two of them are the same."""
+    valid = tuple(_segment_name(name) for name in names)
+    if repeated := sorted({name for name in valid if valid.count(name) > 1}):
+        raise ValueError(f"two {kind} are called {repeated[0]!r}; segments are named after them: rename one of them")
+    return valid
+
+
+def _segment_name(text: str) -> str:
+    """Text with an underscore for each character that a segment's name cannot have."""
+    return "".join(each if each.isprintable() and each not in "/\\" else "_" for each in text)
 
 
 def _whole_file(name: str, file: Path) -> Segment:
@@ -298,8 +313,12 @@ def _whole_file(name: str, file: Path) -> Segment:
 
 def _from_model(file: Path, relative: str, mesh: SegmentedMesh) -> _Source:
     lines = [f"model: {quoted(relative)}", "parts:  # delete what is not wanted; their order is that of the labels"]
-    for number, name in enumerate(mesh.names):
-        lines += [f"  - name: {quoted(name)}", f"    color: {_color(number)}"]
+    names = _segment_names(mesh.names, "parts")
+    for number, (part, name) in enumerate(zip(mesh.names, names, strict=True)):
+        lines.append(f"  - name: {quoted(name)}")
+        lines += [f"    parts: [{quoted(part)}]"] if part != name else []
+        lines.append(f"    color: {_color(number)}")
+    mesh = SegmentedMesh(tuple(replace(part, name=name) for part, name in zip(mesh.segments, names, strict=True)))
     lines.append("    # parts: [A, B]  # parts of the model to join into this segment, instead of the one of its name")
     return _Source("\n".join(lines), mesh, *_unit_of(file, mesh.bounds), *_up_of(file))
 
@@ -309,7 +328,7 @@ def _from_volume(file: Path, relative: str) -> _Source:
     values = [int(value) for value in np.unique(volume.labels) if value > 0]
     if not values:
         raise ValueError(f"{file} holds only empty space; a label volume has values above 0: export it again")
-    names = {value: volume.names.get(value, f"label_{value}") for value in values}
+    names = {value: _segment_name(volume.names.get(value, f"label_{value}")) for value in values}
     mesh = segment_surfaces(volume, names, LABEL_CELLS)
     lines = [f"labels: {quoted(relative)}", "names:  # of the volume's values; delete what is not wanted"]
     lines += [f"  {value}: {quoted(name)}" for value, name in names.items()]
@@ -350,7 +369,7 @@ def _text(name: str, source: _Source, units: str | None) -> str:
     bend, lattice = blocks[0], blocks[-1]
     assert isinstance(bend, BendBlock) and isinstance(lattice, LatticeBlock)
     return TEMPLATE.format(
-        name=name,
+        name=quoted(name),
         block=source.block,
         unit=unit,
         reason=reason,
@@ -397,10 +416,9 @@ def _color(number: int) -> str:
 
 
 def quoted(text: str) -> str:
-    """Text as a YAML value on one line: quoted unless it is a plain word."""
-    plain = re.fullmatch(r"[A-Za-z_./][\w./ -]*", text) and not text.endswith(" ")
-    reserved = text.lower() in ("yes", "no", "on", "off", "true", "false", "null", "y", "n")
-    return text if plain and not reserved else "'" + text.replace("'", "''") + "'"
+    """Text as a YAML value on one line, also within a list: quoted and escaped where it would not be this text."""
+    listed = yaml.safe_dump([text], default_flow_style=True, allow_unicode=True, width=float("inf"))
+    return listed.strip()[1:-1]
 
 
 def _numbers(values: Float[np.ndarray, "3"]) -> str:
