@@ -1,18 +1,20 @@
 """Parts as CAD programs write them: long faces bend with the object, overlaps are exact and say their cause."""
 
 import re
+from collections.abc import Iterator
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
-from cad_objects import write_pliers
+from cad_objects import tongs, write_parts, write_pliers
 from manifold3d import Manifold
 from scene_files import write_bar, write_mesh
 from shapes import ball, box
 
 from mereo.deformation.maps import Rigid
-from mereo.deformation.samplers import cubic_cells
+from mereo.deformation.samplers import JointSampler, RandomMotion, cubic_cells
 from mereo.deformation.warps import Squash
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import Segment, SegmentedMesh
@@ -22,7 +24,7 @@ from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.learning.object_files import describe_scene_file
 from mereo.scenes.files.build import TOLERANCE, refined
-from mereo.scenes.files.check import check_scene
+from mereo.scenes.files.check import STATE_TOLERANCE, check_scene
 from mereo.scenes.files.joints import contacts
 from mereo.scenes.files.template import (
     MOTION,
@@ -177,6 +179,15 @@ def test_an_overlap_in_random_states_is_told_with_its_cause(
         assert (cause or "") in printed and "nothing to repair" not in printed
 
 
+def test_an_overlap_at_rest_is_one_fault(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Deformations have not caused it: no random state counts it again."""
+    files = [write_mesh(box((low, 0, 0), (low + 20, 10, 10)), tmp_path / f"{low}.stl") for low in (0, 15)]
+    path = write_scene_file(files, tmp_path / "a.yaml")
+    with pytest.raises(ValueError, match=r"has 1 fault, listed above: repair the meshes with --repair$"):
+        check_scene(str(path))
+    assert "overlap in 25.00%" in capsys.readouterr().out
+
+
 # --- defaults ---------------------------------------------------------------------------------------------------------
 
 
@@ -265,15 +276,54 @@ def test_the_pliers_hinge_is_proposed_and_valid(written: Path, capsys: pytest.Ca
         "#  - type: joint  # turns on the round contact, radius 4.98, of pin and lower\n#    segments: [lower]" in text
     )
     assert "Its parts touch like 2 joints, which that file proposes in comments" in describe_scene_file(written)
-    head, tail = text.split("deformations:", 1)
-    path = written.with_name("hinges.yaml")
-    path.write_text(head + "deformations:" + re.sub("^#  ", "  ", tail.split("  - type: bend")[0], flags=re.MULTILINE))
+    path = with_joints(written, "hinges.yaml")
     check_scene(str(path))
     assert "fault" not in capsys.readouterr().out
     scene = load_scene(path)
     scale, middle = scene.T_scene_source[0, 0], scene.T_scene_source[:3, 3]
     for _, deform in zip(range(2), scene.sample_deformations(np.random.default_rng(0)), strict=False):
         assert np.linalg.norm((deform(middle[None]) - middle)[0, :2]) < 0.05 * scale  # the pin's axis stays
+
+
+def with_joints(written: Path, name: str) -> Path:
+    """Copy of a written scene file with the proposed joints alone."""
+    head, tail = written.read_text().split("deformations:", 1)
+    path = written.with_name(name)
+    path.write_text(head + "deformations:" + re.sub("^#  ", "  ", tail.split("  - type: bend")[0], flags=re.MULTILINE))
+    return path
+
+
+def test_joints_that_collide_together_are_narrowed_until_no_combination_does(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each lever turns by 30 degrees alone; both inwards meet at the middle, which the check refuses."""
+    written = write_scene_file(write_parts(tmp_path, tongs()), tmp_path / "tongs.yaml")
+    path = with_joints(written, "joints.yaml")
+    check_scene(str(path))
+    assert "fault" not in capsys.readouterr().out
+    reason = re.compile(r"angle: (\[.*\])  # narrowed from (\[-30, 30\]): beyond, joints collide together")
+    assert len(reason.findall(path.read_text())) == 2
+    for motions in corners_and_random(load_scene(path)):
+        assert not overlaps(motions, STATE_TOLERANCE)
+    former = written.with_name("former.yaml")
+    former.write_text(reason.sub(r"angle: \2", path.read_text()))
+    with pytest.raises(ValueError, match=r"has 1 fault, listed above: correct its deformations$"):
+        check_scene(str(former))
+    assert "fault: in random states" in capsys.readouterr().out
+
+
+def corners_and_random(scene: Scene) -> Iterator[SegmentedMesh]:
+    """States at the corners of the box of two joints' ranges, and within it."""
+    draw, rng = scene.sample_deformations, np.random.default_rng(1)
+    assert isinstance(draw, RandomMotion)
+    joints = [(sampler, members) for sampler, members in draw.steps if isinstance(sampler, JointSampler)]
+    angles = [sampler.angle_rad for sampler, _ in joints]
+    for chosen in (*product(*angles), *(tuple(rng.uniform(*np.transpose(angles))) for _ in range(30))):
+        steps = [
+            (replace(sampler, angle_rad=(angle, angle)), members)
+            for (sampler, members), angle in zip(joints, chosen, strict=True)
+        ]
+        yield scene.deform(replace(draw, steps=tuple(steps))(rng)).mesh
 
 
 def test_planes_cylinders_and_other_contacts() -> None:

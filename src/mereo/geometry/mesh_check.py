@@ -1,5 +1,6 @@
 """What is wrong with a user's meshes: each segment by itself, and the volume that segments share."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -161,7 +162,9 @@ class Overlap:
         return f"{self.small} and {self.large} overlap in {self.share:.2%} of {self.small}"
 
 
-def overlaps(mesh: SegmentedMesh, tolerance: float = TOLERANCE) -> tuple[Overlap, ...]:
+def overlaps(
+    mesh: SegmentedMesh, tolerance: float = TOLERANCE, among: Collection[tuple[int, int]] | None = None
+) -> tuple[Overlap, ...]:
     """Pairs of segments that share more than ``tolerance`` of the smaller one, or nest with as much outside.
 
     Exact for solids, however thin what they share; within a percent or so where one of two is no solid. Segments that
@@ -170,12 +173,16 @@ def overlaps(mesh: SegmentedMesh, tolerance: float = TOLERANCE) -> tuple[Overlap
     Args:
         mesh: any unit.
         tolerance: share of a segment's volume, from 0 to 1.
+        among: pairs of indices, the lower one first, to which the test is limited.
     """
     bodies, nesting = [_Body(segment) for segment in mesh.segments], set(mesh.nesting)
     order = sorted(range(len(bodies)), key=lambda index: bodies[index].box_volume)
     pairs = []
     for small, large in combinations(order, 2):
-        nested = (min(small, large), max(small, large)) in nesting
+        pair = (min(small, large), max(small, large))
+        if among is not None and pair not in among:
+            continue
+        nested = pair in nesting
         inner, outer = sorted((small, large)) if nested else (small, large)
         share = bodies[inner].share_in(bodies[outer])
         pairs.append(Overlap(mesh.names[inner], mesh.names[outer], 1.0 - share if nested else share, nested))

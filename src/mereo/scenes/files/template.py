@@ -404,11 +404,16 @@ def _joints(mesh: SegmentedMesh, assembly: bool) -> str:
             f"#    segments: [{', '.join(quoted(mesh.names[index]) for index in joint.moved)}]",
             f"#    pivot: {_numbers(contact.point)}",
             f"#    axis: {_numbers(joint.axis)}",
-            f"#    {'angle' if joint.hinge else 'slide'}: [{joint.most[0]:.4g}, {joint.most[1]:.4g}]",
+            f"#    {'angle' if joint.hinge else 'slide'}: {_range(joint.most)}"
+            + (f"  # narrowed from {_range(joint.alone)}: beyond, joints collide together" if joint.narrowed else ""),
         ]
     if not lines:
         return EXAMPLE_JOINT.format(part=quoted(mesh.names[-1]), center=_numbers(mesh.bounds.mean(axis=0)))
     return "".join(line + "\n" for line in (JOINTS, *lines))
+
+
+def _range(values: tuple[float, float]) -> str:
+    return f"[{values[0]:.4g}, {values[1]:.4g}]"
 
 
 def _color(number: int) -> str:
