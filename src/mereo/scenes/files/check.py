@@ -21,7 +21,6 @@ from mereo.geometry.transforms import inverse_rigid
 from mereo.io.atomic_files import atomic_file, check_file_place, remove_abandoned
 from mereo.io.yaml_document import Document
 from mereo.scenes.files.build import build, read, read_segments
-from mereo.scenes.files.joints import collisions, resting_overlaps
 from mereo.scenes.files.template import motion
 from mereo.scenes.registry import is_yaml, load_scene
 from mereo.scenes.scene import SCENES, Scene, Workspace
@@ -245,7 +244,7 @@ STATES = 12
 """Random states in which segments are tested for overlap, and for being in view."""
 
 STATE_TOLERANCE = 0.02
-"""Share of a segment that another one may overlap in a random state beyond that at rest, which is a fault by itself."""
+"""Share of a segment that another one may overlap in a random state."""
 
 WIDTH = 96
 """Of the depth image in pixels, the default of ``synthesis.config.GenerateConfig``."""
@@ -256,15 +255,17 @@ def report_states(scene: Scene) -> int:
     moved = motion(scene.rest, scene.sample_deformations)
     print(f"motion: {moved.mean:.1%} of the longest side in a typical state, {moved.largest:.1%} where it moves most")
     print(f"up: {_direction(scene.workspace)}")
-    resting, worst = resting_overlaps(scene.rest), dict[frozenset[str], Overlap]()
+    at_rest = {frozenset((each.small, each.large)) for each in overlaps(scene.rest)}  # faults by themselves
+    worst: dict[frozenset[str], Overlap] = {}
     seen = 1.0
     pixels: list[int] = []
     for index in range(STATES):
         rng = example_rng(0, index)
         mesh = scene.sample_state(rng).mesh
-        for overlap in collisions(mesh, resting, STATE_TOLERANCE):
+        for overlap in overlaps(mesh, STATE_TOLERANCE):
             pair = frozenset((overlap.small, overlap.large))
-            worst[pair] = max(worst.get(pair, overlap), overlap, key=lambda each: each.share)
+            if pair not in at_rest:
+                worst[pair] = max(worst.get(pair, overlap), overlap, key=lambda each: each.share)
         share, count = _view(scene.workspace, mesh, rng)
         seen = min(seen, share)
         pixels.append(count)

@@ -4,7 +4,7 @@ A joint moves all that hangs on its smaller side: what is still connected to it 
 the motion leaves closed. Its range is as far as nothing collides, up to a limit: first by itself, then with the others.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 
@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from mereo.deformation.maps import Compose, Rigid
 from mereo.geometry.mesh import Segment, SegmentedMesh, surface_points
-from mereo.geometry.mesh_check import Overlap, overlaps
+from mereo.geometry.mesh_check import overlaps
 
 # --- contacts ---------------------------------------------------------------------------------------------------------
 
@@ -351,7 +351,7 @@ class _CollisionTest:
     def __init__(self, mesh: SegmentedMesh) -> None:
         self.mesh = mesh
         self.reach = CLEARANCE * float((mesh.bounds[1] - mesh.bounds[0]).max())
-        self._resting = resting_overlaps(mesh)
+        self._resting = {frozenset((each.small, each.large)): each.share for each in overlaps(mesh, 0.0)}
         self._known = dict[tuple[tuple[int, int], tuple[Chain, Chain]], bool]()
 
     def free(self, joint: Joint, steps: Sequence[float]) -> float:
@@ -372,10 +372,11 @@ class _CollisionTest:
         keys = {pair: _relative(*(chains[index] for index in pair)) for pair in combinations(range(len(chains)), 2)}
         keys = {pair: key for pair, key in keys.items() if any(key)}
         untested = {pair for pair, key in keys.items() if (pair, key) not in self._known}
-        found = collisions(self.mesh.with_vertices(places), self._resting, COLLIDES, untested) if untested else []
-        names = {frozenset((each.small, each.large)) for each in found}
+        found = overlaps(self.mesh.with_vertices(places), COLLIDES, untested) if untested else ()
+        shares = {frozenset((each.small, each.large)): each.share for each in found}
         for pair in untested:
-            self._known[pair, keys[pair]] = frozenset(self.mesh.names[index] for index in pair) in names
+            names = frozenset(self.mesh.names[index] for index in pair)
+            self._known[pair, keys[pair]] = shares.get(names, 0.0) > self._resting.get(names, 0.0) + COLLIDES
         return [pair for pair, key in keys.items() if self._known[pair, key]]
 
 
@@ -394,29 +395,6 @@ def _motion(joint: Joint, way: float) -> Rigid:
     """Rigid motion of a joint by an angle in degrees, or a way in the mesh's unit."""
     turn, shift = (np.deg2rad(way) * joint.axis, np.zeros(3)) if joint.hinge else (np.zeros(3), way * joint.axis)
     return Rigid(turn, shift, joint.contact.point)
-
-
-Resting = dict[frozenset[str], float]
-
-
-def resting_overlaps(mesh: SegmentedMesh) -> Resting:
-    """Shares by which pairs of segments overlap at rest, of those that do."""
-    return {frozenset((each.small, each.large)): each.share for each in overlaps(mesh, 0.0)}
-
-
-def collisions(
-    mesh: SegmentedMesh, resting: Resting, tolerance: float, among: Collection[tuple[int, int]] | None = None
-) -> list[Overlap]:
-    """Overlaps of a moved mesh that exceed those at rest by more than a tolerance.
-
-    Args:
-        mesh: the segments where they are now.
-        resting: of the same segments at rest, from ``resting_overlaps``.
-        tolerance: share of a segment's volume, from 0 to 1.
-        among: pairs of indices, the lower one first, to which the test is limited.
-    """
-    found = overlaps(mesh, tolerance, among)
-    return [each for each in found if each.share > resting.get(frozenset((each.small, each.large)), 0.0) + tolerance]
 
 
 def _narrowed(test: _CollisionTest, joints: Sequence[Joint]) -> tuple[Joint, ...]:
