@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from cad_objects import tongs, write_parts, write_pliers
 from manifold3d import Manifold
 from scene_files import write_bar, write_mesh
@@ -30,6 +31,7 @@ from mereo.scenes.files.template import (
     MOTION,
     UNPLACED,
     default_deformations,
+    flat_base,
     material_points,
     motion,
     random_motion,
@@ -244,7 +246,7 @@ def test_the_picture_is_filled_and_nothing_is_cut(pliers: Scene) -> None:
 def test_up_is_told_by_the_kind_of_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for suffix, axis in (("stl", [0, 0, 1]), ("obj", [0, 1, 0]), ("glb", [0, 1, 0])):
         file = write_mesh(ball((0, 0, 0), 3.0, level=1), tmp_path / f"a.{suffix}")
-        path = write_scene_file([file], tmp_path / f"{suffix}.yaml")
+        path = write_scene_file([file], tmp_path / f"{suffix}.yaml", aperture=140.0)
         assert f"axis: {axis}  # the middle of that cone" in path.read_text()
     check_scene(str(path))
     printed = capsys.readouterr().out
@@ -252,6 +254,75 @@ def test_up_is_told_by_the_kind_of_file(tmp_path: Path, capsys: pytest.CaptureFi
     assert re.search(r"motion: [45]\.\d% of the longest side in a typical state, ", printed)
     pixels = int(re.search(r"shows it in (\d+) of 9,216 pixels", printed)[1])  # type: ignore[index]
     assert pixels > 2500
+
+
+def test_the_camera_looks_from_everywhere_unless_it_is_narrowed(tmp_path: Path) -> None:
+    file = write_mesh(box((0, 0, 0), (30, 20, 10)), tmp_path / "a.stl")
+    written = load_scene(write_scene_file([file], tmp_path / "a.yaml")).workspace
+    assert written.all_around and written.any_roll and written.axis == (0.0, 0.0, 1.0)
+    narrow = load_scene(write_scene_file([file], tmp_path / "b.yaml", aperture=140.0)).workspace
+    assert np.rad2deg(narrow.aperture_rad) == pytest.approx(140) and not narrow.any_roll
+
+
+def dome() -> Segment:
+    """Ball of radius 1 that is cut flat at z = -0.3."""
+    whole = ball((0, 0, 0), 1.0)
+    return replace(whole, vertices=np.maximum(whole.vertices, (-np.inf, -np.inf, -0.3)))
+
+
+def test_a_flat_base_is_found_in_any_position() -> None:
+    for turn in (
+        Rigid(np.zeros(3), np.zeros(3), np.zeros(3)),
+        Rigid(np.array([0.3, -0.5, 0.2]), np.ones(3), np.ones(3)),
+    ):
+        base = flat_base(SegmentedMesh((replace(dome(), vertices=turn(dome().vertices)),)), (0.0, 0.0, 1.0))
+        assert base is not None
+        start, end = turn(np.array([[0.0, 0, 0], [0, 0, -1]]))
+        assert base.normal @ (end - start) > 0.999
+        # a disc of radius sqrt(1 - 0.3^2), and the cap of height 1.3 above it
+        assert base.share == pytest.approx(0.91 / (0.91 + 2 * 1.3), abs=0.01)
+
+
+def test_a_box_stands_on_the_side_that_is_down() -> None:
+    for up in ((0, 0, 1), (0, -1, 0)):
+        base = flat_base(SegmentedMesh((box((0, 0, 0), (4, 3, 3)),)), up)
+        assert base is not None
+        np.testing.assert_array_equal(base.normal, -np.array(up))
+        assert base.share == pytest.approx(12 / 66)
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        trimesh.creation.icosphere(4),
+        trimesh.creation.torus(3, 1),
+        trimesh.creation.capsule(3, 1),
+        trimesh.creation.cylinder(1, 12),  # stands on its ends, but falls over
+        trimesh.creation.icosphere(4).apply_scale([1, 0.7, 0.25]),
+    ],
+    ids=["ball", "ring", "capsule", "rod", "pebble"],
+)
+def test_what_is_round_or_falls_over_has_no_base(shape: trimesh.Trimesh) -> None:
+    part = Segment("part", (0, 0, 0), np.array(shape.vertices), np.array(shape.faces))
+    assert flat_base(SegmentedMesh((part,)), (0.0, 0.0, 1.0)) is None
+
+
+def test_a_base_is_named_where_the_camera_looks_from_below(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = write_mesh(dome(), tmp_path / "dome.obj")
+    sentences: list[str] = []
+    path = write_scene_file([file], tmp_path / "dome.yaml", report=sentences.append)
+    check_scene(str(path))
+    (sentence,) = sentences
+    assert sentence in capsys.readouterr().out.splitlines()
+    assert sentence == (
+        "base: it can stand on a flat base (normal 0 0 -1, 26% of its hull): if it stays on a table, the camera never "
+        "sees it from below; narrow it with `camera: {axis: [0, 0, 1], aperture: 180}`"
+    )
+    text = path.read_text().replace("aperture: 360", "aperture: 180")
+    assert "axis: [0, 0, 1]  # the middle of that cone" in text  # although y is up in most OBJ files
+    path.write_text(text)
+    check_scene(str(path))
+    assert "26% of its hull), and the camera never looks from below" in capsys.readouterr().out
 
 
 def test_a_spacing_that_does_not_fit_is_explained(tmp_path: Path) -> None:

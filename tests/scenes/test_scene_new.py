@@ -174,6 +174,11 @@ def test_the_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
     assert command_line.main(["scene", "new", "a.ply", "--units", "cm"]) == 0
     assert "units: cm  # as you said" in (tmp_path / "a.yaml").read_text()
     assert "wrote a.yaml" in capsys.readouterr().out
+    assert command_line.main(["scene", "new", "a.ply", "--output", "b b.yaml", "--aperture", "90"]) == 0
+    assert "aperture: 90 " in (tmp_path / "b b.yaml").read_text()
+    assert "mereo scene check 'b b.yaml'" in capsys.readouterr().out
+    assert command_line.main(["scene", "new", "a.ply", "--output", "c.yaml", "--aperture", "400"]) == 2
+    assert "--aperture is 400" in capsys.readouterr().err and not (tmp_path / "c.yaml").exists()
     assert command_line.main(["scene", "check", "a.yaml"]) == 0
     assert "a: 1 segments, closed" in capsys.readouterr().out
     assert command_line.main(["scene", "preview", "a.yaml", "--output", "a.png"]) == 0

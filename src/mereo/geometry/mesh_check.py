@@ -177,12 +177,10 @@ def overlaps(
     """
     bodies, nesting = [_Body(segment) for segment in mesh.segments], set(mesh.nesting)
     order = sorted(range(len(bodies)), key=lambda index: bodies[index].box_volume)
+    chosen = combinations(order, 2) if among is None else (sorted(pair, key=order.index) for pair in sorted(among))
     pairs = []
-    for small, large in combinations(order, 2):
-        pair = (min(small, large), max(small, large))
-        if among is not None and pair not in among:
-            continue
-        nested = pair in nesting
+    for small, large in chosen:
+        nested = (min(small, large), max(small, large)) in nesting
         inner, outer = sorted((small, large)) if nested else (small, large)
         share = bodies[inner].share_in(bodies[outer])
         pairs.append(Overlap(mesh.names[inner], mesh.names[outer], 1.0 - share if nested else share, nested))

@@ -193,15 +193,15 @@ SLIDES = (0.5, 0.25, 0.1)
 """Ranges of a slide that are tried, in lengths of the contact."""
 
 COLLIDES = 0.01
-"""Share of a segment that another may overlap within a joint's range, beyond that at rest: half of what a check allows,
-because states lie between those that are tried."""
+"""Share of a segment that another may overlap within a joint's range: half of what a check allows, because states lie
+between those that are tried."""
 
 STATES = 128
 """States in which all joints are tried: at most half of them corners of the box of ranges, then some with joints at
 rest, then random ones."""
 
-MOST_FACES = 1_000_000
-"""Faces of all states together; objects of more than a few thousand faces are tried in fewer, in an eighth at least."""
+MOST_MOVED = 10_000_000
+"""Faces of all states together, times joints; what has more of them is tried in fewer states, an eighth at least."""
 
 MOST_PASSES = 8
 """Passes over all states, in states; what still collides then is given up."""
@@ -351,7 +351,6 @@ class _CollisionTest:
     def __init__(self, mesh: SegmentedMesh) -> None:
         self.mesh = mesh
         self.reach = CLEARANCE * float((mesh.bounds[1] - mesh.bounds[0]).max())
-        self._resting = {frozenset((each.small, each.large)): each.share for each in overlaps(mesh, 0.0)}
         self._known = dict[tuple[tuple[int, int], tuple[Chain, Chain]], bool]()
 
     def free(self, joint: Joint, steps: Sequence[float]) -> float:
@@ -369,14 +368,18 @@ class _CollisionTest:
             Compose(tuple(_motion(*each) for each in chain))(segment.vertices) if chain else segment.vertices
             for chain, segment in zip(chains, self.mesh.segments, strict=True)
         ]
-        keys = {pair: _relative(*(chains[index] for index in pair)) for pair in combinations(range(len(chains)), 2)}
-        keys = {pair: key for pair, key in keys.items() if any(key)}
+        apart = {
+            (min(index, other), max(index, other))
+            for index, chain in enumerate(chains)
+            for other in (range(len(chains)) if chain else ())
+            if chains[other] != chain
+        }
+        keys = {(i, j): _relative(chains[i], chains[j]) for i, j in sorted(apart)}
         untested = {pair for pair, key in keys.items() if (pair, key) not in self._known}
         found = overlaps(self.mesh.with_vertices(places), COLLIDES, untested) if untested else ()
-        shares = {frozenset((each.small, each.large)): each.share for each in found}
+        overlapping = {frozenset((each.small, each.large)) for each in found}
         for pair in untested:
-            names = frozenset(self.mesh.names[index] for index in pair)
-            self._known[pair, keys[pair]] = shares.get(names, 0.0) > self._resting.get(names, 0.0) + COLLIDES
+            self._known[pair, keys[pair]] = frozenset(self.mesh.names[index] for index in pair) in overlapping
         return [pair for pair, key in keys.items() if self._known[pair, key]]
 
 
@@ -406,7 +409,7 @@ def _narrowed(test: _CollisionTest, joints: Sequence[Joint]) -> tuple[Joint, ...
     if len(joints) < 2:
         return tuple(joints)
     faces = sum(len(segment.faces) for segment in test.mesh.segments)
-    shares = _combinations(len(joints), int(np.clip(MOST_FACES // faces, STATES // 8, STATES)))
+    shares = _combinations(len(joints), int(np.clip(MOST_MOVED // (faces * len(joints)), STATES // 8, STATES)))
     alone = np.array([joint.alone for joint in joints])
     ranges, tries, clean = alone.copy(), 0, False
     while not clean:

@@ -12,11 +12,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import trimesh
 import yaml
 from jaxtyping import Float, Int
+from scipy.spatial import ConvexHull, QhullError
 
-from mereo.deformation.maps import Deformation
+from mereo.deformation.maps import Deformation, unit
 from mereo.deformation.samplers import RandomMotion, distance_from_line
+from mereo.geometry.brief import counted
 from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, surface_points
 from mereo.geometry.mesh_check import likely_unit
@@ -25,7 +28,7 @@ from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.volume_files import is_volume, read_label_volume, segment_surfaces
 from mereo.scenes.files.deformation_blocks import BendBlock, DeformationBlock, LatticeBlock, Target
-from mereo.scenes.files.joints import SLIDES_ALONG, TURNS_ON, proposed_joints
+from mereo.scenes.files.joints import SLIDES_ALONG, TURNS_ON, Joint, proposed_joints
 from mereo.scenes.scene import SCENES, Workspace
 from mereo.scenes.seeds import example_rng
 
@@ -167,6 +170,99 @@ def random_motion(mesh: SegmentedMesh, blocks: tuple[DeformationBlock, ...], pla
     return RandomMotion(mesh, tuple((block.sampler(target), everything) for block in blocks))
 
 
+# --- the side on which it stands --------------------------------------------------------------------------------------
+
+THICKNESS_SHARE = 0.08
+"""Depth of what counts as the plane of a base, in ratios of the hull's volume to its area (a ball's radius is three):
+scans of flat faces are bumpy."""
+
+SAME_NORMAL = 0.98
+"""Least cosine of a face's normal with that of the base."""
+
+LEAST_BASE = 0.08
+"""Share of the hull's area within the outline of a base."""
+
+LEAST_COVER = 0.25
+"""Share of that outline that is surface of the object: three places of a rounded body are no base."""
+
+LEAST_TILT = float(np.tan(np.deg2rad(15.0)))
+"""Slope on which the object still stands."""
+
+MOST_FACETS = 200
+"""Faces of the hull, the largest first, whose normals are tried."""
+
+
+@dataclass(frozen=True, eq=False)
+class FlatBase:
+    """Flat face on which an object stands stably.
+
+    Attributes:
+        normal: outward unit vector, exactly along an axis where it is nearly.
+        share: of the area of the object's convex hull that lies within the outline of the face, from 0 to 1.
+    """
+
+    normal: Float[np.ndarray, "3"]
+    share: float
+
+    def describe(self, workspace: Workspace) -> str:
+        """One sentence: where it is, and what a camera in a workspace sees of it."""
+        normal = " ".join(f"{value:.2g}" for value in self.normal + 0.0)
+        text = f"it can stand on a flat base (normal {normal}, {self.share:.0%} of its hull)"
+        axis = np.array(workspace.axis) / np.linalg.norm(workspace.axis)
+        away = float(np.arccos(np.clip(axis @ self.normal, -1.0, 1.0)))
+        if away - workspace.aperture_rad / 2 > np.pi / 2 - 0.01:
+            return f"{text}, and the camera never looks from below"
+        return (
+            f"{text}: if it stays on a table, the camera never sees it from below; narrow it with "
+            f"`camera: {{axis: {_numbers(-self.normal)}, aperture: 180}}`"
+        )
+
+
+def flat_base(mesh: SegmentedMesh, up: Sequence[float]) -> FlatBase | None:
+    """Flat face on which an object can stand, the one opposite to ``up`` or else the largest; None where it has none.
+
+    It is a part of the surface near a plane that supports the convex hull, large enough, and so wide that the centre of
+    mass is above it also on a slope.
+    """
+    vertices, faces, _ = mesh.merged()
+    solid = trimesh.Trimesh(vertices - vertices.mean(axis=0), faces, process=False)
+    try:
+        hull = solid.convex_hull
+    except QhullError:  # it has no volume
+        return None
+    bases = list[FlatBase]()
+    for normal in hull.face_normals[np.argsort(-hull.area_faces, kind="stable")[:MOST_FACETS]]:
+        if not any(normal @ base.normal > SAME_NORMAL for base in bases):
+            base = _base(solid, hull, normal)
+            bases += [base] if base is not None else []
+    lowest = [base for base in bases if base.normal @ np.array(up) < -SAME_NORMAL * np.linalg.norm(up)]
+    return max(lowest or bases, key=lambda base: base.share, default=None)
+
+
+def _base(solid: trimesh.Trimesh, hull: trimesh.Trimesh, normal: Float[np.ndarray, "3"]) -> FlatBase | None:
+    """Base with about this normal."""
+    heights = solid.vertices @ normal
+    top = heights.max() - THICKNESS_SHARE * hull.volume / hull.area
+    crossed = solid.triangles_cross * np.sign(solid.triangles_cross @ normal)[:, None]
+    areas = np.linalg.norm(crossed, axis=1)
+    on = (heights[solid.faces].min(axis=1) > top) & (crossed @ normal > SAME_NORMAL * areas)
+    if areas[on].sum() / 2 < LEAST_COVER * LEAST_BASE * hull.area:
+        return None
+    normal = unit(crossed[on].sum(axis=0))
+    across = np.linalg.svd(normal[None])[2][1:]
+    outline = ConvexHull(solid.vertices[np.unique(solid.faces[on])] @ across.T)
+    center = (
+        solid.center_mass if solid.volume > 0.01 * hull.volume else hull.center_mass
+    )  # of open meshes it is nonsense
+    inside = -float((outline.equations[:, :2] @ (across @ center) + outline.equations[:, 2]).max())
+    share, cover = outline.volume / hull.area, areas[on].sum() / 2 / outline.volume
+    height = float((solid.vertices @ normal).max() - center @ normal)
+    if share < LEAST_BASE or cover < LEAST_COVER or inside < LEAST_TILT * height:
+        return None
+    nearest = np.round(normal)
+    return FlatBase(nearest if np.abs(normal).max() > np.cos(np.deg2rad(3.0)) else normal, float(share))
+
+
 # --- the camera -------------------------------------------------------------------------------------------------------
 
 
@@ -231,7 +327,12 @@ class _Source:
 
 
 def write_scene_file(
-    files: Sequence[Path], output: Path | None = None, units: str | None = None, name: str | None = None
+    files: Sequence[Path],
+    output: Path | None = None,
+    units: str | None = None,
+    name: str | None = None,
+    aperture: float = 360.0,
+    report: Callable[[str], None] | None = None,
 ) -> Path:
     """Write a commented YAML file that names ``files`` relative to itself; returns its path.
 
@@ -240,6 +341,9 @@ def write_scene_file(
         output: by default ``NAME.yaml`` in the working directory, after the first file.
         units: a key of ``geometry.conventions.UNITS_M``; None guesses.
         name: of the scene; by default that of ``output``.
+        aperture: of the cone of directions, about the side that is up, from which the camera looks, in degrees above 0
+            to 360: all around.
+        report: called with each sentence about what was found, once the file is written.
 
     Raises ``FileExistsError`` where ``output`` exists, ``ValueError`` and ``FileNotFoundError`` for unusable files.
     """
@@ -253,8 +357,12 @@ def write_scene_file(
     if path.exists():
         raise FileExistsError(f"{path} exists; it is not overwritten: choose another --output")
     source = _source(list(files), path.parent)
+    text, notes = _draft(name, source, units, aperture)
     with atomic_file(path, force=False) as temporary:
-        temporary.write_text(_text(name, source, units), encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8")
+    if report is not None:
+        for note in notes:
+            report(note)
     return path
 
 
@@ -357,45 +465,80 @@ def _up_of(file: Path) -> tuple[int, str]:
 # --- the text ---------------------------------------------------------------------------------------------------------
 
 
-def _text(name: str, source: _Source, units: str | None) -> str:
+def _draft(name: str, source: _Source, units: str | None, aperture: float) -> tuple[str, list[str]]:
+    """Text of a scene file, and sentences about what it proposes."""
     sides = np.ptp(source.mesh.bounds, axis=0)
     size = rounded(min(SIZE, LONGEST * float(sides.min() / sides.max())), 3)
     placement = placed(source.mesh, size)
     blocks = default_deformations(source.mesh)
     rest = source.mesh.with_vertices([placement.apply(segment.vertices) for segment in source.mesh.segments])
     x, y, z = np.eye(3)[source.up].tolist()
-    near, far, view = _default_view(rest, random_motion(rest, blocks, placement), Workspace(axis=(x, y, z)))
+    up_reason, base = source.up_reason, flat_base(source.mesh, (x, y, z)) if source.assembly else None
+    if base is not None:
+        up_reason, (x, y, z) = "it stands on its flat base", [rounded(value, 3) for value in -base.normal]
+    workspace = Workspace(float(np.deg2rad(aperture)), axis=(x, y, z), any_roll=aperture == 360.0)
+    near, far, view = _default_view(rest, random_motion(rest, blocks, placement), workspace)
     unit, reason = (units, "as you said") if units else (source.unit, source.reason)
-    bend, lattice = blocks[0], blocks[-1]
-    assert isinstance(bend, BendBlock) and isinstance(lattice, LatticeBlock)
-    return TEMPLATE.format(
+    joints = proposed_joints(source.mesh) if source.assembly else ()
+    text = TEMPLATE.format(
         name=quoted(name),
         block=source.block,
         unit=unit,
         reason=reason,
         sides=" x ".join(f"{side:.4g}" for side in sides),
         size=f"{size:g}",
-        up=[int(k == source.up) for k in range(3)],
-        up_reason=source.up_reason,
+        aperture=f"{aperture:g}",
+        up=_numbers(np.array((x, y, z))),
+        up_reason=up_reason,
         near=f"{near:g}",
         far=f"{far:g}",
+        roll="true" if workspace.any_roll else "false",
         view=view,
+        deformations=_deformations(source.mesh, blocks, joints),
+    )
+    return text, _notes(source.mesh, joints) + ([f"base: {base.describe(workspace)}"] if base is not None else [])
+
+
+def _notes(mesh: SegmentedMesh, joints: Sequence[Joint]) -> list[str]:
+    """Sentences about proposed joints."""
+    if not joints:
+        return []
+    count = counted(len(joints), "joint")
+    notes = [f"joints: its parts touch like {count}, proposed in comments: remove the # where it has them"]
+    for joint in joints:
+        if joint.narrowed:
+            names = ", ".join(mesh.names[index] for index in joint.moved)
+            way = "turns by" if joint.hinge else "slides by"
+            notes.append(f"  {names} {way} {_range(joint.most)}, {_narrowed(joint)}")
+    return notes
+
+
+def _narrowed(joint: Joint) -> str:
+    """Why the range of a joint is less than it could be by itself."""
+    return f"narrowed from {_range(joint.alone)}: beyond, joints collide together"
+
+
+def _deformations(mesh: SegmentedMesh, blocks: Sequence[BendBlock | LatticeBlock], joints: Sequence[Joint]) -> str:
+    """Lines of the list of deformations: joints in comments, what bends the whole, and others in comments."""
+    bend, lattice, sides = blocks[0], blocks[-1], np.ptp(mesh.bounds, axis=0)
+    assert isinstance(bend, BendBlock) and isinstance(lattice, LatticeBlock)
+    end, axis, length = _numbers(np.array(bend.origin)), [int(value) for value in bend.axis], f"{bend.length:g}"
+    soft = SOFT.format(
         spacing=f"{lattice.spacing:g}",
         strength=f"{lattice.strength:g}",
-        end=_numbers(np.array(bend.origin)),
-        axis=[int(value) for value in bend.axis],
-        length=f"{bend.length:g}",
+        end=end,
+        axis=axis,
+        length=length,
         angle=f"{bend.angle[1]:g}",
-        joints=_joints(source.mesh, source.assembly),
-        push=f"{0.1 * sides.min():.3g}",
-        reach=f"{0.5 * sides.min():.3g}",
     )
+    push, reach = f"{0.1 * sides.min():.3g}", f"{0.5 * sides.min():.3g}"
+    return _joints(mesh, joints) + soft + FURTHER.format(end=end, axis=axis, length=length, push=push, reach=reach)
 
 
-def _joints(mesh: SegmentedMesh, assembly: bool) -> str:
+def _joints(mesh: SegmentedMesh, joints: Sequence[Joint]) -> str:
     """Comments: the joints that the parts seem to have, and what each was derived from; else an example."""
     lines = list[str]()
-    for joint in proposed_joints(mesh) if assembly else ():
+    for joint in joints:
         contact = joint.contact
         kind = f"the round contact, radius {contact.radius:.3g}," if joint.hinge else "the flat contact"
         lines += [
@@ -405,7 +548,7 @@ def _joints(mesh: SegmentedMesh, assembly: bool) -> str:
             f"#    pivot: {_numbers(contact.point)}",
             f"#    axis: {_numbers(joint.axis)}",
             f"#    {'angle' if joint.hinge else 'slide'}: {_range(joint.most)}"
-            + (f"  # narrowed from {_range(joint.alone)}: beyond, joints collide together" if joint.narrowed else ""),
+            + (f"  # {_narrowed(joint)}" if joint.narrowed else ""),
         ]
     if not lines:
         return EXAMPLE_JOINT.format(part=quoted(mesh.names[-1]), center=_numbers(mesh.bounds.mean(axis=0)))
@@ -441,6 +584,37 @@ EXAMPLE_JOINT = """\
 #    angle: [-30, 30]
 """
 
+SOFT = """\
+  - type: bend  # along the longest side, to any side
+    origin: {end}
+    axis: {axis}
+    length: {length}
+    angle: [-{angle}, {angle}]
+  - type: lattice  # smooth and free-form: the object in a box of rubber
+    spacing: {spacing}  # of the points that are moved: wider is smoother
+    strength: {strength}  # from 0 to below 1, at which space might fold over
+  - type: lattice  # once more, for one alone is stiffer than rubber
+    spacing: {spacing}
+    strength: {strength}
+"""
+
+FURTHER = """\
+#  - type: twist
+#    origin: {end}
+#    axis: {axis}
+#    length: {length}
+#    angle: [-30, 30]
+#  - type: squash  # along a random axis, with the volume kept
+#    factor: [0.9, 1.1]
+#  - type: waves
+#    wavelength: [{length}, {length}]
+#    strength: 0.3
+#  - type: push  # an instrument pulls (above 0) or presses (below 0) at a random place
+#    distance: [-{push}, {push}]
+#    tip: {push}
+#    reach: {reach}
+"""
+
 TEMPLATE = """\
 # A scene for mereo: what the object is, how it may deform, and from where it is seen.
 # Lengths and places are those of the files, angles are degrees, a range is [least, most].
@@ -457,41 +631,16 @@ source: my own  # where the meshes come from, and their licence; kept with datas
 size: {size}
 
 camera:
-  aperture: 140  # of the cone of directions from which the camera looks; 360 is all around
+  aperture: {aperture}  # of the cone of directions from which the camera looks: 360 is all around, 180 never from below
   axis: {up}  # the middle of that cone, as seen from the object: above it, where {up_reason}
   distance: [{near}, {far}]  # from the object's centre, in scene units
-  roll: false  # whether the camera may be rolled about its line of sight
+  roll: {roll}  # whether the camera may be rolled about its line of sight
   field_of_view: {view}  # as narrow as still shows all of the object at the nearest distance
 
 # Drawn at random within these bounds for every example, and applied in this order to the segments named, or to all.
 # Segments that touch should move by the same deformations, so that they stay in contact. These bend the object as if it
 # were of rubber, as far as suits soft things: for what has joints, drop them and say how its parts move.
 deformations:
-{joints}  - type: bend  # along the longest side, to any side
-    origin: {end}
-    axis: {axis}
-    length: {length}
-    angle: [-{angle}, {angle}]
-  - type: lattice  # smooth and free-form: the object in a box of rubber
-    spacing: {spacing}  # of the points that are moved: wider is smoother
-    strength: {strength}  # from 0 to below 1, at which space might fold over
-  - type: lattice  # once more, for one alone is stiffer than rubber
-    spacing: {spacing}
-    strength: {strength}
-#  - type: twist
-#    origin: {end}
-#    axis: {axis}
-#    length: {length}
-#    angle: [-30, 30]
-#  - type: squash  # along a random axis, with the volume kept
-#    factor: [0.9, 1.1]
-#  - type: waves
-#    wavelength: [{length}, {length}]
-#    strength: 0.3
-#  - type: push  # an instrument pulls (above 0) or presses (below 0) at a random place
-#    distance: [-{push}, {push}]
-#    tip: {push}
-#    reach: {reach}
-# Recorded frames of a simulator take the place of all deformations:
+{deformations}# Recorded frames of a simulator take the place of all deformations:
 #states: states.npz
 """
