@@ -175,7 +175,7 @@ def overlaps(
         tolerance: share of a segment's volume, from 0 to 1.
         among: pairs of indices, the lower one first, to which the test is limited.
     """
-    bodies, nesting = [_Body(segment) for segment in mesh.segments], set(mesh.nesting)
+    bodies, nesting, names = [_Body(segment) for segment in mesh.segments], set(mesh.nesting), mesh.names
     order = sorted(range(len(bodies)), key=lambda index: bodies[index].box_volume)
     chosen = combinations(order, 2) if among is None else (sorted(pair, key=order.index) for pair in sorted(among))
     pairs = []
@@ -183,7 +183,7 @@ def overlaps(
         nested = (min(small, large), max(small, large)) in nesting
         inner, outer = sorted((small, large)) if nested else (small, large)
         share = bodies[inner].share_in(bodies[outer])
-        pairs.append(Overlap(mesh.names[inner], mesh.names[outer], 1.0 - share if nested else share, nested))
+        pairs.append(Overlap(names[inner], names[outer], 1.0 - share if nested else share, nested))
     return tuple(pair for pair in pairs if pair.share > tolerance)
 
 
@@ -198,7 +198,7 @@ class _Body:
 
     def __init__(self, segment: Segment) -> None:
         self.segment = segment
-        low, high = segment.bounds
+        self.bounds = low, high = segment.bounds
         self.box_volume = float(np.prod(high - low))
         self.axes = [low[k] + (np.arange(CELLS) + 0.5) * (high[k] - low[k]) / CELLS for k in range(3)]
 
@@ -219,7 +219,7 @@ class _Body:
 
     def share_in(self, other: "_Body") -> float:
         """How much of the volume lies in another segment, from 0 to 1."""
-        box, around = self.segment.bounds, other.segment.bounds
+        box, around = self.bounds, other.bounds
         if (around[1] <= box[0]).any() or (around[0] >= box[1]).any():
             return 0.0
         if self.solid is None or other.solid is None:

@@ -377,9 +377,9 @@ class _CollisionTest:
         keys = {(i, j): _relative(chains[i], chains[j]) for i, j in sorted(apart)}
         untested = {pair for pair, key in keys.items() if (pair, key) not in self._known}
         found = overlaps(self.mesh.with_vertices(places), COLLIDES, untested) if untested else ()
-        overlapping = {frozenset((each.small, each.large)) for each in found}
-        for pair in untested:
-            self._known[pair, keys[pair]] = frozenset(self.mesh.names[index] for index in pair) in overlapping
+        index = {name: number for number, name in enumerate(self.mesh.names)}
+        overlapping = {tuple(sorted((index[each.small], index[each.large]))) for each in found}
+        self._known |= {(pair, keys[pair]): pair in overlapping for pair in untested}
         return [pair for pair, key in keys.items() if self._known[pair, key]]
 
 
