@@ -1,18 +1,21 @@
 """Parts as CAD programs write them: long faces bend with the object, overlaps are exact and say their cause."""
 
 import re
+from collections.abc import Iterator
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
-from cad_objects import write_pliers
+import trimesh
+from cad_objects import tongs, write_parts, write_pliers
 from manifold3d import Manifold
 from scene_files import write_bar, write_mesh
 from shapes import ball, box
 
 from mereo.deformation.maps import Rigid
-from mereo.deformation.samplers import cubic_cells
+from mereo.deformation.samplers import JointSampler, RandomMotion, cubic_cells
 from mereo.deformation.warps import Squash
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import Segment, SegmentedMesh
@@ -22,12 +25,13 @@ from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.learning.object_files import describe_scene_file
 from mereo.scenes.files.build import TOLERANCE, refined
-from mereo.scenes.files.check import check_scene
+from mereo.scenes.files.check import STATE_TOLERANCE, check_scene
 from mereo.scenes.files.joints import contacts
 from mereo.scenes.files.template import (
     MOTION,
     UNPLACED,
     default_deformations,
+    flat_base,
     material_points,
     motion,
     random_motion,
@@ -177,6 +181,15 @@ def test_an_overlap_in_random_states_is_told_with_its_cause(
         assert (cause or "") in printed and "nothing to repair" not in printed
 
 
+def test_an_overlap_at_rest_is_one_fault(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Deformations have not caused it: no random state counts it again."""
+    files = [write_mesh(box((low, 0, 0), (low + 20, 10, 10)), tmp_path / f"{low}.stl") for low in (0, 15)]
+    path = write_scene_file(files, tmp_path / "a.yaml")
+    with pytest.raises(ValueError, match=r"has 1 fault, listed above: repair the meshes with --repair$"):
+        check_scene(str(path))
+    assert "overlap in 25.00%" in capsys.readouterr().out
+
+
 # --- defaults ---------------------------------------------------------------------------------------------------------
 
 
@@ -233,7 +246,7 @@ def test_the_picture_is_filled_and_nothing_is_cut(pliers: Scene) -> None:
 def test_up_is_told_by_the_kind_of_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for suffix, axis in (("stl", [0, 0, 1]), ("obj", [0, 1, 0]), ("glb", [0, 1, 0])):
         file = write_mesh(ball((0, 0, 0), 3.0, level=1), tmp_path / f"a.{suffix}")
-        path = write_scene_file([file], tmp_path / f"{suffix}.yaml")
+        path = write_scene_file([file], tmp_path / f"{suffix}.yaml", aperture=140.0)
         assert f"axis: {axis}  # the middle of that cone" in path.read_text()
     check_scene(str(path))
     printed = capsys.readouterr().out
@@ -241,6 +254,75 @@ def test_up_is_told_by_the_kind_of_file(tmp_path: Path, capsys: pytest.CaptureFi
     assert re.search(r"motion: [45]\.\d% of the longest side in a typical state, ", printed)
     pixels = int(re.search(r"shows it in (\d+) of 9,216 pixels", printed)[1])  # type: ignore[index]
     assert pixels > 2500
+
+
+def test_the_camera_looks_from_everywhere_unless_it_is_narrowed(tmp_path: Path) -> None:
+    file = write_mesh(box((0, 0, 0), (30, 20, 10)), tmp_path / "a.stl")
+    written = load_scene(write_scene_file([file], tmp_path / "a.yaml")).workspace
+    assert written.all_around and written.any_roll and written.axis == (0.0, 0.0, 1.0)
+    narrow = load_scene(write_scene_file([file], tmp_path / "b.yaml", aperture=140.0)).workspace
+    assert np.rad2deg(narrow.aperture_rad) == pytest.approx(140) and not narrow.any_roll
+
+
+def dome() -> Segment:
+    """Ball of radius 1 that is cut flat at z = -0.3."""
+    whole = ball((0, 0, 0), 1.0)
+    return replace(whole, vertices=np.maximum(whole.vertices, (-np.inf, -np.inf, -0.3)))
+
+
+def test_a_flat_base_is_found_in_any_position() -> None:
+    for turn in (
+        Rigid(np.zeros(3), np.zeros(3), np.zeros(3)),
+        Rigid(np.array([0.3, -0.5, 0.2]), np.ones(3), np.ones(3)),
+    ):
+        base = flat_base(SegmentedMesh((replace(dome(), vertices=turn(dome().vertices)),)), (0.0, 0.0, 1.0))
+        assert base is not None
+        start, end = turn(np.array([[0.0, 0, 0], [0, 0, -1]]))
+        assert base.normal @ (end - start) > 0.999
+        # a disc of radius sqrt(1 - 0.3^2), and the cap of height 1.3 above it
+        assert base.share == pytest.approx(0.91 / (0.91 + 2 * 1.3), abs=0.01)
+
+
+def test_a_box_stands_on_the_side_that_is_down() -> None:
+    for up in ((0, 0, 1), (0, -1, 0)):
+        base = flat_base(SegmentedMesh((box((0, 0, 0), (4, 3, 3)),)), up)
+        assert base is not None
+        np.testing.assert_array_equal(base.normal, -np.array(up))
+        assert base.share == pytest.approx(12 / 66)
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        trimesh.creation.icosphere(4),
+        trimesh.creation.torus(3, 1),
+        trimesh.creation.capsule(3, 1),
+        trimesh.creation.cylinder(1, 12),  # stands on its ends, but falls over
+        trimesh.creation.icosphere(4).apply_scale([1, 0.7, 0.25]),
+    ],
+    ids=["ball", "ring", "capsule", "rod", "pebble"],
+)
+def test_what_is_round_or_falls_over_has_no_base(shape: trimesh.Trimesh) -> None:
+    part = Segment("part", (0, 0, 0), np.array(shape.vertices), np.array(shape.faces))
+    assert flat_base(SegmentedMesh((part,)), (0.0, 0.0, 1.0)) is None
+
+
+def test_a_base_is_named_where_the_camera_looks_from_below(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = write_mesh(dome(), tmp_path / "dome.obj")
+    sentences: list[str] = []
+    path = write_scene_file([file], tmp_path / "dome.yaml", report=sentences.append)
+    check_scene(str(path))
+    (sentence,) = sentences
+    assert sentence in capsys.readouterr().out.splitlines()
+    assert sentence == (
+        "base: it can stand on a flat base (normal 0 0 -1, 26% of its hull): if it stays on a table, the camera never "
+        "sees it from below; narrow it with `camera: {axis: [0, 0, 1], aperture: 180}`"
+    )
+    text = path.read_text().replace("aperture: 360", "aperture: 180")
+    assert "axis: [0, 0, 1]  # the middle of that cone" in text  # although y is up in most OBJ files
+    path.write_text(text)
+    check_scene(str(path))
+    assert "26% of its hull), and the camera never looks from below" in capsys.readouterr().out
 
 
 def test_a_spacing_that_does_not_fit_is_explained(tmp_path: Path) -> None:
@@ -265,15 +347,54 @@ def test_the_pliers_hinge_is_proposed_and_valid(written: Path, capsys: pytest.Ca
         "#  - type: joint  # turns on the round contact, radius 4.98, of pin and lower\n#    segments: [lower]" in text
     )
     assert "Its parts touch like 2 joints, which that file proposes in comments" in describe_scene_file(written)
-    head, tail = text.split("deformations:", 1)
-    path = written.with_name("hinges.yaml")
-    path.write_text(head + "deformations:" + re.sub("^#  ", "  ", tail.split("  - type: bend")[0], flags=re.MULTILINE))
+    path = with_joints(written, "hinges.yaml")
     check_scene(str(path))
     assert "fault" not in capsys.readouterr().out
     scene = load_scene(path)
     scale, middle = scene.T_scene_source[0, 0], scene.T_scene_source[:3, 3]
     for _, deform in zip(range(2), scene.sample_deformations(np.random.default_rng(0)), strict=False):
         assert np.linalg.norm((deform(middle[None]) - middle)[0, :2]) < 0.05 * scale  # the pin's axis stays
+
+
+def with_joints(written: Path, name: str) -> Path:
+    """Copy of a written scene file with the proposed joints alone."""
+    head, tail = written.read_text().split("deformations:", 1)
+    path = written.with_name(name)
+    path.write_text(head + "deformations:" + re.sub("^#  ", "  ", tail.split("  - type: bend")[0], flags=re.MULTILINE))
+    return path
+
+
+def test_joints_that_collide_together_are_narrowed_until_no_combination_does(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each lever turns by 30 degrees alone; both inwards meet at the middle, which the check refuses."""
+    written = write_scene_file(write_parts(tmp_path, tongs()), tmp_path / "tongs.yaml")
+    path = with_joints(written, "joints.yaml")
+    check_scene(str(path))
+    assert "fault" not in capsys.readouterr().out
+    reason = re.compile(r"angle: (\[.*\])  # narrowed from (\[-30, 30\]): beyond, joints collide together")
+    assert len(reason.findall(path.read_text())) == 2
+    for motions in corners_and_random(load_scene(path)):
+        assert not overlaps(motions, STATE_TOLERANCE)
+    former = written.with_name("former.yaml")
+    former.write_text(reason.sub(r"angle: \2", path.read_text()))
+    with pytest.raises(ValueError, match=r"has 1 fault, listed above: correct its deformations$"):
+        check_scene(str(former))
+    assert "fault: in random states" in capsys.readouterr().out
+
+
+def corners_and_random(scene: Scene) -> Iterator[SegmentedMesh]:
+    """States at the corners of the box of two joints' ranges, and within it."""
+    draw, rng = scene.sample_deformations, np.random.default_rng(1)
+    assert isinstance(draw, RandomMotion)
+    joints = [(sampler, members) for sampler, members in draw.steps if isinstance(sampler, JointSampler)]
+    angles = [sampler.angle_rad for sampler, _ in joints]
+    for chosen in (*product(*angles), *(tuple(rng.uniform(*np.transpose(angles))) for _ in range(30))):
+        steps = [
+            (replace(sampler, angle_rad=(angle, angle)), members)
+            for (sampler, members), angle in zip(joints, chosen, strict=True)
+        ]
+        yield scene.deform(replace(draw, steps=tuple(steps))(rng)).mesh
 
 
 def test_planes_cylinders_and_other_contacts() -> None:

@@ -1,5 +1,6 @@
 """`mereo scene new`: the file it writes loads as it is, fits the object, and explains every choice."""
 
+import os
 import re
 from pathlib import Path
 
@@ -105,6 +106,61 @@ def test_nothing_is_overwritten_and_bad_input_is_explained(tmp_path: Path) -> No
     assert not (tmp_path / "b.yaml").exists()
 
 
+AWKWARD = (
+    "true",
+    "null",
+    "1",
+    "1e-3",
+    "2026-11-25",
+    "~",
+    "a: b #c",
+    "[x], y",
+    "it's",
+    " - ",
+    "naïve",
+    "two\nlines\x7f",
+)
+
+
+def test_every_name_of_a_file_is_a_segment(tmp_path: Path) -> None:
+    """Also one that YAML takes for another kind of value, or for several; what a name cannot have is replaced."""
+    files = [write_mesh(box((10 * k, 0, 0), (10 * k + 9, 9, 9)), tmp_path / f"{k}.stl") for k in range(len(AWKWARD))]
+    named = [file.rename(tmp_path / f"{name}.stl") for file, name in zip(files, AWKWARD, strict=True)]
+    path = write_scene_file(named, tmp_path / "on.yaml")
+    scene = load_scene(path)
+    assert (scene.name, scene.rest.names) == ("on", (*AWKWARD[:-1], "two_lines_"))
+    path.write_text(uncommented(path.read_text()))
+    assert load_scene(path).rest.names == scene.rest.names
+    assert load_scene(write_scene_file(named[:1], tmp_path / "1.yaml")).name == "1"
+
+
+def test_every_name_of_a_part_is_a_segment(tmp_path: Path) -> None:
+    def write(*names: str) -> Path:
+        model = trimesh.Scene()
+        for low, name in enumerate(names):
+            part = box((low, 0, 0), (low + 0.9, 1, 1))
+            model.add_geometry(trimesh.Trimesh(part.vertices, part.faces), node_name=name, geom_name=name)
+        model.export(tmp_path / "model.glb")
+        return tmp_path / "model.glb"
+
+    path = write_scene_file([write("Body/Lid\n2", "null", "3")], tmp_path / "a.yaml")
+    assert load_scene(path).rest.names == ("Body_Lid_2", "null", "3")
+    with pytest.raises(ValueError, match="two parts are called 'a_b'; segments are named after them: rename one"):
+        write_scene_file([write("a/b", "a_b")], tmp_path / "b.yaml")
+    assert not (tmp_path / "b.yaml").exists()
+
+
+def test_a_file_name_that_no_text_holds_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / os.fsdecode(b"part\xff.stl")
+    try:
+        write_mesh(ball((0, 0, 0), 3.0, level=1), tmp_path / "a.stl").rename(file)
+    except OSError:
+        pytest.skip("this file system has names in UTF-8 only")
+    with pytest.raises(ValueError, match="has a name that is not UTF-8; .*: rename it"):
+        write_scene_file([file], tmp_path / "a.yaml")
+    assert not (tmp_path / "a.yaml").exists()
+
+
 def test_names_are_valid_and_new() -> None:
     assert identifier("My part (2)") == "My-part-2"
     assert identifier("...") == "object"
@@ -118,6 +174,11 @@ def test_the_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
     assert command_line.main(["scene", "new", "a.ply", "--units", "cm"]) == 0
     assert "units: cm  # as you said" in (tmp_path / "a.yaml").read_text()
     assert "wrote a.yaml" in capsys.readouterr().out
+    assert command_line.main(["scene", "new", "a.ply", "--output", "b b.yaml", "--aperture", "90"]) == 0
+    assert "aperture: 90 " in (tmp_path / "b b.yaml").read_text()
+    assert "mereo scene check 'b b.yaml'" in capsys.readouterr().out
+    assert command_line.main(["scene", "new", "a.ply", "--output", "c.yaml", "--aperture", "400"]) == 2
+    assert "--aperture is 400" in capsys.readouterr().err and not (tmp_path / "c.yaml").exists()
     assert command_line.main(["scene", "check", "a.yaml"]) == 0
     assert "a: 1 segments, closed" in capsys.readouterr().out
     assert command_line.main(["scene", "preview", "a.yaml", "--output", "a.png"]) == 0

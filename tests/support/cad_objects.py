@@ -24,10 +24,25 @@ def pliers() -> dict[str, Manifold]:
     }
 
 
-def write_pliers(folder: Path) -> list[Path]:
-    """STL files of the pliers' parts, in the order of ``pliers``."""
+def write_parts(folder: Path, parts: dict[str, Manifold]) -> list[Path]:
+    """STL files of an object's parts, in their order."""
     files = []
-    for name, solid in pliers().items():
+    for name, solid in parts.items():
         files.append(folder / f"{name}.stl")
         trimesh.Trimesh(*mesh_of(solid), process=False).export(files[-1])
     return files
+
+
+def write_pliers(folder: Path) -> list[Path]:
+    return write_parts(folder, pliers())
+
+
+def tongs() -> dict[str, Manifold]:
+    """A bar with two pegs 40 mm apart, and a lever on each that turns: each by itself freely, both into each other."""
+    peg = Manifold.cylinder(10, 5, 5, 32).translate((0, 0, -5))
+    lever = (CrossSection([[(-8, -8), (8, -8), (8, 36), (-8, 36)]]) - CrossSection.circle(5, 32)).extrude(5)
+    return {
+        "bar": Manifold.cube((60, 20, 5)).translate((-10, -10, -5)) + peg + peg.translate((40, 0, 0)),
+        "left": lever,
+        "right": lever.translate((40, 0, 0)),
+    }

@@ -1,5 +1,6 @@
 """The commands ``mereo scene ...`` and ``mereo assets ...``: scenes of objects, and meshes and scans to download."""
 
+import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -7,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import arg
 
 from mereo.cli.options import AssetNames, MeshUnits, ObjectFiles, SceneName, SceneNameOrNone
-from mereo.io.bounds import CountOrNone, States
+from mereo.io.bounds import Aperture, CountOrNone, States
 from mereo.synthesis.config import SENSORS, Sensor, SequenceConfig
 
 if TYPE_CHECKING:
@@ -41,20 +42,24 @@ class SceneNew:
             volume (NIfTI, NRRD).
         output: the YAML file; by default called after the first file, in the working directory.
         units: of the files; guessed where not given.
+        aperture: of the cone of directions from which your camera looks, about the side that is up, in degrees; 360 is
+            all around, with any roll.
     """
 
     files: ObjectFiles
     output: Path | None = None
     units: MeshUnits = None
+    aperture: Aperture = 360.0
 
     def run(self) -> None:
-        """Write the scene file, and print what to do next."""
+        """Write the scene file, and print what was found and what to do next."""
         from mereo.scenes.files.template import write_scene_file
 
-        path = write_scene_file(self.files, self.output, self.units)
+        path = write_scene_file(self.files, self.output, self.units, aperture=self.aperture, report=print)
+        named = shlex.quote(str(path))
         print(f"wrote {path}; read it, then:")
-        print(f"  mereo scene check {path}")
-        print(f"  mereo scene preview {path} --output states.png")
+        print(f"  mereo scene check {named}")
+        print(f"  mereo scene preview {named} --output states.png")
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """What is wrong with a user's meshes: each segment by itself, and the volume that segments share."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -161,7 +162,9 @@ class Overlap:
         return f"{self.small} and {self.large} overlap in {self.share:.2%} of {self.small}"
 
 
-def overlaps(mesh: SegmentedMesh, tolerance: float = TOLERANCE) -> tuple[Overlap, ...]:
+def overlaps(
+    mesh: SegmentedMesh, tolerance: float = TOLERANCE, among: Collection[tuple[int, int]] | None = None
+) -> tuple[Overlap, ...]:
     """Pairs of segments that share more than ``tolerance`` of the smaller one, or nest with as much outside.
 
     Exact for solids, however thin what they share; within a percent or so where one of two is no solid. Segments that
@@ -170,15 +173,17 @@ def overlaps(mesh: SegmentedMesh, tolerance: float = TOLERANCE) -> tuple[Overlap
     Args:
         mesh: any unit.
         tolerance: share of a segment's volume, from 0 to 1.
+        among: pairs of indices, the lower one first, to which the test is limited.
     """
-    bodies, nesting = [_Body(segment) for segment in mesh.segments], set(mesh.nesting)
+    bodies, nesting, names = [_Body(segment) for segment in mesh.segments], set(mesh.nesting), mesh.names
     order = sorted(range(len(bodies)), key=lambda index: bodies[index].box_volume)
+    chosen = combinations(order, 2) if among is None else (sorted(pair, key=order.index) for pair in sorted(among))
     pairs = []
-    for small, large in combinations(order, 2):
+    for small, large in chosen:
         nested = (min(small, large), max(small, large)) in nesting
         inner, outer = sorted((small, large)) if nested else (small, large)
         share = bodies[inner].share_in(bodies[outer])
-        pairs.append(Overlap(mesh.names[inner], mesh.names[outer], 1.0 - share if nested else share, nested))
+        pairs.append(Overlap(names[inner], names[outer], 1.0 - share if nested else share, nested))
     return tuple(pair for pair in pairs if pair.share > tolerance)
 
 
@@ -193,7 +198,7 @@ class _Body:
 
     def __init__(self, segment: Segment) -> None:
         self.segment = segment
-        low, high = segment.bounds
+        self.bounds = low, high = segment.bounds
         self.box_volume = float(np.prod(high - low))
         self.axes = [low[k] + (np.arange(CELLS) + 0.5) * (high[k] - low[k]) / CELLS for k in range(3)]
 
@@ -214,7 +219,7 @@ class _Body:
 
     def share_in(self, other: "_Body") -> float:
         """How much of the volume lies in another segment, from 0 to 1."""
-        box, around = self.segment.bounds, other.segment.bounds
+        box, around = self.bounds, other.bounds
         if (around[1] <= box[0]).any() or (around[0] >= box[1]).any():
             return 0.0
         if self.solid is None or other.solid is None:

@@ -77,6 +77,7 @@ Seed = Annotated[int, *_within(0, 2**63, below=True)]  # what torch takes
 Positive = Annotated[float, *_within(0, above=True)]
 PositiveOrUnknown = Annotated[float | None, *_within(0, above=True)]
 NotNegative = Annotated[float, *_within(0)]
+Aperture = Annotated[float, *_within(0, 360, above=True)]
 Multiple = Annotated[float, *_within(0, 1000)]
 Probability = Annotated[float, *_within(0, 1)]
 ProperFraction = Annotated[float, *_within(0, 1, below=True)]

@@ -127,8 +127,8 @@ def preview_scene(scene: Scene, path: str | Path, seed: int = 0, states: int = 9
     """Write ``preview_states`` of random states of a scene; state i comes from (seed, i) alone."""
     settings = GenerateConfig()
     views = [sample_view(scene, settings, example_rng(seed, index)) for index in range(states)]
-    # a workspace around the whole object has no meaningful axis; mesh files are mostly y up
-    up = (0.0, 1.0, 0.0) if scene.workspace.all_around else scene.workspace.axis
+    # scenes in code that are seen from all around state no axis; their meshes are mostly y up
+    up = (0.0, 1.0, 0.0) if scene.workspace.all_around and scene.file is None else scene.workspace.axis
     preview_states(path, views, f"{scene.name}: {states} random states", up=up)
 
 

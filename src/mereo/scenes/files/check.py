@@ -21,7 +21,7 @@ from mereo.geometry.transforms import inverse_rigid
 from mereo.io.atomic_files import atomic_file, check_file_place, remove_abandoned
 from mereo.io.yaml_document import Document
 from mereo.scenes.files.build import build, read, read_segments
-from mereo.scenes.files.template import motion
+from mereo.scenes.files.template import flat_base, motion
 from mereo.scenes.registry import is_yaml, load_scene
 from mereo.scenes.scene import SCENES, Scene, Workspace
 from mereo.scenes.seeds import example_rng
@@ -255,6 +255,9 @@ def report_states(scene: Scene) -> int:
     moved = motion(scene.rest, scene.sample_deformations)
     print(f"motion: {moved.mean:.1%} of the longest side in a typical state, {moved.largest:.1%} where it moves most")
     print(f"up: {_direction(scene.workspace)}")
+    if base := flat_base(scene.rest, scene.workspace.axis):
+        print(f"base: {base.describe(scene.workspace)}")
+    at_rest = {frozenset((each.small, each.large)) for each in overlaps(scene.rest)}  # faults by themselves
     worst: dict[frozenset[str], Overlap] = {}
     seen = 1.0
     pixels: list[int] = []
@@ -263,7 +266,8 @@ def report_states(scene: Scene) -> int:
         mesh = scene.sample_state(rng).mesh
         for overlap in overlaps(mesh, STATE_TOLERANCE):
             pair = frozenset((overlap.small, overlap.large))
-            worst[pair] = max(worst.get(pair, overlap), overlap, key=lambda each: each.share)
+            if pair not in at_rest:
+                worst[pair] = max(worst.get(pair, overlap), overlap, key=lambda each: each.share)
         share, count = _view(scene.workspace, mesh, rng)
         seen = min(seen, share)
         pixels.append(count)

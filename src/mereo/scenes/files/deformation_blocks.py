@@ -451,7 +451,11 @@ class ModelPart(PartLook):
 
 
 class CameraBlock(Block):
-    """Workspace of the camera, ``scenes.scene.Workspace`` in degrees."""
+    """Workspace of the camera, ``scenes.scene.Workspace`` in degrees.
+
+    The defaults stay those of the paper, although new files state 360: datasets and weights record them in the
+    definition of a file that states no camera.
+    """
 
     aperture: Annotated[FiniteFloat, Field(gt=0, le=360)] = 140.0
     distance: PositiveRange = (100.0, 200.0)

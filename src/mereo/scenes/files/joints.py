@@ -1,12 +1,12 @@
 """Joints that an assembly seems to have, for a new scene file: hinges on round contacts, slides on flat ones.
 
 A joint moves all that hangs on its smaller side: what is still connected to it once the contacts are taken away that
-the motion leaves closed. Its range is as far as nothing collides, up to a limit.
+the motion leaves closed. Its range is as far as nothing collides, up to a limit: first by itself, then with the others.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import combinations
+from dataclasses import dataclass, replace
+from itertools import combinations, product
 
 import igl
 import numpy as np
@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from mereo.deformation.maps import Rigid
+from mereo.deformation.maps import Compose, Rigid
 from mereo.geometry.mesh import Segment, SegmentedMesh, surface_points
 from mereo.geometry.mesh_check import overlaps
 
@@ -193,7 +193,24 @@ SLIDES = (0.5, 0.25, 0.1)
 """Ranges of a slide that are tried, in lengths of the contact."""
 
 COLLIDES = 0.01
-"""Share of a segment that another may overlap within a joint's range."""
+"""Share of a segment that another may overlap within a joint's range: half of what a check allows, because states lie
+between those that are tried."""
+
+STATES = 128
+"""States in which all joints are tried: at most half of them corners of the box of ranges, then some with joints at
+rest, then random ones."""
+
+MOST_MOVED = 10_000_000
+"""Faces of all states together, times joints; what has more of them is tried in fewer states, an eighth at least."""
+
+MOST_PASSES = 8
+"""Passes over all states, in states; what still collides then is given up."""
+
+NARROWER = 0.8
+"""Factor of the ranges that take part in a collision."""
+
+NARROWEST = 0.2
+"""Share of a joint's range below which it is given up."""
 
 PARALLEL = float(np.cos(np.deg2rad(3.0)))
 
@@ -213,7 +230,8 @@ class Joint:
         hinge: whether it turns about ``axis``, else it slides along it.
         moved: indices of the segments that it moves.
         axis: unit vector.
-        most: least and most angle in degrees, or way in the mesh's unit.
+        most: least and most angle in degrees, or way in the mesh's unit, between which no joints collide together.
+        alone: the same where all other joints rest.
     """
 
     contact: Contact
@@ -221,20 +239,26 @@ class Joint:
     moved: tuple[int, ...]
     axis: Float[np.ndarray, "3"]
     most: tuple[float, float]
+    alone: tuple[float, float]
+
+    @property
+    def narrowed(self) -> bool:
+        """Whether it moves less far than it could by itself."""
+        return self.most != self.alone
 
 
 def proposed_joints(mesh: SegmentedMesh) -> tuple[Joint, ...]:
     """Joints of an assembly at rest, those that move least first, as a chain wants it."""
     touching = contacts(mesh)
-    reach = CLEARANCE * float((mesh.bounds[1] - mesh.bounds[0]).max())
+    test = _CollisionTest(mesh)
     joints: list[Joint] = []
     for contact in sorted(touching, key=lambda each: each.kind):  # cylinders before planes
         if contact.kind == "other" or _held(contact, joints):
             continue
-        joint = _joint(mesh, touching, contact, reach)
+        joint = _joint(test, touching, contact, joints)
         if joint is not None and not any(_same(joint, other) for other in joints):
             joints.append(joint)
-    return tuple(sorted(joints, key=lambda joint: len(joint.moved)))
+    return _narrowed(test, sorted(joints, key=lambda joint: len(joint.moved)))
 
 
 def _held(contact: Contact, joints: Sequence[Joint]) -> bool:
@@ -251,8 +275,11 @@ def _same(first: Joint, second: Joint) -> bool:
     return first.moved == second.moved and first.hinge == second.hinge and abs(first.axis @ second.axis) > PARALLEL
 
 
-def _joint(mesh: SegmentedMesh, touching: Sequence[Contact], contact: Contact, reach: float) -> Joint | None:
+def _joint(
+    test: "_CollisionTest", touching: Sequence[Contact], contact: Contact, joints: Sequence[Joint]
+) -> Joint | None:
     """The joint of a contact; None where its sides hang together elsewhere, look alike in it, or collide at once."""
+    mesh, reach = test.mesh, test.reach
     hinge = contact.kind == "cylinder"
     axis = contact.axis if hinge else contact.along
     axis = axis * np.sign(axis[np.abs(axis).argmax()])
@@ -263,13 +290,22 @@ def _joint(mesh: SegmentedMesh, touching: Sequence[Contact], contact: Contact, r
     for moved in sorted(groups, key=lambda group: sum(abs(mesh.segments[index].volume) for index in group)):
         if hinge and all(_is_round(mesh, index, contact.point, axis, reach) for index in moved):
             continue
+        if any(_cross(set(moved), set(other.moved)) for other in joints):
+            continue
         steps = ANGLES_DEG if hinge else tuple(contact.extent * share for share in SLIDES)
-        least, most = (
-            _free(mesh, moved, contact.point, axis, hinge, [sign * step for step in steps]) for sign in (-1, 1)
-        )
+        joint = Joint(contact, hinge, moved, axis, (0.0, 0.0), (0.0, 0.0))
+        least, most = (test.free(joint, [sign * step for step in steps]) for sign in (-1, 1))
         if most > least:
-            return Joint(contact, hinge, moved, axis, (least, most))
+            return replace(joint, most=(least, most), alone=(least, most))
     return None
+
+
+def _cross(first: set[int], second: set[int]) -> bool:
+    """Whether neither of two sets holds the other and they share members.
+
+    One of two such joints would turn about a pivot at rest from which the other has carried its segments away.
+    """
+    return bool(first & second and first - second and second - first)
 
 
 def _sides(count: int, held: Sequence[Contact]) -> np.ndarray:
@@ -301,30 +337,118 @@ def _is_round(
     return bool(distance(turned, segment)[0].max() < reach)
 
 
-def _free(
-    mesh: SegmentedMesh,
-    moved: tuple[int, ...],
-    point: Float[np.ndarray, "3"],
-    axis: Float[np.ndarray, "3"],
-    hinge: bool,
-    steps: Sequence[float],
-) -> float:
-    """First of the steps, from the farthest to the nearest, over which nothing collides; 0 where there is none."""
-    for step in steps:
-        ways = [step * share for share in (0.5, 1.0)]
-        if not any(_collides(mesh, moved, _motion(point, axis, hinge, way)) for way in ways):
-            return step
-    return 0.0
+# --- joints together --------------------------------------------------------------------------------------------------
 
 
-def _motion(point: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"], hinge: bool, way: float) -> Rigid:
-    turn, shift = (np.deg2rad(way) * axis, np.zeros(3)) if hinge else (np.zeros(3), way * axis)
-    return Rigid(turn, shift, point)
+class _CollisionTest:
+    """Test whether segments collide where joints have moved them.
+
+    Attributes:
+        mesh: the segments at rest.
+        reach: largest gap of a contact.
+    """
+
+    def __init__(self, mesh: SegmentedMesh) -> None:
+        self.mesh = mesh
+        self.reach = CLEARANCE * float((mesh.bounds[1] - mesh.bounds[0]).max())
+        self._known = dict[tuple[tuple[int, int], tuple[Chain, Chain]], bool]()
+
+    def free(self, joint: Joint, steps: Sequence[float]) -> float:
+        """First of the steps, from the farthest to the nearest, over which nothing collides; 0 where there is none."""
+        for step in steps:
+            if not any(self.pairs([joint], [step * share]) for share in (0.5, 1.0)):
+                return step
+        return 0.0
+
+    def pairs(self, joints: Sequence[Joint], ways: Sequence[float]) -> list[tuple[int, int]]:
+        """Indices of the segments that collide where each joint has gone its way, in degrees or the mesh's unit."""
+        motions = [(joint, way) for joint, way in zip(joints, ways, strict=True) if way]
+        chains = [tuple(each for each in motions if index in each[0].moved) for index in range(len(self.mesh.segments))]
+        places = [
+            Compose(tuple(_motion(*each) for each in chain))(segment.vertices) if chain else segment.vertices
+            for chain, segment in zip(chains, self.mesh.segments, strict=True)
+        ]
+        apart = {
+            (min(index, other), max(index, other))
+            for index, chain in enumerate(chains)
+            for other in (range(len(chains)) if chain else ())
+            if chains[other] != chain
+        }
+        keys = {(i, j): _relative(chains[i], chains[j]) for i, j in sorted(apart)}
+        untested = {pair for pair, key in keys.items() if (pair, key) not in self._known}
+        found = overlaps(self.mesh.with_vertices(places), COLLIDES, untested) if untested else ()
+        index = {name: number for number, name in enumerate(self.mesh.names)}
+        overlapping = {tuple(sorted((index[each.small], index[each.large]))) for each in found}
+        self._known |= {(pair, keys[pair]): pair in overlapping for pair in untested}
+        return [pair for pair, key in keys.items() if self._known[pair, key]]
 
 
-def _collides(mesh: SegmentedMesh, moved: tuple[int, ...], motion: Rigid) -> bool:
-    """Whether moved segments overlap others by more than they do at rest."""
-    places = [motion(s.vertices) if index in moved else s.vertices for index, s in enumerate(mesh.segments)]
-    inside = {mesh.names[index] for index in moved}
-    collisions = overlaps(mesh.with_vertices(places), COLLIDES)
-    return any(len({each.small, each.large} & inside) == 1 for each in collisions)
+Chain = tuple[tuple[Joint, float], ...]
+"""Motions of joints by their ways, in the order in which they are applied."""
+
+
+def _relative(first: Chain, second: Chain) -> tuple[Chain, Chain]:
+    """Chains without the motions at their ends that both share: these move two segments as a whole."""
+    while first and second and first[-1] == second[-1]:
+        first, second = first[:-1], second[:-1]
+    return first, second
+
+
+def _motion(joint: Joint, way: float) -> Rigid:
+    """Rigid motion of a joint by an angle in degrees, or a way in the mesh's unit."""
+    turn, shift = (np.deg2rad(way) * joint.axis, np.zeros(3)) if joint.hinge else (np.zeros(3), way * joint.axis)
+    return Rigid(turn, shift, joint.contact.point)
+
+
+def _narrowed(test: _CollisionTest, joints: Sequence[Joint]) -> tuple[Joint, ...]:
+    """Joints in ranges within which no combination that is tried collides; without those of which nothing is left.
+
+    Each collision narrows the ranges, on the side in use, of all joints that move one of the two segments alone. This
+    ends where a whole pass over all combinations finds no collision.
+    """
+    if len(joints) < 2:
+        return tuple(joints)
+    faces = sum(len(segment.faces) for segment in test.mesh.segments)
+    shares = _combinations(len(joints), int(np.clip(MOST_MOVED // (faces * len(joints)), STATES // 8, STATES)))
+    alone = np.array([joint.alone for joint in joints])
+    ranges, tries, clean = alone.copy(), 0, False
+    while not clean:
+        clean = True
+        for share in shares:
+            tries += 1
+            while blamed := _blamed(test, joints, share, _ways(share, ranges)):
+                clean = False
+                tries += 1
+                for joint, side in blamed:
+                    way = float(f"{NARROWER * ranges[joint, side]:.2g}")
+                    given_up = abs(way) < NARROWEST * abs(alone[joint, side]) or tries > MOST_PASSES * len(shares)
+                    ranges[joint, side] = 0.0 if given_up else way
+    narrow = [replace(joint, most=(float(a), float(b))) for joint, (a, b) in zip(joints, ranges, strict=True)]
+    return tuple(joint for joint in narrow if joint.most[1] > joint.most[0])
+
+
+def _combinations(joints: int, states: int) -> Float[np.ndarray, "states joints"]:
+    """Shares of joints' ranges, -1 at the least and 1 at the most: corners, with some at rest, and random ones."""
+    rng = np.random.default_rng(0)
+    if 2**joints <= states // 2:
+        corners = np.array(list(product((-1.0, 1.0), repeat=joints)))
+    else:
+        corners = rng.choice([-1.0, 1.0], (states // 2, joints))
+    mixed = rng.choice([-1.0, 0.0, 1.0], (states // 4, joints))
+    return np.concatenate([corners, mixed, rng.uniform(-1.0, 1.0, (states // 4, joints))])
+
+
+def _ways(share: Float[np.ndarray, " joints"], ranges: Float[np.ndarray, "joints 2"]) -> list[float]:
+    return (np.maximum(share, 0.0) * ranges[:, 1] + np.maximum(-share, 0.0) * ranges[:, 0]).tolist()
+
+
+def _blamed(
+    test: _CollisionTest, joints: Sequence[Joint], share: Float[np.ndarray, " joints"], ways: Sequence[float]
+) -> set[tuple[int, int]]:
+    """Joints, and the side (0 for the least, 1 for the most) of their ranges, that bring segments into collision."""
+    return {
+        (k, int(share[k] > 0))
+        for pair in test.pairs(joints, ways)
+        for k, joint in enumerate(joints)
+        if ways[k] and len(set(pair) & set(joint.moved)) == 1
+    }

@@ -8,14 +8,18 @@ lattices of cubes follow, one after the other, all scaled until the surface move
 import os
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import trimesh
+import yaml
 from jaxtyping import Float, Int
+from scipy.spatial import ConvexHull, QhullError
 
-from mereo.deformation.maps import Deformation
+from mereo.deformation.maps import Deformation, unit
 from mereo.deformation.samplers import RandomMotion, distance_from_line
+from mereo.geometry.brief import counted
 from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, surface_points
 from mereo.geometry.mesh_check import likely_unit
@@ -24,7 +28,7 @@ from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.volume_files import is_volume, read_label_volume, segment_surfaces
 from mereo.scenes.files.deformation_blocks import BendBlock, DeformationBlock, LatticeBlock, Target
-from mereo.scenes.files.joints import SLIDES_ALONG, TURNS_ON, proposed_joints
+from mereo.scenes.files.joints import SLIDES_ALONG, TURNS_ON, Joint, proposed_joints
 from mereo.scenes.scene import SCENES, Workspace
 from mereo.scenes.seeds import example_rng
 
@@ -166,6 +170,99 @@ def random_motion(mesh: SegmentedMesh, blocks: tuple[DeformationBlock, ...], pla
     return RandomMotion(mesh, tuple((block.sampler(target), everything) for block in blocks))
 
 
+# --- the side on which it stands --------------------------------------------------------------------------------------
+
+THICKNESS_SHARE = 0.08
+"""Depth of what counts as the plane of a base, in ratios of the hull's volume to its area (a ball's radius is three):
+scans of flat faces are bumpy."""
+
+SAME_NORMAL = 0.98
+"""Least cosine of a face's normal with that of the base."""
+
+LEAST_BASE = 0.08
+"""Share of the hull's area within the outline of a base."""
+
+LEAST_COVER = 0.25
+"""Share of that outline that is surface of the object: three places of a rounded body are no base."""
+
+LEAST_TILT = float(np.tan(np.deg2rad(15.0)))
+"""Slope on which the object still stands."""
+
+MOST_FACETS = 200
+"""Faces of the hull, the largest first, whose normals are tried."""
+
+
+@dataclass(frozen=True, eq=False)
+class FlatBase:
+    """Flat face on which an object stands stably.
+
+    Attributes:
+        normal: outward unit vector, exactly along an axis where it is nearly.
+        share: of the area of the object's convex hull that lies within the outline of the face, from 0 to 1.
+    """
+
+    normal: Float[np.ndarray, "3"]
+    share: float
+
+    def describe(self, workspace: Workspace) -> str:
+        """One sentence: where it is, and what a camera in a workspace sees of it."""
+        normal = " ".join(f"{value:.2g}" for value in self.normal + 0.0)
+        text = f"it can stand on a flat base (normal {normal}, {self.share:.0%} of its hull)"
+        axis = np.array(workspace.axis) / np.linalg.norm(workspace.axis)
+        away = float(np.arccos(np.clip(axis @ self.normal, -1.0, 1.0)))
+        if away - workspace.aperture_rad / 2 > np.pi / 2 - 0.01:
+            return f"{text}, and the camera never looks from below"
+        return (
+            f"{text}: if it stays on a table, the camera never sees it from below; narrow it with "
+            f"`camera: {{axis: {_numbers(-self.normal)}, aperture: 180}}`"
+        )
+
+
+def flat_base(mesh: SegmentedMesh, up: Sequence[float]) -> FlatBase | None:
+    """Flat face on which an object can stand, the one opposite to ``up`` or else the largest; None where it has none.
+
+    It is a part of the surface near a plane that supports the convex hull, large enough, and so wide that the centre of
+    mass is above it also on a slope.
+    """
+    vertices, faces, _ = mesh.merged()
+    solid = trimesh.Trimesh(vertices - vertices.mean(axis=0), faces, process=False)
+    try:
+        hull = solid.convex_hull
+    except QhullError:  # it has no volume
+        return None
+    bases = list[FlatBase]()
+    for normal in hull.face_normals[np.argsort(-hull.area_faces, kind="stable")[:MOST_FACETS]]:
+        if not any(normal @ base.normal > SAME_NORMAL for base in bases):
+            base = _base(solid, hull, normal)
+            bases += [base] if base is not None else []
+    lowest = [base for base in bases if base.normal @ np.array(up) < -SAME_NORMAL * np.linalg.norm(up)]
+    return max(lowest or bases, key=lambda base: base.share, default=None)
+
+
+def _base(solid: trimesh.Trimesh, hull: trimesh.Trimesh, normal: Float[np.ndarray, "3"]) -> FlatBase | None:
+    """Base with about this normal."""
+    heights = solid.vertices @ normal
+    top = heights.max() - THICKNESS_SHARE * hull.volume / hull.area
+    crossed = solid.triangles_cross * np.sign(solid.triangles_cross @ normal)[:, None]
+    areas = np.linalg.norm(crossed, axis=1)
+    on = (heights[solid.faces].min(axis=1) > top) & (crossed @ normal > SAME_NORMAL * areas)
+    if areas[on].sum() / 2 < LEAST_COVER * LEAST_BASE * hull.area:
+        return None
+    normal = unit(crossed[on].sum(axis=0))
+    across = np.linalg.svd(normal[None])[2][1:]
+    outline = ConvexHull(solid.vertices[np.unique(solid.faces[on])] @ across.T)
+    center = (
+        solid.center_mass if solid.volume > 0.01 * hull.volume else hull.center_mass
+    )  # of open meshes it is nonsense
+    inside = -float((outline.equations[:, :2] @ (across @ center) + outline.equations[:, 2]).max())
+    share, cover = outline.volume / hull.area, areas[on].sum() / 2 / outline.volume
+    height = float((solid.vertices @ normal).max() - center @ normal)
+    if share < LEAST_BASE or cover < LEAST_COVER or inside < LEAST_TILT * height:
+        return None
+    nearest = np.round(normal)
+    return FlatBase(nearest if np.abs(normal).max() > np.cos(np.deg2rad(3.0)) else normal, float(share))
+
+
 # --- the camera -------------------------------------------------------------------------------------------------------
 
 
@@ -230,7 +327,12 @@ class _Source:
 
 
 def write_scene_file(
-    files: Sequence[Path], output: Path | None = None, units: str | None = None, name: str | None = None
+    files: Sequence[Path],
+    output: Path | None = None,
+    units: str | None = None,
+    name: str | None = None,
+    aperture: float = 360.0,
+    report: Callable[[str], None] | None = None,
 ) -> Path:
     """Write a commented YAML file that names ``files`` relative to itself; returns its path.
 
@@ -239,6 +341,9 @@ def write_scene_file(
         output: by default ``NAME.yaml`` in the working directory, after the first file.
         units: a key of ``geometry.conventions.UNITS_M``; None guesses.
         name: of the scene; by default that of ``output``.
+        aperture: of the cone of directions, about the side that is up, from which the camera looks, in degrees above 0
+            to 360: all around.
+        report: called with each sentence about what was found, once the file is written.
 
     Raises ``FileExistsError`` where ``output`` exists, ``ValueError`` and ``FileNotFoundError`` for unusable files.
     """
@@ -252,8 +357,12 @@ def write_scene_file(
     if path.exists():
         raise FileExistsError(f"{path} exists; it is not overwritten: choose another --output")
     source = _source(list(files), path.parent)
+    text, notes = _draft(name, source, units, aperture)
     with atomic_file(path, force=False) as temporary:
-        temporary.write_text(_text(name, source, units), encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8")
+    if report is not None:
+        for note in notes:
+            report(note)
     return path
 
 
@@ -265,6 +374,9 @@ def identifier(text: str) -> str:
 
 def _source(files: list[Path], folder: Path) -> _Source:
     relative = [Path(os.path.relpath(file, folder)).as_posix() for file in files]
+    for file, text in zip(files, relative, strict=True):
+        if text != text.encode("utf-8", "replace").decode():
+            raise ValueError(f"{file} has a name that is not UTF-8; a scene file is text in UTF-8: rename it")
     if any(is_volume(file) for file in files):
         if len(files) > 1:
             raise ValueError(
@@ -279,15 +391,26 @@ def _source(files: list[Path], folder: Path) -> _Source:
 
 def _from_meshes(files: Sequence[Path], relative: Sequence[str]) -> _Source:
     """One segment for each file, called after it, with all of its parts."""
-    names = tuple(re.sub(r"[^\w. -]+", "_", file.stem) for file in files)
-    if repeated := sorted({name for name in names if names.count(name) > 1}):
-        raise ValueError(f"two files are called {repeated[0]!r}; segments are named after them: rename one of them")
+    names = _segment_names([file.stem for file in files], "files")
     mesh = SegmentedMesh(tuple(_whole_file(name, file) for name, file in zip(names, files, strict=True)))
     lines = ["segments:  # one closed mesh for each; their order is that of the labels"]
     for number, (name, file) in enumerate(zip(names, relative, strict=True)):
         lines += [f"  - name: {quoted(name)}", f"    file: {quoted(file)}", f"    color: {_color(number)}"]
     lines.append("    # nested_in: NAME  # for a segment that lies inside another one, which has to come after it")
     return _Source("\n".join(lines), mesh, *_unit_of(files[0], mesh.bounds), *_up_of(files[0]))
+
+
+def _segment_names(names: Sequence[str], kind: str) -> tuple[str, ...]:
+    """Names of segments after those of files or parts; raises ``ValueError`` where two of them are the same."""
+    valid = tuple(_segment_name(name) for name in names)
+    if repeated := sorted({name for name in valid if valid.count(name) > 1}):
+        raise ValueError(f"two {kind} are called {repeated[0]!r}; segments are named after them: rename one of them")
+    return valid
+
+
+def _segment_name(text: str) -> str:
+    """Text with an underscore for each character that a segment's name cannot have."""
+    return "".join(each if each.isprintable() and each not in "/\\" else "_" for each in text)
 
 
 def _whole_file(name: str, file: Path) -> Segment:
@@ -298,8 +421,12 @@ def _whole_file(name: str, file: Path) -> Segment:
 
 def _from_model(file: Path, relative: str, mesh: SegmentedMesh) -> _Source:
     lines = [f"model: {quoted(relative)}", "parts:  # delete what is not wanted; their order is that of the labels"]
-    for number, name in enumerate(mesh.names):
-        lines += [f"  - name: {quoted(name)}", f"    color: {_color(number)}"]
+    names = _segment_names(mesh.names, "parts")
+    for number, (part, name) in enumerate(zip(mesh.names, names, strict=True)):
+        lines.append(f"  - name: {quoted(name)}")
+        lines += [f"    parts: [{quoted(part)}]"] if part != name else []
+        lines.append(f"    color: {_color(number)}")
+    mesh = SegmentedMesh(tuple(replace(part, name=name) for part, name in zip(mesh.segments, names, strict=True)))
     lines.append("    # parts: [A, B]  # parts of the model to join into this segment, instead of the one of its name")
     return _Source("\n".join(lines), mesh, *_unit_of(file, mesh.bounds), *_up_of(file))
 
@@ -309,7 +436,7 @@ def _from_volume(file: Path, relative: str) -> _Source:
     values = [int(value) for value in np.unique(volume.labels) if value > 0]
     if not values:
         raise ValueError(f"{file} holds only empty space; a label volume has values above 0: export it again")
-    names = {value: volume.names.get(value, f"label_{value}") for value in values}
+    names = {value: _segment_name(volume.names.get(value, f"label_{value}")) for value in values}
     mesh = segment_surfaces(volume, names, LABEL_CELLS)
     lines = [f"labels: {quoted(relative)}", "names:  # of the volume's values; delete what is not wanted"]
     lines += [f"  {value}: {quoted(name)}" for value, name in names.items()]
@@ -338,45 +465,80 @@ def _up_of(file: Path) -> tuple[int, str]:
 # --- the text ---------------------------------------------------------------------------------------------------------
 
 
-def _text(name: str, source: _Source, units: str | None) -> str:
+def _draft(name: str, source: _Source, units: str | None, aperture: float) -> tuple[str, list[str]]:
+    """Text of a scene file, and sentences about what it proposes."""
     sides = np.ptp(source.mesh.bounds, axis=0)
     size = rounded(min(SIZE, LONGEST * float(sides.min() / sides.max())), 3)
     placement = placed(source.mesh, size)
     blocks = default_deformations(source.mesh)
     rest = source.mesh.with_vertices([placement.apply(segment.vertices) for segment in source.mesh.segments])
     x, y, z = np.eye(3)[source.up].tolist()
-    near, far, view = _default_view(rest, random_motion(rest, blocks, placement), Workspace(axis=(x, y, z)))
+    up_reason, base = source.up_reason, flat_base(source.mesh, (x, y, z)) if source.assembly else None
+    if base is not None:
+        up_reason, (x, y, z) = "it stands on its flat base", [rounded(value, 3) for value in -base.normal]
+    workspace = Workspace(float(np.deg2rad(aperture)), axis=(x, y, z), any_roll=aperture == 360.0)
+    near, far, view = _default_view(rest, random_motion(rest, blocks, placement), workspace)
     unit, reason = (units, "as you said") if units else (source.unit, source.reason)
-    bend, lattice = blocks[0], blocks[-1]
-    assert isinstance(bend, BendBlock) and isinstance(lattice, LatticeBlock)
-    return TEMPLATE.format(
-        name=name,
+    joints = proposed_joints(source.mesh) if source.assembly else ()
+    text = TEMPLATE.format(
+        name=quoted(name),
         block=source.block,
         unit=unit,
         reason=reason,
         sides=" x ".join(f"{side:.4g}" for side in sides),
         size=f"{size:g}",
-        up=[int(k == source.up) for k in range(3)],
-        up_reason=source.up_reason,
+        aperture=f"{aperture:g}",
+        up=_numbers(np.array((x, y, z))),
+        up_reason=up_reason,
         near=f"{near:g}",
         far=f"{far:g}",
+        roll="true" if workspace.any_roll else "false",
         view=view,
+        deformations=_deformations(source.mesh, blocks, joints),
+    )
+    return text, _notes(source.mesh, joints) + ([f"base: {base.describe(workspace)}"] if base is not None else [])
+
+
+def _notes(mesh: SegmentedMesh, joints: Sequence[Joint]) -> list[str]:
+    """Sentences about proposed joints."""
+    if not joints:
+        return []
+    count = counted(len(joints), "joint")
+    notes = [f"joints: its parts touch like {count}, proposed in comments: remove the # where it has them"]
+    for joint in joints:
+        if joint.narrowed:
+            names = ", ".join(mesh.names[index] for index in joint.moved)
+            way = "turns by" if joint.hinge else "slides by"
+            notes.append(f"  {names} {way} {_range(joint.most)}, {_narrowed(joint)}")
+    return notes
+
+
+def _narrowed(joint: Joint) -> str:
+    """Why the range of a joint is less than it could be by itself."""
+    return f"narrowed from {_range(joint.alone)}: beyond, joints collide together"
+
+
+def _deformations(mesh: SegmentedMesh, blocks: Sequence[BendBlock | LatticeBlock], joints: Sequence[Joint]) -> str:
+    """Lines of the list of deformations: joints in comments, what bends the whole, and others in comments."""
+    bend, lattice, sides = blocks[0], blocks[-1], np.ptp(mesh.bounds, axis=0)
+    assert isinstance(bend, BendBlock) and isinstance(lattice, LatticeBlock)
+    end, axis, length = _numbers(np.array(bend.origin)), [int(value) for value in bend.axis], f"{bend.length:g}"
+    soft = SOFT.format(
         spacing=f"{lattice.spacing:g}",
         strength=f"{lattice.strength:g}",
-        end=_numbers(np.array(bend.origin)),
-        axis=[int(value) for value in bend.axis],
-        length=f"{bend.length:g}",
+        end=end,
+        axis=axis,
+        length=length,
         angle=f"{bend.angle[1]:g}",
-        joints=_joints(source.mesh, source.assembly),
-        push=f"{0.1 * sides.min():.3g}",
-        reach=f"{0.5 * sides.min():.3g}",
     )
+    push, reach = f"{0.1 * sides.min():.3g}", f"{0.5 * sides.min():.3g}"
+    return _joints(mesh, joints) + soft + FURTHER.format(end=end, axis=axis, length=length, push=push, reach=reach)
 
 
-def _joints(mesh: SegmentedMesh, assembly: bool) -> str:
+def _joints(mesh: SegmentedMesh, joints: Sequence[Joint]) -> str:
     """Comments: the joints that the parts seem to have, and what each was derived from; else an example."""
     lines = list[str]()
-    for joint in proposed_joints(mesh) if assembly else ():
+    for joint in joints:
         contact = joint.contact
         kind = f"the round contact, radius {contact.radius:.3g}," if joint.hinge else "the flat contact"
         lines += [
@@ -385,11 +547,16 @@ def _joints(mesh: SegmentedMesh, assembly: bool) -> str:
             f"#    segments: [{', '.join(quoted(mesh.names[index]) for index in joint.moved)}]",
             f"#    pivot: {_numbers(contact.point)}",
             f"#    axis: {_numbers(joint.axis)}",
-            f"#    {'angle' if joint.hinge else 'slide'}: [{joint.most[0]:.4g}, {joint.most[1]:.4g}]",
+            f"#    {'angle' if joint.hinge else 'slide'}: {_range(joint.most)}"
+            + (f"  # {_narrowed(joint)}" if joint.narrowed else ""),
         ]
     if not lines:
         return EXAMPLE_JOINT.format(part=quoted(mesh.names[-1]), center=_numbers(mesh.bounds.mean(axis=0)))
     return "".join(line + "\n" for line in (JOINTS, *lines))
+
+
+def _range(values: tuple[float, float]) -> str:
+    return f"[{values[0]:.4g}, {values[1]:.4g}]"
 
 
 def _color(number: int) -> str:
@@ -397,10 +564,9 @@ def _color(number: int) -> str:
 
 
 def quoted(text: str) -> str:
-    """Text as a YAML value on one line: quoted unless it is a plain word."""
-    plain = re.fullmatch(r"[A-Za-z_./][\w./ -]*", text) and not text.endswith(" ")
-    reserved = text.lower() in ("yes", "no", "on", "off", "true", "false", "null", "y", "n")
-    return text if plain and not reserved else "'" + text.replace("'", "''") + "'"
+    """Text as a YAML value on one line, also within a list: quoted and escaped where it would not be this text."""
+    listed = yaml.safe_dump([text], default_flow_style=True, allow_unicode=True, width=float("inf"))
+    return listed.strip()[1:-1]
 
 
 def _numbers(values: Float[np.ndarray, "3"]) -> str:
@@ -416,6 +582,37 @@ EXAMPLE_JOINT = """\
 #    pivot: {center}
 #    axis: [0, 0, 1]
 #    angle: [-30, 30]
+"""
+
+SOFT = """\
+  - type: bend  # along the longest side, to any side
+    origin: {end}
+    axis: {axis}
+    length: {length}
+    angle: [-{angle}, {angle}]
+  - type: lattice  # smooth and free-form: the object in a box of rubber
+    spacing: {spacing}  # of the points that are moved: wider is smoother
+    strength: {strength}  # from 0 to below 1, at which space might fold over
+  - type: lattice  # once more, for one alone is stiffer than rubber
+    spacing: {spacing}
+    strength: {strength}
+"""
+
+FURTHER = """\
+#  - type: twist
+#    origin: {end}
+#    axis: {axis}
+#    length: {length}
+#    angle: [-30, 30]
+#  - type: squash  # along a random axis, with the volume kept
+#    factor: [0.9, 1.1]
+#  - type: waves
+#    wavelength: [{length}, {length}]
+#    strength: 0.3
+#  - type: push  # an instrument pulls (above 0) or presses (below 0) at a random place
+#    distance: [-{push}, {push}]
+#    tip: {push}
+#    reach: {reach}
 """
 
 TEMPLATE = """\
@@ -434,41 +631,16 @@ source: my own  # where the meshes come from, and their licence; kept with datas
 size: {size}
 
 camera:
-  aperture: 140  # of the cone of directions from which the camera looks; 360 is all around
+  aperture: {aperture}  # of the cone of directions from which the camera looks: 360 is all around, 180 never from below
   axis: {up}  # the middle of that cone, as seen from the object: above it, where {up_reason}
   distance: [{near}, {far}]  # from the object's centre, in scene units
-  roll: false  # whether the camera may be rolled about its line of sight
+  roll: {roll}  # whether the camera may be rolled about its line of sight
   field_of_view: {view}  # as narrow as still shows all of the object at the nearest distance
 
 # Drawn at random within these bounds for every example, and applied in this order to the segments named, or to all.
 # Segments that touch should move by the same deformations, so that they stay in contact. These bend the object as if it
 # were of rubber, as far as suits soft things: for what has joints, drop them and say how its parts move.
 deformations:
-{joints}  - type: bend  # along the longest side, to any side
-    origin: {end}
-    axis: {axis}
-    length: {length}
-    angle: [-{angle}, {angle}]
-  - type: lattice  # smooth and free-form: the object in a box of rubber
-    spacing: {spacing}  # of the points that are moved: wider is smoother
-    strength: {strength}  # from 0 to below 1, at which space might fold over
-  - type: lattice  # once more, for one alone is stiffer than rubber
-    spacing: {spacing}
-    strength: {strength}
-#  - type: twist
-#    origin: {end}
-#    axis: {axis}
-#    length: {length}
-#    angle: [-30, 30]
-#  - type: squash  # along a random axis, with the volume kept
-#    factor: [0.9, 1.1]
-#  - type: waves
-#    wavelength: [{length}, {length}]
-#    strength: 0.3
-#  - type: push  # an instrument pulls (above 0) or presses (below 0) at a random place
-#    distance: [-{push}, {push}]
-#    tip: {push}
-#    reach: {reach}
-# Recorded frames of a simulator take the place of all deformations:
+{deformations}# Recorded frames of a simulator take the place of all deformations:
 #states: states.npz
 """
