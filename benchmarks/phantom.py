@@ -197,14 +197,16 @@ def jacobian(arm: np.ndarray, R: np.ndarray, basis: np.ndarray) -> np.ndarray:
 
 def coherent_point_drift(vertices: np.ndarray, cloud: Points) -> np.ndarray:
     """Vertices moved by pycpd's deformable registration of 1,500 of them; the others follow its kernel."""
-    from pycpd import DeformableRegistration, gaussian_kernel
+    from pycpd import DeformableRegistration
 
     some = np.random.default_rng(0).choice(len(vertices), 1500, replace=False)
     middle, size = vertices.mean(axis=0), float(np.ptp(vertices, axis=0).max()) / 2
     source, target = (vertices - middle) / size, (cloud[0] - middle) / size
-    drift = DeformableRegistration(X=target, Y=source[some], alpha=2.0, beta=0.5, w=0.1, max_iterations=150)
+    drift = DeformableRegistration(X=target, Y=source[some], alpha=2000.0, beta=2.0, w=0.3, max_iterations=60)
     drift.register()
-    return (source + gaussian_kernel(source, drift.beta, source[some]) @ drift.W) * size + middle
+    return (
+        source + np.exp(-cdist(source, source[some], "sqeuclidean") / (2 * drift.beta**2)) @ drift.W
+    ) * size + middle
 
 
 # --- truth ------------------------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
 
@@ -44,18 +44,28 @@ class SceneNew:
         units: of the files; guessed where not given.
         aperture: of the cone of directions from which your camera looks, about the side that is up, in degrees; 360 is
             all around, with any roll.
+        deformations: how the object moves: rigid, soft or stiff (as an elastic solid), or articulated (by the joints
+            that its contacts suggest); auto is articulated where there are such joints, else soft.
     """
 
     files: ObjectFiles
     output: Path | None = None
     units: MeshUnits = None
     aperture: Aperture = 360.0
+    deformations: Literal["auto", "rigid", "soft", "stiff", "articulated"] = "auto"
 
     def run(self) -> None:
         """Write the scene file, and print what was found and what to do next."""
         from mereo.scenes.files.template import write_scene_file
 
-        path = write_scene_file(self.files, self.output, self.units, aperture=self.aperture, report=print)
+        path = write_scene_file(
+            self.files,
+            self.output,
+            self.units,
+            aperture=self.aperture,
+            report=print,
+            deformations=self.deformations,
+        )
         named = shlex.quote(str(path))
         print(f"wrote {path}; read it, then:")
         print(f"  mereo scene check {named}")

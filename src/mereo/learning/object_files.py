@@ -11,14 +11,12 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from mereo.geometry.brief import counted
 from mereo.geometry.mesh_check import examine
 from mereo.io.mesh_formats import MESH_SUFFIXES, read_segmented_mesh
 from mereo.io.volume_files import is_volume
 from mereo.io.writers.meshes import write_positions_ply
 from mereo.scenes.files.build import MeshWarning
 from mereo.scenes.files.check import check_scene
-from mereo.scenes.files.joints import SLIDES_ALONG, TURNS_ON
 from mereo.scenes.files.template import write_scene_file
 from mereo.scenes.registry import is_yaml, load_scene
 from mereo.scenes.scene import SCENES, Scene
@@ -105,9 +103,13 @@ def scene_for(files: Sequence[Path], folder: Path, units: str | None, quiet: boo
         return str(files[0])
     path = folder / SCENE
     if not path.is_file():
-        write_scene_file(files, path, units, name=files[0].name.split(".")[0])
+        report = None if quiet else print
+        write_scene_file(files, path, units, name=files[0].name.split(".")[0], report=report)
         if not quiet:
-            print(describe_scene_file(path))
+            print(
+                f"wrote {path}; where the object moves in other ways, stop with Ctrl-C, say so in that file "
+                "(docs/own-object.md), and learn it anew: mereo learn FILE --output ANOTHER"
+            )
     return str(path)
 
 
@@ -134,22 +136,6 @@ def scene_of_meshes(files: Sequence[Path], units: str | None = None) -> Scene:
         text = str(warning.message).replace(f"{path}: ", "")
         warnings.warn(text.replace(f"repair it with `mereo scene check {path} --repair`", cure), warning.category, 2)
     return replace(scene, file=None)
-
-
-def describe_scene_file(path: Path) -> str:
-    """What a user should know of the scene file that was written for their meshes, before minutes go by."""
-    joints = sum(line.startswith((TURNS_ON, SLIDES_ALONG)) for line in path.read_text("utf-8").splitlines())
-    start = f"wrote {path}: the object bends as if it were of rubber"
-    if joints == 0:
-        return (
-            f"{start}; where it has joints or moves in other ways, say so in that file (docs/own-object.md), and learn "
-            "it anew: mereo learn FILE --output ANOTHER"
-        )
-    return (
-        f"{start}. Its parts touch like {counted(joints, 'joint')}, which that file proposes in comments: if it has "
-        "them, stop with Ctrl-C, take the # away from them and the rubber out (docs/own-object.md), and mereo learn "
-        "FILE --output ANOTHER"
-    )
 
 
 def check(files: Sequence[Path], units: str | None) -> None:

@@ -281,6 +281,10 @@ def model_key(scene: Scene, count: int) -> str:
     for segment in drawn.rest.segments:
         digest.update(f"{segment.name} {segment.color} {segment.solid} {segment.faces.shape}".encode())
         digest.update(np.ascontiguousarray(segment.faces, dtype=np.int64).tobytes())
-    for mesh in (drawn.rest, *(drawn.sample_state(example_rng(STATES_SEED, i)).mesh for i in range(KEYED_BY))):
+    solid = elastic_motion(drawn.sample_deformations)
+    states = () if solid is not None else range(KEYED_BY)  # to draw from a solid takes seconds
+    for mesh in (drawn.rest, *(drawn.sample_state(example_rng(STATES_SEED, i)).mesh for i in states)):
         digest.update(np.ascontiguousarray(mesh.merged()[0], dtype=np.float64).tobytes())
+    if solid is not None:
+        digest.update(f"{solid.digest} {solid.motion!r}".encode())
     return digest.hexdigest()[:32]

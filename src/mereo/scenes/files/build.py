@@ -337,6 +337,8 @@ def refined(rest: SegmentedMesh, draw: Callable[[np.random.Generator], tuple[Def
         rest: segments in scene units.
         draw: one map for each segment.
     """
+    if not any(_is_long(segment).any() for segment in rest.segments):
+        return rest
     states = [draw(example_rng(0, index)) for index in range(STATES)]
     tolerance = TOLERANCE
     most = max(MOST_FACES, 2 * sum(len(segment.faces) for segment in rest.segments))
@@ -345,6 +347,13 @@ def refined(rest: SegmentedMesh, draw: Callable[[np.random.Generator], tuple[Def
             return _refined_surface(rest, states, tolerance, most)
         except TooManyFaces:
             tolerance *= 2
+
+
+def _is_long(segment: Segment) -> Bool[np.ndarray, " f"]:
+    """Whether an edge of each face is longer than ``SHORTEST``."""
+    corners = segment.vertices[segment.faces]
+    edges = corners - np.roll(corners, 1, axis=1)
+    return np.asarray(np.linalg.norm(edges, axis=2).max(axis=1) > SHORTEST)
 
 
 def _refined_surface(

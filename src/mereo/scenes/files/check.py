@@ -21,7 +21,7 @@ from mereo.geometry.transforms import inverse_rigid
 from mereo.io.atomic_files import atomic_file, check_file_place, remove_abandoned
 from mereo.io.yaml_document import Document
 from mereo.scenes.files.build import build, read, read_segments
-from mereo.scenes.files.template import flat_base, motion
+from mereo.scenes.files.template import flat_base, measure_motion
 from mereo.scenes.registry import is_yaml, load_scene
 from mereo.scenes.scene import SCENES, Scene, Workspace
 from mereo.scenes.seeds import example_rng
@@ -252,7 +252,7 @@ WIDTH = 96
 
 def report_states(scene: Scene) -> int:
     """Print how far random states move, how they are seen, and each overlap with its cause; returns their number."""
-    moved = motion(scene.rest, scene.sample_deformations)
+    moved = measure_motion(scene.rest, scene.sample_deformations)
     print(f"motion: {moved.mean:.1%} of the longest side in a typical state, {moved.largest:.1%} where it moves most")
     print(f"up: {_direction(scene.workspace)}")
     if base := flat_base(scene.rest, scene.workspace.axis):

@@ -22,7 +22,7 @@ from pydantic import (
 )
 
 from mereo.deformation import samplers
-from mereo.deformation.elastic import ElasticSampler, Material, build_lattice
+from mereo.deformation.elastic import ElasticSampler, ElasticSolid, Material, build_lattice
 from mereo.deformation.maps import unit
 from mereo.deformation.samplers import DeformationSampler
 from mereo.geometry.conventions import UNITS_M
@@ -326,6 +326,10 @@ SOFT, STIFF = 0.2, 0.05
 """``ElasticBlock.motion`` of what is soft, as organs are, and of what is stiff, as hard rubber is."""
 
 
+CELLS, FULL = (16, 24, 32, 48), 0.6
+"""Cells along the longest side of an elastic solid, and how full one is on average of those that hold material."""
+
+
 class ElasticBlock(DeformationBlock):
     """States of an elastic solid under random loads.
 
@@ -334,7 +338,7 @@ class ElasticBlock(DeformationBlock):
         poisson: Poisson's ratio, the same for all segments.
         stiffness: Young's modulus of segments, in that of those which are not named.
         held: places that do not move against each other; nothing is held where absent.
-        cells: of the lattice along its longest side; more follow thin parts better, and take longer.
+        cells: of the lattice along its longest side; where absent, as few of ``CELLS`` as thin parts allow.
         modes: how many ways to bend there are.
     """
 
@@ -343,8 +347,18 @@ class ElasticBlock(DeformationBlock):
     poisson: Annotated[FiniteFloat, Field(gt=-1, lt=0.49)] = 0.4
     stiffness: dict[Name, Annotated[FiniteFloat, Field(ge=1e-3, le=1e3)]] = {}
     held: Annotated[list[HeldPlace], Field(min_length=1)] | None = None
-    cells: Annotated[int, Field(ge=4, le=64)] = 16
+    cells: Annotated[int, Field(ge=4, le=64)] | None = None
     modes: Annotated[int, Field(ge=1, le=150)] = 100
+
+    def lattice(self, mesh: SegmentedMesh, stiffness: list[float] | None = None) -> ElasticSolid:
+        """Lattice of ``cells``, or the coarsest of which a typical cell that holds material is half full."""
+        if self.cells is not None:
+            return build_lattice(mesh, self.cells, stiffness)
+        for cells in CELLS:
+            solid = build_lattice(mesh, cells, stiffness)
+            if np.average(solid.filled, weights=solid.volumes) >= FULL:
+                break
+        return solid
 
     def sampler(self, target: Target) -> DeformationSampler:
         """Sampler of states of all segments as one solid, in scene units.
@@ -356,7 +370,7 @@ class ElasticBlock(DeformationBlock):
             if name not in names:
                 raise Misfit("stiffness", f"no segment is called {name!r}: {similar(name, names)}")
         stiffness = [self.stiffness.get(name, 1.0) for name in names] if self.stiffness else None
-        solid = build_lattice(target.moved, self.cells, stiffness)
+        solid = self.lattice(target.moved, stiffness)
         if (pieces := solid.pieces) > 1:
             raise Misfit(
                 "type",
@@ -392,8 +406,23 @@ AnyDeformation = (
     | ElasticBlock
 )
 
-Deformations = Annotated[list[Annotated[AnyDeformation, Field(discriminator="type")]], Field(min_length=1)]
-"""A list of deformations, told apart by their ``type``."""
+WORDS: dict[str, list[dict[str, object]]] = {
+    "rigid": [],
+    "soft": [{"type": "elastic", "motion": SOFT}],
+    "stiff": [{"type": "elastic", "motion": STIFF}],
+}
+"""Deformations that one word says."""
+
+
+def _spelled_out(value: object) -> object:
+    """Blocks of a word."""
+    if isinstance(value, str) and value not in WORDS:
+        raise ValueError(f"{value!r} is no way to deform; it must be {', '.join(WORDS)}, or a list of deformations")
+    return WORDS[value] if isinstance(value, str) else value
+
+
+Deformations = Annotated[list[Annotated[AnyDeformation, Field(discriminator="type")]], BeforeValidator(_spelled_out)]
+"""A list of deformations, told apart by their ``type``, or a word of ``WORDS``."""
 
 
 def _lengths(values: tuple[float, float], target: Target) -> tuple[float, float]:
@@ -508,7 +537,7 @@ class SceneFile(Block):
             longest side of the grid on which their surfaces are found.
         size: length of the object's shortest side, in scene units.
         camera: its workspace.
-        deformations: applied in this order; a lattice over all segments where absent.
+        deformations: applied in this order; ``template.default_deformations`` where absent.
         states, held_out: recorded states instead of deformations, and the share of frames kept for testing.
     """
 

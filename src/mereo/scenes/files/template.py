@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import trimesh
@@ -27,7 +28,16 @@ from mereo.geometry.transforms import Normalizer, fit_rigid, inverse_rigid, tran
 from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.volume_files import is_volume, read_label_volume, segment_surfaces
-from mereo.scenes.files.deformation_blocks import BendBlock, DeformationBlock, LatticeBlock, Target
+from mereo.scenes.files.deformation_blocks import (
+    SOFT,
+    STIFF,
+    BendBlock,
+    DeformationBlock,
+    ElasticBlock,
+    JointBlock,
+    LatticeBlock,
+    Target,
+)
 from mereo.scenes.files.joints import SLIDES_ALONG, TURNS_ON, Joint, proposed_joints
 from mereo.scenes.scene import SCENES, Workspace
 from mereo.scenes.seeds import example_rng
@@ -57,7 +67,7 @@ class Motion:
     largest: float
 
 
-def motion(rest: SegmentedMesh, draw: Draw, states: int = STATES) -> Motion:
+def measure_motion(rest: SegmentedMesh, draw: Draw, states: int = STATES) -> Motion:
     """Motion of an object in ``states`` random states, which are the same in every call."""
     points, owner = material_points(rest, POINTS)
     length = float((rest.bounds[1] - rest.bounds[0]).max())
@@ -110,7 +120,8 @@ FARTHER = 1.25
 
 MOST_VIEW_RAD = float(np.deg2rad(40.0))
 
-VIEWS = 64
+STATES_SEEN, VIEWS = 16, 64
+"""Random states in which an object is seen, and from how many places in all."""
 
 FRAMED = 1000
 """Places of the surface that a view must show, and at most so many vertices of each segment."""
@@ -122,7 +133,28 @@ MARGIN = 1.03
 UNPLACED = Normalizer(np.zeros(3), 1.0)
 
 
-def default_deformations(mesh: SegmentedMesh) -> tuple[BendBlock | LatticeBlock, ...]:
+Way = Literal["auto", "rigid", "soft", "stiff", "articulated"]
+"""How an object deforms: not at all, as a soft or a stiff elastic solid, by its joints, or as its meshes suggest."""
+
+
+def default_deformations(
+    mesh: SegmentedMesh, motion: float = SOFT
+) -> tuple[ElasticBlock | BendBlock | LatticeBlock, ...]:
+    """States of an elastic solid; of segments that do not touch, those of a box of rubber around them.
+
+    Args:
+        mesh: segments in the file's frame and unit.
+        motion: as ``ElasticBlock.motion``.
+    """
+    elastic = ElasticBlock(type="elastic", motion=motion)
+    try:
+        pieces = elastic.lattice(mesh).pieces
+    except ValueError:  # it has no inside
+        pieces = 0
+    return (elastic,) if pieces == 1 else rubber(mesh)
+
+
+def rubber(mesh: SegmentedMesh) -> tuple[BendBlock | LatticeBlock, ...]:
     """Deformations under which the surface moves by about ``MOTION``, or by as much as does not fold space over.
 
     Args:
@@ -131,7 +163,7 @@ def default_deformations(mesh: SegmentedMesh) -> tuple[BendBlock | LatticeBlock,
     strength = 1.0
     for _ in range(4):  # motion is nearly proportional to the strength
         blocks = _blocks(mesh, strength)
-        moved = motion(mesh, random_motion(mesh, blocks, UNPLACED)).mean
+        moved = measure_motion(mesh, random_motion(mesh, blocks, UNPLACED)).mean
         if abs(moved / MOTION - 1) < 0.02 or (moved < MOTION and strength == 1.0):
             break
         strength = min(strength * MOTION / moved, 1.0)
@@ -272,7 +304,8 @@ def _default_view(rest: SegmentedMesh, draw: Draw, workspace: Workspace) -> tupl
     reach = max(float(np.linalg.norm(points - center, axis=1).max()) for points, center in states)
     near = max(NEAR, float(np.ceil(reach / np.sin(MOST_VIEW_RAD / 2))))
     widest = 0.0
-    for index, (points, center) in enumerate(states):
+    for index in range(VIEWS):
+        points, center = states[index % STATES_SEEN]
         pose = workspace.sample(example_rng(1, index), center)
         pose[:3, 3] = center - near * pose[:3, 2]
         seen = transform_points(inverse_rigid(pose), points)
@@ -287,7 +320,7 @@ def _states(rest: SegmentedMesh, draw: Draw) -> list[tuple[Float[np.ndarray, "_ 
     corners = [segment.vertices[:: 1 + len(segment.vertices) // FRAMED] for segment in rest.segments]
     owner = np.concatenate([owner, np.repeat(np.arange(len(corners)), [len(part) for part in corners])])
     points = np.concatenate([points, *corners])
-    moved = [move(points, owner, draw(example_rng(0, index))) for index in range(VIEWS)]
+    moved = [move(points, owner, draw(example_rng(0, index))) for index in range(STATES_SEEN)]
     return [(places, (places.min(axis=0) + places.max(axis=0)) / 2) for places in moved]
 
 
@@ -333,6 +366,7 @@ def write_scene_file(
     name: str | None = None,
     aperture: float = 360.0,
     report: Callable[[str], None] | None = None,
+    deformations: Way = "auto",
 ) -> Path:
     """Write a commented YAML file that names ``files`` relative to itself; returns its path.
 
@@ -344,6 +378,7 @@ def write_scene_file(
         aperture: of the cone of directions, about the side that is up, from which the camera looks, in degrees above 0
             to 360: all around.
         report: called with each sentence about what was found, once the file is written.
+        deformations: how the object moves.
 
     Raises ``FileExistsError`` where ``output`` exists, ``ValueError`` and ``FileNotFoundError`` for unusable files.
     """
@@ -357,7 +392,7 @@ def write_scene_file(
     if path.exists():
         raise FileExistsError(f"{path} exists; it is not overwritten: choose another --output")
     source = _source(list(files), path.parent)
-    text, notes = _draft(name, source, units, aperture)
+    text, notes = _draft(name, source, units, aperture, deformations)
     with atomic_file(path, force=False) as temporary:
         temporary.write_text(text, encoding="utf-8")
     if report is not None:
@@ -465,21 +500,22 @@ def _up_of(file: Path) -> tuple[int, str]:
 # --- the text ---------------------------------------------------------------------------------------------------------
 
 
-def _draft(name: str, source: _Source, units: str | None, aperture: float) -> tuple[str, list[str]]:
+def _draft(name: str, source: _Source, units: str | None, aperture: float, way: Way) -> tuple[str, list[str]]:
     """Text of a scene file, and sentences about what it proposes."""
     sides = np.ptp(source.mesh.bounds, axis=0)
     size = rounded(min(SIZE, LONGEST * float(sides.min() / sides.max())), 3)
     placement = placed(source.mesh, size)
-    blocks = default_deformations(source.mesh)
+    joints = proposed_joints(source.mesh) if source.assembly else ()
+    way, why = choose_way(way, joints)
+    moves = Moves.of(source.mesh, way, joints)
     rest = source.mesh.with_vertices([placement.apply(segment.vertices) for segment in source.mesh.segments])
     x, y, z = np.eye(3)[source.up].tolist()
     up_reason, base = source.up_reason, flat_base(source.mesh, (x, y, z)) if source.assembly else None
     if base is not None:
         up_reason, (x, y, z) = "it stands on its flat base", [rounded(value, 3) for value in -base.normal]
     workspace = Workspace(float(np.deg2rad(aperture)), axis=(x, y, z), any_roll=aperture == 360.0)
-    near, far, view = _default_view(rest, random_motion(rest, blocks, placement), workspace)
+    near, far, view = _default_view(rest, moves.draw(rest, placement), workspace)
     unit, reason = (units, "as you said") if units else (source.unit, source.reason)
-    joints = proposed_joints(source.mesh) if source.assembly else ()
     text = TEMPLATE.format(
         name=quoted(name),
         block=source.block,
@@ -494,18 +530,80 @@ def _draft(name: str, source: _Source, units: str | None, aperture: float) -> tu
         far=f"{far:g}",
         roll="true" if workspace.any_roll else "false",
         view=view,
-        deformations=_deformations(source.mesh, blocks, joints),
+        deformations=_deformations(source.mesh, moves),
     )
-    return text, _notes(source.mesh, joints) + ([f"base: {base.describe(workspace)}"] if base is not None else [])
+    return text, [f"deformations: {moves.description}, {why}"] + _notes(source.mesh, moves) + (
+        [f"base: {base.describe(workspace)}"] if base is not None else []
+    )
 
 
-def _notes(mesh: SegmentedMesh, joints: Sequence[Joint]) -> list[str]:
-    """Sentences about proposed joints."""
-    if not joints:
-        return []
+def choose_way(way: Way, joints: Sequence[Joint]) -> tuple[Way, str]:
+    """How an object deforms, and why; ``ValueError`` where it is to be articulated and has no joints."""
     count = counted(len(joints), "joint")
-    notes = [f"joints: its parts touch like {count}, proposed in comments: remove the # where it has them"]
-    for joint in joints:
+    if way == "auto":
+        return ("articulated", f"for its parts touch like {count}") if joints else ("soft", "for it has no joints")
+    if way == "articulated" and not joints:
+        raise ValueError(
+            "the object is to be articulated, and no parts of it touch as in a joint: take soft, stiff or rigid, and "
+            "write its joints into the scene file by hand"
+        )
+    return way, "as you said"
+
+
+@dataclass(frozen=True)
+class Moves:
+    """How the object of a new scene file moves.
+
+    Attributes:
+        way: in a word.
+        joints: that its contacts suggest.
+        blocks: that move all segments; none of what is rigid or articulated.
+    """
+
+    way: Way
+    joints: Sequence[Joint]
+    blocks: tuple[DeformationBlock, ...]
+
+    @classmethod
+    def of(cls, mesh: SegmentedMesh, way: Way, joints: Sequence[Joint]) -> "Moves":
+        """Moves of segments in the file's frame and unit."""
+        motions = {"soft": SOFT, "stiff": STIFF}
+        return cls(way, joints, default_deformations(mesh, motions[way]) if way in motions else ())
+
+    @property
+    def description(self) -> str:
+        """Phrase on how it moves."""
+        if self.way == "articulated":
+            return "by its joints"
+        if self.way == "rigid":
+            return "none"
+        if not isinstance(self.blocks[0], ElasticBlock):
+            return "as in a box of rubber, for its segments do not touch"
+        return f"as a {self.way} elastic solid"
+
+    def draw(self, rest: SegmentedMesh, placement: Normalizer) -> RandomMotion:
+        """Random motion of the segments, placed already, in scene units."""
+        if self.way != "articulated":
+            return random_motion(rest, self.blocks, placement)
+        target = Target(rest, rest.bounds, placement)
+        return RandomMotion(rest, tuple((_joint_block(joint).sampler(target), joint.moved) for joint in self.joints))
+
+
+def _joint_block(joint: Joint) -> JointBlock:
+    (x, y, z), (u, v, w) = joint.contact.point.tolist(), joint.axis.tolist()
+    most = (float(joint.most[0]), float(joint.most[1]))
+    angle, slide = (most, (0.0, 0.0)) if joint.hinge else ((0.0, 0.0), most)
+    return JointBlock(type="joint", pivot=(x, y, z), axis=(u, v, w), angle=angle, slide=slide)
+
+
+def _notes(mesh: SegmentedMesh, moves: Moves) -> list[str]:
+    """Sentences about proposed joints."""
+    if not moves.joints:
+        return []
+    count = counted(len(moves.joints), "joint")
+    ending = "" if moves.way == "articulated" else ", proposed in comments: remove the # where it has them"
+    notes = [f"joints: its parts touch like {count}{ending}"]
+    for joint in moves.joints:
         if joint.narrowed:
             names = ", ".join(mesh.names[index] for index in joint.moved)
             way = "turns by" if joint.hinge else "slides by"
@@ -518,21 +616,37 @@ def _narrowed(joint: Joint) -> str:
     return f"narrowed from {_range(joint.alone)}: beyond, joints collide together"
 
 
-def _deformations(mesh: SegmentedMesh, blocks: Sequence[BendBlock | LatticeBlock], joints: Sequence[Joint]) -> str:
-    """Lines of the list of deformations: joints in comments, what bends the whole, and others in comments."""
-    bend, lattice, sides = blocks[0], blocks[-1], np.ptp(mesh.bounds, axis=0)
+def _deformations(mesh: SegmentedMesh, moves: Moves) -> str:
+    """The key ``deformations`` with its lines: joints, what bends the whole, and others in comments."""
+    sides, joints = np.ptp(mesh.bounds, axis=0), _joints(mesh, moves.joints)
+    longest = int(sides.argmax())
+    start = (mesh.bounds[0] + mesh.bounds[1]) / 2
+    start[longest] = mesh.bounds[0, longest]
+    end, axis, length = _numbers(start), [int(value) for value in _direction(longest)], f"{rounded(sides[longest]):g}"
+    push, reach = f"{0.1 * sides.min():.3g}", f"{0.5 * sides.min():.3g}"
+    further = FURTHER.format(end=end, axis=axis, length=length, push=push, reach=reach)
+    if moves.way == "rigid":
+        return f"deformations: rigid\n{joints}{further}"
+    if moves.way == "articulated":
+        lines = [line.removeprefix("#") for line in joints.splitlines(keepends=True)[1:]]
+        return f"{ARTICULATED}\ndeformations:\n{''.join(lines)}{ELASTIC_COMMENT}{further}"
+    return f"deformations:\n{joints}{_soft(moves.blocks)}{further}"
+
+
+def _soft(blocks: Sequence[DeformationBlock]) -> str:
+    """Lines of what bends the whole object."""
+    if isinstance(blocks[0], ElasticBlock):
+        return ELASTIC_TEXT.format(motion=f"{blocks[0].motion:g}", soft=f"{SOFT:g}", stiff=f"{STIFF:g}")
+    bend, lattice = blocks[0], blocks[-1]
     assert isinstance(bend, BendBlock) and isinstance(lattice, LatticeBlock)
-    end, axis, length = _numbers(np.array(bend.origin)), [int(value) for value in bend.axis], f"{bend.length:g}"
-    soft = SOFT.format(
+    return RUBBER.format(
         spacing=f"{lattice.spacing:g}",
         strength=f"{lattice.strength:g}",
-        end=end,
-        axis=axis,
-        length=length,
+        end=_numbers(np.array(bend.origin)),
+        axis=[int(value) for value in bend.axis],
+        length=f"{bend.length:g}",
         angle=f"{bend.angle[1]:g}",
     )
-    push, reach = f"{0.1 * sides.min():.3g}", f"{0.5 * sides.min():.3g}"
-    return _joints(mesh, joints) + soft + FURTHER.format(end=end, axis=axis, length=length, push=push, reach=reach)
 
 
 def _joints(mesh: SegmentedMesh, joints: Sequence[Joint]) -> str:
@@ -576,6 +690,8 @@ def _numbers(values: Float[np.ndarray, "3"]) -> str:
 
 JOINTS = "# Joints that the contacts suggest, in ranges without collisions; remove the '#'. The tip comes first:"
 
+ARTICULATED = "# Joints that the contacts suggest, in ranges without collisions. The tip comes first."
+
 EXAMPLE_JOINT = """\
 #  - type: joint  # rigid, and before what bends the whole; in a chain, the joint at the tip comes first
 #    segments: [{part}]
@@ -584,7 +700,21 @@ EXAMPLE_JOINT = """\
 #    angle: [-30, 30]
 """
 
-SOFT = """\
+ELASTIC_TEXT = """\
+  - type: elastic  # all segments as one solid under random loads
+    motion: {motion}  # of a typical place, in half longest sides: {soft} is soft, as organs are, {stiff} is stiff
+#    stiffness: {{NAME: 10}}  # of a segment, in that of the others
+#    held:  # what does not move, such as an attachment: a ball, or a side of a plane (direction instead of radius)
+#      - center: [0, 0, 0]
+#        radius: 1
+"""
+
+ELASTIC_COMMENT = """\
+#  - type: elastic  # bends the whole as well
+#    motion: 0.05
+"""
+
+RUBBER = """\
   - type: bend  # along the longest side, to any side
     origin: {end}
     axis: {axis}
@@ -638,9 +768,8 @@ camera:
   field_of_view: {view}  # as narrow as still shows all of the object at the nearest distance
 
 # Drawn at random within these bounds for every example, and applied in this order to the segments named, or to all.
-# Segments that touch should move by the same deformations, so that they stay in contact. These bend the object as if it
-# were of rubber, as far as suits soft things: for what has joints, drop them and say how its parts move.
-deformations:
+# Segments that touch should move by the same deformations, so that they stay in contact. One word says them too:
+# rigid, soft or stiff (an elastic solid).
 {deformations}# Recorded frames of a simulator take the place of all deformations:
 #states: states.npz
 """
