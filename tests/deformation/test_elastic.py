@@ -8,6 +8,9 @@ from lattice import fine, lattice
 from shapes import box
 
 from mereo.deformation.elastic import (
+    LEAST_RATIO,
+    MOST_SWELLING,
+    ElasticSampler,
     ElasticSolid,
     Material,
     StateMap,
@@ -165,6 +168,67 @@ def test_drawn_states_keep_their_volume_and_centre() -> None:
     assert np.median(grown) > 3 * np.median(kept) and grown.max() > 0.1
 
 
+def test_no_drawn_state_folds_or_swells_however_large_the_motion() -> None:
+    """At a motion at which most of the prior's states turn tetrahedra inside out, and their volume by a tenth."""
+    sampler = ElasticSampler(solid(), Material(), COUNT, 0.5 * 2.5)
+    state, share, calmed = StateMap(solid(), sampler.modes), solid().volumes / solid().volumes.sum(), 0
+    for seed in range(12):
+        drawn = sampler(np.random.default_rng(seed), no_surface)
+        ratios = solid().mesh.volume_ratios(drawn.nodes)
+        assert ratios.min() >= LEAST_RATIO and abs(share @ ratios - 1) <= MOST_SWELLING
+        again = sampler(np.random.default_rng(seed), no_surface)
+        assert np.array_equal(drawn.nodes, again.nodes)
+        wild = state(np.random.default_rng(seed).normal(size=COUNT)).nodes
+        calmed += not np.allclose(wild, drawn.nodes)
+    assert calmed > 6
+
+
+def no_surface() -> tuple[np.ndarray, np.ndarray]:
+    return np.empty((0, 3)), np.empty((0, 3))
+
+
+# --- parts that are stiffer, and parts that are held ------------------------------------------------------------------
+
+
+def test_a_stiffer_part_bends_less() -> None:
+    bar = SegmentedMesh((box((0, 0, 0), (3, 1, 1), "left", 0), box((3, 0, 0), (6, 1, 1), "right", 1)))
+    even, uneven = (build_lattice(bar, 12, stiffness) for stiffness in ((1.0, 1.0), (1.0, 50.0)))
+
+    def energies(body: ElasticSolid) -> np.ndarray:
+        """Strain energy of each half in the softest modes, under the same stiffness."""
+        _, vectors = find_modes(body, 4, Material())
+        center = body.mesh.nodes[body.mesh.elements].mean(axis=1)[:, 0]
+        halves = []
+        for side in (center < 3, center > 3):
+            part = ElasticSolid(body.mesh, body.filled, np.where(side, 1.0, 1e-9))
+            stiffness = assemble_stiffness(part, Material())
+            flat = vectors.reshape(-1, 4)
+            halves.append(np.einsum("ik,ik->", flat, stiffness @ flat))
+        return np.array(halves)
+
+    soft, stiff = energies(even), energies(uneven)
+    assert soft[0] == pytest.approx(soft[1], rel=0.05)
+    assert stiff[1] < 0.05 * stiff[0]
+    stretched = np.zeros_like(uneven.mesh.nodes)
+    stretched[:, 0] = 0.01 * uneven.mesh.nodes[:, 0]
+    ratio = [stretched.ravel() @ (assemble_stiffness(body, Material()) @ stretched.ravel()) for body in (uneven, even)]
+    assert ratio[0] / ratio[1] == pytest.approx((1 + 50) / 2, rel=0.05)
+
+
+def test_what_is_held_does_not_move_and_nothing_is_rigid() -> None:
+    held = solid().mesh.nodes[:, 0] < 1.0
+    values, vectors = find_modes(solid(), COUNT, Material(), held)
+    assert (vectors[held] == 0).all() and (np.abs(vectors[~held]).max(axis=(1, 2)) > 0).all()
+    assert (np.diff(values) >= 0).all() and values[0] > 0
+    flat, mass = vectors.reshape(-1, COUNT), np.repeat(solid().mass, 3) / solid().mass.sum()
+    np.testing.assert_allclose(flat.T @ (mass[:, None] * flat), np.eye(COUNT), atol=1e-6)
+    free = find_modes(solid(), COUNT, Material())[0]
+    assert values[0] < free[0], "a cantilever is softer than a free bar"
+    hinge = np.isclose(solid().mesh.nodes[:, [0, 2]], solid().mesh.nodes[0, [0, 2]]).all(axis=1)
+    with pytest.raises(ValueError, match="what is held leaves it free to turn: hold more of it"):
+        find_modes(solid(), COUNT, Material(), hinge)
+
+
 # --- what is no solid -------------------------------------------------------------------------------------------------
 
 
@@ -201,6 +265,8 @@ def test_bad_modes_are_refused() -> None:
 
 
 def test_a_solid_in_pieces_is_refused() -> None:
+    assert solid().pieces == 1
     pieces = SegmentedMesh((box((0, 0, 0), (2, 2, 2), "left", 0), box((6, 0, 0), (8, 2, 2), "right", 1)))
+    assert build_lattice(pieces, 12).pieces == 2
     with pytest.raises(ValueError, match="it is not in one piece, or parts of it meet in an edge alone"):
         find_modes(build_lattice(pieces, 12), COUNT, Material())
