@@ -190,6 +190,14 @@ def test_an_overlap_at_rest_is_one_fault(tmp_path: Path, capsys: pytest.CaptureF
     assert "overlap in 25.00%" in capsys.readouterr().out
 
 
+def test_parts_that_all_overlap_are_not_in_one_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = [write_mesh(box((0, 0, 0), (20, 10, 10 + k)), tmp_path / f"{k}.stl") for k in range(3)]
+    for count, hinted in ((2, False), (3, True)):
+        with pytest.raises(ValueError, match="listed above"):
+            check_scene(str(write_scene_file(files[:count], tmp_path / f"of{count}.yaml")))
+        assert ("note: most pairs overlap" in capsys.readouterr().out) == hinted
+
+
 # --- defaults ---------------------------------------------------------------------------------------------------------
 
 

@@ -99,9 +99,12 @@ def _report(mesh: SegmentedMesh, health: list[Health], unit: str) -> int:
             faults += 1
             print(f"  fault: it {fault}")
     if usable:
-        for overlap in overlaps(_marked(mesh, health)):
+        shared, count = overlaps(_marked(mesh, health)), len(health)
+        for overlap in shared:
             faults += 1
             print(f"  fault: {overlap}")
+        if count > 2 and len(shared) > count * (count - 1) / 4:
+            print("  note: most pairs overlap; the files may each have a frame of their own: export them assembled")
     return faults
 
 

@@ -376,9 +376,9 @@ class _CollisionTest:
         }
         keys = {(i, j): _relative(chains[i], chains[j]) for i, j in sorted(apart)}
         untested = {pair for pair, key in keys.items() if (pair, key) not in self._known}
-        found = overlaps(self.mesh.with_vertices(places), COLLIDES, untested) if untested else ()
+        pairs = overlaps(self.mesh.with_vertices(places), COLLIDES, untested) if untested else ()
         index = {name: number for number, name in enumerate(self.mesh.names)}
-        overlapping = {tuple(sorted((index[each.small], index[each.large]))) for each in found}
+        overlapping = {tuple(sorted((index[each.small], index[each.large]))) for each in pairs}
         self._known |= {(pair, keys[pair]): pair in overlapping for pair in untested}
         return [pair for pair, key in keys.items() if self._known[pair, key]]
 
