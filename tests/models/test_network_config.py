@@ -88,7 +88,3 @@ def test_a_recipe_is_written_flat() -> None:
     assert list(PRESETS["tiny-autodecoder"].to_dict()) == names
     assert list(written["network"])[:6] == ["encoder", "points", "neighbors", "ratio1", "radius1", "mlp1"]
     assert written["augment"]["keep_points"] == (1.0, 1.0)
-
-
-def test_the_papers_recipe_is_the_default() -> None:
-    assert PRESETS["paper"] == TrainConfig()

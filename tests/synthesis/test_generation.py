@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from folder_contents import contents
 from safetensors.numpy import load_file
-from toy_data import SMALL, read_all
+from toy_data import SMALL
 from toy_scene import toy_scene
 
 from mereo.api.generate import generate
@@ -23,7 +23,6 @@ from mereo.synthesis import shards
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import Example, synthesize
 from mereo.synthesis.shards import example_bytes
-from mereo.training.dataset import Dataset
 
 TOY = toy_scene()
 
@@ -69,26 +68,6 @@ def test_killed_and_resumed_equals_uninterrupted(
     assert contents(tmp_path / "data") == contents(whole)
 
 
-def test_machines_that_share_the_work_and_the_directory_make_the_same_dataset(whole: Path, tmp_path: Path) -> None:
-    for part in (1, 0):
-        generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3, shard=(part, 2))
-    assert contents(whole) == contents(tmp_path / "data")
-    with pytest.raises(FileExistsError, match="holds a dataset; continue it with resume"):
-        generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3, shard=(0, 2))
-
-
-def test_a_damaged_shard_is_reported_and_made_again(
-    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3)
-    shard = tmp_path / "data" / "shard-00001.safetensors"
-    shard.write_bytes(shard.read_bytes()[:-1])
-    capsys.readouterr()
-    generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3, resume=True)
-    assert "shard-00001.safetensors is damaged and is made again" in capsys.readouterr().out
-    assert contents(whole) == contents(tmp_path / "data")
-
-
 def test_any_example_can_be_remade_alone(whole: Path) -> None:
     example = synthesize(TOY, SMALL, example_rng(3, 5))
     shard = load_file(whole / "shard-00001.safetensors")
@@ -107,14 +86,6 @@ def test_two_workers_equal_one(whole: Path, tmp_path: Path) -> None:
 
 
 # --- what is stored ---------------------------------------------------------------------------------------------------
-
-
-def test_training_reads_what_generation_writes(whole: Path) -> None:
-    data = Dataset.load(whole)
-    stored = read_all(data)
-    assert len(data) == 10 and stored.cloud.shape == (10, 128, 3)
-    assert stored.positions.shape == (10, SMALL.sampling.total(4), 3)
-    assert (stored.viewpoint[:, 2] < stored.cloud[..., 2].amin(dim=1)).all()
 
 
 def test_tensors_are_as_documented(whole: Path) -> None:
@@ -211,11 +182,6 @@ def test_an_existing_directory_is_left_alone(tmp_path: Path, resume: bool) -> No
     with pytest.raises(FileExistsError, match="is a file; a dataset is a directory: choose another output"):
         generate(TOY, tmp_path / "notes.txt", SMALL, examples=4, seed=1, resume=resume)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
-
-
-def test_a_dataset_is_not_overwritten_without_being_asked(whole: Path) -> None:
-    with pytest.raises(FileExistsError, match="holds a dataset; continue it with resume, or choose another output"):
-        generate(TOY, whole, SMALL, examples=10, seed=3)
 
 
 @pytest.mark.parametrize("victim", ["template", "statistical_model", "shard-00000"])

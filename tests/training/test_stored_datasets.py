@@ -66,14 +66,18 @@ def empty(request: pytest.FixtureRequest, tmp_path: Path) -> Place:
     return tmp_path / "data" if request.param == "folder" else ObjectPath(f"memory://datasets/{next(NUMBERS)}")
 
 
+def copied(folder: Path, place: Place) -> Place:
+    if isinstance(place, Path):
+        place.mkdir()
+    for name in names_in(folder):
+        write_whole(place / name, (folder / name).read_bytes())
+    return place
+
+
 @pytest.fixture
 def stored(whole: Path, empty: Place) -> Place:
     """A copy in either kind of place."""
-    if isinstance(empty, Path):
-        empty.mkdir()
-    for name in names_in(whole):
-        write_whole(empty / name, (whole / name).read_bytes())
-    return empty
+    return copied(whole, empty)
 
 
 # --- made and continued -----------------------------------------------------------------------------------------------
@@ -128,7 +132,7 @@ def test_another_dataset_or_other_objects_are_left_alone(stored: Place) -> None:
 
 
 def test_a_lost_network_is_no_damage(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stored, read = make(ObjectPath(f"memory://datasets/{next(NUMBERS)}")), ObjectPath.read_bytes
+    stored, read = copied(whole, ObjectPath(f"memory://datasets/{next(NUMBERS)}")), ObjectPath.read_bytes
 
     def lost(path: ObjectPath) -> bytes:
         if path.name.startswith("shard-"):
