@@ -1,6 +1,7 @@
 """Training runs that are stopped or shared, for the tests of every encoder."""
 
 import os
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -39,22 +40,21 @@ def assert_resumes_exactly(dataset: Path, folder: Path, config: TrainConfig, ste
     assert (folder / "whole" / "metrics.csv").read_text() == (folder / "parts" / "metrics.csv").read_text()
 
 
-def train_in_two_processes(dataset: Path, folder: Path, module: str, config: str) -> Path:
-    """Train under torchrun with ``config``, an expression of the test module's ``SMALL``; returns the run."""
+def train_in_two_processes(dataset: Path, folder: Path, config: TrainConfig) -> Path:
+    """Train under torchrun, and return the run."""
+    (folder / "config.pickle").write_bytes(pickle.dumps(config))
     script = folder / "run.py"
     script.write_text(
-        "import sys\nfrom dataclasses import replace\nfrom pathlib import Path\n"
-        f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
-        f"from {module} import SMALL\nfrom mereo.training.trainer import train\n"
-        f"train(Path(sys.argv[1]), Path(sys.argv[2]), {config})\n"
+        "import pickle\nimport sys\nfrom pathlib import Path\nfrom mereo.training.trainer import train\n"
+        "dataset, run, config = map(Path, sys.argv[1:])\n"
+        "train(dataset, run, pickle.loads(config.read_bytes()))\n"
         # threads of the group would outlive the interpreter, and may then wait forever
         "threads = [name.read_text() for name in Path('/proc/self/task').glob('*/comm')]\n"
         "assert not any('gloo' in name for name in threads), threads\n"
     )
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "JAXTYPING_DISABLE": "1"}
-    done = subprocess.run(
-        [*command, str(dataset), str(folder / "run")], env=environment, capture_output=True, text=True, timeout=240
-    )
+    arguments = [str(dataset), str(folder / "run"), str(folder / "config.pickle")]
+    done = subprocess.run([*command, *arguments], env=environment, capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stderr[-2000:]
     return folder / "run"

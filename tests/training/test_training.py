@@ -114,6 +114,9 @@ def test_it_learns_the_two_halves(dataset: Path, tmp_path: Path) -> None:
 def test_every_loss_variant_trains_and_answers(dataset: Path, tmp_path: Path, loss: str) -> None:
     config = replace(SMALL, loss=loss, epochs=0.2)  # type: ignore[arg-type]
     model = load_model(trainer.train(dataset, tmp_path / "run", config))
+    with (tmp_path / "run/metrics.csv").open() as file:
+        last = list(csv.DictReader(file))[-1]
+    assert (last["ce"] == "", last["val_miou"] == "") == (loss == "l1", loss == "l1") and last["val_iou"]
     cloud = np.random.default_rng(0).normal(loc=(0.0, 0.0, 50.0), size=(80, 3))
     answer = model.query(model.encode(cloud), cloud[:7])
     assert answer.label.shape == (7,) and answer.probability.shape[1] == (2 if loss == "l1" else 3)
@@ -181,7 +184,7 @@ def test_a_dataset_without_template_is_refused(dataset: Path, tmp_path: Path) ->
 @pytest.mark.slow
 def test_two_processes_train_together(dataset: Path, tmp_path: Path) -> None:
     """Under torchrun, both halves of every batch count: the result is finite, complete, and resumable."""
-    run = train_in_two_processes(dataset, tmp_path, "test_training", "replace(SMALL, epochs=0.5)")
+    run = train_in_two_processes(dataset, tmp_path, replace(SMALL, epochs=0.5))
     tensors = load_file(run / "checkpoint.safetensors")
     assert all(torch.isfinite(value).all() for value in tensors.values())
     with (run / "metrics.csv").open() as file:
