@@ -287,16 +287,13 @@ def test_reconstruct_and_evaluate(dataset: Path, model: Model) -> None:
 # --- recipes ----------------------------------------------------------------------------------------------------------
 
 
-def test_the_papers_recipe() -> None:
+def test_the_papers_recipe_and_the_small_one_which_adds_nothing_to_its_network() -> None:
+    """Rates, passes, widths and frequencies differ; what an observed cloud tells only the search knows."""
     recipe, paper = PRESETS["paper-autodecoder"], PRESETS["paper"]
     assert (recipe.batch, recipe.learning_rate, recipe.code_rate, recipe.epochs) == (64, 5e-4, 1e-3, 1000)
     assert recipe.network.decoder.dropout == 0.2 and recipe.network.autodecoder == AutodecoderConfig(75, 1e-3)
     network = recipe.network.changed(encoder="pointnet2", dropout=0.0)
     assert replace(recipe, batch=40, epochs=300.0, network=network) == paper
-
-
-def test_the_small_recipe_adds_nothing_to_the_papers_network() -> None:
-    """Rates, passes, widths and frequencies differ; what an observed cloud tells only the search knows."""
     small = PRESETS["tiny-autodecoder"]
     added = small.network.additions
     assert not (added.local_neighbors or added.sight_neighbors or added.align_points or added.rest_template)

@@ -56,15 +56,12 @@ def test_it_is_torchs_and_no_less_exact(spreads: float) -> None:
 
 
 @pytest.mark.usefixtures("group")
-def test_in_use_it_has_its_running_statistics() -> None:
+def test_in_use_it_has_its_running_statistics_and_one_process_keeps_torchs() -> None:
     norm, rows = nn.BatchNorm1d(4), torch.rand(16, 4)
     shared = share_statistics(nn.Sequential(norm), Process(0, 2), CPU).eval()
     assert isinstance(norm, SharedBatchNorm) and norm.num_batches_tracked == 0
     assert torch.allclose(shared(rows), rows / (1 + norm.eps) ** 0.5)
     shared.train()(rows)
     assert norm.num_batches_tracked == 1 and list(norm.state_dict()) == list(nn.BatchNorm1d(4).state_dict())
-
-
-def test_one_process_keeps_torchs() -> None:
     network = nn.Sequential(nn.BatchNorm1d(4))
     assert share_statistics(network, Process(), CPU) is network and type(network[0]) is nn.BatchNorm1d

@@ -20,7 +20,7 @@ def miou(logits: torch.Tensor, labels: torch.Tensor) -> float:
     return intersection_over_union(confusion_matrix(labels.numpy(), logits.argmax(1).numpy(), logits.shape[1])).miou
 
 
-def test_a_rare_class_that_was_trained_as_if_common_is_drawn_smaller() -> None:
+def test_a_rare_class_trained_as_if_common_is_drawn_smaller_and_what_is_right_is_left_alone() -> None:
     """Likelihoods alone are what equal shares would teach; the class is really one point in a hundred."""
     share = (0.69, 0.3, 0.01)
     logits, labels = noisy_world(60_000, share, seed=0)
@@ -28,8 +28,5 @@ def test_a_rare_class_that_was_trained_as_if_common_is_drawn_smaller() -> None:
     assert offsets[0] == 0 and offsets[2] < -0.5
     fresh, truth = noisy_world(60_000, share, seed=1)
     assert miou(fresh + offsets, truth) > miou(fresh, truth) + 0.01
-
-
-def test_a_network_that_is_right_is_left_alone() -> None:
     labels = torch.arange(3).repeat(50)
     assert torch.equal(class_offsets(5.0 * torch.nn.functional.one_hot(labels).float(), labels), torch.zeros(3))

@@ -1,4 +1,4 @@
-"""Two nodes of two processes, started by torchrun on this machine: they train what one process does.
+"""Processes and nodes, started by torchrun on this machine: they train what one process does, and fail as one.
 
 Equal is: to rounding, because sums over processes are added in another order than those of one. Adam turns the rounding
 of a gradient near zero into a step of the size of its rate, so that in single precision runs that differ in one bit
@@ -21,8 +21,9 @@ from mereo.training.processes import SEPARATE
 
 TRAIN = (
     "--preset tiny --precision float32 --compile off --batch 8 --queries 48 --network.points 64 "
-    "--network.width 48 --network.neighbors 8 --holdout 6 --offset-examples 0"
+    "--network.width 48 --network.neighbors 8"
 )
+NODES = f"{TRAIN} --holdout 6 --offset-examples 0"
 
 WORKER = """
 import os, signal, sys
@@ -63,7 +64,14 @@ def train_on_nodes(folder: Path, output: str, options: str, nodes: int = 2, **mo
     launcher = [sys.executable, "-m", "torch.distributed.run", "--nnodes", str(nodes), "--nproc-per-node", "2"]
     launcher += ["--rdzv-backend", "c10d", "--rdzv-endpoint", f"127.0.0.1:{port}", "--rdzv-id", "mereo"]
     launcher += ["--local-addr", "127.0.0.1", "--max-restarts", "2", "worker.py"]
-    command = [*launcher, "train", "data", "--output", output, *f"{TRAIN} {options}".split()]
+    command = [
+        *launcher,
+        "train",
+        "data",
+        "--output",
+        output,
+        *f"{NODES} {options}".split(),
+    ]
     started = [
         subprocess.Popen(
             command, cwd=folder, env=environment(**more), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
@@ -77,7 +85,15 @@ def train_on_nodes(folder: Path, output: str, options: str, nodes: int = 2, **mo
 
 def train_alone(folder: Path, output: str, options: str) -> None:
     (folder / "worker.py").write_text(WORKER)
-    command = [sys.executable, "worker.py", "train", "data", "--output", output, *f"{TRAIN} {options}".split()]
+    command = [
+        sys.executable,
+        "worker.py",
+        "train",
+        "data",
+        "--output",
+        output,
+        *f"{NODES} {options}".split(),
+    ]
     done = subprocess.run(command, cwd=folder, env=environment(), capture_output=True, text=True, timeout=280)
     assert done.returncode == 0, done.stderr[-4000:]
 
@@ -124,3 +140,57 @@ def test_a_killed_worker_is_started_again_and_ends_with_the_same_result(folder: 
     assert not any("this is a fault of mereo" in text for text in said), said
     apart = differences(folder, "whole", "parts")
     assert apart["losses"] < 1e-8 and apart["weights"] < 1e-7, apart
+
+
+FAILS = """
+import errno, os, sys
+from pathlib import Path
+import mereo.__main__ as command_line
+from mereo.training import trainer
+from mereo.io.atomic_files import atomic_file
+def full(run_dir, checkpoint):
+    with atomic_file(run_dir / "checkpoint.safetensors"):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+def refused(self, step):
+    raise ValueError("the table is odd")
+{patch}
+trainer.train.__kwdefaults__["checkpoint_every_s"] = 0.0
+code = command_line.main(sys.argv[1:])
+print(f"rank {{os.environ['RANK']}} ends with {{code}}", flush=True)
+sys.exit(code)
+"""
+
+
+def run_ranks(folder: Path, patch: str) -> "subprocess.CompletedProcess[str]":
+    """Two processes that train, process 0 with a patch."""
+    (folder / "fails.py").write_text(FAILS.format(patch=patch))
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    return subprocess.run(
+        [*launcher, "fails.py", *f"train data --output run {TRAIN} --epochs 2 --holdout 0".split()],
+        cwd=folder,
+        env={**os.environ, "OMP_NUM_THREADS": "1", "JAXTYPING_DISABLE": "1"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+
+@pytest.mark.slow
+def test_a_full_disk_at_a_checkpoint_ends_all_with_one_sentence(tmp_path: Path) -> None:
+    write_toy_dataset(tmp_path / "data", examples=32)
+    done = run_ranks(tmp_path, "trainer.save_checkpoint = full")
+    said = [line for line in done.stderr.splitlines() if line.startswith("mereo: ")]
+    assert done.returncode != 0 and len(said) == 1, done.stderr
+    assert said[0].startswith("mereo: error: the disk is full while writing run/checkpoint.safetensors"), said
+    assert "Traceback" not in done.stderr.partition("torch/distributed")[0], done.stderr
+    assert not list((tmp_path / "run").glob(".*"))
+
+
+@pytest.mark.slow
+def test_a_refused_folder_ends_all_with_one_sentence(tmp_path: Path) -> None:
+    write_toy_dataset(tmp_path / "data", examples=32)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "thesis.tex").write_text("precious")
+    done = run_ranks(tmp_path, "")
+    said = [line for line in done.stderr.splitlines() if line.startswith("mereo: ")]
+    assert done.returncode != 0 and len(said) == 1 and "is not empty and holds no config.json" in said[0], done.stderr
