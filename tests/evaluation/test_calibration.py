@@ -36,9 +36,6 @@ def logits() -> np.ndarray:
     return np.random.default_rng(1).normal(scale=3.0, size=(40_000, 3))
 
 
-# --- the calibration error --------------------------------------------------------------------------------------------
-
-
 def test_the_error_is_the_distance_of_confidence_from_right_answers() -> None:
     """Nine of ten right at 0.6: 0.3; and half of the answers without any error halve it."""
     counted = Reliability()
@@ -75,9 +72,6 @@ def test_cells_are_drawn_among_those_that_count_and_are_the_same_every_time() ->
     np.testing.assert_array_equal(sample_cells(truth, 500)[0], points)
 
 
-# --- the model --------------------------------------------------------------------------------------------------------
-
-
 def test_labels_stay_and_probabilities_are_scaled() -> None:
     plain = untrained(NAMES)
     scaled = replace(plain, calibration=SCALED)
@@ -104,9 +98,6 @@ def test_observed_points_have_the_calibrated_probability_of_their_own_segment() 
     np.testing.assert_allclose(given.confidence, [0.2, 5 / 8], rtol=1e-5)
 
 
-# --- the file ---------------------------------------------------------------------------------------------------------
-
-
 def tensors(path: Path) -> dict[str, bytes]:
     with safe_open(path, framework="pt") as file:
         return {key: file.get_tensor(key).numpy().tobytes() for key in file.keys()}  # noqa: SIM118 (not a mapping)
@@ -126,9 +117,6 @@ def test_biases_of_other_classes_are_refused(tmp_path: Path) -> None:
     wrong.write_bytes(with_calibration(path, SCALED.model_copy(update={"biases": (0.0, 1.0)})))
     with pytest.raises(ValueError, match="a calibration with 2 biases, and 3 classes; calibrate it again"):
         load_model(wrong)
-
-
-# --- the command ------------------------------------------------------------------------------------------------------
 
 
 def test_weights_are_not_replaced_unasked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -170,9 +170,6 @@ def test_a_model_of_distances_is_scored_on_the_whole() -> None:
     assert np.isnan(grid_scores(model, cloud(), two_cuboids(), cells=20).miou)
 
 
-# --- synthetic test sets ---------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def rope() -> AnalyticModel:
     """An answer of planes: quick to evaluate, right nowhere in particular."""
@@ -243,9 +240,6 @@ def test_the_table_agrees_with_the_matrix() -> None:
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
     assert rows[2] == ["whole set", "0.800", "0.833", "0.667", "1.000"]
     assert {len(row) for row in rows} == {5}
-
-
-# --- sample views and the demo ---------------------------------------------------------------------------------------
 
 
 def test_a_sample_view_survives_its_file(tmp_path: Path) -> None:

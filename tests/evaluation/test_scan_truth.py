@@ -181,8 +181,6 @@ def test_the_rest_pose_is_exported(bar: tuple[Path, Scene, np.ndarray], capsys: 
     assert "has the suffix '.xyz'; it must be .ply or .glb" in capsys.readouterr().err
 
 
-# --- the bunny's real scans ------------------------------------------------------------------------------------------
-
 TOLERANCE = {"body": (0.25, 0.4), "tail": (0.7, 2.0)} | dict.fromkeys(("head", "ear_left", "ear_right"), (0.7, 1.0))
 """Millimetres at the segment's middle, and degrees, from the published pose; the scan lies 0.1 mm from the model."""
 

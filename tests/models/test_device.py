@@ -37,9 +37,6 @@ def fresh_decisions() -> Iterator[None]:
         decide.cache_clear()
 
 
-# --- device and precision ---------------------------------------------------------------------------------------------
-
-
 @pytest.mark.usefixtures("fresh_decisions")
 @pytest.mark.parametrize(
     ("features", "is_amd", "chosen"),
@@ -93,9 +90,6 @@ def test_cuda_where_there_is_none_is_refused(tmp_path: Path, capsys: pytest.Capt
     assert command_line.main([*arguments, "--device", "cuda"]) != 0
     assert "torch sees no CUDA device; leave out --device" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
-
-
-# --- products by oneDNN: the same numbers, where nothing but numbers is asked for -------------------------------------
 
 
 @pytest.fixture
@@ -158,9 +152,6 @@ def test_the_processor_decides_and_no_clock(monkeypatch: pytest.MonkeyPatch) -> 
     with torch.inference_mode():
         weight, bias = layer()
         assert torch.equal(linear(rows(ROWS), weight, bias), F.linear(rows(ROWS), weight, bias))
-
-
-# --- threads: the same bits, the caller's settings untouched, errors told ---------------------------------------------
 
 
 @pytest.fixture

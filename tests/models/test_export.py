@@ -51,9 +51,6 @@ def agree(found: dict[str, Any], expected: tuple[np.ndarray, ...]) -> None:
     assert np.asarray(found["logits"]).std() > 100 * TOLERANCE, "the comparison would be empty"
 
 
-# --- torch.export ----------------------------------------------------------------------------------------------------
-
-
 def export(case: str, place: Path, kind: str) -> tuple[Model, Path]:
     """By the command, in a process of its own: the tests' shape checks know no sizes that are left open."""
     weights = case
@@ -98,9 +95,6 @@ def test_missing_packages_are_named_with_their_extra(tmp_path: Path, monkeypatch
     with pytest.raises(ImportError, match=r"onnxscript is needed to export to ONNX: pip install 'mereo\[onnx\]'"):
         export_weights(SHIPPED, tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
-
-
-# --- the runner, without a graph -------------------------------------------------------------------------------------
 
 
 def raw_cloud(count: int, seed: int = 0) -> np.ndarray:
@@ -178,8 +172,6 @@ def test_the_runner_is_short_and_needs_numpy_and_onnxruntime_only() -> None:
     imported |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
     assert imported - set(sys.stdlib_module_names) == {"numpy", "onnxruntime"}
 
-
-# --- ONNX ------------------------------------------------------------------------------------------------------------
 
 FULL_SIZE = "paper"
 """A preset as it is; `base` is what the shipped weights are, and `large` is `base` with other widths."""

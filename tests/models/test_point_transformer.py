@@ -32,9 +32,6 @@ def settled(config: NetworkConfig = TINY) -> PointTransformer:
     return encoder.eval()
 
 
-# --- attention --------------------------------------------------------------------------------------------------------
-
-
 def attended(layer: VectorAttention, p: Tensor, x: Tensor, neighbors: list[int], i: int) -> Tensor:
     """Equation 3 of Zhao et al. for one point, term by term."""
 
@@ -85,9 +82,6 @@ def test_transition_down_takes_the_largest_of_each_neighbourhood() -> None:
         for b, m in ((0, 0), (1, 4)):
             each = torch.stack([down.mlp(features[b, j]) for j in index[b, m].tolist()])
             assert torch.allclose(found[b, m], each.amax(dim=0), atol=1e-6)
-
-
-# --- the encoder ------------------------------------------------------------------------------------------------------
 
 
 def test_repeated_points_are_nobodys_neighbours() -> None:

@@ -114,9 +114,6 @@ def test_a_calibration_comes_back_from_the_file_and_damage_to_it_is_one_sentence
         load_model(path)
 
 
-# --- `mereo weights` --------------------------------------------------------------------------------------------------
-
-
 def said(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
     assert command_line.main(["weights", *map(str, arguments)]) == 0
     return capsys.readouterr().out

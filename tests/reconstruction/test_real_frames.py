@@ -89,9 +89,6 @@ def test_the_object_is_cut_out_of_every_real_image(
     assert only.dropped == 0, "no strays are seen in what was cut out well"
 
 
-# --- every format ----------------------------------------------------------------------------------------------------
-
-
 @cache
 def millimetres() -> np.ndarray:
     return np.array(Image.open(TABLE)).astype(np.uint16)
@@ -182,9 +179,6 @@ def test_the_bottle_is_the_same_from_every_format(tmp_path: Path, name: str) -> 
     assert len(found.cloud) == pytest.approx(len(known.cloud), rel=0.01)
     assert found.size_m == pytest.approx(known.size_m, abs=0.002)
     assert found.depth_m == pytest.approx(known.depth_m, abs=0.002)
-
-
-# --- masks -----------------------------------------------------------------------------------------------------------
 
 
 def masked(folder: Path, pixels: int) -> Observation:

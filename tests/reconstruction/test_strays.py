@@ -104,9 +104,6 @@ def test_points_that_are_not_finite_are_refused() -> None:
         readings(np.where(np.arange(120).reshape(40, 3) == 7, np.nan, 1.0))
 
 
-# --- views -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", ["shapes", "lizard"])
 def test_clean_views_lose_nothing(name: str) -> None:
     for points, genuine in views(name, "paper", range(6)):

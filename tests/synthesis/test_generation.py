@@ -42,9 +42,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return output
 
 
-# --- the same bits ----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("calls", [0, 5, 9])
 def test_killed_and_resumed_equals_uninterrupted(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: int
@@ -85,10 +82,8 @@ def test_two_workers_equal_one(whole: Path, tmp_path: Path) -> None:
     assert contents(whole) == contents(tmp_path / "data")
 
 
-# --- what is stored ---------------------------------------------------------------------------------------------------
-
-
-def test_tensors_are_as_documented(whole: Path) -> None:
+def test_tensors_are_as_documented_and_a_paper_size_dataset_fits_in_2_5_gigabytes(whole: Path) -> None:
+    """28,800 examples of a five-segment scene, on disk and in memory."""
     shard = load_file(whole / "shard-00000.safetensors")
     queries = SMALL.sampling.total(4)
     assert {key: (value.dtype.name, value.shape) for key, value in shard.items()} == {
@@ -103,10 +98,6 @@ def test_tensors_are_as_documented(whole: Path) -> None:
         "rest": ("float16", (4, queries, 3)),
     }
     assert np.array_equal(np.isnan(shard["rest"]).any(axis=-1), shard["labels"] == 0)
-
-
-def test_a_paper_size_dataset_fits_in_2_5_gigabytes(whole: Path) -> None:
-    """28,800 examples of a five-segment scene, on disk and in memory."""
     stored = sum(value.nbytes for value in load_file(whole / "shard-00000.safetensors").values())
     assert stored == 4 * example_bytes(SMALL, segments=4)
     file = (whole / "shard-00000.safetensors").stat().st_size
@@ -114,7 +105,7 @@ def test_a_paper_size_dataset_fits_in_2_5_gigabytes(whole: Path) -> None:
     assert 28_800 * example_bytes(GenerateConfig(), segments=5) + 450 * 2000 < 1.65e9 < 2.5e9
 
 
-def test_manifest_tells_how_to_make_it_again(whole: Path) -> None:
+def test_manifest_tells_how_to_make_it_again_and_files_have_the_users_permissions(whole: Path) -> None:
     manifest = json.loads((whole / "manifest.json").read_text())
     assert (manifest["scene"], manifest["seed"], manifest["examples"]) == ("toy", 3, 10)
     assert manifest["settings"]["sampling"]["per_segment"] == 16
@@ -123,9 +114,6 @@ def test_manifest_tells_how_to_make_it_again(whole: Path) -> None:
     assert len(manifest["rest_sha256"]) == 64 and manifest["any_roll"] is False
     assert manifest["bytes"] == 10 * example_bytes(SMALL, 4)
     assert manifest["libraries"]["numpy"] == np.__version__
-
-
-def test_files_have_the_users_permissions(whole: Path) -> None:
     mask = os.umask(0)
     os.umask(mask)
     assert all(path.stat().st_mode & 0o777 == 0o666 & ~mask for path in whole.iterdir())
@@ -135,9 +123,6 @@ def test_a_built_in_scene_goes_by_its_name(tmp_path: Path) -> None:
     generate("rope", tmp_path / "data", SMALL, examples=1, seed=1)
     manifest = json.loads((tmp_path / "data" / "manifest.json").read_text())
     assert [part["name"] for part in manifest["segments"]] == list(load_scene("rope").rest.names)
-
-
-# --- refusals ---------------------------------------------------------------------------------------------------------
 
 
 def test_test_seeds_and_training_seeds_never_meet(tmp_path: Path) -> None:

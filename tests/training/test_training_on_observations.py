@@ -50,9 +50,6 @@ def assert_same(one: Batch, other: Batch) -> None:
         assert torch.equal(getattr(one, name), getattr(other, name)), name
 
 
-# --- which one is seen ------------------------------------------------------------------------------------------------
-
-
 def test_a_batch_depends_on_its_generator_alone_and_with_probability_0_on_no_further_one(
     data: tuple[Dataset, Dataset],
 ) -> None:
@@ -89,9 +86,6 @@ def test_queries_and_cloud_stay_in_one_frame(data: tuple[Dataset, Dataset], numb
         (found.distances, seen.distances[:8]),
     ):
         assert torch.allclose(now, then * scale.view(-1, *[1] * (then.dim() - 1)), rtol=1e-4, atol=1e-3)
-
-
-# --- runs -------------------------------------------------------------------------------------------------------------
 
 
 def test_killed_and_resumed_equals_uninterrupted(folders: tuple[Path, Path], tmp_path: Path) -> None:

@@ -105,9 +105,6 @@ def test_observed_points_have_the_segment_they_lie_on(found: Reconstruction) -> 
     np.testing.assert_array_equal(cloud.labels, np.repeat([1, 2], 600))
     np.testing.assert_allclose(cloud.occupancy[cloud.points[:, 1] < 0.22], 0.5, atol=0.01)
     np.testing.assert_array_equal(cloud.points, view())
-
-
-def test_confidence_is_among_segments_and_occupancy_against_empty_space() -> None:
     logits = np.log(np.array([[0.5, 0.4, 0.1], [0.98, 0.005, 0.015]], dtype=np.float32))
     cloud = segment_points(logits, np.zeros((2, 3)), NAMES, PALETTE[:2])
     np.testing.assert_array_equal(cloud.labels, [1, 2])
@@ -132,7 +129,7 @@ def test_a_missing_extra_is_said_before_the_work(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_command_line_takes_formats() -> None:
+def test_the_command_line_takes_formats(tmp_path: Path) -> None:
     start = ["reconstruct", "c.ply", "--weights", "w", "--output", "o"]
     chosen, default = (
         parse([*start, "--formats", "ply", "seg.nrrd", "--millimetres", "--unit-m", "0.001"]),
@@ -142,8 +139,5 @@ def test_the_command_line_takes_formats() -> None:
     assert chosen.files == FilesConfig(("ply", "seg.nrrd"), True)
     assert chosen.reading.unit_m == 0.001
     assert chosen_formats(default.files.formats) == ("glb", "npz", "json")
-
-
-def test_contradictory_files(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="there is no format 'step'; the formats are glb, ply, .* and all: choose one"):
         chosen_formats(["ply", "step"])
