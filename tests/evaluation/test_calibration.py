@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from analytic import AnalyticModel, ball, logits_of, untrained
+from analytic import untrained
 from safetensors import safe_open
 
 from mereo import __main__ as command_line
@@ -15,7 +15,7 @@ from mereo.evaluation.calibrate import GOOD_ENOUGH, calibrate, ece_of, fit_scali
 from mereo.evaluation.cases import BINS, Reliability, sample_cells
 from mereo.evaluation.metrics import truth_grid
 from mereo.models.calibration import Calibration
-from mereo.models.model import Model, scaled_logits
+from mereo.models.model import scaled_logits
 from mereo.models.weights import load_model, save_model, with_calibration
 from mereo.reconstruction.pipeline import segment_points
 from mereo.scenes.registry import load_scene
@@ -47,12 +47,9 @@ def test_the_error_is_the_distance_of_confidence_from_right_answers() -> None:
     assert np.isnan(Reliability().ece)
 
 
-def test_answers_that_are_as_likely_as_they_say_have_none(logits: np.ndarray) -> None:
-    assert ece_of(logits, drawn(logits)) < 0.01
-
-
 def test_scaling_finds_what_made_the_probabilities_wrong(logits: np.ndarray) -> None:
     """Logits that are sharper, and favour a class, by known amounts; labels come from the true ones."""
+    assert ece_of(logits, drawn(logits)) < 0.01
     truth = drawn(logits)
     sharper = fit_scaling(2.5 * logits, truth)
     assert sharper.biases is None and sharper.temperature == pytest.approx(2.5, rel=0.03)
@@ -103,34 +100,26 @@ def tensors(path: Path) -> dict[str, bytes]:
         return {key: file.get_tensor(key).numpy().tobytes() for key in file.keys()}  # noqa: SIM118 (not a mapping)
 
 
-def test_all_else_of_a_file_stays(tmp_path: Path) -> None:
+def test_all_else_of_a_file_stays_and_biases_of_other_classes_are_refused(tmp_path: Path) -> None:
     path, calibrated = tmp_path / "plain.safetensors", tmp_path / "calibrated.safetensors"
     save_model(untrained(NAMES), path, torch.float16)
     calibrated.write_bytes(with_calibration(path, SCALED))
     assert tensors(path) == tensors(calibrated)
     assert load_model(calibrated).calibration == SCALED and load_model(path).calibration is None
-
-
-def test_biases_of_other_classes_are_refused(tmp_path: Path) -> None:
-    path, wrong = tmp_path / "plain.safetensors", tmp_path / "wrong.safetensors"
-    save_model(untrained(NAMES), path)
-    wrong.write_bytes(with_calibration(path, SCALED.model_copy(update={"biases": (0.0, 1.0)})))
+    calibrated.write_bytes(with_calibration(path, SCALED.model_copy(update={"biases": (0.0, 1.0)})))
     with pytest.raises(ValueError, match="a calibration with 2 biases, and 3 classes; calibrate it again"):
-        load_model(wrong)
+        load_model(calibrated)
 
 
-def test_weights_are_not_replaced_unasked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "plain.safetensors"
+def test_the_command_writes_what_was_measured_and_replaces_no_weights_unasked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A network that knows nothing: its probabilities become those of the classes' shares."""
+    path, output = tmp_path / "plain.safetensors", tmp_path / "calibrated.safetensors"
     save_model(untrained(load_scene("rope").rest.names), path)
     before = path.read_bytes()
     assert command_line.main(["calibrate", str(path)]) == 2
     assert "exists; it is not overwritten" in capsys.readouterr().err and path.read_bytes() == before
-
-
-def test_the_command_writes_what_was_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A network that knows nothing: its probabilities become those of the classes' shares."""
-    path, output = tmp_path / "plain.safetensors", tmp_path / "calibrated.safetensors"
-    save_model(untrained(load_scene("rope").rest.names), path)
     assert command_line.main(["calibrate", str(path), "--output", str(output), "--views", "8"]) == 0
     told = capsys.readouterr().out
     assert "8 views of the training seed 900000" in told and f"wrote {output}" in told
@@ -151,9 +140,3 @@ def test_the_command_writes_what_was_measured(tmp_path: Path, capsys: pytest.Cap
 def test_test_seeds_and_too_few_views_are_refused(options: dict[str, int], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         calibrate(untrained(load_scene("rope").rest.names), **options)
-
-
-def test_an_analytic_field_answers_as_before() -> None:
-    """The tests' closed-form model has no calibration and says so."""
-    model: Model = AnalyticModel.of(logits_of(ball((0.0, 0.0, 5.0), 1.0)), ("one",))
-    assert not model.calibrates

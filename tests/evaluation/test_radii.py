@@ -17,7 +17,7 @@ def some_radii() -> Radii:
     return Radii(points, labels, np.linspace(1, 2, 30), (10, 10), False)
 
 
-def test_radii_between_points_are_between_theirs() -> None:
+def test_radii_between_points_are_between_theirs_and_their_scale_ends_at_all_but_a_twentieth() -> None:
     """And at a point they are its own; other segments' points do not count."""
     radii = some_radii()
     np.testing.assert_allclose(radii.at(radii.points[:10], 1), radii.values[:10])
@@ -29,18 +29,11 @@ def test_radii_between_points_are_between_theirs() -> None:
     assert np.isnan(on_grid[0]) and 1 <= on_grid[1] <= 2 and 1.3 < on_grid[2] < 1.7
     scaled = radii.scaled(1000.0)
     np.testing.assert_allclose(scaled.at(1000.0 * radii.points[:3], 1), 1000.0 * radii.values[:3])
-
-
-def test_three_digits_are_kept() -> None:
-    np.testing.assert_allclose(rounded_to(np.array([0.0123456, 98765.0, 1.0]), 3), [0.0123, 98800.0, 1.0], rtol=1e-9)
-
-
-def test_the_scale_of_radii_ends_at_all_but_a_twentieth() -> None:
-    radii = some_radii()
     scale = radius_scale(radii, " mm")
     assert scale.high == pytest.approx(np.quantile(radii.values[:20], 0.95)) and "not calibrated" in scale.title
     np.testing.assert_array_equal(scale.colors(radii.values), radii.colors(radii.values))
     assert scale.words[1].endswith(" mm")
+    np.testing.assert_allclose(rounded_to(np.array([0.0123456, 98765.0, 1.0]), 3), [0.0123, 98800.0, 1.0], rtol=1e-9)
 
 
 def measured(off: np.ndarray, misfit: float = 0.1, displaced: float = 0.04) -> MeasuredRadii:
@@ -76,11 +69,8 @@ def test_a_frame_that_is_misfitted_or_where_the_network_is_elsewhere_has_wider_r
     plain = RegistrationErrors.together([one.errors for one in (*right, *lost)]).scale()
     assert plain > 4.0
     assert factors.widening(0.2) == pytest.approx(4.0) and factors.widening(0.05) == 1.0
-    assert (
-        factors.extra_radius(0.04) == 0.0
-        and factors.extra_radius(None) == 0.0
-        and factors.extra_radius(0.4) == pytest.approx(0.398, 1e-2)
-    )
+    assert factors.extra_radius(0.04) == factors.extra_radius(None) == 0.0
+    assert factors.extra_radius(0.4) == pytest.approx(0.398, 1e-2)
     widened = lost[1].widened(factors)
     assert (widened.radii > 5.0).all() and (widened.ratios == 0.0).all()
     assert RadiusFactors(2.0).scale_at(9.9) == 2.0 and RadiusFactors().scale_at(1.0) is None

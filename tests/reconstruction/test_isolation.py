@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from two_balls import front
 
 from mereo.evaluation.scans import SCANS, scan_in_camera
 from mereo.evaluation.scoring import grid_scores
@@ -19,10 +20,7 @@ from mereo.reconstruction.observation import find_object, observe
 
 def half_ball(count: int = 3000, center: tuple[float, float, float] = (0.0, 0.0, 0.8)) -> np.ndarray:
     """The near side of a ball of 10 cm."""
-    points = np.random.default_rng(0).normal(size=(count, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    points[:, 2] = -np.abs(points[:, 2])
-    return 0.1 * points + center
+    return front(center, 0.1, -1.0, count)
 
 
 def wall(count: int = 6000, z: float = 1.5) -> np.ndarray:

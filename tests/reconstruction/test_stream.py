@@ -192,23 +192,6 @@ def test_an_item_that_waits_its_turn_arrives_then(monkeypatch: pytest.MonkeyPatc
     assert (first.arrived_s, second.arrived_s) == (1.0, 2.0)
 
 
-def test_a_stop_drops_what_waits_and_frees_both_sides() -> None:
-    slot, found = LatestSlot[int](), []
-    slot.put(1)
-    threads = [threading.Thread(target=lambda: found.append(slot.put(2, wait=True)))]
-    empty = LatestSlot[int]()
-    threads.append(threading.Thread(target=lambda: found.append(empty.take())))
-    for thread in threads:
-        thread.start()
-    slot.stop()
-    empty.stop()
-    for thread in threads:
-        thread.join(10)
-        assert not thread.is_alive()
-    assert len(found) == 2 and not any(found)
-    assert slot.take() is None and slot.stopped and not slot.put(3)
-
-
 def test_leaving_early_ends_a_thread_for_which_nothing_comes() -> None:
     asked = threading.Semaphore(0)
 

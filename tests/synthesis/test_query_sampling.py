@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from balls import Balls
+from shapes import box
 
-from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.synthesis import query_sampling
 from mereo.synthesis.config import SamplingConfig
@@ -29,13 +30,6 @@ def square(low: float, high: float, shift: float = 0.0) -> np.ndarray:
     return np.array([[low + shift, low], [high + shift, low], [high + shift, high], [low + shift, high]])
 
 
-def cube(name: str, shift: float) -> Segment:
-    corners = np.array([[x + shift, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
-    return Segment(name, PALETTE[0], corners, faces)
-
-
 def shapes() -> dict[str, Shape]:
     """Two dimensions and three, one segment and several, touching and apart, convex and not."""
     outlines, _ = read_outlines()
@@ -43,7 +37,7 @@ def shapes() -> dict[str, Shape]:
         "thin": Polygons2D(outlines["thin"]),
         "squares": Polygons2D(square(0, 1), square(0, 1, shift=1.0), square(2, 2.3)),
         "balls": Balls(((0, 0, 0), 1.0), ((2.05, 0, 0), 1.0), ((0, 1.4, 0), 0.35)),
-        "cubes": Solids(SegmentedMesh((cube("left", 0.0), cube("right", 1.0)))),
+        "cubes": Solids(SegmentedMesh((box((0, 0, 0), (1, 1, 1), "left"), box((1, 0, 0), (2, 1, 1), "right")))),
     }
 
 

@@ -7,11 +7,11 @@ from toy_scene import rest_mesh, sample_deformations, toy_scene
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
+from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.scenes.scene import Scene, Workspace
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig, SamplingConfig
-from mereo.synthesis.examples import Example, View, _rest_guess, sample_view, synthesize
+from mereo.synthesis.examples import Example, View, sample_view, synthesize
 
 SETTINGS = GenerateConfig(sampling=SamplingConfig(per_segment=128))
 SCENE = toy_scene()
@@ -90,18 +90,6 @@ def test_rest_coordinates_lead_back_to_the_query_and_lie_in_the_same_segment_at_
     # faces are flat before and after, the map between them is not: only points beside a face may change sides
     clear = solids.nearest(rest).distance > 0.1
     assert np.array_equal(solids.label(rest[clear]), queries.labels[inside][clear])
-
-
-def test_the_guess_is_exact_for_rigid_motions() -> None:
-    """Then Newton has nothing to do; here it is not even allowed to."""
-    turn, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
-    motion = rigid(turn * np.linalg.det(turn), np.array([30.0, -20.0, 150.0]))
-    mesh = rest_mesh().transformed(motion)
-    rest = np.random.default_rng(1).uniform(-20, 20, size=(500, 3))
-    points = transform_points(motion, rest)
-    nearest = Solids(mesh).nearest(points)
-    guess = _rest_guess(rest_mesh(), mesh, points, nearest.point, nearest.face)
-    assert np.abs(guess - rest).max() < 1e-8
 
 
 def test_the_mesh_of_a_view_is_the_state_seen_from_the_camera() -> None:

@@ -107,12 +107,9 @@ def test_it_learns_the_two_halves(dataset: Path, tmp_path: Path, config: TrainCo
     assert float(last["val_iou"]) > iou and float(last["val_miou"]) > miou
     assert config is TRANSFORMER or float(last["rest"]) < 0.2
     model = load_model(tmp_path / "run" / "weights.safetensors")
-    rng = np.random.default_rng(0)
-    front = rng.normal(size=(300, 3))
-    front *= 8.0 / np.linalg.norm(front, axis=1, keepdims=True)
-    front[:, 2] = -np.abs(front[:, 2])
     center = np.array([3.0, -2.0, 150.0])
-    answer = model.query(model.encode(center + front), center + np.array([[-4.0, 0, 0], [4.0, 0, 0], [0, 0, 20.0]]))
+    cloud = front((3.0, -2.0, 150.0), 8.0, -1.0, 300)
+    answer = model.query(model.encode(cloud), center + np.array([[-4.0, 0, 0], [4.0, 0, 0], [0, 0, 20.0]]))
     assert answer.label.tolist() == [1, 2, 0]
     assert np.allclose(answer.probability.sum(axis=1), 1.0, atol=1e-5)
 

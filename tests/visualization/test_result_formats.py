@@ -10,6 +10,7 @@ import pytest
 import trimesh
 from analytic import AnalyticModel, ball, logits_of
 from answers import answer_to
+from two_balls import front
 
 from mereo.__main__ import main, parse
 from mereo.api.result import Result
@@ -33,10 +34,7 @@ def model() -> AnalyticModel:
 
 def view() -> np.ndarray:
     """The front halves of both balls."""
-    points = np.random.default_rng(0).normal(size=(600, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    points[:, 2] = -np.abs(points[:, 2])
-    return np.concatenate([np.add(center, radius * points) for center, radius in (BIG, SMALL)])
+    return np.concatenate([front(*BIG, -1.0), front(*SMALL, -1.0)])
 
 
 @pytest.fixture(scope="module")
