@@ -24,7 +24,7 @@ from mereo.models.weights import save_model
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import SizeWarning
 from mereo.reconstruction.pipeline import Reconstruction
-from mereo.visualization.result_files import summary_of, write_answer
+from mereo.visualization.result_files import write_answer
 
 pytestmark = pytest.mark.usefixtures("small_previews")
 
@@ -118,24 +118,6 @@ def test_files(answer: Answer, tmp_path: Path) -> None:
     # the root node turns the frame for viewers: y up in both cases, z toward the viewer
     place = loaded.graph.get("big")[0] @ [*BIG[0], 1.0]
     np.testing.assert_allclose(place[:3], np.array(BIG[0]) * ([1, -1, -1] if frame == "camera" else 1), atol=1e-6)
-
-
-def test_from_file_to_files(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cloud, model = scene("camera")
-    monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: model)
-    np.save(tmp_path / "cloud.npy", cloud)
-    found = reconstruct_file(
-        tmp_path / "cloud.npy", tmp_path / "out", FrameJob(ReconstructCommand((), weights="any", resolution=16))
-    )
-    assert summary_of(found)["segments"][0]["name"] == "big"
-    assert (tmp_path / "out/report.html").is_file()
-    assert "wrote" in capsys.readouterr().out
-    with pytest.raises(FileExistsError):
-        reconstruct_file(
-            tmp_path / "cloud.npy", tmp_path / "out", FrameJob(ReconstructCommand((), weights="any", resolution=16))
-        )
 
 
 def test_what_is_read_and_left_out_is_printed_and_kept(

@@ -1,5 +1,6 @@
-"""Training runs that are stopped or shared, for the tests of every encoder."""
+"""Training runs that are stopped, diverge or are shared."""
 
+import math
 import os
 import pickle
 import subprocess
@@ -12,6 +13,7 @@ from safetensors.torch import load_file
 
 from mereo.training import trainer
 from mereo.training.config import TrainConfig
+from mereo.training.dataset import Batch
 
 
 def kill_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
@@ -24,6 +26,20 @@ def kill_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
         original(self, batch)  # type: ignore[arg-type]
 
     monkeypatch.setattr(trainer.Trainer, "train_step", step)
+
+
+def diverge_at(monkeypatch: pytest.MonkeyPatch, step: int, loss: float, gradient: float) -> None:
+    """From ``step`` on the loss, or its gradient, is what is given here."""
+    original = trainer.Trainer._loss
+
+    def spoilt(self: trainer.Trainer, batch: Batch) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        value, terms = original(self, batch)
+        if self.step + 1 >= step:
+            value = value + (loss if math.isnan(gradient) else 0.0)
+            value.register_hook(lambda grad: grad * gradient if not math.isnan(gradient) else grad)
+        return value, terms
+
+    monkeypatch.setattr(trainer.Trainer, "_loss", spoilt)
 
 
 def assert_resumes_exactly(dataset: Path, folder: Path, config: TrainConfig, steps: int) -> None:

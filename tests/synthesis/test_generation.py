@@ -9,14 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from analytic import AnalyticModel
 from folder_contents import contents
 from safetensors.numpy import load_file
+from scene_code import CODE
+from scene_files import write_bar, write_mesh
+from shapes import ball
 from toy_data import SMALL
 from toy_scene import toy_scene
 
 from mereo.api.generate import generate
+from mereo.evaluation.scoring import trained_scene
 from mereo.io import progress
-from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis import shards
@@ -117,12 +121,6 @@ def test_manifest_tells_how_to_make_it_again_and_files_have_the_users_permission
     mask = os.umask(0)
     os.umask(mask)
     assert all(path.stat().st_mode & 0o777 == 0o666 & ~mask for path in whole.iterdir())
-
-
-def test_a_built_in_scene_goes_by_its_name(tmp_path: Path) -> None:
-    generate("rope", tmp_path / "data", SMALL, examples=1, seed=1)
-    manifest = json.loads((tmp_path / "data" / "manifest.json").read_text())
-    assert [part["name"] for part in manifest["segments"]] == list(load_scene("rope").rest.names)
 
 
 def test_test_seeds_and_training_seeds_never_meet(tmp_path: Path) -> None:
@@ -227,3 +225,41 @@ def test_progress_tells_rate_and_time_left(
     lines = lines[101:]
     assert re.fullmatch(r"generate: 4 of 6 examples, \d+\.\d examples/s, \d+ s left", lines[0])
     assert lines[1].startswith("generate: 6 of 6 ") and re.fullmatch(r"generate: 6 examples in \d+ (s|min)", lines[2])
+
+
+def made(scene: Path, output: Path, workers: int = 1, examples: int = 2, resume: bool = False) -> dict[str, bytes]:
+    generate(str(scene), output, SMALL, examples=examples, seed=0, workers=workers, resume=resume)
+    return {file.name: file.read_bytes() for file in output.iterdir()}
+
+
+def test_an_edited_scene_is_not_resumed_but_an_edited_comment_is(tmp_path: Path) -> None:
+    scene = write_bar(tmp_path, "deformations:\n  - type: lattice\n    strength: 0.5\n")
+    first = made(scene, tmp_path / "data")
+    manifest = json.loads(first["manifest.json"])
+    assert manifest["scene"] == "bar" and len(manifest["scene_file_sha256"]) == 64
+    assert manifest["unit_m"] == pytest.approx(0.0005)
+    scene.write_text("# a comment\n" + scene.read_text())
+    assert made(scene, tmp_path / "data", resume=True) == first
+    scene.write_text(scene.read_text().replace("0.5", "0.4"))
+    # the deformation decides how long faces are divided, so the rest mesh is another one, too, and is compared first
+    with pytest.raises(ValueError, match="was made with (rest|scene_file)_sha256 = .*resuming needs equal settings"):
+        made(scene, tmp_path / "data", resume=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["yaml", "py"])
+def test_two_workers_make_the_same_files_as_one(kind: str, tmp_path: Path) -> None:
+    scene = write_bar(tmp_path)
+    if kind == "py":
+        scene = tmp_path / "mine.py"
+        file = write_mesh(ball((0, 0, 0), 10.0, level=2), tmp_path / "ball.ply")
+        scene.write_text(CODE.format(name="mine", file=str(file)))
+    one = made(scene, tmp_path / "one", 1, examples=70)
+    assert made(scene, tmp_path / "two", 2, examples=70) == one
+
+
+def test_weights_of_a_scene_that_is_not_built_in_ask_for_its_file() -> None:
+    model = AnalyticModel.of(lambda points: points, ("a", "b", "c"))
+    object.__setattr__(model, "provenance", {"scene": "bar"})
+    with pytest.raises(ValueError, match=r"trained on the scene 'bar', which is not built in; .*--scene FILE.yaml"):
+        trained_scene(model)

@@ -17,8 +17,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from small_training import SMALL
 from toy_data import write_toy_dataset
-from training_commands import diverge_at
-from training_runs import kill_after
+from training_runs import diverge_at, kill_after
 
 from mereo import __main__ as command_line
 from mereo.training import metrics_log, trainer
@@ -143,9 +142,7 @@ SECOND_DIVERGES = """
 import math, os, sys
 import pytest
 from mereo import __main__ as command_line
-from training_commands import diverge_at
-
-from mereo import __main__ as command_line
+from training_runs import diverge_at
 if os.environ["RANK"] == "1":
     diverge_at(pytest.MonkeyPatch(), 2, math.inf, math.nan)  # with a finite gradient, so only its own loss says so
 sys.exit(command_line.main(sys.argv[1:]))
