@@ -13,7 +13,8 @@ import torch
 from safetensors.torch import load_file
 from small_training import SMALL, TRANSFORMER
 from toy_data import NAMES, write_toy_dataset
-from training_runs import train_in_two_processes
+from training_runs import assert_resumes_exactly, train_in_two_processes
+from two_balls import front
 
 from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
 from mereo.models.weights import load_model
