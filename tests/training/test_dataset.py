@@ -124,6 +124,7 @@ def test_padding_is_chosen_last_and_a_small_cloud_survives_any_hole() -> None:
     cloud = torch.arange(200.0)[None, :, None].repeat(1, 1, 3)
     kept = choose_points(cloud, torch.tensor([200]), 200, AugmentConfig(keep_points=(0.5, 0.5)), rng())[0, :, 0]
     assert 70 < len(kept.unique()) < 130 and (kept[:70].diff() > 0).all(), "in order, and half of them dropped"
+    assert kept.max() > 190, "anywhere, not at the end"
     cloud = torch.zeros(1, 40, 3)
     huge = AugmentConfig(hole_probability=1.0, hole_radius=1e6)
     assert choose_points(cloud, torch.tensor([40]), 40, huge, rng()).shape == (1, 40, 3)
