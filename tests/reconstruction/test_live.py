@@ -24,14 +24,14 @@ from mereo.scenes.registry import load_scene
 from mereo.synthesis.config import SENSORS, SequenceConfig
 from mereo.synthesis.recording import CAMERA, FRAMES, write_recording
 
-COUNT, BAD, RATE_HZ = 12, 5, 30.0
+COUNT, BAD, RATE_HZ = 6, 3, 30.0
 
 
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, InputConfig]:
     """Depth images of a rope that moves, one of them damaged, and how they are read."""
     folder = tmp_path_factory.mktemp("sequence")
-    settings = SequenceConfig(seconds=COUNT / RATE_HZ, occluder="none")
+    settings = SequenceConfig(seconds=COUNT / RATE_HZ, image_size=96, occluder="none")
     write_recording(folder, load_scene("rope"), settings, ("paper", SENSORS["paper"]), 740_000)
     (folder / FRAMES / f"{BAD:04}.png").write_bytes(b"\x89PNG cut off")
     return folder / FRAMES, InputConfig(intrinsics=folder / CAMERA)
