@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from analytic import AnalyticModel, untrained
+from shapes import box, one
 
 from mereo.api.objects import Object
 from mereo.api.reconstruct import load_frame
@@ -13,17 +14,10 @@ from mereo.cli import demo
 from mereo.evaluation.cases import PICTURE_MARGIN, Evaluation, TestCase, grid_confusion
 from mereo.evaluation.metrics import confusion_matrix, format_score, intersection_over_union, truth_grid
 from mereo.evaluation.sample_views import DEPTH_STEP, load_view, make_view, save_view
-from mereo.evaluation.scoring import (
-    EvaluationConfig,
-    evaluate,
-    grid_scores,
-    predict_grid,
-    score_cases,
-    trained_scene,
-)
+from mereo.evaluation.scoring import EvaluationConfig, evaluate, grid_scores, predict_grid, score_cases, trained_scene
 from mereo.evaluation.tables import markdown_table
 from mereo.geometry.camera import PointCloud
-from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.models.weights import save_model
 from mereo.scenes.registry import load_scene
@@ -39,16 +33,9 @@ pytestmark = pytest.mark.usefixtures("small_previews")
 NAMES = ("left", "right")
 
 
-def cuboid(name: str, low: tuple[float, float, float], high: tuple[float, float, float], number: int = 0) -> Segment:
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
-    return Segment(name, PALETTE[number], np.array(low) + corners * np.subtract(high, low), faces)
-
-
 def two_cuboids() -> SegmentedMesh:
     """Side by side along x, 1 x 1 x 1 each."""
-    return SegmentedMesh((cuboid("left", (0, 0, 5), (1, 1, 6)), cuboid("right", (1, 0, 5), (2, 1, 6), 1)))
+    return SegmentedMesh((box((0, 0, 5), (1, 1, 6), "left"), box((1, 0, 5), (2, 1, 6), "right", 1)))
 
 
 def cloud() -> PointCloud:
@@ -61,16 +48,10 @@ def oracle(mesh: SegmentedMesh, shift: tuple[float, float, float] = (0.0, 0.0, 0
     return AnalyticModel.of(lambda points: 5.0 * np.eye(3)[solids.label(points - shift)], mesh.names)
 
 
-def test_the_truth_scores_one() -> None:
+def test_the_truth_scores_one_and_a_shifted_answer_its_closed_form() -> None:
+    """A shift by 0.25 along x, on the joint box [0, 2]: what is predicted outside the true box is not counted."""
     scores = grid_scores(oracle(two_cuboids()), cloud(), two_cuboids(), cells=40)
     assert (scores.iou, scores.miou) == (1.0, 1.0)
-
-
-def test_scores_of_a_shifted_answer_have_a_closed_form() -> None:
-    """A shift by 0.25 along x, on the joint box [0, 2]: what is predicted outside the true box is not counted.
-
-    left: predicted 0.25..1.25, overlap 0.75, union 1.25; right: predicted 1.25..2, overlap 0.75, union 1.
-    """
     scores = grid_scores(oracle(two_cuboids(), (0.25, 0.0, 0.0)), cloud(), two_cuboids(), cells=40)
     np.testing.assert_allclose(scores.per_segment, [0.6, 0.75])
     assert scores.miou == pytest.approx(0.675)
@@ -78,14 +59,20 @@ def test_scores_of_a_shifted_answer_have_a_closed_form() -> None:
 
 
 @pytest.mark.parametrize("missing", [None, float("nan")])
-def test_scores_have_three_decimals_and_a_mark_where_they_are_missing(missing: float | None) -> None:
+def test_scores_have_three_decimals_and_the_table_agrees_with_the_matrix(missing: float | None) -> None:
     assert [format_score(score) for score in (0.0, 0.12349, 1.0, missing)] == ["0.000", "0.123", "1.000", "-"]
     assert format_score(missing, "") == "" and format_score(0.5, "") == "0.500"
+    confusion = np.array([[50, 5, 0], [5, 20, 0], [0, 0, 20]])
+    each = intersection_over_union(confusion)
+    table = markdown_table(Evaluation(NAMES, confusion, {"a": each, "b": each}))
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
+    assert rows[2] == ["whole set", "0.800", "0.833", "0.667", "1.000"]
+    assert {len(row) for row in rows} == {5}
 
 
 def test_false_positives_in_free_space_count() -> None:
     """Everything is called left: the joint box is 2 x 1 x 1, of which left fills a third once right is short."""
-    mesh = SegmentedMesh((cuboid("left", (0, 0, 5), (1, 1, 6)), cuboid("right", (1, 0, 5), (2, 1, 5.5), 1)))
+    mesh = SegmentedMesh((box((0, 0, 5), (1, 1, 6), "left"), box((1, 0, 5), (2, 1, 5.5), "right", 1)))
     everywhere = AnalyticModel.of(lambda points: np.tile([0.0, 1.0, 0.0], (len(points), 1)), NAMES)
     truth = truth_grid(mesh, 40)
     scores = grid_scores(everywhere, cloud(), mesh, cells=40)
@@ -159,7 +146,7 @@ def test_pictures_show_what_lies_beside_the_box_of_the_truth() -> None:
 
 def test_a_model_of_distances_is_scored_on_the_whole() -> None:
     """One class: all segments of the truth are one."""
-    whole = SegmentedMesh((cuboid("all", (0, 0, 5), (2, 1, 6)),))
+    whole = one(box((0, 0, 5), (2, 1, 6)))
     solids = Solids(whole)
     base = oracle(two_cuboids())
     model = AnalyticModel(base.network, NAMES, base.colors, loss="l1", field=lambda p: 5.0 * np.eye(2)[solids.label(p)])
@@ -168,9 +155,6 @@ def test_a_model_of_distances_is_scored_on_the_whole() -> None:
     assert np.isnan(result.scores.miou) and np.isnan(result.example_mean[1]) and result.example_mean[0] == 1.0
     assert "| whole set | 1.000 | - | 1.000 |" in markdown_table(result)
     assert np.isnan(grid_scores(model, cloud(), two_cuboids(), cells=20).miou)
-
-
-# --- synthetic test sets ---------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -184,13 +168,17 @@ def rope() -> AnalyticModel:
     )
 
 
-def test_example_i_is_made_from_seed_and_i_alone(rope: AnalyticModel) -> None:
+def test_example_i_is_made_from_seed_and_i_alone_and_of_the_weights_own_object(rope: AnalyticModel) -> None:
     three, two = (evaluate(rope, EvaluationConfig(None, n, 1_000_005, cells=16)) for n in (3, 2))
     assert list(three.examples) == ["rope 0", "rope 1", "rope 2"]
     for name, scores in two.examples.items():
         np.testing.assert_array_equal(scores.per_segment, three.examples[name].per_segment)
     other = evaluate(rope, EvaluationConfig(load_scene("rope"), 2, 1_000_006, cells=16))
     assert (other.confusion != two.confusion).any()
+    with pytest.raises(ValueError, match="the weights know the segments left, right but the truth has"):
+        evaluate(untrained(NAMES), EvaluationConfig("rope"))
+    with pytest.raises(ValueError, match="do not say which scene they were trained on; name it with --scene"):
+        trained_scene(AnalyticModel.of(lambda p: p, NAMES))
 
 
 @pytest.mark.parametrize(
@@ -204,13 +192,6 @@ def test_example_i_is_made_from_seed_and_i_alone(rope: AnalyticModel) -> None:
 def test_impossible_evaluations(rope: AnalyticModel, options: dict[str, object], text: str) -> None:
     with pytest.raises(ValueError, match=text):
         evaluate(rope, EvaluationConfig(**options))  # type: ignore[arg-type]
-
-
-def test_weights_of_another_object() -> None:
-    with pytest.raises(ValueError, match="the weights know the segments left, right but the truth has"):
-        evaluate(untrained(NAMES), EvaluationConfig("rope"))
-    with pytest.raises(ValueError, match="do not say which scene they were trained on; name it with --scene"):
-        trained_scene(AnalyticModel.of(lambda p: p, NAMES))
 
 
 def test_written_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -236,18 +217,6 @@ def test_written_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
         evaluate_weights(tmp_path / "w.safetensors", tmp_path / "out", EvaluationConfig(examples=1))
 
 
-def test_the_table_agrees_with_the_matrix() -> None:
-    confusion = np.array([[50, 5, 0], [5, 20, 0], [0, 0, 20]])
-    each = intersection_over_union(confusion)
-    table = markdown_table(Evaluation(NAMES, confusion, {"a": each, "b": each}))
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
-    assert rows[2] == ["whole set", "0.800", "0.833", "0.667", "1.000"]
-    assert {len(row) for row in rows} == {5}
-
-
-# --- sample views and the demo ---------------------------------------------------------------------------------------
-
-
 def test_a_sample_view_survives_its_file(tmp_path: Path) -> None:
     view = make_view("rope", 1_000_002, cells=24)
     save_view(tmp_path / "rope.npz", view)
@@ -259,9 +228,6 @@ def test_a_sample_view_survives_its_file(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.truth.kept, view.truth.kept)
     assert again.depth.camera == view.depth.camera and again.truth.grid.names == view.truth.grid.names
     assert (again.scene, again.seed) == ("rope", 1_000_002)
-
-
-def test_not_a_sample_view(tmp_path: Path) -> None:
     np.savez(tmp_path / "other.npz", x=np.zeros(3))
     (tmp_path / "broken.npz").write_bytes(b"PK\x03\x04")
     for name in ("other.npz", "broken.npz"):

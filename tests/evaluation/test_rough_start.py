@@ -27,16 +27,13 @@ def write(folder: Path, value: object) -> Path:
     return path
 
 
-def test_exact_pairs_and_matrices_give_the_pose(tmp_path: Path) -> None:
+def test_exact_pairs_and_matrices_give_the_pose_and_a_segment_may_have_its_own(tmp_path: Path) -> None:
     rest = object_at_rest()
     by_pairs = read_start(write(tmp_path, {"object": pairs()}), rest, SCALE)
     np.testing.assert_allclose(by_pairs.poses, np.stack([POSE] * 3), atol=1e-9)
     assert not by_pairs.separate.any()
     by_matrix = read_start(write(tmp_path, {"object": POSE.tolist()}), rest)
     np.testing.assert_allclose(by_matrix.poses[0], POSE, atol=1e-9)
-
-
-def test_a_segment_may_have_a_start_of_its_own(tmp_path: Path) -> None:
     other = rigid(SCALE * np.eye(3), np.array([5.0, 6.0, 7.0]))
     start = read_start(
         write(tmp_path, {"object": pairs(), "segments": {"arm": pairs(pose=other)}}), object_at_rest(), SCALE
@@ -46,13 +43,15 @@ def test_a_segment_may_have_a_start_of_its_own(tmp_path: Path) -> None:
     assert start.how == "object; arm from start.json"
 
 
-def test_the_known_scale_is_kept_and_the_middle_stays(tmp_path: Path) -> None:
+def test_the_known_scale_is_kept_and_the_middle_stays_and_a_missing_file_is_named(tmp_path: Path) -> None:
     """A matrix of a scale that is 5 % off: size from the units, place and turn from the matrix."""
     rest, rough = object_at_rest(), rigid(1.05 * SCALE * TURN, np.array([1.0, 2.0, 3.0]))
     pose = read_start(write(tmp_path, {"object": rough.tolist()}), rest, SCALE).poses[0]
     np.testing.assert_allclose(pose[:3, :3], SCALE * TURN, atol=1e-9)
     middle = rest.bounds.mean(axis=0)
     np.testing.assert_allclose(transform_points(pose, middle), transform_points(rough, middle))
+    with pytest.raises(FileNotFoundError, match="gone.json does not exist; a start file is needed"):
+        read_start(tmp_path / "gone.json", object_at_rest())
 
 
 def test_noisy_pairs_give_the_best_rotation() -> None:
@@ -108,8 +107,3 @@ MIRROR = POSE @ np.diag([-1.0, 1, 1, 1])
 def test_bad_starts(tmp_path: Path, stated: object, scale: float | None, sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         read_start(write(tmp_path, stated), object_at_rest(), scale)
-
-
-def test_a_missing_start_file(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="start.json does not exist; a start file is needed"):
-        read_start(tmp_path / "start.json", object_at_rest())

@@ -39,7 +39,7 @@ def bar(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Scene, np.ndarr
     return folder, scene, pose
 
 
-def test_the_command_places_the_segments(bar: tuple[Path, Scene, np.ndarray]) -> None:
+def test_the_command_places_the_segments_and_the_truth_is_in_one_frame(bar: tuple[Path, Scene, np.ndarray]) -> None:
     """Points are 0.02 mm off and 0.2 mm apart; the bar is 40 mm long."""
     folder, scene, pose = bar
     facts = json.loads((folder / "truth/truth.json").read_text())
@@ -52,10 +52,6 @@ def test_the_command_places_the_segments(bar: tuple[Path, Scene, np.ndarray]) ->
         assert shift_mm < 0.05 and turn_deg < 0.15
         assert entry["placed_by"] == "scan" and entry["residual"]["median"] < 0.04
     assert {path.name for path in (folder / "truth").glob("[!.]*")} == {"truth.json", "overlay.png", "segments.glb"}
-
-
-def test_the_truth_is_scan_and_segments_in_one_frame(bar: tuple[Path, Scene, np.ndarray]) -> None:
-    folder, scene, pose = bar
     posed = read_truth(folder / "truth")
     expected = moved(scene.rest, np.stack([pose] * 2))
     for found, true in zip(posed.truth.segments, expected.segments, strict=True):
@@ -138,12 +134,9 @@ def test_a_truth_file_never_runs_a_python_scene_that_the_user_has_not_named(
     assert named == [("left", "right")] and (folder / "was-run").exists()
 
 
-def test_a_scene_without_truths_is_refused(bar: tuple[Path, Scene, np.ndarray]) -> None:
+def test_a_scene_without_truths_and_two_truths_of_one_name_are_refused(bar: tuple[Path, Scene, np.ndarray]) -> None:
     with pytest.raises(ValueError, match="the scene 'bar' is given without truth files; the bunny's own scans"):
         evaluate(AnalyticModel.of(lambda points: points, ("left", "right")), EvaluationConfig(bar[1], scans=()))
-
-
-def test_two_truths_of_one_name(bar: tuple[Path, Scene, np.ndarray]) -> None:
     model = AnalyticModel.of(lambda points: np.zeros((len(points), 3)), ("left", "right"))
     with pytest.raises(ValueError, match="two truths are called 'truth'; results are listed by name"):
         evaluate(model, EvaluationConfig(scans=[bar[0] / "truth", bar[0] / "truth/truth.json"]))
@@ -180,8 +173,6 @@ def test_the_rest_pose_is_exported(bar: tuple[Path, Scene, np.ndarray], capsys: 
     assert main(["scene", "export", str(folder / "bar.yaml"), "--output", str(folder / "rest.xyz")]) == 2
     assert "has the suffix '.xyz'; it must be .ply or .glb" in capsys.readouterr().err
 
-
-# --- the bunny's real scans ------------------------------------------------------------------------------------------
 
 TOLERANCE = {"body": (0.25, 0.4), "tail": (0.7, 2.0)} | dict.fromkeys(("head", "ear_left", "ear_right"), (0.7, 1.0))
 """Millimetres at the segment's middle, and degrees, from the published pose; the scan lies 0.1 mm from the model."""

@@ -14,8 +14,6 @@ import pytest
 import torch
 from exported import CASES, NAMES, model_of, seen
 
-from mereo.__main__ import parse
-from mereo.cli.training import Export
 from mereo.geometry.downsampling import farthest_point_order
 from mereo.geometry.mesh import PALETTE
 from mereo.models.export.mereo_onnx import main, prepare
@@ -51,9 +49,6 @@ def agree(found: dict[str, Any], expected: tuple[np.ndarray, ...]) -> None:
         assert got.shape == wanted.shape
         np.testing.assert_allclose(got, wanted, atol=TOLERANCE, rtol=TOLERANCE, err_msg=name)
     assert np.asarray(found["logits"]).std() > 100 * TOLERANCE, "the comparison would be empty"
-
-
-# --- torch.export ----------------------------------------------------------------------------------------------------
 
 
 def export(case: str, place: Path, kind: str) -> tuple[Model, Path]:
@@ -100,14 +95,6 @@ def test_missing_packages_are_named_with_their_extra(tmp_path: Path, monkeypatch
     with pytest.raises(ImportError, match=r"onnxscript is needed to export to ONNX: pip install 'mereo\[onnx\]'"):
         export_weights(SHIPPED, tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_the_command_line() -> None:
-    command = parse(["export", "bunny", "--output", "o", "--format", "torch"])
-    assert command == Export("bunny", Path("o"), "torch")
-
-
-# --- the runner, without a graph -------------------------------------------------------------------------------------
 
 
 def raw_cloud(count: int, seed: int = 0) -> np.ndarray:
@@ -186,8 +173,6 @@ def test_the_runner_is_short_and_needs_numpy_and_onnxruntime_only() -> None:
     assert imported - set(sys.stdlib_module_names) == {"numpy", "onnxruntime"}
 
 
-# --- ONNX ------------------------------------------------------------------------------------------------------------
-
 FULL_SIZE = "paper"
 """A preset as it is; `base` is what the shipped weights are, and `large` is `base` with other widths."""
 
@@ -201,7 +186,7 @@ def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
 
 
 @pytest.mark.slow
-def test_onnx_graphs_answer_as_the_network(exported: tuple[Model, Path]) -> None:
+def test_onnx_graphs_answer_as_the_network_and_the_folder_says_what_it_holds(exported: tuple[Model, Path]) -> None:
     import onnxruntime
 
     model, folder = exported
@@ -218,6 +203,11 @@ def test_onnx_graphs_answer_as_the_network(exported: tuple[Model, Path]) -> None
         given["points"] = places.numpy()
         found = query.run(ANSWERS, {entry.name: given[entry.name] for entry in query.get_inputs()})
         agree(dict(zip(ANSWERS, found, strict=True)), answers_of(model, cloud, places))
+    assert {"encoder.onnx", "query.onnx", "model.json", "mereo_onnx.py"} <= {path.name for path in folder.iterdir()}
+    settings = json.loads((folder / "model.json").read_text())
+    assert settings["points"] == model.network.config.points
+    assert settings["names"] == (list(model.names) if model.segmented else ["object"])
+    assert len(settings["colors"]) == len(settings["names"])
 
 
 ALONE = """
@@ -250,13 +240,3 @@ def test_the_runner_answers_as_the_model_without_torch(exported: tuple[Model, Pa
             difference = np.abs(np.nan_to_num(found[name]) - np.nan_to_num(wanted))
             assert (difference <= TOLERANCE * unit).mean() >= 0.999, f"{name}: {difference.max()}"
         assert tuple(found["names"]) == (model.names if model.segmented else ("object",))
-
-
-@pytest.mark.slow
-def test_the_folder_says_what_it_holds(exported: tuple[Model, Path]) -> None:
-    model, folder = exported
-    assert {"encoder.onnx", "query.onnx", "model.json", "mereo_onnx.py"} <= {path.name for path in folder.iterdir()}
-    settings = json.loads((folder / "model.json").read_text())
-    assert settings["points"] == model.network.config.points
-    assert settings["names"] == (list(model.names) if model.segmented else ["object"])
-    assert len(settings["colors"]) == len(settings["names"])

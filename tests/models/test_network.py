@@ -3,15 +3,18 @@
 import pytest
 import torch
 import torch.nn.functional as F
+from torch import nn
 
 from mereo.models.config import Loss, NetworkConfig, Supervision
 from mereo.models.decoder import FrequencyEncoding, Prediction
 from mereo.models.encoders import PointNet2
+from mereo.models.model import fold_batch_norm
 from mereo.models.network import Network
 from mereo.training.config import PRESETS
 from mereo.training.losses import occupancy_loss
 
 TINY = PRESETS["tiny"].network
+FOLDED = TINY.changed(points=64)
 
 
 def cloud_of(config: NetworkConfig, batch: int = 2, seed: int = 0) -> torch.Tensor:
@@ -138,13 +141,6 @@ def test_frequency_encoding_is_the_papers() -> None:
     assert torch.allclose(encode(x)[0, 0], expected, atol=1e-5)
 
 
-def test_negative_exponents_tell_far_points_apart() -> None:
-    """The reason for them: with exponents from 0, points two units apart would be encoded alike."""
-    a, b = torch.tensor([[[0.5, 0.0, 0.0]]]), torch.tensor([[[2.5, 0.0, 0.0]]])
-    assert torch.allclose(FrequencyEncoding(0, 5)(a), FrequencyEncoding(0, 5)(b), atol=1e-4)
-    assert not torch.allclose(FrequencyEncoding(-4, 5)(a), FrequencyEncoding(-4, 5)(b), atol=0.1)
-
-
 def test_without_encoding_the_query_is_its_three_coordinates() -> None:
     """The paper's ablation: a network of one layer is then piecewise linear in the position."""
     plain = NetworkConfig().changed(points=64, width=16, depth=1, skip_after=1, mlp_global=(8,), encode_positions=False)
@@ -182,32 +178,20 @@ def example_prediction() -> tuple[Prediction, torch.Tensor, torch.Tensor, torch.
     return prediction, torch.randint(0, 4, (2, 5)), torch.randn(2, 5), F.normalize(torch.randn(2, 5, 3), dim=-1)
 
 
-def test_loss_variants_add_up() -> None:
-    prediction, labels, distances, directions = example_prediction()
-    full, terms = occupancy_loss(prediction, labels, distances, directions, Supervision.of("ce+l1+cd"), 100.0)
-    assert torch.isclose(full, terms["ce"] + 100.0 * terms["l1"] + terms["cd"])
-    for loss, names in (("ce", {"ce"}), ("l1", {"l1"}), ("ce+l1", {"ce", "l1"})):
-        _, part = occupancy_loss(prediction, labels, distances, directions, Supervision.of(loss), 100.0)
-        assert set(part) == names
-        assert all(torch.isclose(part[name], terms[name]) for name in names)
-
-
-def test_cosine_term_is_minus_one_for_the_right_direction_of_any_length() -> None:
-    prediction, labels, distances, directions = example_prediction()
-    right = Prediction(prediction.logits, prediction.distance, 7.0 * directions)
-    _, terms = occupancy_loss(right, labels, distances, directions, Supervision.of("ce+l1+cd"), 100.0)
-    assert torch.isclose(terms["cd"], torch.tensor(-1.0))
-
-
-def test_each_term_is_the_papers() -> None:
+def test_each_term_is_the_papers_and_variants_add_up() -> None:
     """Against the formulas of equation 1, written out."""
-    prediction, labels, distances, directions = example_prediction()
-    _, terms = occupancy_loss(prediction, labels, distances, directions, Supervision.of("ce+l1+cd"), 100.0)
+    prediction, *truth = example_prediction()
+    labels, distances, directions = truth
+    full, terms = occupancy_loss(prediction, *truth, Supervision.of("ce+l1+cd"), 100.0)
     probability = prediction.logits.exp() / prediction.logits.exp().sum(dim=-1, keepdim=True)
     assert torch.isclose(terms["ce"], -probability.gather(-1, labels[..., None]).log().mean())
     assert torch.isclose(terms["l1"], (prediction.distance - distances).abs().mean())
     cosine = (prediction.direction * directions).sum(dim=-1) / prediction.direction.norm(dim=-1)
     assert torch.isclose(terms["cd"], -cosine.mean())
+    assert torch.isclose(full, terms["ce"] + 100.0 * terms["l1"] + terms["cd"])
+    for loss, names in (("ce", {"ce"}), ("l1", {"l1"}), ("ce+l1", {"ce", "l1"})):
+        _, part = occupancy_loss(prediction, *truth, Supervision.of(loss), 100.0)
+        assert set(part) == names and all(torch.isclose(part[name], terms[name]) for name in names)
 
 
 @pytest.mark.parametrize("loss, rows", [("ce", [0, 1, 2, 3]), ("l1", [4]), ("ce+l1", [0, 1, 2, 3, 4])])
@@ -217,3 +201,49 @@ def test_a_loss_trains_its_own_heads_only(loss: Loss, rows: list[int]) -> None:
     _, *truth = example_prediction()
     occupancy_loss(prediction, *truth, Supervision.of(loss), 100.0)[0].backward()
     assert network.decoder.head.weight.grad.abs().amax(dim=1).nonzero().flatten().tolist() == rows
+
+
+def lived_in(config: NetworkConfig) -> Network:
+    """A network whose normalization has statistics of its own, as after training."""
+    torch.manual_seed(0)
+    network = Network(config, 3)
+    for norm in network.modules():
+        if isinstance(norm, nn.BatchNorm1d):
+            nn.init.normal_(norm.running_mean)  # type: ignore[arg-type]
+            nn.init.uniform_(norm.running_var, 0.5, 2.0)  # type: ignore[arg-type]
+            nn.init.uniform_(norm.weight, 0.5, 2.0)
+            nn.init.normal_(norm.bias)
+    return network.eval()
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        FOLDED,
+        FOLDED.changed(align_points=0, rest_template=False, local_neighbors=0, sight_neighbors=0),
+        FOLDED.changed(align_points=0, rest_template=False, encode_positions=False),
+        FOLDED.changed(encoder="point-transformer", transformer_widths=(8, 16, 32), points=128),
+    ],
+    ids=["everything", "the paper's", "plain positions", "point transformer"],
+)
+def test_a_folded_network_answers_the_same(config: NetworkConfig) -> None:
+    """Folding changes the arithmetic, not the answers."""
+    network = lived_in(config)
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    folded = fold_batch_norm(network)
+    cloud, queries = torch.randn(2, config.points, 3), torch.randn(2, 50, 3)
+    cloud[..., 2] += 4.0
+    queries[..., 2] += 4.0
+    eye = torch.zeros(2, 3)
+    with torch.inference_mode():
+        expected = network.query(network.encode(cloud, eye), queries)
+        found = folded.query(folded.encode(cloud, eye), queries)
+    torch.testing.assert_close(found.logits, expected.logits, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(found.distance, expected.distance, rtol=1e-3, atol=1e-4)
+    assert expected.logits.std() > 1e-2
+    # the original stays as it was: it can still be saved
+    assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
+    norms = sum(isinstance(module, nn.BatchNorm1d) for module in network.modules())
+    assert sum(isinstance(module, nn.BatchNorm1d) for module in folded.modules()) < norms / 2
+    with pytest.raises(ValueError, match="training mode"):
+        fold_batch_norm(network.train())

@@ -42,15 +42,12 @@ def options(settings: dict[str, Any]) -> list[str]:
 ALL_OTHERS = {name: another(name, value) for name, value in NetworkConfig().to_dict().items()} | {"spread_penalty": 0.5}
 
 
-def test_every_setting_has_one_name() -> None:
+def test_every_setting_has_one_name_and_comes_back_as_it_was_written() -> None:
     """Side by side none hides another: as many names as the parts have settings."""
     count = 2 + sum(len(fields(part)) for part in PARTS.values())
     assert len(NetworkConfig().to_dict()) == count - 1  # an unused penalty is not written
     assert len(NetworkConfig.from_dict(ALL_OTHERS).to_dict()) == len(ALL_OTHERS) == count
     assert not any(isinstance(value, dict) for value in NetworkConfig().to_dict().values())
-
-
-def test_written_settings_come_back() -> None:
     for config in (
         NetworkConfig(),
         NetworkConfig.from_dict(ALL_OTHERS),
@@ -88,7 +85,3 @@ def test_a_recipe_is_written_flat() -> None:
     assert list(PRESETS["tiny-autodecoder"].to_dict()) == names
     assert list(written["network"])[:6] == ["encoder", "points", "neighbors", "ratio1", "radius1", "mlp1"]
     assert written["augment"]["keep_points"] == (1.0, 1.0)
-
-
-def test_the_papers_recipe_is_the_default() -> None:
-    assert PRESETS["paper"] == TrainConfig()

@@ -1,33 +1,15 @@
 """Point Transformer: its attention against the paper's equation, and what the encoder must ignore."""
 
-from dataclasses import replace
-from pathlib import Path
-
-import manifold3d
-import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from answers import reconstruct
-from small_training import SMALL
 from torch import Tensor
-from toy_data import NAMES, write_toy_dataset
-from training_runs import assert_resumes_exactly
 
-from mereo.evaluation.cases import TestCase
-from mereo.evaluation.metrics import truth_grid
-from mereo.evaluation.scoring import score_cases
-from mereo.geometry.camera import PointCloud
-from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.models.config import NetworkConfig
 from mereo.models.encoders import PointTransformer, TransitionDown, VectorAttention
 from mereo.models.neighbors import distinct_distances, nearest
 from mereo.models.network import Network
-from mereo.models.weights import load_model
-from mereo.training import trainer
-from mereo.training.config import PRESETS, AugmentConfig
-
-pytestmark = pytest.mark.usefixtures("without_curves")
+from mereo.training.config import PRESETS
 
 TINY = NetworkConfig().changed(
     encoder="point-transformer",
@@ -48,9 +30,6 @@ def settled(config: NetworkConfig = TINY) -> PointTransformer:
     encoder = PointTransformer(config.transformer, config.latent).train()
     encoder(cloud_of(config.points, batch=4))
     return encoder.eval()
-
-
-# --- attention --------------------------------------------------------------------------------------------------------
 
 
 def attended(layer: VectorAttention, p: Tensor, x: Tensor, neighbors: list[int], i: int) -> Tensor:
@@ -105,9 +84,6 @@ def test_transition_down_takes_the_largest_of_each_neighbourhood() -> None:
             assert torch.allclose(found[b, m], each.amax(dim=0), atol=1e-6)
 
 
-# --- the encoder ------------------------------------------------------------------------------------------------------
-
-
 def test_repeated_points_are_nobodys_neighbours() -> None:
     """Against a slow reference: the nearest of the points that do not repeat an earlier one."""
     cloud = cloud_of(12)
@@ -119,18 +95,14 @@ def test_repeated_points_are_nobodys_neighbours() -> None:
             assert index[b, i].tolist() == reach.argsort()[:5].tolist()
 
 
-def test_encoder_ignores_which_points_fill_up_a_cloud() -> None:
+def test_encoder_ignores_which_points_fill_up_a_cloud_and_the_order_of_what_is_not_kept() -> None:
+    """The first quarter are the points of the second level; the rest is a set."""
     encoder, cloud = settled(), cloud_of()
     front, again = cloud[:, :80], torch.randperm(80, generator=torch.Generator().manual_seed(2))[:48]
     with torch.inference_mode():
         one = encoder(torch.cat([front, front[:, :48]], dim=1)).latent
         other = encoder(torch.cat([front, front[:, again]], dim=1)).latent
         assert torch.allclose(one, other, atol=1e-5)
-
-
-def test_encoder_ignores_the_order_of_what_is_not_kept() -> None:
-    """The first quarter are the points of the second level; the rest is a set."""
-    encoder, cloud = settled(), cloud_of()
     first = TINY.points // 4
     order = torch.randperm(TINY.points - first, generator=torch.Generator().manual_seed(2))
     shuffled = torch.cat([cloud[:, :first], cloud[:, first:][:, order]], dim=1)
@@ -174,60 +146,5 @@ def test_paper_sizes() -> None:
     with torch.inference_mode():
         ours, theirs = ([level.features.shape for level in each.encoder(cloud).levels] for each in networks)
     assert ours == theirs
-
-
-def test_too_few_blocks_are_refused() -> None:
     with pytest.raises(ValueError, match=r"transformer_widths are \(8, 16\); a Point Transformer needs at least three"):
         Network(TINY.changed(transformer_widths=(8, 16)), 2)
-
-
-# --- training ---------------------------------------------------------------------------------------------------------
-
-CONFIG = replace(
-    SMALL,
-    network=SMALL.network.changed(
-        encoder="point-transformer",
-        transformer_widths=(8, 12, 16),
-        transformer_neighbors=6,
-        align_points=0,
-        rest_template=False,
-        sight_neighbors=0,
-    ),
-)
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_toy_dataset(tmp_path_factory.mktemp("toy") / "data")
-
-
-def test_killed_and_resumed_equals_uninterrupted(dataset: Path, tmp_path: Path) -> None:
-    assert_resumes_exactly(dataset, tmp_path, replace(CONFIG, epochs=0.4), steps=2)
-
-
-def half_balls(center: np.ndarray, radius: float) -> SegmentedMesh:
-    whole = manifold3d.Manifold.sphere(radius, 48)
-    parts = []
-    for number, (name, side) in enumerate(zip(NAMES, (-1.0, 1.0), strict=True)):
-        mesh = whole.trim_by_plane((side, 0.0, 0.0), 0.0).to_mesh()
-        parts.append(
-            Segment(name, PALETTE[number], center + mesh.vert_properties[:, :3], mesh.tri_verts.astype(np.int64))
-        )
-    return SegmentedMesh(tuple(parts))
-
-
-@pytest.mark.slow
-def test_it_learns_and_goes_the_whole_path(dataset: Path, tmp_path: Path) -> None:
-    """Train, evaluate, reconstruct: the two halves of a ball, from its front."""
-    config = replace(CONFIG, epochs=24, augment=AugmentConfig())
-    model = load_model(trainer.train(dataset, tmp_path / "run", config))
-    center, rng = np.array([3.0, -2.0, 150.0]), np.random.default_rng(0)
-    front = rng.normal(size=(300, 3))
-    front *= 8.0 / np.linalg.norm(front, axis=1, keepdims=True)
-    front[:, 2] = -np.abs(front[:, 2])
-    case = TestCase("ball", PointCloud(center + front), truth_grid(half_balls(center, 8.0), 24))
-    scores = score_cases(model, lambda _: case, 1, progress=False).scores
-    assert scores.iou > 0.7 and scores.miou > 0.7
-    found = reconstruct(case.cloud, model, resolution=24).segments
-    assert [segment.name for segment in found] == list(NAMES)
-    assert [np.sign(segment.centroid[0] - center[0]) for segment in found] == [-1, 1]

@@ -1,22 +1,22 @@
-"""Files of weights that were damaged or changed: one sentence that names the file and what is wrong, and no output."""
+"""Files of weights: what `mereo weights` says of them, and of a damaged one the sentence that names what is wrong."""
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from analytic import untrained
 from safetensors.torch import load_file, save_file
 
 from mereo import __main__ as command_line
 from mereo.models.calibration import Calibration
-from mereo.models.model import Model
-from mereo.models.network import Network
 from mereo.models.weights import load_model, save_model, trained_steps, weights_bytes
-from mereo.models.weights_place import SHIPPED
-from mereo.training.config import PRESETS
+from mereo.models.weights_place import SHIPPED, shipped_names
 
 WITH_STATES = SHIPPED / "rope.safetensors"
 
@@ -30,9 +30,7 @@ def header_of(content: bytes) -> dict[str, Any]:
 def changed(folder: Path, change: Callable[[Any, dict[str, torch.Tensor]], Any], with_states: bool = False) -> Path:
     """Weights after a change to header and tensors, which may return another header."""
     path = folder / "changed.safetensors"
-    network = Network(PRESETS["tiny"].network, 2).eval()
-    good = weights_bytes(Model(network, ("a", "b"), ((1, 2, 3), (4, 5, 6))))
-    content = WITH_STATES.read_bytes() if with_states else good
+    content = WITH_STATES.read_bytes() if with_states else weights_bytes(untrained(("a", "b")))
     path.write_bytes(content)
     header, tensors = header_of(content), load_file(path)
     other = change(header, tensors)
@@ -101,26 +99,53 @@ def test_names_that_look_like_markup_are_printed_as_they_are(
     weights = changed(tmp_path, lambda h, t: h.update(names=["[/x]", ":heart:[red]"]))
     cloud = tmp_path / "[red] [y].npy"
     np.save(cloud, np.random.default_rng(0).normal((0, 0, 20), 1, (200, 3)))
-    arguments = [
-        "--weights",
-        str(weights),
-        "--output",
-        str(tmp_path / "out"),
-        "--resolution",
-        "8",
-        "--method",
-        "network",
-    ]
-    assert command_line.main(["reconstruct", str(cloud), *arguments]) == 0
+    options = ["--output", str(tmp_path / "out"), "--resolution", "8", "--method", "network"]
+    assert command_line.main(["reconstruct", str(cloud), "--weights", str(weights), *options]) == 0
     printed = capsys.readouterr().out
     assert all(text in printed for text in ("[red] [y].npy", "[/x]", ":heart:[red]"))
 
 
 def test_a_calibration_comes_back_from_the_file_and_damage_to_it_is_one_sentence(tmp_path: Path) -> None:
-    network = Network(PRESETS["tiny"].network, 1).eval()
-    model = Model(network, ("a",), ((1, 2, 3),), calibration=Calibration(seed=3, views=8, radius_scale=1.5))
+    model = replace(untrained(("a",)), calibration=Calibration(seed=3, views=8, radius_scale=1.5))
     save_model(model, tmp_path / "weights.safetensors")
     assert load_model(tmp_path / "weights.safetensors").calibration == model.calibration
     path = changed(tmp_path, lambda h, t: h.update(calibration={"seed": 3, "views": 8, "radius_scale": -1.0}))
     with pytest.raises(ValueError, match="header with a wrong 'calibration.radius_scale'"):
         load_model(path)
+
+
+def said(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+    assert command_line.main(["weights", *map(str, arguments)]) == 0
+    return capsys.readouterr().out
+
+
+def test_every_shipped_file_is_listed_with_the_scores_of_its_card(capsys: pytest.CaptureFixture[str]) -> None:
+    rows = {line.split()[1]: line for line in said(capsys, "list").splitlines() if line.startswith("│")}
+    assert tuple(rows) == shipped_names()
+    for name, row in rows.items():
+        assert f"{(SHIPPED / f'{name}.safetensors').stat().st_size / 2**20:.1f} MB" in row
+    assert "0.973 0.904" in rows["bunny"]
+
+
+def test_show_prints_the_unit_and_the_card_or_all_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    text = said(capsys, "show", "tumor")
+    assert "8.134 mm to a scene unit" in text and (SHIPPED / "tumor.md").read_text("utf-8") in text
+    assert sha256((SHIPPED / "tumor.safetensors").read_bytes()).hexdigest() in text.split("# tumor")[0]
+    facts = json.loads(said(capsys, "show", "bunny", "--json"))
+    assert facts["names"] == list(load_model("bunny").names) and facts["unit_m"] == pytest.approx(0.00604, rel=1e-3)
+    assert facts["provenance"]["recipe"]["batch"] == 40 and facts["network"]["points"] == 1024
+    assert facts["card"] == (SHIPPED / "bunny.md").read_text("utf-8")
+
+
+def test_weights_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Neither card nor statistical model, and unknown provenance; a checkpoint beside it is no weights."""
+    save_model(untrained(("one", "two")), tmp_path / "mine.safetensors")
+    (tmp_path / "checkpoint.safetensors").write_bytes(b"something else")
+    listed = [line for line in said(capsys, "list", tmp_path).splitlines() if line.startswith("│")]
+    assert len(listed) >= 1 and "checkpoint" not in "".join(listed)
+    text = said(capsys, "show", tmp_path / "mine.safetensors")
+    assert "none: the network answers alone" in text and "true size not known" in text and "Not measured yet" in text
+    (tmp_path / "empty").mkdir()
+    for name, sentence in (("checkpoint.safetensors", "is not a safetensors file"), ("empty", "holds no weights")):
+        assert command_line.main(["weights", "list", str(tmp_path / name)]) == 2
+        assert sentence in capsys.readouterr().err

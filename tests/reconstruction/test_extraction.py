@@ -80,11 +80,6 @@ def test_any_grid_shape(shape: tuple[int, int, int]) -> None:
     np.testing.assert_array_equal(fine.logits[fine.rows[known]], dense.logits[dense.rows[known]])
 
 
-def test_few_points_are_asked() -> None:
-    field = logits_of(ball((0.0, 0.0, 0.0), 0.6))
-    assert run(field, resolution=128).evaluated < 0.08 * 129**3
-
-
 def test_a_surface_once_met_is_followed_to_its_end() -> None:
     """A wire of one voxel's radius leaves a ball; saturated logits give the coarse lattice no slope to notice it by."""
     turn = np.linspace(0.0, 5.0, 400)
@@ -96,7 +91,7 @@ def test_a_surface_once_met_is_followed_to_its_end() -> None:
     assert fine.grid.labels[:, :, -7:].any(), "the wire reaches up"
 
 
-def test_a_ball_is_a_closed_surface_of_euler_number_2() -> None:
+def test_a_ball_is_a_closed_surface_of_euler_number_2_for_which_few_points_are_asked() -> None:
     found = run(logits_of(ball((0.03, -0.02, 0.05), 0.7)), resolution=64)
     segment = found.surfaces.segments[0]
     assert segment.edge_imbalance() == (0, 0)
@@ -104,6 +99,8 @@ def test_a_ball_is_a_closed_surface_of_euler_number_2() -> None:
     assert segment.volume == pytest.approx(4 / 3 * np.pi * 0.7**3, rel=2e-3)
     radius = np.linalg.norm(segment.vertices - [0.03, -0.02, 0.05], axis=1)
     assert np.abs(radius - 0.7).max() < 0.05 * 2 / 64, "a twentieth of a voxel"
+    field = logits_of(ball((0.0, 0.0, 0.0), 0.6))
+    assert run(field, resolution=128).evaluated < 0.08 * 129**3
 
 
 def test_neighbours_share_their_interface_and_volumes_add_up() -> None:
@@ -185,17 +182,14 @@ def test_locate_grows_until_the_object_is_inside() -> None:
     box = locate(field, BOX)
     assert (box[0] < [0.5, -2.0, -2.0]).all() and (box[1] > [4.499, 2.0, 2.0]).all()
     assert (box[1] - box[0]).max() < 6.0, "not much more than the ball"
+    with pytest.raises(ValueError, match="finds no segment near the cloud.*check the weights"):
+        locate(logits_of(lambda p: np.ones(len(p))), BOX)
 
 
 def test_extract_whole_grows_a_side_that_is_touched() -> None:
     found = extract_whole(logits_of(ball((0.5, 0.0, 0.0), 0.8)), BOX, 24, ("a",), PALETTE[:1])
     assert not found.grid.touched_sides().any()
     assert found.surfaces.segments[0].volume == pytest.approx(4 / 3 * np.pi * 0.8**3, rel=0.02)
-
-
-def test_nothing_to_locate() -> None:
-    with pytest.raises(ValueError, match="finds no segment near the cloud.*check the weights"):
-        locate(logits_of(lambda p: np.ones(len(p))), BOX)
 
 
 @pytest.mark.parametrize(

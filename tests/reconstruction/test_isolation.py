@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from two_balls import front
 
 from mereo.evaluation.scans import SCANS, scan_in_camera
 from mereo.evaluation.scoring import grid_scores
@@ -19,10 +20,7 @@ from mereo.reconstruction.observation import find_object, observe
 
 def half_ball(count: int = 3000, center: tuple[float, float, float] = (0.0, 0.0, 0.8)) -> np.ndarray:
     """The near side of a ball of 10 cm."""
-    points = np.random.default_rng(0).normal(size=(count, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    points[:, 2] = -np.abs(points[:, 2])
-    return 0.1 * points + center
+    return front(center, 0.1, -1.0, count)
 
 
 def wall(count: int = 6000, z: float = 1.5) -> np.ndarray:
@@ -48,10 +46,12 @@ def kept(points: np.ndarray, config: IsolationConfig, unit_m: float = 1.0) -> np
     return isolate(PointCloud(points), config, unit_m)[0].points
 
 
-def test_nothing_happens_by_default() -> None:
+def test_nothing_happens_by_default_and_a_depth_image_is_taken_as_its_points() -> None:
     cloud = PointCloud(EVERYTHING)
     left, steps = isolate(cloud, IsolationConfig())
     assert left.points is cloud.points and steps == () and not IsolationConfig().on
+    image = DepthImage(np.full((20, 20), 0.5), Camera(20, 20, 30.0, 30.0, 10.0, 10.0))
+    assert len(isolate(image, IsolationConfig(depth_range=(0.4, 0.6)))[0]) == 400
 
 
 def test_crops_are_in_metres_whatever_the_unit() -> None:
@@ -64,16 +64,13 @@ def test_crops_are_in_metres_whatever_the_unit() -> None:
         assert [(step.before, step.kept) for step in steps] == [(160, 120), (120, 40)]
 
 
-def test_a_depth_image_is_taken_as_its_points() -> None:
-    image = DepthImage(np.full((20, 20), 0.5), Camera(20, 20, 30.0, 30.0, 10.0, 10.0))
-    assert len(isolate(image, IsolationConfig(depth_range=(0.4, 0.6)))[0]) == 400
-
-
 @pytest.mark.parametrize("factor", [1.0, 1000.0])
 def test_the_largest_plane_goes_and_the_object_stays(factor: float) -> None:
     left = kept(factor * EVERYTHING, IsolationConfig(remove_plane=True), 1 / factor) / factor
     assert (left[:, 2] < 1.3).sum() >= len(BALL), "all of the ball"
     assert (left[:, 2] > 1.4).sum() < 0.01 * len(WALL)
+    with pytest.raises(ValueError, match=r"the largest plane holds \d% of the 20000 points.*leave out --remove-plane"):
+        isolate(PointCloud(half_ball(20000)), IsolationConfig(remove_plane=True))
 
 
 def test_the_plane_is_the_one_of_least_squares() -> None:
@@ -97,11 +94,6 @@ def test_far_planes_are_as_rough_as_depth_cameras_make_them() -> None:
     assert (left[:, 1] <= 0.2).sum() >= 1000 and len(left) < 1000 + 0.01 * len(floor)
 
 
-def test_a_cloud_without_a_plane_is_said_so() -> None:
-    with pytest.raises(ValueError, match=r"the largest plane holds \d% of the 20000 points.*leave out --remove-plane"):
-        isolate(PointCloud(half_ball(20000)), IsolationConfig(remove_plane=True))
-
-
 def test_outliers_go_and_the_object_stays() -> None:
     left = kept(np.concatenate([BALL, STRAYS]), IsolationConfig(remove_outliers=True))
     off = np.linalg.norm(left - [0, 0, 0.8], axis=1) - 0.1
@@ -121,9 +113,6 @@ def test_clusters_follow_neighbours_not_distance() -> None:
     np.testing.assert_array_equal(clusters(sheets), np.repeat([1, 0], [1500, 3000]))
     assert (clusters(dense * [1.0, 5.0, 1.0]) == 0).all()
     assert (clusters(dense * [1.0, 10.1, 1.0]) > 0).any(), "rows farther apart than the gap"
-
-
-def test_a_few_points_are_no_trouble() -> None:
     for count in (1, 2, 5):
         assert clusters(np.ones((count, 3))).tolist() == [0] * count
 
@@ -164,9 +153,6 @@ def test_too_little_left_names_the_step_and_its_cure() -> None:
             isolate(PointCloud(EVERYTHING), config)
 
 
-# --- thinning --------------------------------------------------------------------------------------------------------
-
-
 def test_thinning_is_even_and_keeps_measurements() -> None:
     """Nine tenths of the points are in one corner; a tenth of the cells is there."""
     rng = np.random.default_rng(0)
@@ -185,9 +171,6 @@ def test_spacing_is_that_of_the_pixels() -> None:
     assert spacing(0.25 * grid) == pytest.approx(0.25)
     assert spacing(np.repeat(grid, 2, axis=0)) == pytest.approx(1.0), "the same place twice is no distance"
     assert spacing(np.ones((9, 3))) == 0.0
-
-
-# --- a real scan -----------------------------------------------------------------------------------------------------
 
 
 def crowd() -> Callable[[np.ndarray, np.random.Generator], np.ndarray]:

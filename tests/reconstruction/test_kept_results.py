@@ -1,23 +1,18 @@
-"""What is there stays: surfaces of a stream and outputs of the examples, as the results of other commands."""
+"""What is there stays: outputs of the examples and experiments, and the meshes of a scene."""
 
-import json
 import os
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from written_results import segments
 
 from mereo import __main__ as command_line
-from mereo.cli.stream import SurfaceFolder
 from mereo.io.atomic_files import new_directory
 from mereo.io.writers.glb import write_segments_glb
-from mereo.reconstruction.stream import Outcome
 
-FRAMES = ("a.npy", "b.npy")
 EXAMPLES = Path(__file__).parents[2] / "examples"
 OUTPUTS = {
     "isolate_object.py": ("--output", "out/kept.png"),
@@ -27,51 +22,6 @@ OUTPUTS = {
     "shipped_weights.py": ("--output", "out/kept.png"),
     "simulate_liver.py": ("--output", "out/kept.npz"),
 }
-
-
-def stream(monkeypatch: pytest.MonkeyPatch, surfaces: Path, frames: tuple[str, ...], *more: str) -> int:
-    """Exit code of a stream in which every frame is answered with the same surfaces."""
-    answered = SimpleNamespace(surfaces=segments())
-    outcomes = [Outcome(name, 0.0, answered, "", 0.1, 0.1, 0) for name in frames]
-    nothing = SimpleNamespace(network=None, registrar=lambda _: None)
-    monkeypatch.setattr("mereo.cli.stream.loaded_object", lambda *_: nothing)
-    monkeypatch.setattr("mereo.cli.stream.Answering", lambda *_: SimpleNamespace(close=lambda: None))
-    monkeypatch.setattr("mereo.cli.stream.stream", lambda *_, **__: iter(outcomes))
-    monkeypatch.setattr("mereo.cli.stream.line", lambda outcome: {"error": outcome.error})
-    return command_line.main(["stream", "-", "--weights", "rope", "--surfaces", str(surfaces), *more])
-
-
-def test_a_stream_replaces_no_surfaces_unless_forced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / "a.npy.glb").write_text("precious")
-    (out / "thesis.tex").write_text("precious")
-    assert stream(monkeypatch, out, FRAMES) == 2
-    said = capsys.readouterr()
-    assert said.err.startswith(f"mereo: error: {out} exists and is not empty; nothing in it is overwritten")
-    assert not said.out and {path.name for path in out.iterdir()} == {"a.npy.glb", "thesis.tex"}
-    assert stream(monkeypatch, out, FRAMES, "--force") == 0
-    assert {path.name for path in out.iterdir()} == {"a.npy.glb", "b.npy.glb", "thesis.tex"}
-    assert (out / "a.npy.glb").read_bytes()[:4] == b"glTF" and (out / "thesis.tex").read_text() == "precious"
-
-
-def test_a_frame_replaces_its_own_file_and_no_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert stream(monkeypatch, tmp_path / "out", ("c d.npy", "c d.npy", "c_d.npy")) == 0
-    first, again, other = (json.loads(line)["error"] for line in capsys.readouterr().out.splitlines())
-    assert (first, again) == ("", "") and other.endswith("c_d.npy.glb holds the surfaces of c d.npy: rename c_d.npy")
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["c_d.npy.glb"]
-
-
-def test_what_came_meanwhile_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = SurfaceFolder(tmp_path, force=False)
-    (tmp_path / "a.npy.glb").write_text("precious")
-    outcome = Outcome("a.npy", 0.0, SimpleNamespace(surfaces=segments()), "", 0.1, 0.1, 0)
-    assert "exists; it is not overwritten" in folder.written(outcome, "camera").error  # type: ignore[arg-type]
-    assert (tmp_path / "a.npy.glb").read_text() == "precious"
 
 
 @pytest.mark.slow

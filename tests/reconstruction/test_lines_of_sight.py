@@ -27,7 +27,7 @@ from mereo.reconstruction.observation import (
 from mereo_serving.options import FrameOptions
 
 
-def test_each_pixel_has_its_kind() -> None:
+def test_each_pixel_has_its_kind_and_a_lone_depth_between_object_and_wall_is_no_surface() -> None:
     lines = lines_of_image(DepthImage(scene(), CAMERA), SHOWN)
     expected = np.where(scene() == 2.0, "p", "u")
     expected[14:36, 19:41] = "u"  # the rim, which the object's own pixels cover but for one all around
@@ -40,9 +40,6 @@ def test_each_pixel_has_its_kind() -> None:
     # at the ends of the wall, at other depths beside it, a pixel may have too few that agree
     assert wrong.sum() <= 4 and not wrong[12:38, 17:43].any()
     assert lines.other_lines == "unknown"
-
-
-def test_a_lone_depth_between_object_and_wall_is_no_surface() -> None:
     depth = scene()
     depth[25, 42] = 1.5
     lines = lines_of_image(DepthImage(depth, CAMERA), SHOWN)
@@ -87,9 +84,6 @@ def test_many_lines_are_thinned_far_from_the_object_only() -> None:
     for row, column in np.argwhere((distance > 0) & (distance <= 100))[::997]:
         gap = np.abs(near - [row, column]).max(axis=1).min()
         assert gap <= max(1.0, distance[row, column] / DENSE)
-
-
-# --- clouds ----------------------------------------------------------------------------------------------------------
 
 
 def test_a_cloud_has_the_kinds_of_its_image() -> None:
@@ -155,9 +149,6 @@ def test_points_that_were_only_thinned_out_are_the_objects() -> None:
     rows, columns = pixels(seen.lines.unknown, camera)
     inside = (rows >= 0) & (rows < 300) & (columns >= 0) & (columns < 400)
     assert ball[rows[inside], columns[inside]].mean() > 0.9 and len(seen.lines.past) == 0
-
-
-# --- options and files -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("extent", "other_lines"), [("whole", "past"), ("partial", "unknown"), ("auto", None)])

@@ -117,6 +117,7 @@ def test_the_unit_of_a_cloud(tmp_path: Path) -> None:
 
 
 def test_size_against_training(tmp_path: Path) -> None:
+    """The Stanford Bunny is 15 cm long; the same cloud read as millimetres cannot be it."""
     np.save(tmp_path / "c.npy", np.random.default_rng(0).uniform((0, 0, 1), (0.1, 0.05, 1.1), (400, 3)))
     seen = find_object(read_frame(tmp_path / "c.npy", InputConfig(unit_m=1.0)))
     unknown = find_object(read_frame(tmp_path / "c.npy"))
@@ -126,18 +127,11 @@ def test_size_against_training(tmp_path: Path) -> None:
         assert size_warning(unknown, {"visible_m": visible_m}) is None, "what has no unit may be of any size"
         assert fits or (text and "m in training: other things are in the cloud" in text and "--unit-m 0.001" in text)
     assert size_warning(seen, {"scene": "bunny"}) is None and size_warning(seen, {"visible_m": None}) is None
-
-
-def test_shipped_bunny_weights_know_the_bunny_size(tmp_path: Path) -> None:
-    """The Stanford Bunny is 15 cm long; the same cloud read as millimetres cannot be it."""
     np.save(tmp_path / "c.npy", np.random.default_rng(0).uniform((0, 0, 1), (0.15, 0.15, 1.1), (400, 3)))
     provenance = load_model("bunny").provenance
     assert size_warning(find_object(read_frame(tmp_path / "c.npy", InputConfig(unit_m=1.0))), provenance) is None
     text = size_warning(find_object(read_frame(tmp_path / "c.npy", InputConfig(unit_m=0.001))), provenance)
     assert text is not None and "m long, but 0.12 to 0.254 m in training" in text
-
-
-# --- Zivid -----------------------------------------------------------------------------------------------------------
 
 
 def test_zdf_is_an_organized_cloud_in_millimetres(tmp_path: Path) -> None:
@@ -168,9 +162,6 @@ def test_missing_extras_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
             read_frame(tmp_path / name)
 
 
-# --- the command line ------------------------------------------------------------------------------------------------
-
-
 def test_the_options_of_reconstruct() -> None:
     text = "reconstruct d.png --weights bunny --output o --intrinsics k.json --depth-range 0.4 0.9 --remove-plane"
     command = command_line.parse(f"{text} --box -1 -2 0 1 2 3 --largest-cluster --cluster-gap 0.01".split())
@@ -182,17 +173,3 @@ def test_the_options_of_reconstruct() -> None:
     )
     assert isinstance(command, ReconstructCommand)
     assert command.reading == InputConfig(topic="/d", frame_index=4) and not command.isolation.on
-
-
-@pytest.mark.parametrize(
-    "options, text",
-    [
-        ("--depth-range 0.9 0.4", "the depth range is 0.9 0.4"),
-        ("--box 0 0 0 1 1 0", "the box is 0 0 0 1 1 0"),
-        ("--unit-m -1", "the unit is -1.0 m"),
-    ],
-)
-def test_bad_options_are_one_line(options: str, text: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert command_line.main(f"reconstruct c.npy --weights bunny --output o {options}".split()) == 2
-    message = capsys.readouterr().err.strip()
-    assert message.startswith("mereo: error: ") and text in message and "\n" not in message

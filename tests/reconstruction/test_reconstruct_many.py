@@ -72,6 +72,11 @@ def test_what_is_no_frames_fault_stops_before_the_work(
     (out / MARKER).write_text("{}")
     assert run(folder, "--output", out) == 2
     assert "is a folder of results; each frame gets a folder of its own" in capsys.readouterr().err
+    assert run("--output", tmp_path / "out") == 2
+    assert "no input is given; name a frame" in capsys.readouterr().err
+    (tmp_path / "empty").mkdir()
+    assert run(tmp_path / "empty", "--output", tmp_path / "out") == 2
+    assert "has no depth images or point clouds" in capsys.readouterr().err
 
 
 def test_folders_are_called_by_as_much_of_the_name_as_tells_frames_apart(tmp_path: Path) -> None:
@@ -83,16 +88,5 @@ def test_folders_are_called_by_as_much_of_the_name_as_tells_frames_apart(tmp_pat
         names("x/one/a.ply", "y/one/a.ply")
     with pytest.raises(ValueError, match="would both"):
         names("one/a.ply", "one/A.ply")
-
-
-def test_a_frame_that_is_named_twice_is_one(tmp_path: Path) -> None:
     folder = frames(tmp_path / "frames", "a.npy", "b.npy")
     assert many.list_frames([folder / "b.npy", folder], InputConfig()) == [folder / "b.npy", folder / "a.npy"]
-
-
-def test_without_a_frame_there_is_a_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("--output", tmp_path / "out") == 2
-    assert "no input is given; name a frame" in capsys.readouterr().err
-    (tmp_path / "empty").mkdir()
-    assert run(tmp_path / "empty", "--output", tmp_path / "out") == 2
-    assert "has no depth images or point clouds" in capsys.readouterr().err

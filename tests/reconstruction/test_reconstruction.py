@@ -15,7 +15,6 @@ from answers import answer_to, reconstruct
 from two_balls import BIG, NAMES, SMALL, front, scene, two_balls
 
 import mereo
-from mereo.api.result import Result
 from mereo.cli.answers import ReconstructCommand, StreamCommand
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.cli.stream import stream_reconstructions
@@ -25,7 +24,7 @@ from mereo.models.weights import save_model
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import SizeWarning
 from mereo.reconstruction.pipeline import Reconstruction
-from mereo.visualization.result_files import summary_of, write_answer
+from mereo.visualization.result_files import write_answer
 
 pytestmark = pytest.mark.usefixtures("small_previews")
 
@@ -50,7 +49,11 @@ def test_labels_are_the_fields_at_their_positions(found: Reconstruction) -> None
     assert grid.names == NAMES and not found.clipped
 
 
-def test_segments_are_where_they_are(found: Reconstruction) -> None:
+def test_segments_are_where_they_are_and_an_absent_one_is_listed(found: Reconstruction) -> None:
+    absent = found.segments[2]
+    assert (absent.name, absent.volume, absent.voxels, absent.components) == ("absent", 0.0, 0, 0)
+    assert np.isnan(absent.confidence) and np.isnan(absent.box).all()
+    assert len(found.surfaces.segments[2].faces) == 0
     for segment, surface, (center, radius) in zip(found.segments, found.surfaces.segments, (BIG, SMALL), strict=False):
         np.testing.assert_allclose(segment.centroid, center, atol=0.001)
         np.testing.assert_allclose(segment.box, np.add(center, [[-radius] * 3, [radius] * 3]), atol=0.0005)
@@ -59,13 +62,6 @@ def test_segments_are_where_they_are(found: Reconstruction) -> None:
         assert surface.edge_imbalance() == (0, 0)
         assert segment.components == 1 and 0.5 < segment.confidence <= 1.0
         np.testing.assert_allclose(surface.bounds, segment.box, atol=1e-9)
-
-
-def test_an_absent_segment_is_listed(found: Reconstruction) -> None:
-    absent = found.segments[2]
-    assert (absent.name, absent.volume, absent.voxels, absent.components) == ("absent", 0.0, 0, 0)
-    assert np.isnan(absent.confidence) and np.isnan(absent.box).all()
-    assert len(found.surfaces.segments[2].faces) == 0
 
 
 def test_components_are_counted_and_nothing_is_removed() -> None:
@@ -122,32 +118,6 @@ def test_files(answer: Answer, tmp_path: Path) -> None:
     # the root node turns the frame for viewers: y up in both cases, z toward the viewer
     place = loaded.graph.get("big")[0] @ [*BIG[0], 1.0]
     np.testing.assert_allclose(place[:3], np.array(BIG[0]) * ([1, -1, -1] if frame == "camera" else 1), atol=1e-6)
-
-
-def test_an_existing_result_is_kept(answer: Answer, tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out/mine.txt").write_text("keep")
-    with pytest.raises(FileExistsError, match="choose another output or pass overwrite=True"):
-        Result.of(answer).save(tmp_path / "out")
-    assert [p.name for p in tmp_path.rglob("*")] == ["out", "mine.txt"]
-
-
-def test_from_file_to_files(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cloud, model = scene("camera")
-    monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: model)
-    np.save(tmp_path / "cloud.npy", cloud)
-    found = reconstruct_file(
-        tmp_path / "cloud.npy", tmp_path / "out", FrameJob(ReconstructCommand((), weights="any", resolution=16))
-    )
-    assert summary_of(found)["segments"][0]["name"] == "big"
-    assert (tmp_path / "out/report.html").is_file()
-    assert "wrote" in capsys.readouterr().out
-    with pytest.raises(FileExistsError):
-        reconstruct_file(
-            tmp_path / "cloud.npy", tmp_path / "out", FrameJob(ReconstructCommand((), weights="any", resolution=16))
-        )
 
 
 def test_what_is_read_and_left_out_is_printed_and_kept(
@@ -244,23 +214,11 @@ def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cloud.npy", "w.safetensors"]
 
 
-def test_an_empty_field_is_said_so() -> None:
-    model = AnalyticModel.of(logits_of(lambda p: np.ones(len(p))), ("one",))
-    with pytest.raises(ValueError, match="the model finds no segment near the cloud"):
-        reconstruct(scene("camera")[0], model)
-
-
-# --- the package -----------------------------------------------------------------------------------------------------
-
-
-def test_every_public_name_exists() -> None:
+def test_every_public_name_exists_and_importing_the_package_loads_nothing() -> None:
     for name in mereo.__all__:
         assert getattr(mereo, name) is not None
     assert set(mereo.__all__) <= set(dir(mereo))
     with pytest.raises(AttributeError, match="module 'mereo' has no attribute 'reconstrukt'"):
         mereo.reconstrukt  # noqa: B018
-
-
-def test_importing_the_package_is_instant_and_loads_nothing() -> None:
     code = "import sys, mereo; print(sorted({'torch', 'numpy', 'scipy'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"

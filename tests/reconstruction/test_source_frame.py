@@ -44,8 +44,8 @@ def test_files_in_millimetres_come_to_the_scene(tmp_path: Path) -> None:
         ("liver", "liver/lapgym_liver_visual.stl"),
         ("tumor", "liver/lapgym_gallbladder_visual.stl"),
         ("liver-simulated", "liver/lapgym_liver_visual.stl"),
-        ("skull", "skull/sofa_skull_and_teeth_coarse.obj"),
-        ("human", "human/makehuman_base.obj"),
+        pytest.param("skull", "skull/sofa_skull_and_teeth_coarse.obj", marks=pytest.mark.slow),
+        pytest.param("human", "human/makehuman_base.obj", marks=pytest.mark.slow),
     ],
 )
 def test_built_in_scenes_say_how_their_files_lie_in_them(

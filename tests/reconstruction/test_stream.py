@@ -1,6 +1,9 @@
-"""Streams: the latest frame wins, memory stays bounded, one bad frame stops nothing."""
+"""Streams: the latest frame wins, one bad frame stops nothing, and half-written files are waited for."""
 
 import json
+import os
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -10,9 +13,22 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from mereo.cli.answers import StreamCommand
+from mereo.cli.stream import stream_reconstructions
 from mereo.geometry.camera import PointCloud
+from mereo.io.config import InputConfig
 from mereo.reconstruction import stream as stream_module
-from mereo.reconstruction.stream import Counter, Outcome, StreamFrame, stream
+from mereo.reconstruction.config import IsolationConfig
+from mereo.reconstruction.stream import (
+    PATIENCE_S,
+    Counter,
+    LatestSlot,
+    Outcome,
+    StreamFrame,
+    WatchedFolder,
+    stream,
+    watched_frames,
+)
 
 
 def frame(number: int, time_s: float = 0.0) -> StreamFrame[PointCloud]:
@@ -80,7 +96,9 @@ def test_dropped_frames_are_not_decoded() -> None:
     assert len(decoded) <= 2
 
 
-def test_a_bad_frame_is_reported_and_passed_over() -> None:
+def test_a_bad_frame_is_passed_over_and_the_memory_of_a_summary_is_bounded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def load() -> PointCloud:
         raise ValueError("the file\nis damaged")
 
@@ -94,6 +112,12 @@ def test_a_bad_frame_is_reported_and_passed_over() -> None:
     counter = Counter()
     counter.add(outcomes[1])
     assert "0 frames answered" in str(counter.summary()) and "1 bad" in str(counter.summary())
+    monkeypatch.setattr("mereo.reconstruction.stream.RECENT", 3)
+    counter = Counter()
+    for latency_s in (100.0, 1.0, 2.0, 3.0):
+        counter.add(Outcome("", 0.0, 0, "", latency_s, 0.0, 0))
+    assert len(counter.latencies) == 3
+    assert counter.summary().answered == 4 and counter.summary().latency_median_s == 2.0
 
 
 @pytest.mark.parametrize(
@@ -129,15 +153,6 @@ def test_a_librarys_own_error_names_the_frame() -> None:
     assert lost.error == "no/such.ply: no such file or directory: correct that and try again"
 
 
-def test_the_memory_of_a_summary_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mereo.reconstruction.stream.RECENT", 3)
-    counter = Counter()
-    for latency_s in (100.0, 1.0, 2.0, 3.0):
-        counter.add(Outcome("", 0.0, 0, "", latency_s, 0.0, 0))
-    assert len(counter.latencies) == 3
-    assert counter.summary().answered == 4 and counter.summary().latency_median_s == 2.0
-
-
 def test_a_broken_sequence_is_raised_after_its_frames() -> None:
     def frames() -> Iterator[StreamFrame[PointCloud]]:
         yield frame(0)
@@ -158,6 +173,23 @@ def test_frames_keep_their_recorded_pace(monkeypatch: pytest.MonkeyPatch) -> Non
     frames = (frame(i, 7.0 + 0.1 * i) for i in range(4))
     outcomes = list(stream(frames, number_of, recorded_pace=True, every_frame=True))
     assert now == pytest.approx([100.3]) and [outcome.result for outcome in outcomes] == [0, 1, 2, 3]
+
+
+def test_an_item_that_waits_its_turn_arrives_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [1.0]
+    monkeypatch.setattr(stream_module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    slot = LatestSlot[str]()
+    slot.put("first")
+    thread = threading.Thread(target=lambda: slot.put("second", wait=True))
+    thread.start()
+    thread.join(0.05)
+    assert thread.is_alive(), "it waits"
+    now[0] = 2.0
+    first, second = slot.take(), slot.take(10)
+    thread.join(10)
+    assert first is not None and second is not None
+    assert (first.item, second.item, second.replaced) == ("first", "second", 0)
+    assert (first.arrived_s, second.arrived_s) == (1.0, 2.0)
 
 
 def test_leaving_early_ends_a_thread_for_which_nothing_comes() -> None:
@@ -194,3 +226,102 @@ def test_leaving_early_ends_the_reading_thread() -> None:
     while any(thread.name == "frames" for thread in threading.enumerate()) and time.monotonic() < deadline:
         time.sleep(0.01)
     assert not any(thread.name == "frames" for thread in threading.enumerate())
+
+
+# --- a folder that a camera fills -------------------------------------------------------------------------------------
+
+
+def write(path: Path, content: bytes, changed_s: int) -> Path:
+    path.write_bytes(content)
+    os.utime(path, (changed_s, changed_s))
+    return path
+
+
+@pytest.fixture
+def watched(tmp_path: Path) -> WatchedFolder:
+    return WatchedFolder(tmp_path, lambda file: file.suffix == ".ply")
+
+
+def test_a_file_is_taken_once_when_it_has_come_to_rest_and_forgotten_when_it_goes(watched: WatchedFolder) -> None:
+    file = write(watched.folder / "a.ply", b"ply", 1)
+    write(watched.folder / "notes.doc", b"not wanted", 1)
+    assert watched.look(0.0) == []
+    write(file, b"ply, longer", 1)
+    assert watched.look(0.1) == []
+    assert watched.look(0.2) == [file]
+    assert watched.look(0.3) == []
+    file.unlink()
+    assert watched.look(0.4) == []
+    write(file, b"ply, longer", 1)
+    assert watched.look(0.5) == [] and watched.look(0.6) == [file]
+
+
+def test_files_come_in_the_order_in_which_they_were_written_and_again_when_they_change(watched: WatchedFolder) -> None:
+    late, early = write(watched.folder / "a.ply", b"1", 9), write(watched.folder / "b.ply", b"2", 3)
+    assert watched.look(0.0) == [] and watched.look(0.1) == [early, late]
+    write(late, b"2", 10)
+    assert watched.look(0.2) == [] and watched.look(0.3) == [late]
+
+
+def test_an_empty_or_restless_file_is_waited_for_within_bounds(watched: WatchedFolder) -> None:
+    empty, restless = write(watched.folder / "a.ply", b"", 1), write(watched.folder / "b.ply", b"1", 1)
+    for second in range(int(PATIENCE_S)):
+        write(restless, b"1" * second, second)
+        assert watched.look(float(second)) == []
+    write(restless, b"the end?", 99)
+    assert watched.look(PATIENCE_S) == [empty, restless]
+
+
+def test_frames_are_answered_as_their_files_arrive(tmp_path: Path) -> None:
+    np.save(tmp_path / "first.npy", np.ones((40, 3)))
+    (tmp_path / "second.npy").touch()
+    (tmp_path / ".third.partial.npy").write_bytes(b"a writer renames it when it is whole")
+    isolation = IsolationConfig(box=(-9, -9, 0, 9, 9, 9))
+    frames = watched_frames(str(tmp_path), InputConfig(), isolation)
+    outcomes = stream(frames, lambda seen: len(seen.cloud), every_frame=True)
+    assert (found := next(outcomes)).name == "first.npy" and found.result == 40
+    np.save(tmp_path / "second.npy", np.ones((50, 3)))
+    assert (found := next(outcomes)).name == "second.npy" and found.result == 50
+    np.save(tmp_path / "first.npy", np.ones((60, 3)))
+    assert (found := next(outcomes)).name == "first.npy" and found.result == 60
+    outcomes.close()  # type: ignore[attr-defined]
+
+
+def test_watching_ends_with_ctrl_c(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    np.save(tmp_path / "a.npy", np.random.default_rng(0).uniform(1, 2, (500, 3)))
+    monkeypatch.setattr("mereo.cli.stream.answer_frame", interrupted)
+    command = StreamCommand(str(tmp_path), weights="rope", watch=True, method="network")
+    assert stream_reconstructions(command).answered == 0
+    assert capsys.readouterr().err.startswith("stopped\n0 frames answered")
+
+
+def test_what_cannot_be_watched_is_refused(tmp_path: Path) -> None:
+    reading, isolation = InputConfig(), IsolationConfig()
+    with pytest.raises(FileNotFoundError, match="does not exist; a folder that can be watched is needed: make it"):
+        watched_frames(str(tmp_path / "nowhere"), reading, isolation)
+    (tmp_path / "a.ply").touch()
+    for source in ("-", str(tmp_path / "a.ply")):
+        with pytest.raises(ValueError, match=f"{source} is no folder of frames; only such a folder can be watched"):
+            watched_frames(source, reading, isolation)
+
+
+@pytest.mark.parametrize("given, taken", [(None, "4"), ("1024", "1024")])
+def test_the_cache_of_products_is_small_before_torch_is_loaded(given: str | None, taken: str) -> None:
+    code = (
+        "import os, sys\n"
+        "class Finder:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name == 'torch': sys.exit(os.environ.get('ONEDNN_PRIMITIVE_CACHE_CAPACITY'))\n"
+        "sys.meta_path.insert(0, Finder())\n"
+        "from mereo.__main__ import main\n"
+        "main(['stream', 'folder', '--weights', 'rope'])"
+    )
+    variables = {name: value for name, value in os.environ.items() if not name.startswith("ONEDNN")}
+    variables |= {} if given is None else {"ONEDNN_PRIMITIVE_CACHE_CAPACITY": given}
+    result = subprocess.run([sys.executable, "-c", code], env=variables, capture_output=True, text=True, check=False)
+    assert result.stderr.strip() == taken

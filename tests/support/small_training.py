@@ -13,3 +13,16 @@ SMALL = replace(
     holdout=8,
     augment=AugmentConfig(keep_points=(0.6, 1.0), hole_probability=0.3),
 )
+
+TRANSFORMER = replace(
+    SMALL,
+    network=SMALL.network.changed(
+        encoder="point-transformer",
+        transformer_widths=(8, 12, 16),
+        transformer_neighbors=6,
+        align_points=0,
+        rest_template=False,
+        sight_neighbors=0,
+    ),
+)
+"""Another encoder, and none of what is added to the paper's network."""

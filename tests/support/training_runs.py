@@ -1,6 +1,8 @@
-"""Training runs that are stopped or shared, for the tests of every encoder."""
+"""Training runs that are stopped, diverge or are shared."""
 
+import math
 import os
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +13,7 @@ from safetensors.torch import load_file
 
 from mereo.training import trainer
 from mereo.training.config import TrainConfig
+from mereo.training.dataset import Batch
 
 
 def kill_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
@@ -23,6 +26,20 @@ def kill_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
         original(self, batch)  # type: ignore[arg-type]
 
     monkeypatch.setattr(trainer.Trainer, "train_step", step)
+
+
+def diverge_at(monkeypatch: pytest.MonkeyPatch, step: int, loss: float, gradient: float) -> None:
+    """From ``step`` on the loss, or its gradient, is what is given here."""
+    original = trainer.Trainer._loss
+
+    def spoilt(self: trainer.Trainer, batch: Batch) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        value, terms = original(self, batch)
+        if self.step + 1 >= step:
+            value = value + (loss if math.isnan(gradient) else 0.0)
+            value.register_hook(lambda grad: grad * gradient if not math.isnan(gradient) else grad)
+        return value, terms
+
+    monkeypatch.setattr(trainer.Trainer, "_loss", spoilt)
 
 
 def assert_resumes_exactly(dataset: Path, folder: Path, config: TrainConfig, steps: int) -> None:
@@ -39,22 +56,21 @@ def assert_resumes_exactly(dataset: Path, folder: Path, config: TrainConfig, ste
     assert (folder / "whole" / "metrics.csv").read_text() == (folder / "parts" / "metrics.csv").read_text()
 
 
-def train_in_two_processes(dataset: Path, folder: Path, module: str, config: str) -> Path:
-    """Train under torchrun with ``config``, an expression of the test module's ``SMALL``; returns the run."""
+def train_in_two_processes(dataset: Path, folder: Path, config: TrainConfig) -> Path:
+    """Train under torchrun, and return the run."""
+    (folder / "config.pickle").write_bytes(pickle.dumps(config))
     script = folder / "run.py"
     script.write_text(
-        "import sys\nfrom dataclasses import replace\nfrom pathlib import Path\n"
-        f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
-        f"from {module} import SMALL\nfrom mereo.training.trainer import train\n"
-        f"train(Path(sys.argv[1]), Path(sys.argv[2]), {config})\n"
+        "import pickle\nimport sys\nfrom pathlib import Path\nfrom mereo.training.trainer import train\n"
+        "dataset, run, config = map(Path, sys.argv[1:])\n"
+        "train(dataset, run, pickle.loads(config.read_bytes()))\n"
         # threads of the group would outlive the interpreter, and may then wait forever
         "threads = [name.read_text() for name in Path('/proc/self/task').glob('*/comm')]\n"
         "assert not any('gloo' in name for name in threads), threads\n"
     )
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "JAXTYPING_DISABLE": "1"}
-    done = subprocess.run(
-        [*command, str(dataset), str(folder / "run")], env=environment, capture_output=True, text=True, timeout=240
-    )
+    arguments = [str(dataset), str(folder / "run"), str(folder / "config.pickle")]
+    done = subprocess.run([*command, *arguments], env=environment, capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stderr[-2000:]
     return folder / "run"

@@ -9,21 +9,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from analytic import AnalyticModel
 from folder_contents import contents
 from safetensors.numpy import load_file
-from toy_data import SMALL, read_all
+from scene_code import CODE
+from scene_files import write_bar, write_mesh
+from shapes import ball
+from toy_data import SMALL
 from toy_scene import toy_scene
 
 from mereo.api.generate import generate
+from mereo.evaluation.scoring import trained_scene
 from mereo.io import progress
-from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis import shards
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import Example, synthesize
 from mereo.synthesis.shards import example_bytes
-from mereo.training.dataset import Dataset
 
 TOY = toy_scene()
 
@@ -41,9 +44,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr(shards, "SHARD_SIZE", 4)
         generate(TOY, output, SMALL, examples=10, seed=3)
     return output
-
-
-# --- the same bits ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("calls", [0, 5, 9])
@@ -69,26 +69,6 @@ def test_killed_and_resumed_equals_uninterrupted(
     assert contents(tmp_path / "data") == contents(whole)
 
 
-def test_machines_that_share_the_work_and_the_directory_make_the_same_dataset(whole: Path, tmp_path: Path) -> None:
-    for part in (1, 0):
-        generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3, shard=(part, 2))
-    assert contents(whole) == contents(tmp_path / "data")
-    with pytest.raises(FileExistsError, match="holds a dataset; continue it with resume"):
-        generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3, shard=(0, 2))
-
-
-def test_a_damaged_shard_is_reported_and_made_again(
-    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3)
-    shard = tmp_path / "data" / "shard-00001.safetensors"
-    shard.write_bytes(shard.read_bytes()[:-1])
-    capsys.readouterr()
-    generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3, resume=True)
-    assert "shard-00001.safetensors is damaged and is made again" in capsys.readouterr().out
-    assert contents(whole) == contents(tmp_path / "data")
-
-
 def test_any_example_can_be_remade_alone(whole: Path) -> None:
     example = synthesize(TOY, SMALL, example_rng(3, 5))
     shard = load_file(whole / "shard-00001.safetensors")
@@ -106,18 +86,8 @@ def test_two_workers_equal_one(whole: Path, tmp_path: Path) -> None:
     assert contents(whole) == contents(tmp_path / "data")
 
 
-# --- what is stored ---------------------------------------------------------------------------------------------------
-
-
-def test_training_reads_what_generation_writes(whole: Path) -> None:
-    data = Dataset.load(whole)
-    stored = read_all(data)
-    assert len(data) == 10 and stored.cloud.shape == (10, 128, 3)
-    assert stored.positions.shape == (10, SMALL.sampling.total(4), 3)
-    assert (stored.viewpoint[:, 2] < stored.cloud[..., 2].amin(dim=1)).all()
-
-
-def test_tensors_are_as_documented(whole: Path) -> None:
+def test_tensors_are_as_documented_and_a_paper_size_dataset_fits_in_2_5_gigabytes(whole: Path) -> None:
+    """28,800 examples of a five-segment scene, on disk and in memory."""
     shard = load_file(whole / "shard-00000.safetensors")
     queries = SMALL.sampling.total(4)
     assert {key: (value.dtype.name, value.shape) for key, value in shard.items()} == {
@@ -132,10 +102,6 @@ def test_tensors_are_as_documented(whole: Path) -> None:
         "rest": ("float16", (4, queries, 3)),
     }
     assert np.array_equal(np.isnan(shard["rest"]).any(axis=-1), shard["labels"] == 0)
-
-
-def test_a_paper_size_dataset_fits_in_2_5_gigabytes(whole: Path) -> None:
-    """28,800 examples of a five-segment scene, on disk and in memory."""
     stored = sum(value.nbytes for value in load_file(whole / "shard-00000.safetensors").values())
     assert stored == 4 * example_bytes(SMALL, segments=4)
     file = (whole / "shard-00000.safetensors").stat().st_size
@@ -143,7 +109,7 @@ def test_a_paper_size_dataset_fits_in_2_5_gigabytes(whole: Path) -> None:
     assert 28_800 * example_bytes(GenerateConfig(), segments=5) + 450 * 2000 < 1.65e9 < 2.5e9
 
 
-def test_manifest_tells_how_to_make_it_again(whole: Path) -> None:
+def test_manifest_tells_how_to_make_it_again_and_files_have_the_users_permissions(whole: Path) -> None:
     manifest = json.loads((whole / "manifest.json").read_text())
     assert (manifest["scene"], manifest["seed"], manifest["examples"]) == ("toy", 3, 10)
     assert manifest["settings"]["sampling"]["per_segment"] == 16
@@ -152,21 +118,9 @@ def test_manifest_tells_how_to_make_it_again(whole: Path) -> None:
     assert len(manifest["rest_sha256"]) == 64 and manifest["any_roll"] is False
     assert manifest["bytes"] == 10 * example_bytes(SMALL, 4)
     assert manifest["libraries"]["numpy"] == np.__version__
-
-
-def test_files_have_the_users_permissions(whole: Path) -> None:
     mask = os.umask(0)
     os.umask(mask)
     assert all(path.stat().st_mode & 0o777 == 0o666 & ~mask for path in whole.iterdir())
-
-
-def test_a_built_in_scene_goes_by_its_name(tmp_path: Path) -> None:
-    generate("rope", tmp_path / "data", SMALL, examples=1, seed=1)
-    manifest = json.loads((tmp_path / "data" / "manifest.json").read_text())
-    assert [part["name"] for part in manifest["segments"]] == list(load_scene("rope").rest.names)
-
-
-# --- refusals ---------------------------------------------------------------------------------------------------------
 
 
 def test_test_seeds_and_training_seeds_never_meet(tmp_path: Path) -> None:
@@ -211,11 +165,6 @@ def test_an_existing_directory_is_left_alone(tmp_path: Path, resume: bool) -> No
     with pytest.raises(FileExistsError, match="is a file; a dataset is a directory: choose another output"):
         generate(TOY, tmp_path / "notes.txt", SMALL, examples=4, seed=1, resume=resume)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
-
-
-def test_a_dataset_is_not_overwritten_without_being_asked(whole: Path) -> None:
-    with pytest.raises(FileExistsError, match="holds a dataset; continue it with resume, or choose another output"):
-        generate(TOY, whole, SMALL, examples=10, seed=3)
 
 
 @pytest.mark.parametrize("victim", ["template", "statistical_model", "shard-00000"])
@@ -276,3 +225,41 @@ def test_progress_tells_rate_and_time_left(
     lines = lines[101:]
     assert re.fullmatch(r"generate: 4 of 6 examples, \d+\.\d examples/s, \d+ s left", lines[0])
     assert lines[1].startswith("generate: 6 of 6 ") and re.fullmatch(r"generate: 6 examples in \d+ (s|min)", lines[2])
+
+
+def made(scene: Path, output: Path, workers: int = 1, examples: int = 2, resume: bool = False) -> dict[str, bytes]:
+    generate(str(scene), output, SMALL, examples=examples, seed=0, workers=workers, resume=resume)
+    return {file.name: file.read_bytes() for file in output.iterdir()}
+
+
+def test_an_edited_scene_is_not_resumed_but_an_edited_comment_is(tmp_path: Path) -> None:
+    scene = write_bar(tmp_path, "deformations:\n  - type: lattice\n    strength: 0.5\n")
+    first = made(scene, tmp_path / "data")
+    manifest = json.loads(first["manifest.json"])
+    assert manifest["scene"] == "bar" and len(manifest["scene_file_sha256"]) == 64
+    assert manifest["unit_m"] == pytest.approx(0.0005)
+    scene.write_text("# a comment\n" + scene.read_text())
+    assert made(scene, tmp_path / "data", resume=True) == first
+    scene.write_text(scene.read_text().replace("0.5", "0.4"))
+    # the deformation decides how long faces are divided, so the rest mesh is another one, too, and is compared first
+    with pytest.raises(ValueError, match="was made with (rest|scene_file)_sha256 = .*resuming needs equal settings"):
+        made(scene, tmp_path / "data", resume=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["yaml", "py"])
+def test_two_workers_make_the_same_files_as_one(kind: str, tmp_path: Path) -> None:
+    scene = write_bar(tmp_path)
+    if kind == "py":
+        scene = tmp_path / "mine.py"
+        file = write_mesh(ball((0, 0, 0), 10.0, level=2), tmp_path / "ball.ply")
+        scene.write_text(CODE.format(name="mine", file=str(file)))
+    one = made(scene, tmp_path / "one", 1, examples=70)
+    assert made(scene, tmp_path / "two", 2, examples=70) == one
+
+
+def test_weights_of_a_scene_that_is_not_built_in_ask_for_its_file() -> None:
+    model = AnalyticModel.of(lambda points: points, ("a", "b", "c"))
+    object.__setattr__(model, "provenance", {"scene": "bar"})
+    with pytest.raises(ValueError, match=r"trained on the scene 'bar', which is not built in; .*--scene FILE.yaml"):
+        trained_scene(model)

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from balls import Balls
+from shapes import box
 
-from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.synthesis import query_sampling
 from mereo.synthesis.config import SamplingConfig
@@ -29,13 +30,6 @@ def square(low: float, high: float, shift: float = 0.0) -> np.ndarray:
     return np.array([[low + shift, low], [high + shift, low], [high + shift, high], [low + shift, high]])
 
 
-def cube(name: str, shift: float) -> Segment:
-    corners = np.array([[x + shift, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
-    return Segment(name, PALETTE[0], corners, faces)
-
-
 def shapes() -> dict[str, Shape]:
     """Two dimensions and three, one segment and several, touching and apart, convex and not."""
     outlines, _ = read_outlines()
@@ -43,7 +37,7 @@ def shapes() -> dict[str, Shape]:
         "thin": Polygons2D(outlines["thin"]),
         "squares": Polygons2D(square(0, 1), square(0, 1, shift=1.0), square(2, 2.3)),
         "balls": Balls(((0, 0, 0), 1.0), ((2.05, 0, 0), 1.0), ((0, 1.4, 0), 0.35)),
-        "cubes": Solids(SegmentedMesh((cube("left", 0.0), cube("right", 1.0)))),
+        "cubes": Solids(SegmentedMesh((box((0, 0, 0), (1, 1, 1), "left"), box((1, 0, 0), (2, 1, 1), "right")))),
     }
 
 
@@ -55,9 +49,6 @@ def halves(samples: Samples, keep: int) -> list[tuple[Samples, Samples]]:
     points, labels = (np.split(a, len(a) // keep) for a in samples)
     sides = [Samples(p, q) for p, q in zip(points, labels, strict=True)]
     return list(zip(sides[::2], sides[1::2], strict=True))
-
-
-# --- the algorithm ---------------------------------------------------------------------------------------------------
 
 
 def one_at_a_time(shape: Shape, keep: int, draw: int, seed: int, nested: bool) -> Samples:
@@ -94,7 +85,10 @@ def test_equals_drawing_one_point_at_a_time(name: str, nested: bool) -> None:
         np.testing.assert_array_equal(fast.labels, slow.labels)
 
 
-def test_batch_size_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_batch_size_changes_no_bit_and_the_generator_advances_alike_whatever_is_drawn(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """So the uniform points after it are comparable between samplers' settings."""
     shape = shapes()["balls"]
     usual = sort_sample(shape, 40, 80, np.random.default_rng(1))
     for first, largest in ((1, 1 << 17), (300, 1 << 17), (8, 7)):
@@ -102,10 +96,6 @@ def test_batch_size_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(query_sampling, "_LARGEST_BATCH", largest)
         other = sort_sample(shape, 40, 80, np.random.default_rng(1))
         np.testing.assert_array_equal(usual.points, other.points)
-
-
-def test_generator_advances_by_the_same_amount_whatever_is_drawn() -> None:
-    """So the uniform points after it are comparable between samplers' settings."""
     rngs = [np.random.default_rng(3) for _ in range(2)]
     for rng, draw in zip(rngs, (20, 200), strict=True):
         sort_sample(shapes()["balls"], 20, draw, rng)
@@ -122,9 +112,6 @@ def test_few_distances_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = query_sampling._nearest_rows(ball, 0, points, 100)
     assert set(rows) == set(np.argsort(real(0, points))[:100])
     assert sum(measured) < 5_000
-
-
-# --- counts, labels, what is dropped and what is kept ----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -192,9 +179,6 @@ def test_nested_sampler_reaches_what_sort_sample_cannot() -> None:
     assert set(beyond.labels) <= {0, 1}
 
 
-# --- how far points lie ----------------------------------------------------------------------------------------------
-
-
 def test_reach_around_balls_in_closed_form() -> None:
     """Equal volumes on both sides: r * 2^(1/3) for n = k; half volumes r * 0.5^(1/3) and r * 1.5^(1/3) for n = 2k."""
     balls = Balls(((0, 0, 0), 1.0), ((9, 0, 0), 2.0))
@@ -206,9 +190,6 @@ def test_reach_around_balls_in_closed_form() -> None:
             if inner is not None:
                 innermost = np.mean([balls.radius(index, run[index][0].points).min() for run in runs])
                 assert innermost == pytest.approx(r * inner ** (1 / 3), rel=0.025)
-
-
-# --- all queries of an example ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("sampler", ["volume-uniform", "label-uniform", "sort-sample", "nested-sort-sample"])
@@ -229,14 +210,11 @@ def test_queries_of_an_example(sampler: str) -> None:
     assert np.abs(unit.mean(axis=0) - 0.5).max() < 4 * np.sqrt(1 / 12 / 96)
 
 
-def test_uniform_points_are_the_papers_share_of_all() -> None:
+def test_settings_reach_the_sampler_and_uniform_points_are_the_papers_share_of_all() -> None:
     """Appendix B: "15% of total points"."""
     for segments in range(1, 40):
         total, near = SamplingConfig().total(segments), 256 * segments
         assert abs((total - near) - 0.15 * total) < 1
-
-
-def test_settings_reach_the_sampler() -> None:
     shape, config = shapes()["balls"], SamplingConfig(per_segment=80, oversample=3, box_margin=0.8, uniform_fraction=0)
     queries = sample_queries(shape, config, np.random.default_rng(4))
     direct = sort_sample(shape, 40, 120, np.random.default_rng(4), extended_boxes(shape, 0.8))
@@ -253,14 +231,11 @@ def test_settings_reach_the_sampler() -> None:
 def test_bad_settings(change: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         sample_queries(shapes()["balls"], replace(SamplingConfig(), **change), np.random.default_rng(0))
-
-
-def test_fewer_drawn_than_kept() -> None:
     with pytest.raises(ValueError, match="keep is 9 and draw is 8; .* pass keep <= draw"):
         sort_sample(shapes()["balls"], 9, 8, np.random.default_rng(0))
 
 
-def test_a_segment_that_is_never_hit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_segments_that_are_never_hit_or_never_missed(monkeypatch: pytest.MonkeyPatch) -> None:
     assert query_sampling.MAX_DRAWS == 2_000_000
     monkeypatch.setattr(query_sampling, "MAX_DRAWS", 30_000)
     covered = Balls(((0, 0, 0), 3.0), ((0, 0, 0), 1.0))
@@ -270,9 +245,6 @@ def test_a_segment_that_is_never_hit(monkeypatch: pytest.MonkeyPatch) -> None:
         "segment 1 has 0 of 30,000 draws inside it; 128 are needed: check that it is closed and no earlier segment "
         "covers it, or split it into shorter parts"
     )
-
-
-def test_a_segment_without_empty_space_around_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(query_sampling, "MAX_DRAWS", 30_000)
     enclosed = Balls(((0, 0, 0), 1.0), ((0, 0, 0), 3.0))
     with pytest.raises(ValueError) as caught:

@@ -50,10 +50,7 @@ def look(solids: Solids, seed: int = 0, noise_std: float = 0.0, **terms: object)
     return observe(solids, CAMERA, noise_std, replace(OFF, **terms), np.random.default_rng(seed))  # type: ignore[arg-type]
 
 
-# --- noise in depth and across ----------------------------------------------------------------------------------------
-
-
-def test_published_values() -> None:
+def test_published_values_which_grow_with_distance_and_slant() -> None:
     """By hand from the papers' formulas: Kinect at 1 m and at 0.4 m and 45 degrees, Kinect v2 at 2 m; pixels."""
     z, flat = np.array([1.0]), np.zeros(1)
     assert axial_std_m(z, flat) == pytest.approx(0.001884)
@@ -62,6 +59,11 @@ def test_published_values() -> None:
     assert lateral_std(z, flat) * 585 == pytest.approx(0.8)
     assert lateral_std(z, np.array([np.pi / 4])) * 585 == pytest.approx(0.835)
     assert lateral_std(np.array([2.0]), flat, "time-of-flight") == pytest.approx(0.0008)
+    z, angle = np.linspace(0.5, 4, 50), np.linspace(0, np.pi / 2, 91)
+    for model in MODELS:
+        assert (np.diff(axial_std_m(np.linspace(1, 4, 50), np.zeros(50), model)) > 0).all()
+        assert (np.diff(axial_std_m(np.ones(91), angle, model)) >= 0).all()
+    assert np.isfinite(axial_std_m(z, np.full(50, np.pi / 2))).all()
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -74,14 +76,6 @@ def test_axial_noise_has_the_published_deviation(model: SensorModel, z: float, t
     assert abs(score.std() - 1) < 5 / np.sqrt(2 * score.size)
     twice = look(wall(z, tilt_deg), model=model, axial=2.0).whole.depth
     assert np.allclose(twice - clean, 2 * (noisy - clean), atol=1e-9)
-
-
-def test_axial_noise_grows_with_distance_and_slant() -> None:
-    z, angle = np.linspace(0.5, 4, 50), np.linspace(0, np.pi / 2, 91)
-    for model in MODELS:
-        assert (np.diff(axial_std_m(np.linspace(1, 4, 50), np.zeros(50), model)) > 0).all()
-        assert (np.diff(axial_std_m(np.ones(91), angle, model)) >= 0).all()
-    assert np.isfinite(axial_std_m(z, np.full(50, np.pi / 2))).all()
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -107,10 +101,7 @@ def test_lateral_noise_frays_outlines_only() -> None:
     assert 0.2 < (frayed & ~clean).sum() / len(changed) < 0.8
 
 
-# --- depth steps ------------------------------------------------------------------------------------------------------
-
-
-def test_depth_has_the_steps_of_whole_disparities() -> None:
+def test_depth_has_the_steps_of_whole_disparities_in_the_image_after_all_noise() -> None:
     z_m = np.random.default_rng(0).uniform(0.4, 5.0, size=5000)
     steps = quantize(z_m, 1.0)
     disparity = 351.3 / steps
@@ -120,15 +111,9 @@ def test_depth_has_the_steps_of_whole_disparities() -> None:
     assert np.array_equal(quantize(np.zeros(3), 1.0), np.zeros(3))
     # Khoshelham and Elberink: 2.85e-5 / cm, so 7 cm at 5 m
     assert np.isclose(np.diff(np.unique(quantize(np.linspace(4.9, 5.1, 10_000), 1.0))).mean(), 0.071, atol=0.001)
-
-
-def test_the_steps_are_in_the_image_after_all_noise() -> None:
     image = look(wall(150.0, 30.0), noise_std=0.1, axial=1.0, quantization=2.0).image
     disparity = 351.3 / 2 / (image.depth * UNIT_M)
     assert np.allclose(disparity, np.rint(disparity), atol=1e-6) and len(np.unique(disparity.round())) > 20
-
-
-# --- flying pixels ----------------------------------------------------------------------------------------------------
 
 
 def two_walls() -> Solids:
@@ -136,7 +121,7 @@ def two_walls() -> Solids:
     return Solids(SegmentedMesh((near, far)))
 
 
-def test_flying_pixels_lie_between_the_two_depths_at_the_edge() -> None:
+def test_flying_pixels_lie_between_the_two_depths_at_an_edge_and_nowhere_else() -> None:
     clean, flown = look(two_walls()).whole.depth, look(two_walls(), flying=1.0).whole.depth
     moved = flown != clean
     edge = np.flatnonzero(np.abs(np.diff(clean[0])) > 10)[0]
@@ -146,17 +131,11 @@ def test_flying_pixels_lie_between_the_two_depths_at_the_edge() -> None:
     assert abs(share.mean() - 0.5) < 5 / np.sqrt(12 * share.size) and share.min() < 0.1 and share.max() > 0.9
     some = (look(two_walls(), flying=0.3).whole.depth != clean).sum() / moved.sum()
     assert abs(some - 0.3) < 5 * np.sqrt(0.21 / moved.sum())
-
-
-def test_nothing_flies_on_steep_walls_or_before_nothing() -> None:
     for solids in (wall(150.0, 60.0), Solids(one(box((-20, -20, 140), (20, 20, 150))))):
         assert np.array_equal(look(solids, flying=1.0).whole.depth, look(solids).whole.depth)
     depth = np.zeros((5, 5))
     depth[2, 2] = 100.0
     assert np.array_equal(mix_edges(depth, 150.0, 1.0, np.random.default_rng(0)), depth)
-
-
-# --- missing pixels ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("tilt_deg", [40.0, 65.0, 72.0])
@@ -185,9 +164,6 @@ def test_holes_take_the_expected_area() -> None:
     assert abs((lost == 0).mean() - np.exp(-2)) < 5 * np.sqrt(np.exp(-2) / len(views))
 
 
-# --- the mask ---------------------------------------------------------------------------------------------------------
-
-
 def masks(seen: np.ndarray, count: int = 300, **terms: float) -> np.ndarray:
     return np.stack(
         [
@@ -199,7 +175,7 @@ def masks(seen: np.ndarray, count: int = 300, **terms: float) -> np.ndarray:
     )
 
 
-def test_the_edge_of_the_mask_is_off_as_probably_as_asked() -> None:
+def test_the_mask_is_off_and_shifted_as_probably_as_asked() -> None:
     """Pixels beside a straight edge are half a pixel away from it, the next ones one and a half."""
     seen = np.zeros((60, 60), dtype=bool)
     seen[:, :30] = True
@@ -211,9 +187,6 @@ def test_the_edge_of_the_mask_is_off_as_probably_as_asked() -> None:
     # the error is smooth: neighbours along the edge mostly agree
     assert (drawn[:, 1:, 30] == drawn[:, :-1, 30]).mean() > 0.9
     assert np.array_equal(masks(seen, 2)[1], seen)
-
-
-def test_the_mask_shifts_as_far_as_asked() -> None:
     v, u = np.mgrid[:61, :61] - 30
     centers = np.array([[u[m].mean(), v[m].mean()] for m in masks(u**2 + v**2 < 200, mask_shift_px=2.0)])
     assert np.allclose(centers.mean(axis=0), 0, atol=0.5) and np.allclose(centers.std(axis=0), 2.0, atol=0.35)
@@ -222,9 +195,6 @@ def test_the_mask_shifts_as_far_as_asked() -> None:
 def test_the_random_field_has_unit_variance_everywhere() -> None:
     fields = np.stack([smooth_field(40, 70, np.random.default_rng(i)) for i in range(2000)])
     assert np.abs(fields.std(axis=0) - 1).max() < 0.1 and np.abs(fields.mean(axis=0)).max() < 0.12
-
-
-# --- together ---------------------------------------------------------------------------------------------------------
 
 
 def test_off_is_the_paper_bit_for_bit() -> None:

@@ -30,12 +30,6 @@ def places(scene: Scene, seed: int, times_s: np.ndarray, change_s: float = 1.0) 
     return np.stack([vertices(scene.deform(one.deformations).mesh) for one in walk(scene, seed, times_s, change_s)])
 
 
-def test_a_walk_has_the_distribution_of_the_states_at_any_time() -> None:
-    weights = process_weights(np.linspace(0.0, 5.3, 50))
-    np.testing.assert_allclose((weights**2).sum(axis=1), 1.0)
-    assert weights.min() >= 0 and (np.count_nonzero(weights, axis=1) <= 4).all()
-
-
 def test_a_walk_starts_in_the_state_of_its_seed_and_moves_on_smoothly() -> None:
     scene = toy_scene()
     coarse, fine = (places(scene, 3, np.arange(0.0, 2.0, step)) for step in (0.1, 0.05))
@@ -46,6 +40,9 @@ def test_a_walk_starts_in_the_state_of_its_seed_and_moves_on_smoothly() -> None:
     assert 0.4 < largest[1] / largest[0] < 0.65  # half the time, half the way
     assert np.linalg.norm(coarse[-1] - coarse[0], axis=1).max() > 1.0
     assert not np.allclose(places(scene, 4, np.array([0.0, 1.0])), coarse[[0, 10]])
+    weights = process_weights(np.linspace(0.0, 5.3, 50))
+    np.testing.assert_allclose((weights**2).sum(axis=1), 1.0)
+    assert weights.min() >= 0 and (np.count_nonzero(weights, axis=1) <= 4).all()
 
 
 def bent_or_not(rng: np.random.Generator) -> tuple[Deformation, ...]:
@@ -79,14 +76,11 @@ def refusing(most: float) -> Scene:
     return Scene("refusing", rest_mesh(), draw)
 
 
-def test_a_walk_goes_round_what_the_scene_refuses() -> None:
+def test_a_walk_goes_round_what_the_scene_refuses_and_tells_where_that_is_everything() -> None:
     """And does not jump to the other side, from -0.5 to 0.5, where the scene would draw again."""
     states = walk(refusing(0.2), 0, np.arange(20) / 10, 1.0)
     drawn = np.array([2 * one.calls[0].shares[0] - 1 for one in states])
     assert (np.abs(np.abs(drawn) - 0.5) < 0.2).all() and len(np.unique(np.sign(drawn))) == 1 and np.ptp(drawn) > 0.01
-
-
-def test_a_scene_that_refuses_everything_else_is_told() -> None:
     allowed: list[float] = []
 
     def draw(rng: np.random.Generator) -> tuple[Deformation, ...]:
@@ -122,9 +116,12 @@ def test_the_same_seed_is_the_same_sequence(sensor: str) -> None:
         np.testing.assert_array_equal(one.seen.image.depth, other.seen.image.depth)
 
 
-def test_a_sequence_of_one_frame_is_refused() -> None:
+def test_a_sequence_of_one_frame_and_test_seeds_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(ValueError, match="0.01 s at 30 frames a second are 0 frames; a sequence has at least 2"):
         SequenceConfig(seconds=0.01)
+    out = ["scene", "record", "rope", "--output", str(tmp_path / "x"), "--seed", "1000000"]
+    assert command_line.main(out) == 2 and not (tmp_path / "x").exists()
+    assert "seeds from 1000000 up are for testing: take a smaller one, or say --test" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")
@@ -176,9 +173,3 @@ def test_the_command_records_what_stream_answers(tmp_path: Path, capsys: pytest.
     first = Segment("base", (0, 0, 0), unit_m * truth["vertices"][1, :count].astype(float), truth["faces"][:faces])
     np.testing.assert_allclose(base["centroid"], first.vertices.mean(axis=0), atol=0.02)
     assert base["volume"] == pytest.approx(first.volume, rel=0.1)
-
-
-def test_test_seeds_are_for_testing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = ["scene", "record", "rope", "--output", str(tmp_path / "x"), "--seed", "1000000"]
-    assert command_line.main(out) == 2 and not (tmp_path / "x").exists()
-    assert "seeds from 1000000 up are for testing: take a smaller one, or say --test" in capsys.readouterr().err

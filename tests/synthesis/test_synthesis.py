@@ -7,11 +7,11 @@ from toy_scene import rest_mesh, sample_deformations, toy_scene
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
+from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.scenes.scene import Scene, Workspace
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig, SamplingConfig
-from mereo.synthesis.examples import Example, View, _rest_guess, sample_view, synthesize
+from mereo.synthesis.examples import Example, View, sample_view, synthesize
 
 SETTINGS = GenerateConfig(sampling=SamplingConfig(per_segment=128))
 SCENE = toy_scene()
@@ -48,16 +48,14 @@ def test_the_cloud_is_the_depth_image_unprojected_and_normalized(case: Case) -> 
     assert len(np.unique(gaps.argmin(axis=1))) == len(kept) == min(len(seen), SETTINGS.points)
     low, high = example.normalizer.apply(seen).min(axis=0), example.normalizer.apply(seen).max(axis=0)
     assert np.isclose((high - low).max(), 2) and np.allclose(low + high, 0)
-
-
-def test_the_cloud_lies_on_the_object_up_to_the_noise(case: Case) -> None:
     _, view = case
     distance = Solids(view.mesh).nearest(view.depth.to_points().points).distance
     # noise is along the ray: never farther from the surface than that, 0.1 in standard deviation
     assert distance.max() < 0.6 and 0.02 < distance.mean() < 0.1
 
 
-def test_labels_and_signs_are_those_of_the_deformed_segments(case: Case) -> None:
+def test_labels_distances_and_directions_are_those_of_the_deformed_segments(case: Case) -> None:
+    """Walking the distance along the direction ends on the surface."""
     example, view = case
     queries, solids = example.queries, Solids(view.mesh)
     points = example.normalizer.invert(queries.positions)
@@ -65,17 +63,13 @@ def test_labels_and_signs_are_those_of_the_deformed_segments(case: Case) -> None
     assert np.array_equal(solids.label(points[clear]), queries.labels[clear])
     assert np.array_equal(queries.distances < 0, queries.labels > 0)
     assert len(queries.labels) == SETTINGS.sampling.total(4)
-
-
-def test_walking_the_distance_along_the_direction_ends_on_the_surface(case: Case) -> None:
-    example, view = case
     queries = example.queries
     foot = queries.positions + np.abs(queries.distances)[:, None] * queries.directions
     assert Solids(view.mesh).nearest(example.normalizer.invert(foot)).distance.max() < 1e-6
     assert np.allclose(np.linalg.norm(queries.directions, axis=1), 1)
 
 
-def test_rest_coordinates_lead_back_to_the_query(case: Case) -> None:
+def test_rest_coordinates_lead_back_to_the_query_and_lie_in_the_same_segment_at_rest(case: Case) -> None:
     """The theorem: deform(rest) is the query's place in the scene; outside there is no rest."""
     example, view = case
     queries = example.queries
@@ -88,9 +82,6 @@ def test_rest_coordinates_lead_back_to_the_query(case: Case) -> None:
         assert members.sum() >= 64
         assert np.abs(deformation(rest[members]) - world[members]).max() < 1e-3
         assert (np.abs(queries.rest[members]) <= 1 + 1e-4).all()
-
-
-def test_rest_coordinates_lie_in_the_same_segment_at_rest(case: Case) -> None:
     queries = case[0].queries
     low, high = SCENE.rest.bounds
     inside = queries.labels > 0
@@ -99,29 +90,6 @@ def test_rest_coordinates_lie_in_the_same_segment_at_rest(case: Case) -> None:
     # faces are flat before and after, the map between them is not: only points beside a face may change sides
     clear = solids.nearest(rest).distance > 0.1
     assert np.array_equal(solids.label(rest[clear]), queries.labels[inside][clear])
-
-
-def test_the_guess_is_exact_for_rigid_motions() -> None:
-    """Then Newton has nothing to do; here it is not even allowed to."""
-    turn, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
-    motion = rigid(turn * np.linalg.det(turn), np.array([30.0, -20.0, 150.0]))
-    mesh = rest_mesh().transformed(motion)
-    rest = np.random.default_rng(1).uniform(-20, 20, size=(500, 3))
-    points = transform_points(motion, rest)
-    nearest = Solids(mesh).nearest(points)
-    guess = _rest_guess(rest_mesh(), mesh, points, nearest.point, nearest.face)
-    assert np.abs(guess - rest).max() < 1e-8
-
-
-def test_rest_coordinates_match_the_closed_form_inverse() -> None:
-    settings = GenerateConfig(sampling=SamplingConfig(per_segment=64))
-    example, view = example_and_view(11, settings)
-    low, high = SCENE.rest.bounds
-    rest = example.queries.rest * (high - low).max() / 2 + (low + high) / 2
-    world = transform_points(view.T_world_camera, example.normalizer.invert(example.queries.positions))
-    members = np.isin(example.queries.labels, (1, 2, 3))
-    shear = view.deformations[0]
-    assert np.abs(shear.inverse(world[members]) - rest[members]).max() < 2e-3  # type: ignore[attr-defined]
 
 
 def test_the_mesh_of_a_view_is_the_state_seen_from_the_camera() -> None:
@@ -133,28 +101,21 @@ def test_the_mesh_of_a_view_is_the_state_seen_from_the_camera() -> None:
     assert np.allclose(camera_in_camera, 0, atol=1e-9)
 
 
-def test_noise_moves_points_along_their_rays_only() -> None:
+def test_noise_moves_points_along_their_rays_only_and_large_clouds_are_thinned() -> None:
     clean = sample_view(SCENE, GenerateConfig(noise_std=0.0), example_rng(3, 1)).depth
     noisy = sample_view(SCENE, GenerateConfig(noise_std=0.1), example_rng(3, 1)).depth
     assert np.array_equal(clean.valid, noisy.valid)
     assert 0.09 < (noisy.depth - clean.depth)[clean.valid].std() < 0.11
-
-
-def test_large_clouds_are_thinned_to_the_asked_number() -> None:
     example, _ = example_and_view(0, GenerateConfig(points=100, sampling=SETTINGS.sampling))
     assert len(example.cloud) == 100
 
 
-def test_a_scene_out_of_sight_is_named() -> None:
+def test_views_that_see_too_little_are_drawn_again_and_a_scene_out_of_sight_is_named() -> None:
     far = toy_scene(distance=(20_000.0, 20_001.0))
     with pytest.raises(
         ValueError, match=rf"'toy' showed fewer than {MIN_POINTS} points in 100 random views; its camera"
     ):
         sample_view(far, SETTINGS, example_rng(0, 0))
-
-
-def test_views_that_see_too_little_are_drawn_again() -> None:
-    """Half of the states have the object shrunk out of sight; every view still sees enough."""
 
     def sometimes_tiny(rng: np.random.Generator) -> tuple:
         tiny = bool(rng.random() < 0.5)

@@ -69,13 +69,6 @@ def test_a_share_of_a_batch_meets_the_changes_of_the_whole(data: Dataset) -> Non
         assert torch.equal(share.labels, whole.labels[rows]) and torch.equal(share.index, index[rows])
 
 
-def test_same_generator_same_batch(data: Dataset) -> None:
-    first, second = (data.batch(torch.arange(8), 64, 32, FULL, rng(3)) for _ in range(2))
-    other = data.batch(torch.arange(8), 64, 32, FULL, rng(4))
-    assert torch.equal(first.cloud, second.cloud) and torch.equal(first.positions, second.positions)
-    assert not torch.equal(first.cloud, other.cloud)
-
-
 def test_query_subset_keeps_labels_with_positions(data: Dataset) -> None:
     index = torch.tensor([2, 5])
     batch, stored = data.batch(index, 96, 16, NONE, rng()), data.read(index)
@@ -94,7 +87,7 @@ def test_augmented_cloud_fills_the_unit_box_and_camera_stays_in_front(data: Data
 
 
 def test_roll_is_a_rigid_motion_about_the_optical_axis(data: Dataset) -> None:
-    """Distances between queries, cloud and camera keep their ratios, and depth order is unchanged."""
+    """Distances keep their ratios, depth order is unchanged, and directions still end where they did on the surface."""
     plain = data.batch(torch.arange(6), 96, 0, NONE, rng())
     rolled = augment_batch(plain, AugmentConfig(roll=True), rng(1))
 
@@ -107,6 +100,12 @@ def test_roll_is_a_rigid_motion_about_the_optical_axis(data: Dataset) -> None:
     assert torch.allclose(gaps(plain), gaps(rolled), atol=1e-5)
     assert torch.equal(plain.positions[..., 2].argsort(dim=1), rolled.positions[..., 2].argsort(dim=1))
     assert not torch.allclose(plain.positions, rolled.positions, atol=0.1)
+    one, other = (
+        torch.cdist(b.positions + b.distances.abs()[..., None] * b.directions, b.cloud)
+        / b.distances.abs().amax(dim=1)[:, None, None]
+        for b in (plain, rolled)
+    )
+    assert torch.allclose(one, other, rtol=2e-2, atol=2e-2)
 
 
 def test_distances_scale_with_positions(data: Dataset) -> None:
@@ -118,43 +117,17 @@ def test_distances_scale_with_positions(data: Dataset) -> None:
     assert torch.allclose(changed.distances, plain.distances * ratio[:, None], rtol=1e-3)
 
 
-def test_directions_turn_with_the_view(data: Dataset) -> None:
-    """Walking the signed distance along the direction still ends where it did relative to the cloud."""
-    plain = data.batch(torch.arange(6), 96, 0, NONE, rng())
-    rolled = augment_batch(plain, AugmentConfig(roll=True), rng(1))
-    feet = [b.positions + b.distances.abs()[..., None] * b.directions for b in (plain, rolled)]
-    gaps = [
-        torch.cdist(f, b.cloud) * b.distances.abs().amax(dim=1)[:, None, None] ** -1
-        for f, b in zip(feet, (plain, rolled), strict=True)
-    ]
-    assert torch.allclose(gaps[0], gaps[1], rtol=2e-2, atol=2e-2)
-
-
-def test_padding_is_never_chosen_before_it_must_be() -> None:
+def test_padding_is_chosen_last_and_a_small_cloud_survives_any_hole() -> None:
     cloud = torch.arange(10.0)[None, :, None].repeat(1, 1, 3)
     chosen = choose_points(cloud, torch.tensor([7]), 10, NONE, rng())
     assert chosen[0, :, 0].tolist() == [0, 1, 2, 3, 4, 5, 6, 0, 1, 2]
-
-
-def test_a_small_cloud_survives_any_hole() -> None:
+    cloud = torch.arange(200.0)[None, :, None].repeat(1, 1, 3)
+    kept = choose_points(cloud, torch.tensor([200]), 200, AugmentConfig(keep_points=(0.5, 0.5)), rng())[0, :, 0]
+    assert 70 < len(kept.unique()) < 130 and (kept[:70].diff() > 0).all(), "in order, and half of them dropped"
+    assert kept.max() > 190, "anywhere, not at the end"
     cloud = torch.zeros(1, 40, 3)
     huge = AugmentConfig(hole_probability=1.0, hole_radius=1e6)
     assert choose_points(cloud, torch.tensor([40]), 40, huge, rng()).shape == (1, 40, 3)
-
-
-def test_incomplete_dataset_is_refused(tmp_path: Path) -> None:
-    directory = write_toy_dataset(tmp_path / "data")
-    (directory / "shard-00001.safetensors").unlink()
-    with pytest.raises(ValueError, match="holds 32 of 64 examples; training needs all of them"):
-        Dataset.load(directory)
-
-
-def test_truncated_shard_is_named(tmp_path: Path) -> None:
-    directory = write_toy_dataset(tmp_path / "data")
-    shard = directory / "shard-00001.safetensors"
-    shard.write_bytes(shard.read_bytes()[:500])
-    with pytest.raises(ValueError, match=r"shard-00001\.safetensors cannot be read"):
-        Dataset.load(directory)
 
 
 def test_shards_that_differ_are_refused(tmp_path: Path) -> None:
@@ -164,11 +137,6 @@ def test_shards_that_differ_are_refused(tmp_path: Path) -> None:
     save_file({k: v[:, :9].contiguous() if k in queries else v for k, v in load_file(path).items()}, path)
     with pytest.raises(ValueError, match=r"00001.* has the shape \(9.*in an example, the first shard \(128"):
         Dataset.load(directory)
-
-
-def test_a_directory_without_manifest_is_not_a_dataset(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"has no manifest\.json; a dataset is a directory made by"):
-        Dataset.load(tmp_path)
 
 
 def test_domain_holds_every_segment_point_with_a_margin(data: Dataset) -> None:

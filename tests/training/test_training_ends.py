@@ -17,8 +17,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from small_training import SMALL
 from toy_data import write_toy_dataset
-from training_commands import diverge_at
-from training_runs import kill_after
+from training_runs import diverge_at, kill_after
 
 from mereo import __main__ as command_line
 from mereo.training import metrics_log, trainer
@@ -49,7 +48,7 @@ def files(run: Path) -> dict[str, bytes]:
     return {name: (run / name).read_bytes() for name in FILES}
 
 
-@pytest.mark.parametrize("lost", [name for name in FILES if name != "metrics.csv"])
+@pytest.mark.parametrize("lost", ["weights.safetensors", "checkpoint.safetensors", "curves.png"])
 def test_what_a_finished_run_lacks_is_written(lost: str, dataset: Path, finished: Path, tmp_path: Path) -> None:
     shutil.copytree(finished, tmp_path / "run")
     (tmp_path / "run" / lost).unlink()
@@ -98,6 +97,7 @@ def test_a_resumed_run_leaves_the_same_files(often: float, dataset: Path, finish
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
         kill_after(patch, 3)
         trainer.train(dataset, tmp_path / "run", BRIEF, checkpoint_every_s=0.0)
+    assert not list((tmp_path / "run").glob(".*"))  # a file being written has a hidden name
     trainer.train(dataset, tmp_path / "run", BRIEF, checkpoint_every_s=often)
     assert files(tmp_path / "run") == files(finished)
 
@@ -142,9 +142,7 @@ SECOND_DIVERGES = """
 import math, os, sys
 import pytest
 from mereo import __main__ as command_line
-from training_commands import diverge_at
-
-from mereo import __main__ as command_line
+from training_runs import diverge_at
 if os.environ["RANK"] == "1":
     diverge_at(pytest.MonkeyPatch(), 2, math.inf, math.nan)  # with a finite gradient, so only its own loss says so
 sys.exit(command_line.main(sys.argv[1:]))

@@ -50,30 +50,23 @@ def assert_same(one: Batch, other: Batch) -> None:
         assert torch.equal(getattr(one, name), getattr(other, name)), name
 
 
-# --- which one is seen ------------------------------------------------------------------------------------------------
-
-
-def test_with_probability_0_a_batch_is_that_of_the_dataset_without(data: tuple[Dataset, Dataset]) -> None:
+def test_a_batch_depends_on_its_generator_alone_and_with_probability_0_on_no_further_one(
+    data: tuple[Dataset, Dataset],
+) -> None:
     plain, seen = data
     assert (plain.further, seen.further) == (0, KINDS)
     for seed in range(3):
         assert_same(batch(seen, 0.0, seed=seed), batch(plain, 0.5, seed=seed))
     assert_same(batch(seen, 1.0, FIRST), batch(plain, 1.0))
-
-
-def test_with_probability_1_every_further_one_is_seen_and_never_the_first() -> None:
-    drawn = draw_observations(300, KINDS, 1.0, rng())
-    assert set(drawn.tolist()) == {1, 2, 3} and torch.bincount(drawn)[1:].min() > 70
-
-
-def test_by_default_half_of_them_are_the_first() -> None:
-    counts = torch.bincount(draw_observations(3000, KINDS, AugmentConfig().observations, rng()))
-    assert abs(counts[0] / 3000 - 0.5) < 0.05 and counts[1:].min() > 400
-
-
-def test_a_batch_depends_on_its_generator_alone(data: tuple[Dataset, Dataset]) -> None:
     assert_same(batch(data[1], 0.5, seed=4), batch(data[1], 0.5, seed=4))
     assert not torch.equal(batch(data[1], 0.5, seed=4).cloud, batch(data[1], 0.5, seed=5).cloud)
+
+
+def test_further_ones_are_seen_as_often_as_asked_and_by_default_in_half_of_the_draws() -> None:
+    drawn = draw_observations(300, KINDS, 1.0, rng())
+    assert set(drawn.tolist()) == {1, 2, 3} and torch.bincount(drawn)[1:].min() > 70
+    counts = torch.bincount(draw_observations(3000, KINDS, AugmentConfig().observations, rng()))
+    assert abs(counts[0] / 3000 - 0.5) < 0.05 and counts[1:].min() > 400
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])
@@ -93,9 +86,6 @@ def test_queries_and_cloud_stay_in_one_frame(data: tuple[Dataset, Dataset], numb
         (found.distances, seen.distances[:8]),
     ):
         assert torch.allclose(now, then * scale.view(-1, *[1] * (then.dim() - 1)), rtol=1e-4, atol=1e-3)
-
-
-# --- runs -------------------------------------------------------------------------------------------------------------
 
 
 def test_killed_and_resumed_equals_uninterrupted(folders: tuple[Path, Path], tmp_path: Path) -> None:

@@ -23,9 +23,11 @@ def two_balls(radius: float = 2.0) -> SegmentedMesh:
     return SegmentedMesh((ball((0, 0, 0), radius, "one", 0, level=3), ball((6, 0, 0), radius, "two", 1, level=3)))
 
 
-def test_a_scale_is_linear_between_its_stops_and_constant_beyond() -> None:
+def test_a_scale_is_linear_between_its_stops_and_vertex_normals_of_a_ball_point_outward() -> None:
     values = np.array([-5.0, 1.0, 1.5, 2.0, 2.5, 3.0, 9.0, np.nan])
     assert GREYS.colors(values)[:, 0].tolist() == [0, 0, 50, 100, 175, 250, 250, 128]
+    segment = ball((1, 2, 3), 2.0, "one", 0, level=3)
+    np.testing.assert_allclose(vertex_normals(segment), (segment.vertices - [1, 2, 3]) / 2.0, atol=0.02)
 
 
 def test_confidence_is_the_drop_of_probability_across_the_surface() -> None:
@@ -43,14 +45,6 @@ def test_confidence_is_the_drop_of_probability_across_the_surface() -> None:
     np.testing.assert_array_equal(guessed, 0.0)
 
 
-def test_segments_that_were_not_found_have_no_colours() -> None:
-    mesh = two_balls()
-    lost = replace(mesh.segments[1], vertices=np.zeros((0, 3)), faces=np.zeros((0, 3), dtype=np.int64))
-    mesh = SegmentedMesh((mesh.segments[0], lost))
-    assert [len(v) for v in observed_distance(mesh, np.zeros((1, 3)))] == [len(mesh.segments[0].vertices), 0]
-    assert distance_scale([np.zeros(0)], "").high > 0
-
-
 def test_distance_to_what_was_observed_tells_seen_from_guessed() -> None:
     mesh = two_balls()
     one, two = observed_distance(mesh, mesh.segments[0].vertices)
@@ -59,11 +53,10 @@ def test_distance_to_what_was_observed_tells_seen_from_guessed() -> None:
     assert two.max() == pytest.approx(6.0, abs=0.05)
     scale = distance_scale([one, two], " mm")
     assert 0 < scale.high <= 6 and scale.words[1].endswith(" mm, guessed")
-
-
-def test_vertex_normals_of_a_ball_point_away_from_its_middle() -> None:
-    segment = ball((1, 2, 3), 2.0, "one", 0, level=3)
-    np.testing.assert_allclose(vertex_normals(segment), (segment.vertices - [1, 2, 3]) / 2.0, atol=0.02)
+    lost = replace(mesh.segments[1], vertices=np.zeros((0, 3)), faces=np.zeros((0, 3), dtype=np.int64))
+    mesh = SegmentedMesh((mesh.segments[0], lost))
+    assert [len(v) for v in observed_distance(mesh, np.zeros((1, 3)))] == [len(mesh.segments[0].vertices), 0]
+    assert distance_scale([np.zeros(0)], "").high > 0
 
 
 def test_a_ray_meets_the_nearest_surface_that_is_shown() -> None:

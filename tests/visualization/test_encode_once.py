@@ -45,19 +45,15 @@ def test_a_trial_of_the_laboratory(encoded: list[np.ndarray]) -> None:
     assert len({cloud.tobytes() for cloud in encoded}) == len(encoded)
 
 
-def test_a_result_that_is_written(encoded: list[np.ndarray], tmp_path: Path) -> None:
+def test_a_result_that_is_written_and_a_page_of_a_frame(encoded: list[np.ndarray], tmp_path: Path) -> None:
     cloud = load_view("rope").depth.to_points()
     mereo.reconstruct(cloud, load_model("rope"), "network", resolution=16).save(tmp_path / "result")
     assert len(encoded) == 1
-
-
-def test_a_page_of_a_frame(encoded: list[np.ndarray]) -> None:
-    cloud = load_view("rope").depth.to_points()
     model = load_model("rope")
     answer = answer_to(cloud, model, None, 16)
     probe_answer(answer, cloud.points[:5])
     confidence(answer.reconstruction.surfaces, partial(ask_network, answer))
-    assert len(encoded) == 1
+    assert len(encoded) == 2, "once for each"
 
 
 def test_the_code_answers_in_the_camera_frame() -> None:

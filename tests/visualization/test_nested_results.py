@@ -51,16 +51,15 @@ def result(answer: Answer) -> Reconstruction:
     return answer.reconstruction
 
 
-def test_a_reconstruction_is_nested_as_the_model_is(result: Reconstruction) -> None:
+def test_a_reconstruction_is_nested_as_the_model_is_and_the_inner_segment_owns_its_voxels(
+    result: Reconstruction,
+) -> None:
     assert result.surfaces.nested == NESTED
     result.surfaces.check()
     check_overlap(result.surfaces)
     core, organ = (found.volume / (4 / 3 * np.pi) for found in result.segments)
     assert core == pytest.approx(CORE_RADIUS**3, rel=0.03)
     assert organ == pytest.approx(RADIUS**3 - CORE_RADIUS**3, rel=0.03)
-
-
-def test_the_inner_segment_owns_its_voxels(result: Reconstruction) -> None:
     voxels = np.argwhere(result.labels.labels == 1)
     solids = Solids(result.surfaces)
     places = result.labels.positions(voxels)

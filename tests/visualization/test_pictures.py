@@ -1,17 +1,22 @@
 """The renderer agrees with closed forms, and the pictures show what they claim to show."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from toy_scene import toy_scene
 
+from mereo.cli.scenes import ScenePreview
 from mereo.evaluation.cases import EvaluatedView
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
 from mereo.geometry.transforms import rigid
+from mereo.scenes.scene import SCENES, Scene
 from mereo.synthesis.examples import View
+from mereo.visualization import previews
 from mereo.visualization.contact_sheets import contact_sheet, depth_to_rgb, legend
 from mereo.visualization.error_maps import (
     EXTRA_OR_MISSING,
@@ -23,14 +28,23 @@ from mereo.visualization.error_maps import (
     UNDER,
     WRONG,
     Comparison,
+    cell_size,
     comparison_picture,
     error_picture,
     offset_colors,
     offset_triangles,
     segmentation_error,
+    signed_distance,
+    surface_offset,
     voxel_triangles,
 )
-from mereo.visualization.previews import preview_states, render_cloud_and_segments
+from mereo.visualization.previews import (
+    TILE_PX,
+    preview_all,
+    preview_states,
+    render_cloud_and_segments,
+    scene_row,
+)
 from mereo.visualization.renderer import SUPERSAMPLE, Canvas, Triangles, Viewpoint, corner_normals, shade
 
 FRONT = ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
@@ -61,9 +75,6 @@ def test_an_orthographic_ball_has_its_closed_form_depth_and_area() -> None:
     inner = x**2 + y**2 < 0.9
     # depth in the view frame, whose origin is the middle of the box
     np.testing.assert_allclose(canvas.depth[seen][inner], -np.sqrt(1 - x**2 - y**2)[inner], atol=6e-3)
-
-
-def test_a_view_along_its_own_up_is_still_a_rotation() -> None:
     view = Viewpoint.along(np.array([[-1.0, -1, 4], [1, 1, 6]]), (0.0, 0.0, 2.0), (0.0, 0.0, 1.0))
     rotation = view.T_view_world[:3, :3]
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
@@ -124,24 +135,18 @@ def test_normals_are_smooth_on_a_ball_and_sharp_on_a_box() -> None:
     np.testing.assert_allclose(sharp, np.repeat(box.face_normals[:, None], 3, axis=1), atol=1e-12)
 
 
-def test_depth_colours_show_near_bright_and_missing_grey() -> None:
+def test_depth_colours_show_near_bright_and_missing_grey_and_sheets_hold_every_image_unchanged() -> None:
     camera = Camera(3, 1, 1.0, 1.0, 1.5, 0.5)
     picture = depth_to_rgb(DepthImage(np.array([[0.0, 1.0, 2.0]]), camera))[0].astype(int)
     assert picture[0].std() < 3
     assert picture[1].sum() > picture[2].sum() + 200
     assert depth_to_rgb(DepthImage(np.zeros((1, 3)), camera)).std() < 3
-
-
-def test_a_contact_sheet_holds_every_image_unchanged() -> None:
     images = [np.full((20, 30, 3), 40 * i, np.uint8) for i in range(5)]
     sheet = contact_sheet(images, ["a", "b", "c", "", "a very long caption that does not fit"], 3, "title")
     for image in images:
         assert (sheet == image[0, 0]).all(axis=-1).sum() >= 600
     with pytest.raises(ValueError, match="one caption for each image"):
         contact_sheet(images, ["a"], 3)
-
-
-# --- voxels ----------------------------------------------------------------------------------------------------------
 
 
 def test_voxel_faces_are_a_closed_outward_surface_of_the_right_volume() -> None:
@@ -194,14 +199,11 @@ def test_a_comparison_has_the_reference_and_a_column_for_each_answer(tmp_path: P
     assert np.array_equal(error[0], segmentation[0]), "the reference stays what it is"
 
 
-def test_offsets_are_pale_within_the_tolerance_and_full_at_the_end_of_the_scale() -> None:
+def test_offsets_are_pale_within_the_tolerance_and_for_rounding_and_full_at_the_end_of_the_scale() -> None:
     shown = offset_colors(np.array([-9.0, -FULL_CELLS, -TOLERANCE_CELLS, 0.0, TOLERANCE_CELLS, FULL_CELLS, 9.0]))
     np.testing.assert_array_equal(shown, [UNDER, UNDER, PALE, PALE, PALE, OVER, OVER])
     ramp = offset_colors(np.linspace(TOLERANCE_CELLS, FULL_CELLS, 9))
     assert (np.diff(ramp[:, 0]) < 0).all()  # the red of blue falls
-
-
-def test_a_reconstruction_that_is_right_but_for_rounding_is_drawn_pale() -> None:
     grid = np.indices((40, 40, 40)).transpose(1, 2, 3, 0)
     truth = (np.linalg.norm(grid - 19.5, axis=-1) < 14.0).astype(np.uint8)
     moved = (np.linalg.norm(grid - [19.8, 19.3, 19.6], axis=-1) < 14.1).astype(np.uint8)
@@ -235,7 +237,7 @@ def test_the_error_picture_shows_each_error_in_its_column_only(tmp_path: Path) -
     assert [f.name for f in tmp_path.iterdir()] == ["e.png"]
 
 
-def test_an_error_on_the_far_side_is_seen_from_behind_only(tmp_path: Path) -> None:
+def test_an_error_on_the_far_side_is_seen_from_behind_only_and_an_empty_prediction_can_be_drawn(tmp_path: Path) -> None:
     truth = np.zeros((20, 20, 20), np.uint8)
     truth[5:15, 5:15, 5:12] = 1
     found = truth.copy()
@@ -244,17 +246,11 @@ def test_an_error_on_the_far_side_is_seen_from_behind_only(tmp_path: Path) -> No
     picture = np.asarray(Image.open(tmp_path / "e.png"))
     columns = np.array_split(picture[: -strips(picture), 12:], 8, axis=1)
     assert [bool(hue_is(columns[k], OVER).sum() > 20) for k in (3, 4)] == [False, True]
-
-
-def test_an_empty_prediction_can_be_drawn(tmp_path: Path) -> None:
     truth = np.zeros((6, 6, 6), np.uint8)
     truth[2:4, 2:4, 2:4] = 1
     error_picture(tmp_path / "e.png", [labelled(truth, np.zeros_like(truth))], size=40)
     picture = np.asarray(Image.open(tmp_path / "e.png"))
     assert hue_is(picture[: -strips(picture)], UNDER).any()  # all of it is missing
-
-
-# --- sheets ----------------------------------------------------------------------------------------------------------
 
 
 def test_the_preview_shows_cloud_and_segments(tmp_path: Path) -> None:
@@ -278,3 +274,110 @@ def test_a_preview_of_states_has_three_pictures_for_each_state(tmp_path: Path) -
     thirds = np.array_split(picture[:, 12:], 9, axis=1)
     reds = [int(hue_is(part, (255, 0, 0)).sum()) for part in thirds]
     assert [red > 50 for red in reds[:6]] == [True, True, False] * 2
+
+
+SPACING = np.array([0.5, 0.3, 0.4])
+CENTER = np.array([8.1, 7.9, 8.05])
+CELLS = (32, 52, 40)
+
+
+def ball_cells(radius: float) -> np.ndarray:
+    """Occupied cells of a ball on the anisotropic grid."""
+    grid = np.indices(CELLS).transpose(1, 2, 3, 0) * SPACING
+    return np.asarray(np.linalg.norm(grid - CENTER, axis=-1) < radius)
+
+
+def directions() -> np.ndarray:
+    drawn = np.random.default_rng(5).normal(size=(400, 3))
+    return np.asarray(drawn / np.linalg.norm(drawn, axis=1, keepdims=True))
+
+
+@pytest.mark.parametrize(("truth", "found"), [(5.0, 5.6), (5.0, 6.5), (5.6, 5.0), (6.5, 5.0), (5.0, 5.1)])
+def test_the_offset_of_concentric_balls_is_the_difference_of_their_radii(truth: float, found: float) -> None:
+    places = (CENTER + max(truth, found) * directions()) / SPACING  # on the surface of both together
+    expected = (found - truth) / cell_size(SPACING)
+    measured = surface_offset(ball_cells(truth), ball_cells(found), SPACING, places)
+    assert abs(np.median(measured) - expected) < 0.2
+    assert np.abs(measured - expected).max() < 0.6
+
+
+def test_what_is_missing_is_the_farther_off_the_longer_it_is() -> None:
+    truth = np.zeros((40, 20, 20), dtype=bool)
+    truth[5:35, 8:12, 8:12] = True
+    found = truth.copy()
+    found[20:] = False
+    places = np.array([[x, 7.5, 9.5] for x in (10.0, 22.0, 26.0, 30.0)])
+    offset = surface_offset(truth, found, np.ones(3), places)
+    np.testing.assert_allclose(offset, [0.0, -2.5, -6.5, -10.5], atol=0.3)
+    np.testing.assert_array_equal(surface_offset(found, truth, np.ones(3), places), -offset)
+    occupied = np.zeros((6, 6, 6), dtype=bool)
+    occupied[2:4, 2:4, 2:4] = True
+    places = np.array([[1.5, 2.0, 3.0], [2.0, 3.0, 3.5]])
+    assert surface_offset(occupied, np.zeros_like(occupied), np.ones(3), places).max() < -10
+
+
+def test_equal_grids_have_no_offset_and_distances_vanish_on_faces() -> None:
+    occupied = np.random.default_rng(6).random((7, 8, 9)) > 0.5
+    places = np.random.default_rng(7).uniform(-0.5, 6.5, size=(90, 3))
+    assert not surface_offset(occupied, occupied, SPACING, places).any()
+    slab = np.zeros((9, 4, 4), dtype=bool)
+    slab[:4] = True
+    expected = (np.arange(9) - 3.5) * 0.5
+    np.testing.assert_allclose(signed_distance(slab, SPACING)[:, 1, 2], expected, rtol=1e-6)
+
+
+def toy(name: str) -> Scene:
+    return replace(toy_scene(), name=name)
+
+
+def colored(picture: np.ndarray) -> np.ndarray:
+    return np.ptp(picture.astype(int), axis=-1) > 60
+
+
+def test_the_sheet_has_a_row_of_five_for_every_scene(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    assert set(previews.SCENE_VIEWS) == set(SCENES)
+    loaded: list[str] = []
+
+    def load(name: str) -> Scene:
+        loaded.append(name)
+        return toy(name)
+
+    monkeypatch.setattr(previews, "load_scene", load)
+    monkeypatch.setattr(previews, "SCENES", ("robot", "sheet", "tumor"))
+    preview_all(tmp_path / "all.png", seed=2)
+    assert loaded == ["robot", "sheet", "tumor"]
+    picture = np.asarray(Image.open(tmp_path / "all.png"))
+    row = TILE_PX + 24 + 12
+    assert picture.shape == (12 + 2 * row, 12 + 10 * (TILE_PX + 12), 3)
+    cells = [picture[12 + r * row :, 12 + c * (TILE_PX + 12) :][:TILE_PX, :TILE_PX] for r in (0, 1) for c in range(10)]
+    filled = [bool((cell < 250).any()) for cell in cells]
+    assert filled == [True] * 15 + [False] * 5
+    assert np.array_equal(cells[5], scene_row(toy("sheet"), 2)[0])
+
+
+def test_a_row_is_three_states_at_one_scale_their_overlay_and_a_depth_image() -> None:
+    rest, first, second, laid, depth = scene_row(toy("robot"), seed=1)
+    assert all(picture.shape == (TILE_PX, TILE_PX, 3) for picture in (rest, first, second, laid, depth))
+    drawn = [(picture < 255).any(axis=-1) for picture in (rest, first, second)]
+    assert np.array_equal((laid < 255).any(axis=-1), np.logical_or.reduce(drawn)), "what any shows, the overlay shows"
+    only = drawn[1] & ~drawn[0] & ~drawn[2]
+    assert only.any() and np.abs(laid[only] - (510.0 + first[only]) / 3).max() <= 0.5
+    shown = [colored(picture) for picture in (rest, first, second)]
+    assert all(700 < mask.sum() < 0.8 * TILE_PX**2 for mask in shown)
+    margin = np.ones((TILE_PX, TILE_PX), dtype=bool)
+    margin[2:-2, 2:-2] = False
+    together = np.logical_or.reduce(shown)
+    assert not (together & margin).any()  # nothing is cut off
+    sides = [np.ptp(np.flatnonzero(together.any(axis=axis))) for axis in (0, 1)]
+    assert max(sides) > 0.8 * TILE_PX  # and no room is wasted
+    assert (rest != first).any() and (first != second).any()
+    assert (np.abs(depth.astype(int) - 237).max(axis=-1) > 20).mean() > 0.02
+    again = scene_row(toy("robot"), seed=1)
+    assert all(np.array_equal(a, b) for a, b in zip(again, (rest, first, second, laid, depth), strict=True))
+
+
+@pytest.mark.parametrize("scene, all_scenes, said", [("", False, "neither"), ("rope", True, "both 'rope' and --all")])
+def test_one_scene_or_all(tmp_path: Path, scene: str, all_scenes: bool, said: str) -> None:
+    with pytest.raises(ValueError, match=f"{said}.*name a scene, or give --all"):
+        ScenePreview(tmp_path / "x.png", scene, all_scenes).run()
+    assert not list(tmp_path.iterdir())

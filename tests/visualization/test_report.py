@@ -1,4 +1,4 @@
-"""The page is self-contained, small, and shows the segments in a real browser, with and without WebGL."""
+"""Pages of reconstructions and evaluations: self-contained, small, and drawn by a real browser, also without WebGL."""
 
 import base64
 import io
@@ -6,6 +6,7 @@ import re
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -17,11 +18,12 @@ from scipy.spatial import cKDTree
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.visualization.contact_sheets import MISSING, MOST_DEPTH_PX, depth_data
+from mereo.visualization.evaluation_report import write_evaluation_report
 from mereo.visualization.reconstruction_report import BUDGET_BYTES, Report, cluster
 from mereo.visualization.units import Unit
 
 
-def test_the_page_holds_the_shapes_to_16_bits_of_the_box(tmp_path: Path) -> None:
+def test_the_page_holds_the_shapes_to_16_bits_of_the_box_and_needs_nothing_from_outside(tmp_path: Path) -> None:
     cloud, mesh, summary = example()
     Report(cloud, mesh, summary).write(tmp_path / "r.html")
     data = page_data(tmp_path / "r.html")
@@ -34,10 +36,6 @@ def test_the_page_holds_the_shapes_to_16_bits_of_the_box(tmp_path: Path) -> None
         assert (shown["name"], tuple(shown["color"])) == (segment.name, segment.color)
     assert not data["coarsened"]
     assert data["words"]["rows"][2] == ["\N{EN DASH}", "0", None]
-
-
-def test_the_page_needs_nothing_from_outside_and_cannot_be_broken_by_names(tmp_path: Path) -> None:
-    Report(*example()).write(tmp_path / "r.html")
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
     assert not re.search(r"https?://|src=|@import|url\(|fetch\(|XMLHttpRequest", page)
     assert page.count("</script>") == 1
@@ -47,22 +45,17 @@ def test_the_page_needs_nothing_from_outside_and_cannot_be_broken_by_names(tmp_p
 @pytest.mark.parametrize(
     ("unit", "heads", "row", "voxels"),
     [
-        (Unit(1.0), ["centre x, y, z (mm)", "volume (cm³)"], [[100, 200, 300], 4189], "voxels of 2.01 mm"),
-        (
-            Unit(None),
-            ["centre x, y, z (units)", "volume (units³)"],
-            [[0.1, 0.2, 0.3], 4.19e-3],
-            "voxels of 0.00201 units",
-        ),
+        (Unit(1.0), "centre x, y, z (mm)|volume (cm³)", [[100, 200, 300], 4189], "2.01 mm"),
+        (Unit(None), "centre x, y, z (units)|volume (units³)", [[0.1, 0.2, 0.3], 4.19e-3], "0.00201 units"),
     ],
 )
 def test_figures_are_in_millimetres_where_the_unit_is_known(
-    tmp_path: Path, unit: Unit, heads: list[str], row: list, voxels: str
+    tmp_path: Path, unit: Unit, heads: str, row: list, voxels: str
 ) -> None:
     cloud, mesh, summary = example()
     Report(cloud, mesh, summary, unit=unit).write(tmp_path / "r.html")
     words = page_data(tmp_path / "r.html")["words"]
-    assert words["heads"][1:3] == heads and voxels in words["facts"]
+    assert words["heads"][1:3] == heads.split("|") and f"voxels of {voxels}" in words["facts"]
     place, volume, confidence = words["rows"][0]
     assert [float(value) for value in place.split()] == row[0] and confidence == 0.5
     assert float(volume.replace(",", "")) == pytest.approx(row[1], rel=0.02)
@@ -132,6 +125,11 @@ def test_clustering_keeps_the_shape_and_moves_no_vertex_beyond_its_cell() -> Non
     assert len(np.unique(np.sort(coarse.faces, axis=1), axis=0)) == len(coarse.faces)
 
 
+in_browser = pytest.mark.skipif(
+    BROWSER is None, reason="no chromium or chrome in PATH: install one (Debian: apt-get install chromium)"
+)
+
+
 def browse(page: str, tmp_path: Path, *options: str) -> str:
     assert BROWSER
     command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader"]
@@ -142,9 +140,7 @@ def browse(page: str, tmp_path: Path, *options: str) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(
-    BROWSER is None, reason="no chromium or chrome in PATH: install one (Debian: apt-get install chromium)"
-)
+@in_browser
 @pytest.mark.parametrize("mode", ["", "#2d"])
 def test_a_browser_draws_every_segment(tmp_path: Path, mode: str) -> None:
     cloud, mesh, summary = example()
@@ -169,9 +165,7 @@ def test_a_browser_draws_every_segment(tmp_path: Path, mode: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(
-    BROWSER is None, reason="no chromium or chrome in PATH: install one (Debian: apt-get install chromium)"
-)
+@in_browser
 @pytest.mark.parametrize("width", [390, 990, 1280])
 def test_every_column_is_seen_on_a_phone_too(tmp_path: Path, width: int) -> None:
     cloud, mesh, summary = example()
@@ -195,11 +189,7 @@ def test_every_column_is_seen_on_a_phone_too(tmp_path: Path, width: int) -> None
         )
         for name, centre, volume, confidence in places:
             # on a phone name and volume are the first line of a card, centre and confidence its second
-            assert (abs(name - volume) < 4, abs(centre - confidence) < 4, centre - name > 9) == (
-                True,
-                True,
-                width < 500,
-            )
+            assert abs(name - volume) < 4 and abs(centre - confidence) < 4 and (centre - name > 9) == (width < 500)
 
 
 def test_places_and_volumes_are_told_as_exactly_as_they_are_known() -> None:
@@ -210,3 +200,59 @@ def test_places_and_volumes_are_told_as_exactly_as_they_are_known() -> None:
     assert Unit(None).place(place, 0.0) == "-0.0247 -1e-06 1.59 ± 0", "without an error as without a radius"
     assert Unit(0.01).volume(648.0, (633.2, 663.1)) == "648 (633 to 663)"
     assert Unit(None).volume(4.9012, (4.889, 4.9204)) == "4.901 (4.889 to 4.920)"
+
+
+METRICS = {
+    "weights": "bunny",
+    "scene": "<b>bunny</b>",
+    "seed": 1_000_000,
+    "examples": 2,
+    "iou": 0.91234,
+    "miou": 0.81234,
+    "definition": "100^3 cells",
+    "per_segment": {"body": 0.95, "</script>": float("nan")},
+    "example_mean": {"iou": 0.7, "miou": float("nan")},
+    "per_example": {"bunny 0": {"iou": 0.8, "miou": 0.7}, "bunny 1": {"iou": 0.6, "miou": float("nan")}},
+    "ece": 0.1234,
+    "reliability": [
+        {"confidence": 0.25, "right": 0.5, "share": 0.64},
+        {"confidence": 0.75, "right": 1.0, "share": 0.36},
+    ],
+    "confusion": np.array([[90, 10, 0], [20, 60, 0], [0, 0, 0]]),
+}
+COLORS = ((86, 180, 233), (230, 159, 0))
+
+
+def write_evaluation(folder: Path, picture: np.ndarray) -> str:
+    Image.fromarray(picture).save(folder / "errors.png")
+    write_evaluation_report(folder / "r.html", METRICS, COLORS, folder / "errors.png")
+    return (folder / "r.html").read_text(encoding="utf-8")
+
+
+def test_the_page_of_an_evaluation_holds_every_figure_and_nothing_from_outside(tmp_path: Path) -> None:
+    page = write_evaluation(tmp_path, np.zeros((8, 8, 3), dtype=np.uint8))
+    words = re.sub(r"<[^>]+>", " ", re.sub(r"<style>.*?</style>", "", page, flags=re.DOTALL))
+    for text in ("0.912", "0.812", "0.700", "0.950", "seed: 1000000", "100^3 cells", "90.0", "25.0", "75.0"):
+        assert text in words, text
+    assert page.index("bunny 1") < page.index("bunny 0")  # the worst comes first
+    assert "<script" not in page and "</script>" not in page
+    assert "<b>bunny</b>" not in page
+    assert not re.search(r"https?://|@import|url\(", page)
+    (data,) = re.findall(r'src="data:image/png;base64,([^"]+)"', page)
+    assert base64.b64decode(data) == (tmp_path / "errors.png").read_bytes()
+    (drawn,) = re.findall(r"<svg class=\"rel\".*?</svg>", page)
+    tree = ElementTree.fromstring(drawn)
+    words = [text.text for text in tree.iter("text")]
+    assert words == ["0", "1", "confidence in a cell's label", "0", "1", "share that is right"]
+    assert tree.find("polyline").attrib["points"] == "65.0,130.0 195.0,0.0"  # type: ignore[union-attr]
+    low, top, width, height = (float(value) for value in tree.attrib["viewBox"].split())
+    foot = max(float(text.attrib.get("y", 0)) for text in tree.iter("text"))
+    assert low <= -18 - 11 and top <= -10 and foot + 4 <= top + height and low + width >= 260 + 10, "nothing is cut off"
+
+
+def test_a_large_picture_becomes_small_enough(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, size=(2400, 2400, 3), dtype=np.uint8)
+    page = write_evaluation(tmp_path, noise)
+    assert (tmp_path / "errors.png").stat().st_size > BUDGET_BYTES
+    assert 1_000_000 < (tmp_path / "r.html").stat().st_size <= BUDGET_BYTES
+    assert "data:image/jpeg;base64," in page

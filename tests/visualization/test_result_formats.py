@@ -10,6 +10,7 @@ import pytest
 import trimesh
 from analytic import AnalyticModel, ball, logits_of
 from answers import answer_to
+from two_balls import front
 
 from mereo.__main__ import main, parse
 from mereo.api.result import Result
@@ -33,10 +34,7 @@ def model() -> AnalyticModel:
 
 def view() -> np.ndarray:
     """The front halves of both balls."""
-    points = np.random.default_rng(0).normal(size=(600, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    points[:, 2] = -np.abs(points[:, 2])
-    return np.concatenate([np.add(center, radius * points) for center, radius in (BIG, SMALL)])
+    return np.concatenate([front(*BIG, -1.0), front(*SMALL, -1.0)])
 
 
 @pytest.fixture(scope="module")
@@ -105,9 +103,6 @@ def test_observed_points_have_the_segment_they_lie_on(found: Reconstruction) -> 
     np.testing.assert_array_equal(cloud.labels, np.repeat([1, 2], 600))
     np.testing.assert_allclose(cloud.occupancy[cloud.points[:, 1] < 0.22], 0.5, atol=0.01)
     np.testing.assert_array_equal(cloud.points, view())
-
-
-def test_confidence_is_among_segments_and_occupancy_against_empty_space() -> None:
     logits = np.log(np.array([[0.5, 0.4, 0.1], [0.98, 0.005, 0.015]], dtype=np.float32))
     cloud = segment_points(logits, np.zeros((2, 3)), NAMES, PALETTE[:2])
     np.testing.assert_array_equal(cloud.labels, [1, 2])
@@ -132,7 +127,7 @@ def test_a_missing_extra_is_said_before_the_work(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_command_line_takes_formats() -> None:
+def test_the_command_line_takes_formats(tmp_path: Path) -> None:
     start = ["reconstruct", "c.ply", "--weights", "w", "--output", "o"]
     chosen, default = (
         parse([*start, "--formats", "ply", "seg.nrrd", "--millimetres", "--unit-m", "0.001"]),
@@ -142,8 +137,5 @@ def test_the_command_line_takes_formats() -> None:
     assert chosen.files == FilesConfig(("ply", "seg.nrrd"), True)
     assert chosen.reading.unit_m == 0.001
     assert chosen_formats(default.files.formats) == ("glb", "npz", "json")
-
-
-def test_contradictory_files(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="there is no format 'step'; the formats are glb, ply, .* and all: choose one"):
         chosen_formats(["ply", "step"])

@@ -1,0 +1,263 @@
+"""Where and how exactly a network computes: device, precision, products by oneDNN, pieces of work in threads."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional as F
+
+from mereo import __main__ as command_line
+from mereo.cli.answers import ReconstructCommand
+from mereo.cli.reconstruct import FrameJob, reconstruct_file
+from mereo.evaluation.sample_views import load_view
+from mereo.models import device
+from mereo.models.config import EXACT, InferenceConfig, Precision
+from mereo.models.device import ROWS, bfloat16_pays, find_device, in_threads, linear, onednn_pays, pick_precision
+from mereo.models.model import CPU_QUERY_CHUNK, Model
+from mereo.models.weights import load_for, load_model
+from mereo_experiments.speed.roofline import count_operations
+from mereo_experiments.speed.stages import random_points
+
+CPU = InferenceConfig(device="cpu", precision="bfloat16")
+
+
+@pytest.fixture
+def fresh_decisions() -> Iterator[None]:
+    """What is decided once in a process is decided again, in the test and after it."""
+    for decide in (bfloat16_pays, onednn_pays):
+        decide.cache_clear()
+    yield
+    for decide in (bfloat16_pays, onednn_pays):
+        decide.cache_clear()
+
+
+@pytest.mark.usefixtures("fresh_decisions")
+@pytest.mark.parametrize(
+    ("features", "is_amd", "chosen"),
+    [
+        ({"amx": True, "avx512_bf16": True}, False, torch.bfloat16),
+        ({"amx": False, "avx512_bf16": True}, True, torch.bfloat16),
+        ({"amx": False, "avx512_bf16": True}, False, None),
+        ({"amx": None, "avx512_bf16": None}, True, None),
+    ],
+)
+def test_auto_takes_bfloat16_where_the_processor_gains_by_it(
+    monkeypatch: pytest.MonkeyPatch, features: dict[str, bool | None], is_amd: bool, chosen: torch.dtype | None
+) -> None:
+    monkeypatch.setattr(device, "cpu_features", lambda: features)
+    monkeypatch.setattr(device, "is_amd", lambda: is_amd)
+    found = [pick_precision(asked, torch.device("cpu")) for asked in ("auto", "float32", "bfloat16")]
+    assert found == [chosen, None, torch.bfloat16]
+
+
+def cloud_file(folder: Path) -> Path:
+    """A blob of the bunny's size in front of the camera."""
+    np.save(folder / "cloud.npy", np.random.default_rng(0).normal((0, 0, 0.6), 0.04, (600, 3)))
+    return folder / "cloud.npy"
+
+
+def test_bfloat16_changes_few_labels_and_little_distance(tmp_path: Path) -> None:
+    """The stated cost: about one label in a thousand; a rounding of coordinates instead would change every tenth."""
+    points = np.load(cloud_file(tmp_path))
+    queries = np.random.default_rng(1).uniform(points.min(axis=0), points.max(axis=0), (4000, 3))
+    models = load_for("bunny", CPU), load_for("bunny", EXACT), load_for("bunny", InferenceConfig(device="cpu"))
+    assert {model.device.type for model in models} == {"cpu"}
+    auto = "bfloat16" if bfloat16_pays() else "float32"
+    assert [model.working_precision for model in models] == ["bfloat16", "float32", auto]
+    fast, exact = (model.query(model.encode(points), queries) for model in models[:2])
+    assert np.abs(fast.probability - exact.probability).max() > 0
+    assert (fast.label != exact.label).mean() < 0.02
+    assert np.abs(fast.distance - exact.distance).mean() < 0.001
+
+
+def test_results_say_where_they_were_computed(tmp_path: Path) -> None:
+    options = ReconstructCommand((), weights="bunny", resolution=12, inference=CPU, method="network")
+    reconstruct_file(cloud_file(tmp_path), tmp_path / "out", FrameJob(options))
+    facts = json.loads((tmp_path / "out/summary.json").read_text())
+    assert (facts["device"], facts["precision"]) == ("cpu", "bfloat16")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device here")
+def test_cuda_where_there_is_none_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert find_device("auto") == find_device("cpu") == torch.device("cpu")
+    arguments = ["reconstruct", str(cloud_file(tmp_path)), "--weights", "bunny", "--output", str(tmp_path / "out")]
+    assert command_line.main([*arguments, "--device", "cuda"]) != 0
+    assert "torch sees no CUDA device; leave out --device" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many rows oneDNN was asked for, as if it were faster here."""
+    rows_of_each: list[int] = []
+    onednn = device._by_onednn
+
+    def by_onednn(rows: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None) -> torch.Tensor:
+        rows_of_each.append(rows.numel() // rows.shape[-1])
+        return onednn(rows, weight, bias)
+
+    monkeypatch.setattr(device, "_by_onednn", by_onednn)
+    monkeypatch.setattr(device, "onednn_pays", lambda: True)
+    return rows_of_each
+
+
+def layer(inputs: int = 70, outputs: int = 40) -> tuple[torch.Tensor, torch.Tensor]:
+    numbers = torch.Generator().manual_seed(0)
+    return torch.randn(outputs, inputs, generator=numbers), torch.randn(outputs, generator=numbers)
+
+
+def rows(count: int, inputs: int = 70) -> torch.Tensor:
+    return torch.randn(1, count, inputs, generator=torch.Generator().manual_seed(1))
+
+
+@pytest.mark.parametrize("biased", [True, False])
+def test_products_are_torchs_own(asked: list[int], biased: bool) -> None:
+    weight, bias = layer()
+    with torch.inference_mode():
+        for count in (ROWS, 2 * ROWS):
+            found = linear(rows(count), weight, bias if biased else None)
+            exact = F.linear(rows(count).double(), weight.double(), bias.double() if biased else None)
+            torch.testing.assert_close(found.double(), exact, rtol=0, atol=1e-4)
+        assert asked == [ROWS, 2 * ROWS]
+        assert count_operations(lambda: linear(rows(ROWS), weight)) == 2 * ROWS * 70 * 40
+
+
+def test_other_sizes_precisions_and_trainings_are_torchs(asked: list[int]) -> None:
+    weight, bias = layer()
+    with torch.inference_mode():
+        assert torch.equal(linear(rows(ROWS + 1), weight, bias), F.linear(rows(ROWS + 1), weight, bias))
+        linear(rows(ROWS).double(), weight.double())
+        linear(rows(0), weight)
+        with torch.autocast("cpu", torch.bfloat16):
+            assert linear(rows(ROWS), weight).dtype == torch.bfloat16
+    weight.requires_grad_()
+    linear(rows(ROWS), weight, bias).sum().backward()
+    assert weight.grad is not None and not asked
+
+
+@pytest.mark.usefixtures("fresh_decisions")
+def test_the_processor_decides_and_no_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    for is_amd, missing, pays in ((True, False, True), (False, False, False), (True, True, False)):
+        onednn_pays.cache_clear()
+        monkeypatch.setattr(device, "is_amd", lambda is_amd=is_amd: is_amd)
+        if missing:  # a private operator of torch, which may go
+            monkeypatch.setattr(torch.ops, "mkldnn", object())
+        assert onednn_pays() is pays
+    with torch.inference_mode():
+        weight, bias = layer()
+        assert torch.equal(linear(rows(ROWS), weight, bias), F.linear(rows(ROWS), weight, bias))
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    """Two threads of torch; their number is put back after the test."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("threads")
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_answers_are_the_same_bits_in_any_number_of_threads(precision: Precision) -> None:
+    model, view = replace(load_model("bunny"), precision=precision), load_view("bunny")
+    code = model.encode(view.depth.to_points())
+    points = np.random.default_rng(0).normal(size=(3 * CPU_QUERY_CHUNK + 7, 3)) * 8 + view.depth.to_points().points[0]
+    torch.set_num_threads(1)
+    alone = model.query(code, points)
+    for count in (2, 3):
+        torch.set_num_threads(count)
+        together = model.query(code, points)
+        for name in ("label", "probability", "distance", "direction"):
+            assert np.array_equal(getattr(alone, name), getattr(together, name), equal_nan=True), (count, name)
+    assert len(np.unique(alone.label)) > 2
+
+
+@pytest.mark.usefixtures("threads")
+def test_each_thread_computes_alone_and_the_callers_number_stays() -> None:
+    found = in_threads(lambda piece: (piece, torch.get_num_threads()), range(20))
+    assert found == [(piece, 1) for piece in range(20)]
+    assert in_threads(lambda _: torch.get_num_threads(), [0]) == [2]  # one piece has them all
+    assert in_threads(lambda _: torch.get_num_threads(), range(5), most=1) == [2] * 5
+    ones = torch.ones(10, 20)
+    assert count_operations(lambda: in_threads(lambda _: ones @ ones.T, range(3))) == 3 * 2 * 10 * 20 * 10
+    assert torch.get_num_threads() == 2
+    torch.set_num_threads(5)
+    assert in_threads(lambda _: torch.get_num_threads(), range(2)) == [2, 2]
+
+
+@pytest.mark.usefixtures("threads")
+def test_the_first_error_is_raised_and_the_next_call_works() -> None:
+    def work(piece: int) -> int:
+        if piece >= 3:
+            raise ValueError(f"piece {piece}")
+        return piece
+
+    with pytest.raises(ValueError, match="piece 3"):
+        in_threads(work, range(50))
+    assert in_threads(work, range(3)) == [0, 1, 2]
+
+
+FORKED = """
+import os, torch
+from mereo.models.device import in_threads
+torch.set_num_threads(2)
+assert in_threads(str, range(4)) == list("0123")
+child = os.fork()
+if not child:
+    os._exit(in_threads(str, range(4)) != list("0123"))
+assert os.waitpid(child, 0)[1] == 0
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
+def test_a_forked_process_has_threads_of_its_own() -> None:
+    subprocess.run([sys.executable, "-W", "ignore", "-c", FORKED], check=True, timeout=60)
+
+
+KERNELS = """
+import torch
+from mereo.models.triton_kernels import nearest
+from mereo.models.neighbors import nearest as expected
+
+torch.manual_seed(0)
+for axes, count, known in ((3, 6, 100), (2, 4, 1000), (3, 1, 5)):
+    queries, others = torch.randn(2, 77, axes), torch.randn(2, known, axes)
+    torch.testing.assert_close(nearest(queries, others, count), expected(queries, others, count))
+tied = torch.zeros(1, 7, 3)
+assert nearest(tied, tied, 3).tolist() == [[[0, 1, 2]] * 7]
+for points in (20000, 3):
+    try:
+        nearest(torch.zeros(1, 2, 3), torch.zeros(1, points, 3), 4)
+    except ValueError as error:
+        assert f"4 of {points} points are asked for" in str(error)
+    else:
+        raise AssertionError
+"""
+
+
+@pytest.mark.skipif(find_spec("triton") is None, reason="Triton comes with PyTorch's CUDA builds only")
+def test_kernels_do_what_the_cpu_does() -> None:
+    """In a process of its own, because the interpreter must be chosen before Triton is imported."""
+    environment = {**os.environ, "TRITON_INTERPRET": "1"}
+    done = subprocess.run([sys.executable, "-c", KERNELS], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("name", ["bunny", "rope"])
+def test_cuda_answers_as_the_cpu(name: str) -> None:
+    exact, view = load_model(name), load_view(name)
+    fast: Model = replace(load_model(name, "cuda"), precision="float32")
+    points, cloud = random_points(view, 900), view.depth.to_points()
+    expected, answer = (model.query(model.encode(cloud), points) for model in (exact, fast))
+    assert (answer.label != expected.label).mean() < 0.01
+    assert abs(answer.distance - expected.distance).mean() < 0.01 * (points.max() - points.min())

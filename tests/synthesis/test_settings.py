@@ -1,0 +1,190 @@
+"""Sensors and workspaces from the options to the files: presets, datasets that state them, evaluation with them."""
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+from toy_scene import toy_scene
+
+import mereo.__main__ as command_line
+from mereo.api.generate import generate
+from mereo.cli import training
+from mereo.evaluation.scoring import EvaluationConfig
+from mereo.evaluation.tables import read_metrics
+from mereo.geometry.camera import PointCloud
+from mereo.models.model import Model
+from mereo.models.trained import EncodedCloud
+from mereo.models.weights import load_model
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import PAPER_APERTURE_RAD, WHOLE_SPHERE_RAD, Scene, Workspace
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.config import SENSOR_TERMS, SENSORS, GenerateConfig, SamplingConfig, Sensor, SensorConfig
+from mereo.synthesis.examples import sample_view
+from mereo.training.model_card import card
+from mereo.visualization.evaluation_report import evaluate_weights
+
+SMALL = GenerateConfig(image_size=48, points=64, sampling=SamplingConfig(per_segment=8))
+NARROW = Workspace(axis=(0.0, 1.0, 0.0), aperture_rad=0.5)
+ALL_AROUND = Workspace(axis=(1.0, 0.0, 0.0), aperture_rad=WHOLE_SPHERE_RAD, any_roll=True, distance=(90.0, 95.0))
+
+
+def parsed(text: str) -> training.Generate | training.Evaluate:
+    command = command_line.parse(text.split())
+    assert isinstance(command, training.Generate | training.Evaluate)
+    return command
+
+
+def generate_options(text: str) -> GenerateConfig:
+    command = parsed(f"generate rope --examples 7 --output out {text}")
+    assert isinstance(command, training.Generate)
+    return command.settings
+
+
+@pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.parametrize("form", ["--sensor {}", "--sensor={}"])
+def test_an_option_chooses_a_sensor(name: Sensor, form: str) -> None:
+    assert generate_options(form.format(name)) == GenerateConfig(sensor=SENSORS[name])
+    command = parsed(f"evaluate rope --output out {form.format(name)}")
+    assert isinstance(command, training.Evaluate) and command.terms == SENSORS[name]
+    assert SENSORS[name].on == (name != "paper")
+
+
+def test_terms_are_added_to_a_sensor_and_all_are_off_by_default() -> None:
+    chosen = generate_options("--sensor structured-light --sensor.tool 0.3 --sensor.holes 0 --sampler label-uniform")
+    assert chosen.sensor == replace(SENSORS["structured-light"], tool=0.3, holes=0.0)
+    assert chosen.sampling.sampler == "label-uniform"
+    assert generate_options("--sensor.axial 1").sensor == SensorConfig(axial=1.0)
+    lengths = {"metres_per_unit", "model", "hole_radius_m"}
+    assert set(SENSOR_TERMS) | lengths == set(SensorConfig.__dataclass_fields__)
+    assert not SensorConfig().on and set(get_args(Sensor)) == set(SENSORS)
+    assert all(replace(SensorConfig(), **{name: 0.1}).on for name in SENSOR_TERMS)
+
+
+def test_an_option_chooses_a_workspace() -> None:
+    assert generate_options("--workspace sphere").workspace == "sphere"
+    scored = parsed("evaluate rope --output out --workspace cone")
+    assert isinstance(scored, training.Evaluate) and scored.workspace == "cone"
+    settings = GenerateConfig()
+    object.__setattr__(settings, "workspace", "dome")  # as where types are not checked
+    with pytest.raises(ValueError, match="workspace is 'dome'; it must be one of own, cone, sphere: give"):
+        settings.__post_init__()
+
+
+@pytest.mark.parametrize(
+    "options, sentences",
+    [
+        ("generate rope --examples 7 --sensor lidar", ("invalid choice 'lidar'", "'time-of-flight'")),
+        ("evaluate rope --workspace dome", ("invalid choice 'dome' for argument '--workspace'",)),
+        (
+            "generate rope --examples 1 --sensor.flying 2",
+            ("mereo: error: sensor.flying is 2.0; it must be from 0 to 1: give for example 0.0\n",),
+        ),
+        ("evaluate bunny --scans --sensor time-of-flight", ("are real and take no simulated camera: leave out --sen",)),
+        ("evaluate bunny --scans --workspace cone", ("--noise-std and --workspace",)),
+    ],
+)
+def test_unknown_and_contradictory_options_are_refused_before_anything_is_written(
+    options: str, sentences: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    try:
+        code = command_line.main([*options.split(), "--output", str(tmp_path / "out")])
+    except SystemExit as leaving:
+        code = leaving.code
+    printed = capsys.readouterr().err
+    assert code == 2 and all(sentence in printed for sentence in sentences), printed
+    assert not list(tmp_path.iterdir())
+
+
+def looks(scene: Scene, settings: GenerateConfig, count: int) -> np.ndarray:
+    """Unit vectors from the object to random cameras."""
+    poses = [sample_view(scene, settings, example_rng(1, index)).T_world_camera for index in range(count)]
+    return np.stack([-pose[:3, 2] for pose in poses])
+
+
+def test_a_scene_has_its_own_workspace_a_cone_and_the_sphere() -> None:
+    """Where it has no cone of its own, the paper's."""
+    scene = replace(toy_scene(), workspace=NARROW)
+    assert scene.workspace_named("own") is scene.workspace_named("cone") is NARROW
+    assert scene.workspace_named("sphere") is not NARROW
+    assert asdict(scene.workspace_named("sphere")) == asdict(NARROW) | {"aperture_rad": 2 * np.pi, "any_roll": True}
+    scene = replace(toy_scene(), workspace=ALL_AROUND)
+    assert scene.workspace_named("own") is scene.workspace_named("sphere") is ALL_AROUND
+    expected = asdict(ALL_AROUND) | {"aperture_rad": PAPER_APERTURE_RAD, "any_roll": False}
+    assert asdict(scene.workspace_named("cone")) == expected
+    assert replace(scene, cone=NARROW).workspace_named("cone") is NARROW
+
+
+def test_cameras_are_where_the_settings_say() -> None:
+    scene = replace(toy_scene(), workspace=NARROW)
+    assert looks(scene, SMALL, 20)[:, 1].min() > np.cos(0.25) - 1e-9
+    around = looks(scene, replace(SMALL, workspace="sphere"), 20)
+    assert np.abs(around).max() > 0.8 and (around < -0.3).any(axis=0).all() and (around > 0.3).any(axis=0).all()
+
+
+def test_the_bunny_is_seen_from_all_around_or_from_above(require_asset: Callable[[str], Path]) -> None:
+    require_asset("bunny/bunny.off")
+    bunny = load_scene("bunny")
+    own, sphere = looks(bunny, SMALL, 10), looks(bunny, replace(SMALL, workspace="sphere"), 10)
+    assert np.array_equal(own, sphere) and own[:, 1].min() < -0.3
+    above = looks(bunny, replace(SMALL, workspace="cone"), 10)
+    up = np.mean([bunny.rest.segments[k].vertices.mean(axis=0) for k in (2, 3)], axis=0)[1]  # the ears are on top
+    assert up > bunny.rest.segments[0].vertices.mean(axis=0)[1] and above[:, 1].min() > np.cos(np.deg2rad(70)) - 1e-9
+
+
+@pytest.mark.parametrize(
+    "change, other",
+    [
+        ({"sensor": SENSORS["time-of-flight"]}, "settings.sensor.model = 'time-of-flight', not 'structured-lig"),
+        ({"workspace": "cone"}, "settings.workspace = 'cone', not 'own'; resuming needs equal"),
+    ],
+)
+def test_the_manifest_states_the_settings_and_resuming_needs_the_same(
+    tmp_path: Path, change: dict[str, object], other: str
+) -> None:
+    scene, settings = replace(toy_scene(), workspace=ALL_AROUND), replace(SMALL, **change)  # type: ignore[arg-type]
+    generate(scene, tmp_path / "data", settings, examples=2, seed=3)
+    manifest = json.loads((tmp_path / "data" / "manifest.json").read_text())
+    assert SensorConfig(**manifest["settings"].get("sensor", {})) == settings.sensor
+    assert manifest["settings"].get("workspace", "own") == settings.workspace
+    workspace = scene.workspace_named(settings.workspace)
+    assert manifest["workspace"] == json.loads(json.dumps(asdict(workspace)))
+    assert manifest["any_roll"] is workspace.any_roll
+    generate(scene, tmp_path / "data", settings, examples=2, seed=3, resume=True)
+    with pytest.raises(ValueError, match=f"was made with {other}"):
+        generate(scene, tmp_path / "data", SMALL, examples=2, seed=3, resume=True)
+
+
+def test_settings_say_nothing_of_the_scenes_own_workspace() -> None:
+    """So manifests, and the keys of datasets made of them, are as they were before there was a choice."""
+    assert "workspace" not in SMALL.stated() and "observations" not in SMALL.stated()
+    assert replace(SMALL, workspace="sphere").stated() == SMALL.stated() | {"workspace": "sphere"}
+
+
+def test_evaluation_looks_through_the_sensor_from_the_workspace_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clouds: list[PointCloud] = []
+    encode = Model.encode
+
+    def watch(model: Model, cloud: PointCloud) -> EncodedCloud:
+        clouds.append(cloud)
+        return encode(model, cloud)
+
+    monkeypatch.setattr(Model, "encode", watch)
+    spoilt = GenerateConfig(128, 0.5, sensor=SENSORS["structured-light"])
+    found = []
+    for number, settings in enumerate((GenerateConfig(), spoilt, GenerateConfig(workspace="sphere"))):
+        config = EvaluationConfig(examples=1, cells=12, settings=settings, method="network")
+        evaluate_weights("rope", tmp_path / str(number), config)
+        found.append(read_metrics(tmp_path / str(number) / "metrics.json"))
+    own, through, around = found
+    assert [(fact["image_size"], fact["noise_std"]) for fact in found] == [(96, 0.1), (128, 0.5), (96, 0.1)]
+    assert [SensorConfig(**fact["sensor"]) for fact in (own, through)] == [SENSORS["paper"], spoilt.sensor]
+    assert len(clouds) == 3 and not np.array_equal(clouds[0].points[:20], clouds[1].points[:20])
+    assert (own["workspace"], around["workspace"]) == ("own", "sphere") and own["iou"] != around["iou"]
+    assert ", workspace sphere, noise 0.1 units" in card("rope", load_model("rope"), [around], b"")
+    assert "workspace sphere" not in card("rope", load_model("rope"), [own], b"").split("## Results")[-1]
