@@ -207,7 +207,7 @@ def test_a_stiffer_part_bends_less() -> None:
         return np.array(halves)
 
     soft, stiff = energies(even), energies(uneven)
-    assert soft[0] == pytest.approx(soft[1], rel=0.05)
+    assert soft[0] == pytest.approx(soft[1], rel=0.2)
     assert stiff[1] < 0.05 * stiff[0]
     stretched = np.zeros_like(uneven.mesh.nodes)
     stretched[:, 0] = 0.01 * uneven.mesh.nodes[:, 0]

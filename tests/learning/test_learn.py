@@ -82,10 +82,10 @@ def test_meshes_get_a_scene_file_once(tmp_path: Path, capsys: pytest.CaptureFixt
     meshes = [tmp_path / "left.stl", tmp_path / "right.stl"]
     (tmp_path / "out").mkdir()
     path = Path(scene_for(meshes, tmp_path / "out", "mm"))
-    assert "as if it were of rubber" in capsys.readouterr().out
+    assert "as a soft elastic solid, for its parts touch in planes alone" in capsys.readouterr().out
     scene = load_scene(path)
     assert scene.name == "left" and scene.rest.names == ("left", "right")
-    path.write_text(re.sub(r"strength: \S+", "strength: 0.25", path.read_text()))  # a user's change is kept
+    path.write_text(re.sub(r"motion: \S+", "motion: 0.1", path.read_text()))  # a user's change is kept
     changed = path.read_text()
     assert scene_for(meshes, tmp_path / "out", "mm") == str(path) and path.read_text() == changed
     assert scene_for([tmp_path / "bar.yaml"], tmp_path, None) == str(tmp_path / "bar.yaml")

@@ -23,7 +23,6 @@ from mereo.geometry.mesh_check import mesh_of, overlaps
 from mereo.geometry.subdivision import TooManyFaces, split_edges
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.mesh_formats import read_segmented_mesh
-from mereo.learning.object_files import describe_scene_file
 from mereo.scenes.files.build import TOLERANCE, refined
 from mereo.scenes.files.check import STATE_TOLERANCE, check_scene
 from mereo.scenes.files.joints import contacts
@@ -33,7 +32,7 @@ from mereo.scenes.files.template import (
     default_deformations,
     flat_base,
     material_points,
-    motion,
+    measure_motion,
     random_motion,
     write_scene_file,
 )
@@ -46,7 +45,7 @@ from mereo.scenes.seeds import example_rng
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Scene file of the pliers, as ``mereo scene new`` writes it."""
     folder = tmp_path_factory.mktemp("pliers")
-    return write_scene_file(write_pliers(folder), folder / "pliers.yaml")
+    return write_scene_file(write_pliers(folder), folder / "pliers.yaml", deformations="soft")
 
 
 @pytest.fixture(scope="module")
@@ -205,18 +204,18 @@ def test_parts_that_all_overlap_are_not_in_one_frame(tmp_path: Path, capsys: pyt
 def test_the_default_moves_every_object_by_five_percent(sides: tuple[int, ...]) -> None:
     mesh = SegmentedMesh((box((0, 0, 0), sides),))
     blocks = default_deformations(mesh)
-    found = motion(mesh, random_motion(mesh, blocks, UNPLACED))
+    found = measure_motion(mesh, random_motion(mesh, blocks, UNPLACED))
     assert found.mean == pytest.approx(MOTION, rel=0.15) and found.largest > found.mean
 
 
 def test_a_rigid_motion_is_none_and_a_stretch_is_its_own() -> None:
     mesh = SegmentedMesh((box((-1, -1, -1), (1, 1, 1)),))
     turn = Rigid(np.array([0.3, 0.2, 0.1]), np.array([5.0, 0, 0]), np.zeros(3))
-    assert motion(mesh, lambda rng: (turn,)).largest < 1e-12
+    assert measure_motion(mesh, lambda rng: (turn,)).largest < 1e-12
     squash = Squash(np.zeros(3), np.array([0, 0, 1.0]), 1.1)
     points, _ = material_points(mesh, 800)
     way = np.linalg.norm(squash(points) - points, axis=1) / 2
-    found = motion(mesh, lambda rng: (squash,))
+    found = measure_motion(mesh, lambda rng: (squash,))
     assert found.mean == pytest.approx(np.sqrt(np.mean(way**2)), rel=0.02)
     assert found.largest == pytest.approx(way.max(), rel=0.1)
 
@@ -354,7 +353,6 @@ def test_the_pliers_hinge_is_proposed_and_valid(written: Path, capsys: pytest.Ca
     assert (
         "#  - type: joint  # turns on the round contact, radius 4.98, of pin and lower\n#    segments: [lower]" in text
     )
-    assert "Its parts touch like 2 joints, which that file proposes in comments" in describe_scene_file(written)
     path = with_joints(written, "hinges.yaml")
     check_scene(str(path))
     assert "fault" not in capsys.readouterr().out
@@ -364,11 +362,32 @@ def test_the_pliers_hinge_is_proposed_and_valid(written: Path, capsys: pytest.Ca
         assert np.linalg.norm((deform(middle[None]) - middle)[0, :2]) < 0.05 * scale  # the pin's axis stays
 
 
+def test_a_word_says_how_the_object_moves(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files, said = write_pliers(tmp_path), list[str]()
+    scene = load_scene(write_scene_file(files, tmp_path / "auto.yaml", report=said.append))
+    assert said[0] == "deformations: by its joints, for its parts touch like 2 hinges"
+    assert scene.definition != load_scene(write_scene_file(files, tmp_path / "s.yaml", deformations="stiff")).definition
+    check_scene(str(tmp_path / "auto.yaml"))
+    assert "fault" not in capsys.readouterr().out
+    text = write_scene_file(files, tmp_path / "r.yaml", deformations="rigid").read_text()
+    assert "\ndeformations: rigid\n#" in text
+    rest = load_scene(tmp_path / "r.yaml")
+    assert np.array_equal(rest.sample_state(np.random.default_rng(0)).mesh.merged()[0], rest.rest.merged()[0])
+    bar = write_mesh(box((0, 0, 0), (40, 10, 10)), tmp_path / "bar.stl")
+    write_scene_file([bar], tmp_path / "bar.yaml", report=said.append)
+    assert "deformations: as a soft elastic solid, for no parts of it touch like a hinge" in said
+    with pytest.raises(ValueError, match="no parts of it touch as in a joint: take soft, stiff or rigid"):
+        write_scene_file([bar], tmp_path / "b.yaml", deformations="articulated")
+    assert not (tmp_path / "b.yaml").exists()
+
+
 def with_joints(written: Path, name: str) -> Path:
     """Copy of a written scene file with the proposed joints alone."""
     head, tail = written.read_text().split("deformations:", 1)
     path = written.with_name(name)
-    path.write_text(head + "deformations:" + re.sub("^#  ", "  ", tail.split("  - type: bend")[0], flags=re.MULTILINE))
+    path.write_text(
+        head + "deformations:" + re.sub("^#  ", "  ", tail.split("  - type: elastic")[0], flags=re.MULTILINE)
+    )
     return path
 
 
@@ -376,7 +395,7 @@ def test_joints_that_collide_together_are_narrowed_until_no_combination_does(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Each lever turns by 30 degrees alone; both inwards meet at the middle, which the check refuses."""
-    written = write_scene_file(write_parts(tmp_path, tongs()), tmp_path / "tongs.yaml")
+    written = write_scene_file(write_parts(tmp_path, tongs()), tmp_path / "tongs.yaml", deformations="soft")
     path = with_joints(written, "joints.yaml")
     check_scene(str(path))
     assert "fault" not in capsys.readouterr().out

@@ -14,11 +14,11 @@ from shapes import ball, box
 
 from mereo.deformation.maps import jacobian_determinant
 from mereo.deformation.samplers import RandomMotion
-from mereo.deformation.warps import Bend, FreeFormLattice
-from mereo.geometry.mesh import PALETTE
+from mereo.deformation.tetrahedral import TetrahedralMap
+from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.scenes.files import build
 from mereo.scenes.files.deformation_blocks import AnyDeformation, SceneFile
-from mereo.scenes.files.template import motion
+from mereo.scenes.files.template import UNPLACED, default_deformations, measure_motion, random_motion
 from mereo.scenes.parameters import parameters, random_state
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES
@@ -35,13 +35,20 @@ def test_the_scene_has_the_files_segments_in_scene_units(tmp_path: Path) -> None
     scene.rest.check()
 
 
-def test_without_deformations_it_bends_as_much_as_the_default_should(tmp_path: Path) -> None:
+def test_without_deformations_it_is_a_soft_elastic_solid(tmp_path: Path) -> None:
     scene = load_scene(write_bar(tmp_path))
     maps = scene.sample_deformations(np.random.default_rng(0))
-    assert [type(part) for part in maps[0].parts] == [Bend, FreeFormLattice, FreeFormLattice]  # type: ignore[attr-defined]
+    assert [type(part) for part in maps[0].parts] == [TetrahedralMap]  # type: ignore[attr-defined]
     assert maps[0] is maps[1]
-    assert motion(scene.rest, scene.sample_deformations).mean == pytest.approx(0.05, rel=0.1)
+    assert 0.03 < measure_motion(scene.rest, scene.sample_deformations).mean < 0.12
     assert scene.definition != load_scene(write_bar(tmp_path, "deformations: [{type: lattice}]\n")).definition
+
+
+def test_segments_that_do_not_touch_bend_as_much_as_they_should_in_a_box_of_rubber() -> None:
+    apart = SegmentedMesh((box((0, 0, 0), (20, 10, 10), "left", 0), box((30, 0, 0), (50, 10, 10), "right", 1)))
+    blocks = default_deformations(apart)
+    assert [block.type for block in blocks] == ["bend", "lattice", "lattice"]
+    assert measure_motion(apart, random_motion(apart, blocks, UNPLACED)).mean == pytest.approx(0.05, rel=0.1)
 
 
 def test_a_scene_that_is_loaded_again_is_not_refined_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

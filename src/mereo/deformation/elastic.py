@@ -100,6 +100,11 @@ class ElasticSolid:
         return np.bincount(corners, weights=shares, minlength=len(self.mesh.nodes))
 
     @property
+    def cell(self) -> float:
+        """Side of a cube of six of the largest tetrahedra: of a lattice, its cell's."""
+        return float(np.cbrt(6 * np.abs(self.mesh.volumes).max()))
+
+    @property
     def pieces(self) -> int:
         """Number of pieces; tetrahedra are of one where a chain of common faces joins them."""
         faces = np.sort(self.mesh.elements[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)

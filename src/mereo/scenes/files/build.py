@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from manifold3d import Manifold, OpType
 
+from mereo.deformation.elastic import ElasticSampler
 from mereo.deformation.maps import Deformation
 from mereo.deformation.samplers import RandomMotion
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
@@ -311,7 +312,9 @@ TOLERANCE = 0.05
 """How far, in scene units, a straight edge may leave the curve that the map makes of it: half of the noise."""
 
 SHORTEST = 1.0
-"""Edges up to this long, in scene units, are not halved: they follow any bend down to a radius of 2.5."""
+"""Edges up to this long, in scene units, are not halved: they follow any bend down to a radius of 2.5.
+
+In an elastic solid they may be half a cell of its lattice long, within which all moves in straight lines."""
 
 STATES = 8
 """Random states in which every edge is compared with its curve."""
@@ -337,34 +340,36 @@ def refined(rest: SegmentedMesh, draw: Callable[[np.random.Generator], tuple[Def
         rest: segments in scene units.
         draw: one map for each segment.
     """
-    if not any(_is_long(segment).any() for segment in rest.segments):
+    steps = draw.steps if isinstance(draw, RandomMotion) else ()
+    cells = [sampler.solid.cell for sampler, _ in steps if isinstance(sampler, ElasticSampler)]
+    shortest = max([SHORTEST, *(0.5 * cell for cell in cells)])
+    if not any(_is_long(segment, shortest) for segment in rest.segments):
         return rest
     states = [draw(example_rng(0, index)) for index in range(STATES)]
     tolerance = TOLERANCE
     most = max(MOST_FACES, 2 * sum(len(segment.faces) for segment in rest.segments))
     while True:
         try:
-            return _refined_surface(rest, states, tolerance, most)
+            return _refined_surface(rest, states, (tolerance, shortest), most)
         except TooManyFaces:
             tolerance *= 2
 
 
-def _is_long(segment: Segment) -> Bool[np.ndarray, " f"]:
-    """Whether an edge of each face is longer than ``SHORTEST``."""
+def _is_long(segment: Segment, shortest: float) -> bool:
+    """Whether any edge is longer than that."""
     corners = segment.vertices[segment.faces]
-    edges = corners - np.roll(corners, 1, axis=1)
-    return np.asarray(np.linalg.norm(edges, axis=2).max(axis=1) > SHORTEST)
+    return bool((np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2) > shortest).any())
 
 
 def _refined_surface(
-    rest: SegmentedMesh, states: list[tuple[Deformation, ...]], tolerance: float, most: int
+    rest: SegmentedMesh, states: list[tuple[Deformation, ...]], limits: tuple[float, float], most: int
 ) -> SegmentedMesh:
     segments = []
     for index, segment in enumerate(rest.segments):
         maps = [state[index] for state in states]
 
         def bent(ends: Ends, maps: list[Deformation] = maps) -> Bool[np.ndarray, " e"]:
-            return _bent(ends, maps, tolerance)
+            return _bent(ends, maps, *limits)
 
         vertices, faces = split_edges(segment.vertices, segment.faces, bent, most)
         most -= len(faces)
@@ -374,10 +379,10 @@ def _refined_surface(
     return replace(rest, segments=tuple(segments))
 
 
-def _bent(ends: Ends, maps: list[Deformation], tolerance: float) -> Bool[np.ndarray, " e"]:
-    """Which edges some map makes a curve of that is farther than ``tolerance`` from its chord."""
+def _bent(ends: Ends, maps: list[Deformation], tolerance: float, shortest: float) -> Bool[np.ndarray, " e"]:
+    """Which edges longer than ``shortest`` a map makes a curve of, farther than ``tolerance`` from its chord."""
     result = np.zeros(len(ends), dtype=bool)
-    long = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > SHORTEST
+    long = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > shortest
     for deform in maps:
         rows = np.flatnonzero(long & ~result)
         if len(rows) == 0:

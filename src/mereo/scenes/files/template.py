@@ -539,9 +539,11 @@ def _draft(name: str, source: _Source, units: str | None, aperture: float, way: 
 
 def choose_way(way: Way, joints: Sequence[Joint]) -> tuple[Way, str]:
     """How an object deforms, and why; ``ValueError`` where it is to be articulated and has no joints."""
-    count = counted(len(joints), "joint")
     if way == "auto":
-        return ("articulated", f"for its parts touch like {count}") if joints else ("soft", "for it has no joints")
+        hinges = counted(sum(joint.hinge for joint in joints), "hinge")
+        if hinges[0] != "0":
+            return "articulated", f"for its parts touch like {hinges}"
+        return "soft", "for its parts touch in planes alone" if joints else "for no parts of it touch like a hinge"
     if way == "articulated" and not joints:
         raise ValueError(
             "the object is to be articulated, and no parts of it touch as in a joint: take soft, stiff or rigid, and "
@@ -630,13 +632,21 @@ def _deformations(mesh: SegmentedMesh, moves: Moves) -> str:
     if moves.way == "articulated":
         lines = [line.removeprefix("#") for line in joints.splitlines(keepends=True)[1:]]
         return f"{ARTICULATED}\ndeformations:\n{''.join(lines)}{ELASTIC_COMMENT}{further}"
-    return f"deformations:\n{joints}{_soft(moves.blocks)}{further}"
+    return f"deformations:\n{joints}{_soft(mesh, moves.blocks)}{further}"
 
 
-def _soft(blocks: Sequence[DeformationBlock]) -> str:
+def _soft(mesh: SegmentedMesh, blocks: Sequence[DeformationBlock]) -> str:
     """Lines of what bends the whole object."""
     if isinstance(blocks[0], ElasticBlock):
-        return ELASTIC_TEXT.format(motion=f"{blocks[0].motion:g}", soft=f"{SOFT:g}", stiff=f"{STIFF:g}")
+        vertices, longest = mesh.merged()[0], int(np.ptp(mesh.bounds, axis=0).argmax())
+        return ELASTIC_TEXT.format(
+            motion=f"{blocks[0].motion:g}",
+            soft=f"{SOFT:g}",
+            stiff=f"{STIFF:g}",
+            part=quoted(mesh.names[-1]),
+            end=_numbers(vertices[vertices[:, longest].argmin()]),
+            held=f"{0.15 * np.ptp(mesh.bounds, axis=0).max():.3g}",
+        )
     bend, lattice = blocks[0], blocks[-1]
     assert isinstance(bend, BendBlock) and isinstance(lattice, LatticeBlock)
     return RUBBER.format(
@@ -703,10 +713,10 @@ EXAMPLE_JOINT = """\
 ELASTIC_TEXT = """\
   - type: elastic  # all segments as one solid under random loads
     motion: {motion}  # of a typical place, in half longest sides: {soft} is soft, as organs are, {stiff} is stiff
-#    stiffness: {{NAME: 10}}  # of a segment, in that of the others
+#    stiffness: {{{part}: 10}}  # of a segment, in that of the others
 #    held:  # what does not move, such as an attachment: a ball, or a side of a plane (direction instead of radius)
-#      - center: [0, 0, 0]
-#        radius: 1
+#      - center: {end}
+#        radius: {held}
 """
 
 ELASTIC_COMMENT = """\
