@@ -54,9 +54,9 @@ def test_other_machines_cannot_reach_it(cluster: Cluster, monkeypatch: pytest.Mo
     listening = {socket.laddr.ip.removeprefix("::ffff:") for socket in sockets if socket.status == "LISTEN"}
     assert listening == {"127.0.0.1"}
     monkeypatch.setattr(ray, "nodes", lambda: [{"NodeManagerAddress": "192.0.2.2"}])
-    with pytest.raises(ConnectionError, match=r"--ray local listen on 192.0.2.2; they must .*give --ray auto"):
-        with spreading._loopback(ray):
-            pass
+    sentence = r"--ray local listen on 192.0.2.2; they must .*give --ray auto"
+    with pytest.raises(ConnectionError, match=sentence), spreading._loopback(ray):
+        pass
 
 
 def test_items_are_taken_as_they_are_needed(cluster: Cluster) -> None:
