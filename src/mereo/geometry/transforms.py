@@ -19,6 +19,15 @@ def inverse_rigid(transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4
     return rigid(rotation, -rotation @ transform[:3, 3])
 
 
+def is_rigid(transform: Float[np.ndarray, "4 4"]) -> bool:
+    """Whether a transform is a rotation and a translation, up to 1e-6; finite, and with 0 0 0 1 below."""
+    if transform.shape != (4, 4) or not np.isfinite(transform).all():
+        return False
+    rotation = transform[:3, :3]
+    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) and np.linalg.det(rotation) > 0
+    return bool(is_rotation and transform[3].tolist() == [0, 0, 0, 1])
+
+
 def transform_points(
     transform: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "*n 3"]
 ) -> Float[np.ndarray, "*n 3"]:

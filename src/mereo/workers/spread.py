@@ -357,7 +357,7 @@ def _loopback(ray: ModuleType) -> Iterator[None]:
     Ray takes an address of the network on Linux, also where ``init`` names the loopback, but for this constant, by
     which it spares users of macOS and Windows the firewall's question. Raises ``ConnectionError`` where that fails.
     """
-    constants = import_module("ray._private.ray_constants")
+    constants: Any = import_module("ray._private.ray_constants")
     before, constants.ENABLE_RAY_CLUSTER = constants.ENABLE_RAY_CLUSTER, False
     try:
         yield

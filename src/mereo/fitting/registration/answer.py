@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, SupportsIndex
 
 import numpy as np
 from jaxtyping import Float
@@ -111,6 +112,12 @@ class Answer:
     seconds: float = 0.0
     located_by: LocatedBy = "network"
     tracking: Tracking = "found"
+
+    def __reduce_ex__(self, protocol: SupportsIndex) -> Any:
+        raise TypeError(
+            "a result cannot be pickled or copied, as it holds search structures of compiled libraries: write it with "
+            "result.save(), or send result.surfaces or its segments, list(result)"
+        )
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.seen.frame.source!r}: {self.source})"
