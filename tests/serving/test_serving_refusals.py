@@ -83,7 +83,7 @@ REFUSED: dict[str, tuple[int, str, dict[str, Any]]] = {
     "a long boundary": (400, "the form's boundary has 5000 characters; at most 70", {"content": b"x", "headers": LONG}),
     "a frame before the first": (
         422,
-        "frame_index is -1; it must be a whole number, at least 0",
+        "--frame-index is -1; it must be a whole number, at least 0",
         asked("frame-index=-1"),
     ),
     "a frame of a cloud": (422, "frame.npy is one point cloud, not a recording", asked("frame-index=1")),

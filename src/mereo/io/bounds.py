@@ -77,6 +77,7 @@ Exponent = Annotated[int, *_within(-30, 30)]
 Cells = Annotated[int, *_within(4, 4096)]
 Port = Annotated[int, *_within(0, 65535)]
 Seed = Annotated[int, *_within(0, 2**63, below=True)]  # what torch takes
+Radius = Annotated[float, *_within(0, 1000, above=True)]
 Positive = Annotated[float, *_within(0, above=True)]
 Number = Annotated[float, *_within(-math.inf)]
 PositiveOrUnknown = Annotated[float | None, *_within(0, above=True)]

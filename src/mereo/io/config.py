@@ -62,4 +62,4 @@ class InputConfig:
     def __post_init__(self) -> None:
         if self.unit_m is not None and not 0 < self.unit_m < math.inf:
             raise ValueError(f"the unit is {self.unit_m} m; it must be positive: give 0.001 for millimetres")
-        check_bounds(self)
+        check_bounds(self, "--")

@@ -18,7 +18,7 @@ from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.progress import stage
 from mereo.models.trained import Trained
 from mereo.reconstruction.isolation import Reading
-from mereo.reconstruction.isosurfaces import Extraction
+from mereo.reconstruction.isosurfaces import Extraction, check_nodes
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.pipeline import (
     EncodedFrame,
@@ -234,6 +234,7 @@ def _label_grid(mesh: SegmentedMesh, resolution: int) -> LabelGrid:
     low, high = mesh.bounds
     spacing = float((high - low).max()) / resolution
     counts = np.ceil((high - low) / spacing).astype(int) + 3
+    check_nodes(resolution, *counts.tolist())
     origin = (low + high - (counts - 1) * spacing) / 2
     labels = label_grid(mesh, *(origin[axis] + np.arange(counts[axis]) * spacing for axis in range(3)))
     return LabelGrid(labels, origin, np.full(3, spacing), mesh.names)
