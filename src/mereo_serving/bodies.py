@@ -43,6 +43,9 @@ MASKS, YAML = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"), (".yaml", ".ym
 
 logging.getLogger("python_multipart").setLevel(logging.CRITICAL + 1)  # it tells the log what the client is told
 
+MOST_BOUNDARY = 70
+"""Most characters of a boundary (RFC 2046)."""
+
 MOST_HEADER = 8192
 """Most bytes of the headers of a part."""
 
@@ -80,6 +83,12 @@ async def take(
         if kind == "multipart/form-data":
             if not (boundary := options.get("boundary")):
                 raise Refused(400, "the form has no boundary; its Content-Type must state one: let a library make it")
+            if len(boundary) > MOST_BOUNDARY:
+                raise Refused(
+                    400,
+                    f"the form's boundary has {len(boundary)} characters; at most {MOST_BOUNDARY} are allowed: let a "
+                    "library make it",
+                )
             parts: _Parts | _Whole = _Parts(folder, stated, boundary.encode("latin-1"), files)
         else:
             suffix = stated or MEDIA.get(kind, "")

@@ -1,9 +1,11 @@
 """mereo in Python: frames, results that are saved, shown and told, and the commands as functions."""
 
 import base64
+import copy
 import inspect
 import io
 import json
+import pickle
 import re
 import sys
 from collections.abc import Callable, Sequence
@@ -11,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jaxtyping
 import numpy as np
 import pytest
 from analytic import untrained
@@ -44,6 +47,51 @@ def unchecked(function: Callable[..., Any]) -> Callable[..., Any]:
 @pytest.fixture(scope="module")
 def result() -> Result:
     return mereo.reconstruct(seen(), MODEL, resolution=24, unit_m=1.0, label_points=True)
+
+
+# --- arguments --------------------------------------------------------------------------------------------------------
+
+LINE = np.linspace(0.1, 1.0, 99)[:, None] * [1.0, 0.5, 2.0]
+CAMERA = Camera(32, 32, 40.0, 40.0, 16.0, 16.0)
+
+GRID = "resolution is .*; it must be a whole number, from 4 to 4096: give for example 128"
+REFUSED: dict[str, tuple[Callable[[], object], str]] = {
+    **{
+        f"axes {axes!r}": (lambda axes=axes: mereo.load_frame(seen(), axes=axes), "^axes is .* one of camera, scanner")
+        for axes in ("Camera", 3, "")
+    },
+    **{
+        f"resolution {n}": (lambda n=n: mereo.reconstruct(seen(), MODEL, resolution=n), GRID)
+        for n in (0.5, np.nan, -5, True, 1_000_000, None)
+    },
+    "a large grid": (lambda: mereo.reconstruct(seen(), MODEL, resolution=4096).surfaces, "at most 80000000 fit: lower"),
+    "an index": (lambda: mereo.load_frame(seen(), frame_index=-1), "^frame_index is -1; it must be a whole number, at"),
+    "a complex cloud": (lambda: PointCloud(seen() * 1j), "values of type complex128; they must be real numbers"),
+    "a boolean cloud": (lambda: PointCloud(seen() > 0), "values of type bool; they must be real numbers"),
+    "pairs": (lambda: PointCloud(seen()[:, :2]), r"have the shape \(\d+, 2\); they must be n x 3"),
+    "complex depth": (lambda: DepthImage(np.ones((32, 32)) * 1j, CAMERA), "the depth image has values of type complex"),
+    "boolean depth": (
+        lambda: mereo.load_frame(np.ones((32, 32), bool), intrinsics=CAMERA), "the depth image has values of type bool"
+    ),
+    "a line": (lambda: mereo.reconstruct(LINE, MODEL), "the 99 points of cloud lie on a line; the object's surface"),
+    "a negative unit": (lambda: replace(mereo.load_frame(seen()), unit_m=-1.0), "unit_m is -1.0; it must be greater"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_wrong_arguments_are_refused_in_a_sentence(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # the check of types that tests put before it
+    call, sentence = REFUSED[case]
+    with pytest.raises(ValueError, match=sentence) as caught:
+        call()
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_result_says_that_it_cannot_be_sent(result: Result) -> None:
+    for send in (pickle.dumps, copy.copy, copy.deepcopy):
+        with pytest.raises(TypeError, match=r"a result cannot be pickled or copied.*write it with result.save\(\)"):
+            send(result)
+    assert pickle.loads(pickle.dumps(list(result)))[0].name == result.names[0]
 
 
 # --- saving -----------------------------------------------------------------------------------------------------------

@@ -1,9 +1,12 @@
 """The registered model as a reconstruction: the rest mesh's own segments, in the input's frame."""
 
 import json
+import pickle
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import jaxtyping
 import numpy as np
 import pytest
 from analytic import untrained
@@ -19,6 +22,7 @@ from mereo.evaluation.scoring import EvaluationConfig, evaluate
 from mereo.fitting.draws.playback import DrawnStates
 from mereo.fitting.registration import register
 from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.register import (
     ChangedSceneWarning,
     CloudToFit,
@@ -28,11 +32,13 @@ from mereo.fitting.registration.register import (
     statistical_model_of,
 )
 from mereo.fitting.registration.registration import Registration
+from mereo.fitting.tracking import Tracker
 from mereo.geometry.camera import SCANNER_TO_CAMERA, PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.models.model import Model
 from mereo.models.weights import save_model
+from mereo.reconstruction.observation import observe
 from mereo.reconstruction.pipeline import Reconstruction
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import AssetUnavailable, Scene
@@ -214,5 +220,46 @@ def test_points_may_be_plain_lists(found: Answer) -> None:
     there = registration.to_camera(rest)
     np.testing.assert_array_equal(registration.to_rest(there.tolist()), registration.to_rest(there))
     assert registration.query([[0, 0, 100]]).label.shape == (1,)
-    with pytest.raises(ValueError, match=r"the points have the shape \(3,\); they must be rows of x, y, z"):
-        registration.to_camera([0.0, 1.0, 2.0])
+    np.testing.assert_array_equal(registration.to_camera(rest[0]), registration.to_camera(rest[:1]))
+
+
+MOTION = "the transform is .*; it must be rigid, a rotation and a translation"
+REFUSED: dict[str, tuple[Callable[[Registration], object], str]] = {
+    "pairs": (lambda r: r.to_camera([[0.0, 1.0]]), r"have the shape \(1, 2\); they must be rows of x, y, z"),
+    "NaN": (lambda r: r.to_camera([[np.nan, 0, 0], [0, 0, 0]]), "1 of 2 points are NaN, infinite or beyond 1e"),
+    "infinity": (lambda r: r.query([0, np.inf, 0]), "1 of 1 point are NaN, infinite or beyond"),
+    "complex": (lambda r: r.to_rest(np.ones((2, 3)) * 1j), "has values of type complex128; they must be real numbers"),
+    "words": (lambda r: r.radius95(["abc"], at="camera"), "has values of type <U3; they must be real numbers"),
+    "a place": (lambda r: r.radius95([0, 0, 0], at="Rest"), "at is 'Rest'; it must be one of camera, rest"),
+    "a place to explain": (lambda r: r.explain([0, 0, 0], at="Rest"), "at is 'Rest'; it must be one of camera, rest"),
+    "a shear": (lambda r: r.moved(np.eye(4) + np.eye(4, k=1)), MOTION),
+    "no motion": (lambda r: r.moved(np.full((4, 4), np.nan)), MOTION),
+    "a rotation": (lambda r: r.moved(np.eye(3)), MOTION),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_is_no_place_or_motion_is_refused(case: str, found: Answer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # the check of types that tests put before it
+    call, sentence = REFUSED[case]
+    assert found.registration is not None
+    with pytest.raises(ValueError, match=sentence):
+        call(found.registration)
+
+
+def test_a_registration_says_that_it_cannot_be_sent(found: Answer) -> None:
+    with pytest.raises(TypeError, match="a registration cannot be pickled or copied.*save_state"):
+        pickle.dumps(found.registration)
+
+
+@pytest.mark.parametrize("scene_unit", [-1.0, 0.0, np.nan, np.inf])
+def test_a_scene_unit_is_a_length(scene_unit: float, view: SampleView, model: Model) -> None:
+    seen, registrar = observe(view.depth.to_points()), Registrar.of(model, "modes")
+    sentence = "scene_unit is .*; it must be greater than 0"
+    with pytest.raises(ValueError, match=sentence):
+        answer_frame(seen, model, registrar, scene_unit=scene_unit)
+    with Tracker(registrar) as tracker:
+        with pytest.raises(ValueError, match=sentence):
+            tracker.follow(seen, 0.0, scene_unit=scene_unit)
+        with pytest.raises(ValueError, match="time_s is nan; it must be a finite number"):
+            tracker.follow(seen, np.nan)

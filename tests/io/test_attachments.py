@@ -76,6 +76,7 @@ def test_poses_come_back_turned(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("a,b,c\n1,2,3\n", "its columns are a, b, c; it needs x, y, z"),
+        ("x,y,z,X\n1,2,3,4\n", "it has several columns 'x', of which one alone"),
         ("x,y,z\n", "it has a header and no row"),
         ("x,y,z\n1,2,3\n1,two,3\n", "line 3 has 'two' in the column y, which is no finite number"),
         ("x,y,z\n1,2,nan\n", "line 2 has 'nan' in the column z"),

@@ -63,10 +63,14 @@ def test_every_number_has_bounds_that_it_cannot_leave(settings: type, name: str,
     bounds = bounds_of(kind)
     assert bounds is not None, "annotate it with a kind of mereo.io.bounds"
     for value in outside(bounds, kind):
-        with pytest.raises(ValueError, match=rf"{name} is .*; it must be .*{re.escape(bounds.rule)}: "):
+        with pytest.raises(
+            ValueError, match=rf"{name.replace('_', '[_-]')} is .*; it must be .*{re.escape(bounds.rule)}: "
+        ):
             check_values(settings, {name: value})
     if settings in SETTINGS:
-        with pytest.raises(ValueError, match=rf"{name} is .*; it must be .*{re.escape(bounds.rule)}: "):
+        with pytest.raises(
+            ValueError, match=rf"{name.replace('_', '[_-]')} is .*; it must be .*{re.escape(bounds.rule)}: "
+        ):
             settings(**{name: outside(bounds, kind)[-1]})
 
 
@@ -104,7 +108,7 @@ def test_every_number_has_bounds_that_it_cannot_leave(settings: type, name: str,
         ("train data --output run --batch 1 --queries 1", "batch and queries are both 1; batch normalization"),
         ("generate rope --examples 1 --output run --image-size 0", "image_size is 0; it must be"),
         ("generate rope --examples 0 --output run", "--examples is 0; it must be a whole number, at least 1: correct"),
-        ("reconstruct a.npy --weights bunny --output run --depth-scale 0", "depth_scale is 0.0; it must be greater"),
+        ("reconstruct a.npy --weights bunny --output run --depth-scale 0", "--depth-scale is 0.0; it must be greater"),
         ("scene preview rope --output a.png --seed -1", "--seed is -1; it must be a whole number, at least 0"),
     ],
 )

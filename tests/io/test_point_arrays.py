@@ -200,7 +200,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "one number": (np.float64(1), "is not a point cloud"),
     "flat list": ([1.0, 2.0, 3.0], "^the list of shape .3,. is not a point cloud"),
     "batch": (np.ones((2, 6, 8, 3)), "is not a point cloud"),
-    "complex": (np.ones((9, 3), complex), "has values of type complex128; positions are real numbers: give an arr"),
+    "complex": (np.ones((9, 3), complex), "has values of type complex128; they must be real numbers: give an arr"),
     "complex tensor": (torch.ones(9, 3, dtype=torch.complex64), "has values of type complex64"),
     "truth values": (np.ones((9, 3), bool), "has values of type bool"),
     "objects": (POINTS.astype(object), "has values of type object"),

@@ -172,7 +172,7 @@ def test_what_a_recording_lacks_is_said(tmp_path: Path) -> None:
             "no images or clouds on topic '/nothing'; those it has are on: /camera/color",
         ),
         ({"frame_index": 3}, "has 3 frames; frame 3 is asked for"),
-        ({"frame_index": -1}, "the frame index is -1"),
+        ({"frame_index": -1}, "--frame-index is -1; it must be a whole number, at least 0"),
         ({"topic": "/camera/color/image_raw"}, "its encoding is 'mono8', not one of 16UC1"),
         ({"frame": "scanner"}, "is a recording; those are always in the camera frame"),
         ({"unit_m": 0.001}, "comes in metres: leave out --unit-m"),

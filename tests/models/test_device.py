@@ -223,6 +223,25 @@ def test_a_forked_process_has_threads_of_its_own() -> None:
     subprocess.run([sys.executable, "-W", "ignore", "-c", FORKED], check=True, timeout=60)
 
 
+FORKED_LATER = """
+import os, sys, torch
+import mereo.models.device
+torch.set_num_threads(2)
+product = lambda: torch.nn.functional.linear(torch.ones(512, 512), torch.ones(512, 512)).sum().item()
+before = product()
+child = os.fork()
+if child == 0:
+    os._exit(0 if product() == before else 1)
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork")
+def test_a_process_that_was_forked_after_an_answer_computes() -> None:
+    """OpenMP's threads do not survive a fork: without care it waits for them without end."""
+    assert subprocess.run([sys.executable, "-W", "ignore", "-c", FORKED_LATER], timeout=120).returncode == 0
+
+
 KERNELS = """
 import torch
 from mereo.models.triton_kernels import nearest

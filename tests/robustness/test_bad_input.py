@@ -78,6 +78,14 @@ def test_broken_files(
     refused(capsys, tmp_path, text, "reconstruct", path, "--weights", weights, "--output", tmp_path / "out")
 
 
+@pytest.mark.parametrize("number", ["1e400", "1e300", "nan"])
+def test_a_mesh_beyond_all_numbers(number: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    places, faces = f"v 0 0 0\nv {number} 0 0\nv 0 1 0\nv 0 0 1\n", "f 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+    (tmp_path / "part.obj").write_text(places + faces)
+    text = "part.obj cannot be read as a mesh (its part 'part' has vertices that are NaN, infinite or beyond 1e+12)"
+    refused(capsys, tmp_path, text, "learn", tmp_path / "part.obj", "--output", tmp_path / "out")
+
+
 def test_bad_depth_images(weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     image, camera = tmp_path / "depth.png", tmp_path / "camera.json"
     camera.write_text(json.dumps({"fx": 60.0, "fy": 60.0, "cx": 32.0, "cy": 24.0, "width": 64, "height": 48}))

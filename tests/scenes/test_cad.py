@@ -29,11 +29,11 @@ from mereo.scenes.files.joints import contacts
 from mereo.scenes.files.template import (
     MOTION,
     UNPLACED,
-    default_deformations,
     flat_base,
     material_points,
     measure_motion,
     random_motion,
+    rubber,
     write_scene_file,
 )
 from mereo.scenes.registry import load_scene
@@ -203,7 +203,7 @@ def test_parts_that_all_overlap_are_not_in_one_frame(tmp_path: Path, capsys: pyt
 @pytest.mark.parametrize("sides", [(1, 1, 1), (4, 3, 1), (20, 2, 1)])
 def test_the_default_moves_every_object_by_five_percent(sides: tuple[int, ...]) -> None:
     mesh = SegmentedMesh((box((0, 0, 0), sides),))
-    blocks = default_deformations(mesh)
+    blocks = rubber(mesh)
     found = measure_motion(mesh, random_motion(mesh, blocks, UNPLACED))
     assert found.mean == pytest.approx(MOTION, rel=0.15) and found.largest > found.mean
 

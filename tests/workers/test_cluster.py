@@ -47,6 +47,18 @@ def test_every_item_once_in_other_processes_of_one_thread(cluster: Cluster) -> N
     assert set(gpus) == {""}, "a task that asked for no GPU sees none"
 
 
+def test_other_machines_cannot_reach_it(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    psutil, ray = pytest.importorskip("psutil"), pytest.importorskip("ray")
+    family = [psutil.Process(), *psutil.Process().children(recursive=True)]
+    sockets = [socket for process in family for socket in process.net_connections("inet")]
+    listening = {socket.laddr.ip.removeprefix("::ffff:") for socket in sockets if socket.status == "LISTEN"}
+    assert listening == {"127.0.0.1"}
+    monkeypatch.setattr(ray, "nodes", lambda: [{"NodeManagerAddress": "192.0.2.2"}])
+    sentence = r"--ray local listen on 192.0.2.2; they must .*give --ray auto"
+    with pytest.raises(ConnectionError, match=sentence), spreading._loopback(ray):
+        pass
+
+
 def test_items_are_taken_as_they_are_needed(cluster: Cluster) -> None:
     taken: list[int] = []
 

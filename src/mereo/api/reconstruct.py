@@ -23,7 +23,7 @@ from mereo.fitting import tracking
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.geometry.camera import Camera, DepthImage
-from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.conventions import CloudAxes, check_real
 from mereo.geometry.transforms import checked_pose
 from mereo.io.config import InputConfig
 from mereo.io.intrinsics import read_intrinsics
@@ -71,7 +71,8 @@ def load_frame(
     Raises ``FileNotFoundError`` where there is no such file or name; ``ValueError`` for what is damaged or no frame,
     and for options that do not belong to this kind of frame; ``TypeError`` for an option that there is none of.
     """
-    reading = InputConfig(frame=axes or "camera", mask=None if mask is None else Path(mask), **options)
+    mask, axes_or_camera = None if mask is None else Path(mask), "camera" if axes is None else axes
+    reading = InputConfig(frame=axes_or_camera, mask=mask, **options)
     if not isinstance(source, str | Path):
         return _frame_in_memory(source, axes, intrinsics, reading)
     path = Path(source)
@@ -110,6 +111,7 @@ def _frame_in_memory(
 
 def _depth_frame(raw: Num[np.ndarray, "h w"], intrinsics: Camera | str | Path, reading: InputConfig) -> SensorFrame:
     """Frame of a depth image that is an array of stored values."""
+    check_real(raw, "the depth image")
     if raw.ndim != 2:
         raise ValueError(f"the depth image has the shape {raw.shape}; it must be rows of pixels: give h x w values")
     path, camera, scale = Path("depth image"), intrinsics, reading.depth_scale

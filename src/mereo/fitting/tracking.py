@@ -36,6 +36,7 @@ from mereo.geometry.camera import SightKind, SightLines
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.downsampling import means_along_sight
 from mereo.geometry.transforms import transform_points
+from mereo.io.bounds import Number, PositiveOrUnknown, check_bounds
 from mereo.io.cores import limit_blas_threads
 from mereo.models.calibration import Calibration
 from mereo.reconstruction.isolation import Reading
@@ -275,9 +276,12 @@ class TrackedFrame:
     """
 
     seen: Observation
-    time_s: float
-    scene_unit: float | None = None
+    time_s: Number
+    scene_unit: PositiveOrUnknown = None
     keep_all: bool = False
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
 
 
 class Searched(NamedTuple):

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mereo.geometry.brief import counted, sides
-from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.conventions import CloudAxes, check_real
 from mereo.geometry.read_only import read_only
 from mereo.geometry.transforms import Normalizer, rigid
 
@@ -77,6 +77,9 @@ class PointCloud:
     points: Float[np.ndarray, "n 3"]
 
     def __post_init__(self) -> None:
+        check_real(self.points, "the point cloud")
+        if self.points.ndim != 2 or self.points.shape[1] != 3:
+            raise ValueError(f"the points have the shape {self.points.shape}; they must be n x 3: give rows of x, y, z")
         if not np.isfinite(self.points).all():
             bad = int((~np.isfinite(self.points).all(axis=1)).sum())
             raise ValueError(f"{bad} of {len(self.points)} points are NaN or infinite; drop them before reconstructing")
@@ -101,6 +104,7 @@ class DepthImage:
     camera: Camera
 
     def __post_init__(self) -> None:
+        check_real(self.depth, "the depth image")
         expected = (self.camera.height, self.camera.width)
         if self.depth.shape != expected:
             raise ValueError(

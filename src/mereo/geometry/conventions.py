@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 MIN_POINTS = 32
 """Fewer observed points say too little about an object: they are refused, drawn again, or left as they were."""
@@ -22,3 +22,12 @@ WorkspaceName = Literal["own", "cone", "sphere"]
 
 UNITS_M: Mapping[str, float] = MappingProxyType({"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254})
 """Metres in each unit of length that files and options may name."""
+
+
+def check_real(values: Any, name: str) -> None:
+    """Raise ``ValueError`` for an array, called so, of anything but real numbers: complex ones, truth values, texts."""
+    kind = getattr(values, "dtype", type(values).__name__)
+    if getattr(kind, "kind", "") not in tuple("fiu"):
+        raise ValueError(
+            f"{name} has values of type {kind}; they must be real numbers: give an array of floats or integers"
+        )

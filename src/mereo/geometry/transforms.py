@@ -20,20 +20,24 @@ def inverse_rigid(transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4
     return rigid(rotation, -rotation @ transform[:3, 3])
 
 
+def is_rigid(transform: Float[np.ndarray, "4 4"], tolerance: float = 1e-6) -> bool:
+    """Whether a transform is a rotation and a translation, up to rounding; finite, and with 0 0 0 1 below."""
+    if transform.shape != (4, 4) or not np.isfinite(transform).all():
+        return False
+    rotation = transform[:3, :3]
+    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=tolerance) and np.linalg.det(rotation) > 0
+    return bool(is_rotation and transform[3].tolist() == [0, 0, 0, 1])
+
+
 def checked_pose(pose: ArrayLike) -> Float[np.ndarray, "4 4"]:
-    """A rigid pose as numbers; ``ValueError`` for what is none."""
+    """A rigid pose as numbers, of a few printed digits or more; ``ValueError`` for what is none."""
     T: np.ndarray = np.asarray(pose, dtype=np.float64)
-    cure = "give 4 x 4 numbers, a rotation and a translation, with 0 0 0 1 in the last row"
-    if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise ValueError(f"the pose has the shape {T.shape}, or numbers that are not finite: {cure}")
-    rotation = T[:3, :3]
-    if (
-        np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3
-        or np.linalg.det(rotation) < 0
-        or list(T[3]) != [0, 0, 0, 1]
-    ):
-        raise ValueError(f"the pose {np.round(T, 3).tolist()} scales, shears or mirrors: {cure}")
-    return T
+    if T.shape == (4, 4) and is_rigid(T, 1e-3):
+        return T
+    raise ValueError(
+        f"the pose is {np.round(T, 3).tolist() if T.shape == (4, 4) else f'of the shape {T.shape}'}, and must be 4 x 4 "
+        "finite numbers: a rotation and a translation, with 0 0 0 1 in the last row"
+    )
 
 
 def transform_points(

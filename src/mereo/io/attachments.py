@@ -234,7 +234,10 @@ Lines = list[tuple[int, list[str]]]
 
 
 def _columns(header: Sequence[str]) -> dict[str, int]:
-    return {name.strip().lower(): index for index, name in enumerate(header)}
+    names = [name.strip().lower() for name in header]
+    if twice := [name for name in (*POSITION, *QUATERNION) if names.count(name) > 1]:
+        raise ValueError(f"it has several columns {twice[0]!r}, of which one alone can be meant")
+    return {name: index for index, name in enumerate(names)}
 
 
 def _numbers(lines: Lines, columns: dict[str, int], names: tuple[str, ...]) -> Float[np.ndarray, "n k"]:

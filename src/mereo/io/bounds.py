@@ -36,6 +36,8 @@ class Bounds:
     @property
     def rule(self) -> str:
         """Words for the interval: "from 0 to 1", "at least 1", "greater than 0"."""
+        if math.isinf(self.least):
+            return "a finite number"
         if math.isinf(self.most):
             return f"greater than {self.least:g}" if self.above else f"at least {self.least:g}"
         lower = f"above {self.least:g}" if self.above else f"from {self.least:g}"
@@ -57,6 +59,7 @@ def _within(least: float, most: float = math.inf, *, above: bool = False, below:
 # could be said.
 Count = Annotated[int, *_within(1)]
 CountOrNone = Annotated[int, *_within(0)]
+IndexOrNone = Annotated[int | None, *_within(0)]
 Threads = Annotated[int, *_within(0, 1024)]
 Workers = Annotated[int, *_within(0, 1024)]
 Points = Annotated[int, *_within(MIN_POINTS, 2**20)]
@@ -74,7 +77,9 @@ Exponent = Annotated[int, *_within(-30, 30)]
 Cells = Annotated[int, *_within(4, 4096)]
 Port = Annotated[int, *_within(0, 65535)]
 Seed = Annotated[int, *_within(0, 2**63, below=True)]  # what torch takes
+Radius = Annotated[float, *_within(0, 1000, above=True)]
 Positive = Annotated[float, *_within(0, above=True)]
+Number = Annotated[float, *_within(-math.inf)]
 PositiveOrUnknown = Annotated[float | None, *_within(0, above=True)]
 NotNegative = Annotated[float, *_within(0)]
 Aperture = Annotated[float, *_within(0, 360, above=True)]
@@ -103,6 +108,12 @@ def check_values(settings: type, values: Mapping[str, Any], prefix: str = "") ->
         if rule is not None:
             name = prefix + (item.name.replace("_", "-") if prefix == "--" else item.name)
             raise ValueError(f"{name} is {_text(values[item.name])}; it must be {rule}: {_cure(item)}")
+
+
+def check_value(name: str, value: object, kind: Any, example: object) -> None:
+    """Raise ``ValueError`` for an argument that its kind, of this module or a ``Literal``, does not allow."""
+    if (rule := _broken_rule(kind, value)) is not None:
+        raise ValueError(f"{name} is {_text(value)}; it must be {rule}: give for example {_text(example)}")
 
 
 @lru_cache(maxsize=64)

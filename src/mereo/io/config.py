@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from mereo.geometry.conventions import CloudAxes
-from mereo.io.bounds import PositiveOrUnknown, check_bounds
+from mereo.io.bounds import IndexOrNone, PositiveOrUnknown, check_bounds
 
 CONFIG = "config.json"
 """Name of the file of options that a folder of results was made with; ``--config`` reads it."""
@@ -57,9 +57,9 @@ class InputConfig:
     drop_invalid: bool = False
     unit_m: PositiveOrUnknown = None
     topic: str | None = None
-    frame_index: int | None = None
+    frame_index: IndexOrNone = None
 
     def __post_init__(self) -> None:
         if self.unit_m is not None and not 0 < self.unit_m < math.inf:
             raise ValueError(f"the unit is {self.unit_m} m; it must be positive: give 0.001 for millimetres")
-        check_bounds(self)
+        check_bounds(self, "--")

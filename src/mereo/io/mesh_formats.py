@@ -13,6 +13,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int, UInt8
 
+from mereo.geometry.conventions import LARGEST
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
 from mereo.geometry.radii import Radii
 from mereo.io.errors import check_count, readable
@@ -80,7 +81,15 @@ def _parts(path: Path) -> list[Part]:
         parts = _obj_parts(path) if suffix == ".obj" else _scene_parts(path)
         if not parts:
             raise ValueError("it has no faces")
+        for name, _, vertices, _ in parts:
+            _check_places(name, vertices)
     return parts
+
+
+def _check_places(name: str, vertices: Float[np.ndarray, "v 3"]) -> None:
+    """Raise ``ValueError`` (its reason only) for places that are not finite, or beyond ``LARGEST``."""
+    if not (np.abs(vertices) <= LARGEST).all():
+        raise ValueError(f"its part {name!r} has vertices that are NaN, infinite or beyond {LARGEST:g}")
 
 
 def _check_off(path: Path) -> None:
@@ -322,8 +331,7 @@ def read_glb(path: str | Path) -> GlbScene:
 
 def _glb_part(scene: Any, node: str, base: str, number: int, stem: str) -> _GlbPart:
     vertices, faces, geometry = _in_frame(scene, node, base)
-    if not np.isfinite(vertices).all():
-        raise ValueError(f"its mesh {node!r} has places that are not finite")
+    _check_places(node, vertices)
     color, colors = _colors(geometry, PALETTE[number % len(PALETTE)])
     radii = geometry.vertex_attributes.get("_RADIUS95")
     facts = geometry.metadata.get("radius95")

@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import DepthImage, PointCloud
+from mereo.geometry.conventions import check_real
 from mereo.io.errors import reason
 from mereo.io.readers import valid_points
 from mereo.io.ros_recordings import cloud_points
@@ -119,7 +120,7 @@ def _positions(source: Any) -> tuple[Float[np.ndarray, "n 3"], str, bool]:
     name = f"{kind} of shape {values.shape}"
     if values.dtype.names is not None:
         return _structured_points(values, name), name, values.ndim > 1
-    _check_numbers(values, name)
+    check_real(values, name)
     if values.size == 0:
         return np.empty((0, 3)), name, False
     if values.ndim not in (2, 3) or values.shape[-1] != 3 or _is_color_image(values):
@@ -151,7 +152,7 @@ def _structured_points(records: np.ndarray, name: str) -> Float[np.ndarray, "n 3
         raise ValueError(f"{name} has the fields {listed(fields)}; x, y and z are needed: rename the fields")
     for axis in "xyz":
         what = f"the field {axis!r} of {name}"
-        _check_numbers(records[axis], what)
+        check_real(records[axis], what)
         if records[axis].shape != records.shape:
             raise ValueError(f"{what} holds several numbers; x, y and z are one each: name the fields of the positions")
     return np.stack([_floats(records[axis]).reshape(-1) for axis in "xyz"], axis=1)
@@ -184,13 +185,6 @@ def _array(source: Any, kind: str) -> np.ndarray:
 def _floats(values: np.ndarray) -> Float[np.ndarray, "..."]:
     """Values as 64-bit floats, NaN where they are masked."""
     return np.asarray(np.ma.filled(values.astype(np.float64), np.nan))
-
-
-def _check_numbers(values: np.ndarray, name: str) -> None:
-    if values.dtype.kind not in "fiu":
-        raise ValueError(
-            f"{name} has values of type {values.dtype}; positions are real numbers: give an array of floats or integers"
-        )
 
 
 def _is_color_image(values: np.ndarray) -> bool:

@@ -17,6 +17,7 @@ import numpy as np
 from mereo.geometry.brief import counted
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import CloudAxes
+from mereo.io.bounds import PositiveOrUnknown, check_bounds
 from mereo.io.config import InputConfig
 from mereo.io.intrinsics import read_intrinsics
 from mereo.io.readers import depth_of, is_depth_image, read_points, read_raw_depth, usable_depth, valid_points
@@ -44,12 +45,15 @@ class SensorFrame:
 
     path: Path
     cloud: PointCloud
-    unit_m: float | None
+    unit_m: PositiveOrUnknown
     axes: CloudAxes
     depth: DepthImage | None = None
     message: str = ""
     invalid: int = 0
     whole: DepthImage | None = None
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
 
     def __repr__(self) -> str:
         size = " x ".join(f"{side:.3g}" for side in np.ptp(self.cloud.points, axis=0) * self.metres)
@@ -117,6 +121,8 @@ def _check_options(path: Path, kind: Kind, reading: InputConfig) -> None:
     if kind == "point cloud":
         if reading.intrinsics is not None or reading.mask is not None or reading.depth_scale is not None:
             raise ValueError(f"{path} is read as a point cloud; leave out intrinsics, mask and depth scale")
+        if reading.frame_index is not None:
+            raise ValueError(f"{path} is one point cloud, not a recording of many: leave out --frame-index")
         return
     if reading.frame != "camera":
         raise ValueError(f"the frame is {reading.frame!r} but {path} is a {kind}; those are always in the camera frame")

@@ -21,6 +21,7 @@ from mereo.io.bounds import (
     Points,
     Positive,
     ProperFraction,
+    Radius,
     Share,
     Width,
     Widths,
@@ -100,10 +101,10 @@ class PointNet2Config:
 
     neighbors: Neighbors = 64
     ratio1: Share = 0.5
-    radius1: Positive = 0.2
+    radius1: Radius = 0.2
     mlp1: Widths = (64, 64, 128)
     ratio2: Share = 0.25
-    radius2: Positive = 0.4
+    radius2: Radius = 0.4
     mlp2: Widths = (128, 128, 256)
     mlp_global: Widths = (256, 512, 1024)
 

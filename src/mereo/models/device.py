@@ -20,6 +20,9 @@ from torch.nn import functional as F
 
 from mereo.models.config import Device, Precision
 
+if hasattr(os, "register_at_fork"):  # OpenMP's other threads do not survive it, and would be waited for without end
+    os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
+
 
 def pick_device(rank: int = 0) -> torch.device:
     """CUDA device of a process where there is one, else the CPU."""

@@ -293,11 +293,16 @@ def _grid(
         raise ValueError(f"the box has sides {size.tolist()}; all must be positive and finite: check the point cloud")
     step = float(size.max()) / resolution
     x, y, z = (int(n) + 1 for n in np.ceil(size / step - 1e-6))
+    check_nodes(resolution, x, y, z)
+    return box[0].astype(np.float64), np.full(3, step), (x, y, z)
+
+
+def check_nodes(resolution: int, x: int, y: int, z: int) -> None:
+    """Raise ``ValueError`` for a grid with more than ``MAX_NODES`` nodes."""
     if x * y * z > MAX_NODES:
         raise ValueError(
             f"resolution {resolution} makes a grid of {x} x {y} x {z} nodes; at most {MAX_NODES} fit: lower it"
         )
-    return box[0].astype(np.float64), np.full(3, step), (x, y, z)
 
 
 def locate(field: Field, box: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "2 3"]:

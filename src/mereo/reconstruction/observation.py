@@ -35,6 +35,10 @@ CLOUD = Path("cloud")
 """Name of a frame that comes from no file."""
 
 
+STRAIGHT = 1e-6
+"""Spread of points across a line, in that along it, up to which they say nothing of a surface; fits take minutes to."""
+
+
 LIKE_SIZE, APART = 0.4, 0.25
 """Points of a second cluster, in those of the largest, and its distance from that, in its own size, from which on both
 may be objects."""
@@ -161,7 +165,20 @@ def find_object(
         )
     selection = select_object(frame.cloud, isolation, frame.metres, frame.axes)
     cloud = frame.cloud if selection.keep.all() else PointCloud(frame.cloud.points[selection.keep])
+    if _is_straight(cloud.points):
+        raise ValueError(
+            f"the {len(cloud)} points of {frame.source} lie on a line; the object's surface must be seen: check the "
+            "columns of the file, and what is cropped"
+        )
     return Observation(frame, cloud, selection.steps, selection, isolation.extent)
+
+
+def _is_straight(points: Float[np.ndarray, "n 3"]) -> bool:
+    """Whether enough points lie on a line; fewer, and points in one place, are refused by that."""
+    if len(points) < MIN_POINTS:
+        return False
+    along, across, _ = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(along > 0 and across <= STRAIGHT * along)
 
 
 def observe(

@@ -19,6 +19,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
+from ipaddress import ip_address
 from itertools import islice
 from multiprocessing import connection, resource_tracker
 from multiprocessing.connection import Connection
@@ -326,7 +327,8 @@ def connect(cluster: Cluster) -> Iterator[None]:
         try:
             if cluster.address == LOCAL:
                 count = cluster.local_cpus or cores()
-                ray.init("local", num_cpus=count, include_dashboard=False, _temp_dir=folder, **quiet)
+                with _loopback(ray):
+                    ray.init("local", num_cpus=count, include_dashboard=False, _temp_dir=folder, **quiet)
                 if not task_slots(cluster):
                     raise ValueError(
                         f"a task needs {cluster.cpus} CPUs and {cluster.gpus:g} GPUs, and this machine has less: "
@@ -346,6 +348,27 @@ def connect(cluster: Cluster) -> Iterator[None]:
             ) from error
         finally:
             ray.shutdown()
+
+
+@contextmanager
+def _loopback(ray: ModuleType) -> Iterator[None]:
+    """Let a cluster that starts in the block listen on this machine's own address alone: who reaches it runs code.
+
+    Ray takes an address of the network on Linux, also where ``init`` names the loopback, but for this constant, by
+    which it spares users of macOS and Windows the firewall's question. Raises ``ConnectionError`` where that fails.
+    """
+    constants: Any = import_module("ray._private.ray_constants")
+    before, constants.ENABLE_RAY_CLUSTER = constants.ENABLE_RAY_CLUSTER, False
+    try:
+        yield
+    finally:
+        constants.ENABLE_RAY_CLUSTER = before
+    address = ray.nodes()[0]["NodeManagerAddress"]
+    if not ip_address(address).is_loopback:
+        raise ConnectionError(
+            f"the servers of --ray local listen on {address}; they must listen on this machine's loopback alone: "
+            "install the Ray of constraints.txt, or start a cluster with `ray start --head` and give --ray auto"
+        )
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, SupportsIndex
 
 import numpy as np
 from jaxtyping import Float
@@ -17,7 +18,7 @@ from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.progress import stage
 from mereo.models.trained import Trained
 from mereo.reconstruction.isolation import Reading
-from mereo.reconstruction.isosurfaces import Extraction
+from mereo.reconstruction.isosurfaces import Extraction, check_nodes
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.pipeline import (
     EncodedFrame,
@@ -111,6 +112,12 @@ class Answer:
     seconds: float = 0.0
     located_by: LocatedBy = "network"
     tracking: Tracking = "found"
+
+    def __reduce_ex__(self, protocol: SupportsIndex) -> Any:
+        raise TypeError(
+            "a result cannot be pickled or copied, as it holds search structures of compiled libraries: write it with "
+            "result.save(), or send result.surfaces or its segments, list(result)"
+        )
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.seen.frame.source!r}: {self.source})"
@@ -227,6 +234,7 @@ def _label_grid(mesh: SegmentedMesh, resolution: int) -> LabelGrid:
     low, high = mesh.bounds
     spacing = float((high - low).max()) / resolution
     counts = np.ceil((high - low) / spacing).astype(int) + 3
+    check_nodes(resolution, *counts.tolist())
     origin = (low + high - (counts - 1) * spacing) / 2
     labels = label_grid(mesh, *(origin[axis] + np.arange(counts[axis]) * spacing for axis in range(3)))
     return LabelGrid(labels, origin, np.full(3, spacing), mesh.names)

@@ -24,6 +24,7 @@ from mereo.fitting.registration.registration import Registration
 from mereo.fitting.search import WHOLE, Screen, rotations, search, tables_of
 from mereo.geometry.camera import SightLines
 from mereo.geometry.transforms import fit_rigid, transform_points
+from mereo.io.bounds import Cells, PositiveOrUnknown, check_value
 from mereo.io.cores import limit_blas_threads
 from mereo.io.progress import stage
 from mereo.models.trained import Trained
@@ -76,6 +77,8 @@ def answer_frame(
 
     Raises ``ValueError`` for unusable clouds, and where nothing is found and no network can answer.
     """
+    check_value("resolution", resolution, Cells, 128)
+    check_value("scene_unit", scene_unit, PositiveOrUnknown, None)
     started = time.perf_counter()
     with stage("register the model"):
         candidate, likelier = find(seen, model, registrar, keep_all, scene_unit)

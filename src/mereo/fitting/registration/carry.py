@@ -20,6 +20,7 @@ from mereo.geometry.solids import Solids, label_grid
 from mereo.geometry.subdivision import split_long_edges
 from mereo.geometry.transforms import best_rotations, transform_points
 from mereo.io.attachments import Attachment, Content, Placeable, Surfaces
+from mereo.io.bounds import check_value
 from mereo.io.config import CarryFrame
 from mereo.io.volume_files import Volume, is_labels
 from mereo.scenes.scene import SourceFrame
@@ -374,6 +375,7 @@ def place(attachments: Sequence[Attachment], registrar: Registrar, frame: CarryF
     Raises ``ValueError`` where the frame of the object's files is not known, and for an attachment that cannot belong
     to the object: most of its points are farther from it than it is long, or none of its voxels is in it.
     """
+    check_value("files", frame, CarryFrame, "source")
     T_scene_file = np.eye(4) if frame == "scene" else _source_frame(registrar).T_scene_source
     solids = Solids(registrar.model.rest)
     return tuple(_placed(attachment, T_scene_file, registrar.model, solids) for attachment in attachments)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal, SupportsIndex
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -13,13 +13,18 @@ from mereo.deformation.moving_least_squares import Anchors
 from mereo.fitting.draws.playback import Drawn
 from mereo.fitting.uncertainty import Explanation, Optimum, Uncertainty
 from mereo.geometry.brief import counted
+from mereo.geometry.conventions import LARGEST, check_real
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids, owned_centroids, signed_distance_and_direction
-from mereo.geometry.transforms import fit_rigid, transform_points
+from mereo.geometry.transforms import fit_rigid, is_rigid, transform_points
+from mereo.io.bounds import check_value
 from mereo.scenes.statistical_model import StatisticalModel, following
 
 Method = Literal["rest", "modes", "draws"]
 """Description of the state that was found: the rest model, unbent; coefficients of the modes; the scene's own draws."""
+
+Place = Literal["camera", "rest"]
+"""Frame of a point: the camera's, in the input's unit, or the rest model's, in scene units."""
 
 AT_ONCE = 20_000
 
@@ -92,6 +97,12 @@ class Registration:
     extra_radius: float = 0.0
     alike: int = 1
 
+    def __reduce_ex__(self, protocol: SupportsIndex) -> Any:
+        raise TypeError(
+            "a registration cannot be pickled or copied, as it holds search structures of compiled libraries: store "
+            "it with mereo.fitting.registration.state.save_state, or keep its material and mesh"
+        )
+
     def __repr__(self) -> str:
         trust = "" if self.accepted else "not believed, "
         unit = f"a scene unit is {self.scene_unit:.4g}"
@@ -145,7 +156,7 @@ class Registration:
         """Map points of the rest model to the camera frame.
 
         Args:
-            points: n x 3, rest pose, scene units.
+            points: n x 3, or x, y, z of one, rest pose, scene units.
             labels: of the segments that they move along with, 1 or more; by default those that hold them or come
                 nearest.
         """
@@ -186,7 +197,7 @@ class Registration:
         return Uncertainty(self.optimum, self.model, self.radius_scale, self.extra_radius)
 
     def radius95(
-        self, points: ArrayLike, labels: UInt8[np.ndarray, " n"] | None = None, *, at: Literal["camera", "rest"]
+        self, points: ArrayLike, labels: UInt8[np.ndarray, " n"] | None = None, *, at: Place
     ) -> Float[np.ndarray, " n"] | None:
         """Radius around each point that holds its true position with probability 0.95, in the input's unit.
 
@@ -200,6 +211,7 @@ class Registration:
                 nearest.
             at: "camera" for points of the camera frame in the input's unit, "rest" for scene units of the rest model.
         """
+        check_value("at", at, Place, "camera")
         if self.uncertainty is None:
             return None
         points = rows_of_three(points)
@@ -207,7 +219,7 @@ class Registration:
             labels = nearest_labels(self.solids if at == "camera" else self.rest_solids, points)
         return self.uncertainty.of_rest(self.to_rest(points, labels) if at == "camera" else points, labels)
 
-    def explain(self, what: ArrayLike | str, *, at: Literal["camera", "rest"] = "camera") -> Explanation | None:
+    def explain(self, what: ArrayLike | str, *, at: Place = "camera") -> Explanation | None:
         """What decides where a point of the object is: observed points, the network, or what was known of its states.
 
         Args:
@@ -217,6 +229,7 @@ class Registration:
         Returns None where the registration was read from a file. Raises ``ValueError`` for a name of no segment and
         for other than three coordinates.
         """
+        check_value("at", at, Place, "camera")
         if self.uncertainty is None:
             return None
         if isinstance(what, str):
@@ -226,7 +239,7 @@ class Registration:
             place = owned_centroids(self.mesh)[names.index(what)]
             decided = self.uncertainty.decided_centroid(names.index(what))
         else:
-            point = rows_of_three(np.asarray(what, dtype=np.float64)[None])
+            point = rows_of_three(np.asarray(what)[None])
             label = nearest_labels(self.solids if at == "camera" else self.rest_solids, point)
             rest = self.to_rest(point, label) if at == "camera" else point
             place = self.to_camera(rest, label)[0]
@@ -240,7 +253,13 @@ class Registration:
         return fit_rigid(self.optimum.unit * self.optimum.posterior.material, self.material)
 
     def moved(self, T_new_camera: Float[np.ndarray, "4 4"]) -> "Registration":
-        """Registration in another frame."""
+        """Registration in another frame; raises ``ValueError`` for a transform that is not rigid."""
+        check_real(T_new_camera, "the transform")
+        if not is_rigid(T_new_camera):
+            raise ValueError(
+                f"the transform is {T_new_camera.tolist()}; it must be rigid, a rotation and a translation, with "
+                "0 0 0 1 below: scale or shear the mesh instead"
+            )
         return replace(self, material=self.material @ T_new_camera[:3, :3].T + T_new_camera[:3, 3])
 
     @cached_property
@@ -249,11 +268,19 @@ class Registration:
 
 
 def rows_of_three(points: ArrayLike) -> Float[np.ndarray, "n 3"]:
-    """Points as an array of numbers; raises ``ValueError`` for another shape."""
-    array = np.asarray(points, dtype=np.float64)
+    """Points as an array of a row each, also where there is only x, y, z; raises ``ValueError`` for anything else."""
+    given = np.asarray(points)
+    check_real(given, "the array of points")
+    array = np.atleast_2d(given.astype(np.float64))
     if array.ndim != 2 or array.shape[1] != 3:
         raise ValueError(
             f"the points have the shape {array.shape}; they must be rows of x, y, z: reshape them to (n, 3)"
+        )
+    bad = int((~(np.abs(array) <= LARGEST)).any(axis=1).sum())
+    if bad:
+        raise ValueError(
+            f"{bad} of {counted(len(array), 'point')} are NaN, infinite or beyond {LARGEST:g}; all must be positions: "
+            "leave them out"
         )
     return array
 

@@ -23,7 +23,7 @@ from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import CURE, other_mesh
 from mereo.fitting.registration.registration import BELIEVED, Method, Registration
 from mereo.geometry.conventions import CloudAxes
-from mereo.geometry.transforms import fit_rigid, transform_points
+from mereo.geometry.transforms import fit_rigid, is_rigid, transform_points
 from mereo.io.atomic_files import write_json
 from mereo.scenes.draw_recorder import SMOOTH
 from mereo.scenes.parameters import Played, draw_names, played_back
@@ -48,10 +48,7 @@ STATE_CURE = "give the state.json of a `mereo reconstruct`"
 
 
 def _rigid(rows: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...]:
-    T = np.array(rows)
-    rotation, last = T[:3, :3], T[3].tolist()
-    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) and np.linalg.det(rotation) > 0
-    if not is_rotation or last != [0, 0, 0, 1]:
+    if not is_rigid(np.array(rows)):
         raise ValueError("it must be a rigid transform: a rotation, a translation, and 0 0 0 1 below")
     return rows
 
