@@ -106,10 +106,10 @@ def _broken_data(vertices: Vertices, faces: Faces) -> tuple[list[str], Bool[np.n
     if not finite.all():
         faults.append(f"has NaN or infinite vertices ({np.count_nonzero(~finite):,} of {len(vertices):,})")
     outside = (faces < 0) | (faces >= len(vertices))
-    usable = ~outside.any(axis=1)
+    usable = np.asarray(~outside.any(axis=1))
     if not usable.all():
         text = f"has a face that refers to vertex {int(faces[outside].max())} of {len(vertices)}"
-        more = np.count_nonzero(~usable) - 1
+        more = int(np.count_nonzero(~usable)) - 1
         faults.append(text + (f", and {counted(more, 'face')} more like it" if more else ""))
     usable[usable] = finite[faces[usable]].all(axis=1)
     return faults, usable
@@ -157,7 +157,8 @@ def _notes(vertices: Vertices, faces: Faces, surface: "_FrontWinding", unit: str
 
 def near(point: Float[np.ndarray, "3"], unit: str) -> str:
     """Phrase for a place, such as "near [1.5, 0, -2] mm"."""
-    return f"near [{', '.join(f'{value + 0.0:.4g}' for value in point)}]{unit and f' {unit}'}"
+    digits = 3 - int(np.floor(np.log10(max(float(np.abs(point).max()), 1e-300))))  # of the largest coordinate, for all
+    return f"near [{', '.join(f'{round(float(value), digits) + 0.0:.4g}' for value in point)}]{unit and f' {unit}'}"
 
 
 def faces_astray(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> bool:

@@ -182,13 +182,13 @@ FINER = 4
 
 LEVELS = 3
 
-MOST_BLOCKS = 500
+MOST_BLOCKS = 300
 """Blocks of 16 x 16 x 16 finer cells in a level, for time and memory."""
 
 FAR = 0.5
 """Distance of the old surface from the new one, in cells, beyond which something was lost."""
 
-MOST_SAMPLES = 200_000
+MOST_SAMPLES = 100_000
 
 
 def _remesh(vertices: Vertices, faces: Faces, unit: str) -> Step:
@@ -214,6 +214,7 @@ class _Body:
 
     def __init__(self, vertices: Vertices, faces: Faces) -> None:
         self.vertices, self.faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces, dtype=np.int64)
+        self._closed = Segment("", (0, 0, 0), vertices, faces).edge_imbalance() == (0, 0)
         self._tree = igl.AABB()
         self._tree.init(self.vertices, self.faces)
 
@@ -232,8 +233,23 @@ class _Body:
         # of a mesh with holes the winding number is one half away from the surface, too
         close = (self.distance(middle) < 1.51 * np.sqrt(3) * cell) | (np.abs(winding - 0.5) < 0.3)
         inside = np.repeat(winding[:, None] > 0.5, 64, axis=1)
-        inside[close] = self.inside((first[close, None] + NODES).reshape(-1, 3) * cell).reshape(-1, 64)
+        places = ((first[close, None] + NODES) * cell).reshape(-1, 3)
+        inside[close] = (self._inside_parts(places, cell) if self._closed else self.inside(places)).reshape(-1, 64)
         return inside
+
+    def _inside_parts(self, nodes: Vertices, cell: float) -> Bool[np.ndarray, " n"]:
+        """The same for nodes of whole blocks: one winding number, which is slow, for all nodes that none parts.
+
+        No surface lies between neighbours if the sum of their distances from it is more than their distance.
+        """
+        distance = self.distance(nodes)
+        pairs = (64 * np.arange(len(nodes) // 64)[:, None, None] + NEIGHBOURS).reshape(-1, 2)
+        pairs = pairs[distance[pairs].sum(axis=1) > 1.001 * cell]
+        graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(nodes),) * 2)
+        _, part = connected_components(graph, directed=False)
+        order = np.argsort(-distance, kind="stable")
+        _, first = np.unique(part[order], return_index=True)
+        return self.inside(nodes[order[first]])[part]
 
     def samples(
         self, faces: Int[np.ndarray, " m"], spacing: float, around: Vertices | None = None
@@ -258,11 +274,15 @@ class _Body:
         along = corners.reshape(-1, 3)[row] + share[:, None] * edges.reshape(-1, 3)[row]
         places = np.concatenate([corners.reshape(-1, 3)[first], along, spread])
         face = np.concatenate([first // 3, row // 3, face])
-        kept = np.ones(len(face), bool) if around is None else _within(places, around, 4.0)
+        kept = np.arange(len(face)) if around is None else np.flatnonzero(_within(places, around, 4.0))
+        kept = kept[:: 1 + len(kept) // MOST_SAMPLES]
         return places[kept], normal[face[kept]], faces[face[kept]]
 
 
 NODES = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+
+NEIGHBOURS = np.argwhere(np.triu(np.abs(NODES[:, None] - NODES).sum(axis=2) == 1))
+"""Pairs of nodes of a block."""
 
 CORNERS = np.array([[0, 0, 0], [0, 1, 0], [1, 1, 0], [1, 0, 0], [0, 0, 1], [0, 1, 1], [1, 1, 1], [1, 0, 1]])
 """Of a cell, in the order in which libigl's marching cubes give faces that face outwards."""
@@ -294,14 +314,14 @@ def _with_thin_parts(
 
     What is thin breaks into dashes before it vanishes. They are near it, so shells of few cells do not count.
     """
-    cell, faces, centres = 1.0, np.arange(len(body.faces)), None
+    cell, faces, centres, last = 1.0, np.arange(len(body.faces)), None, LEVELS
     for level in range(LEVELS + 1):
         places, normals, face = body.samples(faces, 2.0 * FINER**-level, centres)
         whole = _without_specks(solid, 8.0 * FINER**-level)
         way = _distance_to(whole, places)
         seeds = way > FAR
         seeds[seeds] = ~body.inside(places[seeds] + 1e-3 * normals[seeds])  # a union has nothing of what lies within
-        if level == LEVELS or not seeds.any():
+        if level == last or not seeds.any():
             break
         finer = FINER ** -(level + 1.0)
         depth = 2 * finer * normals[seeds]  # a tube of this diameter stays whole
@@ -311,6 +331,8 @@ def _with_thin_parts(
         if len(resolved):
             chosen = np.flatnonzero(_within(places, places[resolved], 2.0) & (way > FAR * FINER * finer))
             blocks = _blocks(places[chosen], way[chosen], 16 * finer, FINER * finer)
+            if len(blocks) > MOST_BLOCKS:  # of finer cells there would be even more
+                blocks, last = blocks[:MOST_BLOCKS], level + 1
             region = _boxes(blocks, 16 * finer)
             solid, cell = (whole - region) + (_fine_surface(body, blocks, finer) ^ region), finer
     worst = int(np.where(seeds, way, -1.0).argmax())
@@ -334,12 +356,12 @@ def _without_specks(solid: manifold3d.Manifold, side: float) -> manifold3d.Manif
 
 
 def _blocks(places: Vertices, way: Float[np.ndarray, " n"], side: float, margin: float) -> Int[np.ndarray, "b 3"]:
-    """Blocks of a lattice with a margin around places; where they are too many, those around the largest ``way``."""
+    """Blocks of a lattice with a margin around places, those around the largest ``way`` first."""
     shifts = margin * (np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) - 1)
     order = np.argsort(-way, kind="stable")
     touched = np.floor((places[order, None] + shifts) / side).astype(np.int64).reshape(-1, 3)
     blocks, first = np.unique(touched, axis=0, return_index=True)
-    return blocks[np.argsort(first)[:MOST_BLOCKS]]
+    return blocks[np.argsort(first)]
 
 
 def _boxes(blocks: Int[np.ndarray, "b 3"], side: float) -> manifold3d.Manifold:
@@ -388,7 +410,7 @@ def _distance_to(solid: manifold3d.Manifold, places: Vertices) -> Float[np.ndarr
 def farthest(before: Segment, after: Segment) -> tuple[float, Float[np.ndarray, "3"]]:
     """Largest distance of a surface from another one, and where; what lies within the first mesh does not count.
 
-    Measured at the corners and at up to 200,000 places between.
+    Measured at the corners and at up to 100,000 places between.
     """
     body = _Body(before.vertices, before.faces)
     length = float(np.linalg.norm(np.ptp(before.vertices, axis=0)))

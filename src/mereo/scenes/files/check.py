@@ -160,6 +160,7 @@ def _moved(before: Segment, kept: Segment, after: Segment, unit: str) -> str:
     finite = before.vertices[np.isfinite(before.vertices).all(axis=1)]
     was, now = (float(np.ptp(vertices, axis=0).max()) for vertices in (finite, after.vertices))
     (lost, where), (new, place) = farthest(kept, after), farthest(after, kept)
+    lost = lost if lost > 1e-9 * was else 0.0
     text = f"longest side {was:.5g} {unit} before, {now:.5g} now; "
     text += f"the old surface is at most {lost:.2g} {unit} from the new one"
     text += f" ({near(where, unit)})" if lost > NOTABLE * was else ""
