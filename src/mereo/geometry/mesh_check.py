@@ -157,7 +157,7 @@ def _notes(vertices: Vertices, faces: Faces, surface: "_FrontWinding", unit: str
 
 def near(point: Float[np.ndarray, "3"], unit: str) -> str:
     """Phrase for a place, such as "near [1.5, 0, -2] mm"."""
-    digits = 3 - int(np.floor(np.log10(max(float(np.abs(point).max()), 1e-300))))  # of the largest coordinate, for all
+    digits = 4 - int(np.floor(np.log10(max(float(np.abs(point).max()), 1e-300))))  # of the largest coordinate, for all
     return f"near [{', '.join(f'{round(float(value), digits) + 0.0:.4g}' for value in point)}]{unit and f' {unit}'}"
 
 
