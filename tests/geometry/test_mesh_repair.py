@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import manifold3d
 import numpy as np
 import pytest
 import trimesh
@@ -12,8 +13,9 @@ from scene_files import write_bar, write_mesh
 from shapes import ball, box, knobbly_torus, segment
 
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.mesh_check import examine, likely_unit, overlaps
-from mereo.geometry.mesh_repair import repaired, without_overlaps
+from mereo.geometry.mesh_check import examine, likely_unit, mesh_of, overlaps, solid_of
+from mereo.geometry.mesh_repair import farthest, repaired, without_overlaps
+from mereo.geometry.solids import Solids
 from mereo.scenes.files import check
 from mereo.scenes.files.build import MeshWarning
 from mereo.scenes.files.check import check_scene
@@ -69,7 +71,12 @@ TORUS = knobbly_torus(1)
         (half_turned(TORUS), "disagree in orientation", "turned 640 faces", TORUS.volume),
         (soup(TORUS, 1e-9), "open edges", "merged 4800 vertices", TORUS.volume),
         (soup(TORUS, 1e-5), "open edges", "merged 4800 vertices", TORUS.volume),
-        (replace(TORUS, faces=np.concatenate([TORUS.faces, TORUS.faces[:7]])), "open edges", "dropped 7", TORUS.volume),
+        (
+            replace(TORUS, faces=np.concatenate([TORUS.faces, TORUS.faces[:7]])),
+            "edges with more than two faces",
+            "dropped 7",
+            TORUS.volume,
+        ),
         (
             joined(
                 TORUS,
@@ -80,7 +87,7 @@ TORUS = knobbly_torus(1)
                 ),
             ),
             "3 open edges",
-            "removed 1 fragments (1 faces)",
+            "removed 1 fragment (1 face), 0.01 long, near [4.0",
             TORUS.volume,
         ),
         (
@@ -118,6 +125,78 @@ def test_the_last_resort_is_a_new_surface_that_keeps_the_shape() -> None:
     assert "new surface" in fixed.changes[-1]
     assert examine(fixed.segment).sound
     np.testing.assert_allclose(fixed.segment.bounds, twisted.bounds, atol=0.05)
+
+
+def horned(radius: float, horns: int) -> Segment:
+    """Ball of radius 1 with thin horns, a hole, and an arm that comes around and runs back into the ball."""
+    shell = ball((0, 0, 0), 1.0)
+    whole = solid_of(shell.vertices, shell.faces)
+    arm = manifold3d.Manifold.cylinder(3.2, 0.3, 0.3, 24).rotate((0, 90, 0)).translate((0.9, 0, 0))
+    whole += arm.refine_to_length(0.15)
+    for degrees in (0, 40)[:horns]:
+        horn = manifold3d.Manifold.cylinder(0.7, radius, radius, 12).rotate((0, -90, 0)).translate((-0.9, 0, 0))
+        whole += horn.rotate((0, 0, degrees))
+    vertices, faces = mesh_of(whole)
+    x, y, z = vertices.T
+    angle, out = (x - 1.2) / 0.6, 0.6 - y
+    bent = np.stack([1.2 + out * np.sin(angle), 0.6 - out * np.cos(angle), z], axis=1)
+    vertices = np.where(x[:, None] > 1.2, bent, vertices)
+    below = np.argsort(vertices[faces].mean(axis=1)[:, 2])
+    return Segment("part", (1, 2, 3), vertices, faces[below[3:]])
+
+
+def test_thin_horns_stay_where_a_new_surface_is_made() -> None:
+    part = horned(0.01, 2)
+    cell = float(np.ptp(part.vertices, axis=0).max()) / 128
+    assert cell > 0.02, "the horns are thinner than a cell"
+    fixed = repaired(part, "mm")
+    made = fixed.changes[-1]
+    assert "new surface" in made and "in thin places those below" in made and "also lost" not in made
+    assert examine(fixed.segment).sound
+    assert len(solid_of(fixed.segment.vertices, fixed.segment.faces).decompose()) == 1
+    np.testing.assert_allclose(fixed.segment.bounds, part.bounds, atol=cell / 2)
+    assert farthest(fixed.kept, fixed.segment)[0] < 0.6 * cell
+    for angle in np.radians([180, 220]):  # each is there along all of its length, and no thicker than it was
+        middle = np.linspace(1.05, 1.55, 40)[:, None] * [np.cos(angle), np.sin(angle), 0]
+        assert Solids(SegmentedMesh((fixed.segment,))).label(middle).all()
+        assert not Solids(SegmentedMesh((fixed.segment,))).label(middle + np.array([0, 0, 0.016])).any()
+
+
+def test_what_is_too_thin_for_the_finest_cells_is_said() -> None:
+    fixed = repaired(horned(1e-5, 1), "mm")
+    assert "also lost is what lies near [-1.6, 0, 0] mm, 0.6 mm from it, too thin or inside out" in fixed.changes[-1]
+    distance, place = farthest(fixed.kept, fixed.segment)
+    assert distance == pytest.approx(0.6, abs=0.02)
+    np.testing.assert_allclose(place, [-1.6, 0, 0], atol=1e-4)
+    assert farthest(fixed.segment, fixed.kept)[0] < 0.1
+
+
+def test_all_faults_of_a_segment_are_named_at_once() -> None:
+    crossing = joined(ball((0, 0, 0), 2.0), ball((2, 0, 0), 2.0), ball((9, 0, 0), 0.05, level=1))
+    vertices = np.concatenate([crossing.vertices, [[np.nan, 0, 0]]])
+    faces = crossing.faces.copy()
+    faces[[10, 400]] = faces[[10, 400], ::-1]
+    first = faces[0]
+    wing = [first[0], first[1], int(crossing.faces[-1, 0])]  # on an edge of the ball, which has two faces already
+    extra = [wing, [5, 5, 9], [7, 8, len(vertices) - 1], [0, 1, 99_999]]
+    health = examine(Segment("part", (1, 2, 3), vertices, np.concatenate([faces[:-1], extra])), "mm")
+    assert [text.split(", near")[0].split(" (")[0] for text in (*health.hopeless, *health.dirty)] == [
+        "has NaN or infinite vertices",
+        f"has a face that refers to vertex 99999 of {len(vertices)}",
+        "has 1 degenerate face with one vertex twice",
+        "has 5 open edges",
+        "has 1 edge with more than two faces",
+        "has 6 edges at which faces disagree in orientation",
+        "intersects itself",
+    ]
+    assert any("1 fragment" in note and "near [9, 0, 0] mm" in note for note in health.notes), health.notes
+
+
+def test_a_mesh_inside_out_with_a_hole_and_a_crossing_is_all_of_that() -> None:
+    part = joined(ball((0, 0, 0), 2.0), ball((2, 0, 0), 2.0))
+    health = examine(replace(part, faces=part.faces[1:, ::-1]), "m")
+    assert health.hopeless[0].startswith("has 100% of its surface facing inwards")
+    assert "has 3 open edges (1 hole, near [" in health.dirty[0] and "intersects itself (" in health.dirty[1]
 
 
 def test_nothing_is_made_of_nothing() -> None:
@@ -173,10 +252,14 @@ def test_check_counts_faults_and_repair_leaves_the_users_files(
     with pytest.raises(ValueError, match=r"bar.yaml has 3 faults, listed above: repair the meshes with --repair"):
         check_scene(str(path))
     printed = capsys.readouterr().out
-    assert "fault: it has 6 open edges (holes)" in printed and "left and right overlap in 15" in printed
+    assert (
+        "fault: it has 6 open edges (1 hole, near [103, 2.08, 9.17] mm)" in printed
+        and "left and right overlap in 15" in printed
+    )
     check_scene(str(path), repair=True)
     printed = capsys.readouterr().out
     assert "repaired left: filled 1 hole" in printed and "cut out" in printed
+    assert "longest side 20 mm before, 17 now; the old surface is at most 3 mm from the new one (near [120, " in printed
     assert {file: file.read_bytes() for file in before} == before
     fixed = (tmp_path / "bar-repaired.yaml").read_text()
     assert fixed.startswith("# bar.yaml with repaired meshes, written by `mereo scene check bar.yaml --repair`.\n")
@@ -223,7 +306,9 @@ def test_a_mesh_without_an_inside_is_reported_and_turned(tmp_path: Path, capsys:
         check_scene(str(path))
     assert "left                     192 faces\n  fault: it has 100% of its surface facing" in capsys.readouterr().out
     check_scene(str(path), repair=True)
-    assert "repaired left: turned 192 faces around" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "repaired left: turned 192 faces around" in printed
+    assert "  longest side 20 mm before, 20 now; the old surface is at most 0 mm from the new one\n" in printed
     files = [block["file"] for block in yaml.safe_load((tmp_path / "bar-repaired.yaml").read_text())["segments"]]
     assert files == ["left-repaired.ply", "right.stl"]
 

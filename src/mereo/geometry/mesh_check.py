@@ -9,9 +9,15 @@ import igl
 import manifold3d
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
+from mereo.geometry.brief import counted
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.solids import label_grid
+
+Vertices = Float[np.ndarray, "_ 3"]
+Faces = Int[np.ndarray, "_ 3"]
 
 MOST_BURIED = 5e-3
 """Share of a segment's surface that may lie within itself, as lips and eyelids do: two rays are compared anyway."""
@@ -31,11 +37,13 @@ class Health:
         dirty: faults that the winding number copes with.
         hopeless: faults that leave no inside.
         mendable: whether a repair may help.
+        notes: what does no harm by itself, but changes in a repair: fragments, faces without area.
     """
 
     dirty: tuple[str, ...] = ()
     hopeless: tuple[str, ...] = ()
     mendable: bool = True
+    notes: tuple[str, ...] = ()
 
     @property
     def sound(self) -> bool:
@@ -43,58 +51,201 @@ class Health:
         return not (self.dirty or self.hopeless)
 
 
-def examine(segment: Segment) -> Health:
-    """Faults of a mesh: missing or broken data, open edges, faces that disagree, face inwards or are buried.
+def examine(segment: Segment, unit: str = "") -> Health:
+    """All faults of a mesh: missing or broken data, wrong edges and faces, faces that face inwards or are buried.
+
+    Each fault has its number, and a place where it is. Faces without vertices are named, and left out of what follows.
 
     Across a face the winding number rises by one from its front to its back. In front of it, it is 0 on a solid's
     surface, 1 where the face lies within the mesh itself (a self-intersection), and -1 where it faces inwards. On both
     sides of an open surface that encloses nothing it is about a half.
+
+    Args:
+        segment: any mesh.
+        unit: of the vertices, such as "mm"; it stands behind each place.
     """
     vertices, faces = segment.vertices, segment.faces
     if len(faces) == 0:
         return Health(hopeless=("has no faces",), mendable=False)
-    if not np.isfinite(vertices).all():
-        return Health(hopeless=("has NaN or infinite vertices",))
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        return Health(hopeless=(f"has a face that refers to vertex {int(faces.max())} of {len(vertices)}",))
-    if not (segment.bounds[1] > segment.bounds[0]).all():
-        return Health(hopeless=("is flat, without any volume",), mendable=False)
+    hopeless, usable = _broken_data(vertices, faces)
+    faces = faces[usable]
+    if len(faces) == 0:
+        return Health(hopeless=tuple(hopeless), mendable=False)
+    corners = vertices[np.unique(faces)] if hopeless else vertices
+    if not (np.ptp(corners, axis=0) > 0).all():
+        return Health(hopeless=(*hopeless, "is flat, without any volume"), mendable=False)
+    collapsed = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
     dirty = []
-    open_edges, misoriented = segment.edge_imbalance()
-    if open_edges:
-        dirty.append(f"has {open_edges} open edges (holes)")
-    buried, backwards, undecided = _wrong_shares(segment)
-    if open_edges and undecided > MOST_UNDECIDED:
-        return Health(hopeless=(f"is an open surface ({open_edges} open edges) that encloses no volume",))
-    if backwards > MOST_BACKWARDS:
-        return Health(tuple(dirty), (f"has {backwards:.0%} of its surface facing inwards",))
-    if misoriented:
-        dirty.append(f"has {misoriented} edges at which faces disagree in orientation")
-    if buried > MOST_BURIED:
-        dirty.append(f"intersects itself ({buried:.1%} of its surface lies within it)")
-    return Health(tuple(dirty))
+    if collapsed.any():
+        where = near(vertices[faces[collapsed][0]].mean(axis=0), unit)
+        dirty.append(f"has {counted(int(collapsed.sum()), 'degenerate face')} with one vertex twice, {where}")
+    faces = faces[~collapsed]
+    if len(faces) == 0:
+        return Health(tuple(dirty), (*hopeless, "has no faces with three vertices"), mendable=False)
+    surface = _front_winding(vertices, faces)
+    opened, edges = _wrong_edges(vertices, faces, unit)
+    if opened and surface.share_where(surface.undecided) > MOST_UNDECIDED:
+        hopeless.append(f"is an open surface ({opened} open edges) that encloses no volume")
+        return Health((*dirty, *edges[1:]), tuple(hopeless), notes=_notes(vertices, faces, surface, unit))
+    dirty += edges
+    backwards, buried = surface.winding < -0.5, surface.winding > 0.5
+    turned = surface.share_where(backwards)
+    if turned > MOST_BACKWARDS:
+        place = f", {surface.place(backwards, unit)}" if turned < 0.995 else ""
+        hopeless.append(f"has {turned:.0%} of its surface facing inwards{place}")
+        buried |= surface.winding < -1.5  # inside out, what lies within the mesh has twice the winding number before it
+    if surface.share_where(buried) > MOST_BURIED:
+        share = f"{surface.share_where(buried):.1%} of its surface lies within it"
+        dirty.append(f"intersects itself ({share}, {surface.place(buried, unit)})")
+    return Health(tuple(dirty), tuple(hopeless), notes=_notes(vertices, faces, surface, unit))
+
+
+def _broken_data(vertices: Vertices, faces: Faces) -> tuple[list[str], Bool[np.ndarray, " f"]]:
+    """Faults of the arrays, and which faces can be used all the same."""
+    faults = []
+    finite = np.isfinite(vertices).all(axis=1)
+    if not finite.all():
+        faults.append(f"has NaN or infinite vertices ({np.count_nonzero(~finite):,} of {len(vertices):,})")
+    outside = (faces < 0) | (faces >= len(vertices))
+    usable = np.asarray(~outside.any(axis=1))
+    if not usable.all():
+        text = f"has a face that refers to vertex {int(faces[outside].max())} of {len(vertices)}"
+        more = int(np.count_nonzero(~usable)) - 1
+        faults.append(text + (f", and {counted(more, 'face')} more like it" if more else ""))
+    usable[usable] = finite[faces[usable]].all(axis=1)
+    return faults, usable
+
+
+def _wrong_edges(vertices: Vertices, faces: Faces, unit: str) -> tuple[int, list[str]]:
+    """Number of open edges, and phrases on them and on edges of too many faces or of faces that disagree."""
+    directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+    keys, inverse, uses = np.unique(
+        np.sort(directed, axis=1) @ [len(vertices), 1], return_inverse=True, return_counts=True
+    )
+    ends = np.stack(np.divmod(keys, len(vertices)), axis=1)
+    forth = np.where(directed[:, 0] < directed[:, 1], 1, -1)
+    unbalanced = np.bincount(inverse.ravel(), weights=forth) != 0
+    faults = []
+    rim = ends[uses == 1]
+    if len(rim):
+        graph = coo_array((np.ones(len(rim)), rim.T), shape=(len(vertices),) * 2)
+        _, loop = np.unique(connected_components(graph, directed=False)[1][rim[:, 0]], return_inverse=True)
+        longest = rim[loop == np.bincount(loop).argmax()]
+        holes = f"{counted(int(loop.max()) + 1, 'hole')}, the largest" if loop.max() else "1 hole,"
+        where = near(vertices[longest].mean(axis=(0, 1)), unit)
+        faults.append(f"has {counted(len(rim), 'open edge')} ({holes} {where})")
+    for wrong, what in (
+        (unbalanced & (uses > 2), "with more than two faces"),
+        (unbalanced & (uses == 2), "at which faces disagree in orientation"),
+    ):
+        if wrong.any():
+            where = near(vertices[ends[wrong][0]].mean(axis=0), unit)
+            faults.append(f"has {counted(int(wrong.sum()), 'edge')} {what}, {where}")
+    return len(rim), faults
+
+
+def _notes(vertices: Vertices, faces: Faces, surface: "_FrontWinding", unit: str) -> tuple[str, ...]:
+    notes = []
+    stray, what = fragments(vertices, faces, unit)
+    if stray.any():
+        notes.append(f"has {what}: a repair drops them")
+    flat = np.flatnonzero(~surface.proper)
+    if len(flat):
+        where = near(vertices[faces[flat[0]]].mean(axis=0), unit)
+        notes.append(f"has {counted(len(flat), 'face')} without area, {where}: they do no harm")
+    return tuple(notes)
+
+
+def near(point: Float[np.ndarray, "3"], unit: str) -> str:
+    """Phrase for a place, such as "near [1.5, 0, -2] mm"."""
+    digits = 4 - int(np.floor(np.log10(max(float(np.abs(point).max()), 1e-300))))  # of the largest coordinate, for all
+    return f"near [{', '.join(f'{round(float(value), digits) + 0.0:.4g}' for value in point)}]{unit and f' {unit}'}"
 
 
 def faces_astray(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> bool:
     """Whether neighbouring faces disagree in orientation, or some face inwards."""
-    segment = Segment("", (0, 0, 0), vertices, faces)
-    return segment.edge_imbalance()[1] > 0 or _wrong_shares(segment)[1] > 1e-3
+    surface = _front_winding(vertices, faces)
+    disagree = Segment("", (0, 0, 0), vertices, faces).edge_imbalance()[1] > 0
+    return disagree or surface.share_where(surface.winding < -0.5) > 1e-3
 
 
-def _wrong_shares(segment: Segment) -> tuple[float, float, float]:
-    """Shares of the surface that lie within the mesh itself, that face inwards, and that have an inside nowhere."""
-    low, high = segment.bounds
-    vertices = (segment.vertices - (low + high) / 2) / float(np.linalg.norm(high - low))
-    a, b, c = (vertices[segment.faces[:, k]] for k in range(3))
+@dataclass(frozen=True, eq=False)
+class _FrontWinding:
+    """Winding number before each face that has an area, the share of the surface that each is, and its middle.
+
+    Attributes:
+        proper: which faces have an area; the other arrays are of these.
+    """
+
+    winding: Float[np.ndarray, " p"]
+    share: Float[np.ndarray, " p"]
+    middle: Float[np.ndarray, "p 3"]
+    proper: Bool[np.ndarray, " f"]
+
+    @property
+    def undecided(self) -> Bool[np.ndarray, " p"]:
+        """Whether a face has as much of an inside before it as behind it."""
+        return (self.winding > -0.75) & (self.winding < -0.25)
+
+    def share_where(self, chosen: Bool[np.ndarray, " p"]) -> float:
+        """Share of the surface that some faces are."""
+        return float(self.share[chosen].sum())
+
+    def place(self, chosen: Bool[np.ndarray, " p"], unit: str) -> str:
+        """Where the largest of some faces is."""
+        return near(self.middle[np.where(chosen, self.share, -1.0).argmax()], unit)
+
+
+def _front_winding(vertices: Vertices, faces: Faces) -> _FrontWinding:
+    corners = vertices[np.unique(faces)]
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    vertices = (np.where(np.isfinite(vertices), vertices, low) - (low + high) / 2) / float(np.linalg.norm(high - low))
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     area = np.linalg.norm(normal, axis=1)
     proper = area > 1e-12
+    middle = ((a + b + c) / 3)[proper]
     # a ten-thousandth of the box's diagonal before each face; libigl's winding number is in single precision
-    front = ((a + b + c) / 3)[proper] + 1e-4 * normal[proper] / area[proper, None]
-    winding = igl.fast_winding_number(vertices, segment.faces.astype(np.int64), front)
-    share = area[proper] / area.sum()
-    undecided = (winding > -0.75) & (winding < -0.25)
-    return float(share[winding > 0.5].sum()), float(share[winding < -0.5].sum()), float(share[undecided].sum())
+    front = middle + 1e-4 * normal[proper] / area[proper, None]
+    winding = igl.fast_winding_number(vertices, faces.astype(np.int64), front)
+    middle = middle * float(np.linalg.norm(high - low)) + (low + high) / 2
+    return _FrontWinding(winding, area[proper] / max(area.sum(), 1e-300), middle, proper)
+
+
+# --- pieces -----------------------------------------------------------------------------------------------------------
+
+
+def pieces(faces: Faces, vertices: int) -> Int[np.ndarray, " f"]:
+    """Number of the piece of each face; a piece is connected over edges which exactly two of its faces share."""
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1) @ [vertices, 1]
+    order = np.argsort(edges, kind="stable")
+    _, first, uses = np.unique(edges[order], return_index=True, return_counts=True)
+    pair = np.stack([order[first[uses == 2]], order[first[uses == 2] + 1]]) // 3
+    graph = coo_array((np.ones(pair.shape[1]), pair), shape=(len(faces), len(faces)))
+    return connected_components(graph, directed=False)[1].astype(np.int64)
+
+
+FRAGMENT = 0.02
+"""Diagonal of a fragment's box at most, in those of the whole."""
+
+
+def fragments(vertices: Vertices, faces: Faces, unit: str = "") -> tuple[Bool[np.ndarray, " f"], str]:
+    """Faces of pieces that are tiny beside the whole, and a phrase with their number, size and place."""
+    piece = pieces(faces, len(vertices))
+    corners = vertices[faces]
+    low, high = np.full((piece.max() + 1, 3), np.inf), np.full((piece.max() + 1, 3), -np.inf)
+    np.minimum.at(low, piece, corners.min(axis=1))
+    np.maximum.at(high, piece, corners.max(axis=1))
+    size = np.linalg.norm(high - low, axis=1)
+    tiny = size < FRAGMENT * float(np.linalg.norm(high.max(axis=0) - low.min(axis=0)))
+    if not tiny.any() or tiny.all():
+        return np.zeros(len(faces), bool), ""
+    stray = tiny[piece]
+    largest = int(np.where(tiny, size, -1.0).argmax())
+    length = f"{np.ptp([low[largest], high[largest]], axis=0).max():.2g}{unit and f' {unit}'}"
+    which = f"the largest {length} long" if tiny.sum() > 1 else f"{length} long"
+    where = near((low[largest] + high[largest]) / 2, unit)
+    return stray, f"{counted(int(tiny.sum()), 'fragment')} ({counted(int(stray.sum()), 'face')}), {which}, {where}"
 
 
 # --- units ------------------------------------------------------------------------------------------------------------
@@ -111,9 +262,6 @@ PLAUSIBLE_M = (0.005, 5.0)
 
 
 # --- solids of manifold3d ---------------------------------------------------------------------------------------------
-
-Vertices = Float[np.ndarray, "_ 3"]
-Faces = Int[np.ndarray, "_ 3"]
 
 
 def solid_of(vertices: Vertices, faces: Faces) -> manifold3d.Manifold:

@@ -1,7 +1,8 @@
 """Meshes made fit: pieces, holes, orientation, self-intersections, overlaps.
 
 ``repaired`` does only what a segment needs, in the order of least change, and says what it did. The surface itself is
-moved by the last resort alone, a new surface from the winding number. Everything is deterministic.
+moved by the last resort alone, a new surface from the winding number, with finer cells where parts are thin. Everything
+is deterministic.
 """
 
 from dataclasses import dataclass, replace
@@ -15,8 +16,20 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
-from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.mesh_check import Faces, Vertices, examine, faces_astray, mesh_of, overlaps, solid_of
+from mereo.geometry.brief import counted
+from mereo.geometry.mesh import Segment, SegmentedMesh, surface_points
+from mereo.geometry.mesh_check import (
+    Faces,
+    Vertices,
+    examine,
+    faces_astray,
+    fragments,
+    mesh_of,
+    near,
+    overlaps,
+    pieces,
+    solid_of,
+)
 
 MERGED_WITHIN = (1e-6, 1e-4)
 """Vertices of open edges this near to each other, in diagonals of the box, count as one; the less, where it helps."""
@@ -24,35 +37,49 @@ MERGED_WITHIN = (1e-6, 1e-4)
 
 @dataclass(frozen=True, eq=False)
 class Repair:
-    """Mended mesh and what was done to it, each as a phrase; none where it was sound."""
+    """Mended mesh and what was done to it, each as a phrase; none where it was sound.
+
+    Attributes:
+        segment: the mended mesh.
+        changes: phrases.
+        kept: the mesh before, without the faces and fragments that were dropped.
+    """
 
     segment: Segment
     changes: tuple[str, ...]
+    kept: Segment
 
 
-def repaired(segment: Segment) -> Repair:
+def repaired(segment: Segment, unit: str = "") -> Repair:
     """Segment mended to a closed solid that faces outwards and does not intersect itself.
+
+    Args:
+        segment: any mesh.
+        unit: of the vertices, such as "mm", for the phrases.
 
     Raises ``ValueError`` where nothing is left to work with.
     """
     if examine(segment).sound:
-        return Repair(segment, ())
+        return Repair(segment, (), segment)
     changes: list[str] = []
-    vertices, faces = segment.vertices, segment.faces
+    vertices, faces = kept = segment.vertices, segment.faces
     for step in (_drop_unusable, _merge_near, _drop_fragments, _orient, _fill_holes, _unite, _remesh):
         if changes and len(faces) and examine(replace(segment, vertices=vertices, faces=faces)).sound:
             break
-        vertices, faces, change = step(vertices, faces)
+        vertices, faces, change = step(vertices, faces, unit)
         changes += [change] if change else []
         if len(faces) == 0:
             raise ValueError(f"segment {segment.name!r} has no surface that could be repaired: export it again")
-    return Repair(replace(segment, vertices=vertices, faces=faces, solid=True), tuple(changes))
+        if step in (_drop_unusable, _drop_fragments):
+            kept = vertices, faces
+    whole = replace(segment, vertices=kept[0], faces=kept[1])
+    return Repair(replace(segment, vertices=vertices, faces=faces, solid=True), tuple(changes), whole)
 
 
 Step = tuple[Vertices, Faces, str]
 
 
-def _drop_unusable(vertices: Vertices, faces: Faces) -> Step:
+def _drop_unusable(vertices: Vertices, faces: Faces, unit: str) -> Step:
     """Faces without place or area, and repeated ones."""
     usable = np.all((faces >= 0) & (faces < len(vertices)), axis=1)
     usable[usable] = np.isfinite(vertices[faces[usable]]).all(axis=(1, 2))
@@ -61,11 +88,12 @@ def _drop_unusable(vertices: Vertices, faces: Faces) -> Step:
     _, first = np.unique(np.sort(kept, axis=1), axis=0, return_index=True)
     kept = kept[np.sort(first)]
     dropped = len(faces) - len(kept)
+    change = f"dropped {counted(dropped, 'unusable or repeated face')}" if dropped else ""
     used, kept = np.unique(kept, return_inverse=True)  # flat before numpy 2
-    return vertices[used], kept.reshape(-1, 3), f"dropped {dropped} unusable or repeated faces" if dropped else ""
+    return vertices[used], kept.reshape(-1, 3), change
 
 
-def _merge_near(vertices: Vertices, faces: Faces) -> Step:
+def _merge_near(vertices: Vertices, faces: Faces, unit: str) -> Step:
     """Vertices of open edges that are nearly the same, where that closes edges."""
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     best, fewest, change = (vertices, faces), len(open_edges(vertices, faces)), ""
@@ -75,7 +103,7 @@ def _merge_near(vertices: Vertices, faces: Faces) -> Step:
             left = len(open_edges(*merged))
             if left < fewest:
                 best, fewest = merged, left
-                change = f"merged {len(vertices) - len(merged[0])} vertices within {distance:.2g}"
+                change = f"merged {len(vertices) - len(merged[0])} vertices within {distance:.2g}{unit and f' {unit}'}"
     return *best, change
 
 
@@ -89,22 +117,15 @@ def _merged(vertices: Vertices, faces: Faces, distance: float) -> tuple[Vertices
     return vertices[first], merged[(merged != np.roll(merged, 1, axis=1)).all(axis=1)]
 
 
-def _drop_fragments(vertices: Vertices, faces: Faces) -> Step:
-    piece = pieces(faces, len(vertices))
-    corners = vertices[faces]
-    low, high = np.full((piece.max() + 1, 3), np.inf), np.full((piece.max() + 1, 3), -np.inf)
-    np.minimum.at(low, piece, corners.min(axis=1))
-    np.maximum.at(high, piece, corners.max(axis=1))
-    whole = float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    stray = np.linalg.norm(high - low, axis=1) < 0.02 * whole
-    if not stray.any() or stray.all():
+def _drop_fragments(vertices: Vertices, faces: Faces, unit: str) -> Step:
+    stray, what = fragments(vertices, faces, unit)
+    if not stray.any():
         return vertices, faces, ""
-    used, kept = np.unique(faces[~stray[piece]], return_inverse=True)
-    lost = int(stray[piece].sum())
-    return vertices[used], kept.reshape(-1, 3), f"removed {int(stray.sum())} fragments ({lost} faces)"
+    used, kept = np.unique(faces[~stray], return_inverse=True)
+    return vertices[used], kept.reshape(-1, 3), f"removed {what}"
 
 
-def _orient(vertices: Vertices, faces: Faces) -> Step:
+def _orient(vertices: Vertices, faces: Faces, unit: str) -> Step:
     """Neighbours agree, and each patch faces outwards; nothing where that is so, for a cavity's wall faces inwards."""
     if not faces_astray(vertices, faces):
         return vertices, faces, ""
@@ -125,14 +146,14 @@ def _signed_volume(vertices: Vertices, faces: Faces) -> float:
     return float(np.einsum("ij,ij->", a, np.cross(b, c)))
 
 
-def _fill_holes(vertices: Vertices, faces: Faces) -> Step:
+def _fill_holes(vertices: Vertices, faces: Faces, unit: str) -> Step:
     closed = close_holes(vertices, faces)
     holes = len(closed[0]) - len(vertices)
     added = len(closed[1]) - len(faces)
     return *closed, f"filled {holes} {'hole' if holes == 1 else 'holes'} with {added} faces" if holes else ""
 
 
-def _unite(vertices: Vertices, faces: Faces) -> Step:
+def _unite(vertices: Vertices, faces: Faces, unit: str) -> Step:
     """Closed shells that reach into each other become one; shells that face inwards are cavities, and are cut out."""
     try:
         solid = solid_of(vertices, faces)
@@ -148,38 +169,259 @@ def _unite(vertices: Vertices, faces: Faces) -> Step:
     return *mesh_of(united), f"united {len(shells)} shells that overlap"
 
 
-def _remesh(vertices: Vertices, faces: Faces) -> Step:
+# --- a new surface ----------------------------------------------------------------------------------------------------
+
+# In cells: one is 1 / CELLS of the longest side. Places of finer cells are multiples of powers of two, so that Booleans
+# along them are exact.
+
+CELLS = 128
+"""Cells along the longest side."""
+
+FINER = 4
+"""Cells of each level along one of the level before."""
+
+LEVELS = 3
+
+MOST_BLOCKS = 300
+"""Blocks of 16 x 16 x 16 finer cells in a level, for time and memory."""
+
+FAR = 0.5
+"""Distance of the old surface from the new one, in cells, beyond which something was lost."""
+
+MOST_SAMPLES = 100_000
+
+
+def _remesh(vertices: Vertices, faces: Faces, unit: str) -> Step:
     """A new surface where the winding number is one half, smooth because it is found by distances near the old one."""
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    step = float((high - low).max()) / 128
-    axes = [np.arange(low[k] - 2.5 * step, high[k] + 2.5 * step, step) for k in range(3)]
-    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    inside = igl.fast_winding_number(vertices, faces.astype(np.int64), nodes) > 0.5
-    squared = _near_squared(vertices, faces, nodes, inside.reshape([len(axis) for axis in axes]), step)
-    field = np.clip(np.sqrt(squared), 1e-3 * step, step) * np.where(inside, 1.0, -1.0)
-    shape = [len(axis) for axis in axes]
-    corners, triangles, _, _ = marching_cubes(field.reshape(shape), 0.0, gradient_direction="ascent")
-    solid = solid_of(corners.astype(np.float64) * step + [axis[0] for axis in axes], triangles.astype(np.int64))
-    solid = solid.simplify(0.2 * step)
-    return *mesh_of(solid), f"made a new surface from the winding number; details below {2 * step:.2g} are lost"
+    low = vertices.min(axis=0)
+    step = float(np.ptp(vertices, axis=0).max()) / CELLS
+    body = _Body((vertices - low) / step + 2.5, faces)
+    solid, cell, lost = _with_thin_parts(body, _even_surface(body))
+    behind = unit and f" {unit}"
+    change = f"made a new surface from the winding number; details below {2 * step:.2g}{behind} are lost"
+    if cell < 1:
+        change += f", in thin places those below {2 * cell * step:.2g}{behind}"
+    if lost:
+        where = f"{near((lost[1] - 2.5) * step + low, unit)}, {lost[0] * step:.2g}{behind} from it"
+        change += f"; also lost is what lies {where}, too thin or inside out: thicken it, turn its faces around, or "
+        change += "make it a segment of its own, which has finer cells"
+    corners, triangles = mesh_of(solid)
+    return (corners - 2.5) * step + low, triangles, change
 
 
-def _near_squared(
-    vertices: Vertices, faces: Faces, nodes: Vertices, inside: Bool[np.ndarray, "a b c"], step: float
-) -> Float[np.ndarray, " n"]:
-    """Squared distances of the nodes at which ``inside`` changes; elsewhere they do not matter."""
-    near = np.zeros_like(inside)
+class _Body:
+    """A mesh in cells: which places it encloses, and how far they are from it."""
+
+    def __init__(self, vertices: Vertices, faces: Faces) -> None:
+        self.vertices, self.faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces, dtype=np.int64)
+        self._closed = Segment("", (0, 0, 0), vertices, faces).edge_imbalance() == (0, 0)
+        self._tree = igl.AABB()
+        self._tree.init(self.vertices, self.faces)
+
+    def inside(self, places: Vertices) -> Bool[np.ndarray, " n"]:
+        """Whether the mesh winds around each place."""
+        return igl.fast_winding_number(self.vertices, self.faces, places) > 0.5
+
+    def distance(self, places: Vertices) -> Float[np.ndarray, " n"]:
+        """Distance from the surface."""
+        return np.sqrt(self._tree.squared_distance(self.vertices, self.faces, places)[0])
+
+    def inside_blocks(self, first: Int[np.ndarray, "b 3"], cell: float) -> Bool[np.ndarray, "b 64"]:
+        """The same for 4 x 4 x 4 nodes from ``first`` on, in cells of a size: far blocks are all in or all out."""
+        middle = (first + 1.5) * cell
+        winding = igl.fast_winding_number(self.vertices, self.faces, middle)
+        # of a mesh with holes the winding number is one half away from the surface, too
+        close = (self.distance(middle) < 1.51 * np.sqrt(3) * cell) | (np.abs(winding - 0.5) < 0.3)
+        inside = np.repeat(winding[:, None] > 0.5, 64, axis=1)
+        places = ((first[close, None] + NODES) * cell).reshape(-1, 3)
+        inside[close] = (self._inside_parts(places, cell) if self._closed else self.inside(places)).reshape(-1, 64)
+        return inside
+
+    def _inside_parts(self, nodes: Vertices, cell: float) -> Bool[np.ndarray, " n"]:
+        """The same for nodes of whole blocks: one winding number, which is slow, for all nodes that none parts.
+
+        No surface lies between neighbours if the sum of their distances from it is more than their distance.
+        """
+        distance = self.distance(nodes)
+        pairs = (64 * np.arange(len(nodes) // 64)[:, None, None] + NEIGHBOURS).reshape(-1, 2)
+        pairs = pairs[distance[pairs].sum(axis=1) > 1.001 * cell]
+        graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(nodes),) * 2)
+        _, part = connected_components(graph, directed=False)
+        order = np.argsort(-distance, kind="stable")
+        _, first = np.unique(part[order], return_index=True)
+        return self.inside(nodes[order[first]])[part]
+
+    def samples(
+        self, faces: Int[np.ndarray, " m"], spacing: float, around: Vertices | None = None
+    ) -> tuple[Vertices, Vertices, Int[np.ndarray, " n"]]:
+        """Corners of some faces and places about ``spacing`` apart, the normal there, and the face of each.
+
+        Where ``around`` is given, only those within four cells of it.
+        """
+        chosen = self.faces[faces]
+        corners = self.vertices[chosen]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = np.linalg.norm(normal, axis=1)
+        normal /= np.maximum(area, 1e-300)[:, None]
+        spread, face = surface_points(
+            self.vertices, chosen, int(np.clip(area.sum() / 2 / spacing**2, 1000, MOST_SAMPLES))
+        )
+        _, first = np.unique(chosen, return_index=True)
+        edges = np.roll(corners, -1, axis=1) - corners  # along which a thin part has places, however small its area is
+        count = np.ceil(np.linalg.norm(edges, axis=2) / spacing).astype(int).ravel()
+        row = np.repeat(np.arange(len(count)), np.where(count > 1, np.minimum(count, 1000), 0))
+        share = (np.arange(len(row)) - np.searchsorted(row, row)) / np.minimum(count, 1000)[row]
+        along = corners.reshape(-1, 3)[row] + share[:, None] * edges.reshape(-1, 3)[row]
+        places = np.concatenate([corners.reshape(-1, 3)[first], along, spread])
+        face = np.concatenate([first // 3, row // 3, face])
+        kept = np.arange(len(face)) if around is None else np.flatnonzero(_within(places, around, 4.0))
+        kept = kept[:: 1 + len(kept) // MOST_SAMPLES]
+        return places[kept], normal[face[kept]], faces[face[kept]]
+
+
+NODES = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+
+NEIGHBOURS = np.argwhere(np.triu(np.abs(NODES[:, None] - NODES).sum(axis=2) == 1))
+"""Pairs of nodes of a block."""
+
+CORNERS = np.array([[0, 0, 0], [0, 1, 0], [1, 1, 0], [1, 0, 0], [0, 0, 1], [0, 1, 1], [1, 1, 1], [1, 0, 1]])
+"""Of a cell, in the order in which libigl's marching cubes give faces that face outwards."""
+
+
+def _even_surface(body: _Body) -> manifold3d.Manifold:
+    """Surface from cells of one size."""
+    shape = np.ceil(body.vertices.max(axis=0) + 2.5 - 1e-9).astype(int)
+    blocks = -(-shape // 4)
+    first = 4 * np.stack(np.meshgrid(*map(np.arange, blocks), indexing="ij"), axis=-1).reshape(-1, 3)
+    inside = body.inside_blocks(first, 1.0).reshape(*blocks, 4, 4, 4).transpose(0, 3, 1, 4, 2, 5)
+    inside = inside.reshape(4 * blocks)[: shape[0], : shape[1], : shape[2]]
+    near_change = np.zeros_like(inside)
     for axis in range(3):
         change = np.diff(inside, axis=axis)
         for side in (slice(None, -1), slice(1, None)):
-            index = tuple(side if k == axis else slice(None) for k in range(3))
-            near[index] |= change
-    squared = np.full(len(nodes), step**2)
-    tree = igl.AABB()
-    tree.init(np.ascontiguousarray(vertices), np.ascontiguousarray(faces, dtype=np.int64))
-    rows = np.flatnonzero(near)
-    squared[rows] = tree.squared_distance(vertices, faces.astype(np.int64), nodes[rows])[0]
-    return squared
+            near_change[tuple(side if k == axis else slice(None) for k in range(3))] |= change
+    field = np.ones(inside.shape)
+    field[near_change] = np.clip(body.distance(np.argwhere(near_change).astype(float)), 1e-3, 1)
+    field[~inside] *= -1
+    corners, triangles, _, _ = marching_cubes(field, 0.0, gradient_direction="ascent")
+    return solid_of(corners.astype(np.float64), triangles.astype(np.int64)).simplify(0.2)
+
+
+def _with_thin_parts(
+    body: _Body, solid: manifold3d.Manifold
+) -> tuple[manifold3d.Manifold, float, tuple[float, Float[np.ndarray, "3"]] | None]:
+    """Solid with finer cells where the old surface is far from it; the least cell; the most still lost, and where.
+
+    What is thin breaks into dashes before it vanishes. They are near it, so shells of few cells do not count.
+    """
+    cell, faces, centres, last = 1.0, np.arange(len(body.faces)), None, LEVELS
+    for level in range(LEVELS + 1):
+        places, normals, face = body.samples(faces, 2.0 * FINER**-level, centres)
+        whole = _without_specks(solid, 8.0 * FINER**-level)
+        way = _distance_to(whole, places)
+        seeds = way > FAR
+        seeds[seeds] = ~body.inside(places[seeds] + 1e-3 * normals[seeds])  # a union has nothing of what lies within
+        if level == last or not seeds.any():
+            break
+        finer = FINER ** -(level + 1.0)
+        depth = 2 * finer * normals[seeds]  # a tube of this diameter stays whole
+        resolved = np.flatnonzero(seeds)[body.inside(places[seeds] - depth) & ~body.inside(places[seeds] + depth)]
+        centres = places[seeds]
+        faces = np.unique(face[_within(places, centres, 4.0)])
+        if len(resolved):
+            chosen = np.flatnonzero(_within(places, places[resolved], 2.0) & (way > FAR * FINER * finer))
+            blocks = _blocks(places[chosen], way[chosen], 16 * finer, FINER * finer)
+            if len(blocks) > MOST_BLOCKS:  # of finer cells there would be even more
+                blocks, last = blocks[:MOST_BLOCKS], level + 1
+            region = _boxes(blocks, 16 * finer)
+            solid, cell = (whole - region) + (_fine_surface(body, blocks, finer) ^ region), finer
+    worst = int(np.where(seeds, way, -1.0).argmax())
+    return (
+        whole.simplify(0.01 * cell) if cell < 1 else solid,
+        cell,
+        (float(way[worst]), places[worst]) if seeds.any() else None,
+    )
+
+
+def _within(places: Vertices, of: Vertices, distance: float) -> Bool[np.ndarray, " n"]:
+    """Whether a place lies as near to any of the others."""
+    return cKDTree(of).query(places, distance_upper_bound=distance)[0] < distance
+
+
+def _without_specks(solid: manifold3d.Manifold, side: float) -> manifold3d.Manifold:
+    """Solid without shells and cavities of less volume than a cube of a side."""
+    shells = solid.decompose()
+    kept = [shell for shell in shells if abs(shell.volume()) > side**3]
+    return solid if len(kept) == len(shells) else manifold3d.Manifold.compose(kept)
+
+
+def _blocks(places: Vertices, way: Float[np.ndarray, " n"], side: float, margin: float) -> Int[np.ndarray, "b 3"]:
+    """Blocks of a lattice with a margin around places, those around the largest ``way`` first."""
+    shifts = margin * (np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) - 1)
+    order = np.argsort(-way, kind="stable")
+    touched = np.floor((places[order, None] + shifts) / side).astype(np.int64).reshape(-1, 3)
+    blocks, first = np.unique(touched, axis=0, return_index=True)
+    return blocks[np.argsort(first)]
+
+
+def _boxes(blocks: Int[np.ndarray, "b 3"], side: float) -> manifold3d.Manifold:
+    cube = manifold3d.Manifold.cube((side, side, side))
+    return manifold3d.Manifold.batch_boolean(
+        [cube.translate(place) for place in (blocks * side).tolist()], manifold3d.OpType.Add
+    )
+
+
+def _fine_surface(body: _Body, blocks: Int[np.ndarray, "b 3"], cell: float) -> manifold3d.Manifold:
+    """Surface within blocks of 16 x 16 x 16 cells and one cell around; it is closed along their outside."""
+    parts = (
+        4 * blocks[:, None] + np.stack(np.meshgrid(*[np.arange(5)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    ).reshape(-1, 3)
+    first = 4 * np.unique(parts, axis=0) - 1
+    nodes = (first[:, None] + NODES).reshape(-1, 3)
+    inside = body.inside_blocks(first, cell).reshape(-1)
+    width = np.array([1 << 42, 1 << 21, 1])
+    keys = (nodes + (1 << 19)) @ width
+    order = np.argsort(keys)
+    place = np.minimum(np.searchsorted(keys, keys[:, None] + CORNERS @ width, sorter=order), len(keys) - 1)
+    corners = order[place]
+    whole = (keys[corners] == keys[:, None] + CORNERS @ width).all(axis=1)
+    corners = corners[whole]
+    inside &= np.bincount(corners.ravel(), minlength=len(nodes)) == 8
+    count = inside[corners].sum(axis=1)
+    corners = corners[(count > 0) & (count < 8)]
+    used, corners = np.unique(corners, return_inverse=True)
+    if len(used) == 0:
+        return manifold3d.Manifold()
+    places = nodes[used] * cell
+    field = np.clip(body.distance(places), 1e-3 * cell, cell) * np.where(inside[used], 1.0, -1.0)
+    vertices, faces = igl.marching_cubes(field, places, corners.reshape(-1, 8).astype(np.int64), 0.0)[:2]
+    return solid_of(vertices, faces.astype(np.int64)).simplify(0.2 * cell)
+
+
+def _distance_to(solid: manifold3d.Manifold, places: Vertices) -> Float[np.ndarray, " n"]:
+    if solid.is_empty():
+        return np.full(len(places), np.inf)
+    return _Body(*mesh_of(solid)).distance(places)
+
+
+# --- what a repair moved ----------------------------------------------------------------------------------------------
+
+
+def farthest(before: Segment, after: Segment) -> tuple[float, Float[np.ndarray, "3"]]:
+    """Largest distance of a surface from another one, and where; what lies within the first mesh does not count.
+
+    Measured at the corners and at up to 100,000 places between.
+    """
+    body = _Body(before.vertices, before.faces)
+    length = float(np.linalg.norm(np.ptp(before.vertices, axis=0)))
+    places, normals, _ = body.samples(np.arange(len(before.faces)), length / 300)
+    way = _Body(after.vertices, after.faces).distance(places)
+    # sorted, for winding numbers of all places would take longer than their distances
+    for rows in np.array_split(np.argsort(-way, kind="stable"), 64):
+        outer = ~body.inside(places[rows] + 1e-4 * length * normals[rows])
+        if outer.any():
+            return float(way[rows[outer.argmax()]]), places[rows[outer.argmax()]]
+    return 0.0, places[0]
 
 
 # --- segments together ------------------------------------------------------------------------------------------------
@@ -218,17 +460,7 @@ def _without_flecks(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
     return vertices[used], kept.reshape(-1, 3)
 
 
-# --- pieces and holes -------------------------------------------------------------------------------------------------
-
-
-def pieces(faces: Faces, vertices: int) -> Int[np.ndarray, " f"]:
-    """Number of the piece of each face; a piece is connected over edges which exactly two of its faces share."""
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1) @ [vertices, 1]
-    order = np.argsort(edges, kind="stable")
-    _, first, uses = np.unique(edges[order], return_index=True, return_counts=True)
-    pair = np.stack([order[first[uses == 2]], order[first[uses == 2] + 1]]) // 3
-    graph = coo_array((np.ones(pair.shape[1]), pair), shape=(len(faces), len(faces)))
-    return connected_components(graph, directed=False)[1].astype(np.int64)
+# --- the largest piece, and holes -------------------------------------------------------------------------------------
 
 
 def largest_piece(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:

@@ -14,8 +14,8 @@ from mereo.deformation.samplers import JointSampler, RandomMotion
 from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.mesh_check import PLAUSIBLE_M, Health, Overlap, examine, grid_volume, likely_unit, overlaps
-from mereo.geometry.mesh_repair import repaired, without_overlaps
+from mereo.geometry.mesh_check import PLAUSIBLE_M, Health, Overlap, examine, grid_volume, likely_unit, near, overlaps
+from mereo.geometry.mesh_repair import farthest, repaired, without_overlaps
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid
 from mereo.io.atomic_files import atomic_file, check_file_place, remove_abandoned
@@ -41,17 +41,17 @@ def check_scene(name: str, repair: bool = False) -> None:
         if repair:
             raise ValueError(f"--repair works on YAML scene files, and {name!r} is none: repair its meshes where it is")
         scene = load_scene(name)
-        faults = _report(scene.rest, _examined(scene.rest), "cubic units")
+        faults = _report(scene.rest, _examined(scene.rest, ""), "cubic units")
     else:
         document = Document(Path(name))
         file = read(document)
         mesh = read_segments(document, file)
-        health = _examined(mesh)
         unit = next((key for key, value in UNITS_M.items() if value == file.units), "unit")
+        health = _examined(mesh, unit)
         faults = _report(mesh, health, f"{unit}³")
         _report_size(mesh, file.units, unit)
         if faults and repair:
-            _check_repaired(document, mesh, health)
+            _check_repaired(document, mesh, health, unit)
             return
         if repair:
             print("no mesh needs a repair")
@@ -82,8 +82,8 @@ def _report_refinement(mesh: SegmentedMesh, rest: SegmentedMesh) -> None:
         print(f"faces: {before:,} in the files, {now:,} after dividing long ones, so that they bend")
 
 
-def _examined(mesh: SegmentedMesh) -> list[Health]:
-    return [examine(segment) for segment in mesh.segments]
+def _examined(mesh: SegmentedMesh, unit: str) -> list[Health]:
+    return [examine(segment, unit) for segment in mesh.segments]
 
 
 def _report(mesh: SegmentedMesh, health: list[Health], unit: str) -> int:
@@ -98,6 +98,10 @@ def _report(mesh: SegmentedMesh, health: list[Health], unit: str) -> int:
         for fault in (*condition.hopeless, *condition.dirty):
             faults += 1
             print(f"  fault: it {fault}")
+        for note in condition.notes:
+            print(f"  note: it {note}")
+        if not condition.mendable:
+            print(f"  cure: no repair makes a solid of it; export {segment.name} again as a closed surface")
     if usable:
         shared, count = overlaps(_marked(mesh, health)), len(health)
         for overlap in shared:
@@ -124,10 +128,13 @@ def _report_size(mesh: SegmentedMesh, unit_m: float, unit: str) -> None:
 
 # --- repairs ----------------------------------------------------------------------------------------------------------
 
+NOTABLE = 1e-3
+"""Distance of two surfaces, in longest sides, from which on the place is printed."""
 
-def _check_repaired(document: Document, mesh: SegmentedMesh, health: list[Health]) -> None:
+
+def _check_repaired(document: Document, mesh: SegmentedMesh, health: list[Health], unit: str) -> None:
     """Repair, say what was changed, write it, and check what was written."""
-    fixed = [repaired(segment) for segment in mesh.segments]
+    fixed = [repaired(segment, unit) for segment in mesh.segments]
     changes = {fix.segment.name: list(fix.changes) for fix in fixed}
     whole, cuts = without_overlaps(replace(mesh, segments=tuple(fix.segment for fix in fixed)))
     for name, cut in cuts.items():
@@ -137,6 +144,7 @@ def _check_repaired(document: Document, mesh: SegmentedMesh, health: list[Health
         index = mesh.names.index(segment.name)
         difference = _difference(mesh.segments[index], health[index], segment)
         print(f"repaired {segment.name}: {'; '.join(changes[segment.name])} ({difference})")
+        print(f"  {_moved(mesh.segments[index], fixed[index].kept, segment, unit)}")
     path = _write(document, whole, {segment.name for segment in changed})
     print(f"wrote {path} and the meshes that it names; checked again:")
     check_scene(str(path))
@@ -148,6 +156,20 @@ def _difference(before: Segment, health: Health, after: Segment) -> str:
         return faces
     was = before.volume if health.sound else grid_volume(replace(before, solid=False))
     return f"{faces}; volume {100 * (after.volume / was - 1) if was else np.inf:+.2g} %"
+
+
+def _moved(before: Segment, kept: Segment, after: Segment, unit: str) -> str:
+    """How the longest side changed, and how far the two surfaces are apart, each from the other where that is more."""
+    finite = before.vertices[np.isfinite(before.vertices).all(axis=1)]
+    was, now = (float(np.ptp(vertices, axis=0).max()) for vertices in (finite, after.vertices))
+    (lost, where), (new, place) = farthest(kept, after), farthest(after, kept)
+    lost = lost if lost > 1e-9 * was else 0.0
+    text = f"longest side {was:.5g} {unit} before, {now:.5g} now; "
+    text += f"the old surface is at most {lost:.2g} {unit} from the new one"
+    text += f" ({near(where, unit)})" if lost > NOTABLE * was else ""
+    if new > max(lost, NOTABLE * was):
+        text += f", the new one at most {new:.2g} {unit} from the old ({near(place, unit)})"
+    return text
 
 
 def _write(document: Document, mesh: SegmentedMesh, changed: set[str]) -> Path:
