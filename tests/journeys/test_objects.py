@@ -127,6 +127,28 @@ def test_a_tracker_begins_with_a_search_and_follows(angle: mereo.Object, points:
     assert first.located_by == second.located_by == "search"
 
 
+def test_an_initial_pose_takes_the_place_of_a_search(
+    found: mereo.Result, angle: mereo.Object, points: np.ndarray, meshes: list[str], tmp_path: Path
+) -> None:
+    again = mereo.reconstruct(points, angle, resolution=24, unit_m=1.0, initial_pose=found.pose)
+    assert again.located_by == "pose" and again.pose is not None and found.pose is not None
+    size = np.ptp(found.surfaces.merged()[0], axis=0).max()
+    assert np.abs(again.surfaces.merged()[0] - found.surfaces.merged()[0]).max() < 0.1 * size
+    found.save(tmp_path / "first", formats=["json"])
+    np.save(tmp_path / "frame.npy", points)
+    given = ["--unit-m", "1", "--initial-pose", str(tmp_path / "first/summary.json"), "--output", str(tmp_path / "out")]
+    objects = ["--object", *meshes, "--units", "mm", "--resolution", "24"]
+    assert command_line.main(["reconstruct", str(tmp_path / "frame.npy"), *objects, *given]) in (0, 3)
+    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    assert summary["registration"]["located_by"] == "pose"
+    np.testing.assert_allclose(summary["pose"], again.pose, atol=1e-4)
+    with pytest.raises(ValueError, match="the length of the frame's or of the object's unit is not known"):
+        mereo.reconstruct(points, angle, initial_pose=found.pose)
+    for wrong in (np.eye(3), 2 * np.eye(4), np.diag([1.0, 1.0, -1.0, 1.0]), np.full((4, 4), np.nan)):
+        with pytest.raises(ValueError, match=r"the pose is .*, and must be 4 x 4 finite numbers: a rotation and a"):
+            mereo.reconstruct(points, angle, unit_m=1.0, initial_pose=wrong)
+
+
 def test_what_is_defined_in_the_meshes_is_carried(found: mereo.Result, scene: Scene) -> None:
     corners = found.carry(scene.rest.merged()[0], files="scene")
     assert np.abs(corners - found.surfaces.merged()[0]).max() < 0.02 * np.ptp(corners, axis=0).max()

@@ -14,9 +14,10 @@ from typing import Any, overload
 
 import numpy as np
 from jaxtyping import Num
+from numpy.typing import ArrayLike
 
 from mereo.api.objects import Object, Source, object_of
-from mereo.api.result import Pose, Result
+from mereo.api.result import Result
 from mereo.api.words import in_callers_words, python_words
 from mereo.evaluation.sample_views import shipped_frame, shipped_frames
 from mereo.fitting import tracking
@@ -157,7 +158,7 @@ def reconstruct(
     resolution: int = 128,
     isolation: IsolationConfig | None = None,
     label_points: bool = False,
-    initial_pose: Pose | None = None,
+    initial_pose: ArrayLike | None = None,
     **reading: Any,
 ) -> Result | list[Result]:
     """Find all segments of an object in a frame, hidden side included: what ``mereo reconstruct`` does.

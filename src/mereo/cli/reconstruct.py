@@ -189,7 +189,8 @@ def print_source(answer: Answer) -> None:
     if registration is None:
         print(f"the network's answer, as no registration was found: {answer.refusal}")
         return
-    by = "; found by search" if answer.taken and answer.located_by == "search" else ""
+    ways = {"search": "; found by search", "pose": "; from the initial pose"}
+    by = ways.get(answer.located_by, "") if answer.taken else ""
     explained = f"the registered model explains {registration.explained:.1%} of the cloud ({registration.method}{by})"
     print(explained if answer.taken else f"{explained}: too little, the network's answer is kept")
     if answer.taken and not registration.accepted:

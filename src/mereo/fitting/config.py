@@ -8,8 +8,8 @@ AnswerMethod = Literal["auto", "network", "search", "modes", "full"]
 alone; the registered model in any case, found by a search without the network, or by its modes or the draws of its
 scene as well."""
 
-LocatedBy = Literal["search", "network"]
-"""Who found the object in a frame: a search over poses and states, or a trained network."""
+LocatedBy = Literal["search", "network", "pose"]
+"""What located the object in a frame: a search over poses and states, a trained network, or a pose that was given."""
 
 Tracking = Literal["found", "followed", "lost"]
 """State of a tracked object in a frame: found by itself; followed from the last frame; or lost, so that its pose is

@@ -112,6 +112,10 @@ CHECKED = 20
 """States of an elastic solid whose distance from its linear model is the model's residue."""
 
 
+WIDER = 2.0
+"""Motion of an elastic solid in its model, in that of the states that are drawn: real ones may go farther."""
+
+
 def elastic_model(
     rest: SegmentedMesh,
     nodes: Float[np.ndarray, "j 3"],
@@ -125,7 +129,7 @@ def elastic_model(
     The residue is the root mean square distance of ``states``, which bend as the modes do not, from the model.
     """
     points = material_points(rest, nodes)
-    flat = solid.modes.reshape(len(solid.modes), -1)
+    flat = WIDER * solid.modes.reshape(len(solid.modes), -1)
     modes = (solid.solid.mesh.embed(points) @ flat).reshape(len(points), 3, -1).astype(np.float32)
     library = np.random.default_rng(0).normal(size=(count, modes.shape[2])).astype(np.float32)
     model = StatisticalModel(rest, nodes, node_labels, points, modes, library, 0.0, PairDistances.none())

@@ -184,7 +184,8 @@ def _answer(registration: Mapping[str, Any], verdict: Trust) -> str:
     explained = _number(registration.get("explained"))
     if registration.get("answer") != "registration":
         return "the network's own answer"
-    how = "found by a search" if registration.get("located_by") == "search" else "registered"
+    ways = {"search": "found by a search", "pose": "fitted from the initial pose"}
+    how = ways.get(str(registration.get("located_by")), "registered")
     # two of the verdicts say themselves how much it explains
     share = "" if explained is None or verdict.level in ("yes", "unchecked") else f"{explained:.1%}"
     return f"your model, {how}" + (share and f": it explains {share} of the points")

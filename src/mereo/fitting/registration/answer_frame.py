@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from mereo.fitting.config import FitConfig
+from mereo.fitting.config import FitConfig, LocatedBy
 from mereo.fitting.modes import fit_rest, is_at_rest
 from mereo.fitting.problem.correspondences import nothing
 from mereo.fitting.problem.evidence import Evidence
@@ -308,14 +308,15 @@ def scene_unit_of(seen: Observation, registrar: Registrar, certain: float | None
 def _searched(frame: EncodedFrame, registrar: Registrar, scene_unit: float | None, seen: Observation) -> Candidate:
     """Candidate of one hypothesis by a search, or from the initial pose that is given."""
     model, start = registrar.model, None
+    by: LocatedBy = "search" if seen.initial_pose is None else "pose"
     try:
         check_size(frame, model, scene_unit)
         if seen.initial_pose is not None and scene_unit is not None:
             start = initial_state(frame.T_camera_input @ seen.initial_pose, model, scene_unit)
         modes = search_modes(cloud_to_fit(frame, seen.lines, scene_unit), model, registrar.config, start)
     except ValueError as error:
-        return Candidate(frame, error=error, located_by="search")
-    return Candidate(frame, modes, located_by="search")
+        return Candidate(frame, error=error, located_by=by)
+    return Candidate(frame, modes, located_by=by)
 
 
 def initial_state(T_camera_model: Float[np.ndarray, "4 4"], model: StatisticalModel, scene_unit: float) -> Posed:

@@ -322,7 +322,7 @@ class HeldPlace(Block):
         return np.asarray((self.radius or 0.0) * target.unit - np.linalg.norm(offset, axis=1))
 
 
-SOFT, STIFF = 0.2, 0.05
+SOFT, STIFF = 0.1, 0.025
 """``ElasticBlock.motion`` of what is soft, as organs are, and of what is stiff, as hard rubber is."""
 
 

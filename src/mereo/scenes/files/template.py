@@ -721,7 +721,7 @@ ELASTIC_TEXT = """\
 
 ELASTIC_COMMENT = """\
 #  - type: elastic  # bends the whole as well
-#    motion: 0.05
+#    motion: 0.025
 """
 
 RUBBER = """\
