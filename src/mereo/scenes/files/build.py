@@ -314,7 +314,7 @@ TOLERANCE = 0.05
 SHORTEST = 1.0
 """Edges up to this long, in scene units, are not halved: they follow any bend down to a radius of 2.5.
 
-In an elastic solid they may be half a cell of its lattice long, within which all moves in straight lines."""
+In an elastic solid they may be as long as a cell of its lattice, within which all moves in straight lines."""
 
 STATES = 8
 """Random states in which every edge is compared with its curve."""
@@ -342,7 +342,7 @@ def refined(rest: SegmentedMesh, draw: Callable[[np.random.Generator], tuple[Def
     """
     steps = draw.steps if isinstance(draw, RandomMotion) else ()
     cells = [sampler.solid.cell for sampler, _ in steps if isinstance(sampler, ElasticSampler)]
-    shortest = max([SHORTEST, *(0.5 * cell for cell in cells)])
+    shortest = max([SHORTEST, *cells])
     if not any(_is_long(segment, shortest) for segment in rest.segments):
         return rest
     states = [draw(example_rng(0, index)) for index in range(STATES)]
