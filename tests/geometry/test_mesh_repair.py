@@ -155,7 +155,7 @@ def test_thin_horns_stay_where_a_new_surface_is_made() -> None:
     assert examine(fixed.segment).sound
     assert len(solid_of(fixed.segment.vertices, fixed.segment.faces).decompose()) == 1
     np.testing.assert_allclose(fixed.segment.bounds, part.bounds, atol=cell / 2)
-    assert farthest(fixed.kept, fixed.segment)[0] < 0.6 * cell
+    assert farthest(fixed.kept, fixed.segment)[0][0] < 0.6 * cell
     for angle in np.radians([180, 220]):  # each is there along all of its length, and no thicker than it was
         middle = np.linspace(1.05, 1.55, 40)[:, None] * [np.cos(angle), np.sin(angle), 0]
         assert Solids(SegmentedMesh((fixed.segment,))).label(middle).all()
@@ -165,10 +165,19 @@ def test_thin_horns_stay_where_a_new_surface_is_made() -> None:
 def test_what_is_too_thin_for_the_finest_cells_is_said() -> None:
     fixed = repaired(horned(1e-5, 1), "mm")
     assert "also lost is what lies near [-1.6, 0, 0] mm, 0.6 mm from it, too thin or inside out" in fixed.changes[-1]
-    distance, place = farthest(fixed.kept, fixed.segment)
+    (distance, place), _ = farthest(fixed.kept, fixed.segment)
     assert distance == pytest.approx(0.6, abs=0.02)
     np.testing.assert_allclose(place, [-1.6, 0, 0], atol=1e-4)
-    assert farthest(fixed.segment, fixed.kept)[0] < 0.1
+    assert max(way for way, _ in farthest(fixed.segment, fixed.kept)) < 0.1
+
+
+def test_a_narrow_gap_that_is_closed_is_no_loss() -> None:
+    low, high, slit = box((0, 0, 0), (4, 4, 1.99)), box((0, 0, 2), (4, 4, 4)), box((0, 0, 0), (4, 4, 4))
+    (lost, _), (filled, place) = farthest(joined(low, high), slit)
+    assert lost == pytest.approx(0, abs=1e-12) and filled == pytest.approx(1.99, abs=0.05)
+    np.testing.assert_allclose(place[:2], [2, 2], atol=0.05)
+    (lost, place), (filled, _) = farthest(slit, low)
+    assert lost == pytest.approx(2.01) and place[2] == 4 and filled == pytest.approx(0, abs=1e-12)
 
 
 def test_all_faults_of_a_segment_are_named_at_once() -> None:
@@ -259,7 +268,10 @@ def test_check_counts_faults_and_repair_leaves_the_users_files(
     check_scene(str(path), repair=True)
     printed = capsys.readouterr().out
     assert "repaired left: filled 1 hole" in printed and "cut out" in printed
-    assert "longest side 20 mm before, 17 now; the old surface is at most 3 mm from the new one (near [120, " in printed
+    assert (
+        "longest side 20 mm before, 17 now; the old surface reaches at most 3 mm out of the new one (near [120, "
+        in printed
+    )
     assert {file: file.read_bytes() for file in before} == before
     fixed = (tmp_path / "bar-repaired.yaml").read_text()
     assert fixed.startswith("# bar.yaml with repaired meshes, written by `mereo scene check bar.yaml --repair`.\n")
@@ -308,7 +320,7 @@ def test_a_mesh_without_an_inside_is_reported_and_turned(tmp_path: Path, capsys:
     check_scene(str(path), repair=True)
     printed = capsys.readouterr().out
     assert "repaired left: turned 192 faces around" in printed
-    assert "  longest side 20 mm before, 20 now; the old surface is at most 0 mm from the new one\n" in printed
+    assert "  longest side 20 mm before, 20 now; the old surface reaches at most 0 mm out of the new one\n" in printed
     files = [block["file"] for block in yaml.safe_load((tmp_path / "bar-repaired.yaml").read_text())["segments"]]
     assert files == ["left-repaired.ply", "right.stl"]
 

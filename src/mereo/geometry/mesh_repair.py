@@ -318,14 +318,12 @@ def _with_thin_parts(
     for level in range(LEVELS + 1):
         places, normals, face = body.samples(faces, 2.0 * FINER**-level, centres)
         whole = _without_specks(solid, 8.0 * FINER**-level)
-        way = _distance_to(whole, places)
-        seeds = way > FAR
-        seeds[seeds] = ~body.inside(places[seeds] + 1e-3 * normals[seeds])  # a union has nothing of what lies within
+        way, seeds = _cut_off(body, whole, places, normals)
         if level == last or not seeds.any():
             break
         finer = FINER ** -(level + 1.0)
-        depth = 2 * finer * normals[seeds]  # a tube of this diameter stays whole
-        resolved = np.flatnonzero(seeds)[body.inside(places[seeds] - depth) & ~body.inside(places[seeds] + depth)]
+        # a tube of this diameter stays whole
+        resolved = np.flatnonzero(seeds)[body.inside(places[seeds] - 2 * finer * normals[seeds])]
         centres = places[seeds]
         faces = np.unique(face[_within(places, centres, 4.0)])
         if len(resolved):
@@ -398,30 +396,47 @@ def _fine_surface(body: _Body, blocks: Int[np.ndarray, "b 3"], cell: float) -> m
     return solid_of(vertices, faces.astype(np.int64)).simplify(0.2 * cell)
 
 
-def _distance_to(solid: manifold3d.Manifold, places: Vertices) -> Float[np.ndarray, " n"]:
+def _cut_off(
+    body: _Body, solid: manifold3d.Manifold, places: Vertices, normals: Vertices
+) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Distances from a new solid, and whether a place lies far out of it; a narrow gap that it closes is no loss."""
     if solid.is_empty():
-        return np.full(len(places), np.inf)
-    return _Body(*mesh_of(solid)).distance(places)
+        return np.full(len(places), np.inf), np.ones(len(places), bool)
+    made = _Body(*mesh_of(solid))
+    way = made.distance(places)
+    far = np.flatnonzero(way > FAR)
+    far = far[~made.inside(places[far])]
+    far = far[~body.inside(places[far] + 1e-3 * normals[far])]  # a union has nothing of what lies within
+    return way, np.isin(np.arange(len(places)), far)
 
 
 # --- what a repair moved ----------------------------------------------------------------------------------------------
 
 
-def farthest(before: Segment, after: Segment) -> tuple[float, Float[np.ndarray, "3"]]:
-    """Largest distance of a surface from another one, and where; what lies within the first mesh does not count.
+Reach = tuple[float, Float[np.ndarray, "3"]]
+"""A distance, and the place where it is."""
 
-    Measured at the corners and at up to 100,000 places between.
+
+def farthest(before: Segment, after: Segment) -> tuple[Reach, Reach]:
+    """Largest distance of a surface from another one, where it lies out of that, and where it lies within.
+
+    Parts of the first surface that lie within the first mesh itself do not count. Measured at the corners and at up to
+    100,000 places between.
     """
-    body = _Body(before.vertices, before.faces)
+    body, other = _Body(before.vertices, before.faces), _Body(after.vertices, after.faces)
     length = float(np.linalg.norm(np.ptp(before.vertices, axis=0)))
     places, normals, _ = body.samples(np.arange(len(before.faces)), length / 300)
-    way = _Body(after.vertices, after.faces).distance(places)
-    # sorted, for winding numbers of all places would take longer than their distances
+    way = other.distance(places)
+    reach: dict[bool, Reach] = {}
+    # the farthest first, for winding numbers of all places would take longer than their distances
     for rows in np.array_split(np.argsort(-way, kind="stable"), 64):
-        outer = ~body.inside(places[rows] + 1e-4 * length * normals[rows])
-        if outer.any():
-            return float(way[rows[outer.argmax()]]), places[rows[outer.argmax()]]
-    return 0.0, places[0]
+        outer = rows[~body.inside(places[rows] + 1e-4 * length * normals[rows])]
+        for row, within in zip(outer.tolist(), other.inside(places[outer]).tolist(), strict=True):
+            reach.setdefault(within, (float(way[row]), places[row]))
+        if len(reach) == 2 or (len(rows) and way[rows[-1]] < 1e-4 * length):
+            break
+    none = (0.0, places[0])
+    return reach.get(False, none), reach.get(True, none)
 
 
 # --- segments together ------------------------------------------------------------------------------------------------

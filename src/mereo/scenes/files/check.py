@@ -162,13 +162,15 @@ def _moved(before: Segment, kept: Segment, after: Segment, unit: str) -> str:
     """How the longest side changed, and how far the two surfaces are apart, each from the other where that is more."""
     finite = before.vertices[np.isfinite(before.vertices).all(axis=1)]
     was, now = (float(np.ptp(vertices, axis=0).max()) for vertices in (finite, after.vertices))
-    (lost, where), (new, place) = farthest(kept, after), farthest(after, kept)
-    lost = lost if lost > 1e-9 * was else 0.0
-    text = f"longest side {was:.5g} {unit} before, {now:.5g} now; "
-    text += f"the old surface is at most {lost:.2g} {unit} from the new one"
+    (lost, where), (filled, within) = farthest(kept, after)
+    new, place = max(farthest(after, kept), key=lambda reach: reach[0])
+    text = f"longest side {was:.5g} {unit} before, {now:.5g} now; the old surface reaches at most "
+    text += f"{lost if lost > 1e-9 * was else 0:.2g} {unit} out of the new one"
     text += f" ({near(where, unit)})" if lost > NOTABLE * was else ""
-    if new > max(lost, NOTABLE * was):
-        text += f", the new one at most {new:.2g} {unit} from the old ({near(place, unit)})"
+    if filled > NOTABLE * was:
+        text += f", and {filled:.2g} {unit} into it ({near(within, unit)}), where gaps were closed"
+    if new > max(lost, filled, NOTABLE * was):
+        text += f"; the new one is at most {new:.2g} {unit} from the old ({near(place, unit)})"
     return text
 
 
