@@ -154,8 +154,8 @@ def test_thin_horns_stay_where_a_new_surface_is_made() -> None:
     assert "new surface" in made and "in thin places those below" in made and "also lost" not in made
     assert examine(fixed.segment).sound
     assert len(solid_of(fixed.segment.vertices, fixed.segment.faces).decompose()) == 1
-    np.testing.assert_allclose(fixed.segment.bounds, part.bounds, atol=cell / 2)
-    assert farthest(fixed.kept, fixed.segment)[0][0] < 0.6 * cell
+    np.testing.assert_allclose(fixed.segment.bounds, part.bounds, atol=cell)
+    assert farthest(fixed.kept, fixed.segment)[0][0] < 1.1 * cell
     for angle in np.radians([180, 220]):  # each is there along all of its length, and no thicker than it was
         middle = np.linspace(1.05, 1.55, 40)[:, None] * [np.cos(angle), np.sin(angle), 0]
         assert Solids(SegmentedMesh((fixed.segment,))).label(middle).all()

@@ -148,7 +148,7 @@ def _notes(vertices: Vertices, faces: Faces, surface: "_FrontWinding", unit: str
     notes = []
     stray, what = fragments(vertices, faces, unit)
     if stray.any():
-        notes.append(f"has {what}: a repair drops them")
+        notes.append(f"has {what}: a repair merges or drops them")
     flat = np.flatnonzero(~surface.proper)
     if len(flat):
         where = near(vertices[faces[flat[0]]].mean(axis=0), unit)

@@ -185,8 +185,8 @@ LEVELS = 3
 MOST_BLOCKS = 300
 """Blocks of 16 x 16 x 16 finer cells in a level, for time and memory."""
 
-FAR = 0.5
-"""Distance of the old surface from the new one, in cells, beyond which something was lost."""
+FAR = 1.0
+"""Distance that the old surface may reach out of the new one, in cells: sharp edges are rounded by up to this."""
 
 MOST_SAMPLES = 100_000
 
@@ -327,7 +327,7 @@ def _with_thin_parts(
         centres = places[seeds]
         faces = np.unique(face[_within(places, centres, 4.0)])
         if len(resolved):
-            chosen = np.flatnonzero(_within(places, places[resolved], 2.0) & (way > FAR * FINER * finer))
+            chosen = np.flatnonzero(_within(places, places[resolved], 2.0) & (way > 0.5 * FINER * finer))
             blocks = _blocks(places[chosen], way[chosen], 16 * finer, FINER * finer)
             if len(blocks) > MOST_BLOCKS:  # of finer cells there would be even more
                 blocks, last = blocks[:MOST_BLOCKS], level + 1
