@@ -58,7 +58,9 @@ def test_crops_are_in_metres_whatever_the_unit() -> None:
     """Millimetres are 0.001 m a unit; both limits belong to the range."""
     for unit_m in (1.0, 0.001):
         crop = IsolationConfig(depth_range=(0.7, 0.8), box=(-0.1, -0.1, 0.0, 0.0, 0.1, 2.0))
-        points = np.array([[-0.05, 0, 0.7], [0.05, 0, 0.7], [-0.05, 0, 0.69], [-0.05, 0.2, 0.75]] * 40) / unit_m
+        corners = np.array([[-0.05, 0, 0.7], [0.05, 0, 0.7], [-0.05, 0, 0.69], [-0.05, 0.2, 0.75]])
+        around = 5e-4 * np.stack([np.arange(40) % 7, np.arange(40) // 7, np.zeros(40)], axis=1)
+        points = (corners + around[:, None]).reshape(-1, 3) / unit_m
         left, steps = isolate(PointCloud(points), crop, unit_m)
         assert len(left) == 40 and [step.name for step in steps] == ["depth range", "box"]
         assert [(step.before, step.kept) for step in steps] == [(160, 120), (120, 40)]

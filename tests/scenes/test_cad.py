@@ -319,7 +319,7 @@ def test_a_base_is_named_where_the_camera_looks_from_below(tmp_path: Path, capsy
     sentences: list[str] = []
     path = write_scene_file([file], tmp_path / "dome.yaml", report=sentences.append)
     check_scene(str(path))
-    (sentence,) = sentences
+    _, sentence = sentences
     assert sentence in capsys.readouterr().out.splitlines()
     assert sentence == (
         "base: it can stand on a flat base (normal 0 0 -1, 26% of its hull): if it stays on a table, the camera never "
@@ -386,7 +386,9 @@ def with_joints(written: Path, name: str) -> Path:
     head, tail = written.read_text().split("deformations:", 1)
     path = written.with_name(name)
     path.write_text(
-        head + "deformations:" + re.sub("^#  ", "  ", tail.split("  - type: elastic")[0], flags=re.MULTILINE)
+        head
+        + "deformations:"
+        + re.sub("^#  ", "  ", re.split("^  - type: (?:bend|elastic)", tail, flags=re.MULTILINE)[0], flags=re.MULTILINE)
     )
     return path
 

@@ -53,7 +53,7 @@ def test_every_example_in_the_comments_is_valid(tmp_path: Path) -> None:
     path.write_text(uncommented(path.read_text()))
     scene = load_scene(path)
     assert isinstance(scene.sample_deformations, RandomMotion)
-    assert len(scene.sample_deformations.steps) == 8
+    assert len(scene.sample_deformations.steps) == 6
     scene.sample_state(np.random.default_rng(0)).mesh.check()
 
 
