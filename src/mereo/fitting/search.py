@@ -573,7 +573,7 @@ def search(whole: Problem, partial: Problem | None = None, start: Posed | None =
             if better is not None:
                 return better.outcome()
             trails = [chosen]
-    return (chosen.with_heavier_cloud() or chosen).outcome()
+    return (heavier or chosen).outcome()
 
 
 def _total(scored: ScoredFit) -> float:

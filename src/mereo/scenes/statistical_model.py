@@ -19,7 +19,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 from mereo.deformation.moving_least_squares import ANCHORS, Anchors, PointWeights, spread
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.transforms import fit_rigid
+from mereo.geometry.transforms import fit_rigid, transform_points
 from mereo.io.checked_tensors import Tensors, pack_tensors, read_content, unpack_tensors
 from mereo.io.errors import reason
 from mereo.io.object_storage import Place, write_whole
@@ -191,6 +191,13 @@ class StatisticalModel:
     def rest_points(self) -> Float[np.ndarray, "m 3"]:
         """All material points at rest."""
         return material_points(self.rest, self.nodes)
+
+    def source_points(self, scene_unit: float) -> Float[np.ndarray, "m 3"]:
+        """Material points at rest in the frame of the object's own files, in a unit of which a scene unit has some."""
+        if self.source_frame is None:
+            return scene_unit * self.rest_points
+        T_source_scene = np.linalg.inv(self.source_frame.T_scene_source)
+        return scene_unit * self.source_frame.scale * transform_points(T_source_scene, self.rest_points)
 
     @cached_property
     def half(self) -> float:

@@ -321,10 +321,7 @@ def _searched(frame: EncodedFrame, registrar: Registrar, scene_unit: float | Non
 
 def initial_state(T_camera_model: Float[np.ndarray, "4 4"], model: StatisticalModel, scene_unit: float) -> Posed:
     """State of the model at rest with a pose as ``Result.pose``, in scene units."""
-    rest, source = model.rest_points, model.source_frame
-    if source is not None:
-        rest = transform_points(source.scale * np.linalg.inv(source.T_scene_source), rest)
-    placed = transform_points(T_camera_model, scene_unit * rest) / scene_unit
+    placed = transform_points(T_camera_model, model.source_points(scene_unit)) / scene_unit
     T = fit_rigid(model.material(model.rest_z), placed)
     return Posed(T[:3, :3], T[:3, 3], model.rest_z)
 

@@ -16,7 +16,7 @@ from mereo.geometry.brief import counted
 from mereo.geometry.conventions import LARGEST, check_real
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids, owned_centroids, signed_distance_and_direction
-from mereo.geometry.transforms import fit_rigid, is_rigid, transform_points
+from mereo.geometry.transforms import fit_rigid, is_rigid
 from mereo.io.bounds import check_value
 from mereo.scenes.statistical_model import StatisticalModel, following
 
@@ -132,10 +132,7 @@ class Registration:
 
     def pose(self, rows: Bool[np.ndarray, " m"] | slice = slice(None)) -> Float[np.ndarray, "4 4"]:
         """Best rigid motion of some material points, of the object's own files in the input's unit, to the frame."""
-        rest, source = self.model.rest_points, self.model.source_frame
-        if source is not None:
-            rest = transform_points(np.linalg.inv(source.T_scene_source), rest)
-        return fit_rigid(self.model_scale * rest[rows], self.material[rows])
+        return fit_rigid(self.model.source_points(self.scene_unit)[rows], self.material[rows])
 
     @cached_property
     def mesh(self) -> SegmentedMesh:

@@ -540,9 +540,8 @@ def _draft(name: str, source: _Source, units: str | None, aperture: float, way: 
 def choose_way(way: Way, joints: Sequence[Joint]) -> tuple[Way, str]:
     """How an object deforms, and why; ``ValueError`` where it is to be articulated and has no joints."""
     if way == "auto":
-        hinges = counted(sum(joint.hinge for joint in joints), "hinge")
-        if hinges[0] != "0":
-            return "articulated", f"for its parts touch like {hinges}"
+        if hinges := sum(joint.hinge for joint in joints):
+            return "articulated", f"for its parts touch like {counted(hinges, 'hinge')}"
         return "soft", "for its parts touch in planes alone" if joints else "for no parts of it touch like a hinge"
     if way == "articulated" and not joints:
         raise ValueError(
