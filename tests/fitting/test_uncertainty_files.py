@@ -18,7 +18,6 @@ from scipy.spatial import cKDTree
 from mereo.cli.answers import ReconstructCommand
 from mereo.cli.reconstruct import FrameJob, explain, target_of
 from mereo.cli.stream import FrameAnswer, line
-from mereo.evaluation.sample_views import load_view
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import CloudToFit, Registrar
 from mereo.fitting.tracking import Tracker
@@ -29,6 +28,7 @@ from mereo.models.model import Model
 from mereo.models.weights import load_model
 from mereo.reconstruction.observation import observe
 from mereo.reconstruction.stream import Outcome
+from mereo.synthesis.sample_views import load_view
 from mereo.visualization.reconstruction_report import MOST, UNEXPLAINED, explain_centroids, point_marks
 from mereo.visualization.result_files import write_answer, write_answer_file
 from mereo.visualization.units import Unit

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from mereo.evaluation.cases import EvaluatedView
 from mereo.synthesis.config import GenerateConfig, Sampler, SamplingConfig
 from mereo_experiments.paper.result import Claim, Result, Row, better, compare, published
 from mereo_experiments.paper.sampling_figure import draw_figure
 from mereo_experiments.paper.scales import ExperimentScale
 from mereo_experiments.paper.store import Score, Store
+from mereo_learning.cases import EvaluatedView
 
 QUESTION = "Which sampler of training queries teaches most?"
 
