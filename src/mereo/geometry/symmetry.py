@@ -4,6 +4,7 @@ The turns are about the centroid of the visible surface and, unless two of its s
 principal axes: a symmetry keeps both. Lengths are those of the mesh.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,6 +16,9 @@ from scipy.spatial.transform import Rotation
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import transform_points
+
+TOLERANCE = 0.45
+"""Scene units up to which a turned surface looks the same: a fit explains a point by a surface up to there."""
 
 SAMPLES, FEW = 4000, 300
 """Samples of all surfaces, and those among the visible ones that compare a turn before it is settled."""
@@ -53,7 +57,12 @@ class Symmetry:
     @property
     def swaps(self) -> bool:
         """Whether it is a permutation of segments that exchanges some."""
-        return None not in self.lands_on and self.lands_on != tuple(range(len(self.lands_on)))
+        return None not in self.lands_on and not self.keeps_segments
+
+    @property
+    def keeps_segments(self) -> bool:
+        """Whether each segment comes to lie on itself, so that the pose alone cannot be told."""
+        return self.lands_on == tuple(range(len(self.lands_on)))
 
     def describe(self, names: tuple[str, ...]) -> str:
         """Make a sentence of what no camera tells, for segments of these names."""
@@ -103,7 +112,7 @@ def find_symmetries(mesh: SegmentedMesh, tolerance: float) -> tuple[Symmetry, ..
     return _settled(surface, center, np.concatenate([around[:, None] * main, np.pi * across]))
 
 
-def describe_symmetries(symmetries: tuple[Symmetry, ...], names: tuple[str, ...]) -> list[str]:
+def describe_symmetries(symmetries: Sequence[Symmetry], names: tuple[str, ...]) -> list[str]:
     """Make one sentence for each thing that no camera tells: of symmetries with the same effect the first."""
     first = {symmetry.lands_on: symmetry for symmetry in reversed(symmetries)}
     kept = [symmetry for symmetry in symmetries if first[symmetry.lands_on] is symmetry]
