@@ -107,6 +107,19 @@ def numpy_and_volume(path: Path) -> tuple[Path, Path]:
     return path / "run.npy", path / "volume.vtk"
 
 
+def numpy_and(suffix: str) -> Callable[[Path], tuple[Path, Path]]:
+    """Positions beside the simulated mesh as Gmsh or Abaqus writes it."""
+
+    def write(path: Path) -> tuple[Path, Path]:
+        meshio = pytest.importorskip("meshio", reason="meshio is not installed: pip install 'mereo[dev]'")
+        np.save(path / "run.npy", to_file(states()))
+        faces = ("triangle", lattice().surface)
+        meshio.Mesh(to_file(lattice().nodes), [faces, ("tetra", lattice().elements)]).write(path / f"volume{suffix}")
+        return path / "run.npy", path / f"volume{suffix}"
+
+    return write
+
+
 def numpy_and_surface(path: Path) -> tuple[Path, Path]:
     moved = np.concatenate(list(moved_vertices().values()), axis=1)
     np.save(path / "run.npy", to_file(moved[:, ::-1]))
@@ -163,6 +176,8 @@ FORMATS: dict[str, Callable[[Path], Path | tuple[Path, Path]]] = {
     "obj": meshes("obj", rest=False),
     "stl": meshes("stl", rest=True),
     "NPY, VTK": numpy_and_volume,
+    "NPY, MSH": numpy_and(".msh"),
+    "NPY, INP": numpy_and(".inp"),
     "NPY, PLY": numpy_and_surface,
     "VTU": folder_of_displacements,
     "VTK": pattern_of_both,
@@ -391,6 +406,10 @@ def test_a_crash_of_the_reader_and_its_absence_are_sentences(tmp_path: Path, mon
     monkeypatch.setattr("mereo.io.vtk_frames.find_spec", lambda name: None)
     with pytest.raises(ImportError, match=r"run.pvd needs pyvista, .* pip install 'mereo\[simulation\]'"):
         load_states(tmp_path / "run.pvd", boxes())
+    (tmp_path / "part.msh").write_text("$MeshFormat", encoding="utf-8")
+    monkeypatch.setattr("mereo.io.vtk_frames.find_spec", lambda name: name != "meshio")
+    with pytest.raises(ImportError, match=r"part.msh needs meshio, .* pip install 'mereo\[simulation\]'"):
+        load_states(tmp_path / "part.msh", boxes())
 
 
 def test_too_few_frames_to_split_and_bad_settings_are_refused(tmp_path: Path) -> None:

@@ -105,7 +105,7 @@ def test_one_word_says_the_deformations(tmp_path: Path) -> None:
         (ELASTIC_BAR.replace("0.1", "0.9"), "motion"),
         (ELASTIC_BAR + "    tetrahedra: bar.vtu\n", "both cells and tetrahedra; .*: drop one"),
         (ELASTIC_BAR.replace("cells: 10", "tetrahedra: bar.vtu"), "bar.vtu does not exist"),
-        (ELASTIC_BAR.replace("cells: 10", "tetrahedra: bar.msh"), "suffix '.msh'; a volume mesh is one of"),
+        (ELASTIC_BAR.replace("cells: 10", "tetrahedra: bar.stl"), "suffix '.stl'; a volume mesh is one of"),
     ],
 )
 def test_blocks_that_do_not_fit_are_refused_with_their_line(tmp_path: Path, tail: str, message: str) -> None:
