@@ -407,7 +407,7 @@ def test_a_crash_of_the_reader_and_its_absence_are_sentences(tmp_path: Path, mon
     with pytest.raises(ImportError, match=r"run.pvd needs pyvista, .* pip install 'mereo\[simulation\]'"):
         load_states(tmp_path / "run.pvd", boxes())
     (tmp_path / "part.msh").write_text("$MeshFormat", encoding="utf-8")
-    monkeypatch.setattr("mereo.io.vtk_frames.find_spec", lambda name: name != "meshio")
+    monkeypatch.setattr("mereo.io.vtk_frames.find_spec", lambda name: None if name == "meshio" else name)
     with pytest.raises(ImportError, match=r"part.msh needs meshio, .* pip install 'mereo\[simulation\]'"):
         load_states(tmp_path / "part.msh", boxes())
 
