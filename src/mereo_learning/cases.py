@@ -35,10 +35,6 @@ from mereo.scenes.statistical_model import StatisticalModel
 
 # --- errors of a registration, and their radii ------------------------------------------------------------------------
 
-# Coverage: how often true positions lie within the radii of a registration, and the factor with which 95 % of them do.
-#
-# Registration, truth -RegistrationErrors.of-> errors of each view -together, scale-> Calibration.radius_scale
-
 
 def seen_points(truth: Float[np.ndarray, "m 3"], cloud: PointCloud, scene_unit: float) -> Bool[np.ndarray, " m"]:
     """Which material points a cloud shows: those whose true positions are within 1.5 scene units of an observed one."""
@@ -163,8 +159,6 @@ def _quantile(values: Float[np.ndarray, " n"], share: float, factor: float | Non
 
 # --- reliability of probabilities -------------------------------------------------------------------------------------
 
-# Reliability of probabilities: how often answers that are given with so much confidence are right.
-#
 # The expected calibration error (Naeini et al., AAAI 2015; Guo et al., ICML 2017) is the mean distance of the share of
 # right answers from their confidence, over bins of equal width, weighed by how many answers fall into each. Confidence
 # is the probability of the answered label, over the cells of the paper's metric (``geometry.metrics``).
@@ -333,8 +327,6 @@ def names_for(registrar: Registrar | None) -> tuple[AnswerName, ...]:
 
 
 # --- results of a test set --------------------------------------------------------------------------------------------
-
-# Result of a test set: scores of the answer that a user gets, and of each that could have answered.
 
 
 @dataclass(frozen=True, eq=False)
@@ -511,7 +503,7 @@ class Scoring:
         """Model and registrar on the device of whoever scores, moved there once."""
         if not self.gpu:
             return self.model, self.registrar
-        from mereo.models.remote import to_gpu  # needs torch, and results do not
+        from mereo.models.weights import to_gpu  # needs torch, and results do not
 
         model = to_gpu(self.model)
         return model, None if self.registrar is None else self.registrar.asking(model)
@@ -521,6 +513,11 @@ class Scoring:
         case, (model, registrar) = self.case(index), self.moved
         candidates = find_candidates(model, case.cloud, case.truth.grid, registrar, case.scene_unit)
         names, colors = segment_names(model)
+        registration, errors = candidates.answer.registration, None
+        if registration is not None and case.material is not None and case.scene_unit is not None:
+            truth = case.material(registration.model)
+            seen = seen_points(truth, case.cloud, case.scene_unit)
+            errors = RegistrationErrors.of(registration, truth, seen, case.scene_unit)
         return ScoredCase(
             name=case.name,
             each={
@@ -533,19 +530,11 @@ class Scoring:
             default=candidates.default,
             source=candidates.source,
             reliability=Reliability.of_view(model, candidates.code, case.truth),
-            errors=_errors(case, candidates.answer.registration),
+            errors=errors,
             view=_evaluated_view(case, model, candidates, colors) if index < self.kept else None,
             known=candidates.known,
             seconds=candidates.seconds,
         )
-
-
-def _errors(case: TestCase, registration: Registration | None) -> RegistrationErrors | None:
-    if registration is None or case.material is None or case.scene_unit is None:
-        return None
-    truth = case.material(registration.model)
-    seen = seen_points(truth, case.cloud, case.scene_unit)
-    return RegistrationErrors.of(registration, truth, seen, case.scene_unit)
 
 
 def _evaluated_view(case: TestCase, model: Trained, candidates: Candidates, colors: Sequence[Color]) -> EvaluatedView:

@@ -9,8 +9,8 @@ Notation: e examples, b of them in a batch, p stored points, n points that the n
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -46,13 +46,13 @@ class Draws:
     """
 
     rng: torch.Generator
-    batch: int | None = None
-    rows: slice = field(default_factory=lambda: slice(None))
+    batch: int | None
+    rows: slice
 
     @classmethod
-    def of(cls, seed: int, batch: int | None = None, rows: slice | None = None) -> "Draws":
+    def of(cls, seed: int, batch: int | None = None, rows: slice = slice(None)) -> "Draws":
         """Numbers of a seed, for these ``rows`` of a ``batch`` or for a whole one."""
-        return cls(torch.Generator().manual_seed(seed), batch, slice(None) if rows is None else rows)
+        return cls(torch.Generator().manual_seed(seed), batch, rows)
 
     def rand(self, count: int, *shape: int) -> Float[Tensor, "b *s"]:
         """Uniform numbers in [0, 1), so many for each example."""
@@ -171,7 +171,7 @@ Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Lower and upper corner."""
 
 Tensors = dict[str, Tensor]
-"""Examples by the names of a shard's tensors (``dataset_contents.SHARD`` and ``OBSERVED``)."""
+"""Examples by the names of a shard's tensors (``shards.SHARD`` and ``OBSERVED``)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,28 +309,18 @@ class Dataset:
         return augment_batch(batch, augment, draws)
 
 
-class ShuffledOrder:
-    """Order in which examples are learnt from: a permutation for each pass, by its seed and number alone.
+def shuffled_index(step: int, examples: int, batch: int, seed: int) -> Int[Tensor, " b"]:
+    """Numbers of the examples in the batch of a step: by a permutation for each pass, by its seed and number alone.
 
     So resuming needs no state. A batch may straddle two passes.
     """
+    positions = range(step * batch, (step + 1) * batch)
+    return torch.stack([_shuffled(p // examples, examples, seed)[p % examples] for p in positions])
 
-    def __init__(self, examples: int, batch: int, seed: int) -> None:
-        self.examples, self.batch, self.seed = examples, batch, seed
-        self.passes: dict[int, Tensor] = {}
 
-    def index(self, step: int) -> Int[Tensor, " b"]:
-        """Numbers of the examples in the batch of a step."""
-        positions = range(step * self.batch, (step + 1) * self.batch)
-        return torch.stack([self._pass(p // self.examples)[p % self.examples] for p in positions])
-
-    def _pass(self, number: int) -> Tensor:
-        """The shuffled examples of a pass; the two latest are kept."""
-        if number not in self.passes:
-            rng = torch.Generator().manual_seed(seed_of(self.seed, number, PASS))
-            kept = {n: order for n, order in self.passes.items() if n == number - 1}
-            self.passes = kept | {number: torch.randperm(self.examples, generator=rng)}
-        return self.passes[number]
+@lru_cache(maxsize=4)
+def _shuffled(number: int, examples: int, seed: int) -> Int[Tensor, " e"]:
+    return torch.randperm(examples, generator=torch.Generator().manual_seed(seed_of(seed, number, PASS)))
 
 
 def _observed_clouds(
