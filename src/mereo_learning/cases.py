@@ -185,14 +185,10 @@ class Reliability:
     """Answers counted by their confidence.
 
     Attributes:
-        count: of answers in each bin.
-        confidence: sum of theirs.
-        right: how many are right.
+        bins: of each bin how many answers it has, the sum of their confidence, and how many are right.
     """
 
-    count: Float[np.ndarray, " b"] = field(default_factory=lambda: np.zeros(BINS))
-    confidence: Float[np.ndarray, " b"] = field(default_factory=lambda: np.zeros(BINS))
-    right: Float[np.ndarray, " b"] = field(default_factory=lambda: np.zeros(BINS))
+    bins: Float[np.ndarray, "3 b"] = field(default_factory=lambda: np.zeros((3, BINS)))
 
     @classmethod
     def of_view(cls, model: Trained, code: EncodedCloud, truth: TruthGrid) -> "Reliability":
@@ -206,31 +202,23 @@ class Reliability:
     def add(self, confidence: Float[np.ndarray, " n"], right: Bool[np.ndarray, " n"]) -> None:
         """Count further answers, by the probability of what was answered and whether that is right."""
         index = np.minimum((confidence * BINS).astype(np.int64), BINS - 1)
-        self.count += np.bincount(index, minlength=BINS)
-        self.confidence += np.bincount(index, weights=confidence, minlength=BINS)
-        self.right += np.bincount(index, weights=right, minlength=BINS)
-
-    def add_all(self, other: "Reliability") -> None:
-        """Count what another one has counted."""
-        self.count += other.count
-        self.confidence += other.confidence
-        self.right += other.right
+        weights = (np.ones(len(index)), confidence, right)
+        self.bins += [np.bincount(index, weights=each, minlength=BINS) for each in weights]
 
     @property
     def ece(self) -> float:
         """Expected calibration error, 0 to 1; NaN without answers."""
-        total = self.count.sum()
-        return float(np.abs(self.right - self.confidence).sum() / total) if total else float("nan")
+        count, confidence, right = self.bins
+        total = count.sum()
+        return float(np.abs(right - confidence).sum() / total) if total else float("nan")
 
     def facts(self) -> list[dict[str, Any]]:
         """Bins that have answers: their share of all, mean confidence and share of right ones."""
+        total, filled = self.bins[0].sum(), self.bins[:, self.bins[0] > 0]
+        names = ("share", "confidence", "right")
         return [
-            {
-                "share": float(self.count[i] / self.count.sum()),
-                "confidence": float(self.confidence[i] / self.count[i]),
-                "right": float(self.right[i] / self.count[i]),
-            }
-            for i in np.flatnonzero(self.count)
+            dict(zip(names, map(float, row), strict=True))
+            for row in zip(filled[0] / total, filled[1] / filled[0], filled[2] / filled[0], strict=True)
         ]
 
 
@@ -554,9 +542,6 @@ def evaluation_of(model: Trained, cases: Sequence[ScoredCase], answers: Sequence
     """Result of a test set from its cases, in order, which all have these answers."""
     scores = AnswerScores.of([case.each[case.default] for case in cases], model.segmented)
     errors = [case.errors for case in cases if case.errors is not None]
-    reliability = Reliability()
-    for case in cases:
-        reliability.add_all(case.reliability)
     return Evaluation(
         names=segment_names(model)[0],
         confusion=scores.confusion,
@@ -567,7 +552,7 @@ def evaluation_of(model: Trained, cases: Sequence[ScoredCase], answers: Sequence
         sources=tuple(case.source for case in cases),
         known=tuple(case.known for case in cases if case.known is not None),
         errors=RegistrationErrors.together(errors) if errors else None,
-        reliability=reliability,
+        reliability=Reliability(np.sum([case.reliability.bins for case in cases], axis=0)),
         calibrated=model.calibrates,
         seconds=tuple(case.seconds for case in cases),
     )

@@ -25,6 +25,7 @@ import hashlib
 import json
 import platform
 import re
+import shutil
 from collections.abc import Iterable, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass
@@ -319,6 +320,15 @@ def generate(
     settings, examples, seed = config.settings, config.examples, config.seed
     loaded = load_scene(scene) if isinstance(scene, str) else scene
     manifest = make_manifest(loaded, settings, examples, seed)
+    if isinstance(output, Path):  # an object storage tells no free space
+        stored = sum(file.stat().st_size for file in output.glob("shard-*.safetensors"))
+        disk = next(folder for folder in output.absolute().parents if folder.is_dir())
+        needed, free = manifest["bytes"] // shard[1] - stored, shutil.disk_usage(disk).free
+        if needed > free:
+            raise ValueError(
+                f"--examples {examples} needs {needed / 1e9:,.1f} GB and {output} has {free / 1e9:,.1f} GB free: ask "
+                "for fewer, or change --output"
+            )
     numbers = range(shard[0], -(-examples // SHARD_SIZE), shard[1])
     before = claim(output, MANIFEST, manifest, "a dataset")
     if before is not None:

@@ -54,7 +54,7 @@ def test_the_error_is_the_distance_of_confidence_from_right_answers() -> None:
     assert counted.ece == pytest.approx(0.3)
     counted.add(np.full(10, 1.0), np.ones(10, dtype=bool))
     assert counted.ece == pytest.approx(0.15)
-    assert [bin["share"] for bin in counted.facts()] == [0.5, 0.5] and len(counted.count) == BINS
+    assert [bin["share"] for bin in counted.facts()] == [0.5, 0.5] and counted.bins.shape == (3, BINS)
     assert np.isnan(Reliability().ece)
 
 

@@ -126,6 +126,12 @@ def test_a_lost_network_is_no_damage(whole: Path, monkeypatch: pytest.MonkeyPatc
     assert contents(stored) == contents(whole)
 
 
+def test_more_examples_than_the_disk_has_room_for_are_refused_at_once(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"examples=10000000000 needs .* GB and .* GB free: ask for fewer, or change"):
+        generate(TOY, tmp_path / "data", SMALL, examples=10**10, seed=3)
+    assert not (tmp_path / "data").exists()
+
+
 # --- changed files ----------------------------------------------------------------------------------------------------
 
 

@@ -168,15 +168,9 @@ def write_graphs(graphs: Graphs, directory: Path, format: Literal["onnx", "torch
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Context without the warnings of torch about its own internals and packages that nobody needs here."""
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logger.setLevel(level)
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    with warnings.catch_warnings(action="ignore"):
+        yield
 
 
 def export_weights(
