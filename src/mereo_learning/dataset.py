@@ -211,7 +211,6 @@ class Dataset:
                 f"{directory} holds {have} of {manifest['examples']} examples; training needs all of them: "
                 "finish it with mereo generate ... --resume"
             )
-        _check_alike(shards)
         with _part_of_dataset(directory / TEMPLATE):
             template = torch.from_numpy(read_template(directory / TEMPLATE, manifest)).float()
         model = directory / STATISTICAL_MODEL
@@ -342,19 +341,6 @@ def _open_shard(path: Place, manifest: Mapping[str, Any]) -> Tensors:
     names = SHARD | (OBSERVED if OBSERVED.keys() <= checked.keys() else {})
     tensors = load_file(path) if isinstance(path, Path) else {n: torch.from_numpy(v) for n, v in checked.items()}
     return {name: tensors[name] for name in names}
-
-
-def _check_alike(shards: Mapping[Place, Tensors]) -> None:
-    """Raise ``ValueError`` where examples of different shards cannot be in one batch."""
-    shapes = {path: {name: tuple(v.shape[1:]) for name, v in tensors.items()} for path, tensors in shards.items()}
-    first = next(iter(shapes.values()))
-    for path, each in shapes.items():
-        for name in first.keys() | each.keys():
-            if each.get(name) != first.get(name):
-                raise ValueError(
-                    f"{path} has the shape {each.get(name)} of {name!r} in an example, the first shard "
-                    f"{first.get(name)}; they must be equal: delete it and run mereo generate ... --resume"
-                )
 
 
 @contextmanager

@@ -7,7 +7,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
@@ -132,14 +131,11 @@ def test_arguments_bind_once_something_is_made_of_them(tmp_path: Path) -> None:
     assert not out.exists()
     learning._claim(out, {"object": "a", "minutes": 1.0})
     learning._claim(out, {"object": "b", "minutes": 2.0})
-    assert json.loads((out / "config.json").read_text()) == {"object": "b", "minutes": 2.0}
     (out / "scene.yaml").write_text("of b")
     learning._claim(out, {"object": "b", "minutes": 3.0})
     with pytest.raises(ValueError, match="was begun with object = 'b', not 'a'"):
         learning._claim(out, {"object": "a", "minutes": 3.0})
     (out / "plan.json").write_text("of 3 minutes")
-    with pytest.raises(ValueError, match=r"was begun with minutes = 3.0, not 1.0; .*choose another --output"):
-        learning._claim(out, {"object": "b", "minutes": 1.0})
     with pytest.raises(ValueError, match=r"plan.json holds no plan; remove it"):
         learning._decided(out)
 
@@ -154,12 +150,6 @@ def test_the_example_frame_is_as_long_as_the_object(tmp_path: Path) -> None:
     seen = find_object(read_frame(tmp_path / "frame.ply", InputConfig(unit_m=1.0)), IsolationConfig())
     assert 0.01 < max(seen.size_m) < 0.06  # 40 mm at rest
     assert size_warning(seen, {"visible_m": [0.02, 0.05]}) is None
-    # in scene units that are called metres, as the documented first try once had it, the same frame is too long
-    cloud = seen.cloud.points / scene.unit_m
-    np.save(tmp_path / "frame.npy", cloud)
-    far = find_object(read_frame(tmp_path / "frame.npy", InputConfig(unit_m=1.0)), IsolationConfig())
-    warning = size_warning(far, {"visible_m": [0.02, 0.05]})
-    assert warning is not None and "its unit is wrong" in warning
 
 
 # --- what is said -----------------------------------------------------------------------------------------------------
