@@ -35,10 +35,6 @@ from mereo.scenes.statistical_model import StatisticalModel
 
 # --- errors of a registration, and their radii ------------------------------------------------------------------------
 
-# Coverage: how often true positions lie within the radii of a registration, and the factor with which 95 % of them do.
-#
-# Registration, truth -RegistrationErrors.of-> errors of each view -together, scale-> Calibration.radius_scale
-
 
 def seen_points(truth: Float[np.ndarray, "m 3"], cloud: PointCloud, scene_unit: float) -> Bool[np.ndarray, " m"]:
     """Which material points a cloud shows: those whose true positions are within 1.5 scene units of an observed one."""
@@ -163,8 +159,6 @@ def _quantile(values: Float[np.ndarray, " n"], share: float, factor: float | Non
 
 # --- reliability of probabilities -------------------------------------------------------------------------------------
 
-# Reliability of probabilities: how often answers that are given with so much confidence are right.
-#
 # The expected calibration error (Naeini et al., AAAI 2015; Guo et al., ICML 2017) is the mean distance of the share of
 # right answers from their confidence, over bins of equal width, weighed by how many answers fall into each. Confidence
 # is the probability of the answered label, over the cells of the paper's metric (``geometry.metrics``).
@@ -191,14 +185,10 @@ class Reliability:
     """Answers counted by their confidence.
 
     Attributes:
-        count: of answers in each bin.
-        confidence: sum of theirs.
-        right: how many are right.
+        bins: of each bin how many answers it has, the sum of their confidence, and how many are right.
     """
 
-    count: Float[np.ndarray, " b"] = field(default_factory=lambda: np.zeros(BINS))
-    confidence: Float[np.ndarray, " b"] = field(default_factory=lambda: np.zeros(BINS))
-    right: Float[np.ndarray, " b"] = field(default_factory=lambda: np.zeros(BINS))
+    bins: Float[np.ndarray, "3 b"] = field(default_factory=lambda: np.zeros((3, BINS)))
 
     @classmethod
     def of_view(cls, model: Trained, code: EncodedCloud, truth: TruthGrid) -> "Reliability":
@@ -212,31 +202,23 @@ class Reliability:
     def add(self, confidence: Float[np.ndarray, " n"], right: Bool[np.ndarray, " n"]) -> None:
         """Count further answers, by the probability of what was answered and whether that is right."""
         index = np.minimum((confidence * BINS).astype(np.int64), BINS - 1)
-        self.count += np.bincount(index, minlength=BINS)
-        self.confidence += np.bincount(index, weights=confidence, minlength=BINS)
-        self.right += np.bincount(index, weights=right, minlength=BINS)
-
-    def add_all(self, other: "Reliability") -> None:
-        """Count what another one has counted."""
-        self.count += other.count
-        self.confidence += other.confidence
-        self.right += other.right
+        weights = (np.ones(len(index)), confidence, right)
+        self.bins += [np.bincount(index, weights=each, minlength=BINS) for each in weights]
 
     @property
     def ece(self) -> float:
         """Expected calibration error, 0 to 1; NaN without answers."""
-        total = self.count.sum()
-        return float(np.abs(self.right - self.confidence).sum() / total) if total else float("nan")
+        count, confidence, right = self.bins
+        total = count.sum()
+        return float(np.abs(right - confidence).sum() / total) if total else float("nan")
 
     def facts(self) -> list[dict[str, Any]]:
         """Bins that have answers: their share of all, mean confidence and share of right ones."""
+        total, filled = self.bins[0].sum(), self.bins[:, self.bins[0] > 0]
+        names = ("share", "confidence", "right")
         return [
-            {
-                "share": float(self.count[i] / self.count.sum()),
-                "confidence": float(self.confidence[i] / self.count[i]),
-                "right": float(self.right[i] / self.count[i]),
-            }
-            for i in np.flatnonzero(self.count)
+            dict(zip(names, map(float, row), strict=True))
+            for row in zip(filled[0] / total, filled[1] / filled[0], filled[2] / filled[0], strict=True)
         ]
 
 
@@ -333,8 +315,6 @@ def names_for(registrar: Registrar | None) -> tuple[AnswerName, ...]:
 
 
 # --- results of a test set --------------------------------------------------------------------------------------------
-
-# Result of a test set: scores of the answer that a user gets, and of each that could have answered.
 
 
 @dataclass(frozen=True, eq=False)
@@ -511,7 +491,7 @@ class Scoring:
         """Model and registrar on the device of whoever scores, moved there once."""
         if not self.gpu:
             return self.model, self.registrar
-        from mereo.models.remote import to_gpu  # needs torch, and results do not
+        from mereo.models.weights import to_gpu  # needs torch, and results do not
 
         model = to_gpu(self.model)
         return model, None if self.registrar is None else self.registrar.asking(model)
@@ -521,6 +501,11 @@ class Scoring:
         case, (model, registrar) = self.case(index), self.moved
         candidates = find_candidates(model, case.cloud, case.truth.grid, registrar, case.scene_unit)
         names, colors = segment_names(model)
+        registration, errors = candidates.answer.registration, None
+        if registration is not None and case.material is not None and case.scene_unit is not None:
+            truth = case.material(registration.model)
+            seen = seen_points(truth, case.cloud, case.scene_unit)
+            errors = RegistrationErrors.of(registration, truth, seen, case.scene_unit)
         return ScoredCase(
             name=case.name,
             each={
@@ -533,19 +518,11 @@ class Scoring:
             default=candidates.default,
             source=candidates.source,
             reliability=Reliability.of_view(model, candidates.code, case.truth),
-            errors=_errors(case, candidates.answer.registration),
+            errors=errors,
             view=_evaluated_view(case, model, candidates, colors) if index < self.kept else None,
             known=candidates.known,
             seconds=candidates.seconds,
         )
-
-
-def _errors(case: TestCase, registration: Registration | None) -> RegistrationErrors | None:
-    if registration is None or case.material is None or case.scene_unit is None:
-        return None
-    truth = case.material(registration.model)
-    seen = seen_points(truth, case.cloud, case.scene_unit)
-    return RegistrationErrors.of(registration, truth, seen, case.scene_unit)
 
 
 def _evaluated_view(case: TestCase, model: Trained, candidates: Candidates, colors: Sequence[Color]) -> EvaluatedView:
@@ -565,9 +542,6 @@ def evaluation_of(model: Trained, cases: Sequence[ScoredCase], answers: Sequence
     """Result of a test set from its cases, in order, which all have these answers."""
     scores = AnswerScores.of([case.each[case.default] for case in cases], model.segmented)
     errors = [case.errors for case in cases if case.errors is not None]
-    reliability = Reliability()
-    for case in cases:
-        reliability.add_all(case.reliability)
     return Evaluation(
         names=segment_names(model)[0],
         confusion=scores.confusion,
@@ -578,7 +552,7 @@ def evaluation_of(model: Trained, cases: Sequence[ScoredCase], answers: Sequence
         sources=tuple(case.source for case in cases),
         known=tuple(case.known for case in cases if case.known is not None),
         errors=RegistrationErrors.together(errors) if errors else None,
-        reliability=reliability,
+        reliability=Reliability(np.sum([case.reliability.bins for case in cases], axis=0)),
         calibrated=model.calibrates,
         seconds=tuple(case.seconds for case in cases),
     )

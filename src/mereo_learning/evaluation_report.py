@@ -22,8 +22,7 @@ from mereo.io.atomic_files import atomic_file, new_directory, write_json
 from mereo.io.config import CONFIG
 from mereo.models.config import EXACT, InferenceConfig
 from mereo.models.model import Model
-from mereo.models.remote import settings_for
-from mereo.models.weights import load_for
+from mereo.models.weights import load_for, settings_for
 from mereo.scenes.registry import files_of
 from mereo.scenes.scene import Scene
 from mereo.visualization.reconstruction_report import BUDGET_BYTES
@@ -118,15 +117,13 @@ DASH = "–"
 def write_evaluation_report(
     path: str | Path, metrics: Mapping[str, Any], colors: Sequence[Color], picture: str | Path
 ) -> None:
-    """Write the page of an evaluation's scores, under ``BUDGET_BYTES``.
+    """Write the page of an evaluation's scores.
 
     Args:
         path: the .html file.
         metrics: what ``metrics.json`` holds, see ``scoring.metrics``; NaN is shown as a dash.
         colors: colours of the segments.
-        picture: a PNG file; it is made smaller where it is too large for the page.
-
-    Raises ``ValueError`` where even then the page is too large.
+        picture: a PNG file, which the page has as a JPEG, made smaller until it fits into ``BUDGET_BYTES``.
     """
     names, mean = tuple(metrics["per_segment"]), metrics["example_mean"]
     title = " on ".join(str(metrics[key]) for key in ("weights", "scene") if key in metrics) or "mereo evaluation"
@@ -145,18 +142,23 @@ def write_evaluation_report(
         )
     )
     words = escape(str(metrics.get("definition", "")))
-    room = BUDGET_BYTES - len(text.encode()) - len(STYLE) - len(words) - 2000
-    kind, data = _fitting(Path(picture), room * 3 // 4)
+    room, encoded = BUDGET_BYTES - len(text.encode()) - len(STYLE) - len(words) - 2000, io.BytesIO()
+    with Image.open(picture) as image:
+        small = image.convert("RGB")
+    small.save(encoded, "JPEG", quality=85)
+    while len(encoded.getvalue()) > room * 3 // 4 and min(small.size) > 16:
+        small = small.resize((max(1, small.width * 3 // 4), max(1, small.height * 3 // 4)))
+        encoded = io.BytesIO()
+        small.save(encoded, "JPEG", quality=85)
+    data = base64.b64encode(encoded.getvalue()).decode("ascii")
     page = (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{escape(title)}</title><style>{STYLE}</style></head><body><main>{text}"
         '<section><h2>Errors of the first examples</h2><img alt="clouds, reconstructions, errors and references" '
-        f'src="data:image/{kind};base64,{data}"></section><footer>Made by mereo: {words}.</footer></main></body>'
+        f'src="data:image/jpeg;base64,{data}"></section><footer>Made by mereo: {words}.</footer></main></body>'
         "</html>\n"
     ).encode("utf-8", errors="replace")
-    if len(page) > BUDGET_BYTES:
-        raise ValueError(f"the report has {len(page)} bytes; at most {BUDGET_BYTES}: evaluate fewer examples")
     with atomic_file(path) as partial:
         partial.write_bytes(page)
 
@@ -253,16 +255,3 @@ def _bar(value: float) -> str:
 
 def _percent(share: float) -> str:
     return "·" if share < 0.0005 else f"{100 * share:.1f}"
-
-
-def _fitting(path: Path, room_bytes: int) -> tuple[str, str]:
-    """The picture as it is, or as a JPEG that is made smaller until it fits: kind and base64 text."""
-    data, kind = path.read_bytes(), "png"
-    with Image.open(path) as image:
-        small = image.convert("RGB")
-    while len(data) > room_bytes and min(small.size) > 16:
-        encoded = io.BytesIO()
-        small.save(encoded, "JPEG", quality=85)
-        data, kind = encoded.getvalue(), "jpeg"
-        small = small.resize((max(1, small.width * 3 // 4), max(1, small.height * 3 // 4)))
-    return kind, base64.b64encode(data).decode("ascii")

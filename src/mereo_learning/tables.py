@@ -32,6 +32,7 @@ def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
     scores, (iou, miou), errors = evaluation.scores, evaluation.example_mean, evaluation.errors
     count = len(evaluation.examples)
     sources = evaluation.sources if len(evaluation.sources) == count else (None,) * count
+    said = [str(known).lower() for known in evaluation.known]
     known = evaluation.known if len(evaluation.known) == count else (None,) * count
     return {
         **facts,
@@ -59,7 +60,7 @@ def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
         "better": {name: _share_better(answer, evaluation) for name, answer in evaluation.answers.items()},
         "registration_error": None if errors is None else errors.summary(evaluation.unit_mm),
         "coverage95": None if errors is None else errors.coverage(evaluation.unit_mm),
-        "known": _recognition(evaluation),
+        "known": {word: said.count(word) / len(said) for word in ("true", "unsure", "false")} if said else None,
     }
 
 
@@ -77,14 +78,6 @@ def _answer(answer: AnswerScores, segmented: bool) -> dict[str, float]:
     scores = intersection_over_union(answer.confusion, segmented)
     tenth = float(np.quantile([example.miou for example in answer.examples], 0.1))
     return {"iou": scores.iou, "miou": scores.miou, "seconds": float(np.median(answer.seconds)), "miou_tenth": tenth}
-
-
-def _recognition(evaluation: Evaluation) -> dict[str, float] | None:
-    """Share of the examples that are said to show the object, not to, and unsure; None where nothing was said."""
-    if not evaluation.known:
-        return None
-    words = [str(known).lower() for known in evaluation.known]
-    return {word: words.count(word) / len(words) for word in ("true", "unsure", "false")}
 
 
 def certainty_lines(metrics: Mapping[str, Any]) -> list[str]:

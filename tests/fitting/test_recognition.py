@@ -34,7 +34,6 @@ from mereo.synthesis.sample_views import load_view
 from mereo_learning.calibrate import (
     CalibrationView,
     RecognitionSigns,
-    clean_views,
     object_views,
     other_objects,
     strange_frames,
@@ -223,7 +222,7 @@ def test_views_are_clean_and_noisy_in_turn_and_the_same_every_time() -> None:
 
 def test_further_views_are_clean_and_others_than_those_before_them() -> None:
     before = next(object_views(SCENE, 1, 710_000))
-    again, further = clean_views(SCENE, 2, 710_000, first=0)
+    again, further = object_views(SCENE, 0, 710_000, clean=2)
     assert [(view.camera, view.scene_unit) for view in (again, further)] == [("paper", 1.0)] * 2
     np.testing.assert_array_equal(before.seen.points, again.seen.points)
     assert not np.array_equal(before.mesh.bounds, further.mesh.bounds)

@@ -15,7 +15,7 @@ from mereo import __main__ as command_line
 from mereo.io.cores import THREAD_VARIABLES
 from mereo.models.config import InferenceConfig
 from mereo.models.model import Model
-from mereo.models.remote import settings_for, to_cpu
+from mereo.models.weights import settings_for, to_cpu
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import example_rng
 from mereo.workers import spread as spreading
