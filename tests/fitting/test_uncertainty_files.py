@@ -211,9 +211,9 @@ def test_a_stream_says_it_where_it_is_asked_to(model: Model, cloud: PointCloud) 
     assert "radius95" not in line(Outcome("frame", 0.0, silent, "", 0.0, 0.0, 0))
     assert set(words["radius95"]) == {"median", "max", "calibrated"} and words["radius95"]["median"] > 0
     for name in model.names:
-        assert "volume95" not in silent.segments[name]
-        low, high = told.segments[name]["volume95"]
-        assert low < told.segments[name]["volume"] < high and told.segments[name]["centroid_radius95"] > 0
+        assert "volume95" not in silent.facts["segments"][name]
+        low, high = words["segments"][name]["volume95"]
+        assert low < words["segments"][name]["volume"] < high and words["segments"][name]["centroid_radius95"] > 0
 
 
 def test_a_calibration_comes_from_the_weights(model: Model, cloud: PointCloud) -> None:

@@ -14,7 +14,7 @@ from written_results import segments
 
 from mereo import __main__ as command_line
 from mereo.cli.answers import StreamCommand
-from mereo.cli.stream import SurfaceFolder, stream_reconstructions
+from mereo.cli.stream import FrameAnswer, SurfaceFolder, stream_reconstructions
 from mereo.evaluation.sample_views import load_view
 from mereo.geometry.camera import PointCloud
 from mereo.io.config import InputConfig
@@ -112,7 +112,7 @@ def test_no_damaged_frame_ends_a_stream(tmp_path: Path, capsys: pytest.CaptureFi
 def test_a_sequence_that_breaks_off_is_told_after_its_frames_and_their_summary(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def frames(*_: object) -> Iterator[StreamFrame[PointCloud]]:
+    def frames(*_: object) -> Iterator[StreamFrame]:
         yield StreamFrame("first", 0.0, lambda: PointCloud(np.ones((40, 3))))
         raise ValueError("it is cut off")
 
@@ -143,13 +143,12 @@ def test_sources_that_are_none_are_refused(tmp_path: Path) -> None:
 
 def run(monkeypatch: pytest.MonkeyPatch, surfaces: Path, frames: tuple[str, ...], *more: str) -> int:
     """Exit code of a stream in which every frame is answered with the same surfaces."""
-    answered = SimpleNamespace(surfaces=segments())
+    answered = FrameAnswer(segments(), {})
     outcomes = [Outcome(name, 0.0, answered, "", 0.1, 0.1, 0) for name in frames]
     nothing = SimpleNamespace(network=None, registrar=lambda _: None)
     monkeypatch.setattr("mereo.cli.stream.loaded_object", lambda *_: nothing)
     monkeypatch.setattr("mereo.cli.stream.Answering", lambda *_: SimpleNamespace(close=lambda: None))
     monkeypatch.setattr("mereo.cli.stream.stream", lambda *_, **__: iter(outcomes))
-    monkeypatch.setattr("mereo.cli.stream.line", lambda outcome: {"error": outcome.error})
     return command_line.main(["stream", "-", "--weights", "rope", "--surfaces", str(surfaces), *more])
 
 
@@ -173,7 +172,7 @@ def test_a_frame_replaces_its_own_file_and_no_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(monkeypatch, tmp_path / "out", ("c d.npy", "c d.npy", "c_d.npy")) == 0
-    first, again, other = (json.loads(line)["error"] for line in capsys.readouterr().out.splitlines())
+    first, again, other = (json.loads(line).get("error", "") for line in capsys.readouterr().out.splitlines())
     assert (first, again) == ("", "") and other.endswith("c_d.npy.glb holds the surfaces of c d.npy: rename c_d.npy")
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["c_d.npy.glb"]
 
@@ -181,6 +180,6 @@ def test_a_frame_replaces_its_own_file_and_no_other(
 def test_what_came_meanwhile_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = SurfaceFolder(tmp_path, force=False)
     (tmp_path / "a.npy.glb").write_text("precious")
-    outcome = Outcome("a.npy", 0.0, SimpleNamespace(surfaces=segments()), "", 0.1, 0.1, 0)
-    assert "exists; it is not overwritten" in folder.written(outcome, "camera").error  # type: ignore[arg-type]
+    outcome = Outcome("a.npy", 0.0, FrameAnswer(segments(), {}), "", 0.1, 0.1, 0)
+    assert "exists; it is not overwritten" in folder.written(outcome, "camera").error
     assert (tmp_path / "a.npy.glb").read_text() == "precious"

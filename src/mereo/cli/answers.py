@@ -193,8 +193,7 @@ class StreamCommand:
         every_frame: answer all frames, however long it takes, instead of the latest.
         watch: the folder is still filled: answer its files as they arrive or are written again, until Ctrl-C.
         surfaces: folder for the surfaces of each answered frame, one GLB file each; one with content is refused.
-        rerun: a new recording FILE.rrd for `rerun FILE.rrd`, or the address of an open viewer: needs the extra `rerun`.
-        force: write into a folder with content, and replace the files of the same names in it; replace a recording.
+        force: write into a folder with content, and replace the files of the same names in it.
         reading: how a frame is read.
         isolation: what is left out of it.
         inference: where and how exactly the network computes.
@@ -212,7 +211,6 @@ class StreamCommand:
     every_frame: bool = False
     watch: bool = False
     surfaces: Path | None = None
-    rerun: str | None = None
     force: bool = False
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
     isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)

@@ -226,7 +226,6 @@ class BenchCommand:
 PURPOSES: dict[str, str] = {
     "network": "weights: training them, and fits that start from them",
     "view": "the pages of `mereo view`",
-    "rerun": "streams as Rerun recordings",
     "track": "training curves in TensorBoard",
     "plots": "curves of training runs, charts of experiments and of modes",
     "onnx": "networks for other runtimes",

@@ -8,16 +8,17 @@ grows, however slow the machine is.
 """
 
 import io
-import os
+import queue
 import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing, suppress
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -27,9 +28,8 @@ from mereo.io.readers import CLOUD_READERS, DEPTH_READERS
 from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame, read_frame, read_frames
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.observation import Observation, find_object
+from mereo.reconstruction.observation import find_object
 
-Content = TypeVar("Content")
 Result = TypeVar("Result")
 
 RECENT = 10_000
@@ -37,7 +37,7 @@ RECENT = 10_000
 
 
 @dataclass(frozen=True, eq=False)
-class StreamFrame(Generic[Content]):
+class StreamFrame:
     """Frame of a sequence, decoded when it is answered.
 
     Attributes:
@@ -48,7 +48,7 @@ class StreamFrame(Generic[Content]):
 
     name: str
     time_s: float
-    load: Callable[[], Content]
+    load: Callable[[], Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,9 +73,13 @@ class Outcome(Generic[Result]):
     dropped: int
 
 
+Arrived = tuple[StreamFrame, float, int]
+"""Frame, when it came by ``time.perf_counter``, and how many gave way to newer ones before it."""
+
+
 def stream(
-    frames: Iterable[StreamFrame[Content] | None],
-    answer: Callable[[Content], Result],
+    frames: Iterable[StreamFrame | None],
+    answer: Callable[[StreamFrame], Result],
     *,
     recorded_pace: bool = False,
     every_frame: bool = False,
@@ -85,56 +89,70 @@ def stream(
     Args:
         frames: the sequence; iterated in a thread of its own, which may wait for the camera. A None says that nothing
             new has come, and lets a thread that waits see that the stream has been left.
-        answer: from a cloud to whatever is wanted, for example ``lambda cloud: reconstruct(cloud, model, 48)``.
+        answer: from a frame, which it decodes, to whatever is wanted.
         recorded_pace: frames arrive when their times say, counted from the first; else as fast as they are read.
-        every_frame: none is dropped; the sequence waits for the answers.
+        every_frame: none is dropped; the sequence waits for the answers, without a thread.
 
     Yields one outcome per answered or failed frame. Whatever goes wrong in one frame is its outcome's error; what goes
     wrong in the sequence itself is raised after the outcomes before it.
     """
-    slot = LatestSlot[StreamFrame[Content]]()
-    threading.Thread(
-        target=_bring_frames, args=(frames, slot, recorded_pace, every_frame), daemon=True, name="frames"
-    ).start()
-    try:
-        while (taken := slot.take()) is not None:
-            frame = taken.item
+    source = _paced(frames) if recorded_pace else iter(frames)
+    each = ((frame, time.perf_counter(), 0) for frame in source if frame is not None)
+    arriving: Generator[Arrived, None, None] = each if every_frame else _latest(source)
+    with closing(arriving):
+        for frame, arrived_s, dropped in arriving:
             start, result, error = time.perf_counter(), None, ""
             try:
-                result = answer(frame.load())
+                result = answer(frame)
             except Exception as problem:  # a damaged frame makes the libraries that parse it raise anything
                 error = frame_error(problem, frame.name)
             now = time.perf_counter()
-            yield Outcome(frame.name, frame.time_s, result, error, now - taken.arrived_s, now - start, taken.replaced)
-        if slot.failure is not None:
-            raise slot.failure
-    finally:
-        slot.stop()
+            yield Outcome(frame.name, frame.time_s, result, error, now - arrived_s, now - start, dropped)
 
 
-def _bring_frames(
-    frames: Iterable[StreamFrame[Content] | None],
-    slot: "LatestSlot[StreamFrame[Content]]",
-    recorded_pace: bool,
-    every_frame: bool,
-) -> None:
-    """Bring every frame to the slot, until it is stopped or the sequence ends: the reading thread's work."""
-    failure: Exception | None = None
-    try:
-        start, zero = time.perf_counter(), None
-        for frame in frames:
-            if frame is None:
-                if slot.stopped:
-                    break
-                continue
+def _paced(frames: Iterable[StreamFrame | None]) -> Iterator[StreamFrame | None]:
+    start, zero = time.perf_counter(), None
+    for frame in frames:
+        if frame is not None:
             zero = frame.time_s if zero is None else zero
-            if recorded_pace:
-                time.sleep(max(0.0, frame.time_s - zero - (time.perf_counter() - start)))
-            if not slot.put(frame, wait=every_frame):
-                break
-    except Exception as problem:  # raised in the caller's thread, after the outcomes before it
-        failure = problem
-    slot.end(failure)
+            time.sleep(max(0.0, frame.time_s - zero - (time.perf_counter() - start)))
+        yield frame
+
+
+def _latest(frames: Iterator[StreamFrame | None]) -> Generator[Arrived, None, None]:
+    """Frames that a thread brings, of those that came since the last one only the newest."""
+    waiting: queue.Queue[Arrived | Exception | None] = queue.Queue(maxsize=1)
+    is_left, reported = threading.Event(), 0
+
+    def bring() -> None:
+        end: Exception | None = None
+        dropped = 0
+        try:
+            for frame in frames:
+                if is_left.is_set():
+                    return
+                if frame is not None:
+                    with suppress(queue.Empty):
+                        waiting.get_nowait()
+                        dropped += 1
+                    waiting.put((frame, time.perf_counter(), dropped))
+        except Exception as problem:  # raised in the caller's thread, after the outcomes before it
+            end = problem
+        while not is_left.is_set():
+            with suppress(queue.Full):  # the last frame is still taken
+                waiting.put(end, timeout=0.1)
+                return
+
+    threading.Thread(target=bring, daemon=True, name="frames").start()
+    try:
+        while isinstance(taken := waiting.get(), tuple):
+            frame, arrived_s, dropped = taken
+            yield frame, arrived_s, dropped - reported
+            reported = dropped
+        if taken is not None:
+            raise taken
+    finally:
+        is_left.set()
 
 
 def frame_error(problem: Exception, name: str) -> str:
@@ -143,133 +161,35 @@ def frame_error(problem: Exception, name: str) -> str:
     return words if is_foreseen(problem) else f"{name} cannot be answered ({words}): record or write it again"
 
 
-@dataclass(frozen=True)
+@dataclass
 class Summary:
-    """Numbers of a stream: answers per second, latencies in seconds (the last ``RECENT``), what was not answered."""
+    """Numbers of a stream: what was answered, what failed, and what gave way to newer frames, up to now."""
 
-    answered: int
-    failed: int
-    dropped: int
-    rate_hz: float
-    latency_median_s: float
-    latency_99_s: float
+    answered: int = 0
+    failed: int = 0
+    dropped: int = 0
+    latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
+    start_s: float = field(default_factory=time.perf_counter)
 
-    def __str__(self) -> str:
-        return (
-            f"{self.answered} frames answered at {self.rate_hz:.1f} Hz, latency {1e3 * self.latency_median_s:.0f} ms "
-            f"(median), {1e3 * self.latency_99_s:.0f} ms (99 %); {self.dropped} dropped for newer ones, "
-            f"{self.failed} bad"
-        )
-
-
-class Counter:
-    """Counter of outcomes that pass by, for their summary."""
-
-    def __init__(self) -> None:
-        self.start = time.perf_counter()
-        self.latencies = deque[float](maxlen=RECENT)
-        self.answered = self.failed = self.dropped = 0
-
-    def add(self, outcome: Outcome[Result]) -> None:
+    def add(self, outcome: Outcome[Any]) -> None:
         """Count an outcome."""
         self.dropped += outcome.dropped
         if outcome.error:
             self.failed += 1
         else:
             self.answered += 1
-            self.latencies.append(outcome.latency_s)
+            self.latencies_s.append(outcome.latency_s)
 
-    def summary(self) -> Summary:
-        """Numbers of the stream up to now; latencies are NaN where nothing was answered."""
-        seconds = time.perf_counter() - self.start
-        median, worst = np.quantile(self.latencies, [0.5, 0.99]) if self.latencies else (np.nan, np.nan)
-        rate_hz = self.answered / seconds
-        return Summary(self.answered, self.failed, self.dropped, rate_hz, float(median), float(worst))
-
-
-# --- the latest item --------------------------------------------------------------------------------------------------
-
-# Room for one item between a thread that brings and one that works: a newer one takes the place of one that waits.
-
-Item = TypeVar("Item")
-
-
-@dataclass(frozen=True, eq=False)
-class Taken(Generic[Item]):
-    """Item out of a ``LatestSlot``.
-
-    Attributes:
-        item: what was put there.
-        arrived_s: when it came to wait there, by ``time.perf_counter``.
-        replaced: how many items gave way since the last one that was taken.
-    """
-
-    item: Item
-    arrived_s: float
-    replaced: int
-
-
-class LatestSlot(Generic[Item]):
-    """Room for one item, which a newer one replaces, so that no work is older than the one before it took.
-
-    Any thread may call any method.
-
-    Attributes:
-        failure: what ended the sequence of items before its end, None without such an error.
-    """
-
-    def __init__(self) -> None:
-        self._changed = threading.Condition()
-        self._waiting: Taken[Item] | None = None
-        self._ended = self._stopped = False
-        self.failure: Exception | None = None
-
-    @property
-    def stopped(self) -> bool:
-        """Whether ``stop`` was called."""
-        return self._stopped
-
-    def put(self, item: Item, *, wait: bool = False) -> bool:
-        """Leave an item, in place of one that waits, or with ``wait`` once that is taken; False after ``stop``."""
-        with self._changed:
-            if wait:
-                self._changed.wait_for(lambda: self._stopped or self._waiting is None)
-            replaced = 0 if self._waiting is None else self._waiting.replaced + 1
-            self._waiting = Taken(item, time.perf_counter(), replaced)
-            self._changed.notify_all()
-            return not self._stopped
-
-    def take(self, timeout_s: float | None = None) -> Taken[Item] | None:
-        """Waiting item, or the next one that comes within ``timeout_s``; by default it waits as long as it takes.
-
-        None where none has come in time, after the last one, and after ``stop``.
-        """
-        with self._changed:
-            self._changed.wait_for(lambda: self._stopped or self._ended or self._waiting is not None, timeout_s)
-            taken, self._waiting = self._waiting, None
-            self._changed.notify_all()
-            return None if self._stopped else taken
-
-    def end(self, failure: Exception | None = None) -> None:
-        """Say that nothing more is brought, and why where something failed; what waits is still taken."""
-        with self._changed:
-            self._ended, self.failure = True, failure
-            self._changed.notify_all()
-
-    def stop(self) -> None:
-        """Say that nothing more is taken; what waits is dropped."""
-        with self._changed:
-            self._stopped = True
-            self._changed.notify_all()
+    def __str__(self) -> str:
+        rate_hz = self.answered / (time.perf_counter() - self.start_s)
+        median, worst = np.quantile(self.latencies_s, [0.5, 0.99]) if self.latencies_s else (np.nan, np.nan)
+        return (
+            f"{self.answered} frames answered at {rate_hz:.1f} Hz, latency {1e3 * median:.0f} ms (median), "
+            f"{1e3 * worst:.0f} ms (99 %); {self.dropped} dropped for newer ones, {self.failed} bad"
+        )
 
 
 # --- watched folders --------------------------------------------------------------------------------------------------
-
-# Folder into which a camera's program writes: its files in the order in which they become complete.
-#
-# No system tells when a writer is done. A file counts as complete when it is not empty and has not changed between two
-# looks. One that never comes to rest is handed over all the same after a while, so that whoever reads it says what is
-# wrong with it; one that was handed over too early comes again when it has changed.
 
 LOOK_S = 0.05
 """Seconds between two looks."""
@@ -281,16 +201,12 @@ Version = tuple[int, int]
 """Time of the last change in nanoseconds, and size in bytes."""
 
 
-@dataclass(frozen=True)
-class _Waiting:
-    """File that is perhaps still written: its version at the last look, and when it was first seen."""
-
-    version: Version
-    since_s: float
-
-
 class WatchedFolder:
-    """Files of a folder, each handed over once for every time that it was written.
+    """Files of a folder into which a camera's program writes, each handed over once for every time it was written.
+
+    No system tells when a writer is done. A file counts as complete when it is not empty and has not changed between
+    two looks. One that never comes to rest is handed over all the same after a while, so that whoever reads it says
+    what is wrong with it; one that was handed over too early comes again when it has changed.
 
     Attributes:
         folder: the folder; what lies deeper is not seen.
@@ -299,40 +215,30 @@ class WatchedFolder:
 
     def __init__(self, folder: Path, wanted: Callable[[Path], bool]) -> None:
         self.folder, self.wanted = folder, wanted
-        self._taken: dict[Path, Version] = {}
-        self._waiting: dict[Path, _Waiting] = {}
+        # of each file the version at the last look, since when it is waited for, and the version handed over
+        self._seen: dict[Path, tuple[Version, float, Version | None]] = {}
 
     def look(self, now_s: float) -> list[Path]:
         """Files that are complete since the last look, the oldest first; ``now_s`` is the time by any clock.
 
         Raises ``OSError`` where the folder is gone.
         """
-        present = self._versions()
-        self._taken = {file: version for file, version in self._taken.items() if file in present}
-        before, self._waiting, complete = self._waiting, {}, []
-        for file, version in present.items():
-            if self._taken.get(file) == version:
+        before, self._seen, complete = self._seen, {}, dict[Path, Version]()
+        for file in list(self.folder.iterdir()):
+            try:
+                facts = file.stat() if self.wanted(file) else None
+            except FileNotFoundError:  # removed or renamed meanwhile
                 continue
-            known = before.get(file, _Waiting((0, -1), now_s))
-            at_rest = known.version == version and version[1] > 0
-            if at_rest or now_s - known.since_s >= PATIENCE_S:
-                self._taken[file] = version
-                complete.append(file)
-            else:
-                self._waiting[file] = _Waiting(version, known.since_s)
-        return sorted(complete, key=lambda file: (present[file][0], file.name))
-
-    def _versions(self) -> dict[Path, Version]:
-        versions = {}
-        with os.scandir(self.folder) as entries:
-            for entry in entries:
-                try:
-                    if self.wanted(Path(entry.path)):
-                        facts = entry.stat()
-                        versions[Path(entry.path)] = (facts.st_mtime_ns, facts.st_size)
-                except FileNotFoundError:  # removed or renamed meanwhile
-                    continue
-        return versions
+            if facts is None:
+                continue
+            version = facts.st_mtime_ns, facts.st_size
+            last, since_s, taken = before.get(file, (None, now_s, None))
+            if version == taken:
+                since_s = now_s
+            elif (version == last and facts.st_size > 0) or now_s - since_s >= PATIENCE_S:
+                complete[file] = taken = version
+            self._seen[file] = version, since_s, taken
+        return sorted(complete, key=lambda file: (complete[file][0], file.name))
 
 
 # --- stream sources ---------------------------------------------------------------------------------------------------
@@ -343,7 +249,7 @@ STANDARD_INPUT = "-"
 
 def frames_of(
     source: str, reading: InputConfig, isolation: IsolationConfig, rate_hz: float = 30.0
-) -> Iterator[StreamFrame[Observation]]:
+) -> Iterator[StreamFrame]:
     """Frames of a source, in order; each is decoded when it is answered.
 
     Args:
@@ -381,9 +287,7 @@ def frames_in(folder: Path, reading: InputConfig) -> list[Path]:
     return files
 
 
-def watched_frames(
-    source: str, reading: InputConfig, isolation: IsolationConfig
-) -> Iterator[StreamFrame[Observation] | None]:
+def watched_frames(source: str, reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamFrame | None]:
     """Frames of a folder as their files arrive, without end; None where nothing new has come.
 
     Files that are there already come first. One that is written again is a new frame; see ``WatchedFolder`` on when a
@@ -399,9 +303,7 @@ def watched_frames(
     return _arriving(WatchedFolder(path, lambda file: _is_frame(file, reading)), reading, isolation)
 
 
-def _arriving(
-    folder: WatchedFolder, reading: InputConfig, isolation: IsolationConfig
-) -> Iterator[StreamFrame[Observation] | None]:
+def _arriving(folder: WatchedFolder, reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamFrame | None]:
     start = time.perf_counter()
     while True:
         begun = time.perf_counter()
@@ -418,7 +320,7 @@ def _is_frame(file: Path, reading: InputConfig) -> bool:
     return known and not file.name.startswith(".") and file != reading.mask and file.is_file()
 
 
-def _named(reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamFrame[Observation]]:
+def _named(reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamFrame]:
     start = time.perf_counter()
     if isinstance(sys.stdin, io.TextIOWrapper):
         sys.stdin.reconfigure(errors="surrogateescape")  # names are bytes: one that is no UTF-8 is still a file's
@@ -428,5 +330,5 @@ def _named(reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamF
             yield StreamFrame(name, time.perf_counter() - start, load)
 
 
-def _loader(read: Callable[[], SensorFrame], isolation: IsolationConfig) -> Callable[[], Observation]:
+def _loader(read: Callable[[], SensorFrame], isolation: IsolationConfig) -> Callable[[], Any]:
     return lambda: find_object(read(), isolation)
