@@ -30,8 +30,7 @@ from mereo.models.trained import Trained
 from mereo.models.weights_place import load_weights
 from mereo.reconstruction.observation import find_object
 from mereo.visualization.result_files import radii_of, summary_of
-from mereo_serving.messages import JSON, FrameRequest, Ready, Reply, Served, Setup
-from mereo_serving.refusals import FAULT, failed
+from mereo_serving.messages import FAULT, JSON, FrameRequest, Ready, Reply, Served, Setup, failed
 
 LOG = logging.getLogger("mereo_serving")
 

@@ -25,11 +25,10 @@ from mereo_serving.bodies import MEDIA, SUFFIXES, take, too_large
 from mereo_serving.config import ServeConfig
 from mereo_serving.dispatcher import Dispatcher, Waiting
 from mereo_serving.gate import Entry, Gate
-from mereo_serving.messages import GLB, JSON, FrameRequest, Media, Reply
+from mereo_serving.messages import FAULT, GLB, JSON, FrameRequest, Media, Refused, Reply, failed
 from mereo_serving.metrics import Metrics
 from mereo_serving.options import FrameOptions, sentence_of
 from mereo_serving.page import docs_page
-from mereo_serving.refusals import FAULT, Refused, failed
 
 GONE = 499
 """Status, as of nginx, of a request whose client has left."""

@@ -131,7 +131,6 @@ def test_force_replaces_a_file(command: str, tmp_path: Path, monkeypatch: pytest
         "scene preview scene.py --output scene.py",
         "scene preview bar.yaml --output bar.yaml",
         "scene preview bar.yaml --output left.ply",
-        "scene preview --all --output assets/bunny/bunny.off",
         "bench --weights weights.safetensors --output weights.safetensors",
     ],
 )

@@ -34,8 +34,8 @@ from mereo.io.sensor_frame import SensorFrame
 from mereo.io.writers.formats import chosen_formats
 from mereo.io.writers.glb import viewer_rotation
 from mereo.io.writers.volumes import MM_PER_M
+from mereo.visualization.reconstruction_report import result_html
 from mereo.visualization.result_files import write_answer, write_answer_file
-from mereo.visualization.result_html import result_html
 from mereo.visualization.units import Unit
 
 if TYPE_CHECKING:

@@ -95,8 +95,7 @@ class ReconstructCommand:
     def run(self) -> Outcome:
         """Write the folder of results and print the segments."""
         from mereo.api.result import free_folder
-        from mereo.cli.reconstruct import FrameJob
-        from mereo.cli.reconstruct_many import reconstruct_inputs
+        from mereo.cli.reconstruct import FrameJob, reconstruct_inputs
         from mereo.workers.spread import choose_cluster
 
         cluster, inference = choose_cluster(self.ray, self.threads, self.task), self.inference
@@ -267,8 +266,7 @@ class ServeCommand:
         if missing := [name for name in SERVE_MODULES if find_spec(name) is None]:
             raise ImportError(f"{missing[0]} is not installed; `mereo serve` needs it: run pip install 'mereo[serve]'")
         from mereo.io.cores import cores
-        from mereo_serving.names import served_objects
-        from mereo_serving.server import serve
+        from mereo_serving.server import serve, served_objects
 
         serve(
             served_objects(self.weights, self.scene, self.object),

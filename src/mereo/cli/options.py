@@ -71,7 +71,6 @@ PlaceOption = Annotated[
 """Local path or URL of an object storage, of which ``Path`` would make s3:/bucket."""
 
 SceneName = Annotated[Positional[str], arg(metavar="SCENE")]
-SceneNameOrNone = Annotated[Positional[str], arg(metavar="[SCENE]", help_behavior_hint="")]
 ObjectFiles = Annotated[
     Positional[tuple[Path, ...]], arg(metavar="OBJECT [OBJECT ...]", help_behavior_hint="(required)")
 ]
