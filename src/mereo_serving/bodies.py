@@ -104,14 +104,19 @@ class _Form(MultiPartParser):
 
 
 async def _take_form(chunks: AsyncGenerator[bytes, None], content_type: str, stated: str, folder: Path) -> Taken:
-    form, names = _Form(Headers({"content-type": content_type}), chunks, max_files=8, max_fields=8), dict[str, str]()
+    async def all_of_it() -> AsyncGenerator[bytes, None]:
+        async for chunk in chunks:
+            yield chunk
+        if not form.is_whole:
+            raise Refused(400, "the form is cut off before its last boundary: send it whole")
+
+    form = _Form(Headers({"content-type": content_type}), all_of_it(), max_files=8, max_fields=8)
+    names = dict[str, str]()
     try:
         parts = await form.parse()
     except (MultiPartException, ValueError, LookupError, TypeError) as error:  # what mail's parser makes of headers
         raise Refused(400, f"the form cannot be read ({' '.join(str(error).split())}): let a library make it") from None
     try:
-        if not form.is_whole:
-            raise Refused(400, "the form is cut off before its last boundary: send it whole")
         for part, content in parts.multi_items():
             if part not in PARTS:
                 raise Refused(422, f"the form has a part {part[:60]!a}; its parts are {', '.join(PARTS)}: leave it out")

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
 RESOLUTION = 100
 
-NEXT = """On your own object, from its meshes: nothing is trained; docs/own-object.md has joints
+NEXT = """
+On your own object, from its meshes: nothing is trained; docs/own-object.md has joints
   mereo reconstruct cloud.ply --object PART.stl PART.stl --output result
   mereo reconstruct depth.png --intrinsics camera.json --depth-scale 1000 --object PART.stl PART.stl --output result
 
@@ -25,11 +26,6 @@ At once, and telling look-alike parts apart: with a network, where that helps, t
   mereo reconstruct frame.ply --object learned --output result
 
 In another shell, first: source .venv/bin/activate"""
-
-WITHOUT = (
-    "PyTorch is not installed, so nothing is shown of networks, which start the fit at once: run pip install "
-    "'mereo[network]' and this again.\n"
-)
 
 
 @dataclass(frozen=True)
@@ -63,8 +59,12 @@ class Demo:
             scores[name] = {"output": str(folder), **_print_scores(title, result, truth), "seconds": seconds}
             page = f", or in the browser: mereo view {folder}" if result.taken else ""
             print(f"{len(frame.cloud)} points, {seconds:.1f} s; look at {folder / 'report.html'}{page}\n")
-        print("" if has_network() else f"{WITHOUT}\n", end="")
-        print(f"All in {time.perf_counter() - began:.0f} s.\n\n{NEXT}")
+        if not has_network():
+            print(
+                "PyTorch is not installed, so nothing is shown of networks, which start the fit at once: run pip install"
+            )
+            print("'mereo[network]' and this again.\n")
+        print(f"All in {time.perf_counter() - began:.0f} s.\n{NEXT}")
         return Outcome(scores)
 
 

@@ -452,8 +452,6 @@ def print_uncertainty(registered: Registration | None, unit: Unit) -> None:
 def print_segments(result: Result) -> None:
     """Print a table of the segments, and a line of the stages' seconds."""
     reconstruction, seen, unit = result.reconstruction, result.seen, Unit(result.unit_m)
-    sure = None if result.registered is None else result.registered.uncertainty
-    radii = {} if sure is None else {segment.name: segment.centroid_radius95 for segment in sure.segments}
     table = Table(title=f"{seen.frame.source}, {len(seen.cloud)} points", title_justify="left")
     table.add_column("segment")
     has_confidence = not all(np.isnan(segment.confidence) for segment in reconstruction.segments)
@@ -462,7 +460,7 @@ def print_segments(result: Result) -> None:
         table.add_column(column, justify="right")
     for segment in reconstruction.segments:
         # the radius gives the digits; it is in the report, and would break the lines of 80 columns
-        centroid = unit.place(segment.centroid, radii.get(segment.name)).partition(" ±")[0]
+        centroid = unit.place(segment.centroid, result[segment.name].error_radius).partition(" ±")[0]
         confidence = [f"{segment.confidence:.2f}"] if has_confidence else []
         row = (unit.volume(segment.volume), *confidence, str(segment.components), centroid)
         table.add_row(segment.name, *(row if segment.voxels else ("0", "not found", "0", "")))

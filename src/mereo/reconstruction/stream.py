@@ -300,18 +300,18 @@ def watched_frames(source: str, reading: InputConfig, isolation: IsolationConfig
         raise FileNotFoundError(f"{path} does not exist; a folder that can be watched is needed: make it first")
     if not path.is_dir() or is_recording(path):
         raise ValueError(f"{source} is no folder of frames; only such a folder can be watched: leave out --watch")
-    return _arriving(WatchedFolder(path, lambda file: _is_frame(file, reading)), reading, isolation)
+    folder, start = WatchedFolder(path, lambda file: _is_frame(file, reading)), time.perf_counter()
 
+    def arriving() -> Iterator[StreamFrame | None]:
+        while True:
+            begun = time.perf_counter()
+            for file in folder.look(begun):
+                load = _loader(partial(read_frame, file, reading), isolation)
+                yield StreamFrame(file.name, time.perf_counter() - start, load)
+            yield None
+            time.sleep(max(LOOK_S, time.perf_counter() - begun))  # at most half of the time in a folder of many files
 
-def _arriving(folder: WatchedFolder, reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamFrame | None]:
-    start = time.perf_counter()
-    while True:
-        begun = time.perf_counter()
-        for file in folder.look(begun):
-            load = _loader(partial(read_frame, file, reading), isolation)
-            yield StreamFrame(file.name, time.perf_counter() - start, load)
-        yield None
-        time.sleep(max(LOOK_S, time.perf_counter() - begun))  # at most half of the time in a folder of many files
+    return arriving()
 
 
 def _is_frame(file: Path, reading: InputConfig) -> bool:

@@ -18,12 +18,11 @@ from dataclasses import dataclass, field
 from html import escape
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8, UInt16
 from PIL import Image
-from pydantic import BaseModel, Field, FiniteFloat, ValidationError
 from scipy.spatial import cKDTree
 
 from mereo.fitting.registration.registration import Registration
@@ -459,33 +458,6 @@ def _radius_bytes(radii: Radii, names: tuple[str, ...], part: Segment) -> str | 
 
 # --- read again -------------------------------------------------------------------------------------------------------
 
-Corner = Annotated[tuple[FiniteFloat, ...], Field(min_length=3, max_length=3)]
-
-
-class _Cloud(BaseModel):
-    count: Annotated[int, Field(ge=0)]
-    positions: str
-
-
-class _Depth(BaseModel):
-    url: str
-    ends: Annotated[tuple[str, ...], Field(max_length=2)]
-
-
-class _Words(BaseModel):
-    title: str
-    trust: tuple[Level, str, str] | None = None
-    warnings: tuple[str, ...] = ()
-    heads: tuple[str, ...] = ()
-
-
-class _Page(BaseModel):
-    low: Corner
-    high: Corner
-    cloud: _Cloud
-    words: _Words
-    depth: _Depth | None = None
-
 
 @dataclass(frozen=True, eq=False)
 class WrittenReport:
@@ -493,7 +465,7 @@ class WrittenReport:
 
     Attributes:
         title: of the page.
-        level: of the verdict; None for a page without one.
+        level: of the verdict.
         verdict: the verdict and why, then what to do: sentences.
         cloud: the observed points in the input's frame and unit, to 16 bits of the box of all, as many as are shown.
         count: number of points of the input.
@@ -503,7 +475,7 @@ class WrittenReport:
     """
 
     title: str
-    level: Level | None
+    level: Level
     verdict: str
     cloud: PointCloud | None
     count: int
@@ -521,23 +493,24 @@ def read_report(path: Path) -> WrittenReport | None:
     if not is_page or not is_whole:
         return None
     try:
-        page = _Page.model_validate(json.loads(text))
-        steps = np.frombuffer(base64.b64decode(page.cloud.positions), "<u2").reshape(-1, 3)
-        points = np.array(page.low) + steps / STEPS * (np.array(page.high) - np.array(page.low))
-        depth = None if page.depth is None else _picture(page.depth.url)
-    except (ValidationError, ValueError, OSError, RecursionError):
+        page = json.loads(text)
+        words, low, high = page["words"], np.array(page["low"], dtype=float), np.array(page["high"], dtype=float)
+        steps = np.frombuffer(base64.b64decode(page["cloud"]["positions"]), "<u2").reshape(-1, 3)
+        level, *sentences = words["trust"]
+        if level not in VERDICTS:
+            return None
+        return WrittenReport(
+            title=str(words["title"]),
+            level=level,
+            verdict=" ".join([*sentences, *words["warnings"]]),
+            cloud=PointCloud(low + steps / STEPS * (high - low)) if len(steps) else None,
+            count=int(page["cloud"]["count"]),
+            depth=None if page["depth"] is None else _picture(page["depth"]["url"]),
+            ends=() if page["depth"] is None else tuple(map(str, page["depth"]["ends"])),
+            unit_known=any("mm" in head for head in words["heads"]),
+        )
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, OSError, RecursionError):
         return None
-    words = page.words
-    return WrittenReport(
-        title=words.title,
-        level=None if words.trust is None else words.trust[0],
-        verdict="" if words.trust is None else " ".join([*words.trust[1:], *words.warnings]),
-        cloud=PointCloud(points) if len(points) else None,
-        count=page.cloud.count,
-        depth=depth,
-        ends=() if page.depth is None else page.depth.ends,
-        unit_known=any("mm" in head for head in words.heads),
-    )
 
 
 def _picture(url: str) -> Picture:
