@@ -56,9 +56,6 @@ class ReconstructCommand:
             points (PLY, XYZ, NPY), CSV (x, y, z; qx, qy, qz, qw for poses) or volume (NIfTI, NRRD), which is
             resampled around the object.
         carry_frame: frame and unit of these files: source is that of the object's own files, scene that of its scene.
-        explain: segment, for its centroid, or place x,y,z in the input's frame and unit: print how sure the object's
-            point there is and what leaves it unsure, and write the observed points coloured by how much each decides it
-            (explained/1.ply, those that the model does not explain in red); once for each. The report has all segments.
         force: replace an existing output folder that mereo wrote, and nothing else is in.
         threads: of torch and all else that computes; 0 means one per core.
         ray: answer each of several frames in a task of a Ray cluster: local, one of so many --threads for this run;
@@ -84,7 +81,6 @@ class ReconstructCommand:
     initial_pose: Path | None = None
     carry: UseAppendAction[tuple[Path, ...]] = ()
     carry_frame: CarryFrame = "source"
-    explain: UseAppendAction[tuple[str, ...]] = ()
     force: bool = False
     threads: Threads = 0
     ray: RayAddress = None

@@ -60,10 +60,8 @@ class Demo:
             page = f", or in the browser: mereo view {folder}" if result.taken else ""
             print(f"{len(frame.cloud)} points, {seconds:.1f} s; look at {folder / 'report.html'}{page}\n")
         if not has_network():
-            print(
-                "PyTorch is not installed, so nothing is shown of networks, which start the fit at once: run pip install"
-            )
-            print("'mereo[network]' and this again.\n")
+            print("PyTorch is not installed, so nothing is shown of networks, which start the fit at once:")
+            print("run pip install 'mereo[network]' and this again.\n")
         print(f"All in {time.perf_counter() - began:.0f} s.\n{NEXT}")
         return Outcome(scores)
 

@@ -19,7 +19,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
 
@@ -42,19 +41,13 @@ from mereo.io.readers import read_pose
 from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.io.writers.formats import chosen_formats
-from mereo.io.writers.meshes import write_explained_ply
-from mereo.io.writers.volumes import MM_PER_M
 from mereo.models.config import InferenceConfig
 from mereo.models.trained import Trained
 from mereo.reconstruction.observation import FrameWarning, find_object
 from mereo.reconstruction.stream import frame_error, frames_in
 from mereo.scenes.registry import files_of
 from mereo.visualization.reconstruction_report import (
-    UNEXPLAINED,
     confidence_title,
-    describe_shares,
-    mark_colors,
-    point_marks,
 )
 from mereo.visualization.result_files import summary_of, write_answer
 from mereo.visualization.units import Unit, rounded
@@ -62,9 +55,6 @@ from mereo.workers.spread import Cluster, spread
 
 Summary = Mapping[str, Any]
 """Content of a summary.json."""
-
-EXPLAINED = "explained"
-"""Folder within a folder of results that holds the observed points of each explanation."""
 
 
 @dataclass(frozen=True)
@@ -91,9 +81,8 @@ class FrameJob:
             raise ValueError(
                 f"--carry-frame is {command.carry_frame!r} and nothing is carried: name a file with --carry"
             )
-        for option, needs in (("carry", "along which things move"), ("explain", "whose fit is explained")):
-            if getattr(command, option) and command.method == "network":
-                raise ValueError(f"--method is network, but --{option} needs a registration, {needs}: use auto")
+        if command.carry and command.method == "network":
+            raise ValueError("--method is network, but --carry needs a registration, along which things move: use auto")
         _ = self.attachments, self.initial_pose  # raises for those that cannot be read
 
     @property
@@ -151,7 +140,7 @@ def reconstruct_file(input: str | Path, output: str | Path, job: FrameJob) -> Re
         job: everything else.
 
     Warns with ``SizeWarning`` where what is seen cannot be the object. Raises as ``FrameJob.check``, ``read_frame``,
-    ``find_object`` and ``reconstruct`` do, and ``ValueError`` for ``carry`` and ``explain`` without a registration.
+    ``find_object`` and ``reconstruct`` do, and ``ValueError`` for ``carry`` without a registration.
     """
     job.check()
     with shown_stages(), new_directory(output, job.command.force, [input, *job.read]) as directory:
@@ -170,7 +159,6 @@ def reconstruct_frame(frame: SensorFrame, directory: Path, job: FrameJob, path: 
     seen = replace(find_object(frame, command.isolation), initial_pose=job.initial_pose)
     print(seen)
     placed = job.placed  # what is carried is refused before the work
-    targets = [target_of(text, job.object.names) for text in command.explain]
     result = reconstruct_observation(
         seen,
         job.object,
@@ -190,8 +178,6 @@ def reconstruct_frame(frame: SensorFrame, directory: Path, job: FrameJob, path: 
         print(each.description)
     with stage("write the files"):
         write_answer(directory, result, command.files, carried)
-    factor = MM_PER_M * result.seen.frame.metres if command.files.millimetres else 1.0
-    explain(result.registered, targets, directory, result.seen.cloud.points, factor, unit)
     write_json(directory / CONFIG, {**options_of(command, "reconstruct"), "inputs": [str(path)]})
     return result
 
@@ -470,68 +456,3 @@ def print_segments(result: Result) -> None:
     console.print(f"seconds: {stages}", highlight=False, soft_wrap=True)
     if reconstruction.clipped:
         console.print("a segment reaches out of the largest box and is closed there: check the cloud and the weights")
-
-
-# --- what decides a position ------------------------------------------------------------------------------------------
-
-Target = str | Float[np.ndarray, "3"]
-"""What is to be explained: the name of a segment, or a position in the input's frame and unit."""
-
-
-def target_of(text: str, names: Sequence[str]) -> Target:
-    """Target of an option's text; raises ``ValueError`` for what is neither a segment nor a position."""
-    if text in names:
-        return text
-    try:
-        position = np.array([float(part) for part in text.split(",")])
-    except ValueError:
-        position = np.empty(0)
-    if len(position) != 3 or not np.isfinite(position).all():
-        raise ValueError(
-            f"--explain is {text!r}; it must be a segment ({', '.join(names)}) or a place x,y,z in the input's frame "
-            "and unit, such as --explain=0.1,-0.02,0.8"
-        )
-    return position
-
-
-def explain(
-    registered: Registration | None,
-    targets: Sequence[Target],
-    directory: Path,
-    points: Float[np.ndarray, "n 3"],
-    factor: float,
-    unit: Unit,
-) -> None:
-    """Print a line for each target, and write the observed points coloured by how much they decide it.
-
-    Args:
-        registered: in the input's frame; None raises ``ValueError`` where there are targets.
-        targets: what is to be explained.
-        directory: of the results.
-        points: observed ones, in the input's frame and unit.
-        factor: from the input's unit to that of the file.
-        unit: of the lengths that are printed.
-    """
-    for number, target in enumerate(targets, 1):
-        if registered is None or registered.uncertainty is None:
-            raise ValueError(
-                "the network's answer is kept, but --explain needs a registration, whose fit is explained: leave out "
-                "of the cloud what is not the object, or take the registered model in any case with --method modes"
-            )
-        sure, names = registered.uncertainty, registered.model.rest.names
-        if isinstance(target, str):
-            title, radius = f"the centre of {target}", sure.segments[names.index(target)].centroid_radius95
-        else:
-            radii = registered.radius95(target[None], at="camera")
-            assert radii is not None
-            title, radius = "the object's point", float(radii[0])
-        explanation = registered.explain(target)
-        assert explanation is not None
-        position = f"{unit.place(explanation.place, radius)} {unit.length_name} ({describe_level(sure.calibrated)})"
-        text = f"{title} is at {position}; what leaves it unsure: {describe_shares(explanation)}"
-        lost = len(explanation.unexplained)
-        print(f"{text}; {lost} points are not the model's" if lost else text)
-        marks = point_marks(explanation, points)
-        (directory / EXPLAINED).mkdir(exist_ok=True)
-        path = directory / EXPLAINED / f"{number}.ply"
-        write_explained_ply(path, factor * points, mark_colors(marks), marks == UNEXPLAINED, text)

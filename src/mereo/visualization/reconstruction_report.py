@@ -30,7 +30,7 @@ from mereo.fitting.uncertainty import Explanation
 from mereo.geometry.camera import DepthImage, PointCloud
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.mesh import Color, Segment, SegmentedMesh
-from mereo.geometry.radii import STOPS, Radii, between_stops, describe_level
+from mereo.geometry.radii import STOPS, Radii, describe_level
 from mereo.geometry.subdivision import split_at_creases
 from mereo.io.atomic_files import atomic_file
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
@@ -434,12 +434,6 @@ def point_marks(explanation: Explanation, points: Float[np.ndarray, "n 3"]) -> U
         lost = cKDTree(explanation.unexplained).query(points)[0]
         marks[(lost <= away) & (lost < spacing)] = UNEXPLAINED
     return marks
-
-
-def mark_colors(marks: UInt8[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
-    """Colours (red, green, blue) of ``point_marks``."""
-    mixed = between_stops(marks / MOST, WEIGHTS)
-    return np.where((marks == UNEXPLAINED)[:, None], RED, mixed).round().astype(np.uint8)
 
 
 def describe_shares(explanation: Explanation) -> str:
