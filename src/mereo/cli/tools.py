@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from mereo.cli.options import ScanCloud
-from mereo.io.bounds import Count, CountOrNone, PositiveOrUnknown, Threads, Workers
+from mereo.io.bounds import Count, PositiveOrUnknown, Threads, Workers
 from mereo.io.cores import workers_for
 from mereo.models.config import Device, Precision
 from mereo.training.config import PresetName
@@ -188,7 +188,6 @@ class BenchCommand:
         precision: of the network's products; auto takes bfloat16 on CUDA and on CPUs that are much faster in it.
         repeats: of each stage.
         rival: time the straightforward implementation too (minutes on a CPU), and check that it gives the same labels.
-        busy: processes that never rest, beside which 40,000 queries are timed again on a CPU; 0 leaves that out.
         threads: of torch and all else that computes; 0 means one per core.
         output: a JSON file for the figures.
         force: replace an existing file, unless the weights are read from it.
@@ -200,7 +199,6 @@ class BenchCommand:
     precision: Precision = "float32"
     repeats: Count = 7
     rival: bool = False
-    busy: Annotated[CountOrNone, arg(name="beside")] = 1
     threads: Threads = 0
     output: Path | None = None
     force: bool = False
@@ -214,7 +212,7 @@ class BenchCommand:
         if self.output is not None:
             check_file_place(self.output, force=self.force, inputs=[self.weights] if self.weights else [])
         device = find_device(self.device)
-        measured = benchmark(self.weights, self.preset, device, self.precision, self.repeats, self.rival, self.busy)
+        measured = benchmark(self.weights, self.preset, device, self.precision, self.repeats, self.rival)
         measured.print()
         if self.output is not None:
             measured.write(self.output, self.force)
