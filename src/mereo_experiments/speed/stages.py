@@ -181,9 +181,9 @@ class Bench:
     ) -> Stage:
         """Ours and the rival's take turns, so that a busy machine slows both; with ``once`` the rival has one."""
         mine, theirs, device = [], [], self.model.device
-        found = other = None
+        answer = other = None
         for repeat in range(self.repeats):
-            spent, found = timed(ours, device)
+            spent, answer = timed(ours, device)
             mine.append(spent)
             if rival is not None and not (once and repeat):
                 spent, other = timed(rival, device)
@@ -191,7 +191,7 @@ class Bench:
         slowest = float(np.quantile(mine, 0.99))
         median = statistics.median(theirs) if theirs else None
         floor = work.seconds(self.machine)
-        return Stage(name, statistics.median(mine), slowest, floor, median, _differing(found, other))
+        return Stage(name, statistics.median(mine), slowest, floor, median, _differing(answer, other))
 
 
 def _differing(ours: np.ndarray | None, theirs: np.ndarray | None) -> float | None:
