@@ -46,8 +46,8 @@ def measure(queries: int, rounds: int, beside: int) -> None:
     """Print threads, and seconds alone and beside busy processes: what the process of one row does."""
     import torch  # before mereo, so that OpenMP finds the variable as this row has it
 
-    from mereo.evaluation.sample_views import load_view
     from mereo.models.weights import load_model
+    from mereo.synthesis.sample_views import load_view
     from mereo_experiments.speed.stages import random_points
 
     model, view = load_model("bunny"), load_view("bunny")

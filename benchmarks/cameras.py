@@ -15,17 +15,17 @@ from functools import partial
 
 import numpy as np
 
-from mereo.evaluation.cases import TestCase
-from mereo.evaluation.metrics import intersection_over_union, truth_grid
-from mereo.evaluation.scoring import CELLS, score_cases
 from mereo.fitting.registration.register import registrar_for
 from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.metrics import intersection_over_union, truth_grid
 from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor
 from mereo.synthesis.examples import sample_view
+from mereo_learning.cases import TestCase
+from mereo_learning.scoring import CELLS, score_cases
 
 ROWS = ((0.5, 96, False), (0.5, 192, False), (1.0, 96, False), (1.0, 192, False), (0.5, 192, True), (1.0, 192, True))
 """Distances in metres from the camera to the object's centre, pixels along each side of the image, whether binned."""

@@ -14,10 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from mereo.evaluation.cases import grid_confusion, labels_on
-from mereo.evaluation.metrics import intersection_over_union, truth_grid
 from mereo.fitting.registration.answer_frame import search_modes
 from mereo.fitting.registration.register import CloudToFit, Registrar
+from mereo.geometry.metrics import grid_confusion, intersection_over_union, labels_on, truth_grid
 from mereo.scenes.files.deformation_blocks import DeformationBlock, ElasticBlock
 from mereo.scenes.files.template import UNPLACED, random_motion, rubber
 from mereo.scenes.random_states import OBJECT_STATES, scene_model

@@ -18,7 +18,7 @@ import torch
 from mereo.models.config import Encoder, NetworkConfig
 from mereo.models.encoders import Autodecoder
 from mereo.models.network import Network
-from mereo.training.config import PRESETS
+from mereo_learning.config import PRESETS
 
 BATCH, QUERIES, SEGMENTS = 8, 1472, 5
 ENCODERS: tuple[Encoder, ...] = ("pointnet2", "point-transformer", "autodecoder")

@@ -24,8 +24,7 @@ from scipy.ndimage import binary_erosion
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from mereo.evaluation.metrics import Scores, TruthGrid, confusion_matrix, intersection_over_union, truth_grid
-from mereo.evaluation.scoring import predict_grid, trained_scene
+from mereo.geometry.metrics import Scores, TruthGrid, confusion_matrix, intersection_over_union, truth_grid
 from mereo.models.model import Model
 from mereo.models.rigid_alignment import Alignment, fit_rigid
 from mereo.models.weights import load_model
@@ -34,8 +33,9 @@ from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
-from mereo.training.config import AugmentConfig
-from mereo.training.dataset import Batch, Dataset, Draws, choose_points
+from mereo_learning.config import AugmentConfig
+from mereo_learning.dataset import Batch, Dataset, Draws, choose_points
+from mereo_learning.scoring import predict_grid, trained_scene
 
 NEAR_CELLS = 1.2
 HELD_OUT = 64

@@ -12,13 +12,13 @@ from functools import partial
 
 import numpy as np
 
-from mereo.evaluation.scoring import trained_scene
 from mereo.models.weights import load_model
 from mereo.reconstruction.isosurfaces import Extraction, extract
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
+from mereo_learning.scoring import trained_scene
 
 
 def main(weights: str = "rope", resolution: int = 64, views: int = 2) -> None:

@@ -15,15 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mereo.evaluation.cases import grid_confusion
-from mereo.evaluation.metrics import TruthGrid, confusion_matrix, intersection_over_union, truth_grid
-from mereo.evaluation.scans import SCANS, scan_in_camera
-from mereo.evaluation.scoring import predict_grid
 from mereo.fitting.draws.playback import DrawnStates
 from mereo.fitting.registration.register import CloudToFit, fit_frame
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.metrics import TruthGrid, confusion_matrix, grid_confusion, intersection_over_union, truth_grid
 from mereo.geometry.solids import label_grid
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.models.model import Model
@@ -35,6 +32,8 @@ from mereo.scenes.seeds import example_rng
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
+from mereo_learning.scans import SCANS, scan_in_camera
+from mereo_learning.scoring import predict_grid
 
 NEAR = 1.5
 

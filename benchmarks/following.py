@@ -24,7 +24,6 @@ from typing import get_args
 
 import numpy as np
 
-from mereo.evaluation.metrics import confusion_matrix, intersection_over_union, truth_grid
 from mereo.fitting.config import TrackConfig
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import CloudToFit, Registrar
@@ -32,6 +31,7 @@ from mereo.fitting.registration.registration import Registration
 from mereo.fitting.tracking import Tracker
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.metrics import confusion_matrix, intersection_over_union, truth_grid
 from mereo.geometry.solids import label_grid
 from mereo.models.weights import load_model
 from mereo.reconstruction.observation import observe

@@ -11,9 +11,7 @@ import time
 
 import numpy as np
 
-from mereo.evaluation.cases import grid_confusion
-from mereo.evaluation.metrics import intersection_over_union, truth_grid
-from mereo.evaluation.scoring import predict_grid, trained_scene
+from mereo.geometry.metrics import grid_confusion, intersection_over_union, truth_grid
 from mereo.models.weights import load_model
 from mereo.models.weights_place import shipped_names
 from mereo.reconstruction.config import IsolationConfig
@@ -22,6 +20,7 @@ from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis.config import SENSORS, GenerateConfig
 from mereo.synthesis.examples import sample_view
+from mereo_learning.scoring import predict_grid, trained_scene
 
 WAYS = {
     "as it comes": IsolationConfig(),

@@ -22,8 +22,8 @@ import numpy as np
 from mereo.io.atomic_files import json_text
 from mereo.io.checked_tensors import pack_tensors
 from mereo.io.object_storage import Place, place_of, write_whole
-from mereo.synthesis.shards import MANIFEST, dataset_key, shard_name
-from mereo.training.dataset import Dataset
+from mereo_learning.dataset import Dataset
+from mereo_learning.shards import MANIFEST, dataset_key, shard_name
 
 EXAMPLES, POINTS, QUERIES = 64, 1024, 1536
 """Of a shard."""

@@ -31,23 +31,12 @@ import numpy as np
 import torch
 
 from mereo.api.generate import generate
-from mereo.evaluation.calibrate import (
-    VIEWS,
-    CalibrationView,
-    calibrate,
-    ece_of,
-    object_views,
-    other_objects,
-    strange_frames,
-)
-from mereo.evaluation.cases import sample_cells
-from mereo.evaluation.metrics import truth_grid
-from mereo.evaluation.scoring import trained_scene
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.recognition import Recognition
 from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import PointCloud
+from mereo.geometry.metrics import truth_grid
 from mereo.io.atomic_files import atomic_file
 from mereo.models.model import Model
 from mereo.models.weights import load_model
@@ -58,8 +47,19 @@ from mereo.scenes.scene import Scene, SourceFrame
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
-from mereo.training.config import PRESETS
-from mereo.training.trainer import train
+from mereo_learning.calibrate import (
+    VIEWS,
+    CalibrationView,
+    calibrate,
+    ece_of,
+    object_views,
+    other_objects,
+    strange_frames,
+)
+from mereo_learning.cases import sample_cells
+from mereo_learning.config import PRESETS
+from mereo_learning.scoring import trained_scene
+from mereo_learning.trainer import train
 
 FACTORS = (25.4, 0.1, 1000.0, 0.0254, 10.0, 1 / 25.4, 0.001, 2.54)
 """Units that are mistaken for each other: inches, millimetres, centimetres, metres."""

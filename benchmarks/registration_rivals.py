@@ -40,15 +40,13 @@ from rivals.frames import Frame, surface_points, thinned_cloud
 from rivals.methods import Registered, Settings
 from rivals.settings import RIVALS, Rival
 
-from mereo.evaluation.metrics import TruthGrid, truth_grid
-from mereo.evaluation.scans import SCANS, scan_in_camera
-from mereo.evaluation.scoring import predict_grid
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.correspondences import find_correspondences
 from mereo.fitting.registration.register import CloudToFit, fit_frame
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.metrics import TruthGrid, truth_grid
 from mereo.geometry.transforms import fit_rigid, robust_rigid, transform_points
 from mereo.models.model import Model
 from mereo.models.weights import load_model
@@ -56,6 +54,8 @@ from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel
+from mereo_learning.scans import SCANS, scan_in_camera
+from mereo_learning.scoring import predict_grid
 
 Row = tuple[float, float, float, bool, np.ndarray, np.ndarray]
 """IoU, mIoU, seconds, finished, errors near observed points and elsewhere."""

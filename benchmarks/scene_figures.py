@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from mereo.deformation.maps import Compose, Rigid
-from mereo.evaluation.metrics import confusion_matrix, intersection_over_union, truth_grid
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.metrics import confusion_matrix, intersection_over_union, truth_grid
 from mereo.geometry.solids import label_grid
 from mereo.geometry.transforms import inverse_rigid
 from mereo.scenes.registry import load_scene

@@ -28,11 +28,10 @@ from typing import Any
 import numpy as np
 
 from mereo.api.objects import Object, load_object
-from mereo.evaluation.cases import grid_confusion
-from mereo.evaluation.metrics import TruthGrid, intersection_over_union, truth_grid
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.metrics import TruthGrid, grid_confusion, intersection_over_union, truth_grid
 from mereo.geometry.solids import label_grid
 from mereo.io.sensor_frame import SensorFrame
 from mereo.reconstruction.config import IsolationConfig

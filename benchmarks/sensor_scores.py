@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from mereo.evaluation.metrics import format_score
+from mereo.geometry.metrics import format_score
 from mereo.models.weights_place import shipped_names
 
 CAMERAS = {

@@ -30,9 +30,9 @@ from typing import Any
 
 import numpy as np
 
-from mereo.evaluation.sample_views import load_view
 from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.io.extras import pyplot
+from mereo.synthesis.sample_views import load_view
 
 FRAMES = 8
 """Files in the watched folder; each is another random part of one frame."""

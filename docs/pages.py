@@ -2,7 +2,8 @@
 
 The home page is README.md, and CONTRIBUTING.md, CHANGELOG.md and LICENSE are pages too; so that links between them and
 the rest work in the repository as well as here, their targets are rewritten. ``src/mereo`` gives a page for each of its
-folders with all that is public there, and one for each model card. The tour is an executed notebook, ``tour.ipynb``.
+folders with all that is public there, ``src/mereo_learning`` one, and each model card one. The tour is an executed
+notebook, ``tour.ipynb``.
 """
 
 import ast
@@ -19,6 +20,7 @@ from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parent.parent
 SOURCE = ROOT / "src" / "mereo"
+LEARNING = ROOT / "src" / "mereo_learning"
 
 COPIES = {
     "README.md": "index.md",
@@ -39,7 +41,7 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
     notes = sorted(path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs" / "design").glob("*.md"))
     config.nav = [
         *(config.nav or []),
-        {"API by room": ["api/index.md", *_rooms(SOURCE)]},
+        {"API by room": ["api/index.md", *_rooms(SOURCE), _page_of(LEARNING)]},
         {"Decisions": notes},
         {"Model cards": [f"models/{card.name}" for card in _cards()]},
         {"Project": ["contributing.md", "changelog.md", "licence.md"]},
@@ -72,7 +74,7 @@ def _pages() -> Iterator[tuple[str, str]]:
         text = (ROOT / source).read_text()
         yield target, f"# Licence\n\n```text\n{text}```\n" if source == "LICENSE" else _from_root(text)
     yield "api/index.md", _public_names()
-    for package in _packages(SOURCE):
+    for package in (*_packages(SOURCE), LEARNING):
         yield _page_of(package), _reference(package)
     for card in _cards():
         yield f"models/{card.name}", card.read_text()
@@ -121,7 +123,11 @@ def _rooms(folder: Path) -> list[Any]:
 
 def _page_of(package: Path) -> str:
     inner = any(True for _ in _packages(package))
-    return f"api/{package.relative_to(SOURCE).as_posix()}{'/index' if inner else ''}.md"
+    return f"api/{'/'.join(_names_of(package))}{'/index' if inner else ''}.md"
+
+
+def _names_of(package: Path) -> tuple[str, ...]:
+    return package.relative_to(SOURCE if SOURCE in package.parents else SOURCE.parent).parts
 
 
 def _reference(package: Path) -> str:
@@ -129,7 +135,9 @@ def _reference(package: Path) -> str:
     path = package.relative_to(SOURCE.parent)
     docstring = ast.get_docstring(ast.parse((package / "__init__.py").read_text())) or ""
     modules = [".".join((*path.parts, module.stem)) for module in sorted(package.glob("[!_]*.py"))]
-    return "\n\n".join([f"# {'.'.join(path.parts[1:])}", docstring, *(f"::: {module}" for module in modules)]) + "\n"
+    return (
+        "\n\n".join([f"# {'.'.join(_names_of(package))}", docstring, *(f"::: {module}" for module in modules)]) + "\n"
+    )
 
 
 def _public_names() -> str:
@@ -138,7 +146,7 @@ def _public_names() -> str:
     rows = [
         f"| `mereo.{alias.asname}` | [`{node.module}.{alias.name}`][{node.module}.{alias.name}] |"
         for node in ast.walk(tree)
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("mereo.")
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("mereo")
         for alias in node.names
         if alias.asname
     ]

@@ -17,8 +17,6 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
-from mereo.evaluation.scans import scan_in_camera
-from mereo.evaluation.scoring import grid_scores
 from mereo.geometry.camera import PointCloud
 from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.io.config import InputConfig
@@ -29,6 +27,8 @@ from mereo.reconstruction.isolation import readings
 from mereo.reconstruction.observation import find_object, observe
 from mereo.visualization.contact_sheets import cloud_picture, contact_sheet, save_png
 from mereo.visualization.renderer import Viewpoint
+from mereo_learning.scans import scan_in_camera
+from mereo_learning.scoring import grid_scores
 
 SCAN = "bun000"
 

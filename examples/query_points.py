@@ -10,7 +10,7 @@ import time
 import numpy as np
 
 import mereo
-from mereo.evaluation.sample_views import load_view
+from mereo.synthesis.sample_views import load_view
 
 
 def main(weights: str = "bunny", queries: int = 2000) -> None:

@@ -9,13 +9,13 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from mereo.evaluation.cases import EvaluatedView
-from mereo.evaluation.scoring import EvaluationConfig, evaluate
 from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.models.weights import load_model
 from mereo.models.weights_place import shipped_names
 from mereo.scenes.scene import AssetUnavailable
-from mereo.visualization.error_maps import error_picture
+from mereo_learning.cases import EvaluatedView
+from mereo_learning.error_maps import error_picture
+from mereo_learning.scoring import EvaluationConfig, evaluate
 
 
 def first_view(name: str, cells: int) -> EvaluatedView:

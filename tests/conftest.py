@@ -22,7 +22,8 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 # before the first import of mereo: from here on a wrong shape or dtype is an error
 install_import_hook(
-    ["mereo", "mereo_objects", "mereo_experiments", "mereo_serving", "mereo_viewer"], "type_checker.check"
+    ["mereo", "mereo_learning", "mereo_objects", "mereo_experiments", "mereo_serving", "mereo_viewer"],
+    "type_checker.check",
 )
 
 from mereo_objects import assets  # noqa: E402
@@ -105,7 +106,7 @@ def few_states(few_rope_states: "DrawnStates", monkeypatch: pytest.MonkeyPatch) 
 @pytest.fixture
 def without_curves(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let trainings leave an empty curves.png: drawing one takes as long as ten steps of a small network."""
-    from mereo.training import metrics_log
+    from mereo_learning import metrics_log
 
     monkeypatch.setattr(metrics_log, "draw_curves", lambda rows, path: path.write_bytes(b""))
 

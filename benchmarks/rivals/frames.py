@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mereo.deformation.moving_least_squares import spread
-from mereo.evaluation.icp import exposed
 from mereo.fitting.problem.residuals import Surface
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.transforms import transform_points
 from mereo.scenes.statistical_model import StatisticalModel
+from mereo_learning.icp import exposed
 
 DENSE = 6000
 TARGETS = 1000

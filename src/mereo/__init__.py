@@ -40,44 +40,44 @@ if TYPE_CHECKING:
     from mereo.scenes.registry import load_scene as load_scene
     from mereo.synthesis.config import GenerateConfig as GenerateConfig
     from mereo.synthesis.examples import synthesize as synthesize
-    from mereo.training.config import TrainConfig as TrainConfig
+    from mereo_learning.config import TrainConfig as TrainConfig
 
 # Here and not where torch is used, because this runs before every import of torch that mereo makes. A thread that spins
 # at a barrier holds the core that the thread it waits for needs: beside other work each barrier may cost a time slice.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 _HOME = {
-    "Camera": "geometry.camera",
-    "DepthImage": "geometry.camera",
-    "GenerateConfig": "synthesis.config",
-    "InferenceConfig": "models.config",
-    "InputConfig": "io.config",
-    "IsolationConfig": "reconstruction.config",
-    "Model": "models.model",
-    "PointCloud": "geometry.camera",
-    "Object": "api.objects",
-    "Result": "api.result",
-    "Segment": "geometry.mesh",
-    "SegmentedMesh": "geometry.mesh",
-    "Tracker": "api.reconstruct",
-    "TrainConfig": "training.config",
-    "evaluate": "api.steps",
-    "export": "api.steps",
-    "generate": "api.generate",
-    "learn": "api.steps",
-    "load_frame": "api.reconstruct",
-    "load_model": "models.weights",
-    "load_object": "api.objects",
-    "load_scene": "scenes.registry",
-    "read_camera": "io.intrinsics",
-    "read_depth_image": "io.readers",
-    "read_point_cloud": "io.readers",
-    "reconstruct": "api.reconstruct",
-    "synthesize": "synthesis.examples",
-    "train": "api.steps",
-    "view": "api.view",
+    "Camera": "mereo.geometry.camera",
+    "DepthImage": "mereo.geometry.camera",
+    "GenerateConfig": "mereo.synthesis.config",
+    "InferenceConfig": "mereo.models.config",
+    "InputConfig": "mereo.io.config",
+    "IsolationConfig": "mereo.reconstruction.config",
+    "Model": "mereo.models.model",
+    "PointCloud": "mereo.geometry.camera",
+    "Object": "mereo.api.objects",
+    "Result": "mereo.api.result",
+    "Segment": "mereo.geometry.mesh",
+    "SegmentedMesh": "mereo.geometry.mesh",
+    "Tracker": "mereo.api.reconstruct",
+    "TrainConfig": "mereo_learning.config",
+    "evaluate": "mereo.api.steps",
+    "export": "mereo.api.steps",
+    "generate": "mereo.api.generate",
+    "learn": "mereo.api.steps",
+    "load_frame": "mereo.api.reconstruct",
+    "load_model": "mereo.models.weights",
+    "load_object": "mereo.api.objects",
+    "load_scene": "mereo.scenes.registry",
+    "read_camera": "mereo.io.intrinsics",
+    "read_depth_image": "mereo.io.readers",
+    "read_point_cloud": "mereo.io.readers",
+    "reconstruct": "mereo.api.reconstruct",
+    "synthesize": "mereo.synthesis.examples",
+    "train": "mereo.api.steps",
+    "view": "mereo.api.view",
 }
-"""Module of each public name, below ``mereo``."""
+"""Module of each public name."""
 
 __all__ = [*_HOME, "__version__"]
 
@@ -95,7 +95,7 @@ def __getattr__(name: str) -> Any:
     from mereo.io.extras import network_needed
 
     with network_needed():
-        return getattr(import_module(f"mereo.{_HOME[name]}"), name)
+        return getattr(import_module(_HOME[name]), name)
 
 
 def __dir__() -> list[str]:

@@ -26,7 +26,7 @@ from mereo.io.bounds import check_bounds
 from mereo.io.cores import use_threads
 from mereo.io.errors import is_foreseen, printable_line, words_of
 from mereo.synthesis.config import SENSORS, GenerateConfig
-from mereo.training.config import PRESETS
+from mereo_learning.config import PRESETS
 
 Choice = TypeVar("Choice")
 

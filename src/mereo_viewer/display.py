@@ -13,9 +13,9 @@ import trimesh
 from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
-from mereo.evaluation.metrics import Scores, format_score
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color, Segment, SegmentedMesh, vertex_normals
+from mereo.geometry.metrics import Scores, format_score
 from mereo.geometry.subdivision import split_at_creases
 from mereo.visualization.color_scales import ColorScale
 from mereo.visualization.contact_sheets import Picture, enlarge

@@ -14,13 +14,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mereo.evaluation.cases import grid_confusion, labels_on
-from mereo.evaluation.metrics import Scores, intersection_over_union, truth_grid
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import Camera, PointCloud
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.metrics import Scores, grid_confusion, intersection_over_union, labels_on, truth_grid
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.errors import words_of

@@ -26,13 +26,13 @@ from mereo.api import reconstruct, view
 from mereo.api.result import SINGLE, Result
 from mereo.cli.answers import ReconstructCommand
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
-from mereo.evaluation.cases import Evaluation
 from mereo.fitting.registration.registration import Located
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.io.atomic_files import MARKER
 from mereo.reconstruction.observation import SizeWarning
 from mereo.scenes.registry import load_scene
 from mereo.visualization.units import Unit
+from mereo_learning.cases import Evaluation
 from mereo_viewer import result_page
 from mereo_viewer.server import OpenPage
 

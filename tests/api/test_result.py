@@ -10,13 +10,13 @@ from toy_frames import CENTERS, MODEL, NAMES, RADII, seen
 
 import mereo
 from mereo.api.result import Result
-from mereo.evaluation.sample_views import load_view
 from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import SCANNER_TO_CAMERA
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.transforms import transform_points
 from mereo.models.model import Model
 from mereo.scenes.scene import SourceFrame
+from mereo.synthesis.sample_views import load_view
 
 pytestmark = pytest.mark.usefixtures("small_previews")
 

@@ -13,11 +13,11 @@ from analytic import untrained
 
 import mereo
 from mereo.api import steps
-from mereo.learning.learn import LearnConfig
 from mereo.scenes.registry import load_scene
-from mereo.synthesis import shards
 from mereo.synthesis.config import GenerateConfig
-from mereo.training.config import PRESETS, TrainConfig
+from mereo_learning import shards
+from mereo_learning.config import PRESETS, TrainConfig
+from mereo_learning.learn import LearnConfig
 
 
 def test_generate_and_train_are_the_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

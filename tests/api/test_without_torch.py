@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from angle import write_angle
 
-from mereo.learning.object_files import scene_of_meshes
+from mereo.scenes.files.object_files import scene_of_meshes
 from mereo.scenes.random_states import CACHE_VARIABLE
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
@@ -131,5 +131,5 @@ print(trial.scores.iou > 0.7, trial.source.split()[0])
 
 def test_what_the_demonstration_loads_before_it_looks_for_torch(tmp_path: Path) -> None:
     """It reads the truth of a scan, and finds its object by the meshes."""
-    ran = hidden("import mereo.cli.demo, mereo.evaluation.scans, mereo.visualization.result_files", tmp_path)
+    ran = hidden("import mereo.cli.demo, mereo_learning.scans, mereo.visualization.result_files", tmp_path)
     assert ran.returncode == 0, ran.stderr

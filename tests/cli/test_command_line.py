@@ -17,7 +17,7 @@ from mereo.cli.answers import ReconstructCommand
 from mereo.io.config import InputConfig
 from mereo.scenes.scene import SCENES
 from mereo.synthesis.config import GenerateConfig, SamplingConfig
-from mereo.training.config import PRESETS, PresetName
+from mereo_learning.config import PRESETS, PresetName
 
 WITHOUT_NETWORK = {"HTTPS_PROXY": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"}
 

@@ -10,12 +10,12 @@ import mereo.__main__ as command_line
 from mereo.cli.answers import ReconstructCommand
 from mereo.cli.options import Outcome
 from mereo.cli.reconstruct import FrameJob
-from mereo.evaluation.scoring import EvaluationConfig
 from mereo.io.config import InputConfig
 from mereo.models.config import InferenceConfig
 from mereo.synthesis.config import GenerateConfig
-from mereo.synthesis.shards import DatasetConfig
-from mereo.training.config import PRESETS
+from mereo_learning.config import PRESETS
+from mereo_learning.scoring import EvaluationConfig
+from mereo_learning.shards import DatasetConfig
 
 
 @pytest.mark.parametrize(
@@ -23,7 +23,7 @@ from mereo.training.config import PRESETS
     [
         (
             "generate rope --examples 7 --seed 3 --output out --workers 2 --shard 1/4 --resume",
-            "mereo.synthesis.shards",
+            "mereo_learning.shards",
             "generate",
             {
                 "config": DatasetConfig(GenerateConfig(), 7, 3),
@@ -41,7 +41,7 @@ from mereo.training.config import PRESETS
         ),
         (
             "evaluate bunny --output out --examples 4 --seed 1000001",
-            "mereo.visualization.evaluation_report",
+            "mereo_learning.evaluation_report",
             "evaluate_weights",
             {"weights": "bunny", "output": Path("out"), "config": EvaluationConfig(None, 4, 1_000_001), "workers": 1},
         ),

@@ -12,7 +12,7 @@ from two_balls import scene
 from mereo import __main__ as command_line
 from mereo.cli.options import options_of
 from mereo.synthesis.config import SENSORS
-from mereo.training.config import PRESETS
+from mereo_learning.config import PRESETS
 
 pytestmark = pytest.mark.usefixtures("small_previews")
 

@@ -9,8 +9,8 @@ import pytest
 from golden_objects import weights_of
 
 from mereo import __main__ as command_line
-from mereo.evaluation.sample_views import load_view
 from mereo.io import progress
+from mereo.synthesis.sample_views import load_view
 
 PLIERS = str(weights_of("pliers"))
 

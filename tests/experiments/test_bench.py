@@ -8,15 +8,15 @@ import pytest
 import torch
 
 from mereo.cli import tools
-from mereo.evaluation.sample_views import load_view
 from mereo.geometry.downsampling import farthest_point_order
 from mereo.models.weights import load_model
-from mereo.training.config import PRESETS
+from mereo.synthesis.sample_views import load_view
 from mereo_experiments.speed import fitted_model
 from mereo_experiments.speed.baseline import Rival, farthest_points
 from mereo_experiments.speed.report import table
 from mereo_experiments.speed.roofline import Machine, Work, count_operations
 from mereo_experiments.speed.stages import Bench, Stage, needed_nodes
+from mereo_learning.config import PRESETS
 
 MACHINE = Machine(1e11, 1e10)
 

@@ -9,17 +9,17 @@ import pytest
 from PIL import Image
 
 from mereo import __main__ as command_line
-from mereo.evaluation.cases import EvaluatedView
 from mereo.geometry.camera import PointCloud
 from mereo.synthesis.config import GenerateConfig
-from mereo.training.config import PRESETS
-from mereo.visualization.error_maps import comparison_picture
 from mereo_experiments.paper.encoders_losses import ENCODERS, lacks, recipe
 from mereo_experiments.paper.plan import Cost, Plan, cost
 from mereo_experiments.paper.registry import EXPERIMENTS, experiment, run_experiment
 from mereo_experiments.paper.result import Claim, Result, Row, better, markdown, published, write_result
 from mereo_experiments.paper.scales import SCALES
 from mereo_experiments.paper.store import Score, Store, content_key, read_score
+from mereo_learning.cases import EvaluatedView
+from mereo_learning.config import PRESETS
+from mereo_learning.error_maps import comparison_picture
 
 NAN = float("nan")
 

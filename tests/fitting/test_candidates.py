@@ -7,12 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mereo.evaluation.cases import Evaluation, RegistrationErrors, find_candidates, seen_points
-from mereo.evaluation.metrics import Scores, truth_grid
-from mereo.evaluation.scoring import EvaluationConfig, evaluate
-from mereo.evaluation.tables import markdown_table, metrics
 from mereo.fitting.registration.register import CloudToFit, Registrar
 from mereo.geometry.camera import PointCloud
+from mereo.geometry.metrics import Scores, truth_grid
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.atomic_files import write_json
 from mereo.models.model import Model
@@ -23,6 +20,9 @@ from mereo.scenes.scene import State
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import View, sample_view
+from mereo_learning.cases import Evaluation, RegistrationErrors, find_candidates, seen_points
+from mereo_learning.scoring import EvaluationConfig, evaluate
+from mereo_learning.tables import markdown_table, metrics
 
 SEED = 1_000_021
 

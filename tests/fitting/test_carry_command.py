@@ -9,7 +9,6 @@ import pytest
 import trimesh
 
 from mereo import __main__ as command_line
-from mereo.evaluation.sample_views import SampleView, load_view
 from mereo.fitting.registration.register import CloudToFit, Registrar, fit_frame
 from mereo.io.attachments import PoseTable, Surfaces, read_attachments, read_pose_table
 from mereo.io.mesh_formats import read_segmented_mesh
@@ -18,6 +17,7 @@ from mereo.io.writers.volumes import write_volume
 from mereo.models.model import Model
 from mereo.models.weights import save_model
 from mereo.scenes.registry import load_scene
+from mereo.synthesis.sample_views import SampleView, load_view
 
 pytestmark = pytest.mark.usefixtures("small_previews")
 

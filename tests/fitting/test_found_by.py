@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from answers import answer_to
 
-from mereo.evaluation.sample_views import load_view
 from mereo.fitting.problem import correspondences
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.answer_frame import (
@@ -23,6 +22,7 @@ from mereo.geometry.camera import PointCloud, SightLines
 from mereo.models.model import Model
 from mereo.models.weights import load_model
 from mereo.reconstruction.observation import observe
+from mereo.synthesis.sample_views import load_view
 
 HYPOTHESES = "mereo.fitting.registration.answer_frame"
 

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 from answers import answer_to
 
-from mereo.evaluation.sample_views import load_view
-from mereo.evaluation.scans import SCANS, scan_in_camera
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.problem import (
@@ -37,6 +35,8 @@ from mereo.scenes.scene import AssetUnavailable
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
+from mereo.synthesis.sample_views import load_view
+from mereo_learning.scans import SCANS, scan_in_camera
 
 CLEAN_SEED = 720_000
 

@@ -7,16 +7,6 @@ import pytest
 from answers import answer_to
 from toy_scene import Shear, toy_scene
 
-from mereo.evaluation.calibrate import (
-    CalibrationView,
-    RecognitionSigns,
-    clean_views,
-    object_views,
-    other_objects,
-    strange_frames,
-    usual_of,
-)
-from mereo.evaluation.sample_views import load_view
 from mereo.fitting.problem.correspondences import CLIPPED
 from mereo.fitting.problem.problem import ACCEPTED
 from mereo.fitting.registration.recognition import (
@@ -40,6 +30,16 @@ from mereo.scenes.scene import Scene, SourceFrame
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
+from mereo.synthesis.sample_views import load_view
+from mereo_learning.calibrate import (
+    CalibrationView,
+    RecognitionSigns,
+    clean_views,
+    object_views,
+    other_objects,
+    strange_frames,
+    usual_of,
+)
 
 SCENE = toy_scene()
 
@@ -230,12 +230,12 @@ def test_further_views_are_clean_and_others_than_those_before_them() -> None:
 
 
 def test_strangers_are_other_objects_planes_and_heaps(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mereo.evaluation.calibrate.SCENES", ("rope", "robot", "liver", "tumor"))
+    monkeypatch.setattr("mereo_learning.calibrate.SCENES", ("rope", "robot", "liver", "tumor"))
     rope: Scene = load_scene("rope")
     load_scene("liver")  # or the test is skipped, where its mesh is missing
     assert [other.name for other in other_objects(rope)] == ["robot", "liver"]
     assert [other.name for other in other_objects(load_scene("liver"))] == ["rope", "robot"]
-    monkeypatch.setattr("mereo.evaluation.calibrate.SCENES", ("rope", "robot"))
+    monkeypatch.setattr("mereo_learning.calibrate.SCENES", ("rope", "robot"))
     frames = list(strange_frames(rope, other_objects(rope), 1, 710_000))
     assert [kind for kind, _ in frames] == ["other object"] + ["plane or clutter"] * 8
     low, high = rope.rest.bounds

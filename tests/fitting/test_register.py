@@ -16,9 +16,6 @@ from trimesh.remesh import subdivide
 import mereo
 from mereo import __main__ as command_line
 from mereo.api.objects import Object
-from mereo.evaluation.metrics import confusion_matrix, intersection_over_union
-from mereo.evaluation.sample_views import SampleView, load_view
-from mereo.evaluation.scoring import EvaluationConfig, evaluate
 from mereo.fitting.draws.playback import DrawnStates
 from mereo.fitting.registration import register
 from mereo.fitting.registration.answer import Answer
@@ -35,6 +32,7 @@ from mereo.fitting.registration.registration import Registration
 from mereo.fitting.tracking import Tracker
 from mereo.geometry.camera import SCANNER_TO_CAMERA, PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.metrics import confusion_matrix, intersection_over_union
 from mereo.geometry.solids import Solids
 from mereo.models.model import Model
 from mereo.models.weights import save_model
@@ -42,6 +40,8 @@ from mereo.reconstruction.observation import observe
 from mereo.reconstruction.pipeline import Reconstruction
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import AssetUnavailable, Scene
+from mereo.synthesis.sample_views import SampleView, load_view
+from mereo_learning.scoring import EvaluationConfig, evaluate
 
 
 @pytest.fixture(scope="module")

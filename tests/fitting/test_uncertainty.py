@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from toy_scene import Lift, Shear, toy_scene
 
-from mereo.evaluation.cases import RegistrationErrors, seen_points
 from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed
 from mereo.fitting.registration.registration import Registration
@@ -21,6 +20,7 @@ from mereo.geometry.transforms import rigid, transform_points
 from mereo.scenes.random_states import scene_model, state_points
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.depth_sensor import render_depth
+from mereo_learning.cases import RegistrationErrors, seen_points
 
 SCENE = toy_scene()
 IN_FRONT = rigid(Rotation.from_euler("xyz", [25, 30, 10], degrees=True).as_matrix(), np.array([1.0, 2.0, 120.0]))

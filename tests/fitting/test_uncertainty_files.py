@@ -16,7 +16,6 @@ from answers import answer_to
 from scipy.spatial import cKDTree
 
 from mereo.cli.stream import FrameAnswer, line
-from mereo.evaluation.sample_views import load_view
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import CloudToFit, Registrar
 from mereo.fitting.tracking import Tracker
@@ -27,6 +26,7 @@ from mereo.models.model import Model
 from mereo.models.weights import load_model
 from mereo.reconstruction.observation import observe
 from mereo.reconstruction.stream import Outcome
+from mereo.synthesis.sample_views import load_view
 from mereo.visualization.reconstruction_report import MOST, UNEXPLAINED, explain_centroids, point_marks
 from mereo.visualization.result_files import write_answer, write_answer_file
 

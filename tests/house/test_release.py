@@ -11,12 +11,12 @@ import torch
 from safetensors.torch import load_file
 
 from mereo import __main__ as command_line
-from mereo.evaluation.tables import read_metrics
 from mereo.models.weights import PACKED, _pack, _unpack, load_model, save_model
 from mereo.models.weights_place import find_weights, shipped_names
 from mereo.synthesis.config import SENSORS, SensorConfig
-from mereo.training.model_card import card, release
-from mereo.training.run_directory import describe_seen, seen_by
+from mereo_learning.model_card import card, release
+from mereo_learning.run_directory import describe_seen, seen_by
+from mereo_learning.tables import read_metrics
 
 TEST = {
     "seed": 1_000_000,

@@ -14,7 +14,7 @@ from mereo.io.config import InputConfig
 from mereo.models.config import PARTS, NetworkConfig
 from mereo.reconstruction.config import IsolationConfig
 from mereo.synthesis.config import GenerateConfig, SamplingConfig, SensorConfig
-from mereo.training.config import AugmentConfig, TrainConfig
+from mereo_learning.config import AugmentConfig, TrainConfig
 
 SETTINGS = (
     *(*PARTS.values(), NetworkConfig, AugmentConfig, TrainConfig),

@@ -18,7 +18,7 @@ from toy_scene import toy_scene
 from mereo.__main__ import main
 from mereo.api.generate import generate
 from mereo.io.object_storage import ObjectPath, StorageError, claim, names_in, write_whole
-from mereo.training.dataset import Dataset
+from mereo_learning.dataset import Dataset
 
 __all__ = ["small_shards"]  # a fixture
 

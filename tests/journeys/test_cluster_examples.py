@@ -19,7 +19,7 @@ from torch.distributed.run import get_args_parser
 
 import mereo.__main__ as command_line
 from mereo.cli.training import Generate, Train
-from mereo.training.processes import SEPARATE
+from mereo_learning.processes import SEPARATE
 
 FOLDER = Path(__file__).parents[2] / "examples" / "cluster"
 SCRIPTS, FILES = sorted(FOLDER.glob("*.sbatch")), sorted(FOLDER.glob("*.yaml"))

@@ -14,9 +14,8 @@ from shapes import box
 import mereo
 from mereo import __main__ as command_line
 from mereo.cli.options import loaded_object
-from mereo.evaluation.cases import grid_confusion, labels_on
-from mereo.evaluation.metrics import intersection_over_union, truth_grid
 from mereo.fitting.registration.register import Registrar
+from mereo.geometry.metrics import grid_confusion, intersection_over_union, labels_on, truth_grid
 from mereo.io.config import InputConfig
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import ClustersWarning

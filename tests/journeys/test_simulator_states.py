@@ -11,8 +11,7 @@ from page_blocks import ROOT, blocks
 
 import mereo
 from mereo import __main__ as command_line
-from mereo.evaluation.cases import grid_confusion, labels_on
-from mereo.evaluation.metrics import intersection_over_union, truth_grid
+from mereo.geometry.metrics import grid_confusion, intersection_over_union, labels_on, truth_grid
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.writers.meshes import write_positions_ply
 from mereo.scenes.random_states import CACHE_VARIABLE

@@ -13,24 +13,34 @@ import torch
 from safetensors.torch import load_file
 from scene_files import write_bar
 
-from mereo.evaluation import calibrate as calibration
 from mereo.fitting.draws.playback import DrawnStates
 from mereo.io.config import InputConfig
 from mereo.io.sensor_frame import read_frame
-from mereo.learning import learn as learning
-from mereo.learning import search_stage
-from mereo.learning.learn import LearnConfig, Plan, Rates, epochs_for, holdout, learn, plan_for, views_for
-from mereo.learning.object_files import check, deformation, scene_for, write_example_frame
 from mereo.models.weights import load_model
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import find_object, size_warning
 from mereo.scenes.files import check as checks
 from mereo.scenes.random_states import CACHE_VARIABLE
 from mereo.scenes.registry import load_scene
-from mereo.synthesis import shards
-from mereo.training import trial
-from mereo.training.config import PRESETS
-from mereo.training.trainer import Trainer
+from mereo_learning import calibrate as calibration
+from mereo_learning import learn as learning
+from mereo_learning import search_stage, shards, trial
+from mereo_learning.config import PRESETS
+from mereo_learning.learn import (
+    LearnConfig,
+    Plan,
+    Rates,
+    check_object,
+    deformation,
+    epochs_for,
+    holdout,
+    learn,
+    plan_for,
+    scene_for,
+    views_for,
+    write_example_frame,
+)
+from mereo_learning.trainer import Trainer
 
 BASE = PRESETS["base"]
 LIGHT = replace(
@@ -99,7 +109,7 @@ def test_meshes_get_a_scene_file_once(tmp_path: Path, capsys: pytest.CaptureFixt
 
 def test_what_hardly_deforms_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = write_bar(tmp_path, NOTHING)
-    check([scene], None)
+    check_object([scene], None)
     assert "warning: bar hardly deforms: by 0.0" in capsys.readouterr().out
     assert deformation(load_scene(scene)) < 0.001
     assert deformation(load_scene(write_bar(tmp_path))) > 0.006

@@ -14,14 +14,14 @@ from scene_files import write_bar
 import mereo
 from mereo import __main__ as command_line
 from mereo.cli.options import loaded_object
-from mereo.learning import learn as learning
-from mereo.learning import search_stage
-from mereo.learning import search_stage as scoring
-from mereo.learning.learn import LearnConfig, learn
-from mereo.learning.object_files import scene_of_folder
-from mereo.learning.search_stage import SearchScores, best_method, is_to_train, shortcomings
 from mereo.scenes.files import check
+from mereo.scenes.files.object_files import scene_of_folder
 from mereo.scenes.random_states import CACHE_VARIABLE
+from mereo_learning import learn as learning
+from mereo_learning import search_stage
+from mereo_learning import search_stage as scoring
+from mereo_learning.learn import LearnConfig, learn
+from mereo_learning.search_stage import SearchScores, best_method, is_to_train, shortcomings
 
 GOOD = {"examples": 16, "iou": 0.96, "miou": 0.92, "lowest_miou": 0.8, "explained": 1.0, "seconds": 1.5}
 
@@ -127,7 +127,7 @@ def scored(monkeypatch: pytest.MonkeyPatch) -> list[SearchScores]:
     """Scores that the search has: the last of the list."""
     given = [scores_of([100, 90], [True, True])]
     monkeypatch.setattr(search_stage, "score_search", lambda scene, **_: given[-1])
-    monkeypatch.setattr(learning, "check", lambda files, units: None)
+    monkeypatch.setattr(learning, "check_object", lambda files, units: None)
     return given
 
 

@@ -13,11 +13,9 @@ from toy_data import read_all, write_toy_dataset
 from training_runs import assert_resumes_exactly, train_in_two_processes
 
 from mereo.api.generate import generate
-from mereo.evaluation.cases import TestCase
-from mereo.evaluation.metrics import confusion_matrix, intersection_over_union, truth_grid
-from mereo.evaluation.scoring import score_cases
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.metrics import confusion_matrix, intersection_over_union, truth_grid
 from mereo.models.config import AutodecoderConfig, NetworkConfig
 from mereo.models.decoder import Code
 from mereo.models.encoders import Autodecoder, Encoding
@@ -25,10 +23,12 @@ from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.models.weights import load_model
 from mereo.synthesis.config import GenerateConfig
-from mereo.training import trainer, validation
-from mereo.training.config import PRESETS, AugmentConfig, TrainConfig
-from mereo.training.dataset import Dataset
-from mereo.training.run_directory import start_network
+from mereo_learning import trainer, validation
+from mereo_learning.cases import TestCase
+from mereo_learning.config import PRESETS, AugmentConfig, TrainConfig
+from mereo_learning.dataset import Dataset
+from mereo_learning.run_directory import start_network
+from mereo_learning.scoring import score_cases
 
 pytestmark = pytest.mark.usefixtures("without_curves")
 

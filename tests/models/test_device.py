@@ -17,12 +17,12 @@ from torch.nn import functional as F
 from mereo import __main__ as command_line
 from mereo.cli.answers import ReconstructCommand
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
-from mereo.evaluation.sample_views import load_view
 from mereo.models import device
 from mereo.models.config import EXACT, InferenceConfig, Precision
 from mereo.models.device import ROWS, bfloat16_pays, find_device, in_threads, linear, onednn_pays, pick_precision
 from mereo.models.model import CPU_QUERY_CHUNK, Model
 from mereo.models.weights import load_for, load_model
+from mereo.synthesis.sample_views import load_view
 from mereo_experiments.speed.roofline import count_operations
 from mereo_experiments.speed.stages import random_points
 

@@ -21,7 +21,7 @@ from mereo.models.export.onnx_export import ANSWERS, RUNNER, code_tensors, expor
 from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.models.weights import load_model, save_model
-from mereo.training.config import PRESETS
+from mereo_learning.config import PRESETS
 
 TOLERANCE = 1e-4
 

@@ -10,8 +10,8 @@ from mereo.models.decoder import FrequencyEncoding, Prediction
 from mereo.models.encoders import PointNet2
 from mereo.models.model import fold_batch_norm
 from mereo.models.network import Network
-from mereo.training.config import PRESETS
-from mereo.training.losses import occupancy_loss
+from mereo_learning.config import PRESETS
+from mereo_learning.losses import occupancy_loss
 
 TINY = PRESETS["tiny"].network
 FOLDED = TINY.changed(points=64)

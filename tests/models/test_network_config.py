@@ -9,7 +9,7 @@ import pytest
 import mereo.__main__ as command_line
 from mereo.cli.training import Train
 from mereo.models.config import PARTS, Encoder, NetworkConfig
-from mereo.training.config import PRESETS, TrainConfig
+from mereo_learning.config import PRESETS, TrainConfig
 
 OTHERS: dict[type, Any] = {
     bool: lambda value: not value,

@@ -13,8 +13,8 @@ from mereo.models.export.onnx_export import trilinear
 from mereo.models.neighbors import _by_rank, ball_query, gather, nearest, squared_distances
 from mereo.models.network import AlignmentNet, Network
 from mereo.models.rigid_alignment import Alignment, fit_rigid, svd3
-from mereo.training.config import PRESETS
-from mereo.training.losses import rest_loss
+from mereo_learning.config import PRESETS
+from mereo_learning.losses import rest_loss
 
 TINY = PRESETS["tiny"].network
 

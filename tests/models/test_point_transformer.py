@@ -9,7 +9,7 @@ from mereo.models.config import NetworkConfig
 from mereo.models.encoders import PointTransformer, TransitionDown, VectorAttention
 from mereo.models.neighbors import distinct_distances, nearest
 from mereo.models.network import Network
-from mereo.training.config import PRESETS
+from mereo_learning.config import PRESETS
 
 TINY = NetworkConfig().changed(
     encoder="point-transformer",

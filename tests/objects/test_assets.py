@@ -15,8 +15,8 @@ import pooch
 import pytest
 import trimesh
 
-from mereo.evaluation.scans import BUNNY_SCAN_POSES
 from mereo.scenes.scene import AssetUnavailable
+from mereo_learning.scans import BUNNY_SCAN_POSES
 from mereo_objects import assets
 from mereo_objects.assets import ASSETS, Asset
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from analytic import Distance, ball, half, logits_of, plate, union
 
-from mereo.evaluation.scoring import trained_scene
 from mereo.geometry.mesh import PALETTE, Segment
 from mereo.models.weights import load_model
 from mereo.models.weights_place import shipped_names
@@ -22,6 +21,7 @@ from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import AssetUnavailable
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.examples import GenerateConfig, sample_view
+from mereo_learning.scoring import trained_scene
 
 BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from two_balls import front
 
-from mereo.evaluation.scans import SCANS, scan_in_camera
-from mereo.evaluation.scoring import grid_scores
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.downsampling import spacing, thin_to_grid
 from mereo.models.weights import load_model
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.isolation import IsolationStep, clusters, largest_plane
 from mereo.reconstruction.observation import find_object, observe
+from mereo_learning.scans import SCANS, scan_in_camera
+from mereo_learning.scoring import grid_scores
 
 
 def half_ball(count: int = 3000, center: tuple[float, float, float] = (0.0, 0.0, 0.8)) -> np.ndarray:

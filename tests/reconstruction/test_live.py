@@ -15,7 +15,6 @@ from written_results import segments
 from mereo import __main__ as command_line
 from mereo.cli.answers import StreamCommand
 from mereo.cli.stream import FrameAnswer, SurfaceFolder, stream_reconstructions
-from mereo.evaluation.sample_views import load_view
 from mereo.geometry.camera import PointCloud
 from mereo.io.config import InputConfig
 from mereo.reconstruction.config import IsolationConfig
@@ -23,6 +22,7 @@ from mereo.reconstruction.stream import Outcome, StreamFrame, Summary, frames_of
 from mereo.scenes.registry import load_scene
 from mereo.synthesis.config import SENSORS, SequenceConfig
 from mereo.synthesis.recording import CAMERA, FRAMES, write_recording
+from mereo.synthesis.sample_views import load_view
 
 COUNT, BAD, RATE_HZ = 6, 3, 30.0
 

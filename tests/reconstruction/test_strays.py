@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mereo.evaluation.scans import SCANS, bunny_scan
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.solids import Solids
@@ -16,6 +15,7 @@ from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor
 from mereo.synthesis.examples import sample_view
+from mereo_learning.scans import SCANS, bunny_scan
 
 SEED, OFF = 700_000, 3.0
 """Training draws, and the distance in scene units from which on a point is a stray: six times the noise."""

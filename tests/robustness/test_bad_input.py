@@ -15,7 +15,7 @@ from mereo.geometry.mesh import Segment, SegmentedMesh, check_segment
 from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.models.weights import load_model, save_model
-from mereo.training.config import PRESETS
+from mereo_learning.config import PRESETS
 
 
 @pytest.fixture(scope="module")

@@ -17,10 +17,10 @@ from scene_files import write_bar
 from toy_data import write_toy_dataset
 from write_boundaries import Case, check_boundaries
 
-from mereo.evaluation.sample_views import load_view
 from mereo.models.weights import save_model
 from mereo.models.weights_place import find_weights
 from mereo.scenes.registry import load_scene
+from mereo.synthesis.sample_views import load_view
 
 TRAIN = (
     "train INPUTS/data --output out --preset tiny --precision float32 --compile off --batch 8 --queries 48 --epochs 1 "

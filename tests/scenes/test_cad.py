@@ -21,6 +21,7 @@ from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.mesh_check import mesh_of, overlaps
 from mereo.geometry.subdivision import TooManyFaces, split_edges
+from mereo.geometry.symmetry import describe_symmetries
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.scenes.files.build import TOLERANCE, refined
@@ -36,6 +37,7 @@ from mereo.scenes.files.template import (
     rubber,
     write_scene_file,
 )
+from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
@@ -450,3 +452,11 @@ def test_planes_cylinders_and_other_contacts() -> None:
     away = round_one.point - turn(np.array([[2.0, 0, 0]]))[0]
     assert np.linalg.norm(away - (away @ axis) * axis) < 0.02
     assert abs(found[frozenset(("body", "lid"))].axis @ axis) > 0.9999
+
+
+def test_a_check_names_parts_that_no_frame_tells_apart(written: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sentence = "the object looks the same turned by 180 degrees about x: no frame tells upper and lower apart"
+    check_scene(str(written))
+    assert f"symmetry: {sentence}" in capsys.readouterr().out.splitlines()
+    model = scene_model(load_scene(written), 20)
+    assert describe_symmetries(model.symmetries, model.rest.names) == [sentence]

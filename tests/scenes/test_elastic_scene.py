@@ -1,5 +1,6 @@
 """Elastic solids in scene files: what the block says, the object's model made of it, and fits of that to frames."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,8 @@ from scene_files import HEAD, write_bar, write_mesh
 from scipy.spatial.transform import Rotation
 from shapes import box
 
+from mereo.deformation.elastic import build_lattice
+from mereo.deformation.tetrahedral import Tetrahedra
 from mereo.fitting.config import ELASTIC, FitConfig
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import Posed
@@ -17,7 +20,9 @@ from mereo.fitting.problem.problem import GivenPose, Problem
 from mereo.fitting.problem.residuals import NetworkTerm, Prior, SampledSurface
 from mereo.fitting.registration.answer_frame import initial_state, search_modes
 from mereo.fitting.registration.register import CloudToFit, Registrar
+from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import rigid, transform_points
+from mereo.scenes.files.build import files_of
 from mereo.scenes.random_states import model_key, scene_model, state_points
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
@@ -98,6 +103,9 @@ def test_one_word_says_the_deformations(tmp_path: Path) -> None:
         (ELASTIC_BAR + "    held: [{center: [0, 0, 0], radius: 5}]\n", r"holds 0 of \d+ nodes .* it gets 3 where"),
         (ELASTIC_BAR + "    held: [{center: [0, 0, 0]}]\n", "either a radius .* or a direction .*: give one"),
         (ELASTIC_BAR.replace("0.1", "0.9"), "motion"),
+        (ELASTIC_BAR + "    tetrahedra: bar.vtu\n", "both cells and tetrahedra; .*: drop one"),
+        (ELASTIC_BAR.replace("cells: 10", "tetrahedra: bar.vtu"), "bar.vtu does not exist"),
+        (ELASTIC_BAR.replace("cells: 10", "tetrahedra: bar.msh"), "suffix '.msh'; a volume mesh is one of"),
     ],
 )
 def test_blocks_that_do_not_fit_are_refused_with_their_line(tmp_path: Path, tail: str, message: str) -> None:
@@ -114,6 +122,63 @@ def test_segments_that_do_not_touch_are_no_solid(tmp_path: Path) -> None:
     message = "2 pieces that do not touch; an elastic solid is one: give each piece a block"
     with pytest.raises(ValueError, match=message):
         load_scene(str(path))
+
+
+def write_volume(folder: Path, nodes: np.ndarray, elements: np.ndarray) -> str:
+    """Block of an elastic solid of these tetrahedra, which are written into ``folder``."""
+    np.savez(folder / "bar.npz", rest_nodes=nodes, tetrahedra=elements)
+    return ELASTIC_BAR.replace("cells: 10", "tetrahedra: bar.npz")
+
+
+@pytest.fixture(scope="module")
+def volume() -> Tetrahedra:
+    """Tetrahedra that fill the bar exactly, in its own unit."""
+    bar = SegmentedMesh((box((100, 0, 0), (140, 10, 10)),))
+    lattice = build_lattice(bar, 16).mesh
+    low, high = lattice.nodes.min(axis=0), lattice.nodes.max(axis=0)
+    return Tetrahedra([100, 0, 0] + (lattice.nodes - low) / (high - low) * [40, 10, 10], lattice.elements)
+
+
+def test_a_volume_mesh_takes_the_place_of_the_lattice(tmp_path: Path, volume: Tetrahedra) -> None:
+    block = write_volume(tmp_path, np.concatenate([[[0.0, 0.0, 0.0]], volume.nodes]), volume.elements + 1)
+    path = write_bar(tmp_path, block)
+    scene = load_scene(str(path))
+    solid = scene.sample_deformations.steps[0][0].solid
+    np.testing.assert_allclose(solid.mesh.nodes, transform_points(scene.T_scene_source, volume.nodes), atol=1e-9)
+    assert solid.volumes.sum() == pytest.approx(np.ptp(scene.rest.bounds, axis=0).prod()), "all of it is filled"
+    assert path.parent / "bar.npz" in files_of(path), "a copy of the object needs it"
+
+    path.write_text(path.read_text() + "    stiffness: {right: 100}\n")
+    stiff = load_scene(str(path)).sample_deformations.steps[0][0].solid
+    right = stiff.mesh.nodes[stiff.mesh.elements].mean(axis=1)[:, 0] > scene.rest.bounds[:, 0].mean()
+    np.testing.assert_array_equal(stiff.stiffness, np.where(right, 100, 1))
+
+    np.savez(tmp_path / "bar.npz", rest_nodes=volume.nodes * [1, 1, 1.01], tetrahedra=volume.elements)
+    assert load_scene(str(path)).definition != scene.definition, "other tetrahedra are another object"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda nodes, cells: (nodes / 1000, cells), "lies .* outside of the tetrahedra .*: check the unit"),
+        (lambda nodes, cells: (nodes, cells + 1), "refers to node"),
+        (lambda nodes, cells: (nodes, cells[:0]), "has no tetrahedra"),
+        (
+            lambda nodes, cells: (np.concatenate([nodes, nodes]), np.concatenate([cells, cells + len(nodes)])),
+            "2 pieces that share no faces",
+        ),
+    ],
+)
+def test_a_volume_mesh_that_does_not_fit_is_refused_with_its_line(
+    tmp_path: Path,
+    volume: Tetrahedra,
+    change: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
+    message: str,
+) -> None:
+    block = write_volume(tmp_path, *change(volume.nodes, volume.elements))
+    with pytest.raises(ValueError, match=message) as raised:
+        load_scene(str(write_bar(tmp_path, block)))
+    assert "bar.yaml:12: " in str(raised.value)
 
 
 # --- the model --------------------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from mereo.synthesis import examples
 from mereo.synthesis.config import OBSERVATIONS, SENSORS, GenerateConfig
 from mereo.synthesis.depth_sensor import SimulatedView, observe
 from mereo.synthesis.examples import Example, _sample_view, synthesize
-from mereo.synthesis.shards import example_bytes, pack
+from mereo_learning.shards import example_bytes, pack
 
 __all__ = ["small_shards"]  # a fixture
 

@@ -30,8 +30,8 @@ from mereo.synthesis.query_sampling import (
     sort_sample,
     volume_uniform,
 )
-from mereo.synthesis.shards import make_manifest
 from mereo.visualization.renderer import Viewpoint, shade
+from mereo_learning.shards import make_manifest
 
 CORE, ORGAN = ((2.0, 0.0, 0.0), 2.6), ((0.0, 0.0, 0.0), 5.0)
 """Centre and radius; the core comes as near as 0.4 to the organ's surface."""

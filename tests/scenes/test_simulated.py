@@ -13,13 +13,13 @@ from toy_scene import toy_scene
 from mereo.api.generate import generate
 from mereo.deformation.maps import invert, jacobian_determinant
 from mereo.deformation.tetrahedral import Surface, SurfaceMap, Tetrahedra, TetrahedralMap
-from mereo.evaluation.scoring import EvaluationConfig, evaluate
 from mereo.io.simulation_states import TetrahedralRecord, read_states
 from mereo.scenes.recorded_states import load_states
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START
-from mereo.synthesis import shards
 from mereo.synthesis.config import GenerateConfig, SamplingConfig
+from mereo_learning import shards
+from mereo_learning.scoring import EvaluationConfig, evaluate
 
 SHIPPED = Path(__file__).parents[2] / "src/mereo/states/liver.npz"
 

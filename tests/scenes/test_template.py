@@ -16,8 +16,8 @@ from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH, rest_distance
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo.synthesis.examples import synthesize
-from mereo.training.config import PRESETS
-from mereo.training.dataset import Dataset
+from mereo_learning.config import PRESETS
+from mereo_learning.dataset import Dataset
 
 TINY = PRESETS["tiny"].network
 AXIS = torch.linspace(-TEMPLATE_REACH, TEMPLATE_REACH, TEMPLATE_NODES)

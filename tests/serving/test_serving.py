@@ -21,12 +21,12 @@ from serving_parts import ADDRESS, CLOUD, NPY, balls, figures, npy, run, running
 import mereo
 from mereo.cli.answers import ReconstructCommand
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
-from mereo.evaluation.sample_views import load_view
 from mereo.io.config import InputConfig
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.sensor_frame import read_frame
 from mereo.models.config import InferenceConfig
 from mereo.models.model import Model
+from mereo.synthesis.sample_views import load_view
 from mereo_serving.messages import GLB, Served, Setup
 
 EXACT = InferenceConfig(precision="float32")

@@ -8,13 +8,13 @@ from scene_files import write_bar
 from scipy.spatial.transform import Rotation
 from shapes import box
 
-from mereo.evaluation.icp import moved
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import rigid, transform_points
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.synthesis.depth_sensor import render_depth
+from mereo_learning.icp import moved
 
 CAMERA = Camera.from_fov(160, 160, float(np.deg2rad(30.0)))
 

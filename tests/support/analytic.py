@@ -11,7 +11,7 @@ from mereo.geometry.mesh import PALETTE
 from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.models.trained import Answer, EncodedCloud
-from mereo.training.config import PRESETS
+from mereo_learning.config import PRESETS
 
 Points = np.ndarray
 Distance = Callable[[Points], np.ndarray]

@@ -24,10 +24,7 @@ ROOMS = (
     "models",
     "reconstruction",
     "fitting",
-    "evaluation",
-    "training",
     "visualization",
-    "learning",
     "api",
     "cli",
 )
@@ -39,13 +36,14 @@ SUBROOMS = {"fitting": ("config", "problem", "modes", "search", "draws", "uncert
 ROOT_MODULES = ("__init__", "__main__")
 """The public names and the entry point, which may import every room."""
 
-MAY_IMPORT_TORCH = ("models/", "training/", "cli/tools.py")
+MAY_IMPORT_TORCH = ("models/", "cli/tools.py")
 
 HEAVY = ("numpy", "torch", "scipy", "trimesh", "matplotlib")
 """What settings must not load, so that ``--help`` is instant: the two, and libraries that bring them."""
 
 SATELLITES = {
-    "mereo_objects": ("cli/", "scenes/registry.py", "evaluation/scans.py"),
+    "mereo_learning": ("api/generate.py", "api/steps.py", "cli/", "__init__.py", "__main__.py"),
+    "mereo_objects": ("cli/", "scenes/registry.py"),
     "mereo_serving": ("cli/",),
     "mereo_viewer": ("api/", "cli/"),
     "mereo_experiments": ("cli/",),

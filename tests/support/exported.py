@@ -8,7 +8,7 @@ from mereo.models.config import NetworkConfig
 from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH
-from mereo.training.config import PRESETS
+from mereo_learning.config import PRESETS
 
 NAMES = ("head", "left ear", "tail")
 

@@ -81,8 +81,7 @@ def _serve() -> None:
     from mereo.io import atomic_files  # noqa: F401
     from mereo.models.export import onnx_export
     from mereo.models.weights import load_model
-    from mereo.training import model_card, trainer
-    from mereo.visualization import evaluation_report
+    from mereo_learning import evaluation_report, model_card, trainer
 
     del model_card
     torch.set_num_threads(1)

@@ -20,7 +20,6 @@ from shapes import ball, box
 from toy_data import write_toy_dataset
 from written_results import COLORS, grid
 
-from mereo.evaluation.sample_views import SHIPPED as VIEWS
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.attachments import read_attachments
@@ -33,8 +32,9 @@ from mereo.models.network import Network
 from mereo.models.weights import save_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.statistical_model import save_statistical_model
-from mereo.training.config import PRESETS
-from mereo.training.run_directory import Checkpoint
+from mereo.synthesis.sample_views import SHIPPED as VIEWS
+from mereo_learning.config import PRESETS
+from mereo_learning.run_directory import Checkpoint
 
 POINTS = np.random.default_rng(0).normal((0, 0, 2), 0.2, (40, 3)).round(3)
 DEPTH = np.random.default_rng(0).integers(500, 900, (12, 16)).astype(np.uint16)

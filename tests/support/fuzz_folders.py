@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 from fuzz_files import POINTS, bar, dataset, scene_file, tiny_model
 
-from mereo.evaluation.placement import PlacedSegment, Placement
-from mereo.evaluation.scans import ScanFile, read_truth, write_truth
-from mereo.evaluation.tables import read_metrics
 from mereo.io.atomic_files import check_new_directory, new_directory, write_json
-from mereo.training.config import PRESETS
-from mereo.training.dataset import Dataset
-from mereo.training.model_card import card
-from mereo.training.processes import Process
-from mereo.training.run_directory import claim_run, fit_config
+from mereo_learning.config import PRESETS
+from mereo_learning.dataset import Dataset
+from mereo_learning.model_card import card
+from mereo_learning.placement import PlacedSegment, Placement
+from mereo_learning.processes import Process
+from mereo_learning.run_directory import claim_run, fit_config
+from mereo_learning.scans import ScanFile, read_truth, write_truth
+from mereo_learning.tables import read_metrics
 
 
 def result(path: Path) -> None:

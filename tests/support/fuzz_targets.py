@@ -55,8 +55,6 @@ from fuzz_files import (
 from fuzz_folders import claimed, placed, replaced, result, run, scored, scores, truth
 from written_results import COLORS, grid, segments
 
-from mereo.evaluation.placement import read_start
-from mereo.evaluation.sample_views import load_view
 from mereo.io.attachments import Positions, read_pose_table, write_attachment
 from mereo.io.intrinsics import read_intrinsics
 from mereo.io.mesh_formats import read_segmented_mesh
@@ -69,8 +67,10 @@ from mereo.io.writers.volumes import write_labels_seg_nrrd
 from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.statistical_model import load_statistical_model, save_statistical_model
-from mereo.training.dataset import Dataset
-from mereo.training.run_directory import load_checkpoint, save_checkpoint
+from mereo.synthesis.sample_views import load_view
+from mereo_learning.dataset import Dataset
+from mereo_learning.placement import read_start
+from mereo_learning.run_directory import load_checkpoint, save_checkpoint
 
 
 @dataclass(frozen=True)

@@ -29,16 +29,15 @@ import numpy as np
 from golden_objects import FOLDER, OWN, weights_of
 
 import mereo
-from mereo.evaluation.cases import grid_confusion, labels_on
-from mereo.evaluation.metrics import intersection_over_union, truth_grid
-from mereo.evaluation.scans import SCANS, bunny_posed
 from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.metrics import grid_confusion, intersection_over_union, labels_on, truth_grid
 from mereo.geometry.transforms import fit_rigid
 from mereo.models.weights_place import shipped_names
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor
 from mereo.synthesis.examples import sample_view
+from mereo_learning.scans import SCANS, bunny_posed
 
 SEED, VIEWS = 1000, 4
 CAMERAS: tuple[Sensor, ...] = ("paper", "structured-light", "time-of-flight")

@@ -3,7 +3,7 @@
 import numpy as np
 from toy_data import half_balls
 
-from mereo.training.dataset import Draws
+from mereo_learning.dataset import Draws
 
 
 def observed(rng: np.random.Generator, points: int, queries: int) -> dict[str, np.ndarray]:

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from mereo.training.config import PRESETS, AugmentConfig
+from mereo_learning.config import PRESETS, AugmentConfig
 
 SMALL = replace(
     PRESETS["tiny"],

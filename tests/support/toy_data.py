@@ -17,9 +17,9 @@ from toy_scene import toy_scene
 
 from mereo.api.generate import generate
 from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH
-from mereo.synthesis import shards
 from mereo.synthesis.config import TEMPLATE, GenerateConfig, SamplingConfig
-from mereo.training.dataset import Dataset
+from mereo_learning import shards
+from mereo_learning.dataset import Dataset
 
 NAMES = ("left", "right")
 SHARD = 32

@@ -11,9 +11,9 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from mereo.training import trainer
-from mereo.training.config import TrainConfig
-from mereo.training.dataset import Batch
+from mereo_learning import trainer
+from mereo_learning.config import TrainConfig
+from mereo_learning.dataset import Batch
 
 
 def kill_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
@@ -61,7 +61,7 @@ def train_in_two_processes(dataset: Path, folder: Path, config: TrainConfig) -> 
     (folder / "config.pickle").write_bytes(pickle.dumps(config))
     script = folder / "run.py"
     script.write_text(
-        "import pickle\nimport sys\nfrom pathlib import Path\nfrom mereo.training.trainer import train\n"
+        "import pickle\nimport sys\nfrom pathlib import Path\nfrom mereo_learning.trainer import train\n"
         "dataset, run, config = map(Path, sys.argv[1:])\n"
         "train(dataset, run, pickle.loads(config.read_bytes()))\n"
         # threads of the group would outlive the interpreter, and may then wait forever

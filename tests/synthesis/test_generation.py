@@ -19,14 +19,14 @@ from toy_data import SMALL
 from toy_scene import toy_scene
 
 from mereo.api.generate import generate
-from mereo.evaluation.scoring import trained_scene
 from mereo.io import progress
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
-from mereo.synthesis import shards
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import Example, synthesize
-from mereo.synthesis.shards import example_bytes
+from mereo_learning import shards
+from mereo_learning.scoring import trained_scene
+from mereo_learning.shards import example_bytes
 
 TOY = toy_scene()
 

@@ -13,8 +13,6 @@ from toy_scene import toy_scene
 import mereo.__main__ as command_line
 from mereo.api.generate import generate
 from mereo.cli import training
-from mereo.evaluation.scoring import EvaluationConfig
-from mereo.evaluation.tables import read_metrics
 from mereo.geometry.camera import PointCloud
 from mereo.models.model import Model
 from mereo.models.trained import EncodedCloud
@@ -24,8 +22,10 @@ from mereo.scenes.scene import PAPER_APERTURE_RAD, WHOLE_SPHERE_RAD, Scene, Work
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import SENSOR_TERMS, SENSORS, GenerateConfig, SamplingConfig, Sensor, SensorConfig
 from mereo.synthesis.examples import sample_view
-from mereo.training.model_card import card
-from mereo.visualization.evaluation_report import evaluate_weights
+from mereo_learning.evaluation_report import evaluate_weights
+from mereo_learning.model_card import card
+from mereo_learning.scoring import EvaluationConfig
+from mereo_learning.tables import read_metrics
 
 SMALL = GenerateConfig(image_size=48, points=64, sampling=SamplingConfig(per_segment=8))
 NARROW = Workspace(axis=(0.0, 1.0, 0.0), aperture_rad=0.5)

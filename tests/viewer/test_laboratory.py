@@ -9,9 +9,8 @@ import pytest
 from browser import BROWSER, Page, pixels_of, until
 from toy_scene import rest_mesh, toy_scene
 
-from mereo.evaluation.cases import labels_on
-from mereo.evaluation.metrics import Scores, truth_grid
 from mereo.fitting.registration.register import Registrar
+from mereo.geometry.metrics import Scores, labels_on, truth_grid
 from mereo.geometry.transforms import transform_points
 from mereo.models.model import Model
 from mereo.scenes.parameters import parameters, random_state, set_value

@@ -18,7 +18,6 @@ from reported_scenes import ball, example, wall
 
 import mereo
 from mereo.__main__ import main
-from mereo.evaluation.sample_views import load_view
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.state import STATE
@@ -28,6 +27,7 @@ from mereo.geometry.radii import Radii
 from mereo.io.mesh_formats import read_glb
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION, write_segments_glb
 from mereo.models.model import Model
+from mereo.synthesis.sample_views import load_view
 from mereo.visualization.reconstruction_report import Report, read_report
 from mereo.visualization.units import UNKNOWN, Unit
 from mereo_viewer.result_page import (

@@ -8,7 +8,6 @@ import pytest
 from answers import answer_to, reconstruct
 
 import mereo
-from mereo.evaluation.sample_views import load_view
 from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import PointCloud, into_camera
 from mereo.geometry.transforms import transform_points
@@ -17,6 +16,7 @@ from mereo.models.trained import EncodedCloud
 from mereo.models.weights import load_model
 from mereo.scenes.parameters import random_state
 from mereo.scenes.registry import load_scene
+from mereo.synthesis.sample_views import load_view
 from mereo.visualization.color_scales import confidence
 from mereo_viewer.laboratory import Laboratory
 from mereo_viewer.result_page import ask_network, probe_answer

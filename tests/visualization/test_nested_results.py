@@ -25,9 +25,9 @@ from mereo.geometry.solids import Solids
 from mereo.io.writers.meshes import OUTER_OPACITY
 from mereo.models.weights import load_model, save_model
 from mereo.reconstruction.pipeline import Reconstruction
-from mereo.training.trainer import train
 from mereo.visualization.previews import render_cloud_and_segments
 from mereo.visualization.result_files import write_answer
+from mereo_learning.trainer import train
 
 NESTED = (("core", "organ"),)
 CENTER, RADIUS = (0.0, 0.0, 5.0), 1.0

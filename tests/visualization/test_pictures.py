@@ -7,13 +7,15 @@ import pytest
 import trimesh
 from PIL import Image
 
-from mereo.evaluation.cases import EvaluatedView
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
 from mereo.geometry.transforms import rigid
 from mereo.synthesis.examples import View
 from mereo.visualization.contact_sheets import contact_sheet, depth_to_rgb, legend
-from mereo.visualization.error_maps import (
+from mereo.visualization.previews import preview_states, render_cloud_and_segments
+from mereo.visualization.renderer import SUPERSAMPLE, Canvas, Triangles, Viewpoint, corner_normals, shade
+from mereo_learning.cases import EvaluatedView
+from mereo_learning.error_maps import (
     EXTRA_OR_MISSING,
     FULL_CELLS,
     OVER,
@@ -33,11 +35,6 @@ from mereo.visualization.error_maps import (
     surface_offset,
     voxel_triangles,
 )
-from mereo.visualization.previews import (
-    preview_states,
-    render_cloud_and_segments,
-)
-from mereo.visualization.renderer import SUPERSAMPLE, Canvas, Triangles, Viewpoint, corner_normals, shade
 
 FRONT = ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
 

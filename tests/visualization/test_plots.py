@@ -10,8 +10,8 @@ from PIL import Image
 import mereo
 from mereo import __main__ as command_line
 from mereo.cli.scenes import SceneModes
-from mereo.training.metrics_log import MetricsLog
 from mereo.visualization.color_scales import TABLE, viridis
+from mereo_learning.metrics_log import MetricsLog
 
 ROWS = [{"step": float(step), "loss": 2.0 / step, "val_iou": 0.1 * step} for step in (1, 2, 3)]
 

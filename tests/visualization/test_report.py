@@ -18,9 +18,9 @@ from scipy.spatial import cKDTree
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.visualization.contact_sheets import MISSING, MOST_DEPTH_PX, depth_data
-from mereo.visualization.evaluation_report import write_evaluation_report
 from mereo.visualization.reconstruction_report import BUDGET_BYTES, Report, cluster
 from mereo.visualization.units import Unit
+from mereo_learning.evaluation_report import write_evaluation_report
 
 
 def test_the_page_holds_the_shapes_to_16_bits_of_the_box_and_needs_nothing_from_outside(tmp_path: Path) -> None:

@@ -13,9 +13,6 @@ from object_work import folder_of_objects
 
 from mereo import __main__ as command_line
 from mereo.io.cores import THREAD_VARIABLES
-from mereo.learning import learn as learning
-from mereo.learning.learn import LearnConfig, learn_objects
-from mereo.learning.object_files import list_objects
 from mereo.models.config import InferenceConfig
 from mereo.models.model import Model
 from mereo.models.remote import settings_for, to_cpu
@@ -23,6 +20,8 @@ from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import example_rng
 from mereo.workers import spread as spreading
 from mereo.workers.spread import Cluster, TaskResources, choose_cluster, connect, spread
+from mereo_learning import learn as learning
+from mereo_learning.learn import LearnConfig, learn_objects, list_objects
 
 HERE = Cluster(local_cpus=2)
 

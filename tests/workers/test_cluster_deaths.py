@@ -24,15 +24,15 @@ from toy_scene import toy_scene
 
 from mereo import __main__ as command_line
 from mereo.api.generate import generate
-from mereo.evaluation.scoring import EvaluationConfig
-from mereo.learning.object_files import scene_of_meshes
 from mereo.models.model import Model
+from mereo.scenes.files.object_files import scene_of_meshes
 from mereo.scenes.seeds import example_rng
-from mereo.synthesis import shards
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
-from mereo.visualization.evaluation_report import evaluate_weights
 from mereo.workers.spread import Cluster
+from mereo_learning import shards
+from mereo_learning.evaluation_report import evaluate_weights
+from mereo_learning.scoring import EvaluationConfig
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'mereo[cluster]'")
 

@@ -10,9 +10,9 @@ from typing import Any
 from mereo.api.words import python_words
 from mereo.io.object_storage import ObjectPath, Place, place_of
 from mereo.scenes.scene import Scene
-from mereo.synthesis import shards
 from mereo.synthesis.config import GenerateConfig
 from mereo.workers.spread import choose_cluster
+from mereo_learning import shards
 
 
 def generate(
@@ -41,7 +41,7 @@ def generate(
         dataset: the other fields of ``DatasetConfig``: ``examples``, how many; ``seed``, by default 0: example i comes
             from (seed, i) alone, and seeds from 1,000,000 up are for testing; ``test=True``, to allow a test seed.
 
-    Raises as ``synthesis.shards.generate`` does, and ``TypeError`` without ``examples``.
+    Raises as ``mereo_learning.shards.generate`` does, and ``TypeError`` without ``examples``.
     """
     place, processes = place_of(output), workers or os.cpu_count() or 1
     with python_words():

@@ -16,10 +16,10 @@ from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.register import Registrar, other_mesh, registrar_for, statistical_model_of
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.mesh_formats import MESH_SUFFIXES
-from mereo.learning.object_files import SCENE, names_scene, scene_of_folder, scene_of_meshes, shapes_in
 from mereo.models.config import Device, InferenceConfig, Precision
 from mereo.models.trained import Trained
 from mereo.models.weights_place import is_weights, load_weights, shipped_names
+from mereo.scenes.files.object_files import SCENE, names_scene, scene_of_folder, scene_of_meshes, shapes_in
 from mereo.scenes.random_states import kept_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES, Scene

@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike
 from mereo.api.objects import Object, Source, object_of
 from mereo.api.result import Result
 from mereo.api.words import in_callers_words, python_words
-from mereo.evaluation.sample_views import shipped_frame, shipped_frames
 from mereo.fitting import tracking
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.answer_frame import answer_frame
@@ -42,6 +41,7 @@ from mereo.reconstruction.observation import (
     find_object,
     size_warning,
 )
+from mereo.synthesis.sample_views import shipped_frame, shipped_frames
 
 # --- frames -----------------------------------------------------------------------------------------------------------
 

@@ -14,25 +14,23 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from mereo.api.words import python_words
-from mereo.evaluation import scoring
-from mereo.evaluation.cases import Evaluation
-from mereo.evaluation.metrics import format_score
-from mereo.evaluation.scoring import EvaluationConfig
 from mereo.fitting.config import AnswerMethod
+from mereo.geometry.metrics import format_score
 from mereo.io.object_storage import ObjectPath, place_of
-from mereo.learning import learn as learning
-from mereo.learning.object_files import FRAME, scene_for
-from mereo.learning.search_stage import TrainChoice
 from mereo.models.config import EXACT, Device, InferenceConfig
 from mereo.models.export.onnx_export import export_weights
 from mereo.models.model import Model
 from mereo.models.remote import settings_for
 from mereo.models.weights import load_for
 from mereo.models.weights_place import WEIGHTS
-from mereo.training import trainer
-from mereo.training.config import PRESETS, PresetName, TrainConfig
-from mereo.visualization.evaluation_report import evaluate_weights
 from mereo.workers.spread import choose_cluster
+from mereo_learning import learn as learning
+from mereo_learning import scoring, trainer
+from mereo_learning.cases import Evaluation
+from mereo_learning.config import PRESETS, PresetName, TrainConfig
+from mereo_learning.evaluation_report import evaluate_weights
+from mereo_learning.scoring import EvaluationConfig
+from mereo_learning.search_stage import TrainChoice
 
 
 def train(
@@ -53,7 +51,7 @@ def train(
         changes: fields of ``TrainConfig`` to be changed in it, such as ``init="bunny"`` or ``epochs=20.0``.
 
     Raises ``TypeError`` for a field that there is none of, ``ValueError`` for a preset that is unknown and values that
-    are refused, and as ``training.trainer.train`` does.
+    are refused, and as ``mereo_learning.trainer.train`` does.
     """
     if isinstance(config, str):
         if config not in PRESETS:
@@ -191,8 +189,8 @@ def learn(
     return Learned(
         folder=folder,
         weights=folder / WEIGHTS if metrics["trained"] else None,
-        scene=scene_for(files, folder, units),
-        frame=folder / FRAME,
+        scene=learning.scene_for(files, folder, units),
+        frame=folder / learning.FRAME,
         report=folder / learning.TEST / "report.html" if metrics["trained"] else None,
         method=metrics["method"],
         metrics=metrics,

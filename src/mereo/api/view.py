@@ -5,7 +5,6 @@ from pathlib import Path
 from mereo.api.objects import Object, Source, object_of
 from mereo.api.reconstruct import reconstruct_observation
 from mereo.api.words import python_words
-from mereo.evaluation.sample_views import shipped_frame, shipped_frames, shipped_views
 from mereo.fitting.registration.answer import Answer
 from mereo.io.config import InputConfig
 from mereo.io.progress import shown_stages
@@ -13,6 +12,7 @@ from mereo.io.sensor_frame import read_frame
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import find_object
 from mereo.scenes.registry import load_scene
+from mereo.synthesis.sample_views import shipped_frame, shipped_frames, shipped_views
 from mereo_viewer.laboratory import open_laboratory
 from mereo_viewer.result_page import are_files, open_answer, open_files
 from mereo_viewer.server import PORT, OpenPage, import_viser, is_interactive

@@ -137,8 +137,8 @@ class ViewCommand:
     def run(self) -> None:
         """Open a page, and keep it until Ctrl-C."""
         from mereo.api.view import view
-        from mereo.evaluation.sample_views import shipped_views
         from mereo.io.progress import shown_stages
+        from mereo.synthesis.sample_views import shipped_views
         from mereo_viewer.server import import_viser
 
         import_viser()  # its absence is better said before the work

@@ -11,7 +11,7 @@ from mereo.cli.options import Outcome
 if TYPE_CHECKING:
     from mereo.api.objects import Object
     from mereo.api.result import Result
-    from mereo.evaluation.metrics import TruthGrid
+    from mereo.geometry.metrics import TruthGrid
     from mereo.io.sensor_frame import SensorFrame
 
 RESOLUTION = 100
@@ -72,14 +72,14 @@ def _inputs(output: Path) -> "Iterator[tuple[str, str, Object, SensorFrame, Trut
 
     from mereo.api.objects import load_object
     from mereo.api.reconstruct import load_frame
-    from mereo.evaluation.metrics import truth_grid
-    from mereo.evaluation.sample_views import SHIPPED_SCAN, load_view
-    from mereo.evaluation.scans import BUNNY_SCAN_POSES
     from mereo.geometry.mesh import SegmentedMesh
+    from mereo.geometry.metrics import truth_grid
     from mereo.io.atomic_files import new_directory
     from mereo.io.extras import has_network
     from mereo.io.writers.meshes import write_surface_stl
     from mereo.models.weights_place import statistical_model_in
+    from mereo.synthesis.sample_views import SHIPPED_SCAN, load_view
+    from mereo_learning.scans import BUNNY_SCAN_POSES
 
     model = statistical_model_in("bunny")
     assert model.source_frame is not None
@@ -105,8 +105,7 @@ def _print_scores(title: str, result: "Result", truth: "TruthGrid") -> dict[str,
     from rich.table import Table
 
     from mereo.cli.reconstruct import print_source
-    from mereo.evaluation.cases import grid_confusion, labels_on
-    from mereo.evaluation.metrics import intersection_over_union
+    from mereo.geometry.metrics import grid_confusion, intersection_over_union, labels_on
     from mereo.visualization.units import Unit
 
     confusion = grid_confusion(truth, labels_on(result.surfaces, truth.grid), len(result.names))

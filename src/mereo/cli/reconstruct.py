@@ -33,6 +33,7 @@ from mereo.fitting.registration.carry import Placed, carry, place
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.radii import describe_level
+from mereo.geometry.symmetry import describe_symmetries
 from mereo.io.atomic_files import MARKER, check_new_directory, check_place, new_directory, write_json
 from mereo.io.attachments import Attachment, read_attachments
 from mereo.io.config import CONFIG, InputConfig
@@ -423,6 +424,11 @@ def print_source(answer: Answer) -> None:
         print(f"that is too little to believe it: {cure}")
     if answer.recognition.description is not None:
         print(answer.recognition.description)
+    model = registration.model
+    for symmetry in describe_symmetries(
+        [each for each in model.symmetries if not each.keeps_segments], model.rest.names
+    ):
+        print(symmetry)
 
 
 def print_uncertainty(registered: Registration | None, unit: Unit) -> None:

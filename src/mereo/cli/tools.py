@@ -16,11 +16,11 @@ from mereo.cli.options import ScanCloud
 from mereo.io.bounds import Count, PositiveOrUnknown, Threads, Workers
 from mereo.io.cores import workers_for
 from mereo.models.config import Device, Precision
-from mereo.training.config import PresetName
 from mereo_experiments.paper.scales import ExperimentName, ScaleName
+from mereo_learning.config import PresetName
 
 if TYPE_CHECKING:
-    from mereo.evaluation.placement import Placement
+    from mereo_learning.placement import Placement
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,6 @@ class Align:
                 f"{'no start is' if self.start is None else 'two starts are'} given; one is needed: --start FILE or "
                 "--weights NAME (docs/own-object.md says how to make a start file)"
             )
-        from mereo.evaluation.icp import load_icp
-        from mereo.evaluation.placement import place, read_start, start_from_model
-        from mereo.evaluation.scans import TRUTH, ScanFile, write_truth
         from mereo.geometry.conventions import UNITS_M
         from mereo.io.atomic_files import new_directory
         from mereo.io.readers import read_point_cloud
@@ -73,7 +70,10 @@ class Align:
         from mereo.scenes.registry import files_of, is_yaml, load_scene
         from mereo.scenes.scene import SCENES
         from mereo.visualization.contact_sheets import save_png
-        from mereo.visualization.error_maps import overlay
+        from mereo_learning.error_maps import overlay
+        from mereo_learning.icp import load_icp
+        from mereo_learning.placement import place, read_start, start_from_model
+        from mereo_learning.scans import TRUTH, ScanFile, write_truth
 
         load_icp()  # its absence is better said before the work
         scan = ScanFile(self.scan, self.unit, self.frame, self.drop_invalid)

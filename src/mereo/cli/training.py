@@ -25,8 +25,8 @@ from mereo.io.config import CONFIG
 from mereo.io.cores import workers_for
 from mereo.models.config import EXACT, Device, InferenceConfig
 from mereo.synthesis.config import GenerateConfig, Sensor, SensorConfig
-from mereo.training.config import PresetName, TrainConfig
 from mereo.workers.spread import DEFAULT_TASK, RayAddress, TaskResources, choose_cluster
+from mereo_learning.config import PresetName, TrainConfig
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class DatasetCheck:
 
     def run(self) -> None:
         """Print what is wrong, a line for each file."""
-        from mereo.synthesis.shards import check_dataset
+        from mereo_learning.shards import check_dataset
 
         check_dataset(self.dataset)
 
@@ -124,7 +124,7 @@ class DatasetShow:
         """Print a line for each fact."""
         from mereo.io.object_storage import names_in
         from mereo.scenes.seeds import TEST_SEED_START
-        from mereo.synthesis.shards import expected_files, read_manifest
+        from mereo_learning.shards import expected_files, read_manifest
 
         manifest = read_manifest(self.dataset)
         files, names = expected_files(manifest), names_in(self.dataset)
@@ -225,9 +225,9 @@ class Evaluate:
 
     def run(self) -> Outcome:
         """Write scores and pictures of their errors, and print the table."""
-        from mereo.evaluation.scoring import EvaluationConfig
-        from mereo.evaluation.tables import read_metrics
-        from mereo.visualization.evaluation_report import evaluate_weights
+        from mereo_learning.evaluation_report import evaluate_weights
+        from mereo_learning.scoring import EvaluationConfig
+        from mereo_learning.tables import read_metrics
 
         settings = GenerateConfig(
             image_size=self.image_size, noise_std=self.noise_std, sensor=self.terms, workspace=self.workspace
@@ -289,7 +289,7 @@ class LearnCommand:
 
     def run(self) -> None:
         """Learn, and print the scores and how to use the object."""
-        from mereo.learning.learn import LearnConfig, learn, learn_objects
+        from mereo_learning.learn import LearnConfig, learn, learn_objects
 
         workers = workers_for(self.workers, self.threads)
         config = LearnConfig(self.minutes, self.init, self.units, workers, self.train)

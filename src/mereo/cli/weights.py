@@ -75,7 +75,7 @@ class WeightsShow:
             text = card.read_text("utf-8")
         else:
             from mereo.models.weights import load_model
-            from mereo.training.model_card import card as card_of
+            from mereo_learning.model_card import card as card_of
 
             text = card_of(path.stem, load_model(path), [], content)
         if not self.json:
@@ -132,12 +132,12 @@ class CalibrateCommand:
 
     def run(self) -> None:
         """Measure, write the weights anew, and print what was found."""
-        from mereo.evaluation.calibrate import calibrate
         from mereo.io.atomic_files import atomic_file
         from mereo.models.calibration import calibration_rows
         from mereo.models.weights import load_model, with_calibration
         from mereo.models.weights_place import find_weights
         from mereo.scenes.registry import files_of
+        from mereo_learning.calibrate import calibrate
 
         path = find_weights(self.weights)
         output = self.output or path
@@ -176,6 +176,6 @@ class Release:
 
     def run(self) -> None:
         """Write the weights to hand on, and their model card."""
-        from mereo.training.model_card import release
+        from mereo_learning.model_card import release
 
         release(self.weights, self.name, self.output, self.tests, self.force)

@@ -89,6 +89,38 @@ def read_states(path: Path, names: tuple[str, ...], mesh: Path | None = None) ->
     return _sequence(path, names, mesh)
 
 
+def read_tetrahedra(path: Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 4"]]:
+    """Nodes and tetrahedra, four node indices each, of a VTK or VTU file, or of `rest_nodes`, `tetrahedra` in an NPZ.
+
+    Nodes of no tetrahedron are left out; other solid cells are divided into tetrahedra.
+
+    Raises ``FileNotFoundError`` and ``ValueError`` naming the file, ``ImportError`` without the extra `simulation`
+    where the format is one of VTK's.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
+        with readable(path, "NPZ file"):
+            arrays = read_arrays(path)
+        if missing := [key for key in TETRAHEDRAL[:2] if key not in arrays]:
+            raise ValueError(
+                f"{path} has the arrays {', '.join(map(repr, sorted(arrays)))} but not {missing[0]}; a volume mesh "
+                "is rest_nodes and tetrahedra: add it"
+            )
+        nodes, elements = _volume(path, arrays)
+    elif suffix in VTK_SUFFIXES:
+        frames = _mesh_frames(path)
+        nodes, elements = frames.points[0], frames.tetrahedra
+    else:
+        known = ", ".join((".npz", *VTK_SUFFIXES[:2]))
+        raise ValueError(f"{path} has the suffix {path.suffix!r}; a volume mesh is one of {known}: convert it")
+    if not len(elements):
+        raise ValueError(f"{path} has no tetrahedra, nor other solid cells: export the volume mesh, not its surface")
+    if elements.min() < 0 or elements.max() >= len(nodes):
+        return nodes, elements  # the mesh's own check names the index
+    used, packed = np.unique(elements, return_inverse=True)
+    return nodes[used], packed.reshape(-1, 4)
+
+
 def frame_files(path: Path) -> list[Path]:
     """Files of frames in natural order, 2 before 10.
 
@@ -238,21 +270,27 @@ def _tetrahedral(path: Path, arrays: dict[str, np.ndarray]) -> TetrahedralRecord
             f"{path} has the arrays {', '.join(map(repr, sorted(arrays)))}; tetrahedral states need rest_nodes, "
             "tetrahedra and one of nodes or displacements: add or remove what differs"
         )
-    rest = _floats(path, "rest_nodes", arrays["rest_nodes"], 2).astype(np.float64)
+    rest, elements = _volume(path, arrays)
     key = "nodes" if "nodes" in arrays else "displacements"
     moved = _floats(path, key, arrays[key], 3)
     if moved.shape[1] != len(rest):
         raise ValueError(
             f"{path}: {key} has {moved.shape[1]} nodes a frame but rest_nodes {len(rest)}; both need the same nodes"
         )
+    frames = _numbered(len(moved))
+    return TetrahedralRecord(rest, elements, moved - rest if key == "nodes" else moved, frames)
+
+
+def _volume(path: Path, arrays: dict[str, np.ndarray]) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 4"]]:
+    """Nodes and tetrahedra of an archive."""
+    rest = _floats(path, "rest_nodes", arrays["rest_nodes"], 2).astype(np.float64)
     elements = arrays["tetrahedra"]
     if elements.ndim != 2 or elements.shape[1] != 4 or not np.issubdtype(elements.dtype, np.integer):
         raise ValueError(
             f"{path}: tetrahedra has the shape {list(elements.shape)} and the type {elements.dtype}; it must be "
             "integers [m, 4]: give four node indices for each"
         )
-    frames = _numbered(len(moved))
-    return TetrahedralRecord(rest, elements.astype(np.int64), moved - rest if key == "nodes" else moved, frames)
+    return rest, elements.astype(np.int64)
 
 
 def _floats(path: Path, key: str, array: np.ndarray, axes: int) -> np.ndarray:

@@ -85,7 +85,7 @@ class Scaling:
     """Scaling of logits before they become probabilities.
 
     Only probabilities are made of scaled logits. Labels are decided by the logits as they are, whose class offsets
-    (logit adjustment, ``training.validation``) serve the mIoU.
+    (logit adjustment, ``mereo_learning.validation``) serve the mIoU.
 
     Attributes:
         temperature: divides them.

@@ -175,18 +175,17 @@ FAR = 0.1
 """A surface that lies mostly farther from the tetrahedra than this, of their longest side, is not theirs."""
 
 
-def tetrahedral_frames(
-    path: Path, record: TetrahedralRecord, rest: SegmentedMesh, scale: float, shift: Float[np.ndarray, "3"]
-) -> TetrahedralFrames:
-    """Frames of a record of tetrahedra, in scene units.
+def tetrahedra_around(
+    path: Path, nodes: Float[np.ndarray, "n 3"], elements: Int[np.ndarray, "m 4"], rest: SegmentedMesh
+) -> Tetrahedra:
+    """Tetrahedra of a file around an object, both in scene units.
 
-    Raises ``ValueError`` for a mesh elsewhere than ``rest`` and for the first frame that inverts a tetrahedron.
+    Raises ``ValueError`` naming the file for tetrahedra that are none, and for a mesh elsewhere than ``rest``.
     """
     try:
-        mesh = Tetrahedra(record.rest_nodes * scale + shift, record.tetrahedra)
+        mesh = Tetrahedra(nodes, elements)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    frames = TetrahedralFrames(mesh, record.displacements, scale, len(rest.segments))
     size = float(np.ptp(mesh.nodes, axis=0).max())
     for segment in rest.segments:
         away = segment.vertices[mesh.locate(segment.vertices) < 0]
@@ -196,6 +195,18 @@ def tetrahedral_frames(
                 f"segment {segment.name!r} lies {np.median(distance):.3g} outside of the tetrahedra in {path}, whose "
                 f"longest side is {size:.3g}; they must hold the surface: check the unit, scale and shift"
             )
+    return mesh
+
+
+def tetrahedral_frames(
+    path: Path, record: TetrahedralRecord, rest: SegmentedMesh, scale: float, shift: Float[np.ndarray, "3"]
+) -> TetrahedralFrames:
+    """Frames of a record of tetrahedra, in scene units.
+
+    Raises ``ValueError`` for a mesh elsewhere than ``rest`` and for the first frame that inverts a tetrahedron.
+    """
+    mesh = tetrahedra_around(path, record.rest_nodes * scale + shift, record.tetrahedra, rest)
+    frames = TetrahedralFrames(mesh, record.displacements, scale, len(rest.segments))
     for frame in range(frames.count):
         ratios = mesh.volume_ratios(frames.nodes(frame))
         worst = int(np.argmin(ratios))

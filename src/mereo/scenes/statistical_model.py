@@ -19,6 +19,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 from mereo.deformation.moving_least_squares import ANCHORS, Anchors, PointWeights, spread
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.symmetry import TOLERANCE, Symmetry, find_symmetries
 from mereo.geometry.transforms import fit_rigid, transform_points
 from mereo.io.checked_tensors import Tensors, pack_tensors, read_content, unpack_tensors
 from mereo.io.errors import reason
@@ -165,6 +166,11 @@ class StatisticalModel:
     def rest_z(self) -> Float[np.ndarray, " k"]:
         """Coefficients nearest to the rest pose."""
         return self.project(self.rest_points)[1]
+
+    @cached_property
+    def symmetries(self) -> tuple[Symmetry, ...]:
+        """Turns of the rest pose that no frame tells from it."""
+        return find_symmetries(self.rest, TOLERANCE)
 
     @property
     def count(self) -> int:

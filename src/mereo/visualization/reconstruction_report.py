@@ -371,6 +371,7 @@ def _answer(registration: Mapping[str, Any], verdict: Trust) -> str:
 def _warnings(summary: Mapping[str, Any], verdict: Trust) -> list[str]:
     """Sentences on what to do about a result that may not be what it seems; the verdict itself has said why."""
     warnings = [] if verdict.cure is None else [verdict.cure]
+    warnings += [str(sentence) for sentence in _block(summary, "registration").get("symmetries") or ()]
     if summary.get("clipped"):
         warnings.append("the object reaches the border of the volume that was searched and may be cut off there")
     return [text[0].upper() + text[1:] + ("" if text.endswith(".") else ".") for text in warnings]

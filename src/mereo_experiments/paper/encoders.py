@@ -1,12 +1,12 @@
 """Lizard and Human by each encoder, in a picture (paper, section 4.4, figure of encoders)."""
 
-from mereo.evaluation.cases import EvaluatedView
 from mereo.models.config import Loss
 from mereo.synthesis.config import GenerateConfig
 from mereo_experiments.paper.encoders_losses import AUTODECODER_RECIPE, ENCODERS, lacks, recipe
 from mereo_experiments.paper.result import Claim, Result, Row, better, compare, published
 from mereo_experiments.paper.scales import ExperimentScale
 from mereo_experiments.paper.store import Score, Store
+from mereo_learning.cases import EvaluatedView
 
 QUESTION = "What does each encoder make of one view of Lizard and of Human?"
 

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 from mereo.models.config import Encoder, Loss
 from mereo.synthesis.config import GenerateConfig
-from mereo.training.config import AugmentConfig, TrainConfig
 from mereo_experiments.paper.result import Claim, Result, Row, better, published
 from mereo_experiments.paper.scales import ExperimentScale
 from mereo_experiments.paper.store import Score, Store
+from mereo_learning.config import AugmentConfig, TrainConfig
 
 QUESTION = "Which encoder and which loss are best?"
 

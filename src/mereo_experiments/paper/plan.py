@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from mereo.evaluation.cases import EvaluatedView
 from mereo.geometry.brief import counted
 from mereo.geometry.camera import PointCloud
 from mereo.synthesis.config import GenerateConfig
-from mereo.training.config import TrainConfig
 from mereo_experiments.paper.registry import EXPERIMENTS, experiment, results_directory
 from mereo_experiments.paper.scales import SCALES
 from mereo_experiments.paper.store import FINISHED, Score, Store, content_key, scene_of
+from mereo_learning.cases import EvaluatedView
+from mereo_learning.config import TrainConfig
 
 SEEN_PER_S = 27.0
 """Examples that a core showed to networks of scale ``cpu`` per second, datasets and tests included: experiments 10."""

@@ -1,10 +1,10 @@
 """Reconstruction and segmentation of every object (paper, section 4.2 and appendix A)."""
 
-from mereo.evaluation.cases import EvaluatedView
 from mereo.synthesis.config import GenerateConfig
 from mereo_experiments.paper.result import Claim, Result, Row, published
 from mereo_experiments.paper.scales import ExperimentScale
 from mereo_experiments.paper.store import Score, Store
+from mereo_learning.cases import EvaluatedView
 
 QUESTION = "How well is each object reconstructed and segmented?"
 

@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from mereo.evaluation.cases import EvaluatedView
-from mereo.evaluation.metrics import format_score
+from mereo.geometry.metrics import format_score
 from mereo.io.atomic_files import atomic_file, new_directory, write_json
 from mereo.io.extras import pyplot
 from mereo.visualization.color_scales import viridis
-from mereo.visualization.error_maps import Comparison, Shown, comparison_picture, error_picture
 from mereo_experiments.paper.store import Score
+from mereo_learning.cases import EvaluatedView
+from mereo_learning.error_maps import Comparison, Shown, comparison_picture, error_picture
 
 Figures = dict[str, float]
 """Scores published in the paper: ``iou`` and ``miou``, or only one of them."""

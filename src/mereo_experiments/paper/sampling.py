@@ -2,11 +2,11 @@
 
 from dataclasses import replace
 
-from mereo.evaluation.cases import EvaluatedView
 from mereo.synthesis.config import GenerateConfig, Sampler, SamplingConfig
 from mereo_experiments.paper.result import Claim, Result, Row, better, compare, published
 from mereo_experiments.paper.scales import ExperimentScale
 from mereo_experiments.paper.store import Score, Store
+from mereo_learning.cases import EvaluatedView
 
 QUESTION = "Which sampler of training queries teaches most?"
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from mereo.training.config import PRESETS, TrainConfig
+from mereo_learning.config import PRESETS, TrainConfig
 
 ExperimentName = Literal[
     "reconstruction", "encoders-losses", "encoders", "sampling", "positional-encoding", "noise", "real-world"

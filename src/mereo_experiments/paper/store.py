@@ -11,20 +11,20 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from mereo.evaluation.cases import EvaluatedView
-from mereo.evaluation.scoring import EvaluationConfig, evaluate
-from mereo.evaluation.tables import read_metrics
 from mereo.fitting.config import AnswerMethod
 from mereo.io.atomic_files import write_json
 from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START
 from mereo.synthesis.config import GenerateConfig
-from mereo.synthesis.shards import MANIFEST, NOT_COMPARED, DatasetConfig, generate, make_manifest
-from mereo.training.config import TrainConfig
-from mereo.training.trainer import train
-from mereo.visualization.evaluation_report import evaluate_weights
 from mereo_experiments.paper.scales import TRAINING_SEED
+from mereo_learning.cases import EvaluatedView
+from mereo_learning.config import TrainConfig
+from mereo_learning.evaluation_report import evaluate_weights
+from mereo_learning.scoring import EvaluationConfig, evaluate
+from mereo_learning.shards import MANIFEST, NOT_COMPARED, DatasetConfig, generate, make_manifest
+from mereo_learning.tables import read_metrics
+from mereo_learning.trainer import train
 
 NETWORK: AnswerMethod = "network"
 """The paper's experiments are about networks: no registered model answers in their place."""

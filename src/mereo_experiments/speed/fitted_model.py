@@ -7,13 +7,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from mereo.evaluation.sample_views import SampleView
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import PALETTE
 from mereo.geometry.transforms import Normalizer
 from mereo.models.model import Box, Model
 from mereo.models.network import Network
-from mereo.training.config import PRESETS
+from mereo.synthesis.sample_views import SampleView
+from mereo_learning.config import PRESETS
 
 STEPS, QUERIES = 200, 2048
 """Number of training steps, and of queries in each."""

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from mereo.evaluation.sample_views import SampleView, load_view, shipped_views
 from mereo.io.atomic_files import write_json
 from mereo.io.cores import cores
 from mereo.models.config import Precision
 from mereo.models.device import cpu_features
 from mereo.models.model import Model
 from mereo.models.weights import load_model
+from mereo.synthesis.sample_views import SampleView, load_view, shipped_views
 from mereo_experiments.speed.fitted_model import fitted_model
 from mereo_experiments.speed.roofline import Machine, measure_machine
 from mereo_experiments.speed.stages import Bench, Stage, random_points

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 
-from mereo.evaluation.sample_views import SampleView
 from mereo.geometry.transforms import Normalizer
 from mereo.models.model import Model
 from mereo.models.trained import EncodedCloud
@@ -24,6 +23,7 @@ from mereo.reconstruction.isosurfaces import (
     sample_dense,
 )
 from mereo.reconstruction.pipeline import SEARCH_BOX
+from mereo.synthesis.sample_views import SampleView
 from mereo_experiments.speed.baseline import Rival
 from mereo_experiments.speed.roofline import Machine, Work, count_operations, timed
 

@@ -37,6 +37,7 @@ from mereo.fitting.registration.registration import Method, Registration
 from mereo.fitting.uncertainty import DrawsOptimum, ModesOptimum, Optimum
 from mereo.geometry.brief import listed
 from mereo.geometry.camera import PointCloud, SightLines
+from mereo.geometry.symmetry import describe_symmetries
 from mereo.io.cores import limit_blas_threads
 from mereo.io.progress import stage
 from mereo.models.calibration import Calibration
@@ -530,6 +531,7 @@ def describe(registration: Registration) -> dict[str, object]:
         "ruled_out": registration.ruled_out,
         "beyond_states": registration.beyond_states,
         "alike": registration.alike,
+        "symmetries": describe_symmetries(registration.model.symmetries, registration.model.rest.names),
         "scene_unit": registration.scene_unit,
         "unit": "known" if registration.unit_known else "found",
         "coefficients": registration.z.tolist(),

@@ -28,6 +28,7 @@ from mereo.io.yaml_document import Document, similar
 from mereo.scenes.files.deformation_blocks import (
     AnyDeformation,
     CameraBlock,
+    ElasticBlock,
     FilePart,
     Misfit,
     ModelPart,
@@ -76,7 +77,13 @@ def files_of(path: Path) -> list[Path]:
     if file.states is not None:
         states, mesh = _paths_of_states(path, file)
         named += [states, *files_of_states(states, mesh)]
-    return [path, *named]
+    return [path, *named, *_volume_meshes(path, file)]
+
+
+def _volume_meshes(path: Path, file: SceneFile) -> list[Path]:
+    """Files of the tetrahedra that elastic solids are made of."""
+    names = [block.tetrahedra for block in file.deformations or () if isinstance(block, ElasticBlock)]
+    return [path.parent / name for name in names if name is not None]
 
 
 def with_warnings(document: Document, mesh: SegmentedMesh) -> SegmentedMesh:
@@ -109,7 +116,9 @@ def build(document: Document, file: SceneFile, mesh: SegmentedMesh) -> Scene:
             blocks = list(_default_deformations(_Keyed(_content(mesh), mesh)))
             definition += str([block.model_dump() for block in blocks])
         motions = _random_motion(document, placement, rest, blocks)
-        key = f"{_content(rest)} {placement.matrix.tolist()} {[block.model_dump() for block in blocks]}"
+        if volumes := _volume_meshes(document.path, file):
+            definition += _digest(volumes)
+        key = f"{_content(rest)} {placement.matrix.tolist()} {definition}"
         rest = _refined(_Keyed(key, (rest, motions)))
         scene = Scene(file.name, rest, replace(motions, rest=rest), workspace, file.source)
     return replace(scene, unit_m=unit_m, T_scene_source=placement.matrix, definition=definition)
@@ -171,7 +180,7 @@ def _paths_of_states(path: Path, file: SceneFile) -> tuple[Path, Path | None]:
 
 
 def _digest(files: Sequence[Path]) -> str:
-    """Digest of the files of recorded states: other states are another scene."""
+    """Digest of the files that say how an object moves: others are another scene."""
     digest = hashlib.sha256()
     for file in files:
         with file.open("rb") as content:
@@ -199,7 +208,8 @@ def _random_motion(
         members = _members(document, rest, index, block)
         moved = SegmentedMesh(tuple(rest.segments[i] for i in members))
         try:
-            steps.append((block.sampler(Target(moved, rest.bounds, placement)), members))
+            target = Target(moved, rest.bounds, placement, document.path.parent)
+            steps.append((block.sampler(target), members))
         except Misfit as misfit:
             raise document.error(("deformations", index, misfit.key), str(misfit)) from None
     return RandomMotion(rest, tuple(steps))

@@ -17,6 +17,7 @@ from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.mesh_check import PLAUSIBLE_M, Health, Overlap, examine, grid_volume, likely_unit, near, overlaps
 from mereo.geometry.mesh_repair import farthest, repaired, without_overlaps
 from mereo.geometry.solids import Solids
+from mereo.geometry.symmetry import TOLERANCE, describe_symmetries, find_symmetries
 from mereo.geometry.transforms import inverse_rigid
 from mereo.io.atomic_files import atomic_file, check_file_place, remove_abandoned
 from mereo.io.yaml_document import Document
@@ -284,6 +285,8 @@ def report_states(scene: Scene) -> int:
     print(f"up: {_direction(scene.workspace)}")
     if base := flat_base(scene.rest, scene.workspace.axis):
         print(f"base: {base.describe(scene.workspace)}")
+    for sentence in describe_symmetries(find_symmetries(scene.rest, TOLERANCE), scene.rest.names):
+        print(f"symmetry: {sentence}")
     at_rest = {frozenset((each.small, each.large)) for each in overlaps(scene.rest)}  # faults by themselves
     worst: dict[frozenset[str], Overlap] = {}
     seen = 1.0

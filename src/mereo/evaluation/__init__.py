@@ -1,1 +1,0 @@
-"""Metrics of the paper (IoU, mIoU), ground truth, test sets, and real scans with their registration."""

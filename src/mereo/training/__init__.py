@@ -1,1 +1,0 @@
-"""Dataset, losses, the loop, its directory, and released weights."""

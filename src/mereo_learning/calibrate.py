@@ -1,0 +1,485 @@
+"""Calibration of weights on views of training seeds: what they say of these is compared with what is true.
+
+    Model, Scene -object_views, strange_frames-> Answer -measured-> Calibration
+
+Three parts are measured: the network's probabilities, the radii of registrations, and the limits of recognition.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import chain
+from typing import Any, Literal
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, UInt8
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+from scipy.special import log_softmax, softmax
+
+from mereo.fitting.registration.answer import Answer, Candidate
+from mereo.fitting.registration.answer_frame import answer_frame
+from mereo.fitting.registration.recognition import CONSERVATIVE, Signs, is_noisy, strangeness
+from mereo.fitting.registration.recognition import LEAST as LEAST_SIGNS
+from mereo.fitting.registration.register import Registrar, registrar_for
+from mereo.fitting.registration.registration import Registration
+from mereo.geometry.camera import Camera, PointCloud
+from mereo.geometry.conventions import MIN_POINTS
+from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.metrics import truth_grid
+from mereo.geometry.solids import Solids
+from mereo.io.progress import progress
+from mereo.models.calibration import Calibration, RadiusFactors, Recognizing, Scaling, SignName, Usual
+from mereo.models.model import Model, scaled_array
+from mereo.reconstruction.observation import observe
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import SCENES, AssetUnavailable, Scene
+from mereo.scenes.seeds import TEST_SEED_START, example_rng
+from mereo.scenes.statistical_model import StatisticalModel
+from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor
+from mereo.synthesis.depth_sensor import observe as observe_scene
+from mereo.synthesis.examples import sample_view
+from mereo_learning.cases import RegistrationErrors, Reliability, sample_cells, seen_points
+from mereo_learning.scoring import check_names, trained_scene, true_material
+
+SEED = 900_000
+"""A training seed, whose examples no shipped weights were trained on."""
+
+VIEWS = 48
+
+LEAST_VIEWS = 8
+
+
+def calibrate(
+    model: Model,
+    scene: Scene | str | None = None,
+    *,
+    views: int = VIEWS,
+    seed: int = SEED,
+    strangers: bool = True,
+    radius_views: int = 0,
+    quiet: bool = True,
+) -> Calibration:
+    """Calibration of a model by views of its scene: clean ones, noisy ones, and frames of what is not its object.
+
+    Args:
+        model: the weights; of such without a statistical model only the probabilities are calibrated.
+        scene: their scene, its name or its file; by default the built-in one that they were trained on.
+        views: of the object, half of them clean; at least ``LEAST_VIEWS``. About as many strange frames come on top.
+        seed: a training seed other than that of the weights' examples.
+        strangers: take in frames of other things too, which place the second limit of recognition.
+        radius_views: further clean views for the radii alone, with the scene unit known: of a fit that ends in a wrong
+            state once in twenty, a few views tell nothing.
+        quiet: show no progress.
+
+    Raises ``ValueError`` for a test seed, too few views, and another object than the model's.
+    """
+    if seed >= TEST_SEED_START:
+        raise ValueError(f"the seed is {seed}; calibration is part of training: take one below {TEST_SEED_START}")
+    if views < LEAST_VIEWS:
+        raise ValueError(f"{views} views are asked for; at least {LEAST_VIEWS} tell anything: 48 are usual")
+    if scene is None or isinstance(scene, str):
+        scene = load_scene(scene or trained_scene(model))
+    check_names(model, scene.rest.names)
+    bare = replace(model, calibration=None)
+    registrar = None if model.statistical_model is None else registrar_for(bare, "modes", scene)
+    more = radius_views if registrar is not None else 0
+    each = max(1, round(views / 24)) if strangers and registrar is not None else 0
+    others = other_objects(scene) if each else []
+    logits, truth, signs = [], [], RecognitionSigns()
+    radii = ViewRadii() if registrar is None else ViewRadii(replace(registrar, method="auto"))
+    every_view = chain(object_views(scene, views, seed), clean_views(scene, more, seed, first=views))
+    with progress("calibrate", views + more + each * (len(others) + 8), "views", quiet=quiet) as shown:
+        for number, view in enumerate(every_view):
+            answer = answer_frame(observe(view.seen), bare, registrar, scene_unit=view.scene_unit)
+            radii.add(view, answer)
+            if number < views:
+                signs.add(answer)
+                # of noisy views the network sees less: a temperature that covered it would make all others vague
+                if view.is_clean:
+                    assert answer.likelier is not None and answer.likelier.code is not None
+                    points, labels = sample_cells(truth_grid(view.mesh, CELLS), SAMPLED_CELLS)
+                    logits.append(bare.logits(answer.likelier.code, points))
+                    truth.append(np.minimum(labels, logits[-1].shape[1] - 1).astype(np.uint8))
+            shown.advance()
+        for _, cloud in strange_frames(scene, others, each, seed):
+            signs.add(answer_frame(observe(cloud), bare, registrar), is_strange=True)
+            shown.advance()
+    joint, labels = np.concatenate(logits), np.concatenate(truth)
+    scaling = fit_scaling(joint, labels)
+    return Calibration(
+        seed=seed,
+        views=views,
+        temperature=scaling.temperature,
+        biases=scaling.biases,
+        ece=(ece_of(joint, labels), ece_of(joint, labels, scaling)),
+        recognizing=signs.limits(),
+        **radii.fields(),
+    )
+
+
+# --- views ------------------------------------------------------------------------------------------------------------
+
+# Views that weights are calibrated with: the object as cameras see it, clean and noisy, and what is not it.
+
+CAMERAS: tuple[Sensor, ...] = ("paper", "structured-light", "paper", "time-of-flight")
+"""Cameras of the views, in turn: half of them clean."""
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationView:
+    """The object in a random state, with its truth, as a camera sees it.
+
+    Attributes:
+        mesh: the true segments, camera frame, scene units.
+        seen: the cloud, in the same.
+        camera: whose errors it has.
+        scene_unit: length of a scene unit in the cloud's unit, 1; None in every other pair of views, which have to
+            find it.
+        material: true positions of a statistical model's material points, or of the first of them.
+    """
+
+    mesh: SegmentedMesh
+    seen: PointCloud
+    camera: Sensor
+    scene_unit: float | None
+    material: Callable[[StatisticalModel], Float[np.ndarray, "m 3"]]
+
+    @property
+    def is_clean(self) -> bool:
+        """Whether the camera is the paper's."""
+        return self.camera == "paper"
+
+
+def object_views(scene: Scene, count: int, seed: int) -> Iterator[CalibrationView]:
+    """Views of a scene; view i is made from (seed, i) alone."""
+    for index in range(count):
+        scene_unit = 1.0 if index // len(CAMERAS) % 2 == 0 else None
+        yield _object_view(scene, seed, index, CAMERAS[index % len(CAMERAS)], scene_unit)
+
+
+def clean_views(scene: Scene, count: int, seed: int, first: int) -> Iterator[CalibrationView]:
+    """Views of a scene by the paper's camera, with the unit known, from view ``first`` on."""
+    for index in range(first, first + count):
+        yield _object_view(scene, seed, index, "paper", 1.0)
+
+
+def _object_view(scene: Scene, seed: int, index: int, camera: Sensor, scene_unit: float | None) -> CalibrationView:
+    view = sample_view(scene.for_seed(seed), GenerateConfig(sensor=SENSORS[camera]), example_rng(seed, index))
+    return CalibrationView(view.mesh, view.depth.to_points(), camera, scene_unit, partial(true_material, view))
+
+
+def strange_frames(
+    scene: Scene, others: Sequence[Scene], each: int, seed: int
+) -> Iterator[tuple[Literal["other object", "plane or clutter"], PointCloud]]:
+    """Frames that do not show the object: of every other one (``other_objects``), and ``4 * each`` planes and heaps."""
+    settings = GenerateConfig()
+    for other in others:
+        for index in range(each):
+            view = sample_view(other, settings, example_rng(seed + 1, index))
+            yield "other object", view.depth.to_points()
+    for index in range(4 * each):
+        plane, heap = example_rng(seed + 2, index), example_rng(seed + 3, index)
+        yield "plane or clutter", stranger_cloud(scene, "plane", settings, plane)
+        yield "plane or clutter", stranger_cloud(scene, "clutter", settings, heap)
+
+
+def other_objects(scene: Scene) -> list[Scene]:
+    """Built-in scenes of other objects than this one, whose meshes are here."""
+    livers = ("liver", "tumor", "liver-simulated")  # of one liver: one is as good as another to be told from the rest
+    same = livers if scene.name in livers else (scene.name,)
+    others = []
+    for name in SCENES:
+        with suppress(AssetUnavailable):
+            if name not in (*same, *livers[1:]):
+                others.append(load_scene(name))
+    return others
+
+
+# --- probabilities ----------------------------------------------------------------------------------------------------
+
+CELLS = 60
+"""Cells of the grid along each axis: which of them are sampled is random anyway."""
+
+SAMPLED_CELLS = 6000
+"""Cells of a view."""
+
+# Temperature and biases that make probabilities of logits: chosen so that what happens is as likely as is said.
+#
+# Temperature scaling divides all logits by one number (Guo et al., ICML 2017). Training queries are not spread as space
+# is, so frequencies of classes differ as well: then one bias for each class is added, which makes up for the average of
+# it. Both are found by the likelihood of the true labels, whose maximum is unique. Labels are not touched.
+#
+# Notation: n points, c classes.
+
+GOOD_ENOUGH = 0.02
+"""Expected calibration error up to which the temperature does alone: two thirds of what is wanted of unseen views."""
+
+
+def ece_of(
+    logits: Float[np.ndarray, "n c"],
+    truth: UInt8[np.ndarray, " n"],
+    scaling: Scaling = Scaling(),  # noqa: B008 (frozen)
+) -> float:
+    """Expected calibration error of the scaled probability of the most likely class by the logits as they are."""
+    labels, rows = logits.argmax(axis=1), np.arange(len(logits))
+    reliability = Reliability()
+    reliability.add(softmax(scaled_array(scaling, logits).astype(np.float64), axis=1)[rows, labels], labels == truth)
+    return reliability.ece
+
+
+def fit_scaling(logits: Float[np.ndarray, "n c"], truth: UInt8[np.ndarray, " n"]) -> Scaling:
+    """The simplest scaling that is good enough: a temperature, or also a bias for each class."""
+    alone = _most_likely(logits, truth, biased=False)
+    return alone if ece_of(logits, truth, alone) <= GOOD_ENOUGH else _most_likely(logits, truth, biased=True)
+
+
+def _most_likely(logits: Float[np.ndarray, "n c"], truth: UInt8[np.ndarray, " n"], biased: bool) -> Scaling:
+    """Scaling under which the true labels are most likely; its logarithm is concave in 1 / temperature and biases."""
+    values = logits.astype(np.float64)
+    count, classes = values.shape
+    hot = np.eye(classes)[truth]
+
+    def loss(parameters: Float[np.ndarray, " p"]) -> tuple[float, Float[np.ndarray, " p"]]:
+        scale = np.exp(parameters[0])
+        biases = np.concatenate([[0.0], parameters[1:]]) if biased else np.zeros(classes)
+        likelihood = log_softmax(values * scale + biases, axis=1)
+        residual = (np.exp(likelihood) - hot) / count
+        gradient = [(residual * values).sum() * scale, *(residual.sum(axis=0)[1:] if biased else ())]
+        return -float((likelihood * hot).sum()) / count, np.array(gradient)
+
+    best = minimize(loss, np.zeros(classes if biased else 1), jac=True, method="L-BFGS-B").x
+    return Scaling(float(np.exp(-best[0])), (0.0, *map(float, best[1:])) if biased else None)
+
+
+# --- radii ------------------------------------------------------------------------------------------------------------
+
+# Factors with which 95 % of the true positions lie within the radii that the posterior of a fit gives.
+
+FIELDS = (
+    ("radius_scale", "usual_misfit", "usual_displaced", "noisy_radius_scale"),
+    ("draws_radius_scale", "draws_usual_misfit", "draws_usual_displaced", "noisy_draws_radius_scale"),
+)
+"""Fields of ``Calibration`` that are of fits of the modes, and of a scene's parameters."""
+
+LEAST = 4
+"""Views without which nothing is said."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredRadii:
+    """Radii of one view, and what of it may make them wider.
+
+    Attributes:
+        errors: with the posterior's own radii.
+        misfit: ``Problem.cloud_misfit``.
+        displaced: ``Correspondences.displaced``.
+        half: of the object's length, scene units.
+    """
+
+    errors: RegistrationErrors
+    misfit: float
+    displaced: float
+    half: float
+
+    @classmethod
+    def of(cls, view: CalibrationView, candidate: Candidate, registration: Registration) -> "MeasuredRadii":
+        """Measurement of a registration that was made of a candidate, by weights that are not calibrated."""
+        truth = view.material(registration.model)
+        errors = RegistrationErrors.of(registration, truth, seen_points(truth, view.seen, 1.0), 1.0)
+        assert registration.optimum is not None and candidate.modes is not None
+        misfit = candidate.modes.problem.cloud_misfit(registration.optimum.surface)
+        return cls(errors, misfit, candidate.displaced(registration) or 0.0, registration.model.half)
+
+    def widened(self, factors: RadiusFactors) -> RegistrationErrors:
+        """Errors with the radii that a calibration makes wider; its scale is left out."""
+        extra_radius = self.half * factors.extra_radius(self.displaced)
+        return self.errors.scaled(factors.widening(self.misfit)).with_extra_radius(extra_radius)
+
+
+class ViewRadii:
+    """Radii of the views whose registration is believed: of others users get none.
+
+    Attributes:
+        full: registrar that fits the scene's parameters to what the modes were fitted to; None where there is no scene.
+        clean, noisy: measurements of fits of the modes, and of the scene's parameters.
+    """
+
+    def __init__(self, full: Registrar | None = None) -> None:
+        self.full = None if full is None or full.states_or_none is None else full
+        self.clean: tuple[list[MeasuredRadii], list[MeasuredRadii]] = [], []
+        self.noisy: tuple[list[MeasuredRadii], list[MeasuredRadii]] = [], []
+        self._noisy_views = 0
+
+    def add(self, view: CalibrationView, answer: Answer) -> None:
+        """Take in a view of the object, answered by its modes."""
+        candidate, registration = answer.candidate, answer.registration
+        self._noisy_views += not view.is_clean
+        if candidate is None or candidate.modes is None or registration is None:
+            return
+        if not view.is_clean and self._noisy_views > 16:  # which are enough: their fits take longest
+            return
+        full = None if self.full is None else self.full.finish(candidate.modes)
+        for kind, fit in enumerate((registration, full)):
+            if fit is not None and fit.accepted and (kind == 0 or fit.method == "draws"):
+                (self.noisy if is_noisy(fit) else self.clean)[kind].append(MeasuredRadii.of(view, candidate, fit))
+
+    def fields(self) -> dict[str, Any]:
+        """Fields of the ``Calibration``: factors of both kinds of fits; none where their views are too few."""
+        fields: dict[str, Any] = {}
+        for (scale, misfit, displaced, noisy_scale), clean, noisy in zip(FIELDS, self.clean, self.noisy, strict=True):
+            if len(clean) >= LEAST:
+                factors = factors_of(clean)
+                fields |= {scale: factors.scale, misfit: factors.misfit, displaced: factors.displaced}
+            # of which half of the points are farther off, a fit has ended in a wrong state. One such view in twenty
+            # would be all that the scale is made of, and of a camera's views there are more; recognition tells them
+            right = [view.errors for view in noisy if np.median(view.errors.ratios) <= 5.0]
+            if len(right) >= LEAST:
+                fields[noisy_scale] = RegistrationErrors.together(right).scale()
+        return fields
+
+
+def factors_of(views: Sequence[MeasuredRadii]) -> RadiusFactors:
+    """Factors by clean views, those that ended in a wrong state included: users meet them."""
+    misfit = float(np.median([view.misfit for view in views]))
+    # a few views may hold none that ended in a wrong state, so it cannot be measured from where on they do
+    displaced = float(np.quantile([view.displaced for view in views], 0.9))
+    factors = RadiusFactors(None, misfit or None, displaced or None)
+    scale = RegistrationErrors.together([view.widened(factors) for view in views]).scale()
+    return replace(factors, scale=scale)
+
+
+# --- recognition ------------------------------------------------------------------------------------------------------
+
+# What is usual of the object's views, and how strange a frame may be.
+
+MEASURED: tuple[SignName, ...] = tuple(name for name in LEAST_SIGNS if name != "size")
+"""Signs that are measured; what is usual of the size follows from how far units are apart."""
+
+SMALLEST_STD: dict[SignName, float] = {
+    "unexplained": 0.5,
+    "ruled_out": 0.5,
+    "beyond": 0.5,
+    "unusual": 0.2,
+    "displaced": 0.1,
+}
+"""Least standard deviations of the signs' logarithms: a few views may be more alike than others will be.
+
+The first three are 0 in most views, where what is added to them alone is left."""
+
+TRUSTED = 4
+"""Views from which on their mean and standard deviation are taken; from fewer, the conservative ones."""
+
+
+@dataclass
+class RecognitionSigns:
+    """Signs of registered frames.
+
+    Attributes:
+        clean: of views of the object.
+        noisy: of views of the object by a depth camera.
+        strange: of frames that show something else, each with whether it is noisy.
+    """
+
+    clean: list[Signs] = field(default_factory=list)
+    noisy: list[Signs] = field(default_factory=list)
+    strange: list[tuple[Signs, bool]] = field(default_factory=list)
+
+    def add(self, answer: Answer, is_strange: bool = False) -> None:
+        """Take in a frame; one that was not registered has no signs."""
+        if answer.registration is None or answer.recognition.signs is None:
+            return
+        signs, noisy = answer.recognition.signs, is_noisy(answer.registration)
+        if is_strange:
+            self.strange.append((signs, noisy))
+        else:
+            (self.noisy if noisy else self.clean).append(signs)
+
+    def limits(self) -> Recognizing | None:
+        """What is usual, and both limits; None where too few views were registered."""
+        if len(self.clean) < TRUSTED:
+            return None
+        clean = usual_of(self.clean)
+        noisy = usual_of(self.noisy) if len(self.noisy) >= TRUSTED else dict(CONSERVATIVE.noisy)
+        objects = [strangeness(signs.strange(clean)) for signs in self.clean]
+        objects += [strangeness(signs.strange(noisy)) for signs in self.noisy]
+        # not the largest: a camera's view that the network misread may well be called strange
+        unsure = max(1.25 * float(np.quantile(objects, 0.95)), 3.0)
+        others = [strangeness(signs.strange(noisy if is_noise else clean)) for signs, is_noise in self.strange]
+        apart = 1.6  # the second limit at least, in the first; else it is in the middle between it and other things
+        lowest = float(np.quantile(others, 0.1)) if others else unsure * apart**2
+        refused = max(float(np.sqrt(unsure * lowest)), apart * unsure)
+        return Recognizing(clean=clean, noisy=noisy, unsure=unsure, refused=refused)
+
+
+def usual_of(signs: Sequence[Signs]) -> dict[SignName, Usual]:
+    """What is usual of each sign, from views of the object; robust against a view that the network misread."""
+    result: dict[SignName, Usual] = {}
+    for name in MEASURED:
+        values = [each.logarithms[name] for each in signs if name in each.logarithms]
+        if values:
+            low, middle, high = np.quantile(values, [0.16, 0.5, 0.84])
+            result[name] = Usual(mean=float(middle), std=max(float(high - low) / 2, SMALLEST_STD[name]))
+    return result
+
+
+# --- distractors ------------------------------------------------------------------------------------------------------
+
+# Clouds of what no scene shows: planes, and heaps of boxes, balls and cylinders.
+#
+# For trials of what is said of a frame that does not show the object. They are as large as the object and seen by the
+# same camera, so that size and noise tell nothing.
+
+Stranger = Literal["plane", "clutter"]
+
+
+def stranger_cloud(scene: Scene, kind: Stranger, settings: GenerateConfig, rng: np.random.Generator) -> PointCloud:
+    """Cloud of a plane or a heap, about as large as a scene's object, by a camera as far away as the scene's."""
+    workspace = scene.workspace_named(settings.workspace)
+    camera = Camera.from_fov(settings.image_size, settings.image_size, workspace.fov_rad)
+    low, high = scene.rest.bounds
+    size = float((high - low).max())
+    while True:
+        middle = np.array([0.0, 0.0, rng.uniform(*workspace.distance)])
+        bodies = [_plate(size, rng)] if kind == "plane" else _heap(size, rng)
+        parts = tuple(
+            Segment(
+                f"body {i + 1}", PALETTE[i % len(PALETTE)], np.asarray(body.vertices) + middle, np.asarray(body.faces)
+            )
+            for i, body in enumerate(bodies)
+        )
+        seen = observe_scene(Solids(SegmentedMesh(parts)), camera, settings.noise_std, settings.sensor, rng)
+        if seen.object_points >= 4 * MIN_POINTS:
+            return seen.image.to_points()
+
+
+def _plate(size: float, rng: np.random.Generator) -> trimesh.Trimesh:
+    """Flat box, whose normal is turned by up to 1.2 rad from the line of sight."""
+    plate = trimesh.creation.box([*(rng.uniform(0.5, 1.0, size=2) * size), 0.01 * size])
+    roll = Rotation.from_euler("z", rng.uniform(0.0, 2 * np.pi))
+    tilt = Rotation.from_euler("zx", [rng.uniform(0.0, 2 * np.pi), rng.uniform(0.0, 1.2)])
+    return _placed(plate, tilt * roll, np.zeros(3))
+
+
+def _heap(size: float, rng: np.random.Generator) -> list[trimesh.Trimesh]:
+    """Three to eight boxes, balls and cylinders of a tenth to a half of ``size``, anywhere within it, any way up."""
+    makers: tuple[Callable[[Float[np.ndarray, "3"]], trimesh.Trimesh], ...] = (
+        lambda sides: trimesh.creation.box(sides),
+        lambda sides: trimesh.creation.icosphere(subdivisions=2, radius=sides[0] / 2),
+        lambda sides: trimesh.creation.cylinder(radius=sides[0] / 3, height=1.5 * sides[1], sections=24),
+    )
+    bodies = []
+    for _ in range(int(rng.integers(3, 9))):
+        body = makers[int(rng.integers(len(makers)))](rng.uniform(0.1, 0.5, size=3) * size)
+        turned = Rotation.from_quat(rng.normal(size=4))
+        bodies.append(_placed(body, turned, rng.uniform(-0.35, 0.35, size=3) * size))
+    return bodies
+
+
+def _placed(body: trimesh.Trimesh, turned: Rotation, place: Float[np.ndarray, "3"]) -> trimesh.Trimesh:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = turned.as_matrix(), place
+    body.apply_transform(T)
+    return body

@@ -1,0 +1,584 @@
+"""One test case scored by itself, wherever that is done, and the set of them put together.
+
+    case(i) -Scoring-> ScoredCase -evaluation_of-> Evaluation
+
+What a case leaves is small, so cases may be scored anywhere; they are put together in their order, so that sums are the
+same bits wherever each one comes from.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+from scipy.spatial import cKDTree
+
+from mereo.fitting.registration.answer_frame import answer_frame
+from mereo.fitting.registration.recognition import Known
+from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.registration import Registration
+from mereo.fitting.uncertainty import LEVEL
+from mereo.geometry.brief import counted, listed
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.labels import LabelGrid
+from mereo.geometry.mesh import Color
+from mereo.geometry.metrics import Scores, TruthGrid, grid_confusion, intersection_over_union
+from mereo.geometry.solids import label_grid
+from mereo.models.trained import EncodedCloud, Trained
+from mereo.reconstruction.isosurfaces import sample_coarse_to_fine
+from mereo.reconstruction.observation import observe
+from mereo.reconstruction.pipeline import segment_names
+from mereo.scenes.statistical_model import StatisticalModel
+
+# --- errors of a registration, and their radii ------------------------------------------------------------------------
+
+# Coverage: how often true positions lie within the radii of a registration, and the factor with which 95 % of them do.
+#
+# Registration, truth -RegistrationErrors.of-> errors of each view -together, scale-> Calibration.radius_scale
+
+
+def seen_points(truth: Float[np.ndarray, "m 3"], cloud: PointCloud, scene_unit: float) -> Bool[np.ndarray, " m"]:
+    """Which material points a cloud shows: those whose true positions are within 1.5 scene units of an observed one."""
+    near: Bool[np.ndarray, " m"] = cKDTree(cloud.points).query(truth)[0] <= 1.5 * scene_unit
+    return near
+
+
+@dataclass(frozen=True, eq=False)
+class RegistrationErrors:
+    """Distances of registered material points from their true positions, and the radii that they have.
+
+    Attributes:
+        distances: scene units.
+        ratios: factor of the posterior's Gaussian radius with which the true position lies on the rim of the whole one;
+            0 where it lies within in any case.
+        gaussian: these radii, scene units.
+        other: radii of the other parts, whose squares add: ``RadiusParts.open``, ``Uncertainty.extra_radius``.
+        seen: which of the points the cloud shows.
+        calibrated: whether the radii are.
+    """
+
+    distances: Float[np.ndarray, " n"]
+    ratios: Float[np.ndarray, " n"]
+    gaussian: Float[np.ndarray, " n"]
+    other: Float[np.ndarray, " n"]
+    seen: Bool[np.ndarray, " n"]
+    calibrated: bool = False
+
+    @classmethod
+    def of(
+        cls,
+        registration: Registration,
+        truth: Float[np.ndarray, "m 3"],
+        seen: Bool[np.ndarray, " m"],
+        scene_unit: float,
+    ) -> "RegistrationErrors":
+        """Errors of one view, with the radii that its registration has, calibrated if the weights are.
+
+        Args:
+            registration: fitted, not read from a file.
+            truth: true positions of its material points, vertices and interior ones, or of the first of them, in its
+                frame and unit.
+            seen: which of these the cloud shows (``seen_points``).
+            scene_unit: true length of a scene unit in that unit, which the registration may have estimated.
+
+        Raises ``ValueError`` for a registration without an optimum.
+        """
+        sure = registration.uncertainty
+        if sure is None:
+            raise ValueError("the registration was read from a file, which has no posterior: fit its frame again")
+        count, unit = len(truth), sure.optimum.unit / registration.scene_unit
+        distances = np.linalg.norm(registration.material[:count] - truth, axis=1)
+        off = distances / registration.scene_unit
+        gaussian, other = (
+            unit * sure.parts.gaussian[:count],
+            unit * np.hypot(sure.parts.open[:count], sure.extra_radius),
+        )
+        ratios = np.sqrt(np.maximum(off**2 - other**2, 0.0)) / gaussian
+        errors = cls(distances / scene_unit, ratios, gaussian, other, seen, registration.radius_scale is not None)
+        return errors.scaled(sure.scale)
+
+    @classmethod
+    def together(cls, each: Sequence["RegistrationErrors"]) -> "RegistrationErrors":
+        """Errors of several views, every point counted once; calibrated where all of them are."""
+        columns = (
+            [getattr(view, name) for view in each] for name in ("distances", "ratios", "gaussian", "other", "seen")
+        )
+        distances, ratios, gaussian, other, seen = (np.concatenate(column) for column in columns)
+        return cls(distances, ratios, gaussian, other, seen, all(view.calibrated for view in each))
+
+    @property
+    def radii(self) -> Float[np.ndarray, " n"]:
+        """Radii of all points, scene units."""
+        return np.hypot(self.gaussian, self.other)
+
+    def scale(self) -> float:
+        """Factor of the Gaussian's radii that holds 95 % of the true positions: ``Calibration.radius_scale``."""
+        return float(np.quantile(self.ratios, LEVEL))
+
+    def scaled(self, scale: float | None) -> "RegistrationErrors":
+        """The same with the Gaussian's radii times a scale, where there is one."""
+        return self if scale is None else replace(self, ratios=self.ratios / scale, gaussian=self.gaussian * scale)
+
+    def with_extra_radius(self, radius: float) -> "RegistrationErrors":
+        """The same with a radius, in scene units, that every point has on top of the others."""
+        off = np.maximum((self.ratios * self.gaussian) ** 2 - radius**2, 0.0)
+        return replace(self, ratios=np.sqrt(off) / self.gaussian, other=np.hypot(self.other, radius))
+
+    def summary(self, unit_mm: float | None) -> dict[str, dict[str, float | None]]:
+        """Median and 95 % quantile of seen and of hidden points' distances, in scene units, and in mm where known."""
+        return {
+            name: {
+                "median": _quantile(self.distances[rows], 0.5),
+                "p95": _quantile(self.distances[rows], 0.95),
+                "median_mm": _quantile(self.distances[rows], 0.5, unit_mm),
+                "p95_mm": _quantile(self.distances[rows], 0.95, unit_mm),
+            }
+            for name, rows in (("seen", self.seen), ("hidden", ~self.seen))
+        }
+
+    def coverage(self, unit_mm: float | None = None) -> dict[str, float | bool | None]:
+        """Share of the true positions within the radii, and how large these are.
+
+        Of ``all``, ``seen`` and ``hidden`` points (None where there are none), with the medians of the radii in scene
+        units, and in mm where ``unit_mm``, millimetres per scene unit, is known; and whether they are calibrated.
+        """
+        parts = {"all": np.ones(len(self.seen), dtype=bool), "seen": self.seen, "hidden": ~self.seen}
+        result: dict[str, float | bool | None] = {
+            name: float((self.ratios[rows] <= 1.0).mean()) if rows.any() else None for name, rows in parts.items()
+        }
+        for name in ("seen", "hidden"):
+            median = float(np.median(self.radii[parts[name]])) if parts[name].any() else None
+            result[f"radius_{name}"] = median
+            result[f"radius_{name}_mm"] = None if median is None or unit_mm is None else median * unit_mm
+        return {**result, "calibrated": self.calibrated}
+
+
+def _quantile(values: Float[np.ndarray, " n"], share: float, factor: float | None = 1.0) -> float | None:
+    """Quantile of values times a factor; None without values, and without a factor."""
+    return None if len(values) == 0 or factor is None else float(np.quantile(values, share)) * factor
+
+
+# --- reliability of probabilities -------------------------------------------------------------------------------------
+
+# Reliability of probabilities: how often answers that are given with so much confidence are right.
+#
+# The expected calibration error (Naeini et al., AAAI 2015; Guo et al., ICML 2017) is the mean distance of the share of
+# right answers from their confidence, over bins of equal width, weighed by how many answers fall into each. Confidence
+# is the probability of the answered label, over the cells of the paper's metric (``geometry.metrics``).
+
+BINS = 15
+"""Bins of equal width, as in the papers."""
+
+SAMPLED_CELLS = 20_000
+"""Cells of a view at which the network is evaluated, evenly drawn: all would take longer than the evaluation."""
+
+
+def sample_cells(
+    truth: TruthGrid, count: int = SAMPLED_CELLS
+) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, " n"]]:
+    """Centres and true labels of at most ``count`` of the cells that count, the same ones every time."""
+    kept = np.argwhere(truth.kept)
+    if len(kept) > count:
+        kept = kept[np.sort(np.random.default_rng(0).choice(len(kept), count, replace=False))]
+    return truth.grid.positions(kept), truth.grid.labels[tuple(kept.T)]
+
+
+@dataclass
+class Reliability:
+    """Answers counted by their confidence.
+
+    Attributes:
+        count: of answers in each bin.
+        confidence: sum of theirs.
+        right: how many are right.
+    """
+
+    count: Float[np.ndarray, " b"] = field(default_factory=lambda: np.zeros(BINS))
+    confidence: Float[np.ndarray, " b"] = field(default_factory=lambda: np.zeros(BINS))
+    right: Float[np.ndarray, " b"] = field(default_factory=lambda: np.zeros(BINS))
+
+    @classmethod
+    def of_view(cls, model: Trained, code: EncodedCloud, truth: TruthGrid) -> "Reliability":
+        """Answers of a network about a view; one that tells no segments apart is asked for the whole."""
+        points, labels = sample_cells(truth)
+        answer, result = model.query(code, points), cls()
+        right = answer.label == np.minimum(labels, answer.probability.shape[1] - 1)
+        result.add(answer.probability[np.arange(len(right)), answer.label].astype(np.float64), right)
+        return result
+
+    def add(self, confidence: Float[np.ndarray, " n"], right: Bool[np.ndarray, " n"]) -> None:
+        """Count further answers, by the probability of what was answered and whether that is right."""
+        index = np.minimum((confidence * BINS).astype(np.int64), BINS - 1)
+        self.count += np.bincount(index, minlength=BINS)
+        self.confidence += np.bincount(index, weights=confidence, minlength=BINS)
+        self.right += np.bincount(index, weights=right, minlength=BINS)
+
+    def add_all(self, other: "Reliability") -> None:
+        """Count what another one has counted."""
+        self.count += other.count
+        self.confidence += other.confidence
+        self.right += other.right
+
+    @property
+    def ece(self) -> float:
+        """Expected calibration error, 0 to 1; NaN without answers."""
+        total = self.count.sum()
+        return float(np.abs(self.right - self.confidence).sum() / total) if total else float("nan")
+
+    def facts(self) -> list[dict[str, Any]]:
+        """Bins that have answers: their share of all, mean confidence and share of right ones."""
+        return [
+            {
+                "share": float(self.count[i] / self.count.sum()),
+                "confidence": float(self.confidence[i] / self.count[i]),
+                "right": float(self.right[i] / self.count[i]),
+            }
+            for i in np.flatnonzero(self.count)
+        ]
+
+
+# --- answers to a test case -------------------------------------------------------------------------------------------
+
+AnswerName = Literal["network", "modes", "full"]
+"""Who answers: the network alone, the registered modes, the better of these and the scene's own parameters."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """One answer to a frame.
+
+    Attributes:
+        labels: on the grid of the truth.
+        seconds: from the cloud to the answer.
+        registration: behind it; None for the network's.
+    """
+
+    labels: UInt8[np.ndarray, "x y z"]
+    seconds: float
+    registration: Registration | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """All answers to a frame.
+
+    Attributes:
+        code: what the network made of the cloud.
+        each: answers by who gives them.
+        default: whose answer a user gets.
+        known: whether the frame is said to show the object; None where no registration was asked for.
+        seconds: from the cloud to the answer that a user gets, all that led to it included.
+    """
+
+    code: EncodedCloud
+    each: dict[AnswerName, Candidate]
+    default: AnswerName
+    known: Known | None = None
+    seconds: float = 0.0
+
+    @property
+    def answer(self) -> Candidate:
+        """The answer that a user gets."""
+        return self.each[self.default]
+
+    @property
+    def source(self) -> str:
+        """Where that answer comes from: network, rest, modes or draws."""
+        return "network" if self.answer.registration is None else self.answer.registration.method
+
+
+def network_labels(model: Trained, code: EncodedCloud, grid: LabelGrid) -> UInt8[np.ndarray, "x y z"]:
+    """Labels by the network at the voxels of a grid, evaluated coarse to fine."""
+    x, y, z = grid.labels.shape
+
+    def logits(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n c"]:
+        return model.logits(code, points)
+
+    return sample_coarse_to_fine(logits, grid.origin, grid.spacing, (x, y, z)).labels
+
+
+def find_candidates(
+    model: Trained, cloud: PointCloud, grid: LabelGrid, registrar: Registrar | None, scene_unit: float | None
+) -> Candidates:
+    """Answers to a frame, scored on a grid: the one that a user gets, and all others that led to it."""
+    answer = answer_frame(observe(cloud), model, registrar, scene_unit=scene_unit)
+    assert answer.likelier is not None and answer.candidate is not None and answer.likelier.code is not None
+    started = time.perf_counter()
+    code, encoding = answer.likelier.code, answer.likelier.timings_s["encode"]
+    labels = network_labels(model, code, grid)
+    network = Candidate(labels, encoding + time.perf_counter() - started)
+    if registrar is None:
+        return Candidates(code, {"network": network}, "network", seconds=network.seconds)
+    known, names = answer.recognition.known, names_for(registrar)
+    if answer.candidate.modes is None or answer.registration is None:  # too few correspondences, whoever is scored
+        return Candidates(code, dict.fromkeys(names, network), "network", known, answer.seconds)
+    registrations = {"modes": answer.candidate.modes.registration(), "full": answer.registration}
+    each: dict[AnswerName, Candidate] = {"network": network}
+    for name in names[1:]:
+        fit = registrations[name]
+        each[name] = Candidate(label_grid(fit.mesh, *grid.axes()), encoding + fit.seconds, fit)
+    return Candidates(code, each, names[-1] if answer.taken else "network", known, answer.seconds)
+
+
+def names_for(registrar: Registrar | None) -> tuple[AnswerName, ...]:
+    """Names of the answers that can be had: the scene's parameters only of an object whose scene is there."""
+    if registrar is None:
+        return ("network",)
+    if registrar.method == "modes" or registrar.states_or_none is None:
+        return ("network", "modes")
+    return ("network", "modes", "full")
+
+
+# --- results of a test set --------------------------------------------------------------------------------------------
+
+# Result of a test set: scores of the answer that a user gets, and of each that could have answered.
+
+
+@dataclass(frozen=True, eq=False)
+class EvaluatedView:
+    """View with its true and its predicted labels: a row of the paper's figure of reconstructions.
+
+    Attributes:
+        name: label at the left of the row.
+        cloud: what the model was given.
+        reference: true labels; 0 is empty space.
+        predicted: labels by the model, on the same grid.
+        origin: centre of voxel [0, 0, 0] in the cloud's frame; that of [i, j, k] is ``origin + [i, j, k] * spacing``.
+        spacing: distances of the voxels' centres along each axis.
+        colors: colours of the segments; label k has ``colors[k - 1]``.
+    """
+
+    name: str
+    cloud: PointCloud
+    reference: UInt8[np.ndarray, "x y z"]
+    predicted: UInt8[np.ndarray, "x y z"]
+    origin: Float[np.ndarray, "3"]
+    spacing: Float[np.ndarray, "3"]
+    colors: Sequence[Color]
+
+
+@dataclass(frozen=True, eq=False)
+class AnswerScores:
+    """Scores of one of the answers over a test set.
+
+    Attributes:
+        confusion: points by true (row) and predicted (column) label, summed over the set.
+        examples: scores of each test case, in order.
+        seconds: of each, from the cloud to the answer.
+    """
+
+    confusion: Int[np.ndarray, "c c"]
+    examples: tuple[Scores, ...]
+    seconds: tuple[float, ...]
+
+    @classmethod
+    def of(cls, cases: Sequence[tuple[Int[np.ndarray, "c c"], float]], segmented: bool) -> "AnswerScores":
+        """Scores of a set by the confusion matrix and the seconds of each case."""
+        each = tuple(intersection_over_union(confusion, segmented) for confusion, _ in cases)
+        return cls(np.sum([confusion for confusion, _ in cases], axis=0), each, tuple(seconds for _, seconds in cases))
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Result of a test set: its confusion matrix, from which its scores come, and the scores of each example.
+
+    Attributes:
+        names: names of the segments.
+        confusion: points by true (row) and predicted (column) label, summed over the set; 0 is empty space.
+        examples: scores of each test case by its name.
+        views: the first few with their labels, for pictures.
+        segmented: whether the model tells segments apart; without, there is no mIoU (NaN).
+        answers: the same of each that could have answered; ``confusion`` and ``examples`` are of what a user gets.
+        sources: where that answer came from, in each example: network, modes or draws.
+        known: whether each example was said to show the object, where a registration was asked for.
+        errors: distances of registered points from their true positions, where a registration was taken.
+        unit_mm: millimetres per scene unit, where they are known.
+        reliability: of the network's probabilities.
+        calibrated: whether these are.
+        seconds: of each example, from the cloud to the answer that a user gets.
+    """
+
+    names: tuple[str, ...]
+    confusion: Int[np.ndarray, "c c"]
+    examples: dict[str, Scores]
+    views: tuple[EvaluatedView, ...] = field(default=())
+    segmented: bool = True
+    answers: dict[AnswerName, AnswerScores] = field(default_factory=dict)
+    sources: tuple[str, ...] = ()
+    known: tuple[Known, ...] = ()
+    errors: RegistrationErrors | None = None
+    unit_mm: float | None = None
+    reliability: Reliability = field(default_factory=Reliability)
+    calibrated: bool = False
+    seconds: tuple[float, ...] = ()
+
+    def __repr__(self) -> str:
+        scores, count = self.scores, counted(len(self.examples), "example")
+        miou = "" if np.isnan(scores.miou) else f", mIoU {scores.miou:.3f}"
+        return f"Evaluation({count}: IoU {scores.iou:.3f}{miou}; {listed(self.names)})"
+
+    @property
+    def scores(self) -> Scores:
+        """Scores over the whole set, from its one confusion matrix."""
+        return intersection_over_union(self.confusion, self.segmented)
+
+    @property
+    def example_mean(self) -> tuple[float, float]:
+        """Mean IoU and mean mIoU over the examples; NaN where no example has a mIoU."""
+        each = self.examples.values()
+        mious = [s.miou for s in each if not np.isnan(s.miou)]
+        return float(np.mean([s.iou for s in each])), float(np.mean(mious)) if mious else float("nan")
+
+
+# --- test cases -------------------------------------------------------------------------------------------------------
+
+PICTURE_MARGIN = 12
+"""Cells drawn around the truth's box: what a model puts there does not count, but belongs into a picture of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class TestCase:
+    """Cloud to be reconstructed and the truth to score it by, both in the same camera frame.
+
+    Attributes:
+        name: name in tables, different from other cases' of the set.
+        cloud: what the model is given.
+        truth: true labels on a grid.
+        scene_unit: length of a scene unit in the cloud's unit, where it is known.
+        material: true positions of a statistical model's material points, or of the first of them, in the cloud's frame
+            and unit; None where no correspondence is known.
+    """
+
+    __test__ = False  # not a test, whatever pytest thinks of the name
+
+    name: str
+    cloud: PointCloud
+    truth: TruthGrid
+    scene_unit: float | None = None
+    material: Callable[[StatisticalModel], Float[np.ndarray, "m 3"]] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredCase:
+    """What is kept of one test case.
+
+    Attributes:
+        name: its own.
+        each: confusion matrix and seconds of each answer, by who gives it.
+        default: whose answer a user gets.
+        source: where that comes from.
+        reliability: of the network's probabilities on this case.
+        errors: of the registration behind the answer; None without one, or without known true positions.
+        view: labels for a picture; None where none is wanted.
+        known: as ``Candidates`` has it.
+        seconds: as ``Candidates`` has them.
+    """
+
+    name: str
+    each: dict[AnswerName, tuple[Int[np.ndarray, "c c"], float]]
+    default: AnswerName
+    source: str
+    reliability: Reliability
+    errors: RegistrationErrors | None
+    view: EvaluatedView | None
+    known: Known | None = None
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Scoring:
+    """Scores test cases by their number; cases and what they are scored with can be sent to where that is done.
+
+    Attributes:
+        model: the trained model.
+        registrar: of the model's object; None scores the network alone.
+        case: test case by its number.
+        kept: how many cases, the first ones, keep their labels for pictures.
+        gpu: whether whoever scores moves the model to a GPU of its own first.
+    """
+
+    model: Trained
+    registrar: Registrar | None
+    case: Callable[[int], TestCase]
+    kept: int
+    gpu: bool = False
+
+    @cached_property
+    def moved(self) -> tuple[Trained, Registrar | None]:
+        """Model and registrar on the device of whoever scores, moved there once."""
+        if not self.gpu:
+            return self.model, self.registrar
+        from mereo.models.remote import to_gpu  # needs torch, and results do not
+
+        model = to_gpu(self.model)
+        return model, None if self.registrar is None else self.registrar.asking(model)
+
+    def __call__(self, index: int) -> ScoredCase:
+        """Score a case."""
+        case, (model, registrar) = self.case(index), self.moved
+        candidates = find_candidates(model, case.cloud, case.truth.grid, registrar, case.scene_unit)
+        names, colors = segment_names(model)
+        return ScoredCase(
+            name=case.name,
+            each={
+                name: (
+                    grid_confusion(case.truth, candidates.each[name].labels, len(names)),
+                    candidates.each[name].seconds,
+                )
+                for name in names_for(registrar)
+            },
+            default=candidates.default,
+            source=candidates.source,
+            reliability=Reliability.of_view(model, candidates.code, case.truth),
+            errors=_errors(case, candidates.answer.registration),
+            view=_evaluated_view(case, model, candidates, colors) if index < self.kept else None,
+            known=candidates.known,
+            seconds=candidates.seconds,
+        )
+
+
+def _errors(case: TestCase, registration: Registration | None) -> RegistrationErrors | None:
+    if registration is None or case.material is None or case.scene_unit is None:
+        return None
+    truth = case.material(registration.model)
+    seen = seen_points(truth, case.cloud, case.scene_unit)
+    return RegistrationErrors.of(registration, truth, seen, case.scene_unit)
+
+
+def _evaluated_view(case: TestCase, model: Trained, candidates: Candidates, colors: Sequence[Color]) -> EvaluatedView:
+    """Truth and answer on the truth's grid and ``PICTURE_MARGIN`` cells around it, which are empty in truth."""
+    grid, registration = case.truth.grid, candidates.answer.registration
+    labels = np.pad(grid.labels, PICTURE_MARGIN)
+    wide = replace(grid, labels=labels, origin=grid.origin - PICTURE_MARGIN * grid.spacing)
+    if registration is None:
+        predicted = network_labels(model, candidates.code, wide)
+    else:
+        predicted = label_grid(registration.mesh, *wide.axes())
+    reference = np.minimum(labels, np.uint8(len(colors)))
+    return EvaluatedView(case.name, case.cloud, reference, predicted, wide.origin, wide.spacing, colors)
+
+
+def evaluation_of(model: Trained, cases: Sequence[ScoredCase], answers: Sequence[AnswerName]) -> Evaluation:
+    """Result of a test set from its cases, in order, which all have these answers."""
+    scores = AnswerScores.of([case.each[case.default] for case in cases], model.segmented)
+    errors = [case.errors for case in cases if case.errors is not None]
+    reliability = Reliability()
+    for case in cases:
+        reliability.add_all(case.reliability)
+    return Evaluation(
+        names=segment_names(model)[0],
+        confusion=scores.confusion,
+        examples={case.name: example for case, example in zip(cases, scores.examples, strict=True)},
+        views=tuple(case.view for case in cases if case.view is not None),
+        segmented=model.segmented,
+        answers={name: AnswerScores.of([case.each[name] for case in cases], model.segmented) for name in answers},
+        sources=tuple(case.source for case in cases),
+        known=tuple(case.known for case in cases if case.known is not None),
+        errors=RegistrationErrors.together(errors) if errors else None,
+        reliability=reliability,
+        calibrated=model.calibrates,
+        seconds=tuple(case.seconds for case in cases),
+    )

@@ -1,0 +1,285 @@
+"""The search alone on test views of an object, scored before anything is trained, and kept in ``search.json``."""
+
+import hashlib
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mereo.fitting.registration.answer_frame import answer_frame
+from mereo.fitting.registration.register import Registrar
+from mereo.geometry.metrics import Scores, format_score, grid_confusion, intersection_over_union
+from mereo.geometry.solids import label_grid
+from mereo.io.atomic_files import write_json
+from mereo.io.progress import progress
+from mereo.reconstruction.observation import observe
+from mereo.scenes.files.object_files import SEARCH
+from mereo.scenes.random_states import kept_model
+from mereo.scenes.rest_pose import rest_digest
+from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import TEST_SEED_START
+from mereo.synthesis.config import GenerateConfig
+from mereo_learning.scoring import CELLS, scene_case
+from mereo_learning.tables import CLEARLY
+
+# --- scores of the search ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class SearchScores:
+    """Scores of the search alone, view by view.
+
+    Attributes:
+        names: names of the segments.
+        confusions: cells by true (row) and answered (column) label, of each view.
+        explained: whether the fit explains the view.
+        seconds: of each view, from the cloud to the answer.
+    """
+
+    names: tuple[str, ...]
+    confusions: Int[np.ndarray, "n c c"]
+    explained: Bool[np.ndarray, " n"]
+    seconds: Float[np.ndarray, " n"]
+
+    def __len__(self) -> int:
+        return len(self.seconds)
+
+    @property
+    def scores(self) -> Scores:
+        """Scores of all views together, from the sum of their confusion matrices."""
+        return intersection_over_union(self.confusions.sum(axis=0))
+
+    @property
+    def median_s(self) -> float:
+        """Median seconds of a view."""
+        return float(np.median(self.seconds))
+
+    def first(self, count: int) -> "SearchScores":
+        """Scores of the first views alone."""
+        return SearchScores(self.names, self.confusions[:count], self.explained[:count], self.seconds[:count])
+
+    def summary(self) -> dict[str, Any]:
+        """IoU, mIoU, the share of views that are explained, the lowest mIoU of a view, and median seconds."""
+        scores = self.scores
+        return {
+            "examples": len(self),
+            "iou": scores.iou,
+            "miou": scores.miou,
+            "lowest_miou": min(intersection_over_union(view).miou for view in self.confusions),
+            "explained": float(self.explained.mean()),
+            "seconds": self.median_s,
+        }
+
+    def content(self) -> dict[str, Any]:
+        """All of it in terms that JSON knows, as ``of_content`` reads it."""
+        views = zip(self.confusions.tolist(), self.explained.tolist(), self.seconds.tolist(), strict=True)
+        return {
+            "names": list(self.names),
+            "views": [
+                {"confusion": confusion, "explained": explained, "seconds": seconds}
+                for confusion, explained, seconds in views
+            ],
+        }
+
+    @classmethod
+    def of_content(cls, content: Mapping[str, Any]) -> "SearchScores":
+        """Scores that ``content`` has made; raises ``KeyError``, ``TypeError`` or ``ValueError`` for anything else."""
+        names, views = tuple(content["names"]), content["views"]
+        classes = len(names) + 1
+        return cls(
+            names,
+            np.array([view["confusion"] for view in views], dtype=np.int64).reshape(len(views), classes, classes),
+            np.array([view["explained"] for view in views], dtype=bool),
+            np.array([view["seconds"] for view in views], dtype=float),
+        )
+
+
+def score_search(
+    scene: Scene,
+    *,
+    views: int,
+    least: int = 1,
+    budget_s: float = float("inf"),
+    cells: int = CELLS,
+    begun: SearchScores | None = None,
+) -> SearchScores:
+    """Score the search alone on the test views that ``scoring.evaluate`` takes, in their order.
+
+    Args:
+        scene: the object's.
+        views: how many.
+        least: how many at least, whatever time they take.
+        budget_s: seconds after which no further view is begun.
+        cells: cells of the grid along each axis.
+        begun: scores of the first views, which are not made again.
+    """
+    registrar = Registrar(None, kept_model(scene), given=scene)
+    registrar.prepare()  # no part of a frame's seconds
+    names, started = scene.rest.names, time.monotonic()
+    rows: list[tuple[Int[np.ndarray, "c c"], bool, float]] = []
+    if begun is not None:
+        rows += zip(begun.confusions, begun.explained.tolist(), begun.seconds.tolist(), strict=True)
+    with progress("score the search", views - len(rows), "views") as shown:
+        while len(rows) < views and (len(rows) < least or time.monotonic() - started < budget_s):
+            rows.append(_scored(scene, registrar, cells, len(rows)))
+            shown.advance()
+    confusions, explained, seconds = zip(*rows, strict=True)
+    return SearchScores(names, np.stack(confusions), np.array(explained), np.array(seconds))
+
+
+def _scored(scene: Scene, registrar: Registrar, cells: int, index: int) -> tuple[Int[np.ndarray, "c c"], bool, float]:
+    """Confusion matrix, whether the view is explained, and seconds; a view in which nothing is found scores 0."""
+    case = scene_case(scene, GenerateConfig(), TEST_SEED_START, cells, index)
+    started = time.perf_counter()
+    labels, explained = np.zeros_like(case.truth.grid.labels), False
+    try:
+        answer = answer_frame(observe(case.cloud), None, registrar, scene_unit=case.scene_unit)
+        seconds = answer.seconds
+        labels = label_grid(answer.surfaces, *case.truth.grid.axes())
+        explained = answer.registration is not None and answer.registration.accepted
+    except ValueError:  # too few points, or nothing is found in them
+        seconds = time.perf_counter() - started
+    return grid_confusion(case.truth, labels, len(scene.rest.names)), explained, seconds
+
+
+# --- the stage --------------------------------------------------------------------------------------------------------
+
+VIEWS, LEAST_VIEWS = 16, 6
+"""Test views on which the search is scored, and how many at least where time is short."""
+
+SEARCH_SHARE = 0.1
+"""Of the budget, for these views."""
+
+
+def search_scores(output: Path, scene: Scene, named: str, budget_s: float, cells: int = CELLS) -> SearchScores:
+    """Scores of the search alone: those in ``output``, or else of as many views as there is time for.
+
+    ``named`` is the scene's name or absolute file, by which ``load_object`` will know the folder's object.
+
+    Raises ``ValueError`` where the folder has scores of another object, or a file that holds none.
+    """
+    if (output / SEARCH).is_file():
+        return _read(output, scene)
+    scores = score_search(scene, views=VIEWS, least=LEAST_VIEWS, budget_s=budget_s, cells=cells)
+    _write(output, scene, named, scores)
+    return scores
+
+
+def scores_of_views(output: Path, scene: Scene, named: str, views: int, cells: int = CELLS) -> SearchScores:
+    """Scores of the search alone on so many views, of which the folder has some already; the others are added to it."""
+    scores = _read(output, scene)
+    if len(scores) < views:
+        scores = score_search(scene, views=views, least=views, cells=cells, begun=scores)
+        _write(output, scene, named, scores)
+    return scores.first(views)
+
+
+def search_line(scores: SearchScores) -> str:
+    """Sentence on the scores, for the terminal."""
+    summary = scores.summary()
+    return (
+        f"search alone, without training: IoU {format_score(summary['iou'])}, mIoU {format_score(summary['miou'])} on "
+        f"{len(scores)} test views, {int(scores.explained.sum())} of them explained, {scores.median_s:.2f} s a frame"
+    )
+
+
+def _digests(scene: Scene) -> dict[str, str | None]:
+    """What tells the object and its deformations from others, as datasets have it."""
+    definition = hashlib.sha256(scene.definition.encode()).hexdigest() if scene.definition else None
+    return {"rest_sha256": rest_digest(scene.rest), "scene_file_sha256": definition}
+
+
+def _write(output: Path, scene: Scene, named: str, scores: SearchScores) -> None:
+    write_json(output / SEARCH, {"scene": named, **_digests(scene), "seed": TEST_SEED_START, **scores.content()})
+
+
+def _read(output: Path, scene: Scene) -> SearchScores:
+    path = output / SEARCH
+    try:
+        content = json.loads(path.read_text("utf-8"))
+        scores = SearchScores.of_content(content)
+    except (ValueError, KeyError, TypeError):
+        raise ValueError(f"{path} holds no scores; remove it, and they are made again") from None
+    if any(content.get(key) != value for key, value in _digests(scene).items()):
+        raise ValueError(
+            f"{output} was begun with another object or other deformations than {scene.name} has now; it is continued "
+            "with equal ones: restore the scene file, or choose another --output"
+        )
+    return scores
+
+
+# --- whether to train -------------------------------------------------------------------------------------------------
+
+TrainChoice = Literal["auto", "always", "never"]
+"""When to train: where the search alone is not good enough, in any case, or not at all."""
+
+Method = Literal["auto", "search", "network"]
+"""Who is to answer, as ``--method`` says it: both, the search alone, or the network alone."""
+
+GOOD_ENOUGH = 0.85
+"""mIoU from which the search alone is good enough; IoU of an object in one segment."""
+
+LOWEST = 0.5
+"""mIoU that each view must have: in one with less, segments that look alike are exchanged."""
+
+
+def shortcomings(search: Mapping[str, Any]) -> list[str]:
+    """Reasons why the search alone is not good enough, by its ``SearchScores.summary``; none where it is."""
+    views, missed = search["examples"], round((1 - search["explained"]) * search["examples"])
+    reasons = []
+    if missed:
+        reasons.append(f"{missed} of {views} views are not explained")
+    if search["miou"] < GOOD_ENOUGH:
+        reasons.append(f"mIoU {format_score(search['miou'])} is below {GOOD_ENOUGH}")
+    if search["lowest_miou"] < LOWEST:
+        reasons.append(f"mIoU of the worst view, {format_score(search['lowest_miou'])}, is below {LOWEST}")
+    return reasons
+
+
+def is_to_train(choice: TrainChoice, reasons: list[str]) -> bool:
+    """Whether to train, by what the user chose and the shortcomings of the search alone."""
+    return choice == "always" or (choice == "auto" and bool(reasons))
+
+
+def training_reason(choice: TrainChoice, reasons: list[str], is_begun: bool) -> str:
+    """Why an object is trained, in a phrase."""
+    if is_begun:
+        return "that was begun before"
+    return "--train is always" if choice == "always" else f"the search alone is not good enough, {', '.join(reasons)}"
+
+
+def best_method(table: Mapping[str, Mapping[str, Any]]) -> tuple[Method, str]:
+    """Choose who is to answer, with the reason in a sentence.
+
+    Of the search alone and both, that with the clearly higher mIoU is taken (by ``CLEARLY``), else that which explains
+    more views, else the faster one; the network alone, which registers nothing, only where it is clearly better still.
+
+    Args:
+        table: IoU, mIoU, explained share and seconds of "search", "network" and "both", on the same views.
+    """
+    scores = {name: float(row["miou"] if row["miou"] is not None else row["iou"]) for name, row in table.items()}
+    search, both = table["search"], table["both"]
+    if scores["network"] > max(scores["search"], scores["both"]) + CLEARLY:
+        return "network", f"use the network alone: mIoU {_than(scores, 'network', 'both')}"
+    if abs(scores["both"] - scores["search"]) > CLEARLY:
+        is_both = scores["both"] > scores["search"]
+        reason = f"mIoU {_than(scores, 'both', 'search') if is_both else _than(scores, 'search', 'both')}"
+    elif both["explained"] != search["explained"]:
+        is_both = both["explained"] > search["explained"]
+        shares = f"{both['explained']:.0%} of the views by both, {search['explained']:.0%} by the search alone"
+        reason = f"it explains more, {shares}"
+    else:
+        is_both = both["seconds"] < search["seconds"]
+        times = f"{both['seconds']:.2f} s a frame with both, {search['seconds']:.2f} s with the search alone"
+        reason = f"as good as {'the search alone' if is_both else 'both'}, and faster, {times}"
+    return ("auto", f"use both: {reason}") if is_both else ("search", f"use the search alone: {reason}")
+
+
+def _than(scores: Mapping[str, float], name: str, other: str) -> str:
+    titles = {"search": "of the search alone", "both": "of both"}
+    return f"{format_score(scores[name])}, not {format_score(scores[other])} {titles[other]}"

@@ -1,0 +1,219 @@
+"""Calibrated probabilities and radii: scaling finds what made them wrong, labels stay, the file keeps all else."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from analytic import untrained
+from safetensors import safe_open
+
+from mereo import __main__ as command_line
+from mereo.geometry.labels import LabelGrid
+from mereo.geometry.metrics import truth_grid
+from mereo.geometry.radii import Radii, rounded_to
+from mereo.models.calibration import Calibration, RadiusFactors
+from mereo.models.model import scaled_logits
+from mereo.models.weights import load_model, save_model, with_calibration
+from mereo.reconstruction.pipeline import segment_points
+from mereo.scenes.registry import load_scene
+from mereo.visualization.color_scales import radius_scale
+from mereo_learning.calibrate import (
+    GOOD_ENOUGH,
+    LEAST,
+    MeasuredRadii,
+    ViewRadii,
+    calibrate,
+    ece_of,
+    factors_of,
+    fit_scaling,
+)
+from mereo_learning.cases import BINS, RegistrationErrors, Reliability, sample_cells
+
+NAMES = ("one", "two")
+FAVOUR = np.array([0.0, 2.0, -1.0])
+SCALED = Calibration(seed=7, views=8, temperature=2.0, biases=(0.0, -1.0, 0.5))
+
+
+def drawn(logits: np.ndarray) -> np.ndarray:
+    """Labels as likely as the logits say."""
+    rng = np.random.default_rng(0)
+    return (logits + rng.gumbel(size=logits.shape)).argmax(axis=1).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def logits() -> np.ndarray:
+    return np.random.default_rng(1).normal(scale=3.0, size=(40_000, 3))
+
+
+def test_the_error_is_the_distance_of_confidence_from_right_answers() -> None:
+    """Nine of ten right at 0.6: 0.3; and half of the answers without any error halve it."""
+    counted = Reliability()
+    counted.add(np.full(10, 0.6), np.arange(10) > 0)
+    assert counted.ece == pytest.approx(0.3)
+    counted.add(np.full(10, 1.0), np.ones(10, dtype=bool))
+    assert counted.ece == pytest.approx(0.15)
+    assert [bin["share"] for bin in counted.facts()] == [0.5, 0.5] and len(counted.count) == BINS
+    assert np.isnan(Reliability().ece)
+
+
+def test_scaling_finds_what_made_the_probabilities_wrong(logits: np.ndarray) -> None:
+    """Logits that are sharper, and favour a class, by known amounts; labels come from the true ones."""
+    assert ece_of(logits, drawn(logits)) < 0.01
+    truth = drawn(logits)
+    sharper = fit_scaling(2.5 * logits, truth)
+    assert sharper.biases is None and sharper.temperature == pytest.approx(2.5, rel=0.03)
+    favoured = fit_scaling(2.5 * (logits + FAVOUR), truth)
+    assert favoured.biases is not None and favoured.temperature == pytest.approx(2.5, rel=0.03)
+    np.testing.assert_allclose(favoured.biases, [0.0, -2.0, 1.0], atol=0.08)
+    before = ece_of(2.5 * (logits + FAVOUR), truth)
+    assert ece_of(2.5 * (logits + FAVOUR), truth, favoured) < GOOD_ENOUGH / 2 < before / 5
+
+
+def test_cells_are_drawn_among_those_that_count_and_are_the_same_every_time() -> None:
+    truth = truth_grid(load_scene("rope").rest, 24)
+    points, labels = sample_cells(truth, 500)
+    index = np.rint((points - truth.grid.origin) / truth.grid.spacing).astype(int)
+    assert len(points) == 500 and truth.kept[tuple(index.T)].all()
+    np.testing.assert_array_equal(truth.grid.labels[tuple(index.T)], labels)
+    np.testing.assert_array_equal(sample_cells(truth, 500)[0], points)
+
+
+def test_labels_stay_and_probabilities_are_scaled() -> None:
+    plain = untrained(NAMES)
+    scaled = replace(plain, calibration=SCALED)
+    points = np.random.default_rng(2).normal(size=(300, 3)) + np.array([0.0, 0.0, 5.0])
+    before, after = (model.query(model.encode(points), points) for model in (plain, scaled))
+    np.testing.assert_array_equal(before.label, after.label)
+    logits = plain.logits(plain.encode(points), points).astype(np.float64)
+    expected = np.exp(logits / 2.0 + [0.0, -1.0, 0.5])
+    np.testing.assert_allclose(after.probability, expected / expected.sum(axis=1, keepdims=True), atol=1e-5)
+    assert scaled.calibrates and not plain.calibrates
+    own = torch.tensor([[1.0, 2.0, 3.0]])
+    assert scaled_logits(Calibration(seed=0, views=8).scaling, own) is own
+
+
+def test_observed_points_have_the_calibrated_probability_of_their_own_segment() -> None:
+    logits = np.log(np.array([[0.5, 0.4, 0.1], [0.2, 0.3, 0.5]], dtype=np.float32))
+    plain = segment_points(logits, np.zeros((2, 3)), NAMES, ((0, 0, 0), (9, 9, 9)))
+    halved = segment_points(
+        logits, np.zeros((2, 3)), NAMES, plain.colors, Calibration(seed=0, views=8, temperature=0.5)
+    )
+    np.testing.assert_array_equal(plain.labels, halved.labels)
+    np.testing.assert_allclose(halved.confidence, [16 / 17, 25 / 34], rtol=1e-5)
+    given = segment_points(logits, np.zeros((2, 3)), NAMES, plain.colors, labels=np.array([2, 2], dtype=np.uint8))
+    np.testing.assert_allclose(given.confidence, [0.2, 5 / 8], rtol=1e-5)
+
+
+def tensors(path: Path) -> dict[str, bytes]:
+    with safe_open(path, framework="pt") as file:
+        return {key: file.get_tensor(key).numpy().tobytes() for key in file.keys()}  # noqa: SIM118 (not a mapping)
+
+
+def test_all_else_of_a_file_stays_and_biases_of_other_classes_are_refused(tmp_path: Path) -> None:
+    path, calibrated = tmp_path / "plain.safetensors", tmp_path / "calibrated.safetensors"
+    save_model(untrained(NAMES), path, torch.float16)
+    calibrated.write_bytes(with_calibration(path, SCALED))
+    assert tensors(path) == tensors(calibrated)
+    assert load_model(calibrated).calibration == SCALED and load_model(path).calibration is None
+    calibrated.write_bytes(with_calibration(path, SCALED.model_copy(update={"biases": (0.0, 1.0)})))
+    with pytest.raises(ValueError, match="a calibration with 2 biases, and 3 classes; calibrate it again"):
+        load_model(calibrated)
+
+
+def test_the_command_writes_what_was_measured_and_replaces_no_weights_unasked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A network that knows nothing: its probabilities become those of the classes' shares."""
+    path, output = tmp_path / "plain.safetensors", tmp_path / "calibrated.safetensors"
+    save_model(untrained(load_scene("rope").rest.names), path)
+    before = path.read_bytes()
+    assert command_line.main(["calibrate", str(path)]) == 2
+    assert "exists; it is not overwritten" in capsys.readouterr().err and path.read_bytes() == before
+    assert command_line.main(["calibrate", str(path), "--output", str(output), "--views", "8"]) == 0
+    told = capsys.readouterr().out
+    assert "8 views of the training seed 900000" in told and f"wrote {output}" in told
+    found = load_model(output).calibration
+    assert found is not None and found.temperature is not None and found.recognizing is None
+    assert found.ece is not None and found.ece[1] < min(0.05, found.ece[0])
+    assert command_line.main(["weights", "show", str(output), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["calibration"]["views"] == 8
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"seed": 1_000_000}, "the seed is 1000000; calibration is part of training: take one below 1000000"),
+        ({"views": 7}, "7 views are asked for; at least 8 tell anything"),
+    ],
+)
+def test_test_seeds_and_too_few_views_are_refused(options: dict[str, int], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        calibrate(untrained(load_scene("rope").rest.names), **options)
+
+
+def some_radii() -> Radii:
+    points = np.random.default_rng(0).random((30, 3))
+    labels = np.repeat(np.array([1, 2, 1], dtype=np.uint8), 10)
+    return Radii(points, labels, np.linspace(1, 2, 30), (10, 10), False)
+
+
+def test_radii_between_points_are_between_theirs_and_their_scale_ends_at_all_but_a_twentieth() -> None:
+    """And at a point they are its own; other segments' points do not count."""
+    radii = some_radii()
+    np.testing.assert_allclose(radii.at(radii.points[:10], 1), radii.values[:10])
+    between = radii.at(np.full((1, 3), 0.5), 2)
+    assert radii.values[10:20].min() <= between[0] <= radii.values[10:20].max()
+    assert [len(part) for part in radii.vertices] == [10, 10]
+    grid = LabelGrid(np.array([[[0, 1, 2]]], dtype=np.uint8), np.zeros(3), np.full(3, 0.4), ("a", "b"))
+    on_grid = radii.on_grid(grid)[0, 0]
+    assert np.isnan(on_grid[0]) and 1 <= on_grid[1] <= 2 and 1.3 < on_grid[2] < 1.7
+    scaled = radii.scaled(1000.0)
+    np.testing.assert_allclose(scaled.at(1000.0 * radii.points[:3], 1), 1000.0 * radii.values[:3])
+    scale = radius_scale(radii, " mm")
+    assert scale.high == pytest.approx(np.quantile(radii.values[:20], 0.95)) and "not calibrated" in scale.title
+    np.testing.assert_array_equal(scale.colors(radii.values), radii.colors(radii.values))
+    assert scale.words[1].endswith(" mm")
+    np.testing.assert_allclose(rounded_to(np.array([0.0123456, 98765.0, 1.0]), 3), [0.0123, 98800.0, 1.0], rtol=1e-9)
+
+
+def measured(off: np.ndarray, misfit: float = 0.1, displaced: float = 0.04) -> MeasuredRadii:
+    """A view whose radii are all 1, and whose points are so far off."""
+    one = np.ones(len(off))
+    errors = RegistrationErrors(np.abs(off), np.abs(off), one, 0 * one, one > 0)
+    return MeasuredRadii(errors, misfit, displaced, half=20.0)
+
+
+def test_a_scale_is_measured_on_all_clean_views() -> None:
+    """Those that are elsewhere too; of noisy ones only on those that are not, and on too few views not at all."""
+    rng = np.random.default_rng(0)
+    right = [measured(rng.normal(size=200)) for _ in range(20)]
+    elsewhere = measured(30.0 + rng.random(200))
+    views = ViewRadii()
+    views.clean[0].extend(right[: LEAST - 1])
+    views.noisy[1].extend([*right[:LEAST], elsewhere])
+    alone = RegistrationErrors.together([one.errors for one in right[:LEAST]]).scale()
+    assert views.fields() == {"noisy_draws_radius_scale": pytest.approx(alone)}
+    views.clean[0].extend([*right[LEAST - 1 :], elsewhere])
+    fields = views.fields()
+    assert fields["radius_scale"] > 2.2 > 1.96 > alone - 0.3  # 99 % and more of the right ones
+    assert (fields["usual_misfit"], fields["usual_displaced"]) == (0.1, 0.04)
+
+
+def test_a_frame_that_is_misfitted_or_where_the_network_is_elsewhere_has_wider_radii() -> None:
+    """By how much more than usual; so the lost frame of many does not widen the others' radii."""
+    rng = np.random.default_rng(0)
+    right = [measured(rng.normal(size=400)) for _ in range(18)]
+    lost = [measured(3.0 * rng.normal(size=400), misfit=0.2), measured(4.0 + rng.random(400), displaced=0.4)]
+    factors = factors_of([*right, *lost])
+    assert factors.scale == pytest.approx(1.96, rel=0.05)
+    plain = RegistrationErrors.together([one.errors for one in (*right, *lost)]).scale()
+    assert plain > 4.0
+    assert factors.widening(0.2) == pytest.approx(4.0) and factors.widening(0.05) == 1.0
+    assert factors.extra_radius(0.04) == factors.extra_radius(None) == 0.0
+    assert factors.extra_radius(0.4) == pytest.approx(0.398, 1e-2)
+    widened = lost[1].widened(factors)
+    assert (widened.radii > 5.0).all() and (widened.ratios == 0.0).all()
+    assert RadiusFactors(2.0).scale_at(9.9) == 2.0 and RadiusFactors().scale_at(1.0) is None

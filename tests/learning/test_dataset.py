@@ -1,0 +1,148 @@
+"""Batches: augmentation moves everything together, and every batch depends on its generator alone."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from observed_views import observed
+from safetensors.torch import load_file, save_file
+from toy_data import write_toy_dataset
+
+from mereo_learning.config import AugmentConfig
+from mereo_learning.dataset import Dataset, Draws, ShuffledOrder, augment_batch, choose_points
+
+NONE = AugmentConfig()
+FULL = AugmentConfig(keep_points=(0.4, 0.9), hole_probability=1.0, jitter_std=0.01, roll=True)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return Dataset.load(write_toy_dataset(tmp_path_factory.mktemp("toy") / "data"))
+
+
+def test_the_size_of_what_is_seen_is_known_where_the_unit_is(tmp_path: Path) -> None:
+    """Half balls of radius 5 to 10 are 10 to 20 wide, seen by points that nearly reach the rim."""
+    directory = write_toy_dataset(tmp_path / "data")
+    assert Dataset.load(directory).visible_m is None
+    manifest = json.loads((directory / "manifest.json").read_text())
+    (directory / "manifest.json").write_text(json.dumps({**manifest, "unit_m": 0.01}))
+    visible_m = Dataset.load(directory).visible_m
+    assert visible_m is not None
+    assert visible_m == (pytest.approx(0.1, rel=0.1), pytest.approx(0.2, rel=0.1))
+
+
+def rng(seed: int = 0) -> Draws:
+    return Draws.of(seed)
+
+
+def test_without_augmentation_a_batch_is_the_stored_data(data: Dataset) -> None:
+    batch, stored = data.batch(torch.arange(4), 96, 0, NONE, rng()), data.read(torch.arange(4))
+    assert torch.allclose(batch.cloud, stored["cloud"], atol=1e-5)
+    assert torch.allclose(batch.positions, stored["positions"], atol=1e-5)
+    viewpoint = -stored["center"] * stored["scale"][:, None]
+    assert torch.allclose(batch.viewpoint, viewpoint.float(), atol=1e-4)
+    assert torch.equal(batch.labels, stored["labels"].long())
+
+
+def test_examples_are_read_in_any_order_from_shards_of_other_sizes(tmp_path: Path) -> None:
+    directory = write_toy_dataset(tmp_path / "data", examples=70, example=observed)
+    files = [load_file(path) for path in sorted(directory.glob("shard-*"))]
+    index = torch.tensor([69, 0, 33, 31, 32, 5])
+    for name, values in Dataset.load(directory).read(index).items():
+        assert torch.equal(values.nan_to_num(), torch.cat([file[name] for file in files])[index].nan_to_num()), name
+
+
+def test_a_shuffled_order_is_one_pass_after_another() -> None:
+    seen = torch.cat([ShuffledOrder(10, 4, 0).index(step) for step in range(5)])
+    assert torch.equal(seen[:10].sort().values, torch.arange(10)) and torch.equal(seen.bincount(), torch.full((10,), 2))
+    assert not torch.equal(seen[:10], seen[10:])
+    assert torch.equal(ShuffledOrder(10, 4, 0).index(3), seen[12:16]), "by the step alone"
+
+
+def test_a_share_of_a_batch_meets_the_changes_of_the_whole(data: Dataset) -> None:
+    index = torch.arange(12)
+    whole = data.batch(index, 48, 32, FULL, Draws.of(5))
+    for rows in (slice(0, 4), slice(4, 12)):
+        share = data.batch(index[rows], 48, 32, FULL, Draws.of(5, 12, rows))
+        assert torch.allclose(share.cloud, whole.cloud[rows], atol=1e-6)
+        assert torch.equal(share.labels, whole.labels[rows]) and torch.equal(share.index, index[rows])
+
+
+def test_query_subset_keeps_labels_with_positions(data: Dataset) -> None:
+    index = torch.tensor([2, 5])
+    batch, stored = data.batch(index, 96, 16, NONE, rng()), data.read(index)
+    assert batch.positions.shape == (2, 16, 3)
+    for row in range(2):
+        for position, label in zip(batch.positions[row], batch.labels[row], strict=True):
+            match = (stored["positions"][row] - position).norm(dim=-1).argmin()
+            assert stored["labels"][row, match] == label
+
+
+def test_augmented_cloud_fills_the_unit_box_and_camera_stays_in_front(data: Dataset) -> None:
+    batch = data.batch(torch.arange(16), 64, 0, FULL, rng())
+    extent = batch.cloud.amax(dim=1) - batch.cloud.amin(dim=1)
+    assert torch.allclose(extent.amax(dim=1), torch.full((16,), 2.0), atol=1e-4)
+    assert (batch.viewpoint[:, 2] < batch.cloud[..., 2].amin(dim=1)).all()
+
+
+def test_roll_is_a_rigid_motion_about_the_optical_axis(data: Dataset) -> None:
+    """Distances keep their ratios, depth order is unchanged, and directions still end where they did on the surface."""
+    plain = data.batch(torch.arange(6), 96, 0, NONE, rng())
+    rolled = augment_batch(plain, AugmentConfig(roll=True), rng(1))
+
+    def gaps(batch: object) -> torch.Tensor:
+        positions, cloud, eye = batch.positions, batch.cloud, batch.viewpoint  # type: ignore[attr-defined]
+        everything = torch.cat([positions[:, :20], cloud[:, :20], eye[:, None]], dim=1).double()
+        distances = torch.cdist(everything, everything)
+        return distances / distances.amax(dim=(1, 2), keepdim=True)
+
+    assert torch.allclose(gaps(plain), gaps(rolled), atol=1e-5)
+    assert torch.equal(plain.positions[..., 2].argsort(dim=1), rolled.positions[..., 2].argsort(dim=1))
+    assert not torch.allclose(plain.positions, rolled.positions, atol=0.1)
+    one, other = (
+        torch.cdist(b.positions + b.distances.abs()[..., None] * b.directions, b.cloud)
+        / b.distances.abs().amax(dim=1)[:, None, None]
+        for b in (plain, rolled)
+    )
+    assert torch.allclose(one, other, rtol=2e-2, atol=2e-2)
+
+
+def test_distances_scale_with_positions(data: Dataset) -> None:
+    plain = data.batch(torch.arange(6), 96, 0, NONE, rng())
+    changed = augment_batch(plain, FULL, rng(2))
+    ratio = (changed.positions[:, 0] - changed.positions[:, 1]).norm(dim=-1) / (
+        plain.positions[:, 0] - plain.positions[:, 1]
+    ).norm(dim=-1)
+    assert torch.allclose(changed.distances, plain.distances * ratio[:, None], rtol=1e-3)
+
+
+def test_padding_is_chosen_last_and_a_small_cloud_survives_any_hole() -> None:
+    cloud = torch.arange(10.0)[None, :, None].repeat(1, 1, 3)
+    chosen = choose_points(cloud, torch.tensor([7]), 10, NONE, rng())
+    assert chosen[0, :, 0].tolist() == [0, 1, 2, 3, 4, 5, 6, 0, 1, 2]
+    cloud = torch.arange(200.0)[None, :, None].repeat(1, 1, 3)
+    kept = choose_points(cloud, torch.tensor([200]), 200, AugmentConfig(keep_points=(0.5, 0.5)), rng())[0, :, 0]
+    assert 70 < len(kept.unique()) < 130 and (kept[:70].diff() > 0).all(), "in order, and half of them dropped"
+    assert kept.max() > 190, "anywhere, not at the end"
+    cloud = torch.zeros(1, 40, 3)
+    huge = AugmentConfig(hole_probability=1.0, hole_radius=1e6)
+    assert choose_points(cloud, torch.tensor([40]), 40, huge, rng()).shape == (1, 40, 3)
+
+
+def test_shards_that_differ_are_refused(tmp_path: Path) -> None:
+    directory = write_toy_dataset(tmp_path / "data")
+    path = directory / "shard-00001.safetensors"
+    queries = ("positions", "labels", "distances", "directions", "rest")
+    save_file({k: v[:, :9].contiguous() if k in queries else v for k, v in load_file(path).items()}, path)
+    with pytest.raises(ValueError, match=r"00001.* has the shape \(9.*in an example, the first shard \(128"):
+        Dataset.load(directory)
+
+
+def test_domain_holds_every_segment_point_with_a_margin(data: Dataset) -> None:
+    low, high = (torch.tensor(corner) for corner in data.domain)
+    stored = data.read(torch.arange(len(data)))
+    occupied = stored["positions"][stored["labels"] > 0]
+    extent = occupied.amax(dim=0) - occupied.amin(dim=0)
+    assert torch.allclose(occupied.amin(dim=0) - low, 0.15 * extent, atol=1e-5)
+    assert torch.allclose(high - occupied.amax(dim=0), 0.15 * extent, atol=1e-5)

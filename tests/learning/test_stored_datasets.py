@@ -1,0 +1,330 @@
+"""Datasets in a folder or an object storage: made, continued, checked and shown; what has changed is refused."""
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import load_file, save_file
+from toy_data import SMALL, make_small_datasets, read_all, small_shards
+from toy_scene import toy_scene
+
+import mereo
+from mereo.__main__ import main, parse
+from mereo.api.generate import generate
+from mereo.cli.training import Generate, Train
+from mereo.io.object_storage import ObjectPath, Place, StorageError, names_in, write_whole
+from mereo.scenes.seeds import TEST_SEED_START
+from mereo_learning import trainer
+from mereo_learning.dataset import Dataset
+
+__all__ = ["small_shards"]  # a fixture
+
+TOY = toy_scene()
+NUMBERS = count()
+FILES = ("shard-00001.safetensors", "template.safetensors", "statistical_model.safetensors")
+
+
+def make(output: Place, seed: int = 3, **options: object) -> Place:
+    generate(TOY, output, SMALL, examples=4, seed=seed, **options)  # type: ignore[arg-type]
+    return output
+
+
+def contents(folder: Place) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in names_in(folder)}
+
+
+@pytest.fixture(scope="module")
+def originals(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two datasets of the same scene with other seeds, each of four examples in two shards."""
+    with pytest.MonkeyPatch.context() as patch:
+        make_small_datasets(patch)
+        folder = tmp_path_factory.mktemp("originals")
+        make(folder / "a"), make(folder / "b", seed=4)
+        return folder / "a", folder / "b"
+
+
+@pytest.fixture
+def whole(originals: tuple[Path, Path]) -> Path:
+    return originals[0]
+
+
+@pytest.fixture
+def data(whole: Path, tmp_path: Path) -> Path:
+    """A copy that may be changed."""
+    return Path(shutil.copytree(whole, tmp_path / "data"))
+
+
+@pytest.fixture(params=["folder", "storage"])
+def empty(request: pytest.FixtureRequest, tmp_path: Path) -> Place:
+    """A place for a dataset."""
+    return tmp_path / "data" if request.param == "folder" else ObjectPath(f"memory://datasets/{next(NUMBERS)}")
+
+
+def copied(folder: Path, place: Place) -> Place:
+    if isinstance(place, Path):
+        place.mkdir()
+    for name in names_in(folder):
+        write_whole(place / name, (folder / name).read_bytes())
+    return place
+
+
+@pytest.fixture
+def stored(whole: Path, empty: Place) -> Place:
+    """A copy in either kind of place."""
+    return copied(whole, empty)
+
+
+# --- made and continued -----------------------------------------------------------------------------------------------
+
+
+def test_a_storage_gets_the_bytes_that_a_folder_gets(whole: Path, empty: Place) -> None:
+    assert contents(make(empty)) == contents(whole)
+    one, other = Dataset.load(empty), Dataset.load(whole)
+    assert one.manifest == other.manifest and torch.equal(one.template, other.template)
+    first, second = (vars(read_all(data)) for data in (one, other))
+    assert first.keys() == second.keys()
+    for name, values in first.items():
+        assert values.dtype == second[name].dtype and torch.equal(values.isnan(), second[name].isnan())
+        assert torch.equal(values.nan_to_num(), second[name].nan_to_num()), name
+
+
+def test_machines_share_a_place(whole: Path, empty: Place) -> None:
+    for part in (1, 0):
+        make(empty, shard=(part, 2))
+    assert contents(empty) == contents(whole)
+    with pytest.raises(FileExistsError, match=rf"{empty} holds a dataset; continue it with resume, or"):
+        make(empty, shard=(0, 2))
+
+
+def test_killed_in_the_middle_of_a_put_and_resumed(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    empty, put = ObjectPath(f"memory://datasets/{next(NUMBERS)}"), ObjectPath.write_bytes
+
+    def killed(path: ObjectPath, content: bytes, force: bool = True) -> None:
+        if path.name == "shard-00001.safetensors":
+            raise KeyboardInterrupt  # a storage drops a put that is not finished
+        put(path, content, force=force)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(ObjectPath, "write_bytes", killed)
+        make(empty)
+    assert "shard-00001.safetensors" not in names_in(empty)
+    with pytest.raises(ValueError, match="holds 2 of 4 examples; training needs all of them: finish it with mereo"):
+        Dataset.load(empty)
+    assert contents(make(empty, resume=True)) == contents(whole)
+
+
+def test_another_dataset_or_other_objects_are_left_alone(stored: Place) -> None:
+    before = contents(stored)
+    with pytest.raises(FileExistsError, match="holds a dataset; continue it with resume, or choose another output"):
+        make(stored)
+    with pytest.raises(ValueError, match="was made with seed = 3, not 4; resuming needs equal settings"):
+        make(stored, seed=4, resume=True)
+    above = stored.parent if isinstance(stored, Path) else ObjectPath("memory://datasets")
+    with pytest.raises(FileExistsError, match=r"is not empty and holds no manifest.json; choose another output"):
+        make(above)
+    assert contents(stored) == before
+
+
+def test_a_lost_network_is_no_damage(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stored, read = copied(whole, ObjectPath(f"memory://datasets/{next(NUMBERS)}")), ObjectPath.read_bytes
+
+    def lost(path: ObjectPath) -> bytes:
+        if path.name.startswith("shard-"):
+            raise StorageError(f"{path} cannot be read: the storage cannot be reached (timed out); check the network")
+        return read(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ObjectPath, "read_bytes", lost)
+        for fails in (lambda: Dataset.load(stored), lambda: make(stored, resume=True)):
+            with pytest.raises(StorageError, match="shard-00000.safetensors cannot be read: the storage cannot be"):
+                fails()
+    assert contents(stored) == contents(whole)
+
+
+def test_more_examples_than_the_disk_has_room_for_are_refused_at_once(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"examples=10000000000 needs .* GB at .* kB each and .* would fit: ask"):
+        generate(TOY, tmp_path / "data", SMALL, examples=10**10, seed=3)
+    assert not (tmp_path / "data").exists()
+
+
+# --- changed files ----------------------------------------------------------------------------------------------------
+
+
+def flipped(content: bytes, _: bytes) -> bytes:
+    return content[:-100] + bytes([content[-100] ^ 1]) + content[-99:]
+
+
+DAMAGE: dict[str, Callable[[bytes, bytes], bytes]] = {
+    "its checksum is another": flipped,
+    "it is of another dataset": lambda _, other: other,
+    "": lambda content, _: content[:200],
+}
+
+
+def assert_made_again(stored: Place, whole: Path, name: str, reason: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(ValueError, match=rf"{name} .*\({reason}.*\); delete it and run .?mereo generate"):
+        Dataset.load(stored)
+    assert main(["dataset", "check", str(stored)]) == 2
+    assert f"{name}: {reason}" in capsys.readouterr().out
+    make(stored, resume=True)
+    assert f"{name} is damaged and is made again" in capsys.readouterr().out
+    assert contents(stored) == contents(whole)
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("reason", DAMAGE)
+def test_a_damaged_file_is_named_and_made_again(
+    stored: Place, originals: tuple[Path, Path], name: str, reason: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_whole(stored / name, DAMAGE[reason](*((folder / name).read_bytes() for folder in originals)))
+    assert_made_again(stored, originals[0], name, reason, capsys)
+
+
+def test_a_shard_in_the_place_of_another_is_noticed(
+    data: Path, whole: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copy(data / "shard-00000.safetensors", data / FILES[0])
+    assert_made_again(data, whole, FILES[0], "it begins with example 0 instead of 2", capsys)
+
+
+@pytest.mark.parametrize("tensor, reason", [(None, "it has no tensor 'rest'"), ((2, 5, 3), "its tensor 'rest' has")])
+def test_a_shard_without_one_of_its_tensors_is_noticed(
+    data: Path, tensor: tuple[int, ...] | None, reason: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for path in (*data.glob("shard-*"), data / "template.safetensors"):
+        save_file(load_file(path), path)  # as earlier versions did, without checksums
+    tensors = load_file(data / FILES[0])
+    kept = np.array(tensors.pop("rest"))
+    save_file(tensors | ({} if tensor is None else {"rest": np.zeros(tensor, np.float16)}), data / FILES[0])
+    with pytest.raises(ValueError, match=rf"shard-00001\.safetensors cannot be read \({reason}"):
+        Dataset.load(data)
+    make(data, resume=True)
+    assert f"{FILES[0]} is damaged and is made again" in capsys.readouterr().out
+    assert torch.equal(read_all(Dataset.load(data)).rest[2:].isnan(), torch.from_numpy(np.isnan(kept)))
+
+
+def test_a_template_of_another_object_is_noticed(data: Path) -> None:
+    for tensors in ({"distance": np.zeros((1, 4, 4, 4), np.float16)}, {"other": np.zeros(3)}):
+        save_file(tensors, data / "template.safetensors")
+        with pytest.raises(ValueError, match=r"template\.safetensors cannot be read \(it(s| has no) tensor"):
+            Dataset.load(data)
+
+
+@pytest.mark.parametrize("content", [b"[]", b'{"scene": "toy"}', b"{", b"\xff\xfe"])
+def test_a_manifest_that_is_none_is_one_sentence(data: Path, content: bytes) -> None:
+    (data / "manifest.json").write_bytes(content)
+    with pytest.raises(ValueError, match=r"manifest\.json is not .*; generate the dataset again"):
+        Dataset.load(data)
+
+
+def test_a_manifest_that_was_changed_does_not_fit_its_files(data: Path) -> None:
+    manifest = json.loads((data / "manifest.json").read_text())
+    for change in ({"seed": 4}, {"any_roll": True}, {"segments": manifest["segments"][::-1]}):
+        (data / "manifest.json").write_text(json.dumps(manifest | change))
+        with pytest.raises(ValueError, match="it is of another dataset"):
+            Dataset.load(data)
+    (data / "manifest.json").write_text(json.dumps(manifest | {"unit_m": 0.01}))
+    assert Dataset.load(data).visible_m is not None, "the unit may be said afterwards"
+
+
+# --- `mereo dataset check` and `show` ---------------------------------------------------------------------------------
+
+
+def test_a_whole_dataset_passes(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = contents(whole)
+    assert main(["dataset", "check", str(whole)]) == 0
+    assert "all 4 files are whole, 4 examples" in capsys.readouterr().out
+    assert contents(whole) == before
+    make(tmp_path / "test", TEST_SEED_START, test=True)
+    assert not (tmp_path / "test/statistical_model.safetensors").exists(), "a test set has none"
+    assert main(["dataset", "check", str(tmp_path / "test")]) == 0
+
+
+def test_every_bad_file_is_named_with_its_reason(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (data / "template.safetensors").unlink()
+    (data / "statistical_model.safetensors").write_bytes((data / "statistical_model.safetensors").read_bytes()[:-1])
+    for number in (0, 2):
+        shutil.copy(data / "shard-00001.safetensors", data / f"shard-0000{number}.safetensors")
+    assert main(["dataset", "check", str(data)]) == 2
+    said = capsys.readouterr()
+    lines = said.out.splitlines()
+    assert "template.safetensors: it is missing" in lines
+    assert any(line.startswith("statistical_model.safetensors: ") for line in lines)
+    assert "shard-00000.safetensors: it begins with example 2 instead of 0" in lines
+    assert "shard-00002.safetensors: it is no part of this dataset, which ends before it" in lines
+    assert not any(line.startswith("shard-00001") for line in lines)
+    assert "3 of 4 files are not good; the `mereo generate` command that made it" in said.err
+    assert said.err.count("\n") == 2
+
+
+def test_show_says_what_a_dataset_is(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (data / "shard-00001.safetensors").unlink()
+    assert main(["dataset", "show", str(data)]) == 0
+    rows = dict(re.split(r"\s+", line, maxsplit=1) for line in capsys.readouterr().out.splitlines())
+    assert rows["files"] == "3 of 4 are there" and rows["examples"].startswith("4, 0.0") and rows["image_size"] == "48"
+    assert main(["dataset", "show", str(data / "nowhere")]) == 2
+    assert "has no manifest.json; a dataset is a directory made by mereo generate" in capsys.readouterr().err
+
+
+# --- URLs -------------------------------------------------------------------------------------------------------------
+
+
+def test_options_keep_urls(tmp_path: Path) -> None:
+    made = parse(["generate", "rope", "--examples", "2", "--output", "s3://bucket/data"])
+    assert isinstance(made, Generate) and made.output == ObjectPath("s3://bucket/data")
+    trained = parse(["train", "gs://bucket/data", "--output", "run"])
+    assert isinstance(trained, Train)
+    assert (trained.dataset, trained.output) == (ObjectPath("gs://bucket/data"), Path("run"))
+    for output, place in (("s3://bucket/file", ObjectPath("s3://bucket/file")), ("local/folder", Path("local/folder"))):
+        (tmp_path / "o.yaml").write_text(f"output: {output}\nexamples: 3\n")
+        from_file = parse(["generate", "rope", "--config", str(tmp_path / "o.yaml")])
+        assert isinstance(from_file, Generate) and from_file.output == place
+
+
+@pytest.mark.parametrize(
+    "text, sentence",
+    [
+        ("generate rope --examples 2 --output ftp://h/x", "has none of the protocols s3, gs and file"),
+        ("train s3://bucket --output run", "names no folder in a bucket"),
+        ("dataset check nowhere", "nowhere has no manifest.json"),
+        ("dataset check memory://nowhere", "memory://nowhere has no manifest.json"),
+        ("train memory://nowhere/x --output s3://b/run", "the output s3://b/run is a URL, and a local path is"),
+    ],
+)
+def test_what_is_no_place_is_one_sentence(
+    text: str, sentence: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(text.split()) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("mereo: error: ") and sentence in said and said.count("\n") == 1
+    assert not any(tmp_path.iterdir())
+
+
+def test_functions_take_urls_as_texts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    url = f"memory://datasets/{next(NUMBERS)}"
+    made = mereo.generate(TOY, url, SMALL, examples=2, seed=3)
+    assert isinstance(made, ObjectPath) and str(made) == url
+    asked: list[object] = []
+    monkeypatch.setattr(
+        trainer, "train", lambda dataset, output, config, device: asked.extend([dataset, output]) or output
+    )
+    mereo.train(url, tmp_path / "run", "tiny")
+    mereo.train("data", "run", "tiny")
+    assert asked == [made, tmp_path / "run", Path("data"), Path("run")]
+
+
+@pytest.mark.slow
+def test_a_network_is_trained_without_a_disk(tmp_path: Path) -> None:
+    url = f"memory://datasets/{next(NUMBERS)}"
+    weights = []
+    for place, run in ((url, tmp_path / "stored"), (tmp_path / "data", tmp_path / "local")):
+        mereo.generate(TOY, place, SMALL, examples=12, seed=3)
+        weights.append(mereo.train(place, run, "tiny", epochs=1.0, batch=4).read_bytes())
+    assert weights[0] == weights[1]

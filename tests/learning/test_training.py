@@ -1,0 +1,264 @@
+"""Training: it learns, and stopping, resuming or sharing the work changes nothing."""
+
+import csv
+import json
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from small_training import SMALL, TRANSFORMER
+from toy_data import NAMES, write_toy_dataset
+from training_runs import assert_resumes_exactly, train_in_two_processes
+from two_balls import front
+
+from mereo.geometry.metrics import confusion_matrix, intersection_over_union
+from mereo.models.weights import load_model
+from mereo_learning import trainer
+from mereo_learning.config import PRESETS, AugmentConfig, TrainConfig
+from mereo_learning.dataset import Dataset
+from mereo_learning.run_directory import claim_run, describe_seen, seen_before, seen_by, seen_in_training, start_network
+from mereo_learning.validation import class_offsets
+
+pytestmark = pytest.mark.usefixtures("without_curves")
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_toy_dataset(tmp_path_factory.mktemp("toy") / "data")
+
+
+@pytest.fixture(scope="module")
+def finished(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that has ended; not to be changed."""
+    run = tmp_path_factory.mktemp("finished") / "run"
+    trainer.train(dataset, run, SMALL)
+    return run
+
+
+@pytest.fixture(scope="module")
+def first(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights of a short run."""
+    return trainer.train(dataset, tmp_path_factory.mktemp("first") / "run", replace(SMALL, epochs=0.2))
+
+
+def test_a_finished_run_is_left_alone_and_not_continued_with_other_settings(dataset: Path, finished: Path) -> None:
+    first = (finished / "weights.safetensors").read_bytes()
+    assert trainer.train(dataset, finished, SMALL).read_bytes() == first
+    with pytest.raises(ValueError, match=r"another train setting learning_rate \(0\.004 instead of 0\.1\)"):
+        trainer.train(dataset, finished, replace(SMALL, learning_rate=0.1))
+
+
+def test_a_directory_with_other_things_is_not_a_run(dataset: Path, tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("precious")
+    with pytest.raises(FileExistsError, match=r"is not empty and holds no config\.json"):
+        trainer.train(dataset, tmp_path, SMALL)
+    assert os.listdir(tmp_path) == ["thesis.tex"]
+
+
+def test_another_encoder_resumes_exactly(dataset: Path, tmp_path: Path) -> None:
+    assert_resumes_exactly(dataset, tmp_path, replace(TRANSFORMER, epochs=0.4), steps=2)
+
+
+def test_run_directory_tells_the_story(finished: Path) -> None:
+    with (finished / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["step"]) for row in rows] == list(range(1, 16))  # 58 examples, batches of 8, two passes
+    assert 0 <= float(rows[-1]["val_iou"]) <= 1
+    assert json.loads((finished / "config.json").read_text())["train"]["batch"] == 8
+    assert (finished / "curves.png").read_bytes().startswith(b"\x89PNG")
+    model = load_model(finished / "weights.safetensors")
+    assert model.names == NAMES
+    assert model.provenance["training_seed"] == 5 and model.provenance["scene"] == "toy"
+    assert model.provenance["visible_m"] is None, "the dataset states no unit"
+
+
+def test_class_offsets_are_in_the_last_bias_and_nowhere_else(finished: Path) -> None:
+    weights = load_model(finished / "weights.safetensors")
+    offsets = weights.provenance["class_offsets"]
+    assert isinstance(offsets, list) and len(offsets) == 3 and offsets[0] == 0
+    average = load_file(finished / "checkpoint.safetensors")
+    for name, value in weights.network.state_dict().items():
+        expected = average[f"average/{name}"].clone()
+        if name == "decoder.head.bias":
+            expected[:3] += torch.tensor(offsets)
+        assert torch.equal(value, expected), name
+
+
+def test_batches_visit_every_example_once_per_pass(dataset: Path, tmp_path: Path) -> None:
+    data = Dataset.load(dataset)
+    config = replace(SMALL, holdout=4, epochs=4)
+    network = start_network(config, data)
+    loop = trainer.Trainer(config, data, network, tmp_path, trainer.Process(), torch.device("cpu"))
+    seen = torch.cat([loop.order.index(step) for step in range(loop.total)])
+    assert loop.total * 8 == 4 * 60
+    assert torch.equal(seen.bincount(), torch.full((60,), 4))
+
+
+@pytest.mark.parametrize(
+    "config, iou, miou", [(SMALL, 0.85, 0.75), pytest.param(TRANSFORMER, 0.7, 0.7, marks=pytest.mark.slow)]
+)
+def test_it_learns_the_two_halves(dataset: Path, tmp_path: Path, config: TrainConfig, iou: float, miou: float) -> None:
+    """Twenty-four passes over 58 examples suffice to beat any constant answer by far."""
+    trainer.train(dataset, tmp_path / "run", replace(config, epochs=24, augment=AugmentConfig()))
+    with (tmp_path / "run" / "metrics.csv").open() as file:
+        last = list(csv.DictReader(file))[-1]
+    assert float(last["val_iou"]) > iou and float(last["val_miou"]) > miou
+    assert config is TRANSFORMER or float(last["rest"]) < 0.2
+    model = load_model(tmp_path / "run" / "weights.safetensors")
+    center = np.array([3.0, -2.0, 150.0])
+    cloud = front((3.0, -2.0, 150.0), 8.0, -1.0, 300)
+    answer = model.query(model.encode(cloud), center + np.array([[-4.0, 0, 0], [4.0, 0, 0], [0, 0, 20.0]]))
+    assert answer.label.tolist() == [1, 2, 0]
+    assert np.allclose(answer.probability.sum(axis=1), 1.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("loss", ["ce", "l1", "ce+l1", "ce+l1+cd"])
+def test_every_loss_variant_trains_and_answers(dataset: Path, tmp_path: Path, loss: str) -> None:
+    config = replace(SMALL, loss=loss, epochs=0.2)  # type: ignore[arg-type]
+    model = load_model(trainer.train(dataset, tmp_path / "run", config))
+    with (tmp_path / "run/metrics.csv").open() as file:
+        last = list(csv.DictReader(file))[-1]
+    assert (last["ce"] == "", last["val_miou"] == "") == (loss == "l1", loss == "l1") and last["val_iou"]
+    cloud = np.random.default_rng(0).normal(loc=(0.0, 0.0, 50.0), size=(80, 3))
+    answer = model.query(model.encode(cloud), cloud[:7])
+    assert answer.label.shape == (7,) and answer.probability.shape[1] == (2 if loss == "l1" else 3)
+    # what was not trained is not answered
+    assert np.isfinite(answer.distance).all() == ("l1" in loss) != np.isnan(answer.distance).all()
+    assert np.isfinite(answer.direction).all() == ("cd" in loss) != np.isnan(answer.direction).all()
+
+
+def test_training_starts_from_given_weights(dataset: Path, first: Path, tmp_path: Path) -> None:
+    """Without any step, the network is that of the weights; other networks are refused."""
+    data, config = Dataset.load(dataset), replace(SMALL, init=str(first))
+    network = start_network(config, data)
+    assert all(torch.equal(v, load_file(first)[k]) for k, v in network.state_dict().items())
+    other_counts = config.network.changed(points=48, neighbors=6)  # the same weights fit
+    network = start_network(replace(config, network=other_counts), data)
+    assert all(torch.equal(v, load_file(first)[k]) for k, v in network.state_dict().items())
+    assert network.config == other_counts
+    with pytest.raises(ValueError, match="another network setting sight_neighbors"):
+        start_network(replace(config, network=config.network.changed(sight_neighbors=0)), data)
+    with pytest.raises(ValueError, match="another network setting width"):
+        start_network(replace(config, network=config.network.changed(width=32)), data)
+    with pytest.raises(FileNotFoundError, match="no weights 'lost'"):
+        trainer.train(dataset, tmp_path / "second", replace(config, init="lost"))
+    assert not (tmp_path / "second").exists()
+
+
+def test_training_starts_from_another_objects_weights(dataset: Path, first: Path) -> None:
+    """All that is not about segments is taken; segments and template are new."""
+    data = Dataset.load(dataset)
+    manifest = data.manifest | {"segments": [{"name": "whole", "color": [1, 2, 3]}]}
+    data = replace(data, manifest=manifest, template=torch.rand(1, 64, 64, 64))
+    given = load_file(first)
+    random, started = (start_network(replace(SMALL, init=init), data).state_dict() for init in ("", str(first)))
+    taken = {name for name in started if not torch.equal(started[name], random[name])}
+    untouched = {name for name in given if "decoder.lookup" in name}
+    assert all(torch.equal(started[name], random[name]) for name in untouched)
+    head = started["decoder.head.weight"]
+    assert torch.equal(head[[0, 2, 3, 4, 5]], given["decoder.head.weight"][[0, 3, 4, 5, 6]])
+    assert torch.equal(head[1], random["decoder.head.weight"][1])
+    same = taken - {"decoder.head.weight", "decoder.head.bias"}
+    assert len(same) > 40 and all(torch.equal(started[name], given[name]) for name in same)
+
+
+def test_a_lookup_may_be_added_to_given_weights(dataset: Path, tmp_path: Path) -> None:
+    """Its grid is the dataset's; all else is that of the weights."""
+    plain = replace(SMALL, network=SMALL.network.changed(rest_template=False))
+    first = trainer.train(dataset, tmp_path / "first", replace(plain, epochs=0.2))
+    data = Dataset.load(dataset)
+    network = start_network(replace(SMALL, init=str(first)), data)
+    state = network.state_dict()
+    assert all(torch.equal(state[k], v) for k, v in load_file(first).items())
+    assert torch.equal(state["decoder.lookup.distance"], data.template)
+
+
+def test_a_dataset_without_template_is_refused(dataset: Path, tmp_path: Path) -> None:
+    """Before anything is written."""
+    partial = tmp_path / "partial"
+    shutil.copytree(dataset, partial)
+    (partial / "template.safetensors").unlink()
+    with pytest.raises(ValueError, match=r"template.safetensors cannot be read .*mereo generate \.\.\. --resume"):
+        trainer.train(partial, tmp_path / "run", SMALL)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+def test_two_processes_train_together(dataset: Path, tmp_path: Path) -> None:
+    """Under torchrun, both halves of every batch count: the result is finite, complete, and resumable."""
+    run = train_in_two_processes(dataset, tmp_path, replace(SMALL, epochs=0.5))
+    tensors = load_file(run / "checkpoint.safetensors")
+    assert all(torch.isfinite(value).all() for value in tensors.values())
+    with (run / "metrics.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == 4
+
+
+def test_only_the_first_process_claims_the_directory(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process that comes while the first one writes the settings waits instead of refusing the directory."""
+    data, waited = Dataset.load(dataset), []
+    with pytest.raises(ValueError, match="batch of 8 cannot be shared by 3 processes"):
+        claim_run(tmp_path / "run", SMALL, data, trainer.Process(0, 3))
+    monkeypatch.setattr(torch.distributed, "get_backend", lambda: "gloo")
+    monkeypatch.setattr(torch.distributed, "broadcast", lambda failed, src: waited.append(src))
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "metrics.csv").touch()  # of a directory without settings, as it is while the first one writes them
+    claim_run(run, SMALL, data, trainer.Process(1, 2))
+    assert waited == [0] and not (run / "config.json").exists()
+    with pytest.raises(FileExistsError, match=r"holds no config\.json"):
+        claim_run(run, SMALL, data, trainer.Process(0, 2))
+
+
+def test_paper_preset_is_the_papers_recipe() -> None:
+    paper = PRESETS["paper"]
+    assert paper == TrainConfig()
+    assert (paper.batch, paper.learning_rate, paper.epochs, paper.l1_weight) == (40, 5e-4, 300.0, 100.0)
+    assert paper.augment == AugmentConfig() and paper.schedule == "constant" and paper.loss == "ce+l1"
+    assert [preset for preset, recipe in PRESETS.items() if not recipe.learned_box] == ["paper", "paper-autodecoder"]
+
+
+def test_a_chain_of_trainings_adds_up_and_only_a_learned_box_limits_it(dataset: Path, tmp_path: Path) -> None:
+    first = trainer.train(dataset, tmp_path / "1", replace(SMALL, epochs=0.3, learned_box=False))
+    second = trainer.train(dataset, tmp_path / "2", replace(SMALL, epochs=0.2, init=str(first)))
+    third = trainer.train(dataset, tmp_path / "3", replace(SMALL, epochs=0.1, init=str(second)))
+    models = [load_model(path) for path in (first, second, third)]
+    shown = [seen_in_training(model.provenance) for model in models]
+    assert shown == [int(str(model.provenance["steps"])) * 8 for model in models] and shown[0] > shown[2] > 0
+    assert [model.provenance["examples_before"] for model in models] == [0, shown[0], shown[0] + shown[1]]
+    assert seen_by(str(third)) == sum(shown)
+    assert f"{sum(shown)} with those of the weights" in describe_seen(models[2].provenance)
+    assert [model.domain is None for model in models] == [True, False, False]
+    old = {key: value for key, value in models[2].provenance.items() if key != "examples_before"}
+    assert seen_before(old) is None and "which do not say how many" in describe_seen(old)
+
+
+def noisy_world(count: int, share: tuple[float, ...], seed: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Labels drawn with ``share``, a noisy observation of each, and the log likelihood of every class given it."""
+    rng = np.random.default_rng(seed)
+    labels = rng.choice(len(share), size=count, p=share)
+    seen = labels + rng.normal(scale=0.6, size=count)
+    logits = -0.5 * ((seen[:, None] - np.arange(len(share))) / 0.6) ** 2
+    return torch.from_numpy(logits).float(), torch.from_numpy(labels)
+
+
+def miou(logits: torch.Tensor, labels: torch.Tensor) -> float:
+    return intersection_over_union(confusion_matrix(labels.numpy(), logits.argmax(1).numpy(), logits.shape[1])).miou
+
+
+def test_a_rare_class_trained_as_if_common_is_drawn_smaller_and_what_is_right_is_left_alone() -> None:
+    """Likelihoods alone are what equal shares would teach; the class is really one point in a hundred."""
+    share = (0.69, 0.3, 0.01)
+    logits, labels = noisy_world(60_000, share, seed=0)
+    offsets = class_offsets(logits, labels)
+    assert offsets[0] == 0 and offsets[2] < -0.5
+    fresh, truth = noisy_world(60_000, share, seed=1)
+    assert miou(fresh + offsets, truth) > miou(fresh, truth) + 0.01
+    labels = torch.arange(3).repeat(50)
+    assert torch.equal(class_offsets(5.0 * torch.nn.functional.one_hot(labels).float(), labels), torch.zeros(3))
