@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jaxtyping
@@ -306,7 +307,9 @@ def test_a_page_stays_open_where_somebody_goes_on(
 ) -> None:
     server = Server()
     page = OpenPage(server)
-    monkeypatch.setattr(OpenPage, "wait", lambda page: page.close())
+    monkeypatch.setattr(
+        "mereo_viewer.server.threading", SimpleNamespace(Event=lambda: SimpleNamespace(wait=lambda: None))
+    )
     monkeypatch.setattr(sys, "ps1", ">>> ", raising=False)
     assert page.stay() is page and server.stopped == 0
     assert capsys.readouterr().out == "open http://127.0.0.1:1234 in a browser; close() ends\n"

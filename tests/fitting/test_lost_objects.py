@@ -13,7 +13,7 @@ import pytest
 from tracked_views import CAMERA, bare, lump_model, mesh_of, rms, view
 
 from mereo.api.result import Result
-from mereo.cli.stream import Answering, SurfaceFolder, line
+from mereo.cli.stream import Answering, Outcome, StreamFrame, SurfaceFolder, line
 from mereo.fitting import tracking
 from mereo.fitting.registration.answer import Candidate
 from mereo.fitting.registration.answer_frame import search_hypotheses
@@ -23,7 +23,6 @@ from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.reconstruction.observation import Observation, observe
 from mereo.reconstruction.pipeline import EncodedFrame
-from mereo.reconstruction.stream import Outcome, StreamFrame
 from mereo.synthesis.clutter import Capsule
 
 

@@ -15,7 +15,7 @@ import trimesh
 from answers import answer_to
 from scipy.spatial import cKDTree
 
-from mereo.cli.stream import FrameAnswer, line
+from mereo.cli.stream import FrameAnswer, Outcome, line
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import CloudToFit, Registrar
 from mereo.fitting.tracking import Tracker
@@ -25,7 +25,6 @@ from mereo.models.calibration import Calibration
 from mereo.models.model import Model
 from mereo.models.weights import load_model
 from mereo.reconstruction.observation import observe
-from mereo.reconstruction.stream import Outcome
 from mereo.synthesis.sample_views import load_view
 from mereo.visualization.reconstruction_report import MOST, UNEXPLAINED, explain_centroids, point_marks
 from mereo.visualization.result_files import write_answer, write_answer_file

@@ -14,11 +14,18 @@ from written_results import segments
 
 from mereo import __main__ as command_line
 from mereo.cli.answers import StreamCommand
-from mereo.cli.stream import FrameAnswer, SurfaceFolder, stream_reconstructions
+from mereo.cli.stream import (
+    FrameAnswer,
+    Outcome,
+    StreamFrame,
+    Summary,
+    SurfaceFolder,
+    frames_of,
+    stream_reconstructions,
+)
 from mereo.geometry.camera import PointCloud
 from mereo.io.config import InputConfig
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.stream import Outcome, StreamFrame, Summary, frames_of
 from mereo.scenes.registry import load_scene
 from mereo.synthesis.config import SENSORS, SequenceConfig
 from mereo.synthesis.recording import CAMERA, FRAMES, write_recording

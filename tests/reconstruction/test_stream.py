@@ -12,20 +12,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from mereo.cli import stream as stream_module
 from mereo.cli.answers import StreamCommand
-from mereo.cli.stream import stream_reconstructions
-from mereo.io.config import InputConfig
-from mereo.reconstruction import stream as stream_module
-from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.stream import (
+from mereo.cli.stream import (
     PATIENCE_S,
     Outcome,
     StreamFrame,
     Summary,
     WatchedFolder,
     stream,
+    stream_reconstructions,
     watched_frames,
 )
+from mereo.io.config import InputConfig
+from mereo.reconstruction.config import IsolationConfig
 
 
 def frame(number: int, time_s: float = 0.0) -> StreamFrame:
@@ -79,7 +79,7 @@ def test_a_slow_answer_gets_the_latest_frame_and_dropped_ones_are_not_decoded() 
 
 
 def test_the_memory_of_a_summary_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mereo.reconstruction.stream.RECENT", 3)
+    monkeypatch.setattr("mereo.cli.stream.RECENT", 3)
     summary = Summary()
     assert "0 frames answered" in str(summary)
     for latency_s in (100.0, 1.0, 2.0, 3.0):

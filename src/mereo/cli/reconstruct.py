@@ -28,6 +28,7 @@ from mereo.api.result import Pose, Result, registration_of
 from mereo.api.words import option_words
 from mereo.cli.answers import ReconstructCommand
 from mereo.cli.options import NOT_RECOGNIZED, Outcome, check_named, files_read, loaded_object, options_of
+from mereo.cli.stream import frame_error, frames_in
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.carry import Placed, carry, place
 from mereo.fitting.registration.register import Registrar
@@ -45,7 +46,6 @@ from mereo.io.writers.formats import chosen_formats
 from mereo.models.config import InferenceConfig
 from mereo.models.trained import Trained
 from mereo.reconstruction.observation import FrameWarning, find_object
-from mereo.reconstruction.stream import frame_error, frames_in
 from mereo.scenes.registry import files_of
 from mereo.visualization.reconstruction_report import (
     confidence_title,

@@ -1,16 +1,27 @@
 """``mereo stream``: a reconstruction of the latest frame, again and again, printed and written.
 
-StreamFrame -Answering-> FrameAnswer -> a line of JSON, surfaces as a GLB file
+    folder, recording, names -frames_of, watched_frames-> StreamFrame -stream, Answering-> Outcome
+    Outcome -> a line of JSON, surfaces as a GLB file
+
+A reading thread waits for frames; the caller's thread answers. Between them there is room for one frame: a newer one
+takes the place of one that still waits, so that an answer is never older than the last computation and memory never
+grows, however slow the machine is. A bad frame is reported and passed over.
 """
 
+import io
 import json
+import queue
 import re
 import sys
-from collections.abc import Iterable
-from contextlib import closing
-from dataclasses import dataclass, replace
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing, suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -25,20 +36,322 @@ from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import owned_centroids
 from mereo.io.atomic_files import atomic_file, check_place, remove_all_abandoned, to_json
+from mereo.io.config import InputConfig
+from mereo.io.errors import is_foreseen, words_of
+from mereo.io.readers import CLOUD_READERS, DEPTH_READERS
+from mereo.io.ros_recordings import is_recording
+from mereo.io.sensor_frame import SensorFrame, read_frame, read_frames
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.models.trained import Trained
-from mereo.reconstruction.observation import Observation
-from mereo.reconstruction.stream import (
-    STANDARD_INPUT,
-    Outcome,
-    StreamFrame,
-    Summary,
-    frame_error,
-    frames_of,
-    stream,
-    watched_frames,
-)
+from mereo.reconstruction.config import IsolationConfig
+from mereo.reconstruction.observation import Observation, find_object
 from mereo.synthesis.recording import CAMERA, FRAMES, is_recording_folder
+
+STANDARD_INPUT = "-"
+"""Source that means names of files on standard input."""
+
+Result = TypeVar("Result")
+
+RECENT = 10_000
+"""Answers whose latencies a summary is made of: a stream may run for weeks in the same memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class StreamFrame:
+    """Frame of a sequence, decoded when it is answered.
+
+    Attributes:
+        name: for people: a file, a number.
+        time_s: when it was recorded, from any zero.
+        load: decodes it; called for frames that are answered only.
+    """
+
+    name: str
+    time_s: float
+    load: Callable[[], Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome(Generic[Result]):
+    """Outcome of a frame: its answer or error, and the time it took.
+
+    Attributes:
+        name, time_s: of the frame.
+        result: the answer; None where it failed.
+        error: one sentence; empty where it did not fail.
+        latency_s: from the frame's arrival to its answer, waiting included.
+        work_s: the decoding and answering in it.
+        dropped: frames that were replaced by newer ones since the last outcome.
+    """
+
+    name: str
+    time_s: float
+    result: Result | None
+    error: str
+    latency_s: float
+    work_s: float
+    dropped: int
+
+
+Arrived = tuple[StreamFrame, float, int]
+"""Frame, when it came by ``time.perf_counter``, and how many gave way to newer ones before it."""
+
+
+def stream(
+    frames: Iterable[StreamFrame | None],
+    answer: Callable[[StreamFrame], Result],
+    *,
+    recorded_pace: bool = False,
+    every_frame: bool = False,
+) -> Iterator[Outcome[Result]]:
+    """Answer the latest frame, again and again, until the sequence ends.
+
+    Args:
+        frames: the sequence; iterated in a thread of its own, which may wait for the camera. A None says that nothing
+            new has come, and lets a thread that waits see that the stream has been left.
+        answer: from a frame, which it decodes, to whatever is wanted.
+        recorded_pace: frames arrive when their times say, counted from the first; else as fast as they are read.
+        every_frame: none is dropped; the sequence waits for the answers, without a thread.
+
+    Yields one outcome per answered or failed frame. Whatever goes wrong in one frame is its outcome's error; what goes
+    wrong in the sequence itself is raised after the outcomes before it.
+    """
+    source = _paced(frames) if recorded_pace else iter(frames)
+    each = ((frame, time.perf_counter(), 0) for frame in source if frame is not None)
+    arriving: Generator[Arrived, None, None] = each if every_frame else _latest(source)
+    with closing(arriving):
+        for frame, arrived_s, dropped in arriving:
+            start, result, error = time.perf_counter(), None, ""
+            try:
+                result = answer(frame)
+            except Exception as problem:  # a damaged frame makes the libraries that parse it raise anything
+                error = frame_error(problem, frame.name)
+            now = time.perf_counter()
+            yield Outcome(frame.name, frame.time_s, result, error, now - arrived_s, now - start, dropped)
+
+
+def _paced(frames: Iterable[StreamFrame | None]) -> Iterator[StreamFrame | None]:
+    start, zero = time.perf_counter(), None
+    for frame in frames:
+        if frame is not None:
+            zero = frame.time_s if zero is None else zero
+            time.sleep(max(0.0, frame.time_s - zero - (time.perf_counter() - start)))
+        yield frame
+
+
+def _latest(frames: Iterator[StreamFrame | None]) -> Generator[Arrived, None, None]:
+    """Frames that a thread brings, of those that came since the last one only the newest."""
+    waiting: queue.Queue[Arrived | Exception | None] = queue.Queue(maxsize=1)
+    is_left, reported = threading.Event(), 0
+
+    def bring() -> None:
+        end: Exception | None = None
+        dropped = 0
+        try:
+            for frame in frames:
+                if is_left.is_set():
+                    return
+                if frame is not None:
+                    with suppress(queue.Empty):
+                        waiting.get_nowait()
+                        dropped += 1
+                    waiting.put((frame, time.perf_counter(), dropped))
+        except Exception as problem:  # raised in the caller's thread, after the outcomes before it
+            end = problem
+        while not is_left.is_set():
+            with suppress(queue.Full):  # the last frame is still taken
+                waiting.put(end, timeout=0.1)
+                return
+
+    threading.Thread(target=bring, daemon=True, name="frames").start()
+    try:
+        while isinstance(taken := waiting.get(), tuple):
+            frame, arrived_s, dropped = taken
+            yield frame, arrived_s, dropped - reported
+            reported = dropped
+        if taken is not None:
+            raise taken
+    finally:
+        is_left.set()
+
+
+def frame_error(problem: Exception, name: str) -> str:
+    """Sentence that says what is wrong with a frame; ``name`` is the frame's."""
+    words = words_of(problem)
+    return words if is_foreseen(problem) else f"{name} cannot be answered ({words}): record or write it again"
+
+
+@dataclass
+class Summary:
+    """Numbers of a stream: what was answered, what failed, and what gave way to newer frames, up to now."""
+
+    answered: int = 0
+    failed: int = 0
+    dropped: int = 0
+    latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
+    start_s: float = field(default_factory=time.perf_counter)
+
+    def add(self, outcome: Outcome[Any]) -> None:
+        """Count an outcome."""
+        self.dropped += outcome.dropped
+        if outcome.error:
+            self.failed += 1
+        else:
+            self.answered += 1
+            self.latencies_s.append(outcome.latency_s)
+
+    def __str__(self) -> str:
+        rate_hz = self.answered / (time.perf_counter() - self.start_s)
+        median, worst = np.quantile(self.latencies_s, [0.5, 0.99]) if self.latencies_s else (np.nan, np.nan)
+        return (
+            f"{self.answered} frames answered at {rate_hz:.1f} Hz, latency {1e3 * median:.0f} ms (median), "
+            f"{1e3 * worst:.0f} ms (99 %); {self.dropped} dropped for newer ones, {self.failed} bad"
+        )
+
+
+# --- watched folders --------------------------------------------------------------------------------------------------
+
+LOOK_S = 0.05
+"""Seconds between two looks."""
+
+PATIENCE_S = 10.0
+"""Seconds after which a file that is still empty, or still changes, is handed over as it is."""
+
+Version = tuple[int, int]
+"""Time of the last change in nanoseconds, and size in bytes."""
+
+
+class WatchedFolder:
+    """Files of a folder into which a camera's program writes, each handed over once for every time it was written.
+
+    No system tells when a writer is done. A file counts as complete when it is not empty and has not changed between
+    two looks. One that never comes to rest is handed over all the same after a while, so that whoever reads it says
+    what is wrong with it; one that was handed over too early comes again when it has changed.
+
+    Attributes:
+        folder: the folder; what lies deeper is not seen.
+        wanted: which of its files count.
+    """
+
+    def __init__(self, folder: Path, wanted: Callable[[Path], bool]) -> None:
+        self.folder, self.wanted = folder, wanted
+        # of each file the version at the last look, since when it is waited for, and the version handed over
+        self._seen: dict[Path, tuple[Version, float, Version | None]] = {}
+
+    def look(self, now_s: float) -> list[Path]:
+        """Files that are complete since the last look, the oldest first; ``now_s`` is the time by any clock.
+
+        Raises ``OSError`` where the folder is gone.
+        """
+        before, self._seen, complete = self._seen, {}, dict[Path, Version]()
+        for file in list(self.folder.iterdir()):
+            try:
+                facts = file.stat() if self.wanted(file) else None
+            except FileNotFoundError:  # removed or renamed meanwhile
+                continue
+            if facts is None:
+                continue
+            version = facts.st_mtime_ns, facts.st_size
+            last, since_s, taken = before.get(file, (None, now_s, None))
+            if version == taken:
+                since_s = now_s
+            elif (version == last and facts.st_size > 0) or now_s - since_s >= PATIENCE_S:
+                complete[file] = taken = version
+            self._seen[file] = version, since_s, taken
+        return sorted(complete, key=lambda file: (complete[file][0], file.name))
+
+
+# --- stream sources ---------------------------------------------------------------------------------------------------
+
+
+def frames_of(
+    source: str, reading: InputConfig, isolation: IsolationConfig, rate_hz: float = 30.0
+) -> Iterator[StreamFrame]:
+    """Frames of a source, in order; each is decoded when it is answered.
+
+    Args:
+        source: a folder of depth images or point clouds (in the order of their names), a ROS recording, or ``-`` for
+            names of files, one a line, as they are written.
+        reading: how a file is read.
+        isolation: what is left out of it.
+        rate_hz: at which a folder was recorded; recordings have their own times.
+
+    Raises ``FileNotFoundError``, or ``ValueError`` for a folder without frames and a rate that is not positive.
+    """
+    if not 0 < rate_hz < float("inf"):
+        raise ValueError(f"the rate is {rate_hz} Hz; it must be positive: give the frames per second, for example 30")
+    if source == STANDARD_INPUT:
+        return _named(reading, isolation)
+    path = Path(source)
+    if not path.exists():
+        raise FileNotFoundError(f"{path} does not exist; a folder of frames or a ROS recording is needed, or -")
+    if is_recording(path):
+        messages = read_frames(path, reading)
+        return (StreamFrame(message.name, message.time_s, _loader(read, isolation)) for message, read in messages)
+    if not path.is_dir():
+        raise ValueError(f"{path} is a single file; for one frame use `mereo reconstruct`, here name its folder")
+    return (
+        StreamFrame(file.name, i / rate_hz, _loader(partial(read_frame, file, reading), isolation))
+        for i, file in enumerate(frames_in(path, reading))
+    )
+
+
+def frames_in(folder: Path, reading: InputConfig) -> list[Path]:
+    """Depth images and point clouds of a folder in the order of their names; ``ValueError`` where it has none."""
+    files = sorted(file for file in folder.iterdir() if _is_frame(file, reading))
+    if not files:
+        raise ValueError(f"{folder} has no depth images or point clouds; a folder of frames is needed: check the path")
+    return files
+
+
+def watched_frames(source: str, reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamFrame | None]:
+    """Frames of a folder as their files arrive, without end; None where nothing new has come.
+
+    Files that are there already come first. One that is written again is a new frame; see ``WatchedFolder`` on when a
+    file is complete. Times count from the start.
+
+    Raises ``FileNotFoundError``, or ``ValueError`` for what is no folder; ``OSError`` where it is removed meanwhile.
+    """
+    path = Path(source)
+    if source != STANDARD_INPUT and not path.exists():
+        raise FileNotFoundError(f"{path} does not exist; a folder that can be watched is needed: make it first")
+    if not path.is_dir() or is_recording(path):
+        raise ValueError(f"{source} is no folder of frames; only such a folder can be watched: leave out --watch")
+    folder, start = WatchedFolder(path, lambda file: _is_frame(file, reading)), time.perf_counter()
+
+    def arriving() -> Iterator[StreamFrame | None]:
+        while True:
+            begun = time.perf_counter()
+            for file in folder.look(begun):
+                load = _loader(partial(read_frame, file, reading), isolation)
+                yield StreamFrame(file.name, time.perf_counter() - start, load)
+            yield None
+            time.sleep(max(LOOK_S, time.perf_counter() - begun))  # at most half of the time in a folder of many files
+
+    return arriving()
+
+
+def _is_frame(file: Path, reading: InputConfig) -> bool:
+    """Whether the name of a file is a frame's; hidden ones are those that a writer renames when they are complete."""
+    known = file.suffix.lower() in CLOUD_READERS or file.suffix.lower() in DEPTH_READERS
+    return known and not file.name.startswith(".") and file != reading.mask and file.is_file()
+
+
+def _named(reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamFrame]:
+    start = time.perf_counter()
+    if isinstance(sys.stdin, io.TextIOWrapper):
+        sys.stdin.reconfigure(errors="surrogateescape")  # names are bytes: one that is no UTF-8 is still a file's
+    for line in sys.stdin:
+        if name := line.strip():
+            load = _loader(partial(read_frame, name, reading), isolation)
+            yield StreamFrame(name, time.perf_counter() - start, load)
+
+
+def _loader(read: Callable[[], SensorFrame], isolation: IsolationConfig) -> Callable[[], Any]:
+    return lambda: find_object(read(), isolation)
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
 
 
 def stream_reconstructions(command: StreamCommand) -> Summary:

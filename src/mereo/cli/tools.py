@@ -225,7 +225,7 @@ PURPOSES: dict[str, str] = {
     "network": "weights: training them, and fits that start from them",
     "view": "the pages of `mereo view`",
     "track": "training curves in TensorBoard",
-    "plots": "curves of training runs, charts of experiments and of modes",
+    "plots": "curves of training runs, charts of experiments",
     "onnx": "networks for other runtimes",
     "cad": "3MF files",
     "medical": "NIfTI and NRRD volumes",

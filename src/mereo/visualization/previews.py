@@ -3,23 +3,18 @@
 Everything is drawn by ``mereo.visualization.renderer``, without a display.
 """
 
-import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import trimesh
 from jaxtyping import Float
-from PIL import Image
 
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.transforms import transform_points
-from mereo.io.extras import has_plots, pyplot
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
-from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import View, sample_view
 from mereo.visualization.contact_sheets import (
@@ -166,89 +161,3 @@ def _arrow(center: Float[np.ndarray, "3"], toward: Float[np.ndarray, "3"], radiu
     cone = trimesh.creation.revolve(profile, sections=16)
     cone.apply_transform(trimesh.geometry.align_vectors([0, 0, 1], toward))
     return Segment("camera direction", (40, 44, 52), center + radius * cone.vertices, np.array(cone.faces))
-
-
-# --- modes ------------------------------------------------------------------------------------------------------------
-
-SCENE_VIEWS: Mapping[str, tuple[Vector, Vector]] = {
-    "human": ((0.3, -0.3, -1.0), (0.0, 1.0, 0.0)),
-    "robot": ((0.9, 0.8, -0.45), (0.0, 0.0, 1.0)),
-    "bunny": ((0.3, -0.3, -1.0), (0.0, 1.0, 0.0)),
-    "lizard": ((0.3, 0.5, -1.0), (0.0, 0.0, 1.0)),
-    "rope": ((-0.3, 0.4, -1.0), (-1.0, 0.0, 0.0)),
-    "skull": ((0.35, 0.8, -0.6), (1.0, 0.0, 0.0)),
-    "engine": ((0.35, 1.0, -0.35), (0.0, 0.0, 1.0)),
-    "liver": ((0.25, 0.6, 0.6), (0.0, 1.0, 0.0)),
-    "shapes": ((0.5, 1.0, -0.6), (0.0, 0.0, 1.0)),
-    "sheet": ((0.3, 0.8, -0.75), (0.0, 0.0, 1.0)),
-    "tumor": ((0.25, 0.6, 0.6), (0.0, 1.0, 0.0)),
-    "liver-simulated": ((0.25, 0.6, 0.6), (0.0, 1.0, 0.0)),
-}
-"""Viewing direction and up from which each built-in scene is drawn, in the scene's frame."""
-
-SHOWN_STD = (-2.0, 0.0, 2.0)
-"""Coefficients, in standard deviations, at which a mode is drawn."""
-
-
-def preview_modes(model: StatisticalModel, path: str | Path, name: str = "", modes: int = 6, size: int = 200) -> None:
-    """Write a sheet of the largest modes, each at -2, 0 and +2 standard deviations.
-
-    Below them the residue by their number, where the extra `plots` is installed.
-
-    Args:
-        model: the statistical model.
-        path: the .png file.
-        name: of the object; a built-in scene's is drawn from its own side.
-        modes: how many are drawn at most.
-        size: width of each picture in pixels.
-    """
-    shown = min(modes, model.count)
-    states = [[_at(model, mode, std) for std in SHOWN_STD] for mode in range(shown)] or [[_at(model, 0, 0.0)]]
-    viewpoint = common_viewpoint(
-        [mesh for row in states for mesh in row], *SCENE_VIEWS.get(name, ((0.3, -0.4, -1.0), (0.0, 1.0, 0.0)))
-    )
-    images = [shade(mesh, viewpoint, (size, size)) for row in states for mesh in row]
-    captions = [_caption(model, mode, std) for mode in range(shown) for std in SHOWN_STD] or ["does not deform"]
-    title = f"{name}: {model.count} modes leave {model.residue:.3f} units of an unseen state"
-    sheet = contact_sheet(images, captions, 2 * len(SHOWN_STD) if shown > 1 else len(images), title)
-    plotted = model.count and has_plots()
-    save_png(path, np.concatenate([sheet, _residue_plot(model, sheet.shape[1])]) if plotted else sheet)
-
-
-def _at(model: StatisticalModel, mode: int, std: float) -> SegmentedMesh:
-    z = np.zeros(model.count)
-    if model.count:
-        z[mode] = std
-    return model.mesh(model.material(z))
-
-
-def _caption(model: StatisticalModel, mode: int, std: float) -> str:
-    if std == 0.0:
-        return "mean state"
-    share = float(model.motion[mode] ** 2 / (np.sum(model.motion**2) + model.residue**2))
-    return f"mode {mode + 1} at {std:+.0f} std, {share:.1%} of the variance"
-
-
-def _residue_plot(model: StatisticalModel, width: int, height: int = 260) -> Picture:
-    """Distance that is left of a state against the number of modes, as wide as the sheet above it."""
-    plt = pyplot()
-    figure, axes = plt.subplots(figsize=(width / 100, height / 100), dpi=100, layout="constrained")
-    axes.semilogy(np.arange(model.count + 1), model.residues, color="#2563c9")
-    axes.axhline(model.residue, color="#98a2b3", linestyle=":")
-    axes.set(xlabel="modes", ylabel="left of a state, rms (units)", xlim=(0, model.count))
-    axes.grid(alpha=0.3)
-    content = io.BytesIO()
-    figure.savefig(content, format="png")
-    plt.close(figure)
-    return np.asarray(Image.open(content).convert("RGB").resize((width, height)))
-
-
-def common_viewpoint(meshes: list[SegmentedMesh], direction: Vector, up: Vector) -> Viewpoint:
-    """Orthographic viewpoint from a direction, just large enough for all meshes."""
-    points = np.concatenate([segment.vertices for mesh in meshes for segment in mesh.segments])
-    turned = Viewpoint.along(meshes[0].bounds, direction, up).T_view_world
-    seen = transform_points(turned, points)
-    low, high = seen.min(axis=0), seen.max(axis=0)
-    centered = turned.copy()
-    centered[:3, 3] -= (low + high) / 2
-    return Viewpoint(centered, half_size=1.04 * float((high - low)[:2].max()) / 2)
