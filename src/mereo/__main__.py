@@ -58,10 +58,7 @@ COMMANDS: dict[str, Any] = {
         {"list": weights.WeightsList, "show": weights.WeightsShow},
     ),
     "generate": training.Generate,
-    "dataset": (
-        "Check or describe generated examples.",
-        {"check": training.DatasetCheck, "show": training.DatasetShow},
-    ),
+    "dataset": ("Check generated examples.", {"check": training.DatasetCheck}),
     "train": training.Train,
     "evaluate": training.Evaluate,
     "calibrate": weights.CalibrateCommand,

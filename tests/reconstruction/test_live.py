@@ -139,8 +139,6 @@ def test_sources_that_are_none_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.ply").write_text("ply")
     with pytest.raises(ValueError, match="is a single file"):
         frames_of(str(tmp_path / "a.ply"), reading, isolation)
-    with pytest.raises(ValueError, match="the rate is 0"):
-        frames_of(str(tmp_path), reading, isolation, 0)
     with pytest.raises(ValueError, match="none of the 1 frames could be answered"):
         stream_reconstructions(StreamCommand(str(tmp_path), weights="rope"))
     # before the weights are loaded and any frame is answered

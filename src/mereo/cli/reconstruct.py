@@ -47,9 +47,7 @@ from mereo.models.config import InferenceConfig
 from mereo.models.trained import Trained
 from mereo.reconstruction.observation import FrameWarning, find_object
 from mereo.scenes.registry import files_of
-from mereo.visualization.reconstruction_report import (
-    confidence_title,
-)
+from mereo.visualization.reconstruction_report import confidence_title
 from mereo.visualization.result_files import summary_of, write_answer
 from mereo.visualization.units import Unit, rounded
 from mereo.workers.spread import Cluster, spread
@@ -456,9 +454,8 @@ def print_segments(result: Result) -> None:
         confidence = [f"{segment.confidence:.2f}"] if has_confidence else []
         row = (unit.volume(segment.volume), *confidence, str(segment.components), centroid)
         table.add_row(segment.name, *(row if segment.voxels else ("0", "not found", "0", "")))
-    console = Console(markup=False, emoji=False)
-    console.print(table)
+    Console(markup=False, emoji=False).print(table)
     stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in reconstruction.timings_s.items())
-    console.print(f"seconds: {stages}", highlight=False, soft_wrap=True)
+    print(f"seconds: {stages}")
     if reconstruction.clipped:
-        console.print("a segment reaches out of the largest box and is closed there: check the cloud and the weights")
+        print("a segment reaches out of the largest box and is closed there: check the cloud and the weights")

@@ -276,10 +276,8 @@ def frames_of(
         isolation: what is left out of it.
         rate_hz: at which a folder was recorded; recordings have their own times.
 
-    Raises ``FileNotFoundError``, or ``ValueError`` for a folder without frames and a rate that is not positive.
+    Raises ``FileNotFoundError``, or ``ValueError`` for a folder without frames.
     """
-    if not 0 < rate_hz < float("inf"):
-        raise ValueError(f"the rate is {rate_hz} Hz; it must be positive: give the frames per second, for example 30")
     if source == STANDARD_INPUT:
         return _named(reading, isolation)
     path = Path(source)
@@ -486,7 +484,7 @@ class Answering:
         uncertainty: bool = False,
         waits: bool = False,
     ) -> None:
-        """Answering with a network, a registrar or both; without a registrar the network alone answers each frame.
+        """Without a registrar the network alone answers each frame; one of both there must be.
 
         ``waits`` lets each frame of a lost object wait for its search, so that answers do not depend on their speed.
         """

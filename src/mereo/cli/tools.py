@@ -122,20 +122,13 @@ def print_placement(placement: "Placement", title: str, mm: float) -> None:
         by = segment.placed_by if segment.seen else f"unseen: {segment.placed_by}"
         motion = f"{mm * segment.shift:.2f}", f"{segment.turn_deg:.1f}"
         table.add_row(segment.name, by, str(segment.points), *fit, *motion, str(segment.held or ""))
-    console = Console(markup=False, emoji=False)
-    console.print(table)
-    console.print(
-        f"{placement.explained:.1%} of the scan lies within {mm * placement.limit:.3g} mm of the placed segments",
-        highlight=False,
-        soft_wrap=True,
-    )
+    Console(markup=False, emoji=False).print(table)
+    print(f"{placement.explained:.1%} of the scan lies within {mm * placement.limit:.3g} mm of the placed segments")
     for segment in placement.segments:
         if segment.held:
-            console.print(
+            print(
                 f"{segment.name}: the scan leaves {segment.held} of 6 directions open (it could turn or slide); there "
-                "it stays where it was placed together with the others",
-                highlight=False,
-                soft_wrap=True,
+                "it stays where it was placed together with the others"
             )
 
 

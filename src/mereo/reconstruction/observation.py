@@ -1,8 +1,6 @@
 """The object in one frame of a sensor: what a reconstruction starts from.
 
-    SensorFrame -find_object-> Observation (the object's points, and what each step left out)
-
-Frames are read by ``mereo.io.sensor_frame``.
+SensorFrame -find_object-> Observation (the object's points, and what each step left out)
 """
 
 from collections.abc import Mapping
@@ -30,14 +28,11 @@ from mereo.reconstruction.isolation import IsolationStep, Reading, Selection, cl
 SIZE_FACTOR = 2.0
 """Times that a visible part may be smaller or larger than any in training; beyond, it is another object or unit."""
 
-
 CLOUD = Path("cloud")
 """Name of a frame that comes from no file."""
 
-
 STRAIGHT = 1e-6
 """Spread of points across a line, in that along it, up to which they say nothing of a surface; fits take minutes to."""
-
 
 LIKE_SIZE, APART = 0.4, 0.25
 """Points of a second cluster, in those of the largest, and its distance from that, in its own size, from which on both
