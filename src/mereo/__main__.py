@@ -58,7 +58,10 @@ COMMANDS: dict[str, Any] = {
         {"list": weights.WeightsList, "show": weights.WeightsShow},
     ),
     "generate": training.Generate,
-    "dataset": ("Check generated examples.", {"check": training.DatasetCheck}),
+    "dataset": (
+        "Check or describe generated examples.",
+        {"check": training.DatasetCheck, "show": training.DatasetShow},
+    ),
     "train": training.Train,
     "evaluate": training.Evaluate,
     "calibrate": weights.CalibrateCommand,

@@ -41,14 +41,6 @@ def test_missing_extra_comes_with_the_command(
     assert line.endswith(f"-m pip install '{requirement}'")
 
 
-def test_installed_extra_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(doctor, "_version", lambda name: "1.0")
-    doctor.Doctor().run()
-    report = capsys.readouterr().out
-    assert "missing" not in report
-    assert "installed, for tests and checks" in report
-
-
 def test_probes_that_this_torch_lacks_are_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(torch.cpu, "_is_amx_tile_supported", raising=False)
 

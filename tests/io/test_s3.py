@@ -141,6 +141,7 @@ def test_a_put_that_breaks_off_leaves_what_was_there(folder: ObjectPath, endpoin
         ),
         (
             {"AWS_ENDPOINT_URL": "http://127.0.0.1:9"},
+            "dataset show s3://bucket/x",
             "your credentials for it and the network",
         ),
         ({"AWS_PROFILE": "none"}, "dataset check s3://bucket/x", "(The config profile (none) could not be found)"),

@@ -1,6 +1,7 @@
 """Datasets in a folder or an object storage: made, continued, checked and shown; what has changed is refused."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from itertools import count
@@ -260,6 +261,15 @@ def test_every_bad_file_is_named_with_its_reason(data: Path, capsys: pytest.Capt
     assert not any(line.startswith("shard-00001") for line in lines)
     assert "3 of 4 files are not good; the `mereo generate` command that made it" in said.err
     assert said.err.count("\n") == 2
+
+
+def test_show_says_what_a_dataset_is(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (data / "shard-00001.safetensors").unlink()
+    assert main(["dataset", "show", str(data)]) == 0
+    rows = dict(re.split(r"\s+", line, maxsplit=1) for line in capsys.readouterr().out.splitlines())
+    assert rows["files"] == "3 of 4 are there" and rows["examples"].startswith("4, 0.0") and rows["image_size"] == "48"
+    assert main(["dataset", "show", str(data / "nowhere")]) == 2
+    assert "has no manifest.json; a dataset is a directory made by mereo generate" in capsys.readouterr().err
 
 
 # --- URLs -------------------------------------------------------------------------------------------------------------

@@ -19,7 +19,6 @@ from mereo.cli.stream import (
     Outcome,
     StreamFrame,
     Summary,
-    SurfaceFolder,
     frames_of,
     stream_reconstructions,
 )
@@ -63,16 +62,6 @@ def test_every_frame_is_answered_but_the_bad_one(
     assert "error" in lines[BAD] and f"{BAD:04}.png" in lines[BAD]["error"]
     assert len(list((tmp_path / "glb").iterdir())) == COUNT - 1
     assert f"{COUNT - 1} frames answered at" in err and "1 bad" in err
-
-
-def test_at_its_recorded_pace_the_latest_frame_wins(
-    sequence: tuple[Path, InputConfig], capsys: pytest.CaptureFixture[str]
-) -> None:
-    summary, lines, _ = streamed(capsys, sequence[0], rate=RATE_HZ, reading=sequence[1])
-    assert summary.answered + summary.failed + summary.dropped == COUNT
-    assert lines[-1]["frame"] == f"{COUNT - 1:04}.png"
-    times = [row["time_s"] for row in lines]
-    assert times == sorted(times) and times[-1] == pytest.approx((COUNT - 1) / RATE_HZ)
 
 
 def test_names_on_standard_input_are_frames(
@@ -180,11 +169,3 @@ def test_a_frame_replaces_its_own_file_and_no_other(
     first, again, other = (json.loads(line).get("error", "") for line in capsys.readouterr().out.splitlines())
     assert (first, again) == ("", "") and other.endswith("c_d.npy.glb holds the surfaces of c d.npy: rename c_d.npy")
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["c_d.npy.glb"]
-
-
-def test_what_came_meanwhile_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = SurfaceFolder(tmp_path, force=False)
-    (tmp_path / "a.npy.glb").write_text("precious")
-    outcome = Outcome("a.npy", 0.0, FrameAnswer(segments(), {}), "", 0.1, 0.1, 0)
-    assert "exists; it is not overwritten" in folder.written(outcome, "camera").error
-    assert (tmp_path / "a.npy.glb").read_text() == "precious"

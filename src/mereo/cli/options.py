@@ -83,9 +83,6 @@ InputName = Annotated[Positional[str], arg(metavar="INPUT")]
 ScanCloud = Annotated[Positional[Path], arg(metavar="SCAN")]
 AssetNames = Annotated[Positional[tuple[str, ...]], arg(metavar="[ASSET ...]", help_behavior_hint="")]
 
-METAVARS = ("SCENE", "OBJECT", "DATASET", "WEIGHTS", "INPUT", "SCAN", "ASSET")
-"""The words; an experiment is chosen from a list, which is shown in the place of one."""
-
 MeshUnits = Literal["mm", "cm", "m", "in"] | None
 """Unit of meshes; None guesses."""
 

@@ -133,11 +133,6 @@ class FrameJob:
 def reconstruct_file(input: str | Path, output: str | Path, job: FrameJob) -> Result:
     """Read one frame of a sensor, reconstruct it, write a new directory, print what was found.
 
-    Args:
-        input: a depth image, a point cloud or a ROS recording.
-        output: folder to create.
-        job: everything else.
-
     Warns with ``SizeWarning`` where what is seen cannot be the object. Raises as ``FrameJob.check``, ``read_frame``,
     ``find_object`` and ``reconstruct`` do, and ``ValueError`` for ``carry`` without a registration.
     """

@@ -269,12 +269,8 @@ def frames_of(
 ) -> Iterator[StreamFrame]:
     """Frames of a source, in order; each is decoded when it is answered.
 
-    Args:
-        source: a folder of depth images or point clouds (in the order of their names), a ROS recording, or ``-`` for
-            names of files, one a line, as they are written.
-        reading: how a file is read.
-        isolation: what is left out of it.
-        rate_hz: at which a folder was recorded; recordings have their own times.
+    A source is a folder of depth images or point clouds (in the order of their names, recorded at ``rate_hz``), a ROS
+    recording, or ``-`` for names of files, one a line, as they are written.
 
     Raises ``FileNotFoundError``, or ``ValueError`` for a folder without frames.
     """

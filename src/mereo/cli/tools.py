@@ -180,7 +180,7 @@ class BenchCommand:
         device: where the network runs, auto on a CUDA device where there is one; preprocessing is always on the CPU.
         precision: of the network's products; auto takes bfloat16 on CUDA and on CPUs that are much faster in it.
         repeats: of each stage.
-        rival: time the straightforward implementation too (minutes on a CPU), and check that it gives the same labels.
+        rival: time the straightforward implementation too (minutes on a CPU), and say what share of labels differ.
         threads: of torch and all else that computes; 0 means one per core.
         output: a JSON file for the figures.
         force: replace an existing file, unless the weights are read from it.

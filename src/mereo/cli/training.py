@@ -15,6 +15,7 @@ from mereo.cli.options import (
     PlaceOption,
     SceneName,
     WeightsName,
+    flat_options,
     options_of,
 )
 from mereo.fitting.config import AnswerMethod
@@ -107,6 +108,38 @@ class DatasetCheck:
         from mereo_learning.shards import check_dataset
 
         check_dataset(self.dataset)
+
+
+@dataclass(frozen=True)
+class DatasetShow:
+    """Say what a dataset is, from its manifest and the names of its files: object, seed, examples, settings.
+
+    Attributes:
+        dataset: folder written by `mereo generate`, or its URL in an object storage.
+    """
+
+    dataset: DatasetFolder
+
+    def run(self) -> None:
+        """Print a line for each fact."""
+        from mereo.io.object_storage import names_in
+        from mereo.scenes.seeds import TEST_SEED_START
+        from mereo_learning.shards import expected_files, read_manifest
+
+        manifest = read_manifest(self.dataset)
+        files, names = expected_files(manifest), names_in(self.dataset)
+        facts = {
+            "dataset": self.dataset,
+            "scene": f"{manifest['scene']}, of {', '.join(segment['name'] for segment in manifest['segments'])}",
+            "seed": f"{manifest['seed']}" + ", which is for testing" * (manifest["seed"] >= TEST_SEED_START),
+            "examples": f"{manifest['examples']}"
+            + (f", {manifest['bytes'] / 1e6:,.1f} MB" if "bytes" in manifest else ""),
+            "files": f"{sum(name in names for name in files)} of {len(files)} are there",
+            "made by": f"mereo {manifest['version']}",
+            **dict(flat_options(manifest["settings"])),
+        }
+        for name, value in facts.items():
+            print(f"{name:<14} {value}")
 
 
 @dataclass(frozen=True)
