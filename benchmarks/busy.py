@@ -14,9 +14,32 @@ import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 SETTINGS = (("passive", None), ("passive", 1), ("active", None), (None, None))
 """OMP_WAIT_POLICY and OMP_NUM_THREADS of each row; None is not set."""
+
+LIMIT = 1.5
+"""Times of the fair share that an answer may take."""
+
+BUSY = "import os; parent = os.getppid(); print('started', flush=True)\nwhile os.getppid() == parent: pass"
+"""A process that never rests, and ends with whoever started it."""
+
+
+@contextmanager
+def busy_processes(count: int) -> Iterator[None]:
+    """That many run meanwhile, each on a core where there are enough."""
+    processes = [subprocess.Popen([sys.executable, "-c", BUSY], stdout=subprocess.PIPE) for _ in range(count)]
+    try:
+        for process in processes:
+            assert process.stdout is not None
+            process.stdout.readline()
+        yield
+    finally:
+        for process in processes:
+            process.kill()
+            process.communicate()
 
 
 def measure(queries: int, rounds: int, beside: int) -> None:
@@ -25,7 +48,6 @@ def measure(queries: int, rounds: int, beside: int) -> None:
 
     from mereo.models.weights import load_model
     from mereo.synthesis.sample_views import load_view
-    from mereo_experiments.speed.busy import busy_processes
     from mereo_experiments.speed.stages import random_points
 
     model, view = load_model("bunny"), load_view("bunny")
@@ -48,7 +70,6 @@ def measure(queries: int, rounds: int, beside: int) -> None:
 def row(policy: str | None, threads: int | None, options: argparse.Namespace) -> float:
     """Print one row of the table; returns the times of the fair share."""
     from mereo.io.cores import cores
-    from mereo_experiments.speed.busy import fair_share
 
     variables = {
         name: value for name, value in os.environ.items() if name not in ("OMP_WAIT_POLICY", "OMP_NUM_THREADS")
@@ -63,14 +84,12 @@ def row(policy: str | None, threads: int | None, options: argparse.Namespace) ->
     ]
     told = subprocess.run(command, env=variables, stdout=subprocess.PIPE, text=True, check=True).stdout.split()
     used, alone, busy = int(told[0]), float(told[1]), float(told[2])
-    fair = fair_share(alone, used, options.beside, cores())
+    fair = alone * max(1.0, (used + options.beside) / cores())
     print(f"| {policy or 'not set'} | {used} | {alone:.2f} | {fair:.2f} | {busy:.2f} | {busy / fair:.2f} |", flush=True)
     return busy / fair
 
 
 def main() -> None:
-    from mereo_experiments.speed.busy import LIMIT
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--queries", type=int, default=40_000)
     parser.add_argument("--rounds", type=int, default=9)

@@ -21,15 +21,12 @@ PRECISIONS = ("float32", "bfloat16")
 AIMS = {"40k queries": (0.3, 3.0), "labels": (1.0, 15.0), "surfaces": (1.0, 15.0)}
 """Most seconds of stages whose names begin so, and least times the straightforward way; two cores without AMX."""
 
-BUSY_LIMIT = 1.5
-"""Times of its fair share that 40,000 queries may take beside other work."""
-
 
 def bench(subject: str, precision: str, options: argparse.Namespace) -> dict[str, Any]:
     """Figures of one run of `mereo bench`, which prints its tables itself."""
     file = options.output / f"{subject}-{precision}.json"
     command = [sys.executable, "-m", "mereo", "bench", *SUBJECTS[subject], "--rival", "--precision", precision]
-    numbers = ["--repeats", str(options.repeats), "--beside", str(options.beside)]
+    numbers = ["--repeats", str(options.repeats)]
     subprocess.run([*command, *numbers, "--output", str(file), "--force"], check=True)
     found: dict[str, Any] = json.loads(file.read_text("utf-8"))
     return found
@@ -46,13 +43,6 @@ def verdicts(name: str, found: dict[str, Any]) -> Iterator[str]:
                     f"| {name}: {stage['name']} | {stage['median']:.2f} s | {most_s:g} s {_met(quick)} "
                     f"| {stage['ratio']:.1f} | {least:g} {_met(ahead)} | {other} |"
                 )
-    for share in found["busy"]:
-        if share["rule"] != "one per core":
-            met = _met(share["times"] <= BUSY_LIMIT)
-            yield (
-                f"| {name}: 40k queries beside {share['processes']} busy, {share['threads']} threads "
-                f"| {share['busy']:.2f} s | {BUSY_LIMIT * share['fair']:.2f} s {met} | | | |"
-            )
 
 
 def _met(holds: bool) -> str:

@@ -10,7 +10,7 @@ import json
 import logging
 import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
@@ -25,19 +25,14 @@ from mereo.io.atomic_files import to_json
 from mereo.io.errors import SizeError, is_foreseen, words_of
 from mereo.io.sensor_frame import read_frame
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
-from mereo.models.config import InferenceConfig, Precision
+from mereo.models.config import Precision
 from mereo.models.trained import Trained
 from mereo.models.weights_place import load_weights
 from mereo.reconstruction.observation import find_object
 from mereo.visualization.result_files import radii_of, summary_of
-from mereo_serving.messages import JSON, FrameRequest, Ready, Reply, Served, Setup
-from mereo_serving.refusals import FAULT, failed
+from mereo_serving.messages import FAULT, JSON, FrameRequest, Ready, Reply, Served, Setup, failed
 
 LOG = logging.getLogger("mereo_serving")
-
-
-class TooManyPoints(ValueError):
-    """Refusal of a frame with more points than are answered."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +55,10 @@ class Loaded:
         if served.weights is None:
             target = load_object(served.object)
         else:
-            target = load_object(ready_weights(served.weights, served.name, setup.inference), served.scene)
+            network: Any = load_weights(served.weights, setup.inference)
+            network = replace(network, name=served.name)
+            _ = network.inference  # made ready for the first question
+            target = load_object(network, served.scene)
         loaded = cls(served, target, setup.method)
         registrar = loaded.registrar
         if registrar is not None:
@@ -99,14 +97,6 @@ class Loaded:
         }
 
 
-def ready_weights(weights: str, name: str, inference: InferenceConfig) -> Trained:
-    """Weights under the name that clients use, made ready for the first question."""
-    loaded: Any = load_weights(weights, inference)
-    model = replace(loaded, name=name)
-    _ = model.inference
-    return model
-
-
 @dataclass(eq=False)
 class Answerer:
     """Answers frames, one after the other.
@@ -142,7 +132,7 @@ class Answerer:
         with option_words(), taken_warnings(messages, frame):
             read = read_frame(frame.path, frame.reading)
             if len(read.cloud) > self.setup.max_points:
-                raise TooManyPoints(
+                raise SizeError(
                     f"{frame.file} has {len(read.cloud)} points; at most {self.setup.max_points} are answered here: "
                     "thin it out, or crop it around the object"
                 )
@@ -163,12 +153,7 @@ class Answerer:
 
 def json_of(result: Result, warned: list[str]) -> bytes:
     """Content of summary.json, and what was warned of."""
-    return encoded_json({**summary_of(result), "warnings": warned})
-
-
-def encoded_json(value: Mapping[str, Any]) -> bytes:
-    """JSON in bytes; NaN and infinity are null."""
-    return json.dumps(to_json(value), ensure_ascii=False, allow_nan=False).encode()
+    return json.dumps(to_json({**summary_of(result), "warnings": warned}), ensure_ascii=False, allow_nan=False).encode()
 
 
 def glb_of(result: Result, request: FrameRequest) -> bytes:
@@ -184,7 +169,7 @@ def refusal(error: Exception, frame: FrameRequest) -> Reply:
     if not (is_foreseen(error) and isinstance(error, ValueError | ImportError)):
         LOG.error("a frame of %s cannot be answered", frame.weights, exc_info=error)
         return failed(500, FAULT)
-    status = 413 if isinstance(error, SizeError | TooManyPoints) else 415 if isinstance(error, ImportError) else 422
+    status = 413 if isinstance(error, SizeError) else 415 if isinstance(error, ImportError) else 422
     return failed(status, shown(words_of(error), frame))
 
 

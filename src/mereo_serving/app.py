@@ -25,11 +25,10 @@ from mereo_serving.bodies import MEDIA, SUFFIXES, take, too_large
 from mereo_serving.config import ServeConfig
 from mereo_serving.dispatcher import Dispatcher, Waiting
 from mereo_serving.gate import Entry, Gate
-from mereo_serving.messages import GLB, JSON, FrameRequest, Media, Reply
+from mereo_serving.messages import FAULT, GLB, JSON, FrameRequest, Media, Refused, Reply, failed
 from mereo_serving.metrics import Metrics
 from mereo_serving.options import FrameOptions, sentence_of
 from mereo_serving.page import docs_page
-from mereo_serving.refusals import FAULT, Refused, failed
 
 GONE = 499
 """Status, as of nginx, of a request whose client has left."""
@@ -240,19 +239,14 @@ def response_of(reply: Reply) -> Response:
 
 
 def media_of(accept: str) -> Media:
-    """Media type of the answer that a client likes best, figures where it does not say; raises ``Refused`` (406)."""
-    liked: dict[Media, float] = {}
+    """First media type that a client names, figures where it takes anything; raises ``Refused`` (406)."""
     for part in accept.lower().split(","):
-        kind, *options = (word.strip() for word in part.split(";"))
-        quality = next((word[2:] for word in options if word.startswith("q=")), "1")
-        for media in (JSON, GLB):
-            if kind in (media, f"{media.partition('/')[0]}/*", "*/*"):
-                with_value = float(quality) if quality.replace(".", "", 1).isdecimal() else 0.0
-                liked[media] = max(liked.get(media, 0.0), with_value)
-    best = max(liked, key=lambda media: (liked[media], media == JSON), default=JSON)
-    if not liked.get(best):
-        raise Refused(406, f"Accept is {accept[:60]!a}; an answer is {JSON} or {GLB}: ask for one of them")
-    return best
+        kind = part.partition(";")[0].strip()
+        if kind in (GLB, "model/*"):
+            return GLB
+        if kind in (JSON, "application/*", "*/*"):
+            return JSON
+    raise Refused(406, f"Accept is {accept[:60]!a}; an answer is {JSON} or {GLB}: ask for one of them")
 
 
 def _written(text: str | None, part: str | None, folder: Path) -> str | None:

@@ -6,20 +6,17 @@ client calls a file only a known suffix counts, as the format; no name of a clie
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator
-from contextlib import ExitStack
-from dataclasses import dataclass, field
+import shutil
+from collections.abc import AsyncGenerator, AsyncIterator
+from contextlib import aclosing
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, BinaryIO
 
-from python_multipart.exceptions import MultipartParseError
-from python_multipart.multipart import MultipartParser, parse_options_header
+from starlette.datastructures import Headers, UploadFile
+from starlette.formparsers import MultiPartException, MultiPartParser
 
 from mereo.io.readers import CLOUD_READERS, DEPTH_READERS
-from mereo_serving.refusals import Refused
-
-if TYPE_CHECKING:
-    from python_multipart.multipart import MultipartCallbacks
+from mereo_serving.messages import Refused
 
 SUFFIXES = tuple(sorted({*CLOUD_READERS, *DEPTH_READERS}))
 """Suffixes of what can be a frame."""
@@ -41,13 +38,9 @@ MEDIA = {
 
 MASKS, YAML = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"), (".yaml", ".yml")
 
+PARTS = ("frame", "mask", "intrinsics")
+
 logging.getLogger("python_multipart").setLevel(logging.CRITICAL + 1)  # it tells the log what the client is told
-
-MOST_BOUNDARY = 70
-"""Most characters of a boundary (RFC 2046)."""
-
-MOST_HEADER = 8192
-"""Most bytes of the headers of a part."""
 
 
 @dataclass(frozen=True)
@@ -75,51 +68,87 @@ async def take(
     Raises ``Refused``: 400 for a body that is no such form, 408 for one that does not come, 413 for one that is too
     large, 415 for an unknown format and 422 for parts that are missing or unknown.
     """
-    kind, options = header_options(content_type)
+    kind = content_type.partition(";")[0].strip().lower()
     stated = suffix_of(f"frame.{format.removeprefix('.')}") if format else ""
     if format and not stated:
         raise unknown(f"format is {format[:60]!a}")
-    with ExitStack() as files:
-        if kind == "multipart/form-data":
-            if not (boundary := options.get("boundary")):
-                raise Refused(400, "the form has no boundary; its Content-Type must state one: let a library make it")
-            if len(boundary) > MOST_BOUNDARY:
-                raise Refused(
-                    400,
-                    f"the form's boundary has {len(boundary)} characters; at most {MOST_BOUNDARY} are allowed: let a "
-                    "library make it",
-                )
-            parts: _Parts | _Whole = _Parts(folder, stated, boundary.encode("latin-1"), files)
-        else:
+    try:
+        async with asyncio.timeout(seconds), aclosing(_counted(chunks, most)) as counted:
+            if kind == "multipart/form-data":
+                return await _take_form(counted, content_type, stated, folder)
             suffix = stated or MEDIA.get(kind, "")
             if not suffix:
                 raise unknown(f"the Content-Type is {kind[:60]!a}" if kind else "there is no Content-Type")
-            parts = _Whole(folder, suffix, files)
-        try:
-            async with asyncio.timeout(seconds):
-                count = 0
-                async for chunk in chunks:
-                    count += len(chunk)
-                    if count > most:
-                        raise too_large(most)
-                    parts.write(chunk)
-        except TimeoutError:
-            raise Refused(
-                408, f"the body has not come within {seconds:g} s; send it faster, or a smaller frame"
-            ) from None
-        except MultipartParseError as error:
-            raise Refused(400, f"the form cannot be read ({error}): let a library make it") from None
-        return parts.taken()
+            with (folder / f"frame{suffix}").open("xb") as file:
+                async for chunk in counted:
+                    file.write(chunk)
+            return Taken(f"frame{suffix}")
+    except TimeoutError:
+        raise Refused(408, f"the body has not come within {seconds:g} s; send it faster, or a smaller frame") from None
 
 
-def header_options(text: str) -> tuple[str, dict[str, str]]:
-    """Value and options of a header such as Content-Type, all latin-1; raises ``Refused`` (400) for nonsense."""
+async def _counted(chunks: AsyncIterator[bytes], most: int) -> AsyncGenerator[bytes, None]:
+    count = 0
+    async for chunk in chunks:
+        count += len(chunk)
+        if count > most:
+            raise too_large(most)
+        yield chunk
+
+
+class _Form(MultiPartParser):
+    is_whole = False
+
+    def on_end(self) -> None:
+        self.is_whole = True
+
+
+async def _take_form(chunks: AsyncGenerator[bytes, None], content_type: str, stated: str, folder: Path) -> Taken:
+    async def all_of_it() -> AsyncGenerator[bytes, None]:
+        async for chunk in chunks:
+            yield chunk
+        if not form.is_whole:
+            raise Refused(400, "the form is cut off before its last boundary: send it whole")
+
+    form = _Form(Headers({"content-type": content_type}), all_of_it(), max_files=8, max_fields=8)
+    names = dict[str, str]()
     try:
-        value, options = parse_options_header(text)
-    except (ValueError, LookupError, TypeError):  # what the parser of mail, which is behind it, makes of it
-        raise Refused(400, f"the header {text[:60]!a} cannot be read: let a library make it") from None
-    read = {key.decode("latin-1").lower(): value.decode("latin-1") for key, value in options.items()}
-    return value.decode("latin-1").lower(), read
+        parts = await form.parse()
+    except (MultiPartException, ValueError, LookupError, TypeError) as error:  # what mail's parser makes of headers
+        raise Refused(400, f"the form cannot be read ({' '.join(str(error).split())}): let a library make it") from None
+    try:
+        for part, content in parts.multi_items():
+            if part not in PARTS:
+                raise Refused(422, f"the form has a part {part[:60]!a}; its parts are {', '.join(PARTS)}: leave it out")
+            if part in names:
+                raise Refused(422, f"the form has two parts {part!r}; each comes once: leave one out")
+            names[part] = f"{part}{_suffix(part, content, stated)}"
+            with (folder / names[part]).open("xb") as file:
+                if isinstance(content, UploadFile):
+                    shutil.copyfileobj(content.file, file)
+                else:
+                    file.write(content.encode())
+    finally:
+        await parts.close()
+    if "frame" not in names:
+        raise Refused(422, "the form has no part 'frame'; it holds the depth image or point cloud: add it")
+    return Taken(**names)
+
+
+def _suffix(part: str, content: UploadFile | str, stated: str) -> str:
+    if isinstance(content, str):
+        if part == "intrinsics":
+            return ".json"
+        raise Refused(415, f"the part {part!r} is text without a file name: send it as a file")
+    given, kind = content.filename or "", (content.content_type or "").partition(";")[0].strip().lower()
+    end = PurePosixPath(given.replace("\\", "/")).suffix.lower()
+    if part == "mask":
+        return end if end in MASKS else ".png"
+    if part == "intrinsics":
+        return ".yaml" if end in YAML or kind.endswith("yaml") else ".json"
+    if suffix := stated or suffix_of(given) or MEDIA.get(kind, ""):
+        return suffix
+    raise unknown(f"the part 'frame' has the Content-Type {kind[:60]!a} and no file name of a known format")
 
 
 def too_large(most: int) -> Refused:
@@ -137,120 +166,3 @@ def suffix_of(name: str) -> str:
     """Suffix by which a frame is read, of whatever name; "" where it is none."""
     suffix = PurePosixPath(name.replace("\\", "/")).suffix.lower()
     return suffix if suffix in SUFFIXES else ""
-
-
-class _Whole:
-    """Body that is the frame itself."""
-
-    def __init__(self, folder: Path, suffix: str, files: ExitStack) -> None:
-        self._name = f"frame{suffix}"
-        self._file: BinaryIO = files.enter_context((folder / self._name).open("xb"))
-
-    def write(self, chunk: bytes) -> None:
-        self._file.write(chunk)
-
-    def taken(self) -> Taken:
-        self._file.flush()
-        return Taken(self._name)
-
-
-@dataclass
-class _Part:
-    """Headers of a part, as they come."""
-
-    names: list[bytearray] = field(default_factory=list)
-    values: list[bytearray] = field(default_factory=list)
-    size: int = 0
-
-    def headers(self) -> dict[str, str]:
-        return {
-            name.decode("latin-1").lower(): value.decode("latin-1")
-            for name, value in zip(self.names, self.values, strict=True)
-        }
-
-
-class _Parts:
-    """Form whose parts are written as they come."""
-
-    def __init__(self, folder: Path, stated: str, boundary: bytes, files: ExitStack) -> None:
-        self._folder, self._stated, self._files = folder, stated, files
-        self._part, self._file, self._ended = _Part(), None, False
-        self._parts: dict[str, str] = {}
-        self._open: list[BinaryIO] = []
-        callbacks: "MultipartCallbacks" = {
-            "on_part_begin": self._begin,
-            "on_header_begin": self._next_header,
-            "on_header_field": self._header_field,
-            "on_header_value": self._header_value,
-            "on_headers_finished": self._place,
-            "on_part_data": self._data,
-            "on_end": self._end,
-        }
-        self._parser = MultipartParser(boundary, callbacks)
-
-    def write(self, chunk: bytes) -> None:
-        self._parser.write(chunk)
-
-    def taken(self) -> Taken:
-        if not self._ended:
-            raise Refused(400, "the form is cut off before its last boundary: send it whole")
-        if "frame" not in self._parts:
-            raise Refused(422, "the form has no part 'frame'; it holds the depth image or point cloud: add it")
-        for file in self._open:
-            file.flush()
-        return Taken(self._parts["frame"], self._parts.get("mask"), self._parts.get("intrinsics"))
-
-    def _begin(self) -> None:
-        self._part = _Part()
-
-    def _next_header(self) -> None:
-        self._part.names.append(bytearray())
-        self._part.values.append(bytearray())
-
-    def _header_field(self, data: bytes, start: int, end: int) -> None:
-        self._header(self._part.names, data[start:end])
-
-    def _header_value(self, data: bytes, start: int, end: int) -> None:
-        self._header(self._part.values, data[start:end])
-
-    def _data(self, data: bytes, start: int, end: int) -> None:
-        self._open[-1].write(data[start:end])
-
-    def _header(self, texts: list[bytearray], piece: bytes) -> None:
-        self._part.size += len(piece)
-        if self._part.size > MOST_HEADER:
-            raise Refused(
-                400, f"a part of the form has more than {MOST_HEADER} bytes of headers: let a library make it"
-            )
-        texts[-1] += piece
-
-    def _place(self) -> None:
-        """Open the file of a part, now that its headers are known."""
-        headers = self._part.headers()
-        _, options = header_options(headers.get("content-disposition", ""))
-        part = options.get("name", "")
-        if part not in ("frame", "mask", "intrinsics"):
-            raise Refused(
-                422, f"the form has a part {part[:60]!a}; its parts are frame, mask, intrinsics: leave it out"
-            )
-        if part in self._parts:
-            raise Refused(422, f"the form has two parts {part!r}; each comes once: leave one out")
-        given = options.get("filename", "")
-        kind = headers.get("content-type", "").partition(";")[0].strip().lower()
-        name = f"{part}{self._suffix(part, given, kind)}"
-        self._parts[part] = name
-        self._open.append(self._files.enter_context((self._folder / name).open("xb")))
-
-    def _suffix(self, part: str, given: str, kind: str) -> str:
-        end = PurePosixPath(given.replace("\\", "/")).suffix.lower()
-        if part == "mask":
-            return end if end in MASKS else ".png"
-        if part == "intrinsics":
-            return ".yaml" if end in YAML or kind.endswith("yaml") else ".json"
-        suffix = self._stated or suffix_of(given) or MEDIA.get(kind, "")
-        if not suffix:
-            raise unknown(f"the part 'frame' has the Content-Type {kind[:60]!a} and no file name of a known format")
-        return suffix
-
-    def _end(self) -> None:
-        self._ended = True

@@ -16,10 +16,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 from mereo_serving.config import ServeConfig
-from mereo_serving.messages import FrameRequest, Reply
+from mereo_serving.messages import CRASHED, FULL, GOING, FrameRequest, Refused, Reply, failed
 from mereo_serving.metrics import Metrics
-from mereo_serving.refusals import CRASHED, FULL, GOING, Refused, failed
-from mereo_serving.workers import Worker, WorkerDied
+from mereo_serving.workers import WorkerDied, WorkerProcess
 
 LOG = logging.getLogger("mereo_serving")
 
@@ -86,7 +85,7 @@ class Dispatcher:
         stopping: whether only what is begun is still answered.
     """
 
-    def __init__(self, workers: Sequence[Worker], config: ServeConfig, metrics: Metrics) -> None:
+    def __init__(self, workers: Sequence[WorkerProcess], config: ServeConfig, metrics: Metrics) -> None:
         self.config, self.metrics, self.held, self.stopping = config, metrics, 0, False
         self._workers, self._alive = list(workers), len(workers)
         self._waiting, self._arrived = deque[Waiting](), asyncio.Event()
@@ -169,7 +168,7 @@ class Dispatcher:
 
     # --- answering ----------------------------------------------------------------------------------------------------
 
-    async def _run(self, worker: Worker) -> None:
+    async def _run(self, worker: WorkerProcess) -> None:
         """Answer frames with one process until the end."""
         while (waiting := await self._take()) is not None:
             started = time.monotonic()
@@ -186,7 +185,7 @@ class Dispatcher:
                 waiting.reply(reply)
                 waiting.release()
 
-    async def _ask(self, worker: Worker, frame: FrameRequest) -> Reply:
+    async def _ask(self, worker: WorkerProcess, frame: FrameRequest) -> Reply:
         """Answer of a process; one that takes far too long is ended."""
         future = asyncio.get_running_loop().run_in_executor(self._threads, worker.ask, frame)
         done, _ = await asyncio.wait([future], timeout=HANGS * self.config.timeout)
@@ -194,7 +193,7 @@ class Dispatcher:
             worker.kill()
         return await future
 
-    async def _revive(self, worker: Worker) -> None:
+    async def _revive(self, worker: WorkerProcess) -> None:
         """Start a process again, until it is ready."""
         self._alive -= 1
         while not self.stopping:

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
+from mereo_serving.messages import failed
 from mereo_serving.metrics import OTHER, Metrics
-from mereo_serving.refusals import failed
 
 PROBES = ("/healthz", "/readyz")
 """Addresses that tell nothing, and that supervisors ask without a token."""
@@ -29,6 +29,8 @@ DRAINED_S = 2.0
 LOCAL_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?", re.IGNORECASE)
 """Names of this machine, with any port: a tunnel (``ssh -L``) may end at another one."""
 
+
+NO_TOKEN = "there is no token, or another one; send that of the printed address: Authorization: Bearer TOKEN"
 
 LOOPBACK = "127.0.0.1"
 """Address that only programs of this machine reach."""
@@ -78,15 +80,9 @@ def bound_socket(host: str, port: int) -> socket.socket:
     return bound
 
 
-def refusal(hosts: Sequence[str], origins: Sequence[str], entry: Entry | None = None, given: Sequence[str] = ()) -> str:
-    """Reason to refuse a request by its ``Host`` and ``Origin`` headers; empty where it may be answered.
-
-    With an ``entry`` that has a token, any name will do, but one of the tokens ``given`` must be it.
-    """
-    if entry is not None and entry.token:
-        if len(hosts) != 1 or not any(map(entry.is_token, given)):
-            return "the address has no token, or another one: open the address that mereo serve has printed"
-    elif len(hosts) != 1 or not LOCAL_HOST.fullmatch(hosts[0]):
+def refusal(hosts: Sequence[str], origins: Sequence[str], any_host: bool) -> str:
+    """Reason to refuse a request by its ``Host`` and ``Origin`` headers; empty where it may be answered."""
+    if len(hosts) != 1 or not (any_host or LOCAL_HOST.fullmatch(hosts[0])):
         return f"the host is {', '.join(hosts) or 'not given'}; it must be 127.0.0.1 or localhost: open that address"
     if any(origin.lower() != f"http://{hosts[0].lower()}" for origin in origins):
         return f"the page is of {', '.join(origins)}; only pages of http://{hosts[0]} are answered: open that address"
@@ -132,25 +128,18 @@ class Gate:
     def _refused(self, scope: Any) -> tuple[int, str] | None:
         """Status and sentence for a request that may not be answered; the token leaves the query."""
         headers = [(name.lower(), value.decode("latin-1")) for name, value in scope["headers"]]
-        hosts = [value for name, value in headers if name == b"host"]
-        origins = [value for name, value in headers if name == b"origin"]
         queried = parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True)
         given = [value for name, value in queried if name == "token"]
         if given:
-            rest = [(name, value) for name, value in queried if name != "token"]
-            scope["query_string"] = urlencode(rest).encode()
-        for name, value in headers:
-            scheme, _, token = value.partition(" ")
-            if name == b"authorization" and scheme.lower() == "bearer":
-                given.append(token.strip())
+            scope["query_string"] = urlencode([pair for pair in queried if pair[0] != "token"]).encode()
+        bearers = [value.partition(" ") for name, value in headers if name == b"authorization"]
+        given += [token.strip() for scheme, _, token in bearers if scheme.lower() == "bearer"]
         if self.entry.token and not any(map(self.entry.is_token, given)):
             if scope["path"] in PROBES:
                 return None
-            return (
-                401,
-                "there is no token, or another one; send that of the printed address: Authorization: Bearer TOKEN",
-            )
-        reason = refusal(hosts, origins, self.entry, given)
+            return 401, NO_TOKEN
+        hosts, origins = ([value for name, value in headers if name == key] for key in (b"host", b"origin"))
+        reason = refusal(hosts, origins, bool(self.entry.token))
         return (403, reason) if reason else None
 
 

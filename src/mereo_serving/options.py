@@ -1,7 +1,8 @@
 """Parameters of a request: the options of ``mereo reconstruct`` by the same names, checked before anything is read."""
 
+from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from pydantic_core import ErrorDetails
@@ -9,7 +10,9 @@ from pydantic_core import ErrorDetails
 from mereo.geometry.conventions import CloudAxes
 from mereo.io.config import InputConfig
 from mereo.reconstruction.config import Extent, IsolationConfig
-from mereo_serving.refusals import Refused
+from mereo_serving.messages import Refused
+
+Config = TypeVar("Config", InputConfig, IsolationConfig)
 
 
 def _numbers(given: Any) -> Any:
@@ -45,32 +48,20 @@ class FrameOptions(BaseModel):
 
     def reading(self, folder: Path, intrinsics: str | None, mask: str | None) -> InputConfig:
         """How the frame is read, with the files of these names in a folder; raises ``Refused`` (422)."""
-        try:
-            return InputConfig(
-                intrinsics=None if intrinsics is None else folder / intrinsics,
-                depth_scale=self.depth_scale,
-                mask=None if mask is None else folder / mask,
-                frame=self.frame,
-                drop_invalid=self.drop_invalid,
-                unit_m=self.unit_m,
-                frame_index=self.frame_index,
-            )
-        except ValueError as error:
-            raise Refused(422, str(error)) from None
+        files = {"intrinsics": intrinsics, "mask": mask}
+        paths = {name: None if file is None else folder / file for name, file in files.items()}
+        return self._config(InputConfig, paths)
 
     def isolation(self) -> IsolationConfig:
         """What of the frame is left out; raises ``Refused`` (422)."""
+        counted = {name: _of(getattr(self, name), count, name) for name, count in (("depth_range", 2), ("box", 6))}
+        return self._config(IsolationConfig, counted)
+
+    def _config(self, kind: type[Config], changed: dict[str, Any]) -> Config:
+        """Settings whose fields are parameters of the same names, but for those that are changed."""
+        names = {item.name for item in fields(kind)} & type(self).model_fields.keys()  # type: ignore[arg-type]
         try:
-            return IsolationConfig(
-                depth_range=_of(self.depth_range, 2, "depth-range"),
-                box=_of(self.box, 6, "box"),
-                remove_plane=self.remove_plane,
-                remove_outliers=self.remove_outliers,
-                largest_cluster=self.largest_cluster,
-                cluster_gap=self.cluster_gap,
-                keep_all=self.keep_all,
-                extent=self.extent,
-            )
+            return kind(**{name: getattr(self, name) for name in names} | changed)
         except ValueError as error:
             raise Refused(422, str(error)) from None
 
@@ -90,9 +81,9 @@ def _of(numbers: list[float] | None, count: int, name: str) -> Any:
     if numbers is None:
         return None
     if len(numbers) != count:
-        raise ValueError(
-            f"{name} has {len(numbers)} numbers; it needs {count}: give for example {name}={EXAMPLES[name]}"
-        )
+        name = name.replace("_", "-")
+        example = f"{name}={EXAMPLES[name]}"
+        raise Refused(422, f"{name} has {len(numbers)} numbers; it needs {count}: give for example {example}")
     return tuple(numbers)
 
 

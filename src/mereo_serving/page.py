@@ -5,17 +5,13 @@ from html import escape
 from typing import Any
 
 STYLE = """
-:root { color-scheme: light dark; --ink: #1d2430; --soft: #667085; --line: #e3e6ec; --code: #f1f3f6; --bg: #fff; }
-@media (prefers-color-scheme: dark) {
-  :root { --ink: #e8ebf1; --soft: #98a2b3; --line: #2b323f; --code: #222936; --bg: #12151b; } }
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem;
-  color: var(--ink); background: var(--bg); }
+:root { color-scheme: light dark; }
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; }
 h2 { margin: 3rem 0 .5rem; font-size: 1.25rem; overflow-wrap: anywhere; }
-code { background: var(--code); padding: .1rem .3rem; border-radius: 4px; }
+code { background: #8883; padding: .1rem .3rem; border-radius: 4px; }
 table { border-collapse: collapse; width: 100%; margin: 0 0 1.5rem; }
-td, th { text-align: left; padding: .3rem .75rem .3rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
-th { color: var(--soft); font-weight: 500; } td:first-child { white-space: nowrap; }
-@media (max-width: 560px) { td, th { font-size: .875rem; } td + td { overflow-wrap: anywhere; } }
+td, th { text-align: left; padding: .3rem .75rem .3rem 0; border-bottom: 1px solid #8884; vertical-align: top; }
+td + td { overflow-wrap: anywhere; }
 """
 
 

@@ -9,7 +9,7 @@ import signal
 import threading
 from dataclasses import replace
 from multiprocessing.connection import Connection
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from mereo.io.errors import LIMIT_VARIABLE
 from mereo.workers.spread import exit_with_parent, limit_child_threads, start_resource_tracker
@@ -26,31 +26,8 @@ class WorkerDied(RuntimeError):
     """A process that answers has ended by itself, or was ended for taking too long."""
 
 
-@runtime_checkable
-class Worker(Protocol):
-    """What answers frames, one at a time.
-
-    Attributes:
-        ready: what it said first.
-    """
-
-    ready: Ready
-
-    def ask(self, frame: FrameRequest) -> Reply:
-        """Answer to a frame; raises ``WorkerDied``. Blocks."""
-
-    def restart(self) -> None:
-        """Begin anew after ``WorkerDied``; raises ``WorkerDied`` or what loading raises. Blocks."""
-
-    def kill(self) -> None:
-        """End it at once, whatever it does; a pending ``ask`` raises ``WorkerDied``."""
-
-    def close(self) -> None:
-        """End it after what it does."""
-
-
 class WorkerProcess:
-    """Process that answers (``Worker``).
+    """Process that answers frames, one at a time.
 
     Attributes:
         setup: what it serves, with the precision that is settled once it is ready.
@@ -76,7 +53,7 @@ class WorkerProcess:
         self.setup = replace(self.setup, inference=replace(self.setup.inference, precision=message.precision))
 
     def ask(self, frame: FrameRequest) -> Reply:
-        """Answer to a frame, see ``Worker``."""
+        """Answer to a frame; raises ``WorkerDied``. Blocks."""
         try:
             self._pipe.send(frame)
         except OSError as error:
@@ -85,18 +62,18 @@ class WorkerProcess:
         return reply
 
     def restart(self) -> None:
-        """Start another process in its place, see ``Worker``."""
+        """Start another process in its place; raises ``WorkerDied`` or what loading raises. Blocks."""
         self.kill()
         self._spawn()
         self.wait_until_ready()
 
     def kill(self) -> None:
-        """End the process at once, see ``Worker``."""
+        """End the process at once, whatever it does; a pending ``ask`` raises ``WorkerDied``."""
         self.process.kill()
         self.process.join()
 
     def close(self) -> None:
-        """Let the process end, which it does when nobody speaks to it any more, see ``Worker``."""
+        """Let the process end after what it does, when nobody speaks to it any more."""
         self._pipe.close()
         self.process.join(END_S)
         self.kill()

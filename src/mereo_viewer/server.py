@@ -130,17 +130,13 @@ class OpenPage:
         block = not is_interactive() if block is None else block
         print(f"open {self.address} in a browser; {'Ctrl-C ends' if block else 'close() ends'}", flush=True)
         if block:
-            self.wait()
+            try:
+                threading.Event().wait()
+            except KeyboardInterrupt:
+                print("closed")
+            finally:
+                self.close()
         return self
-
-    def wait(self) -> None:
-        """Wait until Ctrl-C, and close."""
-        try:
-            threading.Event().wait()
-        except KeyboardInterrupt:
-            print("closed")
-        finally:
-            self.close()
 
     def close(self) -> None:
         """Close the page for all browsers; once is enough."""

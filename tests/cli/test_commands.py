@@ -47,7 +47,7 @@ from mereo_learning.shards import DatasetConfig
         ),
         (
             "reconstruct a.png --weights rope --output out --intrinsics k.json --depth-scale 5000 --mask m.png --force",
-            "mereo.cli.reconstruct_many",
+            "mereo.cli.reconstruct",
             "reconstruct_inputs",
             {
                 "inputs": (Path("a.png"),),

@@ -90,8 +90,7 @@ def test_a_runs_own_settings_are_such_a_file(tmp_path: Path) -> None:
     ("content", "sentence"),
     [
         ({"wieghts": "bunny"}, "has 'wieghts', which is no option of this command: correct it, perhaps to 'weights'"),
-        ({"frobnicate": 1}, "has 'frobnicate', which is no option of this command: take it out"),
-        ({"config": "other.json"}, "has 'config', which is no option"),
+        ({"config": "other.json"}, "has 'config', which is no option of this command: "),
         (
             {"resolution": "many"},
             "options.json: resolution is 'many', which cannot be (Input should be a valid integer",
@@ -100,7 +99,6 @@ def test_a_runs_own_settings_are_such_a_file(tmp_path: Path) -> None:
             {"resolution": 1},
             "options.json: resolution is 1; it must be a whole number, from 4 to 4096: give for example 128",
         ),
-        ({"depth_range": [0.9, 0.4]}, "the depth range is 0.9 0.4"),
         ({"method": "perhaps"}, "options.json: method is 'perhaps', which cannot be (Input should be 'auto'"),
         (
             {"weights": {"name": "bunny"}},
@@ -143,13 +141,3 @@ def test_a_result_is_made_again_from_its_own_options(
     assert {path.name for path in first.iterdir()} == {path.name for path in second.iterdir()}
     assert (first / "config.json").read_text() == (second / "config.json").read_text()
     assert (first / "labels.npz").read_bytes() == (second / "labels.npz").read_bytes()
-
-
-@pytest.mark.slow
-def test_a_dataset_is_made_again_from_its_own_options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    line = "generate rope --examples 2 --seed 1000001 --test --output first --points 64 --per-segment 8 --workers 1"
-    assert command_line.main(line.split()) == 0
-    assert command_line.main(["generate", "--config", "first/config.json", "--output", "second", "--workers", "1"]) == 0
-    for name in ("shard-00000.safetensors", "config.json", "manifest.json"):
-        assert (tmp_path / "first" / name).read_bytes() == (tmp_path / "second" / name).read_bytes()

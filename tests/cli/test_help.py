@@ -10,9 +10,11 @@ from pathlib import Path
 import pytest
 
 from mereo import __main__ as command_line
-from mereo.cli.options import METAVARS
 
 QUICKSTART = Path(__file__).parents[2] / "docs/quickstart.md"
+METAVARS = ("SCENE", "OBJECT", "DATASET", "WEIGHTS", "INPUT", "SCAN", "ASSET")
+"""Words for positionals: see ``cli.options``."""
+
 FREE = ("{encoder-loss,",)
 """Beginning of positionals that are chosen from a list, which is shown instead of a word."""
 

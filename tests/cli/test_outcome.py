@@ -39,12 +39,6 @@ def test_one_frame_is_one_object_and_the_rest_goes_elsewhere(here: Path, capfd: 
     assert "wrote result in" in err and not Path("result/summary.json").exists()
 
 
-def test_results_need_no_name(here: Path) -> None:
-    for _ in range(3):
-        assert mereo("reconstruct", "rope.npy", "--weights", "rope", "--method", "network") == 0
-    assert sorted(path.name for path in here.iterdir() if path.is_dir()) == ["result", "result2", "result3"]
-
-
 def test_what_is_not_the_object_has_a_status_of_its_own(
     here: Path, capfd: pytest.CaptureFixture[str], without_turns: None
 ) -> None:

@@ -14,9 +14,9 @@ from mereo.synthesis.config import GenerateConfig
 from mereo_experiments.paper.encoders_losses import ENCODERS, lacks, recipe
 from mereo_experiments.paper.plan import Cost, Plan, cost
 from mereo_experiments.paper.registry import EXPERIMENTS, experiment, run_experiment
-from mereo_experiments.paper.result import Claim, Result, Row, better, markdown, published, write_result
+from mereo_experiments.paper.result import Claim, Result, Row, markdown, published, write_result
 from mereo_experiments.paper.scales import SCALES
-from mereo_experiments.paper.store import Score, Store, content_key, read_score
+from mereo_experiments.paper.store import Score, Store, read_score
 from mereo_learning.cases import EvaluatedView
 from mereo_learning.config import PRESETS
 from mereo_learning.error_maps import comparison_picture
@@ -62,17 +62,6 @@ def test_the_table_shows_both_figures_and_the_verdict() -> None:
     assert "| 0.375 |  |" in text, "who lacks nothing has an empty cell"
 
 
-def test_verdicts() -> None:
-    assert Claim("", {"a": True}).verdict == "We agree (a)."
-    assert Claim("", {"a": False, "b": False}).verdict == "We do not agree (a, b)."
-    assert Claim("", {}).verdict == "Not tried here."
-
-
-def test_better_is_by_segments_where_both_know_them() -> None:
-    assert better(score(0.5, 0.4), score(0.9, 0.3))
-    assert better(score(0.9, NAN), score(0.5, 0.4)) and not better(score(0.4, NAN), score(0.5, 0.1))
-
-
 def test_results_are_three_files(tmp_path: Path) -> None:
     result = Result("noise", "Noise", "cpu", (Row("rope", "x", score(0.5, NAN)),), (Claim("c", {"rope": True}),))
     write_result(result, tmp_path / "noise")
@@ -90,11 +79,6 @@ def test_scores_are_read_back_with_what_they_lack(tmp_path: Path) -> None:
     found = read_score(path)
     assert (found.iou, found.example_iou, found.per_segment) == (0.5, 0.4, {"object": 0.5})
     assert found.miou != found.miou
-
-
-def test_keys_follow_content_not_order() -> None:
-    assert content_key({"a": 1, "b": 2}) == content_key({"b": 2, "a": 1})
-    assert content_key({"a": 1}) != content_key({"a": 2})
 
 
 def test_small_scales_need_no_download() -> None:
@@ -185,12 +169,6 @@ def test_answers_side_by_side_are_drawn_from_results(name: str, picture: str, co
     comparison_picture(tmp_path / picture, comparison, size=40)
     drawn = np.asarray(Image.open(tmp_path / picture))
     assert drawn.shape[1] == 12 + columns * 52 and drawn.shape[0] >= 12 + 2 * 76
-
-
-@pytest.mark.slow
-def test_encoders_are_trained_and_drawn(tmp_path: Path) -> None:
-    folder = run_experiment("encoders", "smoke", tmp_path)
-    assert (folder / "encoders.png").is_file() and "autodecoder" in (folder / "table.md").read_text()
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 from tracked_views import CAMERA, bare, lump_model, mesh_of, rms, view
 
 from mereo.api.result import Result
-from mereo.cli.stream import Answering, Seen, SurfaceFolder, line
+from mereo.cli.stream import Answering, Outcome, StreamFrame, SurfaceFolder, line
 from mereo.fitting import tracking
 from mereo.fitting.registration.answer import Candidate
 from mereo.fitting.registration.answer_frame import search_hypotheses
@@ -22,7 +23,6 @@ from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.reconstruction.observation import Observation, observe
 from mereo.reconstruction.pipeline import EncodedFrame
-from mereo.reconstruction.stream import Outcome
 from mereo.synthesis.clutter import Capsule
 
 
@@ -257,7 +257,7 @@ def test_a_stream_says_it(
     answering, folder = Answering(None, registrar, 24, waits=True), SurfaceFolder(tmp_path / "out", False)
     lines = []
     for number, name in enumerate(("here", "thing", "there")):
-        answer = answering(Seen(frames[name], 0.03 * number))
+        answer = answering(StreamFrame(name, 0.03 * number, partial(frames.get, name)))
         outcome = folder.written(Outcome("frame" if number < 2 else "last", 0.0, answer, "", 0.0, 0.0, 0), "camera")
         lines.append(line(outcome))
     answering.close()

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from mereo.fitting.registration.recognition import MOST, NOT_EVALUATED, Recognition, Signs
-from mereo.visualization.report_words import VERDICTS, trust
+from mereo.visualization.reconstruction_report import VERDICTS, trust
 
 SIGNS = Signs(size=0.01, unexplained=0.2)
 TAKEN = {"answer": "registration", "explained": 0.989, "accepted": True}

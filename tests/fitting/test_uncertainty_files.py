@@ -15,9 +15,7 @@ import trimesh
 from answers import answer_to
 from scipy.spatial import cKDTree
 
-from mereo.cli.answers import ReconstructCommand
-from mereo.cli.reconstruct import FrameJob, explain, target_of
-from mereo.cli.stream import FrameAnswer, line
+from mereo.cli.stream import FrameAnswer, Outcome, line
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import CloudToFit, Registrar
 from mereo.fitting.tracking import Tracker
@@ -27,11 +25,9 @@ from mereo.models.calibration import Calibration
 from mereo.models.model import Model
 from mereo.models.weights import load_model
 from mereo.reconstruction.observation import observe
-from mereo.reconstruction.stream import Outcome
 from mereo.synthesis.sample_views import load_view
 from mereo.visualization.reconstruction_report import MOST, UNEXPLAINED, explain_centroids, point_marks
 from mereo.visualization.result_files import write_answer, write_answer_file
-from mereo.visualization.units import Unit
 
 needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
 
@@ -211,9 +207,9 @@ def test_a_stream_says_it_where_it_is_asked_to(model: Model, cloud: PointCloud) 
     assert "radius95" not in line(Outcome("frame", 0.0, silent, "", 0.0, 0.0, 0))
     assert set(words["radius95"]) == {"median", "max", "calibrated"} and words["radius95"]["median"] > 0
     for name in model.names:
-        assert "volume95" not in silent.segments[name]
-        low, high = told.segments[name]["volume95"]
-        assert low < told.segments[name]["volume"] < high and told.segments[name]["centroid_radius95"] > 0
+        assert "volume95" not in silent.facts["segments"][name]
+        low, high = words["segments"][name]["volume95"]
+        assert low < words["segments"][name]["volume"] < high and words["segments"][name]["centroid_radius95"] > 0
 
 
 def test_a_calibration_comes_from_the_weights(model: Model, cloud: PointCloud) -> None:
@@ -237,33 +233,3 @@ def test_the_viewer_colours_it_and_says_it_of_a_place(found: Answer, server: obj
     assert scale is not None and "mm" in scale.words[1]
     page.probe(mesh.segments[0].vertices[0])
     assert re.search(r"± [\d.]+ mm \(95\s%\)", page.facts.content)
-
-
-def test_the_command_explains_segments_and_places(
-    found: Answer, cloud: PointCloud, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert found.registered is not None
-    place = found.registered.material[cKDTree(cloud.points).query(found.registered.material)[0].argmin()]  # a seen one
-    wishes = [target_of(text, ("liver", "gallbladder")) for text in ("gallbladder", ",".join(map(str, place)))]
-    explain(found.registered, wishes, tmp_path, cloud.points, 10.0, Unit(1.0))
-    lines = capsys.readouterr().out.splitlines()
-    assert re.match(r"the centre of gallbladder is at .* ± [\d.,]+ mm \(95 %, not calibrated\); what leaves", lines[0])
-    assert re.match(r"the object's point is at .* ± [\d.,]+ mm \(95 %, not calibrated\); what leaves", lines[1])
-    head, body = (tmp_path / "explained" / "2.ply").read_bytes().split(b"end_header\n", 1)
-    kinds = [*((axis, "<f4") for axis in "xyz"), ("color", "u1", 3), ("unexplained", "u1")]
-    points = np.frombuffer(body, np.dtype(kinds))
-    np.testing.assert_allclose(points["x"], 10.0 * cloud.points[:, 0], rtol=1e-5)
-    assert points["unexplained"].max() == 0 and b"property uchar unexplained\n" in head
-    yellowest = cloud.points[points["color"][:, 2].argmin()]
-    assert np.linalg.norm(yellowest - place) < np.median(np.linalg.norm(cloud.points - place, axis=1))
-
-
-def test_what_cannot_be_explained_is_said_in_one_sentence(cloud: PointCloud, tmp_path: Path) -> None:
-    for text in ("nose", "1,2", "1,2,nan", "1,2,x"):
-        with pytest.raises(ValueError, match=r"it must be a segment \(liver, gallbladder\) or a place x,y,z"):
-            target_of(text, ("liver", "gallbladder"))
-    with pytest.raises(ValueError, match="--explain needs a registration, whose fit is explained"):
-        explain(None, ["liver"], tmp_path, cloud.points, 1.0, Unit(1.0))
-    with pytest.raises(ValueError, match="--method is network, but --explain needs a registration"):
-        FrameJob(ReconstructCommand((), weights="liver", method="network", explain=("liver",))).check()
-    assert not any(tmp_path.iterdir())

@@ -57,14 +57,6 @@ def test_workflows_call_what_there_is(path: Path) -> None:
                 assert (TOP / script).is_file(), script
 
 
-def test_only_a_tag_publishes_and_only_that_job_proves_who_it_is() -> None:
-    release = yaml.safe_load((TOP / ".github/workflows/release.yml").read_text())
-    assert release[True]["push"] == {"tags": ["v*"]}
-    build, publish = release["jobs"]["build"], release["jobs"]["publish"]
-    assert publish["permissions"] == {"id-token": "write"} and "permissions" not in build
-    assert publish["needs"] == "build" and publish["if"] == "github.event_name == 'push'"
-
-
 @pytest.mark.parametrize(
     ("tag", "heading", "says"),
     [

@@ -74,10 +74,8 @@ def test_no_assertion_reads_a_clock() -> None:
     "body",
     [
         "start = time.monotonic()\n    work()\n    assert time.monotonic() - start < 2",
-        "end = time.perf_counter_ns() + 5\n    took = end - 4\n    assert 0 < took < 9",
         "seconds = []\n    seconds.append(time.process_time())\n    assert min(seconds) < 0.5",
         "before = spent()\n    assert spent() - before < 1",
-        "assert os.times().user < 1",
         "assert (start := time.time()) < 1",
     ],
 )

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mereo.cli.stream import frames_of
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.io.config import InputConfig
 from mereo.io.intrinsics import CameraWarning, read_intrinsics
 from mereo.io.ros_recordings import recorded_frame, recorded_frames
 from mereo.io.sensor_frame import read_frame
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.stream import frames_of
 
 pytest.importorskip("rosbags", reason="rosbags comes with the extra sensors")
 

@@ -35,12 +35,6 @@ FILLED = {
 }
 """What the variables of scripts stand for."""
 
-OPTIONS = {
-    "job-name", "nodes", "ntasks", "ntasks-per-node", "gpus-per-node", "cpus-per-task", "time", "requeue", "output",
-    "array",
-}  # fmt: skip
-"""Options of sbatch that scripts may have, in the spelling of its manual."""
-
 
 def commands(script: Path) -> list[list[str]]:
     """Commands of a script, as words, with its variables filled in."""
@@ -89,8 +83,6 @@ def test_scripts_are_shell(script: Path) -> None:
     lines = script.read_text().splitlines()
     assert subprocess.run([bash, "-n", script], capture_output=True, text=True).stderr == ""
     assert lines[0] == "#!/bin/bash" and "set -euo pipefail" in lines
-    asked = [line.removeprefix("#SBATCH --").partition("=")[0] for line in lines if line.startswith("#SBATCH")]
-    assert asked and set(asked) <= OPTIONS
     last = max(number for number, line in enumerate(lines) if line.startswith("#SBATCH"))
     assert all(line.startswith("#") for line in lines[:last]), "sbatch reads its options up to the first command"
 

@@ -53,7 +53,7 @@ FIELDS = {
     "thin tilted plate": (logits_of(plate((1.0, 1.0, 1.0), 0.11, 0.06)), 1),
     "two thin plates": (logits_of(plate((0.2, 1.0, 0.1), 0.0, 0.06), plate((0.2, 1.0, 0.1), 0.06, 0.06)), 2),
     "ball smaller than a cell": (logits_of(ball((0.11, 0.12, 0.08), 0.06)), 1),
-    **{f"small balls {seed}": (logits_of(small_balls(seed)), 1) for seed in range(12)},
+    **{f"small balls {seed}": (logits_of(small_balls(seed)), 1) for seed in range(4)},
     "small balls of two labels": (logits_of(small_balls(20), small_balls(21)), 2),
 }
 
@@ -122,35 +122,6 @@ def test_neighbours_share_their_interface_and_volumes_add_up() -> None:
     )
 
 
-def test_ambiguous_cells_are_resolved_alike_for_both_neighbours() -> None:
-    """By Lorensen's table of marching cubes 0.70 of the faces are: it joins corners of one sign, whosoever they are."""
-    rng = np.random.default_rng(3)
-    waves, phases = rng.normal(size=(3, 24)) * 22.0, rng.uniform(0, 2 * np.pi, 24)
-
-    def field(points: np.ndarray) -> np.ndarray:
-        first = np.sin(points @ waves + phases).sum(axis=1)
-        return np.stack([np.full(len(points), -99.0), first, -first], axis=1)
-
-    ours, theirs = (_faces_within(segment) for segment in run(field, 2, 24, dense=True).surfaces.segments)
-    assert len(ours) > 5000, "a rough field, full of such cells"
-    assert len(ours & theirs) > 0.95 * len(ours | theirs)
-
-
-def _faces_within(segment: Segment) -> set[tuple[tuple[float, ...], ...]]:
-    """Faces that do not lie at the box, by their corners in any order."""
-    corners = segment.vertices[segment.faces].round(5)
-    within = corners[(np.abs(corners) < 0.95).all(axis=(1, 2))]
-    return {tuple(sorted(map(tuple, face))) for face in within.tolist()}
-
-
-def test_ties_on_nodes_leave_surfaces_closed() -> None:
-    """Interface and poles lie exactly on nodes, where two logits are equal."""
-    whole = ball((0.0, 0.0, 0.0), 0.5)
-    for segment in run(logits_of(half(whole, -1.0), half(whole, 1.0)), 2).surfaces.segments:
-        assert segment.edge_imbalance() == (0, 0)
-        assert segment.volume == pytest.approx(2 / 3 * np.pi * 0.125, rel=0.02)
-
-
 def test_a_segment_that_fills_the_box_is_closed_half_a_voxel_outside() -> None:
     found = run(logits_of(ball((0.0, 0.0, 0.0), 9.0)), resolution=20)
     segment = found.surfaces.segments[0]
@@ -158,13 +129,6 @@ def test_a_segment_that_fills_the_box_is_closed_half_a_voxel_outside() -> None:
     assert segment.edge_imbalance() == (0, 0)
     np.testing.assert_allclose(segment.bounds, [[-1.05] * 3, [1.05] * 3], rtol=1e-6)
     assert 0.99 * 2.1**3 < segment.volume < 2.1**3
-
-
-def test_an_absent_segment_has_no_faces_but_keeps_its_place() -> None:
-    found = run(logits_of(ball((0.0, 0.0, 0.0), 0.5), lambda p: np.full(len(p), 5.0), ball((0.6, 0.6, 0.6), 0.2)), 3)
-    sizes = [len(segment.faces) for segment in found.surfaces.segments]
-    assert sizes[0] > 0 and sizes[1] == 0 and sizes[2] > 0
-    assert found.surfaces.names == found.grid.names == ("part 0", "part 1", "part 2")
 
 
 def test_voxels_are_cubes_and_the_resolution_is_that_of_the_longest_side() -> None:
@@ -184,12 +148,9 @@ def test_locate_grows_until_the_object_is_inside() -> None:
     assert (box[1] - box[0]).max() < 6.0, "not much more than the ball"
     with pytest.raises(ValueError, match="finds no segment near the cloud.*check the weights"):
         locate(logits_of(lambda p: np.ones(len(p))), BOX)
-
-
-def test_extract_whole_grows_a_side_that_is_touched() -> None:
-    found = extract_whole(logits_of(ball((0.5, 0.0, 0.0), 0.8)), BOX, 24, ("a",), PALETTE[:1])
-    assert not found.grid.touched_sides().any()
-    assert found.surfaces.segments[0].volume == pytest.approx(4 / 3 * np.pi * 0.8**3, rel=0.02)
+    whole = extract_whole(logits_of(ball((0.5, 0.0, 0.0), 0.8)), BOX, 24, ("a",), PALETTE[:1])
+    assert not whole.grid.touched_sides().any()
+    assert whole.surfaces.segments[0].volume == pytest.approx(4 / 3 * np.pi * 0.8**3, rel=0.02)
 
 
 @pytest.mark.parametrize(

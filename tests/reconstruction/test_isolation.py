@@ -1,21 +1,14 @@
 """Each step leaves out what it is for and keeps the object, whatever the unit; the real scan survives its clutter."""
 
-import runpy
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pytest
 from two_balls import front
 
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.downsampling import spacing, thin_to_grid
-from mereo.models.weights import load_model
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.isolation import IsolationStep, clusters, largest_plane
 from mereo.reconstruction.observation import find_object, observe
-from mereo_learning.scans import SCANS, scan_in_camera
-from mereo_learning.scoring import grid_scores
 
 
 def half_ball(count: int = 3000, center: tuple[float, float, float] = (0.0, 0.0, 0.8)) -> np.ndarray:
@@ -173,25 +166,3 @@ def test_spacing_is_that_of_the_pixels() -> None:
     assert spacing(0.25 * grid) == pytest.approx(0.25)
     assert spacing(np.repeat(grid, 2, axis=0)) == pytest.approx(1.0), "the same place twice is no distance"
     assert spacing(np.ones((9, 3))) == 0.0
-
-
-def crowd() -> Callable[[np.ndarray, np.random.Generator], np.ndarray]:
-    """The table, wall and floating points of the example."""
-    path = Path(__file__).parents[2] / "examples/isolate_object.py"
-    return runpy.run_path(str(path))["crowd"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SCANS)
-def test_a_real_scan_among_clutter(name: str, require_asset: Callable[[str], Path]) -> None:
-    """On a table, before a wall, with floating points: useless as it is, nearly as good as alone after isolation."""
-    require_asset("bunny/bunny.off"), require_asset(f"bunny/{name}.ply")
-    scan, truth, _ = scan_in_camera(name)
-    crowded = PointCloud(crowd()(scan.points, np.random.default_rng(0)))
-    near, far = scan.points[:, 2].min() - 0.05, scan.points[:, 2].max() + 0.05
-    config = IsolationConfig(depth_range=(near, far), remove_plane=True, largest_cluster=True, cluster_gap=0.05)
-    isolated, _ = isolate(crowded, config)
-    model = load_model("bunny")
-    alone, before, after = (grid_scores(model, cloud, truth, 40) for cloud in (scan, crowded, isolated))
-    assert before.iou < 0.6 and before.miou < 0.1
-    assert after.iou > alone.iou - 0.05 and after.miou > alone.miou - 0.1

@@ -56,16 +56,6 @@ def test_a_depth_as_far_as_the_object_is_unknown() -> None:
     assert 1.02 not in by_cloud.past[:, 2] and (np.isclose(by_cloud.unknown[:, 2], 1.02)).sum() > 500
 
 
-@pytest.mark.parametrize("factor", [0.001, 1000.0])
-def test_any_unit_gives_the_same_lines(factor: float) -> None:
-    lines = lines_of_image(DepthImage(scene(), CAMERA), SHOWN)
-    other = lines_of_image(DepthImage(scene() * factor, CAMERA), SHOWN)
-    for expected, found in ((lines.scaled(factor), other), (lines, other.scaled(1 / factor))):
-        np.testing.assert_allclose(found.past, expected.past)
-        np.testing.assert_allclose(found.unknown, expected.unknown)
-        assert found.other_lines == expected.other_lines
-
-
 def test_many_lines_are_thinned_far_from_the_object_only() -> None:
     camera = Camera(600, 500, 800.0, 800.0, 300.0, 250.0)
     shown, depth = np.kron(SHOWN, np.ones((10, 10), dtype=bool)), np.kron(scene(), np.ones((10, 10)))
@@ -123,12 +113,6 @@ def test_a_scanner_has_the_lines_of_a_camera() -> None:
     turned = SightLines(lines.past, lines.unknown, "past").transformed(axes)
     np.testing.assert_allclose(turned.past, lines.past * [1, -1, -1])
     assert turned.other_lines == "past"
-
-
-def test_a_bare_cloud_says_nothing() -> None:
-    points = np.random.default_rng(0).normal((0, 0, 10), size=(100, 3))
-    for lines in (observe(PointCloud(points)).lines, lines_of_points(points, np.ones(100, dtype=bool))):
-        assert lines.other_lines is None and len(lines.past) == len(lines.unknown) == 0
 
 
 def test_points_that_were_only_thinned_out_are_the_objects() -> None:

@@ -14,11 +14,17 @@ from written_results import segments
 
 from mereo import __main__ as command_line
 from mereo.cli.answers import StreamCommand
-from mereo.cli.stream import SurfaceFolder, stream_reconstructions
+from mereo.cli.stream import (
+    FrameAnswer,
+    Outcome,
+    StreamFrame,
+    Summary,
+    frames_of,
+    stream_reconstructions,
+)
 from mereo.geometry.camera import PointCloud
 from mereo.io.config import InputConfig
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.stream import Outcome, StreamFrame, Summary, frames_of
 from mereo.scenes.registry import load_scene
 from mereo.synthesis.config import SENSORS, SequenceConfig
 from mereo.synthesis.recording import CAMERA, FRAMES, write_recording
@@ -56,16 +62,6 @@ def test_every_frame_is_answered_but_the_bad_one(
     assert "error" in lines[BAD] and f"{BAD:04}.png" in lines[BAD]["error"]
     assert len(list((tmp_path / "glb").iterdir())) == COUNT - 1
     assert f"{COUNT - 1} frames answered at" in err and "1 bad" in err
-
-
-def test_at_its_recorded_pace_the_latest_frame_wins(
-    sequence: tuple[Path, InputConfig], capsys: pytest.CaptureFixture[str]
-) -> None:
-    summary, lines, _ = streamed(capsys, sequence[0], rate=RATE_HZ, reading=sequence[1])
-    assert summary.answered + summary.failed + summary.dropped == COUNT
-    assert lines[-1]["frame"] == f"{COUNT - 1:04}.png"
-    times = [row["time_s"] for row in lines]
-    assert times == sorted(times) and times[-1] == pytest.approx((COUNT - 1) / RATE_HZ)
 
 
 def test_names_on_standard_input_are_frames(
@@ -112,7 +108,7 @@ def test_no_damaged_frame_ends_a_stream(tmp_path: Path, capsys: pytest.CaptureFi
 def test_a_sequence_that_breaks_off_is_told_after_its_frames_and_their_summary(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def frames(*_: object) -> Iterator[StreamFrame[PointCloud]]:
+    def frames(*_: object) -> Iterator[StreamFrame]:
         yield StreamFrame("first", 0.0, lambda: PointCloud(np.ones((40, 3))))
         raise ValueError("it is cut off")
 
@@ -132,8 +128,6 @@ def test_sources_that_are_none_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.ply").write_text("ply")
     with pytest.raises(ValueError, match="is a single file"):
         frames_of(str(tmp_path / "a.ply"), reading, isolation)
-    with pytest.raises(ValueError, match="the rate is 0"):
-        frames_of(str(tmp_path), reading, isolation, 0)
     with pytest.raises(ValueError, match="none of the 1 frames could be answered"):
         stream_reconstructions(StreamCommand(str(tmp_path), weights="rope"))
     # before the weights are loaded and any frame is answered
@@ -143,13 +137,12 @@ def test_sources_that_are_none_are_refused(tmp_path: Path) -> None:
 
 def run(monkeypatch: pytest.MonkeyPatch, surfaces: Path, frames: tuple[str, ...], *more: str) -> int:
     """Exit code of a stream in which every frame is answered with the same surfaces."""
-    answered = SimpleNamespace(surfaces=segments())
+    answered = FrameAnswer(segments(), {})
     outcomes = [Outcome(name, 0.0, answered, "", 0.1, 0.1, 0) for name in frames]
     nothing = SimpleNamespace(network=None, registrar=lambda _: None)
     monkeypatch.setattr("mereo.cli.stream.loaded_object", lambda *_: nothing)
     monkeypatch.setattr("mereo.cli.stream.Answering", lambda *_: SimpleNamespace(close=lambda: None))
     monkeypatch.setattr("mereo.cli.stream.stream", lambda *_, **__: iter(outcomes))
-    monkeypatch.setattr("mereo.cli.stream.line", lambda outcome: {"error": outcome.error})
     return command_line.main(["stream", "-", "--weights", "rope", "--surfaces", str(surfaces), *more])
 
 
@@ -173,14 +166,6 @@ def test_a_frame_replaces_its_own_file_and_no_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(monkeypatch, tmp_path / "out", ("c d.npy", "c d.npy", "c_d.npy")) == 0
-    first, again, other = (json.loads(line)["error"] for line in capsys.readouterr().out.splitlines())
+    first, again, other = (json.loads(line).get("error", "") for line in capsys.readouterr().out.splitlines())
     assert (first, again) == ("", "") and other.endswith("c_d.npy.glb holds the surfaces of c d.npy: rename c_d.npy")
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["c_d.npy.glb"]
-
-
-def test_what_came_meanwhile_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = SurfaceFolder(tmp_path, force=False)
-    (tmp_path / "a.npy.glb").write_text("precious")
-    outcome = Outcome("a.npy", 0.0, SimpleNamespace(surfaces=segments()), "", 0.1, 0.1, 0)
-    assert "exists; it is not overwritten" in folder.written(outcome, "camera").error  # type: ignore[arg-type]
-    assert (tmp_path / "a.npy.glb").read_text() == "precious"

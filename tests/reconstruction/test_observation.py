@@ -9,8 +9,6 @@ import pytest
 from camera_files import write_camera
 from PIL import Image
 
-from mereo import __main__ as command_line
-from mereo.cli.answers import ReconstructCommand
 from mereo.geometry.camera import Camera
 from mereo.io.config import InputConfig
 from mereo.io.readers import read_point_cloud
@@ -160,16 +158,3 @@ def test_missing_extras_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         monkeypatch.setattr(f"mereo.io.{module}.find_spec", lambda _: None)
         with pytest.raises(ImportError, match=rf"{name} needs {library}.*: pip install 'mereo\[sensors\]'"):
             read_frame(tmp_path / name)
-
-
-def test_the_options_of_reconstruct() -> None:
-    text = "reconstruct d.png --weights bunny --output o --intrinsics k.json --depth-range 0.4 0.9 --remove-plane"
-    command = command_line.parse(f"{text} --box -1 -2 0 1 2 3 --largest-cluster --cluster-gap 0.01".split())
-    assert isinstance(command, ReconstructCommand)
-    assert command.reading == InputConfig(intrinsics=Path("k.json"))
-    assert command.isolation == IsolationConfig((0.4, 0.9), (-1, -2, 0, 1, 2, 3), True, False, True, 0.01)
-    command = command_line.parse(
-        ["reconstruct", "a.mcap", "--weights", "w", "--output", "o", "--topic", "/d", "--frame-index", "4"]
-    )
-    assert isinstance(command, ReconstructCommand)
-    assert command.reading == InputConfig(topic="/d", frame_index=4) and not command.isolation.on

@@ -15,7 +15,6 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
-from mereo.geometry.camera import PointCloud
 from mereo.io.config import InputConfig
 from mereo.io.intrinsics import read_camera
 from mereo.io.readers import read_depth_image
@@ -32,17 +31,6 @@ PERSON, TABLE = FOLDER / "pcl_person_depth_mm.png", FOLDER / "pcl_milk_depth_mm.
 SITTING, DESK = FOLDER / "open3d_person_depth_mm.png", FOLDER / "tum_depth_5000.png"
 KINECT, PRIMESENSE = FOLDER / "intrinsics.json", FOLDER / "open3d_camera_primesense.json"
 BOTTLE = IsolationConfig(box=(-0.35, -0.3, 0.4, -0.07, 0.3, 1.0), remove_plane=True, largest_cluster=True)
-
-
-def test_real_depth_frames_are_where_their_rooms_are() -> None:
-    camera = read_camera(KINECT)
-    assert camera == read_camera(PRIMESENSE)
-    for path, scale in ((PERSON, 1000.0), (DESK, 5000.0)):
-        image = read_depth_image(path, camera, scale)
-        cloud: PointCloud = image.to_points()
-        assert 0.7 < np.median(cloud.points[:, 2]) < 4.0
-        row, column = np.nonzero(image.valid)
-        np.testing.assert_allclose(camera.project(cloud.points), np.column_stack([column, row]) + 0.5, atol=1e-9)
 
 
 CARTON = IsolationConfig((0.4, 1.0), remove_plane=True, largest_cluster=True)
@@ -125,14 +113,6 @@ def masked(folder: Path, pixels: int) -> Observation:
     return find_object(read_frame(PERSON, InputConfig(KINECT, mask=folder / "mask.png")))
 
 
-def test_a_mask_does_what_a_depth_range_does(tmp_path: Path) -> None:
-    by_range = find_object(read_frame(PERSON, InputConfig(KINECT)), IsolationConfig((0.4, 1.1)))
-    by_mask = masked(tmp_path, 0)
-    inside = set(map(tuple, by_range.cloud.points))
-    assert all(tuple(point) in inside for point in by_mask.cloud.points)
-    assert by_mask.size_m == pytest.approx((0.33, 0.484, 0.376), abs=0.001)
-
-
 @pytest.mark.parametrize("pixels", [-4, 0, 1, 2])
 def test_a_mask_that_is_two_pixels_off_leaves_the_person_alone(tmp_path: Path, pixels: int) -> None:
     """What is behind the person stretches the box to eight times its length, and is told as strays."""
@@ -142,7 +122,3 @@ def test_a_mask_that_is_two_pixels_off_leaves_the_person_alone(tmp_path: Path, p
     assert first.cloud.points[:, 2].max() < 1.1
     assert np.ptp(first.cloud.points, axis=0) == pytest.approx((0.33, 0.484, 0.376), abs=0.03)
     assert (first.whole.points[~first.keep, 2] < 1.1).sum() <= 10, "and hardly any of the person goes with it"
-
-
-def test_a_wider_rim_is_a_surface_and_stays(tmp_path: Path) -> None:
-    assert readings(masked(tmp_path, 8).cloud)[0].cloud.points[:, 2].max() > 2.0

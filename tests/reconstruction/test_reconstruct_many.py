@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from many_frames import content, frames, loads, run
 
-from mereo.cli import reconstruct_many as many
+from mereo.cli import reconstruct as many
 from mereo.io.atomic_files import MARKER
 from mereo.io.config import InputConfig
 

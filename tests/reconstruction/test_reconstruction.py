@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from analytic import AnalyticModel, ball, logits_of, union, untrained
+from analytic import AnalyticModel, ball, logits_of, union
 from answers import answer_to, reconstruct
 from two_balls import BIG, NAMES, SMALL, front, scene, two_balls
 
@@ -20,7 +20,6 @@ from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.cli.stream import stream_reconstructions
 from mereo.fitting.registration.answer import Answer
 from mereo.io.config import InputConfig
-from mereo.models.weights import save_model
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import SizeWarning
 from mereo.reconstruction.pipeline import Reconstruction
@@ -70,16 +69,6 @@ def test_components_are_counted_and_nothing_is_removed() -> None:
     segment = reconstruct(cloud, AnalyticModel.of(apart, ("one",)), resolution=96).segments[0]
     assert segment.components == 3
     assert segment.volume == pytest.approx(4 / 3 * np.pi * (0.5**3 + 0.1**3 + 0.04**3), rel=0.02)
-
-
-def test_confidence_is_the_mean_probability() -> None:
-    """Logits of a fixed lead: probability e^3 / (e^3 + 1) everywhere inside."""
-    inside = ball((0.0, 0.0, 5.0), 0.5)
-    model = AnalyticModel.of(
-        lambda p: np.stack([np.zeros(len(p)), np.where(inside(p) < 0, 3.0, -3.0)], axis=1), ("one",)
-    )
-    segment = reconstruct(front((0.0, 0.0, 5.0), 0.5, -1.0), model, resolution=24).segments[0]
-    assert segment.confidence == pytest.approx(np.exp(3) / (1 + np.exp(3)), rel=1e-5)
 
 
 def test_the_unit_of_the_cloud_does_not_matter() -> None:
@@ -178,16 +167,6 @@ def test_strays_are_dropped_and_said_unless_all_are_to_be_kept(
     assert json.loads((tmp_path / "all/summary.json").read_text())["points"] == 1230
 
 
-def test_a_reconstruction_says_what_it_was_made_from() -> None:
-    cloud, own, model = with_strays()
-    found = reconstruct(cloud, model, resolution=16, label_points=True)
-    assert found.reading is not None and found.observed is not None and found.reading.dropped == 30
-    np.testing.assert_array_equal(found.reading.cloud.points, own)
-    np.testing.assert_array_equal(found.observed.points, own)
-    alone = reconstruct(own, model, resolution=16)
-    assert alone.reading is not None and alone.reading.dropped == 0
-
-
 @pytest.mark.parametrize("keep_all, strays", [(False, 30), (True, 0)])
 def test_a_stream_drops_strays_and_counts_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, keep_all: bool, strays: int
@@ -200,18 +179,6 @@ def test_a_stream_drops_strays_and_counts_them(
         StreamCommand(str(tmp_path), weights="any", resolution=16, every_frame=True, isolation=isolation)
     )
     assert json.loads(capsys.readouterr().out)["strays"] == strays
-
-
-def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:
-    save_model(untrained(NAMES), tmp_path / "w.safetensors")
-    np.save(tmp_path / "cloud.npy", scene("camera")[0][:5])
-    with pytest.raises(ValueError, match="the cloud has 5 points; a reconstruction needs at least 32"):
-        reconstruct_file(
-            tmp_path / "cloud.npy",
-            tmp_path / "deep/out",
-            FrameJob(ReconstructCommand((), weights=str(tmp_path / "w.safetensors"))),
-        )
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["cloud.npy", "w.safetensors"]
 
 
 def test_every_public_name_exists_and_importing_the_package_loads_nothing() -> None:

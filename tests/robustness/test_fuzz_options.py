@@ -17,7 +17,7 @@ COMMANDS = {
     "scene new": "scene new missing.stl",
     "scene check": "scene check missing.yaml",
     "scene preview": "scene preview missing.yaml --output out.png",
-    "scene modes": "scene modes missing.yaml --output out",
+    "scene modes": "scene modes missing.yaml",
     "scene export": "scene export missing.yaml --output out",
     "generate": "generate missing.yaml --examples 2 --output out",
     "train": "train missing --output out",

@@ -77,7 +77,6 @@ def test_a_mount_point_is_no_place_for_a_new_folder(tmp_path: Path, monkeypatch:
         "stream . --weights rope --surfaces {}",
         "scene preview rope --output {}",
         "scene export rope --output {}",
-        "scene modes rope --output {}",
         "bench --weights rope --output {}",
         "demo --output {}",
     ],
@@ -92,7 +91,7 @@ def test_every_command_refuses_a_pipe_first(
     assert Path("pipe").is_fifo() and os.listdir() == ["pipe"]
 
 
-@pytest.mark.parametrize("command", ["scene preview rope", "scene export rope", "scene modes rope", "bench"])
+@pytest.mark.parametrize("command", ["scene preview rope", "scene export rope", "bench"])
 def test_an_existing_file_is_refused_before_the_work(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -107,7 +106,6 @@ def test_an_existing_file_is_refused_before_the_work(
     "command",
     [
         "scene export bar.yaml --output rest.ply",
-        pytest.param("scene modes bar.yaml --states 100 --output modes.png", marks=pytest.mark.slow),
     ],
 )
 def test_force_replaces_a_file(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,7 +129,6 @@ def test_force_replaces_a_file(command: str, tmp_path: Path, monkeypatch: pytest
         "scene preview scene.py --output scene.py",
         "scene preview bar.yaml --output bar.yaml",
         "scene preview bar.yaml --output left.ply",
-        "scene preview --all --output assets/bunny/bunny.off",
         "bench --weights weights.safetensors --output weights.safetensors",
     ],
 )

@@ -55,7 +55,6 @@ CASES = {
         "scene export rope --output out.ply --force", first="scene export shapes --output out.ply"
     ),
     "scene preview": Case("scene preview rope --output out.png", again="--force"),
-    "scene modes": Case("scene modes INPUTS/tiny.safetensors --output out.png", again="--force"),
     "scene check": Case(
         "scene check out.yaml --repair",
         again="move or remove it",

@@ -28,7 +28,7 @@ from mereo_serving.answering import Answerer
 from mereo_serving.config import ServeConfig
 from mereo_serving.gate import bound_socket
 from mereo_serving.messages import Served
-from mereo_serving.names import served_objects
+from mereo_serving.server import served_objects
 
 ROOT = Path(__file__).parents[2]
 

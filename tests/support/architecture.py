@@ -6,12 +6,13 @@ sentence each. An empty list means that the rule holds.
 
 import ast
 import re
-from collections import deque
-from collections.abc import Collection, Iterable, Iterator, Mapping
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator, Mapping
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
-from package_imports import Import, Package
+from package_imports import Package
 
 ROOMS = (
     "geometry",
@@ -31,9 +32,6 @@ ROOMS = (
 
 SUBROOMS = {"fitting": ("config", "problem", "modes", "search", "draws", "uncertainty", "registration", "tracking")}
 """Rooms whose sub-rooms, and modules beside them, have an order too: all of the room lies in one of these."""
-
-DATA_FOLDERS = ("frames", "states", "weights")
-"""They travel with the package and hold no code."""
 
 ROOT_MODULES = ("__init__", "__main__")
 """The public names and the entry point, which may import every room."""
@@ -73,10 +71,12 @@ ROOM_ROW = re.compile(r"^\| *\[?`(\w+)/`", re.MULTILINE)
 # --- rules of imports -------------------------------------------------------------------------------------------------
 
 
-def upward_imports(package: Package) -> list[Import]:
+def upward_imports(package: Package) -> list[str]:
     """Imports from a later room or sub-room, or from the root: lazy ones, for type checkers and in strings included."""
     inside = [i for i in package if i.target in package.trees and i.source not in ROOT_MODULES]
-    return [i for i in inside if _height(i.target) > _height(i.source)]
+    upward = [i for i in inside if _height(i.target) > _height(i.source)]
+    rules = {True: "a later room", False: "the root, which lies above all rooms"}
+    return [f"{i.place} imports {i.target.replace('/', '.')}, {rules['/' in i.target]}" for i in upward]
 
 
 def _height(module: str) -> tuple[int, int]:
@@ -89,18 +89,6 @@ def _place(name: str, order: tuple[str, ...]) -> int:
     return order.index(name) if name in order else len(order)
 
 
-def differences(upward: Iterable[Import], exceptions: Collection[str]) -> list[str]:
-    """Upward imports that are no known exception (``Import.edge``), and known exceptions that are no longer there."""
-    new = dict.fromkeys(_upward_sentence(i) for i in upward if i.edge not in exceptions)
-    stale = sorted(set(exceptions) - {i.edge for i in upward})
-    return [*new, *(f"{edge} is listed as an exception and no longer there: delete it" for edge in stale)]
-
-
-def _upward_sentence(found: Import) -> str:
-    rule = "a later room" if "/" in found.target else "the root, which lies above all rooms"
-    return f"{found.place} imports {found.target.replace('/', '.')}, {rule}"
-
-
 def torch_imports(package: Package) -> list[str]:
     """Imports of torch, lazy ones included, in rooms that do without."""
     return [
@@ -108,92 +96,6 @@ def torch_imports(package: Package) -> list[str]:
         for i in package
         if i.target == "torch" and not f"{i.source}.py".startswith(MAY_IMPORT_TORCH)
     ]
-
-
-def heavy_settings(package: Package) -> list[str]:
-    """Modules of settings and conventions that load a heavy library, by themselves or through others."""
-    light = [m for m in package.trees if m.rpartition("/")[2] == "config" or m == "geometry/conventions"]
-    chains = [_chain_to_heavy(package, module) for module in light]
-    return [f"{chain[0]}.py loads {chain[-1]}: {' -> '.join(chain)}" for chain in chains if chain]
-
-
-def _chain_to_heavy(package: Package, module: str) -> list[str]:
-    """A shortest chain of imports from a module to a heavy library; empty where there is none."""
-    chains, seen = deque([[module]]), {module}
-    while chains:
-        chain = chains.popleft()
-        if chain[-1] in HEAVY:
-            return chain
-        for name in package.needs(chain[-1]):
-            if name not in seen:
-                seen.add(name)
-                chains.append([*chain, name])
-    return []
-
-
-def cycles(package: Package) -> list[str]:
-    """Circles of modules that import each other at the start; cutting those named would leave none."""
-    graph = {module: {name for name in package.needs(module) if name in package.trees} for module in package.trees}
-    found: list[str] = []
-    while True:
-        try:
-            TopologicalSorter(graph).prepare()
-        except CycleError as error:
-            circle = error.args[1][::-1]  # now each imports the next
-            found.append(" -> ".join(circle))
-            graph[circle[0]].discard(circle[1])
-        else:
-            return found
-
-
-# --- rules of files ---------------------------------------------------------------------------------------------------
-
-
-def bad_init_files(package: Package) -> list[str]:
-    """Folders of modules below the root whose ``__init__.py`` is missing or is not just a docstring."""
-    folders = sorted({module.rpartition("/")[0] for module in package.trees if "/" in module})
-    faults = {folder: _init_fault(package.trees.get(f"{folder}/__init__")) for folder in folders}
-    return [f"{folder}/__init__.py {fault}" for folder, fault in faults.items() if fault]
-
-
-def _init_fault(tree: ast.Module | None) -> str:
-    if tree is None:
-        return "is missing"
-    if ast.get_docstring(tree) is None:
-        return "has no docstring"
-    return "holds more than its docstring" if len(tree.body) > 1 else ""
-
-
-def misplaced(package: Package) -> list[str]:
-    """Folders that are neither a room nor data, code among the data, and modules that belong in a room or sub-room."""
-    strange = [folder for folder in _folders(package) if folder not in (*ROOMS, *DATA_FOLDERS)]
-    code = [module for module in package.trees if module.startswith(tuple(f"{d}/" for d in DATA_FOLDERS))]
-    loose = [module for module in package.trees if "/" not in module and module not in ROOT_MODULES]
-    homeless = [module for module in package.trees if _in_no_subroom(module)]
-    return [
-        *(f"{folder}/ is neither a room nor a folder of data" for folder in strange),
-        *(f"{module}.py is code in a folder of data" for module in code),
-        *(f"{module}.py lies at the root and not in a room" for module in loose),
-        *(f"{module}.py lies in no sub-room" for module in homeless),
-    ]
-
-
-def _in_no_subroom(module: str) -> bool:
-    room, inside, *_ = *module.split("/"), ""
-    return room in SUBROOMS and inside not in (*SUBROOMS[room], "__init__")
-
-
-def _folders(package: Package) -> list[str]:
-    """Folders directly below the root that hold files; caches that deleted modules left do not count."""
-    files = [file.relative_to(package.root).parts for file in package.root.rglob("*") if file.is_file()]
-    return sorted({parts[0] for parts in files if len(parts) > 1 and "__pycache__" not in parts})
-
-
-def rooms_unlike_page(package: Package, page: str) -> list[str]:
-    """Rooms that the page's table of rooms leaves out, and rows of it that are no room of the package."""
-    named, there = set(ROOM_ROW.findall(page)), {f for f in _folders(package) if f in ROOMS}
-    missing = [f"the table of rooms leaves out {room}/" for room in sorted(there - named)]
-    return missing + [f"the table of rooms names {room}/, which is no room" for room in sorted(named - there)]
 
 
 def satellite_imports(package: Package) -> list[str]:
@@ -205,27 +107,60 @@ def satellite_imports(package: Package) -> list[str]:
     ]
 
 
+def cycles(package: Package) -> list[str]:
+    """A circle of modules that import each other at the start, if there is one."""
+    graph = {module: set[str]() for module in package.trees}
+    for found in package:
+        if found.at_start and found.target in graph and found.target != found.source:
+            graph[found.source].add(found.target)
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return [" -> ".join(error.args[1][::-1])]  # now each imports the next
+    return []
+
+
+def heavy_libraries(modules: Iterable[str]) -> list[str]:
+    """Libraries of ``HEAVY`` that importing these modules in a fresh interpreter loads."""
+    code = f"import sys\nimport {', '.join(modules)}\nprint(*[name for name in {HEAVY} if name in sys.modules])"
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+
+
+# --- rules of files ---------------------------------------------------------------------------------------------------
+
+
+def misplaced(package: Package) -> list[str]:
+    """Modules that lie in no room and sub-room, and ``__init__.py`` of folders that are more than a docstring."""
+    faults = list[str]()
+    for module, tree in package.trees.items():
+        room, inside, *_ = *module.split("/"), ""
+        if room not in (*ROOMS, *ROOT_MODULES):
+            faults.append(f"{module}.py lies in no room")
+        elif room in SUBROOMS and inside not in (*SUBROOMS[room], "__init__"):
+            faults.append(f"{module}.py lies in no sub-room")
+        if module.endswith("/__init__") and (ast.get_docstring(tree) is None or len(tree.body) > 1):
+            faults.append(f"{module}.py is not its docstring alone")
+        if inside and f"{module.rpartition('/')[0]}/__init__" not in package.trees:
+            faults.append(f"{module}.py lies in a folder without __init__.py")
+    return faults
+
+
 def misplaced_tests(tests: Path) -> list[str]:
     """Files of tests that lie neither in a folder named like a room or satellite, nor in one of ``TEST_FOLDERS``."""
     rooms = (*ROOMS, *(satellite.removeprefix("mereo_") for satellite in SATELLITES), *TEST_FOLDERS)
     files = sorted(file.relative_to(tests) for file in tests.rglob("*.py"))
-    return [
-        f"tests/{file} lies in no folder of tests: {', '.join(rooms)}"
-        for file in files
-        if file.parts[0] not in (*rooms, "conftest.py")
-    ]
+    return [f"tests/{file}" for file in files if file.parts[0] not in (*rooms, "conftest.py")]
 
 
 def over_budget(top: Path, budget: Mapping[str, tuple[int, int]]) -> list[str]:
     """Folders of ``top`` with more lines of Python, or more files, than they may have."""
     faults = list[str]()
-    for folder, (most_lines, most_files) in budget.items():
+    for folder, most in budget.items():
         files = sorted((top / folder).rglob("*.py"))
-        lines = sum(len(file.read_text("utf-8").splitlines()) for file in files)
-        if lines > most_lines:
-            faults.append(f"{folder} has {lines:,} lines, more than {most_lines:,}: cut as much as you add")
-        if len(files) > most_files:
-            faults.append(f"{folder} has {len(files)} files, more than {most_files}: merge two that are one idea")
+        counts = sum(len(file.read_text("utf-8").splitlines()) for file in files), len(files)
+        for count, limit, unit in zip(counts, most, ("lines", "files"), strict=True):
+            if count > limit:
+                faults.append(f"{folder} has {count:,} {unit}, more than {limit:,}: cut as much as you add")
     return faults
 
 

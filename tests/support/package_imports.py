@@ -9,9 +9,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-TYPES_ONLY = ("TYPE_CHECKING", "typing.TYPE_CHECKING")
-"""Conditions that hold for type checkers and never when a program runs."""
-
 MODULE_NAME = re.compile(r"\w+\.[\w.]*")
 
 
@@ -23,8 +20,7 @@ class Import:
         source: the module that imports.
         line: where, counted from 1.
         target: the module of the package that is imported, or a library's name (``torch``).
-        at_start: importing ``source`` executes it: it is neither in a function, nor for type checkers only, nor a
-            string.
+        at_start: it is a statement of the module itself, which importing it executes.
     """
 
     source: str
@@ -33,99 +29,58 @@ class Import:
     at_start: bool
 
     @property
-    def edge(self) -> str:
-        """The two modules without the line, which every change above it would move."""
-        return f"{self.source} -> {self.target}"
-
-    @property
     def place(self) -> str:
         return f"{self.source}.py:{self.line}"
 
 
 @dataclass(frozen=True)
 class Package:
-    """The modules of a package.
-
-    Attributes:
-        root: its folder.
-        trees: the syntax of each module.
-        imports: all that they import, by module.
-    """
+    """The modules of a package below ``root``: the syntax of each, and all that they import."""
 
     root: Path
     trees: Mapping[str, ast.Module]
-    imports: Mapping[str, tuple[Import, ...]]
+    imports: tuple[Import, ...]
 
     def __iter__(self) -> Iterator[Import]:
-        for imports in self.imports.values():
-            yield from imports
-
-    def needs(self, module: str) -> list[str]:
-        """What importing a module imports at once: other modules of the package, and libraries."""
-        return [i.target for i in self.imports.get(module, ()) if i.at_start and i.target != module]
+        return iter(self.imports)
 
 
 def read_package(root: Path) -> Package:
     """Read every module below ``root``, the package's folder, whose name is the package's."""
     files = sorted(root.rglob("*.py"))
     trees = {f.relative_to(root).with_suffix("").as_posix(): ast.parse(f.read_text("utf-8"), str(f)) for f in files}
-    modules = {_dotted(root.name, module): module for module in trees}
-    imports = {m: tuple(dict.fromkeys(_imports(root.name, m, tree, modules))) for m, tree in trees.items()}
-    return Package(root, trees, imports)
-
-
-def _dotted(package: str, module: str) -> str:
-    """``mereo.io.writers`` for ``io/writers/__init__``."""
-    return ".".join([package, *module.split("/")]).removesuffix(".__init__")
+    modules = {".".join([root.name, *m.split("/")]).removesuffix(".__init__"): m for m in trees}
+    imports = (found for module, tree in trees.items() for found in _imports(root.name, module, tree, modules))
+    return Package(root, trees, tuple(dict.fromkeys(imports)))
 
 
 def _imports(package: str, source: str, tree: ast.Module, modules: Mapping[str, str]) -> Iterator[Import]:
-    folder = [package, *source.split("/")[:-1]]
-    for node, at_start in _nodes(tree):
-        for name in _imported(node, folder):
+    for node in ast.walk(tree):
+        names = list[str]()
+        match node:
+            case ast.Import(names=aliases):
+                names = [alias.name for alias in aliases]
+            case ast.ImportFrom(module=str(module), names=aliases, level=0):
+                names = [f"{module}.{alias.name}" for alias in aliases]
+            case ast.Call(func=ast.Name(id="import_module"), args=[ast.Constant(value=str(name)), *_]):
+                names = [name]
+            case ast.Constant(value=str(text)) if MODULE_NAME.fullmatch(text):
+                names = _spelled(text.rstrip("."), package, modules)
+        for name in names:
             library = name.partition(".")[0]
             target = _module_of(name, modules) if library == package else library
-            yield Import(source, node.lineno, target, at_start)
-        for target in _spelled(node, package, modules):
-            yield Import(source, node.lineno, target, at_start=False)
+            yield Import(source, node.lineno, target, node in tree.body)  # type: ignore[attr-defined]
 
 
-def _nodes(node: ast.AST, at_start: bool = True) -> Iterator[tuple[ast.stmt | ast.expr, bool]]:
-    """All statements and expressions below a node, with whether importing the module executes them."""
-    if isinstance(node, ast.stmt | ast.expr):
-        yield node, at_start
-    inside = at_start and not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
-    for_types = node.body if isinstance(node, ast.If) and ast.unparse(node.test) in TYPES_ONLY else []
-    for child in ast.iter_child_nodes(node):
-        yield from _nodes(child, inside and child not in for_types)
-
-
-def _imported(node: ast.AST, folder: list[str]) -> list[str]:
-    """Dotted names of what a statement, or a call of ``import_module`` with a literal, imports."""
-    match node:
-        case ast.Import(names=names):
-            return [alias.name for alias in names]
-        case ast.ImportFrom(module=module, names=names, level=level):
-            base = [*folder[: len(folder) - level + 1], *([module] if module else [])] if level else [module or ""]
-            return [".".join([*base, alias.name]) for alias in names]
-        case ast.Call(func=ast.Name(id=called) | ast.Attribute(attr=called), args=[ast.Constant(value=str(name)), *_]):
-            return [name] if called in ("import_module", "__import__") else []
-    return []
-
-
-def _spelled(node: ast.AST, package: str, modules: Mapping[str, str]) -> list[str]:
+def _spelled(name: str, package: str, modules: Mapping[str, str]) -> list[str]:
     """The module that a string names: for ``import_module``, in a table, or as the constant start of an f-string.
 
     Without the package's name, as ``"geometry.mesh"``, it must be a whole module: ``"training.csv"`` is a file. An
     f-string that goes on right after ``"mereo."`` can mean any room, so it counts as the root.
     """
-    if not (isinstance(node, ast.Constant) and isinstance(node.value, str) and MODULE_NAME.fullmatch(node.value)):
-        return []
-    name = node.value.rstrip(".")
     if name.partition(".")[0] != package:
-        return [modules[f"{package}.{name}"]] if f"{package}.{name}" in modules else []
-    target = _module_of(name, modules)
-    return [target] if target != "__init__" or name == package else []
+        return [f"{package}.{name}"] if f"{package}.{name}" in modules else []
+    return [name] if _module_of(name, modules) != "__init__" or name == package else []
 
 
 def _module_of(name: str, modules: Mapping[str, str]) -> str:

@@ -24,7 +24,7 @@ from mereo_serving.dispatcher import Dispatcher
 from mereo_serving.gate import Entry
 from mereo_serving.messages import FrameRequest, Reply, Served, Setup
 from mereo_serving.metrics import Metrics
-from mereo_serving.workers import WorkerDied
+from mereo_serving.workers import WorkerDied, WorkerProcess
 
 NPY = {"Content-Type": "application/x-npy"}
 CLOUD = np.concatenate([front(*BIG, -1.0), front(*SMALL, -1.0)])
@@ -54,7 +54,7 @@ def figures(answer: httpx2.Response | bytes) -> dict[str, Any]:
     return {key: value for key, value in found.items() if key != "timings_s"}
 
 
-class ThreadWorker:
+class ThreadWorker(WorkerProcess):
     """Answers in this process; a test may hold it up, or let it die."""
 
     def __init__(self, answerer: Answerer) -> None:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from balls import Balls
+from polygons import Polygons2D
 from shapes import box
 
 from mereo.geometry.mesh import SegmentedMesh
@@ -23,7 +24,6 @@ from mereo.synthesis.query_sampling import (
     sort_sample,
     volume_uniform,
 )
-from mereo_experiments.paper.sampling_figure import Polygons2D, read_outlines
 
 
 def square(low: float, high: float, shift: float = 0.0) -> np.ndarray:
@@ -32,9 +32,8 @@ def square(low: float, high: float, shift: float = 0.0) -> np.ndarray:
 
 def shapes() -> dict[str, Shape]:
     """Two dimensions and three, one segment and several, touching and apart, convex and not."""
-    outlines, _ = read_outlines()
     return {
-        "thin": Polygons2D(outlines["thin"]),
+        "thin": Polygons2D(np.array([[0, 0], [2, 0], [2, 0.3], [0.3, 0.2], [0.2, 1.5], [0, 1.4]])),
         "squares": Polygons2D(square(0, 1), square(0, 1, shift=1.0), square(2, 2.3)),
         "balls": Balls(((0, 0, 0), 1.0), ((2.05, 0, 0), 1.0), ((0, 1.4, 0), 0.35)),
         "cubes": Solids(SegmentedMesh((box((0, 0, 0), (1, 1, 1), "left"), box((1, 0, 0), (2, 1, 1), "right")))),

@@ -14,8 +14,6 @@ from mereo.geometry.metrics import Scores, labels_on, truth_grid
 from mereo.geometry.transforms import transform_points
 from mereo.models.model import Model
 from mereo.scenes.parameters import parameters, random_state, set_value
-from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import Workspace
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo_viewer.laboratory import CELLS, CameraPlace, Laboratory, LabPage, Trial, slider_range
 
@@ -43,15 +41,6 @@ def test_the_camera_stands_where_its_place_says_and_sees_the_state() -> None:
     assert ((points > low - 1.0) & (points < high + 1.0)).all()
 
 
-def test_a_pose_is_what_the_workspace_draws() -> None:
-    workspace, target = Workspace(any_roll=True, axis=(1.0, 2.0, 0.5)), np.array([1.0, 2.0, 3.0])
-    drawn = workspace.sample(np.random.default_rng(3), target)
-    rng = np.random.default_rng(3)
-    cosine, azimuth = rng.uniform(np.cos(workspace.aperture_rad / 2), 1.0), rng.uniform(0.0, 2 * np.pi)
-    distance, roll = rng.uniform(*workspace.distance), rng.uniform(0.0, 2 * np.pi)
-    np.testing.assert_array_equal(workspace.pose(target, cosine, azimuth, distance, roll), drawn)
-
-
 def test_pictures_do_not_flicker_and_follow_a_slider() -> None:
     laboratory = Laboratory(toy_scene(), None, None)
     played, place = random_state(laboratory.scene, 2), laboratory.first_place
@@ -59,13 +48,6 @@ def test_pictures_do_not_flicker_and_follow_a_slider() -> None:
     np.testing.assert_array_equal(first, again)
     moved = set_value(laboratory.scene, played, parameters(played)[-1], 0.5)
     assert (laboratory.look(moved, place).depth.depth != first).any()
-
-
-def test_a_sensor_makes_the_frame() -> None:
-    laboratory = Laboratory(toy_scene(), None, None)
-    played = random_state(laboratory.scene, 2)
-    plain, real = (laboratory.look(played, laboratory.first_place, name).depth for name in ("paper", "time-of-flight"))
-    assert plain.camera == real.camera and (plain.depth != real.depth).any()
 
 
 def test_what_cannot_be_shown_is_said_in_one_sentence(rope: Model) -> None:
@@ -87,17 +69,6 @@ def test_an_object_without_weights_is_searched(toy_model: StatisticalModel) -> N
     found = (labels_on(trial.surfaces, truth.grid) > 0)[truth.kept]
     true = (truth.grid.labels > 0)[truth.kept]
     assert trial.scores.iou == pytest.approx((found & true).sum() / (found | true).sum())
-
-
-@pytest.mark.slow
-def test_weights_answer_as_they_do_elsewhere(rope: Model) -> None:
-    alone = replace(rope, statistical_model=None)
-    laboratory = Laboratory(load_scene("rope"), alone, None)
-    view = laboratory.look(random_state(laboratory.scene, 3), laboratory.first_place)
-    trial = laboratory.answer(view)
-    assert trial.source == "network alone: the weights carry no statistical model" and trial.scores.iou > 0.5
-    fitted = Laboratory(laboratory.scene, rope, Registrar.of(rope, "modes")).answer(view)
-    assert "registered model (modes)" in fitted.source and fitted.scores.miou > trial.scores.miou
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 from answers import answer_to
-from browser import BROWSER, Page, pixels_of, until
+from browser import BROWSER
 from PIL import Image
 from reported_scenes import ball, example, wall
 
@@ -21,7 +21,6 @@ from mereo.__main__ import main
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.state import STATE
-from mereo.geometry.camera import SCANNER_TO_CAMERA, PointCloud
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.geometry.radii import Radii
 from mereo.io.mesh_formats import read_glb
@@ -231,18 +230,6 @@ def test_places_are_asked_of_the_default_answer(rope: Model) -> None:
     assert seen_as(answer, places).label.all()
 
 
-@pytest.mark.slow
-def test_a_scanners_frame_is_asked_in_its_own_axes(rope: Model) -> None:
-    points = load_view("rope").depth.to_points().points @ SCANNER_TO_CAMERA.T
-    answer = answer_to(PointCloud(points), rope, Registrar.of(rope, "modes"), 24, "scanner")
-    assert answer.registered is not None
-    places = points[:6] - [0.0, 0.0, 2.0]
-    shown = seen_as(answer, places)
-    # what the way to the surface leads to lies on it, in the scanner's frame
-    ends = places + np.abs(shown.distance)[:, None] * shown.direction
-    np.testing.assert_allclose(answer.registered.solids.nearest(ends).distance, 0.0, atol=1e-6)
-
-
 def test_weights_without_a_model_are_asked_alone_and_it_is_said(rope: Model) -> None:
     cloud = load_view("rope").depth.to_points()
     answer = answer_to(cloud, replace(rope, statistical_model=None), None, 24)
@@ -294,20 +281,3 @@ def test_what_cannot_be_shown_is_said_in_one_sentence(
     assert main(["view", str(tmp_path / "s.glb"), *options]) == 2
     error = capsys.readouterr().err
     assert error.startswith("mereo: error: ") and error.count("\n") == 1 and sentence in error
-
-
-@pytest.mark.slow
-@needs_viser
-@needs_browser
-def test_a_result_of_the_network_alone_is_seen_with_points_and_depth(
-    folder: Path, tmp_path: Path, opened: list[Any]
-) -> None:
-    opened.append(mereo.view(folder, port=0, block=False))
-    with Page(tmp_path, opened[-1].address, (900, 900)) as browser:
-        until(lambda: "Network alone" in browser.text())
-        browser.still()
-        words = browser.text()
-        for told in ("frame <7>", "Observed points", "Depth image", "bright: 500 mm; dark: 700 mm", "2 segments"):
-            assert told in words
-        colors = [segment.color for segment in found().segments]
-        until(lambda: all(pixels_of(browser.screenshot()[:, :560], color, 0.97) > 150 for color in colors))

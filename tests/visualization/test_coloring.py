@@ -65,23 +65,3 @@ def test_a_ray_meets_the_nearest_surface_that_is_shown() -> None:
     np.testing.assert_allclose(first_point(mesh, origin, along, [False, True]), [4.0, 0.01, 0.02], atol=0.05)
     assert first_point(mesh, origin, along, [False, False]) is None
     assert first_point(mesh, origin, -along, [True, True]) is None
-
-
-def test_first_hits_are_those_of_moeller_and_trumbore() -> None:
-    """Moeller and Trumbore, "Fast, minimum storage ray-triangle intersection", 1997, in double precision."""
-    mesh, rng = two_balls(), np.random.default_rng(4)
-    vertices, faces, _ = mesh.merged()
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    hits = 0
-    for _ in range(60):
-        origin = 8 * rng.normal(size=3)
-        direction = rng.choice([0.01, 1.0, 100.0]) * (rng.uniform(*mesh.bounds) - origin)
-        columns = np.stack([b - a, c - a, np.broadcast_to(-direction, a.shape)], axis=-1)
-        u, v, t = np.linalg.solve(columns, (origin - a)[..., None])[..., 0].T
-        distance = t[(u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)].min(initial=np.inf)
-        found = first_point(mesh, origin, direction, [True, True])
-        assert (found is None) == np.isinf(distance)
-        if found is not None:
-            hits += 1
-            np.testing.assert_allclose(found, origin + distance * direction, atol=1e-5)
-    assert 20 < hits < 60

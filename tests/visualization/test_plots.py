@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import mereo
 from mereo import __main__ as command_line
-from mereo.cli.scenes import SceneModes
 from mereo.visualization.color_scales import TABLE, viridis
 from mereo_learning.metrics_log import MetricsLog
 
@@ -62,21 +60,6 @@ def test_a_run_with_curves_says_nothing(tmp_path: Path, capsys: pytest.CaptureFi
     (tmp_path / "curves.png").unlink()
     assert not log.is_written(3)
     assert capsys.readouterr().out == ""
-
-
-def test_modes_are_drawn_with_and_without_their_plot(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], request: pytest.FixtureRequest
-) -> None:
-    weights = str(Path(mereo.__file__).parent / "weights" / "rope.safetensors")
-    SceneModes(weights, tmp_path / "with.png", 100).run()
-    assert "left out" not in capsys.readouterr().out
-    request.getfixturevalue("no_matplotlib")
-    SceneModes(weights, tmp_path / "without.png", 100).run()
-    said = capsys.readouterr().out.splitlines()[-1]
-    assert said == "its plot is left out, for matplotlib is not installed: pip install 'mereo[plots]'"
-    whole, sheet = picture(tmp_path / "with.png"), picture(tmp_path / "without.png")
-    assert len(whole) == len(sheet) + 260
-    np.testing.assert_array_equal(whole[: len(sheet)], sheet)
 
 
 @pytest.mark.usefixtures("no_matplotlib")

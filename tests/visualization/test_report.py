@@ -4,13 +4,12 @@ import base64
 import io
 import re
 import subprocess
-from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from browser import BROWSER, Page, until
+from browser import BROWSER
 from PIL import Image
 from reported_scenes import ball, example, page_data, positions, wall
 from scipy.spatial import cKDTree
@@ -162,34 +161,6 @@ def test_a_browser_draws_every_segment(tmp_path: Path, mode: str) -> None:
         assert (cosine > 0.99).sum() > 1000, f"{segment.name} is not to be seen"
     drawn = np.flatnonzero((np.ptp(stage, axis=-1) > 60).any(axis=0))
     assert np.ptp(drawn) > 0.8 * stage.shape[1], "the object does not fill the canvas"
-
-
-@pytest.mark.slow
-@in_browser
-@pytest.mark.parametrize("width", [390, 990, 1280])
-def test_every_column_is_seen_on_a_phone_too(tmp_path: Path, width: int) -> None:
-    cloud, mesh, summary = example()
-    sure = {"volume": 3.51e-5, "centroid": [-0.06364, 0.12345, 0.58857], "centroid_radius95": 0.0006}
-    segments = [{**told, **sure, "volume95": [3.43e-5, 3.59e-5]} for told in summary["segments"]]
-    names = [replace(one, name=f"finger_{k}") for k, one in enumerate(mesh.segments)]
-    summary = {**summary, "segments": segments, "radius95": {"median": 1e-4, "max": 1e-3, "calibrated": True}}
-    Report(cloud, SegmentedMesh(tuple(names)), summary, unit=Unit(1.0), depth=wall(80, 60)).write(tmp_path / "r.html")
-    with Page(tmp_path, (tmp_path / "r.html").as_uri(), (width, 800)) as page:
-        until(lambda: page.evaluate("document.body.dataset.drawing"))
-        words = page.text().replace("\N{NO-BREAK SPACE}", " ")
-        assert "Network alone: nothing says whether this is the object." in words
-        assert "-63.64" in words and "± 0.60" in words and "35.1 (34.3 to 35.9)" in words
-        room = page.evaluate("(t => [t.scrollWidth, t.parentElement.clientWidth])(document.getElementById('table'))")
-        assert room[0] <= room[1], "the table is wider than its card"
-        room = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
-        assert room[0] <= room[1], "the page is scrolled sideways"
-        assert page.evaluate("document.getElementById('depthimage').naturalWidth") == 24
-        places = page.evaluate(
-            "[...document.querySelectorAll('#table tbody tr')].map(r => [...r.cells].map(c => c.offsetTop))"
-        )
-        for name, centre, volume, confidence in places:
-            # on a phone name and volume are the first line of a card, centre and confidence its second
-            assert abs(name - volume) < 4 and abs(centre - confidence) < 4 and (centre - name > 9) == (width < 500)
 
 
 def test_places_and_volumes_are_told_as_exactly_as_they_are_known() -> None:

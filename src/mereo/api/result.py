@@ -34,8 +34,8 @@ from mereo.io.sensor_frame import SensorFrame
 from mereo.io.writers.formats import chosen_formats
 from mereo.io.writers.glb import viewer_rotation
 from mereo.io.writers.volumes import MM_PER_M
+from mereo.visualization.reconstruction_report import result_html
 from mereo.visualization.result_files import write_answer, write_answer_file
-from mereo.visualization.result_html import result_html
 from mereo.visualization.units import Unit
 
 if TYPE_CHECKING:
@@ -163,10 +163,32 @@ class Result(Answer):
         """Length of a unit of the object's own files, or of its scene, in the frame's unit; None without a fit."""
         return None if self.registered is None else self.registered.model_scale
 
+    @python_words()
     def carry(self, what: Any, files: CarryFrame = "source") -> Any:
-        """Carry points, a mesh or a file of the object's own frame and unit to where it is now (``carry_to``)."""
-        with python_words():
-            return carry_to(self, what, files)
+        """Carry points, a mesh or a file of the object's own frame and unit to where it is now.
+
+        Args:
+            what: points (whatever ``load_frame`` takes of points), which come back as an array [n, 3]; a mesh of
+                trimesh, ``Segment`` or ``SegmentedMesh``, which comes back as its kind, with edges short enough to
+                bend; or the path of a file as of ``--carry``, a volume included, which comes back as a ``CarriedFile``.
+            files: frame and unit of it: "source" is that of the object's own files, "scene" that of its scene.
+
+        Raises ``ValueError`` where the answer is the network's, where the frame of the object's files is not known, and
+        for what lies too far from the object to belong to it.
+        """
+        attachment, registered = _attachment(what), registration_of(self)
+        assert self.registrar is not None
+        (placed,) = place([attachment], self.registrar, files)
+        carried = carry(placed, registered)
+        if isinstance(what, str | Path):
+            return CarriedFile(carried.name, carried.content, carried.inside, carried.farthest, self.seen.frame)
+        if isinstance(carried.content, Positions):
+            return carried.content.points
+        assert isinstance(carried.content, Surfaces)
+        if isinstance(what, SegmentedMesh):
+            return carried.content.mesh
+        (segment,) = carried.content.mesh.segments
+        return segment if isinstance(what, Segment) else type(what)(segment.vertices, segment.faces, process=False)
 
     def to_trimesh(self) -> "trimesh.Scene":
         """Scene of trimesh with a mesh for each segment that was found, by its name and in its colour."""
@@ -347,41 +369,15 @@ class CarriedFile:
         return path
 
 
-def carry_to(answer: Answer, what: Any, files: CarryFrame = "source") -> Any:
-    """Carry points, a mesh or a file to where an answer has the object.
-
-    Args:
-        answer: one that is the registered model.
-        what: points (whatever ``load_frame`` takes of points), which come back as an array [n, 3]; a mesh of trimesh,
-            ``Segment`` or ``SegmentedMesh``, which comes back as its kind, with edges short enough to bend; or the path
-            of a file as of ``--carry``, a volume included, which comes back as a ``CarriedFile``.
-        files: frame and unit of what is carried: "source" is that of the object's own files, "scene" that of its scene.
-
-    Raises ``ValueError`` where the answer is the network's, where the frame of the object's files is not known, and for
-    what lies too far from the object to belong to it.
-    """
+def _attachment(what: Any) -> Attachment:
     if isinstance(what, str | Path):
-        attachment = read_attachments([what])[0]
-    elif isinstance(what, SegmentedMesh | Segment) or (hasattr(what, "vertices") and hasattr(what, "faces")):
-        attachment = Attachment("the mesh", Surfaces(_segmented(what)))
-    else:
-        cloud, _ = points_of(what)
-        if not isinstance(cloud, PointCloud):
-            raise ValueError("a depth image is no part of an object's files: carry points, a mesh or a file")
-        attachment = Attachment("the points", Positions(cloud.points))
-    registered = registration_of(answer)
-    assert answer.registrar is not None
-    (placed,) = place([attachment], answer.registrar, files)
-    carried = carry(placed, registered)
-    if isinstance(what, str | Path):
-        return CarriedFile(carried.name, carried.content, carried.inside, carried.farthest, answer.seen.frame)
-    if isinstance(carried.content, Positions):
-        return carried.content.points
-    assert isinstance(carried.content, Surfaces)
-    if isinstance(what, SegmentedMesh):
-        return carried.content.mesh
-    (segment,) = carried.content.mesh.segments
-    return segment if isinstance(what, Segment) else type(what)(segment.vertices, segment.faces, process=False)
+        return read_attachments([what])[0]
+    if isinstance(what, SegmentedMesh | Segment) or (hasattr(what, "vertices") and hasattr(what, "faces")):
+        return Attachment("the mesh", Surfaces(_segmented(what)))
+    cloud, _ = points_of(what)
+    if not isinstance(cloud, PointCloud):
+        raise ValueError("a depth image is no part of an object's files: carry points, a mesh or a file")
+    return Attachment("the points", Positions(cloud.points))
 
 
 def _segmented(mesh: Any) -> SegmentedMesh:

@@ -56,9 +56,6 @@ class ReconstructCommand:
             points (PLY, XYZ, NPY), CSV (x, y, z; qx, qy, qz, qw for poses) or volume (NIfTI, NRRD), which is
             resampled around the object.
         carry_frame: frame and unit of these files: source is that of the object's own files, scene that of its scene.
-        explain: segment, for its centroid, or place x,y,z in the input's frame and unit: print how sure the object's
-            point there is and what leaves it unsure, and write the observed points coloured by how much each decides it
-            (explained/1.ply, those that the model does not explain in red); once for each. The report has all segments.
         force: replace an existing output folder that mereo wrote, and nothing else is in.
         threads: of torch and all else that computes; 0 means one per core.
         ray: answer each of several frames in a task of a Ray cluster: local, one of so many --threads for this run;
@@ -84,7 +81,6 @@ class ReconstructCommand:
     initial_pose: Path | None = None
     carry: UseAppendAction[tuple[Path, ...]] = ()
     carry_frame: CarryFrame = "source"
-    explain: UseAppendAction[tuple[str, ...]] = ()
     force: bool = False
     threads: Threads = 0
     ray: RayAddress = None
@@ -95,8 +91,7 @@ class ReconstructCommand:
     def run(self) -> Outcome:
         """Write the folder of results and print the segments."""
         from mereo.api.result import free_folder
-        from mereo.cli.reconstruct import FrameJob
-        from mereo.cli.reconstruct_many import reconstruct_inputs
+        from mereo.cli.reconstruct import FrameJob, reconstruct_inputs
         from mereo.workers.spread import choose_cluster
 
         cluster, inference = choose_cluster(self.ray, self.threads, self.task), self.inference
@@ -193,8 +188,7 @@ class StreamCommand:
         every_frame: answer all frames, however long it takes, instead of the latest.
         watch: the folder is still filled: answer its files as they arrive or are written again, until Ctrl-C.
         surfaces: folder for the surfaces of each answered frame, one GLB file each; one with content is refused.
-        rerun: a new recording FILE.rrd for `rerun FILE.rrd`, or the address of an open viewer: needs the extra `rerun`.
-        force: write into a folder with content, and replace the files of the same names in it; replace a recording.
+        force: write into a folder with content, and replace the files of the same names in it.
         reading: how a frame is read.
         isolation: what is left out of it.
         inference: where and how exactly the network computes.
@@ -212,7 +206,6 @@ class StreamCommand:
     every_frame: bool = False
     watch: bool = False
     surfaces: Path | None = None
-    rerun: str | None = None
     force: bool = False
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
     isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
@@ -269,8 +262,7 @@ class ServeCommand:
         if missing := [name for name in SERVE_MODULES if find_spec(name) is None]:
             raise ImportError(f"{missing[0]} is not installed; `mereo serve` needs it: run pip install 'mereo[serve]'")
         from mereo.io.cores import cores
-        from mereo_serving.names import served_objects
-        from mereo_serving.server import serve
+        from mereo_serving.server import serve, served_objects
 
         serve(
             served_objects(self.weights, self.scene, self.object),

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
 RESOLUTION = 100
 
-NEXT = """On your own object, from its meshes: nothing is trained; docs/own-object.md has joints
+NEXT = """
+On your own object, from its meshes: nothing is trained; docs/own-object.md has joints
   mereo reconstruct cloud.ply --object PART.stl PART.stl --output result
   mereo reconstruct depth.png --intrinsics camera.json --depth-scale 1000 --object PART.stl PART.stl --output result
 
@@ -25,11 +26,6 @@ At once, and telling look-alike parts apart: with a network, where that helps, t
   mereo reconstruct frame.ply --object learned --output result
 
 In another shell, first: source .venv/bin/activate"""
-
-WITHOUT = (
-    "PyTorch is not installed, so nothing is shown of networks, which start the fit at once: run pip install "
-    "'mereo[network]' and this again.\n"
-)
 
 
 @dataclass(frozen=True)
@@ -63,8 +59,10 @@ class Demo:
             scores[name] = {"output": str(folder), **_print_scores(title, result, truth), "seconds": seconds}
             page = f", or in the browser: mereo view {folder}" if result.taken else ""
             print(f"{len(frame.cloud)} points, {seconds:.1f} s; look at {folder / 'report.html'}{page}\n")
-        print("" if has_network() else f"{WITHOUT}\n", end="")
-        print(f"All in {time.perf_counter() - began:.0f} s.\n\n{NEXT}")
+        if not has_network():
+            print("PyTorch is not installed, so nothing is shown of networks, which start the fit at once:")
+            print("run pip install 'mereo[network]' and this again.\n")
+        print(f"All in {time.perf_counter() - began:.0f} s.\n{NEXT}")
         return Outcome(scores)
 
 
@@ -103,23 +101,16 @@ def _inputs(output: Path) -> "Iterator[tuple[str, str, Object, SensorFrame, Trut
 
 def _print_scores(title: str, result: "Result", truth: "TruthGrid") -> dict[str, float | None]:
     """Print IoU and volume of each segment, and return IoU and mIoU."""
-    from rich.console import Console
-    from rich.table import Table
-
     from mereo.cli.reconstruct import print_source
     from mereo.geometry.metrics import grid_confusion, intersection_over_union, labels_on
     from mereo.visualization.units import Unit
 
     confusion = grid_confusion(truth, labels_on(result.surfaces, truth.grid), len(result.names))
     scores, unit = intersection_over_union(confusion), Unit(result.unit_m)
-    table = Table(title=title, title_justify="left")
-    for column in ("segment", "IoU with the truth", f"volume ({unit.volume_name})"):
-        table.add_column(column, justify="left" if column == "segment" else "right")
+    print(title)
     for segment, iou in zip(result, scores.per_segment, strict=True):
-        table.add_row(segment.name, f"{iou:.3f}", unit.volume(segment.volume))
-    table.add_section()
-    table.add_row("all as one (IoU)", f"{scores.iou:.3f}", "")
-    table.add_row("mean of segments (mIoU)", f"{scores.miou:.3f}", "")
-    Console(markup=False, emoji=False).print(table)
+        volume = f"{unit.volume(segment.volume)} {unit.volume_name}"
+        print(f"  {segment.name:<12} IoU with the truth {iou:.3f}, volume {volume}")
+    print(f"  all as one (IoU) {scores.iou:.3f}, mean of segments (mIoU) {scores.miou:.3f}")
     print_source(result)
     return {"iou": scores.iou, "miou": scores.miou}

@@ -71,7 +71,6 @@ PlaceOption = Annotated[
 """Local path or URL of an object storage, of which ``Path`` would make s3:/bucket."""
 
 SceneName = Annotated[Positional[str], arg(metavar="SCENE")]
-SceneNameOrNone = Annotated[Positional[str], arg(metavar="[SCENE]", help_behavior_hint="")]
 ObjectFiles = Annotated[
     Positional[tuple[Path, ...]], arg(metavar="OBJECT [OBJECT ...]", help_behavior_hint="(required)")
 ]
@@ -83,9 +82,6 @@ InputOrNone = Annotated[Positional[Path | None], arg(metavar="[INPUT]", help_beh
 InputName = Annotated[Positional[str], arg(metavar="INPUT")]
 ScanCloud = Annotated[Positional[Path], arg(metavar="SCAN")]
 AssetNames = Annotated[Positional[tuple[str, ...]], arg(metavar="[ASSET ...]", help_behavior_hint="")]
-
-METAVARS = ("SCENE", "OBJECT", "DATASET", "WEIGHTS", "INPUT", "SCAN", "ASSET")
-"""The words; an experiment is chosen from a list, which is shown in the place of one."""
 
 MeshUnits = Literal["mm", "cm", "m", "in"] | None
 """Unit of meshes; None guesses."""

@@ -1,50 +1,59 @@
-"""``mereo reconstruct``: one frame of a sensor to a folder of results.
+"""``mereo reconstruct``: frames of a sensor, with one model, to a folder of results each.
 
 SensorFrame -reconstruct_frame-> Result, its files in a folder, and what is printed of it
 """
 
-from collections.abc import Sequence
+import io
+import os
+import sys
+import time
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, redirect_stdout
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
 
 from mereo.api.objects import Object
 from mereo.api.reconstruct import reconstruct_observation
 from mereo.api.result import Pose, Result, registration_of
+from mereo.api.words import option_words
 from mereo.cli.answers import ReconstructCommand
-from mereo.cli.options import check_named, files_read, loaded_object, options_of
+from mereo.cli.options import NOT_RECOGNIZED, Outcome, check_named, files_read, loaded_object, options_of
+from mereo.cli.stream import frame_error, frames_in
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.carry import Placed, carry, place
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.radii import describe_level
 from mereo.geometry.symmetry import describe_symmetries
-from mereo.io.atomic_files import new_directory, write_json
+from mereo.io.atomic_files import MARKER, check_new_directory, check_place, new_directory, write_json
 from mereo.io.attachments import Attachment, read_attachments
-from mereo.io.config import CONFIG
-from mereo.io.progress import shown_stages, stage
+from mereo.io.config import CONFIG, InputConfig
+from mereo.io.progress import duration, shown_stages, stage
 from mereo.io.readers import read_pose
+from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.io.writers.formats import chosen_formats
-from mereo.io.writers.meshes import write_explained_ply
-from mereo.io.writers.volumes import MM_PER_M
 from mereo.models.config import InferenceConfig
 from mereo.models.trained import Trained
-from mereo.reconstruction.observation import find_object
+from mereo.reconstruction.observation import FrameWarning, find_object
 from mereo.scenes.registry import files_of
-from mereo.visualization.reconstruction_report import UNEXPLAINED, describe_shares, mark_colors, point_marks
-from mereo.visualization.report_words import confidence_title
-from mereo.visualization.result_files import write_answer
+from mereo.visualization.reconstruction_report import confidence_title
+from mereo.visualization.result_files import summary_of, write_answer
 from mereo.visualization.units import Unit, rounded
+from mereo.workers.spread import Cluster, spread
 
-EXPLAINED = "explained"
-"""Folder within a folder of results that holds the observed points of each explanation."""
+Summary = Mapping[str, Any]
+"""Content of a summary.json."""
 
 
 @dataclass(frozen=True)
@@ -71,9 +80,8 @@ class FrameJob:
             raise ValueError(
                 f"--carry-frame is {command.carry_frame!r} and nothing is carried: name a file with --carry"
             )
-        for option, needs in (("carry", "along which things move"), ("explain", "whose fit is explained")):
-            if getattr(command, option) and command.method == "network":
-                raise ValueError(f"--method is network, but --{option} needs a registration, {needs}: use auto")
+        if command.carry and command.method == "network":
+            raise ValueError("--method is network, but --carry needs a registration, along which things move: use auto")
         _ = self.attachments, self.initial_pose  # raises for those that cannot be read
 
     @property
@@ -125,13 +133,8 @@ class FrameJob:
 def reconstruct_file(input: str | Path, output: str | Path, job: FrameJob) -> Result:
     """Read one frame of a sensor, reconstruct it, write a new directory, print what was found.
 
-    Args:
-        input: a depth image, a point cloud or a ROS recording.
-        output: folder to create.
-        job: everything else.
-
     Warns with ``SizeWarning`` where what is seen cannot be the object. Raises as ``FrameJob.check``, ``read_frame``,
-    ``find_object`` and ``reconstruct`` do, and ``ValueError`` for ``carry`` and ``explain`` without a registration.
+    ``find_object`` and ``reconstruct`` do, and ``ValueError`` for ``carry`` without a registration.
     """
     job.check()
     with shown_stages(), new_directory(output, job.command.force, [input, *job.read]) as directory:
@@ -150,7 +153,6 @@ def reconstruct_frame(frame: SensorFrame, directory: Path, job: FrameJob, path: 
     seen = replace(find_object(frame, command.isolation), initial_pose=job.initial_pose)
     print(seen)
     placed = job.placed  # what is carried is refused before the work
-    targets = [target_of(text, job.object.names) for text in command.explain]
     result = reconstruct_observation(
         seen,
         job.object,
@@ -170,10 +172,226 @@ def reconstruct_frame(frame: SensorFrame, directory: Path, job: FrameJob, path: 
         print(each.description)
     with stage("write the files"):
         write_answer(directory, result, command.files, carried)
-    factor = MM_PER_M * result.seen.frame.metres if command.files.millimetres else 1.0
-    explain(result.registered, targets, directory, result.seen.cloud.points, factor, unit)
     write_json(directory / CONFIG, {**options_of(command, "reconstruct"), "inputs": [str(path)]})
     return result
+
+
+# --- several frames ---------------------------------------------------------------------------------------------------
+
+
+def reconstruct_inputs(inputs: Sequence[Path], output: Path, job: FrameJob, cluster: Cluster | None = None) -> Outcome:
+    """Reconstruct one frame into ``output``, or several, or folders of them, into ``output``/NAME each.
+
+    Several are tasks of ``cluster``, where one is given; ``ValueError`` for a single one then.
+
+    Raises as ``reconstruct_file`` does for one frame; for several as ``reconstruct_frames``.
+    """
+    if not inputs:
+        raise ValueError("no input is given; name a frame, several, or a folder of them: mereo reconstruct FRAME ...")
+    if len(inputs) > 1 or is_folder_of_frames(inputs[0]):
+        return reconstruct_frames(list_frames(inputs, job.command.reading), output, job, cluster)
+    if cluster is not None:
+        raise ValueError("--ray is for several frames, each of which is a task: name more, or leave it out")
+    result = reconstruct_file(inputs[0], output, job)
+    facts = {"output": str(output), **summary_of(result)}
+    return Outcome(facts, NOT_RECOGNIZED if result.known is False else 0)
+
+
+def is_folder_of_frames(path: Path) -> bool:
+    """Whether a path is a folder of frames, and not the folder that a ROS 2 recording is."""
+    return path.is_dir() and not is_recording(path)
+
+
+def list_frames(inputs: Sequence[Path], reading: InputConfig) -> list[Path]:
+    """Files of inputs and of the folders among them, each once; ``ValueError`` for a folder without frames."""
+    files = [file for path in inputs for file in (frames_in(path, reading) if is_folder_of_frames(path) else [path])]
+    return list({file.resolve(): file for file in files}.values())
+
+
+def folder_names(files: Sequence[Path]) -> list[str]:
+    """Name of each frame's folder of results: its file's without the suffix, with as much more as tells all apart.
+
+    Raises ``ValueError`` where no name does, because files of one name lie in folders of one name.
+    """
+    kinds: tuple[Callable[[Path], str], ...] = (
+        lambda file: file.stem,
+        lambda file: file.name,
+        lambda file: f"{file.resolve().parent.name}-{file.name}",
+    )
+    for kind in kinds:
+        names = [kind(file) for file in files]
+        twice, count = Counter(name.casefold() for name in names).most_common(1)[0]  # some systems ignore case
+        if count == 1:
+            return names
+    alike = [str(file) for file, name in zip(files, names, strict=True) if name.casefold() == twice]
+    raise ValueError(f"{alike[0]} and {alike[1]} would both be written to {names[0]!r}: reconstruct them one at a time")
+
+
+def reconstruct_frames(files: Sequence[Path], output: Path, job: FrameJob, cluster: Cluster | None = None) -> Outcome:
+    """Reconstruct each file into ``output``/NAME, print a table at the end; a bad frame is said and passed over.
+
+    Raises ``ValueError`` at the end where a frame could not be answered, and before the work as ``FrameJob.check`` and
+    loading do; ``FileExistsError`` where ``output`` is itself a folder of results.
+    """
+    frames = [(file, output / name) for file, name in zip(files, folder_names(files), strict=True)]
+    check_place(output, may_be_link=True)
+    if output.exists() and not output.is_dir():
+        raise FileExistsError(f"{output} is a file; a folder for each frame is written there: choose another --output")
+    if (output / MARKER).exists():
+        raise FileExistsError(
+            f"{output} is a folder of results; each frame gets a folder of its own in --output: choose another"
+        )
+    job.check()
+    _ = job.object, job.placed  # what is wrong with them is no frame's fault
+    summaries: dict[Path, Summary | None] = {}
+    started = time.monotonic()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("always", category=FrameWarning)  # for each frame, also in the same words
+        alone = ((file, partial(_reconstruct_alone, file, folder, job)) for file, folder in frames)
+        for file, finish in alone if cluster is None else _answer_in_tasks(frames, job, cluster):
+            answered = sum(summary is not None for summary in summaries.values())  # bad frames take no time
+            left_s = (time.monotonic() - started) / max(answered, 1) * (len(files) - len(summaries))
+            left = f", {duration(left_s)} left" if answered else ""
+            print(f"\n[{len(summaries) + 1}/{len(files)}] {file}{left}", flush=True)
+            try:
+                summaries[file] = finish()
+            except Exception as problem:
+                if os.environ.get("MEREO_TRACEBACK") == "1":
+                    raise
+                print(f"mereo: error: {frame_error(problem, file.name)}", file=sys.stderr, flush=True)
+                summaries[file] = None
+    _print_table(frames, summaries, output)
+    if failed := list(summaries.values()).count(None):
+        raise ValueError(
+            f"{failed} of {len(files)} frames could not be reconstructed, each for the reason given with it; the "
+            "others are written: correct them, and name only those again"
+        )
+    results = [{"output": str(folder), **(summaries[file] or {})} for file, folder in frames]
+    unknown = any(summary["recognition"]["known"] is False for summary in results)
+    return Outcome({"output": str(output), "frames": results}, NOT_RECOGNIZED if unknown else 0)
+
+
+def _reconstruct_alone(file: Path, folder: Path, job: FrameJob) -> Summary:
+    return summary_of(reconstruct_file(file, folder, job))
+
+
+def _print_table(frames: Sequence[tuple[Path, Path]], summaries: Mapping[Path, Summary | None], output: Path) -> None:
+    """Of each frame: who answers, what the registered model explains, whether the frame shows the object, seconds."""
+    print()
+    table = Table(title=f"{len(frames)} frames, results in {output}", title_justify="left")
+    table.add_column("frame")
+    table.add_column("answer")
+    for column in ("explained", "known", "segments", "seconds"):
+        table.add_column(column, justify="right")
+    table.add_column("folder", overflow="fold")
+    for file, folder in frames:
+        summary = summaries[file]
+        if summary is None:
+            table.add_row(file.name, "none")
+            continue
+        fit, segments = summary.get("registration", {}), summary["segments"]
+        table.add_row(
+            file.name,
+            "registered model" if fit.get("answer") == "registration" else "network",
+            f"{fit['explained']:.1%}" if "explained" in fit else "",
+            {True: "yes", False: "no", "unsure": "unsure"}[summary["recognition"]["known"]],
+            f"{sum(segment['voxels'] > 0 for segment in segments)} of {len(segments)}",
+            f"{sum(summary['timings_s'].values()):.1f}",
+            folder.name,
+        )
+    Console(markup=False, emoji=False).print(table)
+
+
+# On a cluster each frame is a task: it is read here and its files come back as bytes, so nodes need to see neither.
+
+
+@dataclass(frozen=True, eq=False)
+class _Answered:
+    """What a task sends back: the summary, files by their path in the folder, what it printed and warned of."""
+
+    summary: Summary
+    files: dict[str, bytes]
+    printed: str
+    warned: list[str]
+
+
+Read = tuple[Path, Path, SensorFrame | Exception]
+"""Frame on its way to a task: its file, the folder of its results, and its content, or why it has none."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Answering:
+    """Answers frames in a task, with the weights on a GPU of its own or none; ``job`` has all that they share."""
+
+    job: FrameJob
+    gpu: bool
+
+    @cached_property
+    def moved(self) -> FrameJob:
+        """The job with its weights on the task's device, moved there once."""
+        if self.job.object.network is None or not self.gpu:
+            return self.job
+        from mereo.models.weights import to_gpu
+
+        return self.job.asking(to_gpu(self.job.object.network))
+
+    def __call__(self, frame: Read) -> _Answered | Exception:
+        path, _, content = frame
+        if isinstance(content, Exception):
+            return content
+        with (
+            option_words(),
+            TemporaryDirectory() as name,
+            redirect_stdout(io.StringIO()) as printed,
+            warnings.catch_warnings(record=True) as warned,
+        ):
+            warnings.simplefilter("always", FrameWarning)
+            folder = Path(name)
+            result = reconstruct_frame(content, folder, self.moved, path.absolute())
+            print_segments(result)
+            files = {
+                file.relative_to(folder).as_posix(): file.read_bytes() for file in folder.rglob("*") if file.is_file()
+            }
+        texts = [str(warning.message) for warning in warned if issubclass(warning.category, FrameWarning)]
+        return _Answered(summary_of(result), files, printed.getvalue(), texts)
+
+
+def _answer_in_tasks(
+    frames: Iterable[tuple[Path, Path]], job: FrameJob, cluster: Cluster
+) -> Iterator[tuple[Path, Callable[[], Summary]]]:
+    """Answer frames in tasks of a cluster; yields each as it is there, in any order."""
+    if job.object.network is not None:
+        from mereo.models.weights import to_cpu
+
+        job = job.asking(to_cpu(job.object.network, cluster))
+    if job.registrar is not None:
+        job.registrar.prepare()  # once, here, and not in every task
+
+    def read(path: Path, folder: Path) -> Read:
+        try:
+            check_new_directory(folder, job.command.force, [path, *job.read])
+            return path, folder, read_frame(path, job.command.reading)
+        except Exception as problem:
+            return path, folder, problem
+
+    work, contents = _Answering(job, cluster.gpus > 0), (read(*frame) for frame in frames)
+    with closing(spread(work, contents, cluster, lambda _, error: error)) as answers:
+        for (path, folder, _), answered in answers:
+            yield path, partial(_write_answer, path, folder, answered, job)
+
+
+def _write_answer(path: Path, folder: Path, answered: _Answered | Exception, job: FrameJob) -> Summary:
+    if isinstance(answered, Exception):
+        raise answered
+    print(answered.printed, end="")
+    for text in answered.warned:
+        warnings.warn(text, FrameWarning, stacklevel=2)
+    with new_directory(folder, job.command.force, [path, *job.read]) as directory:
+        for name, content in answered.files.items():
+            (directory / name).parent.mkdir(parents=True, exist_ok=True)
+            (directory / name).write_bytes(content)
+    print(written(folder, sum(answered.summary["timings_s"].values())), flush=True)
+    return answered.summary
 
 
 # --- what is printed --------------------------------------------------------------------------------------------------
@@ -219,8 +437,6 @@ def print_uncertainty(registered: Registration | None, unit: Unit) -> None:
 def print_segments(result: Result) -> None:
     """Print a table of the segments, and a line of the stages' seconds."""
     reconstruction, seen, unit = result.reconstruction, result.seen, Unit(result.unit_m)
-    sure = None if result.registered is None else result.registered.uncertainty
-    radii = {} if sure is None else {segment.name: segment.centroid_radius95 for segment in sure.segments}
     table = Table(title=f"{seen.frame.source}, {len(seen.cloud)} points", title_justify="left")
     table.add_column("segment")
     has_confidence = not all(np.isnan(segment.confidence) for segment in reconstruction.segments)
@@ -229,78 +445,12 @@ def print_segments(result: Result) -> None:
         table.add_column(column, justify="right")
     for segment in reconstruction.segments:
         # the radius gives the digits; it is in the report, and would break the lines of 80 columns
-        centroid = unit.place(segment.centroid, radii.get(segment.name)).partition(" ±")[0]
+        centroid = unit.place(segment.centroid, result[segment.name].error_radius).partition(" ±")[0]
         confidence = [f"{segment.confidence:.2f}"] if has_confidence else []
         row = (unit.volume(segment.volume), *confidence, str(segment.components), centroid)
         table.add_row(segment.name, *(row if segment.voxels else ("0", "not found", "0", "")))
-    console = Console(markup=False, emoji=False)
-    console.print(table)
+    Console(markup=False, emoji=False).print(table)
     stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in reconstruction.timings_s.items())
-    console.print(f"seconds: {stages}", highlight=False, soft_wrap=True)
+    print(f"seconds: {stages}")
     if reconstruction.clipped:
-        console.print("a segment reaches out of the largest box and is closed there: check the cloud and the weights")
-
-
-# --- what decides a position ------------------------------------------------------------------------------------------
-
-Target = str | Float[np.ndarray, "3"]
-"""What is to be explained: the name of a segment, or a position in the input's frame and unit."""
-
-
-def target_of(text: str, names: Sequence[str]) -> Target:
-    """Target of an option's text; raises ``ValueError`` for what is neither a segment nor a position."""
-    if text in names:
-        return text
-    try:
-        position = np.array([float(part) for part in text.split(",")])
-    except ValueError:
-        position = np.empty(0)
-    if len(position) != 3 or not np.isfinite(position).all():
-        raise ValueError(
-            f"--explain is {text!r}; it must be a segment ({', '.join(names)}) or a place x,y,z in the input's frame "
-            "and unit, such as --explain=0.1,-0.02,0.8"
-        )
-    return position
-
-
-def explain(
-    registered: Registration | None,
-    targets: Sequence[Target],
-    directory: Path,
-    points: Float[np.ndarray, "n 3"],
-    factor: float,
-    unit: Unit,
-) -> None:
-    """Print a line for each target, and write the observed points coloured by how much they decide it.
-
-    Args:
-        registered: in the input's frame; None raises ``ValueError`` where there are targets.
-        targets: what is to be explained.
-        directory: of the results.
-        points: observed ones, in the input's frame and unit.
-        factor: from the input's unit to that of the file.
-        unit: of the lengths that are printed.
-    """
-    for number, target in enumerate(targets, 1):
-        if registered is None or registered.uncertainty is None:
-            raise ValueError(
-                "the network's answer is kept, but --explain needs a registration, whose fit is explained: leave out "
-                "of the cloud what is not the object, or take the registered model in any case with --method modes"
-            )
-        sure, names = registered.uncertainty, registered.model.rest.names
-        if isinstance(target, str):
-            title, radius = f"the centre of {target}", sure.segments[names.index(target)].centroid_radius95
-        else:
-            radii = registered.radius95(target[None], at="camera")
-            assert radii is not None
-            title, radius = "the object's point", float(radii[0])
-        explanation = registered.explain(target)
-        assert explanation is not None
-        position = f"{unit.place(explanation.place, radius)} {unit.length_name} ({describe_level(sure.calibrated)})"
-        text = f"{title} is at {position}; what leaves it unsure: {describe_shares(explanation)}"
-        lost = len(explanation.unexplained)
-        print(f"{text}; {lost} points are not the model's" if lost else text)
-        marks = point_marks(explanation, points)
-        (directory / EXPLAINED).mkdir(exist_ok=True)
-        path = directory / EXPLAINED / f"{number}.ply"
-        write_explained_ply(path, factor * points, mark_colors(marks), marks == UNEXPLAINED, text)
+        print("a segment reaches out of the largest box and is closed there: check the cloud and the weights")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
 
-from mereo.cli.options import AssetNames, MeshUnits, ObjectFiles, SceneName, SceneNameOrNone
+from mereo.cli.options import AssetNames, MeshUnits, ObjectFiles, SceneName
 from mereo.io.bounds import Aperture, CountOrNone, States
 from mereo.synthesis.config import SENSORS, Sensor, SequenceConfig
 
@@ -93,19 +93,17 @@ class SceneCheck:
 
 @dataclass(frozen=True)
 class ScenePreview:
-    """Draw nine random states of a scene, each with its camera and depth image; or all built-in scenes on one sheet.
+    """Draw nine random states of a scene, each with its camera and depth image.
 
     Attributes:
-        output: the picture, a PNG file.
         scene: a name from `mereo scene list`, or a scene file of your own (.yaml, .py).
-        all: draw every built-in scene: at rest, two random states and a depth image.
+        output: the picture, a PNG file.
         seed: another seed shows other states.
         force: replace an existing file, unless the scene is read from it.
     """
 
+    scene: SceneName
     output: Path
-    scene: SceneNameOrNone = ""
-    all: bool = False
     seed: CountOrNone = 0
     force: bool = False
 
@@ -113,50 +111,29 @@ class ScenePreview:
         """Write the picture of random states."""
         from mereo.io.atomic_files import atomic_file, check_file_place
         from mereo.scenes.registry import files_of, load_scene
-        from mereo.visualization.previews import preview_all, preview_scene
+        from mereo.visualization.previews import preview_scene
 
         check_file_place(self.output, force=self.force)
-        if self.all == bool(self.scene):
-            given = f"both {self.scene!r} and --all are" if self.all else "neither a scene nor --all is"
-            raise ValueError(f"{given} given; one of them is needed: name a scene, or give --all")
-        read = files_of(self.scene or "rope")  # of all built-in scenes these are the same: the assets
-        with atomic_file(self.output, force=self.force, inputs=read) as partial:
-            if self.all:
-                preview_all(partial, self.seed)
-            else:
-                preview_scene(load_scene(self.scene), partial, self.seed)
+        with atomic_file(self.output, force=self.force, inputs=files_of(self.scene)) as partial:
+            preview_scene(load_scene(self.scene), partial, self.seed)
         print(f"wrote {self.output}")
 
 
 @dataclass(frozen=True)
 class SceneModes:
-    """Draw the modes in which an object deforms, and say how many its states need.
+    """Say how many modes an object's states need.
 
     Attributes:
         scene: a name from `mereo scene list`, a scene file of your own (.yaml, .py), or weights that carry a model
             (.safetensors).
-        output: the picture, a PNG file; without it only the numbers are printed.
         states: random states from which the model of a scene is built.
-        force: replace an existing file, unless the scene or the weights are read from it.
     """
 
     scene: SceneName
-    output: Path | None = None
     states: States = 1500
-    force: bool = False
 
     def run(self) -> None:
-        """Print how many modes are needed, and write the picture."""
-        from mereo.io.atomic_files import atomic_file, check_file_place
-        from mereo.io.extras import CURE, has_plots
-        from mereo.scenes.registry import files_of
-        from mereo.visualization.previews import preview_modes
-
-        check_file_place(self.output, force=self.force)
-        if self.output is not None and self.output.suffix.lower() != ".png":
-            raise ValueError(
-                f"{self.output} has the suffix {self.output.suffix!r}; the picture is a PNG file: rename it"
-            )
+        """Print how many modes are needed."""
         name, model = self._model()
         print(f"{name}: {model.count} modes of {len(model.library)} states, and what they leave of an unseen one (rms)")
         for share in SHARES:
@@ -171,12 +148,6 @@ class SceneModes:
             if count is None
             else f"{count} modes leave at most {ENOUGH} units, the noise of the paper's sensor"
         )
-        if self.output is not None:
-            with atomic_file(self.output, force=self.force, inputs=files_of(self.scene)) as partial:
-                preview_modes(model, partial, name)
-            print(f"wrote {self.output}")
-            if not has_plots():
-                print(f"its plot is left out, for matplotlib {CURE}")
 
     def _model(self) -> "tuple[str, StatisticalModel]":
         """Name and statistical model of a scene, or those that weights carry."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from mereo.cli.options import ScanCloud
-from mereo.io.bounds import Count, CountOrNone, PositiveOrUnknown, Threads, Workers
+from mereo.io.bounds import Count, PositiveOrUnknown, Threads, Workers
 from mereo.io.cores import workers_for
 from mereo.models.config import Device, Precision
 from mereo_experiments.paper.scales import ExperimentName, ScaleName
@@ -122,20 +122,13 @@ def print_placement(placement: "Placement", title: str, mm: float) -> None:
         by = segment.placed_by if segment.seen else f"unseen: {segment.placed_by}"
         motion = f"{mm * segment.shift:.2f}", f"{segment.turn_deg:.1f}"
         table.add_row(segment.name, by, str(segment.points), *fit, *motion, str(segment.held or ""))
-    console = Console(markup=False, emoji=False)
-    console.print(table)
-    console.print(
-        f"{placement.explained:.1%} of the scan lies within {mm * placement.limit:.3g} mm of the placed segments",
-        highlight=False,
-        soft_wrap=True,
-    )
+    Console(markup=False, emoji=False).print(table)
+    print(f"{placement.explained:.1%} of the scan lies within {mm * placement.limit:.3g} mm of the placed segments")
     for segment in placement.segments:
         if segment.held:
-            console.print(
+            print(
                 f"{segment.name}: the scan leaves {segment.held} of 6 directions open (it could turn or slide); there "
-                "it stays where it was placed together with the others",
-                highlight=False,
-                soft_wrap=True,
+                "it stays where it was placed together with the others"
             )
 
 
@@ -187,8 +180,7 @@ class BenchCommand:
         device: where the network runs, auto on a CUDA device where there is one; preprocessing is always on the CPU.
         precision: of the network's products; auto takes bfloat16 on CUDA and on CPUs that are much faster in it.
         repeats: of each stage.
-        rival: time the straightforward implementation too (minutes on a CPU), and check that it gives the same labels.
-        busy: processes that never rest, beside which 40,000 queries are timed again on a CPU; 0 leaves that out.
+        rival: time the straightforward implementation too (minutes on a CPU), and say what share of labels differ.
         threads: of torch and all else that computes; 0 means one per core.
         output: a JSON file for the figures.
         force: replace an existing file, unless the weights are read from it.
@@ -200,7 +192,6 @@ class BenchCommand:
     precision: Precision = "float32"
     repeats: Count = 7
     rival: bool = False
-    busy: Annotated[CountOrNone, arg(name="beside")] = 1
     threads: Threads = 0
     output: Path | None = None
     force: bool = False
@@ -214,7 +205,7 @@ class BenchCommand:
         if self.output is not None:
             check_file_place(self.output, force=self.force, inputs=[self.weights] if self.weights else [])
         device = find_device(self.device)
-        measured = benchmark(self.weights, self.preset, device, self.precision, self.repeats, self.rival, self.busy)
+        measured = benchmark(self.weights, self.preset, device, self.precision, self.repeats, self.rival)
         measured.print()
         if self.output is not None:
             measured.write(self.output, self.force)
@@ -226,9 +217,8 @@ class BenchCommand:
 PURPOSES: dict[str, str] = {
     "network": "weights: training them, and fits that start from them",
     "view": "the pages of `mereo view`",
-    "rerun": "streams as Rerun recordings",
     "track": "training curves in TensorBoard",
-    "plots": "curves of training runs, charts of experiments and of modes",
+    "plots": "curves of training runs, charts of experiments",
     "onnx": "networks for other runtimes",
     "cad": "3MF files",
     "medical": "NIfTI and NRRD volumes",

@@ -117,7 +117,8 @@ def select_object(
         keep, detail = step(points)
         left = int(keep.sum())
         if left < MIN_POINTS:
-            corners = " to ".join(_numbers(corner * unit_m) for corner in (points.min(axis=0), points.max(axis=0)))
+            box = unit_m * np.stack([points.min(axis=0), points.max(axis=0)])
+            corners = " to ".join(f"({', '.join(f'{value:.3g}' for value in corner)})" for corner in box)
             raise ValueError(
                 f"the step {name!r} leaves {left} of {len(points)} points, which reach from {corners} m; the object "
                 f"needs at least {MIN_POINTS}: {CURES[name]}"
@@ -141,10 +142,6 @@ CURES = {
     "largest cluster": "leave out --largest-cluster, or crop with --box first",
 }
 """Advice for each step that leaves too little."""
-
-
-def _numbers(position: Float[np.ndarray, "3"]) -> str:
-    return f"({', '.join(f'{value:.3g}' for value in position)})"
 
 
 def _steps(config: IsolationConfig, unit_m: float, frame: CloudAxes) -> Iterator[tuple[str, Step]]:
@@ -232,7 +229,7 @@ def _largest_cluster(points: Float[np.ndarray, "n 3"], gap: float) -> Keep:
 
 # --- planes -----------------------------------------------------------------------------------------------------------
 
-# The largest plane of a cloud, by random sample consensus (Fischler, Bolles, CACM 1981) and least squares.
+# By random sample consensus (Fischler, Bolles, CACM 1981) and least squares.
 
 TRIALS = 600
 """Planes tried; one that holds a fifth of the points is missed once in a hundred clouds, one with a third never."""
@@ -280,17 +277,16 @@ def largest_plane(
     normals, offsets = _through(points[rng.integers(0, len(points), (TRIALS, 3))])
     if len(normals) == 0:
         return None
-    counts = np.concatenate(
-        [
-            (np.abs(judging @ normals[i : i + BATCH].T - offsets[i : i + BATCH]) <= allowed).sum(axis=0)
-            for i in range(0, len(normals), BATCH)
-        ]
-    )
-    best = int(counts.argmax())
+    batches = [slice(start, start + BATCH) for start in range(0, len(normals), BATCH)]
+    counts = [(np.abs(judging @ normals[each].T - offsets[each]) <= allowed).sum(axis=0) for each in batches]
+    best = int(np.concatenate(counts).argmax())
     plane = Plane(normals[best], float(offsets[best]))
-    for _ in range(REFINEMENTS):
-        near = plane.distance(points) <= tolerance
-        plane = _fit(points, near, plane)
+    for _ in range(REFINEMENTS):  # by least squares through the points near it
+        kept = points[plane.distance(points) <= tolerance]
+        if len(kept) >= 3:
+            center = kept.mean(axis=0)
+            normal = np.linalg.eigh(np.cov((kept - center).T))[1][:, 0]
+            plane = Plane(normal, float(normal @ center))
     return plane
 
 
@@ -303,25 +299,12 @@ def _through(triples: Float[np.ndarray, "t 3 3"]) -> tuple[Float[np.ndarray, "u 
     return normals, np.einsum("ti,ti->t", normals, triples[proper, 0])
 
 
-def _fit(points: Float[np.ndarray, "n 3"], near: Bool[np.ndarray, " n"], plane: Plane) -> Plane:
-    """Least squares through the points near ``plane``."""
-    if near.sum() < 3:
-        return plane
-    center = points[near].mean(axis=0)
-    normal = np.linalg.eigh(np.cov((points[near] - center).T))[1][:, 0]
-    return Plane(normal, float(normal @ center))
-
-
 # --- outlier clusters -------------------------------------------------------------------------------------------------
 
-# Strays: points of a frame that are not the object's, dropped where the cloud itself shows that they are none.
-#
-#     PointCloud -readings-> the reading to take, and the other one where the cloud leaves it open
-#
 # A mask that is wrong by a pixel leaves a rim of background in the cloud, and cameras add points between both. They are
 # few, but the network's frame is the cloud's box, which one of them moves. Geometry alone cannot tell a rim from a thin
 # part of the object that something hides the root of; so where it matters there are two readings, and whoever knows
-# more of the object may choose. Measured in docs/design/0006-sensors.md.
+# more of the object may choose (docs/design/0006-sensors.md).
 
 SCATTERED = 4
 """Patches from which on what lies off all surfaces is taken for strays without further evidence.
@@ -384,11 +367,6 @@ class Reading:
         return f"{dropped} times as long with them (--keep-all keeps them)"
 
 
-def as_cloud(points: PointCloud | Float[np.ndarray, "n 3"]) -> PointCloud:
-    """Cloud of points; raises ``ValueError`` where they are not finite."""
-    return points if isinstance(points, PointCloud) else PointCloud(np.asarray(points, dtype=np.float64))
-
-
 def readings(
     cloud: PointCloud | Float[np.ndarray, "n 3"], axes: CloudAxes = "camera", keep_all: bool = False
 ) -> tuple[Reading, ...]:
@@ -405,7 +383,7 @@ def readings(
 
     Raises ``ValueError`` for points that are not finite.
     """
-    seen = as_cloud(cloud)
+    seen = cloud if isinstance(cloud, PointCloud) else PointCloud(np.asarray(cloud, dtype=np.float64))
     everything = Reading.of_all(seen)
     if keep_all or len(seen) < MIN_POINTS:
         return (everything,)

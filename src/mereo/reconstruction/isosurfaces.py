@@ -19,8 +19,6 @@ from mereo.geometry.mesh import Color, Segment, SegmentedMesh
 
 # --- coarse to fine ---------------------------------------------------------------------------------------------------
 
-# Labels of a field on a dense grid, from evaluations coarse to fine: the same at a fraction of the cost.
-#
 # Every ``COARSE``-th node is evaluated; cells that may hold a change of label are halved until one step wide; all
 # other nodes take the label of the cell they lie in. Which cells may hold one?
 #

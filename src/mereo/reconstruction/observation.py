@@ -1,8 +1,6 @@
 """The object in one frame of a sensor: what a reconstruction starts from.
 
-    SensorFrame -find_object-> Observation (the object's points, and what each step left out)
-
-Frames are read by ``mereo.io.sensor_frame``.
+SensorFrame -find_object-> Observation (the object's points, and what each step left out)
 """
 
 from collections.abc import Mapping
@@ -30,14 +28,11 @@ from mereo.reconstruction.isolation import IsolationStep, Reading, Selection, cl
 SIZE_FACTOR = 2.0
 """Times that a visible part may be smaller or larger than any in training; beyond, it is another object or unit."""
 
-
 CLOUD = Path("cloud")
 """Name of a frame that comes from no file."""
 
-
 STRAIGHT = 1e-6
 """Spread of points across a line, in that along it, up to which they say nothing of a surface; fits take minutes to."""
-
 
 LIKE_SIZE, APART = 0.4, 0.25
 """Points of a second cluster, in those of the largest, and its distance from that, in its own size, from which on both
@@ -233,13 +228,9 @@ def clusters_warning(observation: Observation) -> str | None:
 
 # --- lines of sight ---------------------------------------------------------------------------------------------------
 
-# Lines of sight beside the object in one frame: which went past it, and along which nothing is known.
-#
-#     SensorFrame, Selection -lines_of_frame-> SightLines
-#
-# Depths beside the object are compared with those of the object's pixels nearest in the picture
-# (docs/registration.md). A depth image states a line of sight for each pixel, a point cloud for each point
-# that isolation left out.
+# Which of them went past the object, and along which nothing is known: depths beside it are compared with those of its
+# pixels nearest in the picture (docs/registration.md). A depth image states a line of sight for each pixel, a point
+# cloud for each point that isolation left out.
 
 MOST_LINES = 10_000
 """Number of lines of sight that are kept, at most, unless the outline alone has more."""
@@ -305,9 +296,8 @@ def lines_of_image(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SightLi
     reach = max(height, width)
     # the window may reach beyond the picture
     top, left = rows[0] - reach, columns[0] - reach
-    shape = height + 2 * reach, width + 2 * reach
-    depth, is_object = _window(whole.depth, top, left, shape), _window(shown, top, left, shape)
-    inside = _window(np.ones_like(shown), top, left, shape)
+    part = np.s_[rows[0] : rows[-1] + 1 + 2 * reach, columns[0] : columns[-1] + 1 + 2 * reach]
+    depth, is_object, inside = (np.pad(image, reach)[part] for image in (whole.depth, shown, np.ones_like(shown)))
     # nothing of the object lies outside the picture unless it reaches the edge
     cut = min(rows[0], columns[0], shown.shape[0] - 1 - rows[-1], shown.shape[1] - 1 - columns[-1]) < RIM
     distance, nearest = ndimage.distance_transform_edt(~is_object, return_indices=True)
@@ -327,18 +317,6 @@ def lines_of_image(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SightLi
         np.stack([u + left + 0.5, v + top + 0.5], axis=1), np.where(went, depth[v, u], near[v, u])
     )
     return SightLines(places[went], places[~went], None if silent else "unknown")
-
-
-def _window(
-    image: Float[np.ndarray, "h w"] | Bool[np.ndarray, "h w"], top: int, left: int, shape: tuple[int, int]
-) -> Float[np.ndarray, "a b"] | Bool[np.ndarray, "a b"]:
-    """Part of an image from a pixel on, with zeros where it reaches out of the image."""
-    cut = np.zeros(shape, dtype=image.dtype)
-    low = np.maximum([top, left], 0)
-    high = np.minimum([top + shape[0], left + shape[1]], image.shape)
-    inside = image[low[0] : high[0], low[1] : high[1]]
-    cut[low[0] - top : high[0] - top, low[1] - left : high[1] - left] = inside
-    return cut
 
 
 def _outline_depth(depth: Float[np.ndarray, "h w"], is_object: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:

@@ -23,7 +23,7 @@ from mereo.geometry.camera import PointCloud, into_camera
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
-from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
+from mereo.geometry.mesh import PALETTE, Color, SegmentedMesh
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.models.calibration import Calibration
 from mereo.models.trained import EncodedCloud, Trained, checked_points
@@ -32,7 +32,6 @@ from mereo.reconstruction.isosurfaces import Extraction, Field, extract_whole, l
 
 SEARCH_BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 2.5]])
 """Box in which segments are looked for first, normalized: the visible part fills [-1, 1], the hidden one is behind."""
-
 
 CONFIDENCE_VOXELS = 2000
 """Most voxels of a segment over which its confidence is a mean."""
@@ -274,33 +273,30 @@ def segment_points(
 
 def measure(extraction: Extraction, model: Trained | None, code: EncodedCloud | None) -> tuple[SegmentFacts, ...]:
     """Every segment of an extraction in numbers; ``code`` is what ``model`` made of the cloud, None without one."""
+    grid, measured = extraction.grid, list[SegmentFacts]()
     owned = zip(extraction.surfaces.segments, extraction.surfaces.owned_volumes, strict=True)
-    return tuple(
-        _measure(extraction.grid, label, segment, float(volume), model, code)
-        for label, (segment, volume) in enumerate(owned, start=1)
-    )
-
-
-def _measure(
-    grid: LabelGrid, label: int, segment: Segment, volume: float, model: Trained | None, code: EncodedCloud | None
-) -> SegmentFacts:
-    voxels = np.argwhere(grid.labels == label)
-    if len(voxels) == 0:
-        nothing = np.full((2, 3), np.nan)
-        return SegmentFacts(segment.name, label, 0.0, nothing[0], nothing, float("nan"), 0, 0)
-    confidence = float("nan")
-    if model is not None and code is not None:
-        chosen = random_subset(voxels, CONFIDENCE_VOXELS)
-        confidence = float(model.query(code, grid.positions(chosen)).probability[:, label].mean())
-    low, high = voxels.min(axis=0), voxels.max(axis=0) + 1
-    part = grid.labels[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
-    return SegmentFacts(
-        name=segment.name,
-        label=label,
-        volume=volume,
-        centroid=grid.positions(voxels).mean(axis=0),
-        box=segment.bounds,
-        confidence=confidence,
-        voxels=len(voxels),
-        components=int(ndimage.label(part == label)[1]),
-    )
+    for label, (segment, volume) in enumerate(owned, start=1):
+        voxels = np.argwhere(grid.labels == label)
+        if len(voxels) == 0:
+            nothing = np.full((2, 3), np.nan)
+            measured.append(SegmentFacts(segment.name, label, 0.0, nothing[0], nothing, float("nan"), 0, 0))
+            continue
+        confidence = float("nan")
+        if model is not None and code is not None:
+            chosen = random_subset(voxels, CONFIDENCE_VOXELS)
+            confidence = float(model.query(code, grid.positions(chosen)).probability[:, label].mean())
+        low, high = voxels.min(axis=0), voxels.max(axis=0) + 1
+        part = grid.labels[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+        measured.append(
+            SegmentFacts(
+                name=segment.name,
+                label=label,
+                volume=float(volume),
+                centroid=grid.positions(voxels).mean(axis=0),
+                box=segment.bounds,
+                confidence=confidence,
+                voxels=len(voxels),
+                components=int(ndimage.label(part == label)[1]),
+            )
+        )
+    return tuple(measured)

@@ -3,23 +3,18 @@
 Everything is drawn by ``mereo.visualization.renderer``, without a display.
 """
 
-import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import trimesh
 from jaxtyping import Float
-from PIL import Image
 
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.transforms import transform_points
-from mereo.io.extras import has_plots, pyplot
-from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import SCENES, Scene
+from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
-from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import View, sample_view
 from mereo.visualization.contact_sheets import (
@@ -39,25 +34,6 @@ CAMERA_VIEWS = {
     "from behind": ((0.0, 0.0, -1.0), (0.0, -1.0, 0.0)),
 }
 """Viewing direction and up of the pictures of a reconstruction, in the camera frame."""
-
-TILE_PX = 192
-"""Width and height of a picture on the sheet of all scenes: two pixels for each of the depth image."""
-
-SCENE_VIEWS: Mapping[str, tuple[Vector, Vector]] = {
-    "human": ((0.3, -0.3, -1.0), (0.0, 1.0, 0.0)),
-    "robot": ((0.9, 0.8, -0.45), (0.0, 0.0, 1.0)),
-    "bunny": ((0.3, -0.3, -1.0), (0.0, 1.0, 0.0)),
-    "lizard": ((0.3, 0.5, -1.0), (0.0, 0.0, 1.0)),
-    "rope": ((-0.3, 0.4, -1.0), (-1.0, 0.0, 0.0)),
-    "skull": ((0.35, 0.8, -0.6), (1.0, 0.0, 0.0)),
-    "engine": ((0.35, 1.0, -0.35), (0.0, 0.0, 1.0)),
-    "liver": ((0.25, 0.6, 0.6), (0.0, 1.0, 0.0)),
-    "shapes": ((0.5, 1.0, -0.6), (0.0, 0.0, 1.0)),
-    "sheet": ((0.3, 0.8, -0.75), (0.0, 0.0, 1.0)),
-    "tumor": ((0.25, 0.6, 0.6), (0.0, 1.0, 0.0)),
-    "liver-simulated": ((0.25, 0.6, 0.6), (0.0, 1.0, 0.0)),
-}
-"""Viewing direction and up from which each built-in scene is drawn on the sheet of all, in the scene's frame."""
 
 
 def render_cloud_and_segments(
@@ -178,125 +154,10 @@ def _from_side(view: View, size: int, up: Vector) -> Picture:
     return shade(shown, replace(side, half_size=1.4 * radius), (size, size))
 
 
-def _arrow(center: Float[np.ndarray, "3"], toward: Float[np.ndarray, "3"], radius: float, sides: int = 16) -> Segment:
+def _arrow(center: Float[np.ndarray, "3"], toward: Float[np.ndarray, "3"], radius: float) -> Segment:
     """A cone on a thin shaft outside the object, pointing at it along the camera's line of sight."""
-    helper = np.eye(3)[np.argmin(np.abs(toward))]
-    across = np.cross(toward, helper) / np.linalg.norm(np.cross(toward, helper))
-    angle = np.linspace(0, 2 * np.pi, sides, endpoint=False)
-    ring = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(toward, across)
-    # (distance from the centre, thickness), both in radii, from the tip to the end of the shaft
-    profile = ((0.85, 0.0), (1.03, 0.08), (1.03, 0.03), (1.35, 0.03), (1.35, 0.0))
-    vertices = np.concatenate([center + radius * (far * toward + thick * ring) for far, thick in profile])
-    row, next_row = np.arange(sides), np.roll(np.arange(sides), -1)
-    quads = [
-        (row + k * sides, next_row + k * sides, next_row + (k + 1) * sides, row + (k + 1) * sides) for k in range(4)
-    ]
-    faces = np.concatenate([np.stack(corner, axis=1) for a, b, c, d in quads for corner in ((a, b, c), (a, c, d))])
-    return Segment("camera direction", (40, 44, 52), vertices, faces)
-
-
-# --- all built-in scenes ---------------------------------------------------------------------------------------------
-
-
-def preview_all(path: str | Path, seed: int = 0) -> None:
-    """Write one sheet of all built-in scenes: each at rest, in two random states, these overlaid, and a depth image.
-
-    The first four pictures of a scene have one viewpoint and one scale; the paper's figure of scenes has the overlay as
-    its last row. The depth image is that of the second random state by a random camera. State i comes from (seed, i)
-    alone.
-
-    Raises ``AssetUnavailable`` where a scene's mesh is neither here nor to be had.
-    """
-    images: list[Picture] = []
-    captions: list[str] = []
-    for name in SCENES:
-        scene = load_scene(name)
-        images += scene_row(scene, seed)
-        words = ("random state", "another", "overlaid", "depth image of the other")
-        captions += [f"{name}, {len(scene.rest.segments)} segments", *words]
-    save_png(path, contact_sheet(images, captions, 10))
-
-
-def scene_row(scene: Scene, seed: int) -> list[Picture]:
-    """Pictures of a scene at rest, in two random states and of all three overlaid, and the second's depth image."""
-    views = [sample_view(scene, GenerateConfig(), example_rng(seed, index)) for index in (0, 1)]
-    meshes = [scene.rest, *(view.mesh.transformed(view.T_world_camera) for view in views)]
-    viewpoint = common_viewpoint(meshes, *SCENE_VIEWS[scene.name])
-    states = [shade(mesh, viewpoint, (TILE_PX, TILE_PX)) for mesh in meshes]
-    return [*states, overlaid(states), enlarge(depth_to_rgb(views[1].depth), TILE_PX)]
-
-
-def overlaid(pictures: Sequence[Picture]) -> Picture:
-    """Picture of several on white, laid over each other half transparent: each shows as much as any other."""
-    mean: Picture = np.rint(np.mean([picture.astype(float) for picture in pictures], axis=0)).astype(np.uint8)
-    return mean
-
-
-def common_viewpoint(meshes: list[SegmentedMesh], direction: Vector, up: Vector) -> Viewpoint:
-    """Orthographic viewpoint from a direction, just large enough for all meshes."""
-    points = np.concatenate([segment.vertices for mesh in meshes for segment in mesh.segments])
-    turned = Viewpoint.along(meshes[0].bounds, direction, up).T_view_world
-    seen = transform_points(turned, points)
-    low, high = seen.min(axis=0), seen.max(axis=0)
-    centered = turned.copy()
-    centered[:3, 3] -= (low + high) / 2
-    return Viewpoint(centered, half_size=1.04 * float((high - low)[:2].max()) / 2)
-
-
-# --- modes ------------------------------------------------------------------------------------------------------------
-
-SHOWN_STD = (-2.0, 0.0, 2.0)
-"""Coefficients, in standard deviations, at which a mode is drawn."""
-
-
-def preview_modes(model: StatisticalModel, path: str | Path, name: str = "", modes: int = 6, size: int = 200) -> None:
-    """Write a sheet of the largest modes, each at -2, 0 and +2 standard deviations.
-
-    Below them the residue by their number, where the extra `plots` is installed.
-
-    Args:
-        model: the statistical model.
-        path: the .png file.
-        name: of the object; a built-in scene's is drawn from its own side.
-        modes: how many are drawn at most.
-        size: width of each picture in pixels.
-    """
-    shown = min(modes, model.count)
-    states = [[_at(model, mode, std) for std in SHOWN_STD] for mode in range(shown)] or [[_at(model, 0, 0.0)]]
-    viewpoint = common_viewpoint(
-        [mesh for row in states for mesh in row], *SCENE_VIEWS.get(name, ((0.3, -0.4, -1.0), (0.0, 1.0, 0.0)))
-    )
-    images = [shade(mesh, viewpoint, (size, size)) for row in states for mesh in row]
-    captions = [_caption(model, mode, std) for mode in range(shown) for std in SHOWN_STD] or ["does not deform"]
-    title = f"{name}: {model.count} modes leave {model.residue:.3f} units of an unseen state"
-    sheet = contact_sheet(images, captions, 2 * len(SHOWN_STD) if shown > 1 else len(images), title)
-    plotted = model.count and has_plots()
-    save_png(path, np.concatenate([sheet, _residue_plot(model, sheet.shape[1])]) if plotted else sheet)
-
-
-def _at(model: StatisticalModel, mode: int, std: float) -> SegmentedMesh:
-    z = np.zeros(model.count)
-    if model.count:
-        z[mode] = std
-    return model.mesh(model.material(z))
-
-
-def _caption(model: StatisticalModel, mode: int, std: float) -> str:
-    if std == 0.0:
-        return "mean state"
-    share = float(model.motion[mode] ** 2 / (np.sum(model.motion**2) + model.residue**2))
-    return f"mode {mode + 1} at {std:+.0f} std, {share:.1%} of the variance"
-
-
-def _residue_plot(model: StatisticalModel, width: int, height: int = 260) -> Picture:
-    """Distance that is left of a state against the number of modes, as wide as the sheet above it."""
-    plt = pyplot()
-    figure, axes = plt.subplots(figsize=(width / 100, height / 100), dpi=100, layout="constrained")
-    axes.semilogy(np.arange(model.count + 1), model.residues, color="#2563c9")
-    axes.axhline(model.residue, color="#98a2b3", linestyle=":")
-    axes.set(xlabel="modes", ylabel="left of a state, rms (units)", xlim=(0, model.count))
-    axes.grid(alpha=0.3)
-    content = io.BytesIO()
-    figure.savefig(content, format="png")
-    plt.close(figure)
-    return np.asarray(Image.open(content).convert("RGB").resize((width, height)))
+    # (thickness, distance from the centre), both in radii, from the tip to the end of the shaft
+    profile = ((0.0, 0.85), (0.08, 1.03), (0.03, 1.03), (0.03, 1.35), (0.0, 1.35))
+    cone = trimesh.creation.revolve(profile, sections=16)
+    cone.apply_transform(trimesh.geometry.align_vectors([0, 0, 1], toward))
+    return Segment("camera direction", (40, 44, 52), center + radius * cone.vertices, np.array(cone.faces))

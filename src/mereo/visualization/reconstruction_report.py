@@ -1,6 +1,8 @@
 """``report.html``: one self-contained page that shows the input cloud and the segments, offline, in any browser.
 
     Report -write-> report.html -read_report-> WrittenReport
+    summary of a result -trust-> Trust (a verdict, why, and what to do)
+                        -page_words-> all text of the page, in known units
 
 The page is ``report.html`` beside this module with its data, one line of JSON, in place of one marker. Positions are
 16-bit steps of the joint box and travel as base64, so that the page stays under ``BUDGET_BYTES``; surfaces over the
@@ -11,16 +13,16 @@ their own; what was observed is in the page alone, and is read from it as data; 
 import base64
 import io
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8, UInt16
 from PIL import Image
-from pydantic import BaseModel, Field, FiniteFloat, ValidationError
 from scipy.spatial import cKDTree
 
 from mereo.fitting.registration.registration import Registration
@@ -28,13 +30,14 @@ from mereo.fitting.uncertainty import Explanation
 from mereo.geometry.camera import DepthImage, PointCloud
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.mesh import Color, Segment, SegmentedMesh
-from mereo.geometry.radii import STOPS, Radii, between_stops, describe_level
+from mereo.geometry.radii import STOPS, Radii, describe_level
 from mereo.geometry.subdivision import split_at_creases
 from mereo.io.atomic_files import atomic_file
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
 from mereo.io.writers.meshes import OUTER_OPACITY
-from mereo.visualization.contact_sheets import MOST_DEPTH_PX, PNG_URL, Picture, depth_data
-from mereo.visualization.report_words import Level, page_words
+from mereo.reconstruction.pipeline import SegmentFacts
+from mereo.visualization.contact_sheets import MOST_DEPTH_PX, PNG_URL, Picture, data_url, depth_data
+from mereo.visualization.previews import CAMERA_VIEWS, points_on_segments
 from mereo.visualization.units import UNKNOWN, Unit, rounded
 
 REPORT = "report.html"
@@ -62,7 +65,7 @@ class Report:
             one are drawn see-through.
         summary: what the page says in words; every key may be missing. ``title`` is text; ``segments`` is a list of
             ``{"name", "centroid" [3], "volume", "confidence" in 0..1}`` in the order of ``surfaces``; ``timings_s``
-            maps stages to seconds; of the other texts and numbers those for people are listed (``report_words``).
+            maps stages to seconds; of the other texts and numbers those for people are listed (``page_words``).
         rotation: rotation from the input's frame to the viewer's (x right, y up, z toward the viewer).
         unit: of the cloud's lengths; the page has millimetres and cubic centimetres where it is known.
         registered: the model that the last of ``surfaces`` are, in the cloud's frame, to show how sure they are.
@@ -195,6 +198,196 @@ def _same(rows: Int[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Int[np.n
     return first, inverse
 
 
+# --- trust ------------------------------------------------------------------------------------------------------------
+
+Level = Literal["yes", "doubt", "no", "unchecked", "alone"]
+
+VERDICTS: Mapping[Level, str] = {
+    "yes": "Trust it",
+    "doubt": "Doubtful",
+    "no": "Do not trust it",
+    "unchecked": "Not checked",
+    "alone": "Network alone",
+}
+"""First words of the line."""
+
+
+@dataclass(frozen=True)
+class Trust:
+    """Verdict on an answer.
+
+    Attributes:
+        level: how far it can be trusted; "alone" where no model was registered, which could tell, and "unchecked" where
+            one was, but nobody looked.
+        why: a phrase, without a full stop.
+        cure: what to do, a phrase; None where nothing is to be done, or nothing known.
+    """
+
+    level: Level
+    why: str
+    cure: str | None = None
+
+
+def trust(summary: Mapping[str, Any]) -> Trust:
+    """Verdict on the answer that a summary is of; every key of it may be missing.
+
+    Args:
+        summary: its ``recognition`` and ``registration`` are read.
+    """
+    recognition, registration = _block(summary, "recognition"), _block(summary, "registration")
+    known, reason = recognition.get("known"), recognition.get("reason") or registration.get("refusal")
+    number = _number(registration.get("explained"))
+    explained = None if number is None else f"{100 * number:.1f}\N{NO-BREAK SPACE}% of the points"
+    model_explains = "" if explained is None else f"; the model explains {explained}"
+    is_model = registration.get("answer") == "registration"
+    if known is not True and not recognition.get("signs") and not registration.get("refusal"):
+        return Trust("unchecked" if is_model else "alone", f"nothing says whether this is the object{model_explains}")
+    if known is not True:
+        # a reason is what was seen, a colon, and what to do about it
+        why, _, cure = str(reason or "it was not recognized").removesuffix(".").partition(": ")
+        if explained is not None and not is_model and "of the points" not in why:
+            why = f"{why}; the model explains only {explained}"
+        return Trust("doubt" if known == "unsure" else "no", why, cure or None)
+    if not is_model or registration.get("accepted") is False:
+        why = "the model explains too little" if explained is None else f"the model explains only {explained}"
+        return Trust("doubt", why if is_model else f"{why}, so this is the network's answer")
+    return Trust("yes", f"the frame shows the object{model_explains}")
+
+
+def _block(summary: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    value = summary.get(key)
+    return value if isinstance(value, Mapping) else {}
+
+
+def _number(value: object) -> float | None:
+    """The value as a finite number; None for everything else."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        return None
+    return float(value) if np.isfinite(value) else None
+
+
+# --- text of the page -------------------------------------------------------------------------------------------------
+
+STAGES = {
+    "encode": "reading the points",
+    "fit": "registration",
+    "locate": "finding the object",
+    "extract": "surfaces",
+    "label": "labels of the volume",
+    "points": "labels of the points",
+    "measure": "measuring",
+    "write": "writing files",
+}
+"""What each stage of ``timings_s`` does; another one keeps its name."""
+
+NO_FACTS = (
+    *("title", "recognition", "radius95", "unit", "unit_m", "source", "frame", "points", "segments", "nested"),
+    *("timings_s", "registration", "weights", "spacing", "device", "resolution", "clipped", "calibrated"),
+    *("precision", "evaluated_points", "depth_m", "visible_size_m", "invalid_points", "isolation", "carried"),
+    "scene_file",
+)
+"""Keys of a summary that the page shows in another place, and those that only summary.json has."""
+
+DEVICES = {"cpu": "the processor", "cuda": "the GPU"}
+DASH, GAP = "\N{EN DASH}", 3 * "\N{NO-BREAK SPACE}"
+"""For what there is no number of; between coordinates, which have commas at their thousands."""
+
+
+def confidence_title(calibrated: bool) -> str:
+    """Head of a column of confidences."""
+    return "confidence" if calibrated else "confidence, not calibrated"
+
+
+def page_words(summary: Mapping[str, Any], unit: Unit) -> dict[str, Any]:
+    """Texts of the page.
+
+    Args:
+        summary: as a ``Report`` has it.
+        unit: of the lengths in it.
+
+    Returns ``title``, ``trust`` (level, verdict and why), ``facts`` (phrases), ``warnings`` (sentences), ``heads``
+    (of the table), ``units`` (of its lengths and volumes), ``rows`` (centre, volume and confidence of each segment;
+    confidence is None where there is none), ``weights`` (their name) and ``timings_s``, seconds of each stage in words.
+    """
+    verdict = trust(summary)
+    times = {name: _number(seconds) for name, seconds in dict(summary.get("timings_s") or {}).items()}
+    return {
+        "title": str(summary.get("title", "mereo reconstruction")),
+        "trust": [verdict.level, f"{VERDICTS[verdict.level]}:", f"{verdict.why}."],
+        "facts": _facts(summary, unit, verdict),
+        "warnings": _warnings(summary, verdict),
+        "heads": _heads(summary, unit),
+        "units": [unit.length_name, unit.volume_name],
+        "rows": [_row(segment, unit) for segment in summary.get("segments") or ()],
+        "weights": str(summary.get("weights") or ""),
+        "timings_s": {STAGES.get(name, name): value for name, value in times.items() if value is not None},
+    }
+
+
+def _heads(summary: Mapping[str, Any], unit: Unit) -> list[str]:
+    """Heads of the table; with radii of 95 % its centres and volumes say how sure they are."""
+    sure = isinstance(summary.get("radius95"), Mapping)
+    centre, volume = (", ± 95 %", ", 95 % range") if sure else ("", "")
+    heads = [f"centre x, y, z{centre} ({unit.length_name})", f"volume{volume} ({unit.volume_name})"]
+    segments = summary.get("segments") or ()
+    if not segments or any(_number(segment.get("confidence")) is not None for segment in segments):
+        heads.append(confidence_title(summary.get("calibrated") is True))
+    return ["segment", *heads]
+
+
+def _facts(summary: Mapping[str, Any], unit: Unit, verdict: Trust) -> list[str]:
+    """Where the answer comes from, what it was made with, then whatever else a caller has to say."""
+    registration, radius95 = summary.get("registration"), summary.get("radius95")
+    facts = [_answer(registration, verdict)] if isinstance(registration, Mapping) else []
+    source, spacing = summary.get("source"), _number(summary.get("spacing"))
+    if source is not None and str(source) != str(summary.get("title")):
+        facts.append(f"from {source}")
+    if isinstance(radius95, Mapping):
+        middle, most = (rounded(float(radius95[key]) * unit.length_factor) for key in ("median", "max"))
+        level = describe_level(bool(radius95.get("calibrated")))
+        facts.append(f"surface within {middle} {unit.length_name} in the median, {most} at most ({level})")
+    if spacing is not None:
+        facts.append(f"voxels of {rounded(spacing * unit.length_factor)} {unit.length_name}")
+    if summary.get("device"):
+        facts.append(f"computed on {DEVICES.get(str(summary['device']), str(summary['device']))}")
+    for key, value in summary.items():
+        number = _number(value)
+        if key not in NO_FACTS and (number is not None or isinstance(value, str)):
+            facts.append(f"{key.replace('_', ' ')}: {value if number is None else rounded(number)}")
+    return facts
+
+
+def _answer(registration: Mapping[str, Any], verdict: Trust) -> str:
+    explained = _number(registration.get("explained"))
+    if registration.get("answer") != "registration":
+        return "the network's own answer"
+    ways = {"search": "found by a search", "pose": "fitted from the initial pose"}
+    how = ways.get(str(registration.get("located_by")), "registered")
+    # two of the verdicts say themselves how much it explains
+    share = "" if explained is None or verdict.level in ("yes", "unchecked") else f"{explained:.1%}"
+    return f"your model, {how}" + (share and f": it explains {share} of the points")
+
+
+def _warnings(summary: Mapping[str, Any], verdict: Trust) -> list[str]:
+    """Sentences on what to do about a result that may not be what it seems; the verdict itself has said why."""
+    warnings = [] if verdict.cure is None else [verdict.cure]
+    warnings += [str(sentence) for sentence in _block(summary, "registration").get("symmetries") or ()]
+    if summary.get("clipped"):
+        warnings.append("the object reaches the border of the volume that was searched and may be cut off there")
+    return [text[0].upper() + text[1:] + ("" if text.endswith(".") else ".") for text in warnings]
+
+
+def _row(segment: Mapping[str, Any], unit: Unit) -> list[Any]:
+    centre, volume = segment.get("centroid"), _number(segment.get("volume"))
+    radius = _number(segment.get("centroid_radius95"))
+    words = DASH if centre is None else unit.place(np.asarray(centre, dtype=float), radius)
+    place, sign, off = words.partition(" ± ")
+    # a narrow page breaks these lines at their plain spaces
+    place = GAP.join(place.split()) + (f"{GAP} ±\N{NO-BREAK SPACE}{off}" if sign else "")
+    size = DASH if volume is None else unit.volume(volume, segment.get("volume95"))
+    return [place, size, _number(segment.get("confidence"))]
+
+
 # --- how sure a registered model is -----------------------------------------------------------------------------------
 
 # Bytes for the page: of the surfaces, by their radii, and of the observed points, by what decides each centroid.
@@ -244,12 +437,6 @@ def point_marks(explanation: Explanation, points: Float[np.ndarray, "n 3"]) -> U
     return marks
 
 
-def mark_colors(marks: UInt8[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
-    """Colours (red, green, blue) of ``point_marks``."""
-    mixed = between_stops(marks / MOST, WEIGHTS)
-    return np.where((marks == UNEXPLAINED)[:, None], RED, mixed).round().astype(np.uint8)
-
-
 def describe_shares(explanation: Explanation) -> str:
     """What leaves a place unsure, in words, largest first."""
     order = sorted(explanation.shares.items(), key=lambda item: -item[1])
@@ -266,33 +453,6 @@ def _radius_bytes(radii: Radii, names: tuple[str, ...], part: Segment) -> str | 
 
 # --- read again -------------------------------------------------------------------------------------------------------
 
-Corner = Annotated[tuple[FiniteFloat, ...], Field(min_length=3, max_length=3)]
-
-
-class _Cloud(BaseModel):
-    count: Annotated[int, Field(ge=0)]
-    positions: str
-
-
-class _Depth(BaseModel):
-    url: str
-    ends: Annotated[tuple[str, ...], Field(max_length=2)]
-
-
-class _Words(BaseModel):
-    title: str
-    trust: tuple[Level, str, str] | None = None
-    warnings: tuple[str, ...] = ()
-    heads: tuple[str, ...] = ()
-
-
-class _Page(BaseModel):
-    low: Corner
-    high: Corner
-    cloud: _Cloud
-    words: _Words
-    depth: _Depth | None = None
-
 
 @dataclass(frozen=True, eq=False)
 class WrittenReport:
@@ -300,7 +460,7 @@ class WrittenReport:
 
     Attributes:
         title: of the page.
-        level: of the verdict; None for a page without one.
+        level: of the verdict.
         verdict: the verdict and why, then what to do: sentences.
         cloud: the observed points in the input's frame and unit, to 16 bits of the box of all, as many as are shown.
         count: number of points of the input.
@@ -310,7 +470,7 @@ class WrittenReport:
     """
 
     title: str
-    level: Level | None
+    level: Level
     verdict: str
     cloud: PointCloud | None
     count: int
@@ -328,23 +488,24 @@ def read_report(path: Path) -> WrittenReport | None:
     if not is_page or not is_whole:
         return None
     try:
-        page = _Page.model_validate(json.loads(text))
-        steps = np.frombuffer(base64.b64decode(page.cloud.positions), "<u2").reshape(-1, 3)
-        points = np.array(page.low) + steps / STEPS * (np.array(page.high) - np.array(page.low))
-        depth = None if page.depth is None else _picture(page.depth.url)
-    except (ValidationError, ValueError, OSError, RecursionError):
+        page = json.loads(text)
+        words, low, high = page["words"], np.array(page["low"], dtype=float), np.array(page["high"], dtype=float)
+        steps = np.frombuffer(base64.b64decode(page["cloud"]["positions"]), "<u2").reshape(-1, 3)
+        level, *sentences = words["trust"]
+        if level not in VERDICTS:
+            return None
+        return WrittenReport(
+            title=str(words["title"]),
+            level=level,
+            verdict=" ".join([*sentences, *words["warnings"]]),
+            cloud=PointCloud(low + steps / STEPS * (high - low)) if len(steps) else None,
+            count=int(page["cloud"]["count"]),
+            depth=None if page["depth"] is None else _picture(page["depth"]["url"]),
+            ends=() if page["depth"] is None else tuple(map(str, page["depth"]["ends"])),
+            unit_known=any("mm" in head for head in words["heads"]),
+        )
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, OSError, RecursionError):
         return None
-    words = page.words
-    return WrittenReport(
-        title=words.title,
-        level=None if words.trust is None else words.trust[0],
-        verdict="" if words.trust is None else " ".join([*words.trust[1:], *words.warnings]),
-        cloud=PointCloud(points) if len(points) else None,
-        count=page.cloud.count,
-        depth=depth,
-        ends=() if page.depth is None else page.depth.ends,
-        unit_known=any("mm" in head for head in words.heads),
-    )
 
 
 def _picture(url: str) -> Picture:
@@ -354,3 +515,63 @@ def _picture(url: str) -> Picture:
         if max(image.size) > MOST_DEPTH_PX:
             raise ValueError("a picture that is larger than those of pages")
         return np.asarray(image.convert("RGB"))
+
+
+# --- in a notebook ----------------------------------------------------------------------------------------------------
+
+SIDES = ("as the camera sees it", "from its right")
+"""Of ``CAMERA_VIEWS``: one shows what was seen, the other what was hidden."""
+
+PICTURE_PX = 300
+
+
+def result_html(
+    title: str,
+    lines: Sequence[str],
+    points: Float[np.ndarray, "n 3"],
+    surfaces: SegmentedMesh,
+    segments: Sequence[SegmentFacts],
+    unit: Unit,
+    calibrated: bool = False,
+) -> str:
+    """HTML of a result.
+
+    Args:
+        title: what was seen.
+        lines: where the answer comes from.
+        points: observed, camera frame.
+        surfaces: found, camera frame.
+        segments: in figures, in the frame of the input.
+        unit: of these.
+        calibrated: whether their confidences are.
+    """
+    pictures = points_on_segments(points, surfaces, [CAMERA_VIEWS[name] for name in SIDES], PICTURE_PX)
+    shown = np.flatnonzero(np.any([(picture < 255).any(axis=(1, 2)) for picture in pictures], axis=0))
+    # rows that are blank in all of them are left out, but for a margin
+    rows = slice(max(int(shown[0]) - 8, 0), int(shown[-1]) + 9) if len(shown) else slice(None)
+    figures = "".join(
+        f'<figure style="margin:0"><img alt="{escape(name)}" src="{data_url(picture[rows])}" width="{PICTURE_PX}">'
+        f'<figcaption style="text-align:center;font-size:smaller">{escape(name)}</figcaption></figure>'
+        for name, picture in zip(SIDES, pictures, strict=True)
+    )
+    text = "<br>".join(escape(line) for line in lines)
+    return (
+        f'<div><p style="margin:0 0 6px"><b>{escape(title)}</b><br>{text}</p>'
+        f'<div style="display:flex;gap:8px;flex-wrap:wrap">{figures}</div>'
+        f"{_table(segments, surfaces, unit, calibrated)}</div>"
+    )
+
+
+def _table(segments: Sequence[SegmentFacts], surfaces: SegmentedMesh, unit: Unit, calibrated: bool) -> str:
+    has_confidence = not all(np.isnan(segment.confidence) for segment in segments)
+    sure = [confidence_title(calibrated)] if has_confidence else []
+    heads = ("segment", f"volume, {unit.volume_name}", *sure, f"centre, {unit.length_name}")
+    rows = []
+    for segment, (red, green, blue) in zip(segments, surfaces.colors, strict=True):
+        swatch = f'<span style="color:rgb({red},{green},{blue})">&#9632;</span>'
+        confidence = [f"{segment.confidence:.2f}"] if has_confidence else []
+        values = (unit.volume(segment.volume), *confidence, unit.place(segment.centroid))
+        cells = "".join(f"<td>{value}</td>" for value in (values if segment.voxels else ("0", "not found", "")))
+        rows.append(f'<tr><td style="text-align:left">{swatch} {escape(segment.name)}</td>{cells}</tr>')
+    head = "".join(f"<th>{name}</th>" for name in heads)
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"

@@ -252,18 +252,11 @@ def shaded_canvas(
     mesh: SegmentedMesh, view: Viewpoint, size: tuple[int, int], colors: list[Color] | None = None
 ) -> Canvas:
     """``shade`` before it is finished: more can be drawn on it."""
-    canvas = Canvas.empty(view, size)
-    draw_mesh(canvas, mesh, colors)
-    return canvas
-
-
-def draw_mesh(canvas: Canvas, mesh: SegmentedMesh, colors: list[Color] | None = None) -> None:
-    """Draw a mesh as ``shade`` does where it is nearer than what is drawn already."""
-    colors = list(mesh.colors) if colors is None else colors
+    canvas, colors = Canvas.empty(view, size), list(mesh.colors) if colors is None else colors
     canvas.draw_triangles(Triangles.of(mesh, colors))
-    inner = sorted({index for index, _ in mesh.nesting})
-    if inner:
-        within = Canvas(canvas.view, np.full_like(canvas.rgb, BACKGROUND), np.full_like(canvas.depth, np.inf))
+    if inner := sorted({index for index, _ in mesh.nesting}):
+        within = Canvas.empty(view, size)
         parts = SegmentedMesh(tuple(mesh.segments[index] for index in inner))
         within.draw_triangles(Triangles.of(parts, [colors[index] for index in inner]))
         canvas.let_through(within)
+    return canvas

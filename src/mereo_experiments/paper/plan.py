@@ -14,7 +14,7 @@ from mereo.geometry.brief import counted
 from mereo.geometry.camera import PointCloud
 from mereo.synthesis.config import GenerateConfig
 from mereo_experiments.paper.registry import EXPERIMENTS, experiment, results_directory
-from mereo_experiments.paper.scales import SCALES, ScaleName
+from mereo_experiments.paper.scales import SCALES
 from mereo_experiments.paper.store import FINISHED, Score, Store, content_key, scene_of
 from mereo_learning.cases import EvaluatedView
 from mereo_learning.config import TrainConfig
@@ -91,40 +91,14 @@ def cost(name: str, scale: str) -> Cost:
     return Cost(len(plan.seen), sum(plan.made.values()), sum(plan.seen.values()), sum(plan.tested.values()))
 
 
-@dataclass(frozen=True)
-class Listed:
-    """Experiment as a list shows it.
-
-    Attributes:
-        name: as the command takes it.
-        question: what it answers.
-        costs: by scale.
-        here: scales of which a folder holds results, with the objects where these were chosen by name.
-    """
-
-    name: str
-    question: str
-    costs: dict[ScaleName, Cost]
-    scales: tuple[str, ...]
-
-
-def listed(root: Path) -> tuple[list[Listed], int]:
-    """All experiments, with those results that are in ``root``, and how many finished trainings are there."""
-    experiments = []
+def list_experiments(root: Path) -> None:
+    """Print each experiment with what it answers, its costs and those of its results that a folder holds."""
     for name in EXPERIMENTS:
         places = [results_directory(root, name, scale) for scale in SCALES]
         written = [path.parent.name for place in places for path in root.glob(f"results/{place.name}*/results.json")]
-        scales = tuple(sorted(folder.removeprefix(f"{name}-") for folder in written))
-        costs = {scale.name: cost(name, scale.name) for scale in SCALES.values()}
-        experiments.append(Listed(name, experiment(name).QUESTION, costs, scales))
-    return experiments, len(list(root.glob(f"runs/*/{FINISHED}")))
-
-
-def list_experiments(root: Path) -> None:
-    """Print each experiment with what it answers, its costs and those of its results that a folder holds."""
-    experiments, finished = listed(root)
-    for item in experiments:
-        print(f"{item.name}: {item.question}\n    {_costs(item)}\n    results here: {', '.join(item.scales) or 'none'}")
+        results = ", ".join(sorted(folder.removeprefix(f"{name}-") for folder in written)) or "none"
+        print(f"{name}: {experiment(name).QUESTION}\n    {_costs(name)}\n    results here: {results}")
+    finished = len(list(root.glob(f"runs/*/{FINISHED}")))
     Console(markup=False, emoji=False).print(
         f"\nRun one by: mereo experiment NAME --scale cpu. Results are in {root / 'results'}, each with a table.md. "
         f"{counted(finished, 'finished training')} there: experiments share them and repeat none. Costs are those of "
@@ -134,8 +108,8 @@ def list_experiments(root: Path) -> None:
     )
 
 
-def _costs(item: Listed) -> str:
-    cpu, paper = item.costs["cpu"], item.costs["paper"]
+def _costs(name: str) -> str:
+    cpu, paper = cost(name, "cpu"), cost(name, "paper")
     hours = cpu.seen / SEEN_PER_S / 3600
     return (
         f"cpu: {counted(cpu.trainings, 'training')}, {hours:.1f} hours; "

@@ -1,7 +1,7 @@
 """Result of an experiment, beside what the paper says: as Markdown, JSON and a bar chart."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from importlib import resources
@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from mereo.geometry.metrics import format_score
 from mereo.io.atomic_files import atomic_file, new_directory, write_json
@@ -89,7 +88,6 @@ class Result:
         claims: claims of the paper.
         notes: sentences on what differs from the paper's experiment.
         views: rows of the paper's figure of reconstructions.
-        figures: drawings of further pictures by the names of their files.
         comparisons: pictures of answers side by side by the names of their files.
     """
 
@@ -100,7 +98,6 @@ class Result:
     claims: tuple[Claim, ...]
     notes: tuple[str, ...] = ()
     views: tuple[EvaluatedView, ...] = ()
-    figures: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
     comparisons: Mapping[str, Comparison] = field(default_factory=dict)
 
 
@@ -130,8 +127,6 @@ def write_result(result: Result, directory: Path, force: bool = True) -> None:
         draw_bars(result, partial / "figure.png")
         if result.views:
             error_picture(partial / "reconstructions.png", result.views)
-        for name, draw in result.figures.items():
-            _save(draw(), partial / name)
         for name, comparison in result.comparisons.items():
             comparison_picture(partial / name, comparison)
 
@@ -194,10 +189,6 @@ def draw_bars(result: Result, path: Path) -> None:
     axes.set_ylim(0, 1)
     axes.set_ylabel("IoU (pale), mIoU (full), the paper's scene (line)")
     axes.set_title(f"{result.title} ({result.scale})", fontsize=10)
-    _save(figure, path)
-    plt.close(figure)
-
-
-def _save(figure: Figure, path: Path) -> None:
     with atomic_file(path) as partial:
         figure.savefig(partial, dpi=130, format="png")
+    plt.close(figure)

@@ -2,11 +2,8 @@
 
 from dataclasses import replace
 
-import numpy as np
-
 from mereo.synthesis.config import GenerateConfig, Sampler, SamplingConfig
 from mereo_experiments.paper.result import Claim, Result, Row, better, compare, published
-from mereo_experiments.paper.sampling_figure import draw_figure
 from mereo_experiments.paper.scales import ExperimentScale
 from mereo_experiments.paper.store import Score, Store
 from mereo_learning.cases import EvaluatedView
@@ -44,7 +41,6 @@ def run(store: Store, scale: ExperimentScale) -> Result:
         scale.name,
         tuple(rows),
         _claims(rows),
-        figures={"sampling_2d.png": lambda: draw_figure(np.random.default_rng(0))},
         comparisons={"samplers.png": compare("reconstruction error", views, rows)},
     )
 

@@ -16,13 +16,12 @@ from mereo.models.device import cpu_features
 from mereo.models.model import Model
 from mereo.models.weights import load_model
 from mereo.synthesis.sample_views import SampleView, load_view, shipped_views
-from mereo_experiments.speed.busy import Share, measure_under_load, shares_table
 from mereo_experiments.speed.fitted_model import fitted_model
 from mereo_experiments.speed.roofline import Machine, measure_machine
 from mereo_experiments.speed.stages import Bench, Stage, random_points
 
 QUERIES = 40_000
-"""Number of points that precisions are compared at, and that are queried with busy processes."""
+"""Number of points that precisions are compared at."""
 
 
 @dataclass(frozen=True)
@@ -46,26 +45,21 @@ class Measured:
         stages: each stage of an answer.
         facts: of the machine and the network.
         cost: what a lower precision changes; None in single precision.
-        loads: times while other processes are busy.
     """
 
     stages: list[Stage]
     facts: dict[str, Any]
     cost: Cost | None
-    loads: list[Share]
 
     def print(self) -> None:
-        """Print the tables."""
+        """Print the table."""
         print(table(self.stages, self.facts, self.cost))
-        if self.loads:
-            print(shares_table(self.loads, f"{QUERIES:,} queries"))
 
     def write(self, path: Path, force: bool = False) -> None:
         """Write all as JSON; raises ``FileExistsError`` as ``atomic_file`` does."""
         rows = [{**asdict(stage), "ratio": stage.ratio} for stage in self.stages]
-        loads = [{**asdict(share), "fair": share.fair, "times": share.times} for share in self.loads]
         cost = None if self.cost is None else asdict(self.cost)
-        write_json(path, {**self.facts, "cost": cost, "stages": rows, "busy": loads}, force=force)
+        write_json(path, {**self.facts, "cost": cost, "stages": rows}, force=force)
 
 
 def benchmark(
@@ -75,7 +69,6 @@ def benchmark(
     precision: Precision,
     repeats: int,
     rival: bool,
-    busy: int,
 ) -> Measured:
     """Time all stages of an answer.
 
@@ -86,21 +79,18 @@ def benchmark(
         precision: precision of the network's products.
         repeats: repetitions of each stage.
         rival: whether to time the straightforward implementation too.
-        busy: processes that never rest, with which queries are timed again on a CPU; 0 leaves that out.
 
     Raises ``ValueError`` for weights of an object without a shipped view.
     """
-    load = _load()
+    load = {"load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None}  # before anything is measured
     model, view = _subject(weights, preset)
     model.network.to(device)
     fast = replace(model, precision=precision)
     machine = measure_machine(device, fast.working_dtype)
-    bench = Bench(fast, view, machine, repeats, rival)
-    stages = bench.run()
-    loads = measure_under_load(bench.ask(QUERIES), busy, repeats) if busy and device.type == "cpu" else []
+    stages = Bench(fast, view, machine, repeats, rival).run()
     facts = load | _facts(weights or f"preset {preset}, fitted to one frame", fast, machine)
     cost = _cost(model, fast, view) if fast.working_dtype is not torch.float32 else None
-    return Measured(stages, facts, cost, loads)
+    return Measured(stages, facts, cost)
 
 
 def _subject(weights: str | None, preset: str) -> tuple[Model, SampleView]:
@@ -115,13 +105,6 @@ def _subject(weights: str | None, preset: str) -> tuple[Model, SampleView]:
             f"{', '.join(shipped_views())}: time the architecture instead, with --preset"
         )
     return model, load_view(scene)
-
-
-def _load() -> dict[str, Any]:
-    """How busy the machine is before anything is measured."""
-    return {
-        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
-    }
 
 
 def _facts(subject: str, model: Model, machine: Machine) -> dict[str, Any]:

@@ -5,6 +5,7 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch.utils.flop_counter import FlopCounterMode
@@ -51,13 +52,13 @@ ONEDNN = {torch.ops.mkldnn._linear_pointwise: _operations_of_linear}
 """Products of ``mereo.models.device`` that torch's counter does not know."""
 
 
-def seconds(work: Callable[[], object], device: torch.device) -> float:
-    """Seconds that ``work`` takes, until the device has done what it was asked."""
+def timed(work: Callable[[], Any], device: torch.device) -> tuple[float, Any]:
+    """Seconds that ``work`` takes, until the device has done what it was asked, and what it gives."""
     start = time.perf_counter()
-    work()
+    result = work()
     if device.type == "cuda":
         torch.cuda.synchronize(device)
-    return time.perf_counter() - start
+    return time.perf_counter() - start, result
 
 
 def measure_machine(device: torch.device, dtype: torch.dtype = torch.float32) -> Machine:
@@ -72,7 +73,7 @@ def measure_machine(device: torch.device, dtype: torch.dtype = torch.float32) ->
 
 
 def _median(work: Callable[[], object], device: torch.device, repeats: int = 15) -> float:
-    return statistics.median([seconds(work, device) for _ in range(repeats + 2)][2:])
+    return statistics.median([timed(work, device)[0] for _ in range(repeats + 2)][2:])
 
 
 def count_operations(work: Callable[[], object]) -> int:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from jaxtyping import Bool, Float, Int, Integer, UInt8
+from jaxtyping import Float, Int, Integer, UInt8
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -117,19 +117,6 @@ def write_points_ply(path: str | Path, cloud: SegmentedCloud) -> None:
     sure = {name: ("f4", values) for name, values in cloud.chances.items()}
     vertices = _records(_positions(cloud.points) | _colors(colors) | _label(cloud.labels) | sure)
     _write(path, _comments(cloud.names, cloud.colors), {"vertex": vertices})
-
-
-def write_explained_ply(
-    path: str | Path,
-    points: Float[np.ndarray, "n 3"],
-    colors: UInt8[np.ndarray, "n 3"],
-    unexplained: Bool[np.ndarray, " n"],
-    comment: str,
-) -> None:
-    """Write observed points coloured by how much they decide a place, with ``unexplained`` (uchar, 1 or 0)."""
-    lost: Columns = {"unexplained": ("u1", unexplained)}
-    plain = comment.encode("ascii", "replace").decode("ascii")
-    _write(path, [plain], {"vertex": _records(_positions(points) | _colors(colors) | lost)})
 
 
 def write_positions_ply(path: str | Path, points: Float[np.ndarray, "n 3"], comment: str = "") -> None:
