@@ -7,10 +7,9 @@ import pytest
 from fit_cases import said, shown
 from toy_scene import toy_scene
 
-from mereo.fitting.draws.fit import fit_draws
+from mereo.fitting.draws.fit import DrawsProblem, Shape, approach, derivatives, fit_draws, lay_on_shape, secant
+from mereo.fitting.draws.fit import narrowing as draws_narrowing
 from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
-from mereo.fitting.draws.problem import DrawsProblem, Shape, approach, derivatives, lay_on_shape, secant
-from mereo.fitting.draws.problem import narrowing as draws_narrowing
 from mereo.fitting.modes import narrowing as modes_narrowing
 from mereo.fitting.problem.correspondences import nothing
 from mereo.fitting.problem.residuals import NetworkTerm

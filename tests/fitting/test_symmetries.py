@@ -13,9 +13,8 @@ from shapes import box
 from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Deformation
 from mereo.fitting.config import MANY_DRAWS
-from mereo.fitting.draws.fit import descend, draws_that_may_jump, try_jumps
+from mereo.fitting.draws.fit import DrawsProblem, descend, draws_that_may_jump, simulate, try_jumps
 from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
-from mereo.fitting.draws.problem import DrawsProblem, simulate
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.segments import ANGLES, find_symmetries, left_open
 from mereo.fitting.registration.register import CloudToFit, ModesFit

@@ -12,15 +12,17 @@ from shapes import box
 from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Compose, Deformation, Identity, Rigid
 from mereo.fitting.draws.fit import (
+    DrawsFit,
+    DrawsProblem,
     descend,
     lower,
     refine_by_sight,
+    simulate,
     symmetric_groups,
     try_symmetric_states,
     turn_segments,
 )
 from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
-from mereo.fitting.draws.problem import DrawsFit, DrawsProblem, simulate
 from mereo.fitting.problem.evidence import OBSERVED_SAMPLES
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.registration.register import CloudToFit, ModesFit
@@ -116,11 +118,11 @@ def test_a_state_that_is_turned_so_is_found() -> None:
     """What it is told from is the correspondences alone; a right state stays what it is."""
     problem = problem_of(TRUTH)
     right, wrong = state(problem, TRUTH), descend(problem, state(problem, flipped(TRUTH)), 1)
-    assert np.abs(wrong.placed() - right.placed()).max() > 4.0
+    assert np.abs(wrong.surface.material - right.surface.material).max() > 4.0
     many = replace(problem, config=replace(problem.config, turned_worse=np.inf))
     found = try_symmetric_states(many, wrong)
     assert found.misfit < wrong.misfit
-    assert np.abs(found.placed() - right.placed()).max() < 0.2
+    assert np.abs(found.surface.material - right.surface.material).max() < 0.2
     assert try_symmetric_states(many, found).misfit <= found.misfit
     assert try_symmetric_states(replace(many, config=replace(many.config, turned_worse=-np.inf)), wrong) is wrong
 
