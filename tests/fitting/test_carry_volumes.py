@@ -85,20 +85,20 @@ def test_a_material_point_keeps_its_value(bent: Registration) -> None:
     """A linear function of the position at rest, at points inside, is there where they have been moved to."""
     found = resampled(ramp(), bent)
     assert found.interpolation == "linear" and found.within == found.inside > 5000
-    np.testing.assert_allclose(found.volume.spacing, 10 * SPACING)
+    np.testing.assert_allclose(found.content.spacing, 10 * SPACING)
     points = np.random.default_rng(0).uniform((-15, -4, -4), (15, 4, 4), size=(300, 3))
-    index = np.rint(found.volume.index_of(bent.to_camera(points)))
-    centers = transform_points(found.volume.T_world_index, index.astype(float))
+    index = np.rint(found.content.index_of(bent.to_camera(points)))
+    centers = transform_points(found.content.T_world_index, index.astype(float))
     truth = bent.to_rest(centers) @ RAMP + 100
-    error = at_points(found.volume, centers) - truth
+    error = at_points(found.content, centers) - truth
     assert np.abs(error).max() < 0.1 * SPACING * np.linalg.norm(RAMP)  # a tenth of a voxel
     # and the point's own value is less than a voxel away
-    assert np.abs(at_points(found.volume, centers) - (points @ RAMP + 100)).max() < SPACING * np.linalg.norm(RAMP)
+    assert np.abs(at_points(found.content, centers) - (points @ RAMP + 100)).max() < SPACING * np.linalg.norm(RAMP)
 
 
 def test_rest_positions_are_within_a_tenth_of_a_voxel_of_the_exact_ones(bent: Registration) -> None:
     grid = around()
-    found = [resampled(replace(grid, values=grid.values[..., axis]), bent).volume for axis in range(3)]
+    found = [resampled(replace(grid, values=grid.values[..., axis]), bent).content for axis in range(3)]
     index = np.argwhere(found[2].values > found[2].values.min())
     rows = index[np.random.default_rng(1).choice(len(index), 2000, replace=False)]
     centers = transform_points(found[0].T_world_index, rows.astype(float))
@@ -111,9 +111,10 @@ def test_rest_positions_are_within_a_tenth_of_a_voxel_of_the_exact_ones(bent: Re
 def test_few_points_are_asked_where_the_motion_is_smooth(
     model: StatisticalModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = []
-    own = carrying._source_index
-    monkeypatch.setattr(carrying, "_source_index", lambda places, *a: asked.append(len(places)) or own(places, *a))
+    asked, to_rest = [], Registration.to_rest
+    monkeypatch.setattr(
+        Registration, "to_rest", lambda self, p, labels: asked.append(len(p)) or to_rest(self, p, labels)
+    )
     found = resampled(ramp(), registered(model, transform_points(T, model.rest_points)))
     assert sum(asked) < 0.3 * found.inside
 
@@ -123,30 +124,30 @@ def test_far_from_the_object_there_is_background(model: StatisticalModel) -> Non
     here = registered(model, transform_points(T, model.rest_points))
     source = ramp("int16")
     found = resampled(source, here)
-    assert found.volume.values.dtype == np.int16
-    index = np.argwhere(np.ones(found.volume.values.shape, dtype=bool))
-    centers = transform_points(found.volume.T_world_index, index.astype(float))
+    assert found.content.values.dtype == np.int16
+    index = np.argwhere(np.ones(found.content.values.shape, dtype=bool))
+    centers = transform_points(found.content.T_world_index, index.astype(float))
     distance = here.solids.nearest(centers).distance * (here.solids.label(centers) == 0)
     width = carrying.MARGIN * model.half
-    assert (found.volume.values.ravel()[distance > 1.001 * width] == source.values.min()).all()
-    assert (found.volume.values.ravel()[distance < 0.999 * width] > source.values.min()).all()
+    assert (found.content.values.ravel()[distance > 1.001 * width] == source.values.min()).all()
+    assert (found.content.values.ravel()[distance < 0.999 * width] > source.values.min()).all()
     half = replace(source, values=source.values[:, :, : source.values.shape[2] // 2])
     cut = resampled(half, here)
-    assert 0.4 < cut.within / cut.inside < 0.6 and cut.volume.values.min() == half.values.min()
+    assert 0.4 < cut.within / cut.inside < 0.6 and cut.content.values.min() == half.values.min()
     scaled = resampled(replace(source, slope=-1.0), here)
-    assert scaled.volume.values[0, 0, 0] == source.values.max()  # the least of what they mean
+    assert scaled.content.values[0, 0, 0] == source.values.max()  # the least of what they mean
 
 
 def test_labels_keep_their_values(bent: Registration) -> None:
     source = halves()
     found = resampled(source, bent)
-    assert found.interpolation == "nearest" and found.volume.values.dtype == np.int16
-    assert set(np.unique(found.volume.values)) == {0, 3, 7}
+    assert found.interpolation == "nearest" and found.content.values.dtype == np.int16
+    assert set(np.unique(found.content.values)) == {0, 3, 7}
     points = np.random.default_rng(2).uniform((-15, -4, -4), (15, 4, 4), size=(300, 3))
     points = points[np.abs(points[:, 0]) > 1.5]
-    np.testing.assert_array_equal(at_points(found.volume, bent.to_camera(points)), np.where(points[:, 0] < 0, 3, 7))
+    np.testing.assert_array_equal(at_points(found.content, bent.to_camera(points)), np.where(points[:, 0] < 0, 3, 7))
     blended = resampled(source, bent, interpolation="linear")
-    assert len(np.unique(blended.volume.values)) > 3
+    assert len(np.unique(blended.content.values)) > 3
 
 
 def test_labels_are_told_from_intensities() -> None:
@@ -162,7 +163,7 @@ def test_labels_are_told_from_intensities() -> None:
 
 
 def test_the_grid_has_so_many_voxels_at_most(bent: Registration) -> None:
-    found = resampled(ramp(), bent, most=20_000).volume
+    found = resampled(ramp(), bent, most=20_000).content
     assert 10_000 < found.values.size <= 20_000
     assert found.spacing.min() > 10 * SPACING
     low, high = found.bounds
@@ -192,7 +193,7 @@ def test_a_file_comes_back_in_its_format_and_overlays_the_labels(
     (placed,) = place([read], registrar, "scene")
     found = carry(placed, bent)
     assert isinstance(found, CarriedVolume) and isinstance(found.content, Volume)
-    direct = resampled(ramp("int16"), bent).volume
+    direct = resampled(ramp("int16"), bent).content
     np.testing.assert_array_equal(found.content.values, direct.values)
     write_attachment(tmp_path / "out" / name, found.content, 1000.0, np.eye(3), 0.01)
     again = read_volume(tmp_path / "out" / name)
@@ -244,7 +245,7 @@ def test_nifti_keeps_its_scaling_and_what_else_its_header_says(
     write_attachment(tmp_path / "out.nii.gz", found, 1.0, np.eye(3), 1.0)
     again = nibabel.load(tmp_path / "out.nii.gz")
     assert again.get_data_dtype() == np.int16 and again.header["descrip"].item() == b"phantom"
-    direct = resampled(volume, bent).volume.values
+    direct = resampled(volume, bent).content.values
     np.testing.assert_allclose(again.get_fdata(), 0.5 * direct - 1024)
 
 
