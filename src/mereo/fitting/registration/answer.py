@@ -188,15 +188,8 @@ class Answer:
         return encode_frame(self.hypothesis, self.model, self.seen.frame.axes)
 
 
-# --- surfaces ---------------------------------------------------------------------------------------------------------
-
-
 def registered_reconstruction(
-    seen: EncodedFrame,
-    registration: Registration,
-    model: Trained | None,
-    resolution: int = 128,
-    label_points: bool = False,
+    seen: EncodedFrame, registration: Registration, model: Trained | None, resolution: int, label_points: bool
 ) -> Reconstruction:
     """Make the reconstruction that is the registered model itself, in the input's frame.
 
@@ -206,13 +199,24 @@ def registered_reconstruction(
     seconds = {**seen.timings_s, "fit": registration.seconds}
     mesh = registration.mesh
     with timed(seconds, "label"):
-        grid = _label_grid(mesh, resolution)
+        low, high = mesh.bounds
+        spacing = float((high - low).max()) / resolution
+        counts = np.ceil((high - low) / spacing).astype(int) + 3  # with one empty voxel around
+        check_nodes(resolution, *counts.tolist())
+        origin = (low + high - (counts - 1) * spacing) / 2
+        labels = label_grid(mesh, *(origin[axis] + np.arange(counts[axis]) * spacing for axis in range(3)))
+        grid = LabelGrid(labels, origin, np.full(3, spacing), mesh.names)
     with timed(seconds, "measure"):
         segments = measure(Extraction(mesh, grid, 0), model, seen.code)
     observed = None
     if label_points:
         with timed(seconds, "points"):
-            observed = _observed(seen, registration, model)
+            points = seen.seen.points
+            owner, unknown = nearest_labels(registration.solids, points), np.full(len(points), np.nan)
+            observed = SegmentedCloud(seen.points, owner, unknown, unknown, mesh.names, mesh.colors)
+            if model is not None and seen.code is not None:
+                logits = model.logits(seen.code, points)
+                observed = segment_points(logits, seen.points, model.names, model.colors, model.calibration, owner)
     result = Reconstruction(
         surfaces=mesh,
         labels=grid,
@@ -227,25 +231,3 @@ def registered_reconstruction(
         calibrated=model is not None and model.calibrates,
     )
     return result if seen.axes == "camera" else turned_back(result)
-
-
-def _label_grid(mesh: SegmentedMesh, resolution: int) -> LabelGrid:
-    """Labels of a mesh on a grid of so many cells along its longest side, with one empty voxel around it."""
-    low, high = mesh.bounds
-    spacing = float((high - low).max()) / resolution
-    counts = np.ceil((high - low) / spacing).astype(int) + 3
-    check_nodes(resolution, *counts.tolist())
-    origin = (low + high - (counts - 1) * spacing) / 2
-    labels = label_grid(mesh, *(origin[axis] + np.arange(counts[axis]) * spacing for axis in range(3)))
-    return LabelGrid(labels, origin, np.full(3, spacing), mesh.names)
-
-
-def _observed(seen: EncodedFrame, registration: Registration, model: Trained | None) -> SegmentedCloud:
-    """Segment of each observed point by the registration, with a network's probabilities of it, or NaN."""
-    points = seen.seen.points
-    labels = nearest_labels(registration.solids, points)
-    if model is None or seen.code is None:
-        rest, unknown = registration.mesh, np.full(len(points), np.nan)
-        return SegmentedCloud(seen.points, labels, unknown, unknown, rest.names, rest.colors)
-    logits = model.logits(seen.code, points)
-    return segment_points(logits, seen.points, model.names, model.colors, model.calibration, labels)
