@@ -109,7 +109,7 @@ def test_a_rigid_step_draws_a_pose_to_the_frame(model: StatisticalModel) -> None
     )
     before = screen.scored(poses, 0.05).cost
     for sigma in (0.15, 0.1, 0.1, 0.05, 0.05, 0.05):
-        poses = screen.aligned(poses, sigma)
+        poses = screen.scored(poses, sigma, moves=True)
     assert (screen.scored(poses, 0.05).cost < before).all()
     assert np.linalg.norm(poses.translation - FAR, axis=1).max() < 0.1 * model.half  # from 0.16
 
