@@ -18,7 +18,6 @@ from mereo.fitting.problem.problem import (
     SHARED,
     constants_for,
     is_noise,
-    looks_normal,
     noise_of,
     shared,
 )
@@ -161,9 +160,9 @@ def test_what_neighbours_share_is_no_noise(points: np.ndarray) -> None:
     around, rng = Evidence.of(points).around, np.random.default_rng(0)
     own = rng.normal(scale=0.3, size=len(points))
     half = np.where(points[:, 0] > np.median(points[:, 0]), 2.0, 0.0)
-    assert noise_of(own, around) == pytest.approx(0.3, rel=0.1) and is_noise(own, noise_of(own, around))
+    assert noise_of(own, around) == pytest.approx(0.3, rel=0.1) and is_noise(own, around)
     assert noise_of(own + 1.0, around) == pytest.approx(0.3, rel=0.1)
-    assert not is_noise(own + 1.0, noise_of(own + 1.0, around))
+    assert not is_noise(own + 1.0, around)
     assert noise_of(half, around) == 0.0
     assert 0.97 < shared(own, around, 0.45) < SHARED
     assert shared(own + 0.5, around, 0.45) > 1.3 and shared(own + half, around, 0.45) > 1.3
@@ -172,8 +171,10 @@ def test_what_neighbours_share_is_no_noise(points: np.ndarray) -> None:
 def test_noise_that_neighbours_share_is_spread_evenly_and_a_wrong_state_is_not() -> None:
     rng = np.random.default_rng(0)
     windows = np.repeat(rng.normal(size=300), 9)
-    assert looks_normal(windows)
-    assert not looks_normal(np.where(rng.random(len(windows)) < 0.1, 6.0, windows))
+    around = np.zeros((len(windows), 8), dtype=int)
+    assert is_noise(0.1 * windows, around, is_shared=True) and not is_noise(windows, around, is_shared=True)
+    far = np.where(rng.random(len(windows)) < 0.1, 6.0, windows)
+    assert not is_noise(0.1 * far, around, is_shared=True)
 
 
 def test_a_noisy_cloud_is_explained_where_only_noise_is_left(

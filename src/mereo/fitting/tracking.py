@@ -2,10 +2,10 @@
 
     Observation, time -Tracker.follow-> Answer (found, followed or lost)
 
-What can be seen of a lost object: few points lie near where it was expected, the model explains fewer of them than it
-must, or the frame rules out much of it. Then, and at first, a network fits the frame by itself, as `mereo reconstruct`
-does, and the better of both is continued. Where that explains nothing, or there is no network, the answer says that
-the object is lost, and a search goes on in the background; its state, fitted to the newest frame, begins a new track.
+An object is lost where few points lie near where it was expected, the model explains fewer of them than it must, or the
+frame rules out much of it. Then, and at first, a network fits the frame by itself, and the better of both is continued.
+Where that explains nothing, or there is no network, the answer says so, and a search goes on in the background; its
+state, fitted to the newest frame, begins a new track.
 """
 
 import time
@@ -87,12 +87,19 @@ class Track:
         posed, scale = without_scale(fitted.posed)
         base, model = fitted.problem, fitted.problem.model
         scale_std = config.scale_std if base.is_scale_open else KNOWN_SCALE_STD
-        problem = replace(base, network=NetworkTerm.none(model), scale_std=scale_std)
-        share_surfaces(base, problem)
-        still, noise = np.zeros(POSE + model.count), fitted.problem.residual_noise(fitted.surface)
-        unit, unsure, seen = fitted.unit * scale, config.first_speed, base.evidence
-        area, kind = seen_area(seen), seen.other_lines
-        return cls(problem, unit, posed, time_s, still, unsure, noise, clean, kind, area, fitted.calibration)
+        return cls(
+            problem=changed(base, network=NetworkTerm.none(model), scale_std=scale_std),
+            unit=fitted.unit * scale,
+            posed=posed,
+            time_s=time_s,
+            velocity=np.zeros(POSE + model.count),
+            unsure=config.first_speed,
+            noise=base.residual_noise(fitted.surface),
+            clean=clean,
+            other_lines=base.evidence.other_lines,
+            area=seen_area(base.evidence),
+            calibration=fitted.calibration,
+        )
 
     def expected(self, time_s: float, config: TrackConfig) -> Posed:
         """State that is expected at a time."""
@@ -106,11 +113,10 @@ class Track:
     def squared(self) -> Float[np.ndarray, "p p"]:
         """Mean square of a material point's way, as a form of the parameters' step."""
         model = self.problem.model
-        rows = model.sparse
-        modes = model.modes[rows]
-        position = self.posed.place(model.mean[rows] + modes @ self.posed.z.astype(np.float32))
+        modes = model.modes[model.sparse]
+        position = self.posed.place(model.mean[model.sparse] + modes @ self.posed.z.astype(np.float32))
         jacobian = in_space(self.posed, position, modes).astype(np.float64)
-        form: Float[np.ndarray, "p p"] = jacobian.T @ jacobian / len(rows)
+        form: Float[np.ndarray, "p p"] = jacobian.T @ jacobian / len(modes)
         return form
 
     @property
@@ -125,9 +131,11 @@ def without_scale(posed: Posed) -> tuple[Posed, float]:
     return replace(posed, translation=posed.translation / scale, log_scale=0.0), scale
 
 
-def share_surfaces(base: Problem, other: Problem) -> None:
-    """Give a problem of the same model what another has prepared of the model's surface."""
-    vars(other).update({"pairs": base.pairs, "samples": base.samples})
+def changed(problem: Problem, **changes: Any) -> Problem:
+    """A problem of the same model, with what this one has prepared of the model's surface."""
+    other = replace(problem, **changes)
+    vars(other).update({"pairs": problem.pairs, "samples": problem.samples})
+    return other
 
 
 def gated(track: Track, points: Float[np.ndarray, "n 3"], time_s: float, config: TrackConfig) -> Bool[np.ndarray, " n"]:
@@ -135,8 +143,7 @@ def gated(track: Track, points: Float[np.ndarray, "n 3"], time_s: float, config:
     samples = track.problem.samples.every(2)
     position = samples.posed(track.expected(time_s, config)).position
     most = config.gate * track.problem.model.half + samples.spacing
-    distance = cKDTree(position).query(points / track.unit, distance_upper_bound=most)[0]
-    return np.isfinite(distance)
+    return np.isfinite(cKDTree(position).query(points / track.unit, distance_upper_bound=most)[0])
 
 
 def next_fit(
@@ -168,8 +175,7 @@ def next_fit(
         def fit(other_lines: SightKind) -> ModesFit:
             sight_lines = replace(lines.scaled(1 / track.unit), other_lines=other_lines)
             evidence = Evidence.of(few, outliers / track.unit, config.observed_samples, sight_lines)
-            problem = replace(track.problem, evidence=evidence)
-            share_surfaces(track.problem, problem)
+            problem = changed(track.problem, evidence=evidence)
             posed = descend(problem, start, expectation, config)
             return ModesFit(problem, nothing(), track.unit, posed, 0.0, calibration=track.calibration)
 
@@ -186,21 +192,17 @@ def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig)
     """Track with a further frame."""
     posed, scale = without_scale(fitted.posed)
     passed = max(time_s - track.time_s, 1e-3)
-    velocity = track.velocity + config.smoothing * (between(track.posed, posed) / passed - track.velocity)
-    unsure = track.unsure * (1 - config.smoothing)
     noise = track.noise + config.smoothing * (fitted.problem.residual_noise(fitted.surface) - track.noise)
-    problem = replace(fitted.problem, config=constants_for(noise, track.clean))
-    share_surfaces(fitted.problem, problem)
     return replace(
         track,
-        problem=problem,
+        problem=changed(fitted.problem, config=constants_for(noise, track.clean)),
         unit=track.unit * scale,
         posed=posed,
         time_s=time_s,
-        velocity=velocity,
-        unsure=unsure,
+        velocity=track.velocity + config.smoothing * (between(track.posed, posed) / passed - track.velocity),
+        unsure=track.unsure * (1 - config.smoothing),
         noise=noise,
-        area=max(track.area, seen_area(problem.evidence)),
+        area=max(track.area, seen_area(fitted.problem.evidence)),
     )
 
 
@@ -260,8 +262,7 @@ def descend(problem: Problem, start: Posed, expectation: Expectation, config: Tr
 
 # TrackedFrame -BackgroundSearch.start-> (seconds later) -BackgroundSearch.take-> Searched
 #
-# A search takes a second to several, and frames come 30 times a second. NumPy lets go of the interpreter in most of a
-# search, so a thread is enough.
+# NumPy lets go of the interpreter in most of a search, so a thread is enough.
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,16 +318,13 @@ class BackgroundSearch:
         # a newer frame is worth more than the last round, which takes as long as the two before and longer
         self.registrar = replace(registrar, constants=replace(registrar.config, search_rounds=2))
         self.executor = executor
-        self._thread: ThreadPoolExecutor | None = None
+        self._thread = ThreadPoolExecutor(1, "mereo-search")
         self._running: Future[Searched] | None = None
 
     def start(self, frame: TrackedFrame) -> None:
         """Search a frame, unless one is being searched, or was and has not been taken."""
         if self._running is None:
-            if self.executor is None and self._thread is None:
-                self._thread = ThreadPoolExecutor(1, "mereo-search")
-            executor = self.executor or self._thread
-            assert executor is not None
+            executor = self._thread if self.executor is None else self.executor
             self._running = executor.submit(_search, self.registrar, frame)
 
     def take(self) -> Searched | None:
@@ -349,11 +347,10 @@ class BackgroundSearch:
             self._running = None
 
     def close(self, wait: bool) -> None:
-        """Forget it, and let its thread end with the search, which ``wait`` waits for."""
+        """Forget it, and let its thread end with the search, which ``wait`` waits for; the next has another thread."""
         self.drop()
-        if self._thread is not None:
-            self._thread.shutdown(wait, cancel_futures=True)
-            self._thread = None
+        self._thread.shutdown(wait, cancel_futures=True)
+        self._thread = ThreadPoolExecutor(1, "mereo-search")
 
 
 def _search(registrar: Registrar, frame: TrackedFrame) -> Searched:
@@ -487,18 +484,13 @@ class Tracker:
         seen, registrar, config = frame.seen, self.registrar, self.config
         candidate, likelier = find(seen, registrar.network, registrar, frame.keep_all, frame.scene_unit)
         must_register = registrar.method != "auto" or registrar.network is None
-        if candidate.modes is None and tracked is None and must_register:
-            assert candidate.error is not None
+        if candidate.error is not None and tracked is None and must_register:
             raise candidate.error
-        self._has_begun = True
-        alone = (
-            None if candidate.modes is None else _Tracked.of_frame(candidate, frame.time_s, config, registrar.config)
-        )
-        if (
-            tracked is not None
-            and self._takes(tracked)
-            and (alone is None or alone.score <= tracked.score + config.margin)
-        ):
+        self._has_begun, alone = True, None
+        if candidate.modes is not None:
+            alone = _Tracked.of_frame(candidate, frame.time_s, config, registrar.config)
+        is_better = tracked is not None and (alone is None or alone.score <= tracked.score + config.margin)
+        if tracked is not None and is_better and self._takes(tracked):
             return self._gone_on(frame, tracked, started, restart=True)
         if alone is None or not self._takes(alone):
             registration = None if alone is None else alone.registration

@@ -24,8 +24,7 @@ from mereo.scenes.statistical_model import StatisticalModel
 
 # --- the surface as samples -------------------------------------------------------------------------------------------
 
-# A search among all faces is exact and slow. Samples are as good while the model is farther from the cloud than they
-# are from each other; the last steps of a fit use the faces themselves.
+# Samples are as good as faces, and faster, while the model is farther from the cloud than they are from each other.
 #
 # Notation: s samples, k modes. A frame is three vectors: the sample's position and two edges of its face.
 
@@ -95,15 +94,6 @@ class PosedSamples:
     position: Float32[np.ndarray, "s 3"]
     normal: Float32[np.ndarray, "s 3"]
     facing: Bool[np.ndarray, " s"]
-
-    @property
-    def points(self) -> Float[np.ndarray, "s 3"]:
-        """Positions of the samples, in double precision."""
-        return self.position.astype(np.float64)
-
-    def modes_at(self, rows: Int[np.ndarray, " r"]) -> Float32[np.ndarray, "r 3 k"]:
-        """Modes of some of the samples."""
-        return self.surface.modes[rows, 0]
 
     def few(self, count: int) -> "PosedSamples":
         """About ``count`` samples, as evenly spread."""
@@ -199,29 +189,25 @@ class Surface:
         has a noisy cloud a little in front, and noise across an edge pulls that edge along. Where nothing is met, or
         only a plane farther than ``far`` from the point, it is the nearest position all the same.
         """
-        rows, met = first_faces(self._rays, self._center, points)
+        rows, met = first_faces(*self._rays, points)
         toward, normal = points[rows], self.normals[met]
         corner = self.material[self.model.faces[self.facing[met], 0]]
         shares = np.einsum("pi,pi->p", normal, corner) / np.einsum("pi,pi->p", normal, toward)
         met_position = toward * shares[:, None]
         off = np.abs(np.einsum("pi,pi->p", normal, toward - met_position))
         near = off <= far
-        other = np.ones(len(points), dtype=bool)
-        other[rows[near]] = False
+        rows = rows[near]
+        other = np.setdiff1d(np.arange(len(points)), rows)
         distance, face, position = np.empty(len(points)), np.empty(len(points), dtype=np.int64), np.empty_like(points)
-        distance[~other], face[~other], position[~other] = off[near], met[near], met_position[near]  # rows are in order
-        if other.any():
+        distance[rows], face[rows], position[rows] = off[near], met[near], met_position[near]
+        if len(other):
             distance[other], face[other], position[other] = self.nearest(points[other])
         return distance, face, position
 
     @cached_property
-    def _center(self) -> Float[np.ndarray, "3"]:
+    def _rays(self) -> tuple[EmbreeScene, Float[np.ndarray, "3"]]:
         center: Float[np.ndarray, "3"] = self.material.mean(axis=0)
-        return center
-
-    @cached_property
-    def _rays(self) -> EmbreeScene:
-        return ray_scene(self.material - self._center, self.model.faces[self.facing])
+        return ray_scene(self.material - center, self.model.faces[self.facing]), center
 
     def offsets(self, points: Float[np.ndarray, "p 3"], far: float | None = None) -> Float[np.ndarray, " p"]:
         """Signed distance of each point from the facing surface, negative behind it; with ``far``, ``along_sight``."""
@@ -411,9 +397,6 @@ class PairTerm:
         if len(self.std) == 0:
             return 0.0
         return float((((self._vectors(z)[1] - self.distance) / self.std) ** 2).mean())
-
-
-# --- all of them ---
 
 
 @dataclass(frozen=True, eq=False)
