@@ -14,7 +14,7 @@ from mereo.fitting.problem.residuals import NetworkTerm
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import CloudToFit, Registrar
 from mereo.fitting.registration.registration import Registration
-from mereo.fitting.tracking import Expectation, Track, Tracker, between
+from mereo.fitting.tracking import Track, Tracker, between, motion_precision
 from mereo.geometry.camera import SCANNER_TO_CAMERA, Camera, PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
@@ -242,14 +242,13 @@ def test_without_evidence_the_expected_state_is_the_answer(
     slow = replace(track, velocity=velocity * config.dead / moving.speed)
     np.testing.assert_allclose(between(track.posed, slow.expected(0.5, config)), 0.0, atol=1e-9)
     assert replace(track, velocity=velocity).expected(0.5, replace(config, motion="pose")) is track.posed
-    expectation = Expectation.of(moving, state, 0.5, config)
-    nothing = NormalEquations(np.zeros((count, count)), np.zeros(count))
+    precision = motion_precision(moving, 0.5, config)
     off = state.moved(0.01 * np.random.default_rng(1).normal(size=count))
-    back = off.moved(expectation.add_to(nothing, off).step(0.0))
+    back = off.moved(NormalEquations(precision, precision @ between(state, off)).step(0.0))
     np.testing.assert_allclose(back.place(np.eye(3)), state.place(np.eye(3)), atol=1e-2)
     # what moves is less certain than what is still
-    still = Expectation.of(replace(moving, velocity=np.zeros(count), unsure=0.0), state, 0.5, config)
-    assert np.trace(still.precision) > 10 * np.trace(expectation.precision)
+    still = replace(moving, velocity=np.zeros(count), unsure=0.0)
+    assert np.trace(motion_precision(still, 0.5, config)) > 10 * np.trace(precision)
 
 
 def test_the_speed_of_a_track_is_that_of_its_points(registrar: Registrar, scene: Scene, here: SegmentedMesh) -> None:

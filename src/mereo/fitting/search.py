@@ -48,9 +48,7 @@ class SightTable:
     Attributes:
         T: rotation into the axes of the table, whose third is the direction of the cloud.
         low, cell: corner of the table and length of a cell, as slopes across the direction.
-        toward: unit vector of the nearest line of sight to each cell that met the object, or of which nothing is known.
-        front: distance before which it is free.
-        free: distance up to which a cell beside these is free; negative where it is not beside.
+        toward, front, free: ``Evidence.along`` the cells.
         pitch: angle between neighbouring lines of sight.
     """
 
@@ -111,11 +109,9 @@ CELLS = 32
 
 @dataclass(frozen=True, eq=False)
 class ShapeTables:
-    """Tables of some states, model frame.
+    """Tables of some states, with their coefficients and samples, model frame.
 
     Attributes:
-        z: coefficients of each state.
-        position, normal: of its samples.
         low, cell: corner of each table's box, and the length of a cell.
         nearest: index of the sample nearest to the centre of each cell.
     """
@@ -182,13 +178,7 @@ FARTHEST = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Many poses of states, with their costs.
-
-    Attributes:
-        state: row of each one's state in the tables.
-        rotation, translation, log_scale: of the similarity into the camera frame.
-        cost: of each, as last computed.
-    """
+    """Many poses of states, given by rows of the tables, with their costs as last computed."""
 
     state: Int[np.ndarray, " n"]
     rotation: Float32[np.ndarray, "n 3 3"]
@@ -216,12 +206,9 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class Screen:
-    """What poses are compared with.
+    """What poses are compared with: some observed points, evenly spread, and what the frame rules out.
 
     Attributes:
-        tables: of the states.
-        points: some of the observed ones, evenly spread.
-        sight: what the frame rules out.
         half: half the object's length.
         scaled: whether the scale is unknown.
         in_part: whether something may hide a part of the object.
@@ -376,8 +363,7 @@ class SearchRound:
     Attributes:
         states: medoids of the library that are tried; 0 tries the mean state.
         rotations: tried with each of them.
-        bent: candidates that are bent towards the frame by few points.
-        fitted: how many of these are fitted at most.
+        bent, fitted: candidates that are bent towards the frame by few points, and of these fitted at most.
     """
 
     states: int
@@ -405,34 +391,25 @@ BENDING = ((0.12, 5, 0.05), (0.05, 8, 0.02))
 """First sigma, steps, and the sigma of the choice, of the two stages in which few points bend a candidate."""
 
 RIVAL = 1.5
-"""Misfit by few points, in misfits of the best, up to which a candidate may still be as good.
-
-Of 65 candidates with more, of 25 training views that others explain, none ended lower by a cloud's misfit of .01."""
+"""Misfit by few points, in misfits of the best, up to which a candidate may still be as good."""
 
 ALIKE = 0.05
 """Difference of the cloud's misfit up to which two states explain a frame alike."""
 
 HEAVY, HEAVIER_STEPS, HELPS = 3000.0, (0.04, 12), 0.65
 """Weight of a cloud that an elastic solid explains only under it, the first sigma and the steps of the fit with it, and
-the share of the misfit which must be left.
-
-Bends of a bunny's ears leave .45 to .54; states of livers and tumours .77 to .9, a real deformed liver .93."""
+the share of the misfit that may be left: bends of a bunny's ears leave .45 to .54, states of livers .77 up."""
 
 WHOLE = 150.0
-"""Misfit by which an object that is seen whole may be explained worse than one that something hides in part.
-
-The silhouette only adds to the misfit, so the hypothesis without it has a lower one: by more than this on 4 of 40 whole
-training views, and on all of 40 of which 30 % are hidden."""
+"""Misfit by which an object that is seen whole may be explained worse than one that something hides in part: it is on
+36 of 40 whole training views, and on none of 40 of which 30 % are hidden."""
 
 
 @dataclass(frozen=True, eq=False)
 class SearchOutcome:
-    """Outcome of a search.
+    """Outcome of a search: the frame with the constants of its noise, and the candidate that explains it best.
 
-    Attributes:
-        problem: the frame, with the constants of its noise.
-        best: the candidate that explains the frame best.
-        alike: number of candidates that explain it alike and differ from each other, the best included.
+    ``alike`` candidates explain it alike and differ from each other, the best included.
     """
 
     problem: Problem
@@ -479,7 +456,7 @@ class _Trail:
     def with_heavier_cloud(self) -> "_Trail | None":
         """The same with a cloud that is worth more, where the prior of an elastic solid keeps it from being explained.
 
-        Where more weight hardly helps, the object moves in ways that the modes do not have, and the prior is right.
+        Where that hardly helps, the object moves in ways that the modes do not have, and the prior is right.
         """
         problem, best = self.problem, self.best
         if not problem.model.is_normal or self.is_explained:

@@ -10,9 +10,10 @@ state, fitted to the newest frame, begins a new track.
 
 import time
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -53,14 +54,12 @@ class Track:
         problem: of that frame, without correspondences: the model, and constants by the frame's noise.
         unit: length of a scene unit in the clouds' unit.
         posed: the state, scene units, without a scale.
-        time_s: of the frame.
         velocity: of the parameters, in the order of ``gauss_newton``, a second.
         unsure: how far the velocity may be off because little is known yet, scene units per second.
         noise: of the frames, smoothed, scene units.
         clean: constants of frames without noise; ``problem`` has those for ``noise``.
         other_lines: kind of the lines of sight of which a frame says nothing, as it was when the track began.
         area: greatest area of the object that was seen (``seen_area``).
-        calibration: as ``ModesFit`` has it.
     """
 
     problem: Problem
@@ -156,27 +155,21 @@ def next_fit(
 ) -> tuple[ModesFit, Track]:
     """Fit the modes to a frame, and return the fit with the track that ends with it.
 
-    Args:
-        track: up to the frame before.
-        points: of the object, camera frame, the clouds' unit.
-        outliers: points that are none of it (``Evidence.of``).
-        time_s: of the frame.
-        config: constants.
-        lines: what is known of the lines of sight beside the points, in the same frame and unit. Where they leave it
-            open, the object is seen whole or in part as it was when the track began; where it was seen whole and the
-            frame rules that out by more than ``WHOLE``, it is fitted as seen in part too, and the better fit is taken.
+    Points, outliers and lines of sight are in the camera frame and the clouds' unit. Where ``lines`` leave it open, the
+    object is seen whole or in part as it was when the track began; where it was seen whole and the frame rules that out
+    by more than ``WHOLE``, it is fitted as seen in part too, and the better fit is taken.
     """
     started = time.perf_counter()
     with limit_blas_threads():
         few = means_along_sight(points / track.unit, config.points)
         start = track.expected(time_s, config)
-        expectation = Expectation.of(track, start, max(time_s - track.time_s, 0.0), config)
+        precision = motion_precision(track, max(time_s - track.time_s, 0.0), config)
 
         def fit(other_lines: SightKind) -> ModesFit:
             sight_lines = replace(lines.scaled(1 / track.unit), other_lines=other_lines)
             evidence = Evidence.of(few, outliers / track.unit, config.observed_samples, sight_lines)
             problem = changed(track.problem, evidence=evidence)
-            posed = descend(problem, start, expectation, config)
+            posed = descend(problem, start, precision, config)
             return ModesFit(problem, nothing(), track.unit, posed, 0.0, calibration=track.calibration)
 
         fitted = fit(lines.other_lines or track.other_lines)
@@ -218,41 +211,25 @@ def between(first: Posed, second: Posed) -> Float[np.ndarray, " p"]:
     return np.concatenate([turn, second.translation - first.translation, scale, second.z - first.z])
 
 
-@dataclass(frozen=True, eq=False)
-class Expectation:
-    """Expectation of where material points are: a Gaussian of the parameters around a state.
-
-    Attributes:
-        state: the expected one.
-        precision: of the step from it.
-    """
-
-    state: Posed
-    precision: Float[np.ndarray, "p p"]
-
-    @classmethod
-    def of(cls, track: Track, state: Posed, passed_s: float, config: TrackConfig) -> "Expectation":
-        """Expectation after a time: each point is where ``state`` has it, up to its speeds times that."""
-        speed = config.speed + max(config.gain * max(track.speed - config.dead, 0.0), track.unsure)
-        # noisy frames weigh less, and a moving object must not lag behind for that
-        coarser = track.problem.config.cloud_sigma / track.clean.cloud_sigma
-        sigma = coarser * (speed * passed_s + config.least)
-        return cls(state, track.squared * (config.motion_weight / sigma**2))
-
-    def add_to(self, normal: NormalEquations, posed: Posed) -> NormalEquations:
-        """Sum with the squared distance from the expectation."""
-        gradient = self.precision @ between(self.state, posed)
-        return NormalEquations(normal.matrix + self.precision, normal.gradient + gradient)
+def motion_precision(track: Track, passed_s: float, config: TrackConfig) -> Float[np.ndarray, "p p"]:
+    """Precision of the parameters' step from the expected state: a point is there up to its speeds times the time."""
+    speed = config.speed + max(config.gain * max(track.speed - config.dead, 0.0), track.unsure)
+    # noisy frames weigh less, and a moving object must not lag behind for that
+    coarser = track.problem.config.cloud_sigma / track.clean.cloud_sigma
+    sigma = coarser * (speed * passed_s + config.least)
+    precision: Float[np.ndarray, "p p"] = track.squared * (config.motion_weight / sigma**2)
+    return precision
 
 
-def descend(problem: Problem, start: Posed, expectation: Expectation, config: TrackConfig) -> Posed:
-    """State that explains cloud, silhouette, prior and expectation, from nearby."""
+def descend(problem: Problem, start: Posed, precision: Float[np.ndarray, "p p"], config: TrackConfig) -> Posed:
+    """State that explains cloud, silhouette and prior from nearby, and lies near ``start``, which is expected."""
     constants, half = problem.config, problem.model.half
     prior = Prior.whole(problem.model)
     posed, steps = start, config.steps + config.exact_steps
     for step in range(steps):
         sigma = max(config.first_sigma * half * config.cooling**step, constants.cloud_sigma)
-        normal = expectation.add_to(problem.known(posed, prior, 0.0), posed)
+        expected = NormalEquations(precision, precision @ between(start, posed))
+        normal = problem.known(posed, prior, 0.0).plus(expected)
         normal = problem.seen(normal, posed, sigma, 0.0, exact=step >= config.steps)
         posed = posed.moved(normal.step(DAMPING))
     return posed
@@ -260,21 +237,14 @@ def descend(problem: Problem, start: Posed, expectation: Expectation, config: Tr
 
 # --- search in the background -----------------------------------------------------------------------------------------
 
-# TrackedFrame -BackgroundSearch.start-> (seconds later) -BackgroundSearch.take-> Searched
+# TrackedFrame -BackgroundSearch.start-> (seconds later) -BackgroundSearch.take-> Candidate
 #
 # NumPy lets go of the interpreter in most of a search, so a thread is enough.
 
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
-    """Frame of a sequence, with what is known of it.
-
-    Attributes:
-        seen: the object in the frame.
-        time_s: of the frame.
-        scene_unit: length of a scene unit in the frame's unit, where it is known for certain.
-        keep_all: take every point for the object's.
-    """
+    """Frame of a sequence, with what is known of it: the arguments of ``Tracker.follow``."""
 
     seen: Observation
     time_s: Number
@@ -283,13 +253,6 @@ class TrackedFrame:
 
     def __post_init__(self) -> None:
         check_bounds(self)
-
-
-class Searched(NamedTuple):
-    """Frame in which a lost object was searched for, and its best candidate, which may not explain it."""
-
-    frame: TrackedFrame
-    candidate: Candidate
 
 
 class SynchronousExecutor(Executor):
@@ -319,31 +282,31 @@ class BackgroundSearch:
         self.registrar = replace(registrar, constants=replace(registrar.config, search_rounds=2))
         self.executor = executor
         self._thread = ThreadPoolExecutor(1, "mereo-search")
-        self._running: Future[Searched] | None = None
+        self._running: tuple[TrackedFrame, Future[Candidate]] | None = None
 
     def start(self, frame: TrackedFrame) -> None:
         """Search a frame, unless one is being searched, or was and has not been taken."""
         if self._running is None:
             executor = self._thread if self.executor is None else self.executor
-            self._running = executor.submit(_search, self.registrar, frame)
+            arguments = frame.seen, self.registrar, frame.keep_all, frame.scene_unit
+            self._running = frame, executor.submit(lambda: search_hypotheses(*arguments)[0])
 
-    def take(self) -> Searched | None:
-        """What the last search has found; None while it goes on, and where nothing was searched or could be.
+    def take(self) -> tuple[TrackedFrame, Candidate] | None:
+        """The searched frame and its best candidate, which may not explain it; None where there is none, or not yet.
 
         Raises what a search does, but for the ``ValueError`` of an unusable frame.
         """
-        if self._running is None or not self._running.done():
+        if self._running is None or not self._running[1].done():
             return None
-        ended, self._running = self._running, None
-        try:
-            return ended.result()
-        except ValueError:
-            return None
+        (frame, ended), self._running = self._running, None
+        with suppress(ValueError):
+            return frame, ended.result()
+        return None
 
     def drop(self) -> None:
         """Forget the frame that is being searched."""
         if self._running is not None:
-            self._running.cancel()
+            self._running[1].cancel()
             self._running = None
 
     def close(self, wait: bool) -> None:
@@ -351,10 +314,6 @@ class BackgroundSearch:
         self.drop()
         self._thread.shutdown(wait, cancel_futures=True)
         self._thread = ThreadPoolExecutor(1, "mereo-search")
-
-
-def _search(registrar: Registrar, frame: TrackedFrame) -> Searched:
-    return Searched(frame, search_hypotheses(frame.seen, registrar, frame.keep_all, frame.scene_unit)[0])
 
 
 # --- the tracker ------------------------------------------------------------------------------------------------------
@@ -462,12 +421,12 @@ class Tracker:
 
     def _searched(self, frame: TrackedFrame) -> "_Tracked | None":
         """Fit the frame from the state that a search has found in an earlier one; None where that explains none."""
-        searched = self._search.take()
-        if searched is None or searched.candidate.modes is None:
+        earlier, candidate = self._search.take() or (frame, None)
+        if candidate is None or candidate.modes is None:
             return None
         before = self._T_camera_input, self._axes
-        self._T_camera_input, self._axes = searched.candidate.encoded.T_camera_input, searched.frame.seen.frame.axes
-        begun = _Tracked.of_frame(searched.candidate, searched.frame.time_s, self.config, self.registrar.config)
+        self._T_camera_input, self._axes = candidate.encoded.T_camera_input, earlier.seen.frame.axes
+        begun = _Tracked.of_frame(candidate, earlier.time_s, self.config, self.registrar.config)
         area = 0.0 if self._track is None else self._track.area
         tracked, _ = self._tracked(replace(begun.track, area=max(area, begun.track.area)), frame, np.inf)
         if tracked is not None and self._takes(tracked):

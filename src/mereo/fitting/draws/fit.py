@@ -50,10 +50,7 @@ class DrawsProblem:
 
     Attributes:
         base: the same frame, explained by modes, with the weights that the draws are fitted by.
-        states: random states of the scene.
-        correspondences: of the network, scene units.
-        weights: how their rest positions follow the material points.
-        config: constants.
+        correspondences, weights: of the network, scene units, and how their rest positions follow the material points.
         by_sight: whether observed points are compared with what their lines of sight meet, or with the nearest points.
     """
 
@@ -100,13 +97,11 @@ class DrawsProblem:
 
 @dataclass(frozen=True, eq=False)
 class DrawsFit:
-    """A played state beside the frame.
+    """A played state, by its draws, beside the frame.
 
     Attributes:
-        drawn, z: the state by its draws.
         posed: rigid pose; its ``z`` is empty.
         material: material points, unposed.
-        surface: the posed surface.
         distance, face, position: of what each observed sample is compared with.
         misfit: with the prior of the draws, the cloud by its last sigma.
         motion: of the played points for a standard deviation of each draw, where it is known.
@@ -248,10 +243,8 @@ def secant(
 
 # --- the state of a given shape ---------------------------------------------------------------------------------------
 
-# Draws whose state has a given shape: Levenberg and Marquardt's method on few points, without looking at the frame.
-#
-# The fit of the modes is dense and smooth, so the draws of a state like it are found from far away. Playing few
-# points of a state costs milliseconds; one set of differences serves for several steps (Broyden's rule).
+# Levenberg and Marquardt's method on few points, without looking at the frame. A fit of the modes is dense and smooth,
+# so the draws of a state like it are found from far away; one set of differences serves for several steps.
 
 SHAPE_WEIGHT = 500.0
 """How many independent points a shape is worth."""
@@ -265,11 +258,9 @@ ENOUGH = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """Shape to be met: positions of some points, in any pose.
+    """Shape to be met: positions of some points, in any pose, with their standard deviation.
 
     Attributes:
-        points: the positions.
-        std: standard deviation of each.
         weight: inverse variances, together worth as many points as the shape is.
         follow: how the points follow the played points of a state; they are these where None.
     """
@@ -306,14 +297,13 @@ class Shape:
 
 @dataclass(frozen=True, eq=False)
 class StateOnShape:
-    """A state of a scene beside a shape.
+    """A state of a scene, by its draws, beside a shape.
 
     Attributes:
-        drawn, z: the state by its draws.
         points: its played points.
         rotation, translation: rigid motion onto the shape.
         misfit: how badly it meets the shape, with the prior of the draws.
-        motion: of the played points for a standard deviation of each draw, where it is known.
+        motion: as ``DrawsFit.motion``.
     """
 
     drawn: Drawn
@@ -400,10 +390,9 @@ def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
 
 
 def refine_by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
-    """Refine a state by what the lines of sight meet, with every observed point.
+    """Refine a state by what the lines of sight meet, with every observed point, over which noise averages out.
 
-    Nearest points lead there from afar, and noise takes them a little beside it; over more points it averages out. The
-    fit has the observed samples of all other states, but its misfit by every point: those it was fitted to.
+    The fit has the observed samples of all other states, but its misfit by every point: those it was fitted to.
     """
     sighted = replace(problem, by_sight=True)
     dense = replace(sighted, base=problem.last)
@@ -556,10 +545,7 @@ def find_jumps(problem: DrawsProblem, fit: DrawsFit, number: int, sigma: float) 
 
 
 def draws_that_may_jump(problem: DrawsProblem, fit: DrawsFit) -> Int[np.ndarray, " n"]:
-    """Choose draws that may jump: of many, those that move a part along its own surface, as a ring on its post.
-
-    Only then a state far away may look nearly the same, so that no small step leads there.
-    """
+    """Choose draws that may jump: of many, those that move a part along its own surface, as a ring on its post."""
     smooth = np.flatnonzero(fit.drawn.smooth)
     if problem.config.sliding >= 1.0 or fit.motion is None:
         return smooth
@@ -649,8 +635,7 @@ def redraw_choices(scene: Scene, drawn: Drawn, count: int) -> list[Drawn]:
 # --- segments turned by their symmetries ------------------------------------------------------------------------------
 
 # An arm looks the same with the forearm half a turn round, the wrist bent the other way and the hand turned back. No
-# small step leads there, and no jump of one draw: several change at once. But the shape is known, so that the draws can
-# be drawn towards it as towards that of the modes.
+# jump of one draw leads there, but the shape is known, so that the draws can approach it as that of the modes.
 
 Twins = tuple[tuple[Symmetry, float], ...]
 """Segments that hang on each other, and the angle by which each is turned."""
@@ -660,7 +645,7 @@ Twins = tuple[tuple[Symmetry, float], ...]
 def symmetric_groups(model: StatisticalModel) -> tuple[Twins, ...]:
     """Groups of two segments or more that hang on each other and each look alike in exactly one other turn.
 
-    A segment that spins, or looks alike in many turns, is left to single draws, which slide along its surface.
+    Others are left to single draws, which slide along their surface.
     """
     single = dict[int, tuple[Symmetry, float]]()
     for turn in find_symmetries(model):

@@ -79,10 +79,7 @@ class Problem:
     """Everything a fit of one frame works on; scene units, camera frame.
 
     Attributes:
-        model: the statistical model.
-        network: correspondences.
-        evidence: the frame.
-        scale_std: how far the scale is unsure.
+        scale_std: standard deviation of the scale's logarithm.
         config: constants.
         noisy: whether they are those of a noisy frame.
         given: pose that is known; None where the frame alone says it.
@@ -105,7 +102,7 @@ class Problem:
         scale_std: float,
         config: FitConfig,
     ) -> "Problem":
-        """Problem of one frame: what the network found, and what the frame shows."""
+        """Problem of a frame with correspondences of a network."""
         return cls(model, NetworkTerm.of(model, correspondences), evidence, scale_std, config)
 
     @property
@@ -137,9 +134,7 @@ class Problem:
     def as_noisy_as(self, surface: Surface, is_shared: bool = False) -> "Problem | None":
         """The problem of a frame as noisy as what a fit leaves over; None where the constants are for one like that.
 
-        Args:
-            surface: the fit's.
-            is_shared: take for noise what neighbours share too.
+        What neighbours share is taken for noise too where ``is_shared``.
         """
         noise = noise_of(surface.offsets(self.evidence.points)) if is_shared else self.residual_noise(surface)
         config = constants_for(noise, self.config)
@@ -306,12 +301,10 @@ CLEAN = 0.1
 """Noise, in scene units, up to which the constants are as they are; clean frames have 0.05 to 0.07."""
 
 COHERENT = 1.3
-"""What a fit leaves over, in noises, from which on it is wrong; right ones have 0.8 to 1.1, whatever the camera."""
+"""What a fit leaves over, in noises, from which on it is wrong; right ones have 0.8 to 1.1."""
 
 NORMAL = 4.3
-"""The 95 % quantile of what a fit leaves over, in its median, up to which it looks like normal numbers, with 2.9.
-
-Right fits to simulated and real cameras have 2.7 to 4.2, of sheets in a wrong state 5.5 to 8.6."""
+"""The 95 % quantile of what a fit leaves over, in its median, up to which it looks like normal numbers, with 2.9."""
 
 SIGMAS = 1.5
 """Standard deviation that the cloud gets, in noises: mixed pixels are far beyond ``residuals.ROBUST`` of these."""
@@ -323,14 +316,10 @@ LARGEST = 1.0
 """Largest standard deviation of the cloud, in scene units."""
 
 SHARED = 1.05
-"""Misfit of a noisy cloud, in misfits of what neighbours do not share, up to which nothing more is to be explained.
-
-Fits to noisy training views that other states do not improve have 1.02 to 1.15, those that they do mostly more."""
+"""Misfit of a noisy cloud, in misfits of what neighbours do not share, up to which nothing more is to be explained."""
 
 ACCEPTED = 0.75
-"""Share of a noisy frame's points that a fit must explain to be believed: the rest are outliers that nothing reveals.
-
-Of 13 noisy training views that explain .76 to .95, the network was better in one, that with .76."""
+"""Share of a noisy frame's points that a fit must explain to be believed: nothing reveals the outliers among them."""
 
 
 def unshared(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:

@@ -38,9 +38,7 @@ class Candidate:
 
     Attributes:
         encoded: these points, and what the network made of them.
-        modes: the fit; None where none was wanted or none was found.
-        error: why none was found.
-        located_by: who found the object there.
+        modes: the fit; None where none was wanted, or none was found for ``error``.
     """
 
     encoded: EncodedFrame

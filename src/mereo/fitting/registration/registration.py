@@ -16,7 +16,7 @@ from mereo.geometry.brief import counted
 from mereo.geometry.conventions import LARGEST, check_real
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids, owned_centroids, signed_distance_and_direction
-from mereo.geometry.transforms import fit_rigid, is_rigid
+from mereo.geometry.transforms import checked_pose, fit_rigid, transform_points
 from mereo.io.bounds import check_value
 from mereo.scenes.statistical_model import StatisticalModel, following
 
@@ -54,13 +54,11 @@ class Located:
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """A state of the object's own deformation model, in the frame of an observed cloud.
+    """A state of the object's statistical model, in the frame of an observed cloud.
 
     Attributes:
-        model: the statistical model: rest mesh and material points.
         material: positions of all material points in the camera frame, input unit.
-        method: which description of the states it was found in.
-        z: coefficients of the modes (at rest those nearest to it), or standard normal draws of the scene.
+        method, z: which description of the states it was found in; coefficients of the modes (at rest those nearest to it), or standard normal draws of the scene.
         scene_unit: length of a scene unit in the input's.
         unit_known: whether that was known beforehand; otherwise it was found together with the pose.
         explained: share of the observed points that lie on the model's facing surface, up to the tolerance.
@@ -244,13 +242,7 @@ class Registration:
 
     def moved(self, T_new_camera: Float[np.ndarray, "4 4"]) -> "Registration":
         """Registration in another frame; raises ``ValueError`` for a transform that is not rigid."""
-        check_real(T_new_camera, "the transform")
-        if not is_rigid(T_new_camera):
-            raise ValueError(
-                f"the transform is {T_new_camera.tolist()}; it must be rigid, a rotation and a translation, with "
-                "0 0 0 1 below: scale or shear the mesh instead"
-            )
-        return replace(self, material=self.material @ T_new_camera[:3, :3].T + T_new_camera[:3, 3])
+        return replace(self, material=transform_points(checked_pose(T_new_camera), self.material))
 
     @cached_property
     def _moved_anchors(self) -> tuple[Anchors, ...]:
