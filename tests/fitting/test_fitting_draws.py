@@ -29,15 +29,6 @@ def states(model: StatisticalModel) -> DrawnStates:
     return DrawnStates.of(SCENE, model, 30, 1000)
 
 
-def test_played_points_are_material_points(model: StatisticalModel, states: DrawnStates) -> None:
-    """They move as all material points do, though maps that segments share are called once."""
-    drawn = Drawn.of(SCENE, 1003)
-    deformations = drawn.deformations(SCENE, drawn.z)
-    assert deformations is not None
-    slow = material_moved(SCENE, model, deformations)
-    np.testing.assert_allclose(states.played.moved(deformations), slow[states.played.index], atol=1e-9)
-
-
 def test_all_points_follow_the_played_ones(model: StatisticalModel, states: DrawnStates) -> None:
     drawn = Drawn.of(SCENE, 1004)
     deformations = drawn.deformations(SCENE, drawn.z)

@@ -8,7 +8,6 @@ import pytest
 from answers import answer_to
 
 from mereo.evaluation.sample_views import load_view
-from mereo.evaluation.scans import SCANS, scan_in_camera
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.problem import (
@@ -121,13 +120,6 @@ def test_points_that_a_fit_explains_are_given_back_beside_strays(
     assert keep[lost].all() and not keep[len(points) :].any()
 
 
-def test_without_a_fit_the_likely_reading_is_taken(model: Model, points: np.ndarray) -> None:
-    contaminated = with_rim(points)
-    found, likelier = candidates(model, None, contaminated)
-    assert found.modes is None and found.encoded is likelier
-    assert found.hypothesis.dropped == readings(PointCloud(contaminated))[0].dropped
-
-
 def test_an_answer_says_which_points_it_is_of(model: Model, registrar: Registrar, points: np.ndarray) -> None:
     found = answer_to(with_rim(points), model, registrar, 24, label_points=True, scene_unit=1.0)
     assert found.taken and found.reconstruction.observed is not None
@@ -166,15 +158,6 @@ def test_what_neighbours_share_is_no_noise(points: np.ndarray) -> None:
     assert noise_of(half, around) == 0.0
     assert 0.97 < shared(own, around, 0.45) < SHARED
     assert shared(own + 0.5, around, 0.45) > 1.3 and shared(own + half, around, 0.45) > 1.3
-
-
-def test_noise_that_neighbours_share_is_spread_evenly_and_a_wrong_state_is_not() -> None:
-    rng = np.random.default_rng(0)
-    windows = np.repeat(rng.normal(size=300), 9)
-    around = np.zeros((len(windows), 8), dtype=int)
-    assert is_noise(0.1 * windows, around, is_shared=True) and not is_noise(windows, around, is_shared=True)
-    far = np.where(rng.random(len(windows)) < 0.1, 6.0, windows)
-    assert not is_noise(0.1 * far, around, is_shared=True)
 
 
 def test_a_noisy_cloud_is_explained_where_only_noise_is_left(
@@ -230,14 +213,3 @@ def test_clean_views_lose_nothing(name: str) -> None:
             assert fitted(network, modes, seen.points).hypothesis.dropped == 0, index
         else:
             assert found[0].cloud is seen, index
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SCANS)
-def test_real_scans_lose_nothing(name: str) -> None:
-    try:
-        seen = scan_in_camera(name)[0]
-    except AssetUnavailable as error:
-        pytest.skip(str(error))
-    network = load_model("bunny")
-    assert fitted(network, Registrar.of(network, "modes"), seen.points, unit=None).hypothesis.dropped == 0

@@ -80,25 +80,6 @@ def test_draws_come_back_with_their_seed_sizes_and_names(model: StatisticalModel
     np.testing.assert_array_equal(drawn.smooth, before.drawn.smooth)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["rope", "robot", "engine"])
-def test_a_built_in_scene_is_found_by_its_name(name: str, tmp_path: Path) -> None:
-    scene = load_scene(name)
-    model = scene_model(scene, count=20)
-    before = by_draws(model, scene)
-    save_state(tmp_path / STATE, state_of(before, scene))
-    assert_same(load_state(tmp_path, model), before)
-
-
-def test_weights_keep_the_digest_of_their_model(rope: Model, tmp_path: Path) -> None:
-    save_model(rope, tmp_path / "r.safetensors")
-    one, other = (load_model(tmp_path / "r.safetensors").statistical_model for _ in range(2))
-    assert one is not None and other is not None
-    assert model_digest(one) == model_digest(other)
-    state = state_of(by_modes(one), "rope")
-    assert_same(restored(state, other), by_modes(one))
-
-
 def test_a_state_of_other_weights_is_refused(model: StatisticalModel) -> None:
     state = state_of(by_modes(model), "toy", weights="mine.safetensors")
     modes = model.modes.copy()
@@ -185,3 +166,21 @@ def test_a_damaged_number_of_coefficients_is_said(model: StatisticalModel) -> No
     moved = state.model_copy(update={"z": (state.z[0] + 1, *state.z[1:])})
     with pytest.raises(ValueError, match="has changed since, or the file: register the frame again"):
         restored(moved, model)
+
+
+@pytest.mark.slow
+def test_a_built_in_scene_is_found_by_its_name(tmp_path: Path) -> None:
+    scene = load_scene("rope")
+    model = scene_model(scene, count=20)
+    before = by_draws(model, scene)
+    save_state(tmp_path / STATE, state_of(before, scene))
+    assert_same(load_state(tmp_path, model), before)
+
+
+def test_weights_keep_the_digest_of_their_model(rope: Model, tmp_path: Path) -> None:
+    save_model(rope, tmp_path / "r.safetensors")
+    one, other = (load_model(tmp_path / "r.safetensors").statistical_model for _ in range(2))
+    assert one is not None and other is not None
+    assert model_digest(one) == model_digest(other)
+    state = state_of(by_modes(one), "rope")
+    assert_same(restored(state, other), by_modes(one))

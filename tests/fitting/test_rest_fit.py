@@ -43,14 +43,6 @@ def test_a_bent_object_is_not(model: StatisticalModel, excess: float) -> None:
     assert fit_correspondences(points, said(model, material), model, 1.0).method == "modes"
 
 
-def test_an_object_at_rest_needs_no_draws(model: StatisticalModel) -> None:
-    points, material = seen(model.rest.transformed(IN_FRONT)), transform_points(IN_FRONT, model.rest_points)
-    fitted = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
-    assert fitted.rest is not None
-    found = fitted.with_draws(DrawnStates.of(SCENE, model, 30))
-    assert found.method == "rest" and found.seconds == fitted.seconds
-
-
 def test_under_noise_draws_are_asked_too_and_an_object_at_rest_stays_at_rest(model: StatisticalModel) -> None:
     points, material = seen(model.rest.transformed(IN_FRONT)), transform_points(IN_FRONT, model.rest_points)
     clean = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)

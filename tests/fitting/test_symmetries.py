@@ -95,19 +95,10 @@ def test_of_a_wheel_of_six_sides_only_sixths_look_alike() -> None:
     assert np.isin([60, 120, 180, 240, 300], degrees).all() and not np.isin([30, 90, 150, 210, 270, 330], degrees).any()
 
 
-def test_an_object_without_states_is_at_rest() -> None:
-    model = model_of(free)
-    assert find_symmetries(model.around(model.mean, np.zeros((len(model.mean), 3, 0), dtype=np.float32))) == ()
-
-
 def test_turns_that_no_state_makes_by_themselves_do_not_count() -> None:
     assert find_symmetries(model_of(held)) == ()
     for turn in find_symmetries(model_of(coupled)):  # it may stand on its head
         assert abs(turn.axis[2]) < 0.01
-
-
-def test_a_wheel_with_a_long_peg_is_not_like_itself() -> None:
-    assert find_symmetries(model_of(free, peg=6.0)) == ()
 
 
 def test_what_is_left_open_has_the_second_moments_of_the_turns() -> None:
@@ -193,3 +184,12 @@ def test_of_many_draws_those_jump_that_slide_along_the_surface() -> None:
     assert abs(ndtr(start.z[0]) - ndtr(truth[0])) > 0.1 and abs(ndtr(found.z[0]) - ndtr(truth[0])) < 0.01
     assert found.misfit < start.misfit
     assert try_jumps(replace(problem, config=replace(config, jumps=0)), start) is start
+
+
+def test_an_object_without_states_is_at_rest() -> None:
+    model = model_of(free)
+    assert find_symmetries(model.around(model.mean, np.zeros((len(model.mean), 3, 0), dtype=np.float32))) == ()
+
+
+def test_a_wheel_with_a_long_peg_is_not_like_itself() -> None:
+    assert find_symmetries(model_of(free, peg=6.0)) == ()

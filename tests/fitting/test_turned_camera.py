@@ -72,27 +72,6 @@ def test_a_frame_that_is_explained_is_asked_about_once(model: StatisticalModel) 
     assert network.asked == 0
 
 
-@pytest.mark.slow
-def test_no_better_answer_leaves_the_fit_as_it_is(model: StatisticalModel) -> None:
-    """Another object in the frame: what is stated of it turned is nonsense, and never taken."""
-    points, material = shown(model, 0.5)
-    ball = np.random.default_rng(0).normal(size=(600, 3))
-    ball = 9.0 * ball / np.linalg.norm(ball, axis=1, keepdims=True)
-    points = ball[ball[:, 2] < -3.0] + IN_FRONT[:3, 3]
-    found = said(model, material)
-    alone = ModesFit.of(CloudToFit(points, 1.0), found, model)
-    asked = ModesFit.of(CloudToFit(points, 1.0), found, model, predict=lambda seen: found.rows(np.arange(20)))
-    assert asked.problem.misfit(asked.posed).without_network <= alone.problem.misfit(alone.posed).without_network
-
-
-def test_where_frames_do_not_wait_none_is_asked_about_again(model: StatisticalModel) -> None:
-    points, material = shown(model, 0.8)
-    network = Network(points, said(model, material), None)
-    found = confused(said(model, material))
-    ModesFit.of(CloudToFit(points, 1.0), found, model, FitConfig(turned=False), predict=network)
-    assert network.asked == 0
-
-
 def test_noise_that_hides_how_wrong_a_fit_is_hides_it_from_a_last_try_no_more(model: StatisticalModel) -> None:
     points, material = shown(model, 0.8)
     points = points * (1 + np.random.default_rng(0).normal(scale=0.4, size=(len(points), 1)) / IN_FRONT[2, 3])

@@ -101,10 +101,6 @@ def test_an_arm_has_one_group_of_forearm_and_wrist() -> None:
     assert all(angle == pytest.approx(np.pi) and abs(turn.axis[0]) > 0.999 for turn, angle in together)
 
 
-def test_an_object_without_such_segments_has_no_group(toy_model: StatisticalModel) -> None:
-    assert symmetric_groups(toy_model) == ()
-
-
 def test_the_turned_shape_is_that_of_other_draws() -> None:
     """Exactly, as the segments lie on the axis of the roll; and twice turned is the same."""
     (together,) = symmetric_groups(model())

@@ -58,7 +58,8 @@ class Registration:
 
     Attributes:
         material: positions of all material points in the camera frame, input unit.
-        method, z: which description of the states it was found in; coefficients of the modes (at rest those nearest to it), or standard normal draws of the scene.
+        method: which description of the states it was found in.
+        z: coefficients of the modes (at rest those nearest to it), or standard normal draws of the scene.
         scene_unit: length of a scene unit in the input's.
         unit_known: whether that was known beforehand; otherwise it was found together with the pose.
         explained: share of the observed points that lie on the model's facing surface, up to the tolerance.
