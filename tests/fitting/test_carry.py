@@ -17,14 +17,9 @@ from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import transform_points
 from mereo.io.attachments import Attachment, PoseTable, Positions, Surfaces
-from mereo.scenes.random_states import scene_model, state_points
+from mereo.scenes.random_states import state_points
 from mereo.scenes.scene import State
 from mereo.scenes.statistical_model import StatisticalModel
-
-
-@pytest.fixture(scope="module")
-def model() -> StatisticalModel:
-    return scene_model(SCENE, count=60)
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import transform_points
 from mereo.io.attachments import Attachment, read_attachments, write_attachment
 from mereo.io.volume_files import Volume, is_labels, read_label_volume, read_volume
-from mereo.scenes.random_states import scene_model, state_points
+from mereo.scenes.random_states import state_points
 from mereo.scenes.statistical_model import StatisticalModel
 
 nibabel = pytest.importorskip("nibabel")
@@ -29,11 +29,6 @@ TURN = np.array([[0.0, -1, 0], [0, 0, 1], [1, 0, 0]])
 SPACING = 0.7
 
 RAMP = np.array([3.0, -2.0, 5.0])
-
-
-@pytest.fixture(scope="module")
-def model() -> StatisticalModel:
-    return scene_model(SCENE, count=60)
 
 
 @pytest.fixture(scope="module")

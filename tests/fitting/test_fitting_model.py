@@ -10,11 +10,6 @@ from mereo.scenes.seeds import example_rng
 from mereo.scenes.statistical_model import StatisticalModel
 
 
-@pytest.fixture(scope="module")
-def model(toy_model: StatisticalModel) -> StatisticalModel:
-    return toy_model
-
-
 def test_modes_reproduce_states_they_were_not_built_from(model: StatisticalModel) -> None:
     scene = toy_scene()
     for index in range(5):

@@ -1,4 +1,4 @@
-"""A tracked object without weights that is lost: its frames say so, and it is searched beside them."""
+"""A tracked object without weights: its frames say that it is lost; what passes in front does not pull it."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tracked_views import CAMERA, bare, lump_model, mesh_of, rms, view
+from tracked_views import CAMERA, bare, lump_model, mesh_of, rms, vertices, view, whole
 
 from mereo.api.result import Result
 from mereo.cli.stream import Answering, Seen, SurfaceFolder, line
@@ -24,6 +24,7 @@ from mereo.reconstruction.observation import Observation, observe
 from mereo.reconstruction.pipeline import EncodedFrame
 from mereo.reconstruction.stream import Outcome
 from mereo.synthesis.clutter import Capsule
+from mereo.synthesis.depth_sensor import SimulatedView
 
 
 @pytest.fixture(scope="module")
@@ -262,3 +263,49 @@ def test_a_stream_says_that_an_object_is_lost(
     assert lines[1]["reason"].startswith("the object is lost: only")
     # surfaces of the frame that was there by this name before it was lost are gone
     assert not list((tmp_path / "out").iterdir())
+
+
+# --- what passes in front ---------------------------------------------------------------------------------------------
+
+
+FRAMES, BEFORE, AFTER = 11, 3, 8
+
+
+@pytest.fixture(scope="module")
+def crossing(registrar: Registrar) -> list[tuple[SegmentedMesh, SimulatedView]]:
+    """A tool comes from the side, hides half of an object that bends slowly, and leaves."""
+    frames = []
+    for number in range(FRAMES):
+        mesh = mesh_of(registrar.model, 20, 0.3 * number / FRAMES)
+        low, high = vertices(mesh).min(axis=0), vertices(mesh).max(axis=0)
+        tool: tuple[Capsule, ...] = ()
+        if BEFORE <= number < AFTER:
+            share = np.sin(np.pi * (number - BEFORE + 0.5) / (AFTER - BEFORE))
+            width, z = high[0] - low[0], 0.9 * low[2]
+            x = 0.9 * (low[0] - width + (0.25 + 0.35 * share) * width)
+            tool = (Capsule(np.array([x, -200.0, z]), np.array([x, 200.0, z]), 0.9 * width),)
+        frames.append((mesh, view(mesh, number, tool)))
+    return frames
+
+
+def errors(
+    registrar: Registrar, crossing: list[tuple[SegmentedMesh, SimulatedView]], observed: Callable[..., Observation]
+) -> list[float]:
+    """Greatest error before, while and after something is in front."""
+    with Tracker(registrar, executor=SynchronousExecutor()) as tracker:
+        answers = [tracker.follow(observed(one), i / 30, scene_unit=1.0) for i, (_, one) in enumerate(crossing)]
+    assert [one.tracking for one in answers] == ["found", *["followed"] * (FRAMES - 1)]
+    off = [rms(answer, mesh) for answer, (mesh, _) in zip(answers, crossing, strict=True)]
+    return [max(part) for part in (off[:BEFORE], off[BEFORE:AFTER], off[AFTER:])]
+
+
+@pytest.mark.parametrize("observed", [bare, whole])
+def test_what_passes_in_front_does_not_pull_the_object(
+    registrar: Registrar,
+    crossing: list[tuple[SegmentedMesh, SimulatedView]],
+    observed: Callable[..., Observation],
+) -> None:
+    shown = [int(one.image.valid.sum()) for _, one in crossing]
+    assert min(shown[BEFORE:AFTER]) < 0.6 * shown[0]
+    before, during, after = errors(registrar, crossing, observed)
+    assert max(before, during, after) < 0.6 and during < 1.2 * before

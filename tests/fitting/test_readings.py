@@ -27,16 +27,9 @@ from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import PointCloud
 from mereo.models.model import Model
 from mereo.models.weights import load_model
-from mereo.reconstruction.isolation import Reading, readings
+from mereo.reconstruction.isolation import Reading
 from mereo.reconstruction.observation import observe
 from mereo.reconstruction.pipeline import EncodedFrame
-from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import AssetUnavailable
-from mereo.scenes.seeds import example_rng
-from mereo.synthesis.config import GenerateConfig
-from mereo.synthesis.examples import sample_view
-
-CLEAN_SEED = 720_000
 
 
 @pytest.fixture(scope="module")
@@ -190,26 +183,3 @@ def test_doubtful_points_rule_nothing_out(points: np.ndarray) -> None:
     vertices = np.array([corner * 50.0, corner * 150.0])
     assert (Evidence.of(points).violations(vertices, 0.5)[1] > 0).all()
     assert (Evidence.of(points, corner[None] * 300.0).violations(vertices, 0.5)[1] == 0).all()
-
-
-CLEAN_VIEWS = {"shapes": 20, "lizard": 20, "robot": 20, "rope": 20, "engine": 20, "sheet": 20}
-CLEAN_VIEWS |= {"bunny": 20, "human": 20, "skull": 20, "liver": 20}  # of real meshes
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CLEAN_VIEWS)
-def test_clean_views_lose_nothing(name: str) -> None:
-    """Whether there is one reading or a fit has chosen of two, each point is kept, and so the answer is the same."""
-    try:
-        scene = load_scene(name).for_seed(CLEAN_SEED)
-    except AssetUnavailable as error:
-        pytest.skip(str(error))
-    network = load_model(name)
-    modes = Registrar.of(network, "modes")
-    for index in range(CLEAN_VIEWS[name]):
-        seen = sample_view(scene, GenerateConfig(), example_rng(CLEAN_SEED, index)).depth.to_points()
-        found = readings(seen)
-        if len(found) > 1:
-            assert fitted(network, modes, seen.points).hypothesis.dropped == 0, index
-        else:
-            assert found[0].cloud is seen, index

@@ -31,10 +31,10 @@ from mereo.geometry.camera import PointCloud
 from mereo.models.calibration import Calibration, Recognizing, Usual
 from mereo.models.weights import load_model
 from mereo.scenes.draw_recorder import FartherDraws, with_farther_states
-from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene, SourceFrame
 from mereo.scenes.seeds import example_rng
+from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
 
@@ -42,9 +42,8 @@ SCENE = toy_scene()
 
 
 @pytest.fixture(scope="module")
-def registration() -> Registration:
+def registration(model: StatisticalModel) -> Registration:
     """A registration that nothing speaks against: the mean state."""
-    model = scene_model(SCENE, count=100)
     return Registration(
         model=model,
         material=model.mean + np.array([0.0, 0.0, 100.0]),

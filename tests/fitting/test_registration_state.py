@@ -30,11 +30,6 @@ from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel
 
 
-@pytest.fixture(scope="module")
-def model() -> StatisticalModel:
-    return scene_model(SCENE, count=60)
-
-
 def by_draws(model: StatisticalModel, scene: Scene = SCENE, seed: int = 5) -> Registration:
     """Draws that a fit has moved away from those of their seed."""
     drawn = Drawn.of(scene, seed)

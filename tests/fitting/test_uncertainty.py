@@ -5,51 +5,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from answers import fit_correspondences
+from fit_cases import SCENE, said, seen, shown
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from toy_scene import Lift, Shear, toy_scene
 
 from mereo.evaluation.cases import RegistrationErrors, seen_points
-from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.uncertainty import Posterior, radius95
-from mereo.geometry.camera import Camera, PointCloud
+from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import owned_centroids, owned_gradients
 from mereo.geometry.transforms import rigid, transform_points
-from mereo.scenes.random_states import scene_model, state_points
 from mereo.scenes.statistical_model import StatisticalModel
-from mereo.synthesis.depth_sensor import render_depth
-
-SCENE = toy_scene()
-IN_FRONT = rigid(Rotation.from_euler("xyz", [25, 30, 10], degrees=True).as_matrix(), np.array([1.0, 2.0, 120.0]))
-"""``T_camera_world`` of an object around the world's origin."""
-
-
-@pytest.fixture(scope="module")
-def model() -> StatisticalModel:
-    return scene_model(SCENE, count=200)
 
 
 @pytest.fixture(scope="module")
 def material(model: StatisticalModel) -> np.ndarray:
-    shear = Shear(1.5, 0.15, 0.1)
-    state = SCENE.deform((shear, shear, shear, Lift(1.0, shear)))
-    return transform_points(IN_FRONT, state_points(state, model.nodes, model.node_labels))
-
-
-def seen(mesh: SegmentedMesh) -> np.ndarray:
-    """Cloud of a noiseless depth image, from the origin along z."""
-    return render_depth(mesh, Camera.from_fov(96, 96, 0.6)).to_points().points
-
-
-def said(model: StatisticalModel, material: np.ndarray) -> Correspondences:
-    """What a network might say of a state."""
-    rng = np.random.default_rng(0)
-    chosen = rng.choice(len(model.labels), 200, replace=False)
-    rest = model.rest_points[chosen] + rng.normal(scale=0.5, size=(200, 3))
-    return Correspondences(material[chosen], rest, model.labels[chosen], np.ones(200), np.arange(200) < 100)
+    return shown(model, 0.5)[1]
 
 
 @pytest.fixture(scope="module")
