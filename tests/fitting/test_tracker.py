@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mereo.fitting.config import TrackConfig
+from mereo.fitting.config import FitConfig, TrackConfig
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import CloudToFit, Registrar
@@ -181,7 +181,9 @@ def test_without_evidence_the_expected_state_is_the_answer(
     registrar: Registrar, scene: Scene, here: SegmentedMesh
 ) -> None:
     config = TrackConfig()
-    track = Track.of(registrar.fit_modes(CloudToFit(seen(scene, here).points, scene_unit=1.0)), 0.0, config)
+    track = Track.of(
+        registrar.fit_modes(CloudToFit(seen(scene, here).points, scene_unit=1.0)), 0.0, config, FitConfig()
+    )
     count = POSE + track.problem.model.count
     velocity = 0.1 * np.random.default_rng(0).normal(size=count)
     moving = replace(track, velocity=velocity)

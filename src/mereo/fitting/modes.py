@@ -186,8 +186,7 @@ def states_like_network(problem: Problem, count: int) -> list[Posed]:
 def similar_states(problem: Problem, posed: Posed, count: int) -> list[Posed]:
     """Return states of the library that agree with a fit in most points and differ from each other in the rest.
 
-    A wheel that is seen on one side only may be half a turn off, or a finger taken for the other: everything else is
-    right already.
+    A wheel that is seen on one side only may be half a turn off, or a finger taken for the other.
     """
     model = problem.model
     goal = model.material(posed.z)[model.sparse].astype(np.float32)
@@ -250,12 +249,8 @@ NetworkFit = tuple[Problem, Correspondences, ScoredFit]
 def as_noisy(start: NetworkFit, points: Float[np.ndarray, "n 3"], predict: PredictCorrespondences | None) -> NetworkFit:
     """Fit a noisy frame once more where what the second fit leaves over is noise; else return the first fit.
 
-    The second fit decides, since noise throws the first off by more than it is itself.
-
-    Args:
-        start: the frame, taken for a clean one.
-        points: its cloud, scene units.
-        predict: the network, which also sees the smoothed cloud.
+    The second fit decides, since noise throws the first off by more than it is itself. The network also sees the
+    smoothed cloud. ``points`` are in scene units.
     """
     problem, correspondences, modes = start
     noisy = problem.as_noisy_as(modes.surface)
@@ -270,9 +265,8 @@ def as_noisy(start: NetworkFit, points: Float[np.ndarray, "n 3"], predict: Predi
 
 # --- the camera turned ------------------------------------------------------------------------------------------------
 
-# A camera that turns about its own centre sees the same points along the same lines of sight, so the correspondences
-# may only turn along with it. A network's do so where it recognizes what it sees; where it does not, each turn gives
-# another guess, and the fit decides which is right.
+# Correspondences should turn along with a camera that turns about its centre. A network's do so where it recognizes
+# what it sees; where it does not, each turn gives another guess, and the fit decides which is right.
 
 ROLL = np.pi / 4
 """Angle between two turns about the line of sight to the object, rad."""
@@ -293,12 +287,7 @@ def turns(axis: Float[np.ndarray, "3"]) -> Iterator[Float[np.ndarray, "3 3"]]:
 
 
 def with_turned_camera(start: NetworkFit, predict: PredictCorrespondences | None) -> NetworkFit:
-    """Return a fit, or where it leaves much unexplained the best of it and of fits with the camera turned.
-
-    Args:
-        start: the fit to the frame as it is.
-        predict: the network, in scene units.
-    """
+    """Return a fit, or where it leaves much unexplained the best of it and of fits with the camera turned."""
     problem, _, modes = start
     if predict is None or not problem.config.turned or not problem.wants_turns(modes.misfit.cloud, modes.surface):
         return start

@@ -211,7 +211,7 @@ class Screen:
     Attributes:
         half: half the object's length.
         scaled: whether the scale is unknown.
-        in_part: whether something may hide a part of the object.
+        in_part: whether something may hide a part of the object, or nothing is known beside it.
     """
 
     tables: ShapeTables
@@ -225,7 +225,8 @@ class Screen:
     def of(cls, tables: ShapeTables, evidence: Evidence, half: float, scaled: bool = False) -> "Screen":
         """Screen of a frame."""
         points, sight = evidence.observed_samples[:POINTS].astype(np.float32), SightTable.of(evidence)
-        return cls(tables, points, sight, half, scaled, evidence.may_be_cut)
+        in_part = evidence.other_lines == "unknown" or len(evidence.sight.data) > len(evidence.points)
+        return cls(tables, points, sight, half, scaled, in_part)
 
     def starts(self, rotations: Float[np.ndarray, "r 3 3"]) -> Poses:
         """Every state at every rotation, its visible side on the cloud; where ``scaled``, as large as the cloud.
@@ -428,7 +429,7 @@ def rotations(count: int) -> Float[np.ndarray, "n 3 3"]:
 
 @dataclass(eq=False)
 class _Trail:
-    """Search under one hypothesis on the lines of sight beside the cloud, as far as it has come."""
+    """Search under one hypothesis on the lines of sight beside the cloud."""
 
     problem: Problem
     handicap: float = 0.0
@@ -493,13 +494,10 @@ class _Trail:
 
 
 def search(whole: Problem, partial: Problem | None = None, start: Posed | None = None) -> SearchOutcome:
-    """Search for the state that explains a frame, or fit it from a state that is known.
+    """Search for the state that explains a frame without correspondences, or fit it from ``start``.
 
-    Args:
-        whole: the frame, without correspondences.
-        partial: the same where it is open whether the object is seen whole: with nothing known beside the cloud. It is
-            taken where it explains the frame better by more than ``WHOLE``.
-        start: from which both are fitted instead of a search.
+    ``partial`` is the same where it is open whether the object is seen whole: with nothing known beside the cloud. It
+    is taken where it explains the frame better by more than ``WHOLE``.
     """
     trails = [_Trail(whole)] if partial is None else [_Trail(whole), _Trail(partial, WHOLE)]
     if start is not None:

@@ -75,13 +75,7 @@ class Track:
     calibration: Calibration | None = None
 
     @classmethod
-    def of(
-        cls,
-        fitted: ModesFit,
-        time_s: float,
-        config: TrackConfig,
-        clean: FitConfig = FitConfig(),  # noqa: B008 (frozen)
-    ) -> "Track":
+    def of(cls, fitted: ModesFit, time_s: float, config: TrackConfig, clean: FitConfig) -> "Track":
         """Track that begins with a frame's own fit."""
         posed, scale = without_scale(fitted.posed)
         base, model = fitted.problem, fitted.problem.model

@@ -52,9 +52,8 @@ class Drawn:
 
     Attributes:
         seed: of what is not recorded.
-        z: all draws in the order of the calls, standard normal.
+        z, smooth: all draws in the order of the calls, standard normal, and which of them move the state continuously.
         sizes: how many numbers each call drew.
-        smooth: which draws move the state continuously.
     """
 
     seed: int

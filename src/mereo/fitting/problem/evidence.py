@@ -106,8 +106,7 @@ class Evidence:
     ) -> "Evidence":
         """Prepare a cloud, with so many ``observed_samples`` at most; its lines of sight start at the origin.
 
-        Along those of ``outliers`` points, which a front end has taken for outliers, anything may be: they are within
-        the silhouette, and rule nothing out. ``lines`` says what is known beside the cloud; without it, and where it
+        Those of ``outliers`` rule nothing out. ``lines`` says what is known beside the cloud; without it, and where it
         leaves that open, all lines of sight beside the cloud went past the object.
         """
         points = means_along_sight(points, MOST_POINTS)
@@ -142,11 +141,6 @@ class Evidence:
         normals = np.linalg.eigh(np.einsum("pki,pkj->pij", patches, patches))[1][:, :, 0]
         away = np.einsum("pi,pi->p", normals, self.observed_samples) > 0
         return np.where(away[:, None], -normals, normals)
-
-    @property
-    def may_be_cut(self) -> bool:
-        """Whether something may hide a part of the object, or lie beside it where nothing is known."""
-        return self.other_lines == "unknown" or len(self.sight.data) > len(self.points)
 
     @property
     def hidden_edge(self) -> float:

@@ -23,8 +23,8 @@ from mereo.io.config import CarryFrame
 from mereo.io.volume_files import Volume, is_labels
 from mereo.scenes.statistical_model import StatisticalModel
 
-Interpolation = Literal["auto", "linear", "nearest"]
-"""Linear for intensities, nearest for labels; "auto" tells them apart (``is_labels``)."""
+Interpolation = Literal["linear", "nearest"]
+"""Linear for intensities, nearest for labels (``is_labels``)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,6 @@ class CarriedVolume(Carried):
     Attributes:
         content: the volume.
         within: how many of the voxels inside were within the file's voxels at rest; the others have the background.
-        interpolation: "linear" or "nearest".
     """
 
     content: Volume
@@ -212,14 +211,14 @@ def _shares(
     return shares / shares.sum(axis=1, keepdims=True), away
 
 
-def carry(placed: Placed, registration: Registration, interpolation: Interpolation = "auto") -> Carried:
+def carry(placed: Placed, registration: Registration) -> Carried:
     """Carry an attachment to where the registered object is: points move along with their segments, poses turn so too.
 
-    A volume is resampled around the object, with this interpolation (``resampled``).
+    A volume is resampled around the object (``resampled``).
     """
     content = placed.content
     if isinstance(content, Volume):
-        return resampled(content, registration, interpolation, placed.name)
+        return resampled(content, registration, placed.name)
     points = moved(registration, content.points, placed.shares)
     rotations = None
     if content.rotations is not None:
@@ -278,13 +277,7 @@ CELLS_AT_ONCE, POINTS_AT_ONCE = 1024, 500_000
 CUBE = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
 
 
-def resampled(
-    source: Volume,
-    registration: Registration,
-    interpolation: Interpolation = "auto",
-    name: str = "",
-    most: int = 16_000_000,
-) -> CarriedVolume:
+def resampled(source: Volume, registration: Registration, name: str = "", most: int = 16_000_000) -> CarriedVolume:
     """Resample a volume that was defined in the rest model on a grid around the registered object.
 
     Voxels inside the object have the source's value where they were at rest, and so have those around it, up to
@@ -294,12 +287,10 @@ def resampled(
     Args:
         source: its ``T_world_index`` leads to scene units of the rest model.
         registration: of the object.
-        interpolation: "linear", "nearest", or "auto": nearest for labels, linear for all else.
         name: of the volume's file.
         most: voxels of the grid; its spacing is the source's finest, widened where the grid would have more.
     """
-    if interpolation == "auto":
-        interpolation = "nearest" if is_labels(source) else "linear"
+    interpolation: Interpolation = "nearest" if is_labels(source) else "linear"
     fill = _Fill.around(source, registration, interpolation, most)
     owner, inside = fill.owners()
     within = sum(fill.segment(label, owner == label, inside) for label in range(1, fill.registration.solids.count + 1))

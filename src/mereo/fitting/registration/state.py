@@ -67,13 +67,7 @@ class Block(BaseModel):
 
 
 class StateDraws(Block):
-    """Draws of a scene, beside their values.
-
-    Attributes:
-        seed: of what is not recorded.
-        sizes: how many numbers each call of the generator draws.
-        names: what each number is called, as its slider is; "" for one without.
-    """
+    """What plays the draws: seed, how many numbers each call draws, and what each is called, "" where it is not."""
 
     seed: Annotated[int, Field(ge=0, lt=2**63)]
     sizes: Annotated[tuple[Annotated[int, Field(ge=0, le=MOST_NUMBERS)], ...], Field(max_length=MOST_NUMBERS)]
@@ -81,25 +75,7 @@ class StateDraws(Block):
 
 
 class RegistrationState(Block):
-    """State of a registration: content of ``state.json``.
-
-    Attributes:
-        format: version of the file.
-        mereo: version of mereo that wrote it.
-        scene, segments: the object.
-        weights: how they were named.
-        model: digest of their statistical model.
-        method: which description of the states ``z`` belongs to.
-        z: coefficients of the modes in standard deviations, or the scene's draws, standard normal.
-        draws: what plays the draws; None for modes.
-        T_camera_model: rigid pose of the model in the camera frame, its translation in the input's unit.
-        scene_unit: length of a scene unit in the input's unit.
-        unit_m: metres in the input's unit; None where that is not known.
-        frame: axes of the input.
-        T_camera_input: from the input's frame to the camera frame.
-        unit_known, explained, accepted, seconds: as in ``Registration``.
-        witness: places of a few material points in the camera frame.
-    """
+    """State of a registration: content of ``state.json``, whose keys docs/registration.md explains."""
 
     format: int
     mereo: Text
