@@ -73,7 +73,7 @@ def main(options: Options) -> None:
         canvas.draw_points(points, np.broadcast_to(BLACK, points.shape), 1.0)
         tiles.append(canvas.picture())
     save_png(options.output, np.concatenate(tiles, axis=1))
-    print(f"{found.tried} candidates fitted, {found.alike} explain the frame; wrote {options.output}")
+    print(f"{found.alike} candidates explain the frame; wrote {options.output}")
 
 
 def sight_picture(seen: Observation) -> np.ndarray:
