@@ -90,7 +90,7 @@ def test_made_shared_damaged_continued_and_read(
 
 def test_one_of_two_machines_claims_a_folder(folder: ObjectPath) -> None:
     """The server decides, not our look at the folder before."""
-    assert not (folder / "manifest.json").exists()
+    assert not (folder / "manifest.json").is_file()
     (folder / "manifest.json").write_bytes(b'{"a": 1}', force=False)
     with pytest.raises(FileExistsError, match="manifest.json exists; it is not overwritten"):
         (folder / "manifest.json").write_bytes(b'{"a": 2}', force=False)
@@ -190,7 +190,7 @@ def test_a_refusal_is_no_missing_file(folder: ObjectPath, monkeypatch: pytest.Mo
     try:
         monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{server.server_port}")
         s3fs.S3FileSystem.clear_instance_cache()
-        for look in (folder.names, folder.exists, folder.read_bytes):
+        for look in (folder.names, folder.is_file, folder.read_bytes):
             with pytest.raises(StorageError, match="cannot be used .*: check the bucket"):
                 look()
     finally:

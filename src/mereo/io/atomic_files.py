@@ -37,9 +37,6 @@ MARKER = ".mereo.json"
 
 EXISTS = "exists; it is not overwritten: choose another name or pass --force"
 
-SUFFIX_BYTES = len(".1a2b3c4d.mereo")
-"""Length of what a scratch folder's name has behind that of its output."""
-
 
 # --- scratch folders --------------------------------------------------------------------------------------------------
 
@@ -53,17 +50,13 @@ def check_place(path: Path, may_be_link: bool = False) -> None:
     if re.search("[\0\ud800-\udfff]", str(path)):
         raise ValueError(f"the output {name} has a zero byte, or bytes that are no UTF-8 text: choose another name")
     # a path makes "s3:/bucket" of "s3://bucket"
-    is_url = len(path.parts) > 1 and re.fullmatch(r"[A-Za-z][A-Za-z0-9+.-]+:", path.parts[0])
-    if is_url and not Path(path.parts[0]).exists():
+    if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", path.as_posix()) and not Path(path.parts[0]).exists():
         raise ValueError(
-            f"the output {path.parts[0]}//{'/'.join(path.parts[1:])} is a URL, and a local path is needed here; only "
+            f"the output {path.as_posix().replace(':/', '://', 1)} is a URL, and a local path is needed here; only "
             "datasets go to an object storage: name a folder or file of this machine"
         )
     if path.name in ("", ".."):
         raise ValueError(f"the output {name} has no name of its own, which it needs: name it, as in {path / 'out'}")
-    most = 255 - len(".") - SUFFIX_BYTES  # of usual file systems, which hold the scratch folder too
-    if max(len(part.encode()) for part in path.parts) > most:
-        raise ValueError(f"the output {name[:40]}... has a name of over {most} bytes: choose a shorter one")
     if path.is_symlink() and not (may_be_link and path.is_dir()):
         raise ValueError(f"{path} is a link, which would be lost; an output is written in its own place: name that")
     if path.exists() and not (path.is_file() or path.is_dir()):
@@ -132,33 +125,29 @@ def remove_all_abandoned(directory: Path) -> None:
     _clear_dead(directory, ".+")
 
 
-def is_being_written(path: Path) -> bool:
-    """Whether a process that lives, this one too, has a scratch folder for ``path``."""
-    return any(not is_dead for _, is_dead in _scratches(path.parent, re.escape(path.name)))
+def _clear_dead(directory: Path, names: str) -> bool:
+    """Remove what dead processes left for a pattern of names; whether one that lives, this one too, writes there.
 
-
-def _clear_dead(directory: Path, names: str) -> None:
-    for scratch, is_dead in _scratches(directory, names):
-        if is_dead:
-            _clear(scratch, directory / scratch.name[1:-SUFFIX_BYTES])
-
-
-def _scratches(directory: Path, names: str) -> Iterator[tuple[Path, bool]]:
-    """Scratch folders for a pattern of names, each with whether its process is dead; none where there are no locks."""
-    pattern, scratches = re.compile(rf"\.(?:{names})\.[0-9a-z_]{{8}}\.mereo"), list[Path]()
+    Nothing is known, and nothing removed, where there are no locks.
+    """
+    is_written, scratches = False, list[tuple[Path, str]]()
     with suppress(OSError):  # it may be missing, or be no one's to list
-        scratches = [item for item in directory.iterdir() if pattern.fullmatch(item.name) and not item.is_symlink()]
-    for scratch in scratches:
+        matches = [
+            (item, re.fullmatch(rf"\.({names})\.[0-9a-z_]{{8}}\.mereo", item.name)) for item in directory.iterdir()
+        ]
+        scratches = [(item, match[1]) for item, match in matches if match and not item.is_symlink()]
+    for scratch, name in scratches:
         try:
             lock = _lock(scratch)
         except BlockingIOError:
-            yield scratch, False
+            is_written = True
             continue
         except OSError:  # another user's, or gone by now
             continue
         if lock is not None:
-            yield scratch, True
+            _clear(scratch, directory / name)
             os.close(lock)
+    return is_written
 
 
 def _lock(scratch: Path, *, wait: bool = False) -> int | None:
@@ -177,10 +166,7 @@ def _lock(scratch: Path, *, wait: bool = False) -> int | None:
 
 
 def _clear(scratch: Path, path: Path) -> None:
-    """Remove a scratch folder; an output that was to be replaced and was not goes back to its place.
-
-    While that place is taken, the output waits.
-    """
+    """Remove a scratch folder; an output that was to be replaced and was not goes back to its place when free."""
     old = scratch / OLD
     if old.exists() and (scratch / path.name).exists():  # its successor was not put in its place
         try:
@@ -233,17 +219,12 @@ def check_file_place(path: str | Path | None, *, force: bool = True, inputs: Ite
         raise FileExistsError(f"{path} is a directory; a file is written there: choose another name")
     if path.exists() and not force:
         raise FileExistsError(f"{path} {EXISTS}")
-    if path.exists() and any(_holds(Path(place), path) for place in inputs):
-        raise FileExistsError(
-            f"{path} is read by this command; it is not replaced, not even by --force: choose another name"
-        )
-
-
-def _holds(place: Path, path: Path) -> bool:
-    """Whether ``path``, which exists, is the file ``place`` by whatever name, or lies in the folder ``place``."""
-    if place.is_dir():
-        return path.resolve().is_relative_to(place.resolve())
-    return place.exists() and path.samefile(place)
+    for place in map(Path, inputs) if path.exists() else ():
+        # a file may have several names
+        if path.resolve().is_relative_to(place.resolve()) or (place.exists() and path.samefile(place)):
+            raise FileExistsError(
+                f"{path} is read by this command; it is not replaced, not even by --force: choose another name"
+            )
 
 
 def _place_new(partial: Path, path: Path) -> None:
@@ -309,9 +290,8 @@ def check_new_directory(path: Path, force: bool, inputs: Sequence[str | Path] = 
         raise FileExistsError(f"{path} is a file; a directory is written there: choose another --output")
     if os.path.ismount(path):
         raise ValueError(f"{path} is a mount point, which cannot be renamed: name a folder in it")
-    if is_being_written(path):
+    if _clear_dead(path.parent, re.escape(path.name)):
         raise FileExistsError(f"{path} is being written by another process: wait for it, or choose another --output")
-    remove_abandoned(path)
     if not _has_content(path):
         return
     if not force:
@@ -334,10 +314,9 @@ def _check_ours(folder: Path, path: Path) -> None:
     Links are never in that list.
     """
     try:
-        listed = json.loads((folder / MARKER).read_text("utf-8"))["files"]
+        known = dict(json.loads((folder / MARKER).read_text("utf-8"))["files"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        listed = {}
-    known = listed if isinstance(listed, dict) else {}
+        known = {}
     stamps = {name: stamp for name, stamp in _stamps(folder).items() if name != MARKER}
     others = [name for name, stamp in stamps.items() if stamp is None or known.get(name) != stamp]
     if others:

@@ -19,7 +19,7 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.atomic_files import atomic_file
 from mereo.io.errors import readable
 from mereo.io.mesh_formats import read_segmented_mesh
-from mereo.io.readers import CLOUD_READERS, ply_counts
+from mereo.io.readers import CLOUD_READERS, check_ply
 from mereo.io.volume_files import VOLUME_SUFFIXES, Volume, is_volume, read_scalar_volume
 from mereo.io.writers.glb import write_segments_glb
 from mereo.io.writers.meshes import write_positions_ply, write_segments_obj, write_segments_ply, write_surface_stl
@@ -149,7 +149,7 @@ def _read(path: Path) -> Content:
     is_mesh = suffix in MESHES
     if suffix == ".ply":
         with readable(path, "mesh or point cloud"):
-            is_mesh = ply_counts(path).get("face", 0) > 0
+            is_mesh = check_ply(path).get("face", 0) > 0
     content = Surfaces(read_segmented_mesh(path)) if is_mesh else _cloud(path)
     if not np.isfinite(content.points).all():
         raise ValueError(f"{path} has NaN or infinite positions; all must be finite: export it again")

@@ -4,6 +4,8 @@
 """
 
 import re
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -150,12 +152,11 @@ def _split_parts(
     """
     level = 0 if len({key[0] for key in owners}) > 1 else 1
     labels = [key[level] or key[0] for key in owners]
-    names = list(dict.fromkeys(labels))
-    index = np.asarray([names.index(label) for label in labels], dtype=np.int64)
-    parts: list[Part] = []
-    for i, name in enumerate(names):
-        used, local = np.unique(faces[index == i], return_inverse=True)
-        worn = {colors.get(owner[2]) for owner, label in zip(owners, labels, strict=True) if label == name}
+    names, parts = list(dict.fromkeys(labels)), list[Part]()
+    for name in names:
+        rows = [row for row, label in enumerate(labels) if label == name]
+        used, local = np.unique(faces[rows], return_inverse=True)
+        worn = {colors.get(owners[row][2]) for row in rows}
         color = worn.pop() if len(worn) == 1 else None
         title = name if name and len(names) > 1 else stem
         parts.append((title, color, *merge_positions(vertices[used], local.reshape(-1, 3))))
@@ -171,31 +172,19 @@ def _material_colors(mesh: Path, library: str) -> dict[str, Color]:
     path = mesh.parent / library
     if not library or Path(library).name != library or not path.is_file():
         return {}
-    try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except (OSError, MemoryError):
-        return {}
-    colors: dict[str, Color] = {}
-    textured: set[str] = set()
-    name = ""
-    for line in lines:
+    colors, textured, name = dict[str, Color](), set[str](), ""
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         kind, *cells = line.split() or [""]
         if kind == "newmtl":
             name = " ".join(cells)
-        elif kind == "Kd" and (color := _color_of_shares(cells)) is not None:
-            colors[name] = color
         elif kind == "map_Kd":
             textured.add(name)
+        elif kind == "Kd":
+            with suppress(ValueError):  # of a spectral curve, CIE XYZ, damage
+                red, green, blue = map(float, cells)
+                if min(red, green, blue) >= 0 and max(red, green, blue) <= 1:
+                    colors[name] = round(255 * red), round(255 * green), round(255 * blue)
     return {name: color for name, color in colors.items() if name not in textured}
-
-
-def _color_of_shares(cells: list[str]) -> Color | None:
-    """Colour of three numbers from 0 to 1; None for anything else (a spectral curve, CIE XYZ, damage)."""
-    try:
-        red, green, blue = (round(255 * value) if 0 <= value <= 1 else -1 for value in map(float, cells))
-    except ValueError:
-        return None
-    return (red, green, blue) if min(red, green, blue) >= 0 else None
 
 
 def _scene_parts(path: Path) -> list[Part]:
@@ -292,16 +281,6 @@ class GlbScene:
     is_ours: bool
 
 
-@dataclass(frozen=True, eq=False)
-class _GlbPart:
-    """Node with faces: its segment, colours of its vertices, their radii, and whether these are calibrated."""
-
-    segment: Segment
-    colors: UInt8[np.ndarray, "v 3"] | None
-    radii: Float[np.ndarray, " v"] | None
-    calibrated: bool
-
-
 def is_glb(path: Path) -> bool:
     """Whether a path names a GLB file."""
     return path.suffix.lower() == ".glb"
@@ -321,22 +300,26 @@ def read_glb(path: str | Path) -> GlbScene:
         nodes = _nodes_with_faces(scene)
         if not nodes:
             raise ValueError("it has no faces")
-        parts = [_glb_part(scene, node, base, number, path.stem) for number, node in enumerate(nodes)]
+        parts = (_glb_part(scene, node, base, number, path.stem) for number, node in enumerate(nodes))
+        segments, colors, radii, calibrated = zip(*parts, strict=True)
         unit_m = float(abs(np.linalg.det(root)) ** (1 / 3))
         if not unit_m > 0:
             raise ValueError("its root node has a scale of 0")
-        mesh = SegmentedMesh(_renamed([part.segment for part in parts]))
-        return GlbScene(mesh, tuple(part.colors for part in parts), _radii(parts), root / unit_m, unit_m, is_ours)
+        mesh = SegmentedMesh(_renamed(segments))
+        return GlbScene(mesh, colors, _radii(segments, radii, all(calibrated)), root / unit_m, unit_m, is_ours)
 
 
-def _glb_part(scene: Any, node: str, base: str, number: int, stem: str) -> _GlbPart:
+def _glb_part(
+    scene: Any, node: str, base: str, number: int, stem: str
+) -> tuple[Segment, UInt8[np.ndarray, "v 3"] | None, Float[np.ndarray, " v"] | None, bool]:
+    """Segment of a node with faces, colours of its vertices, their radii, and whether these are calibrated."""
     vertices, faces, geometry = _in_frame(scene, node, base)
     _check_places(node, vertices)
     color, colors = _colors(geometry, PALETTE[number % len(PALETTE)])
     radii = geometry.vertex_attributes.get("_RADIUS95")
     facts = geometry.metadata.get("radius95")
     kept, index = _distinct(vertices if colors is None else np.column_stack([vertices, colors]))
-    return _GlbPart(
+    return (
         Segment(stem if node.startswith("geometry_") else node, color, vertices[kept], index[faces], solid=False),
         None if colors is None else colors[kept],
         None if radii is None else np.asarray(radii, dtype=np.float64).reshape(-1)[kept],
@@ -374,7 +357,7 @@ def _screen(linear: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
     return np.rint(255 * share).astype(np.uint8)
 
 
-def _renamed(segments: list[Segment]) -> tuple[Segment, ...]:
+def _renamed(segments: Sequence[Segment]) -> tuple[Segment, ...]:
     """Segments of which no two have the same name: repeated ones are numbered."""
     names: list[str] = []
     for segment in segments:
@@ -383,12 +366,14 @@ def _renamed(segments: list[Segment]) -> tuple[Segment, ...]:
     return tuple(replace(segment, name=name) for segment, name in zip(segments, names, strict=True))
 
 
-def _radii(parts: list[_GlbPart]) -> Radii | None:
+def _radii(
+    segments: Sequence[Segment], radii: Sequence[Float[np.ndarray, " _"] | None], calibrated: bool
+) -> Radii | None:
     """Radii of all parts; None where one of them has none."""
-    values = [part.radii for part in parts if part.radii is not None and np.isfinite(part.radii).all()]
-    if len(values) < len(parts):
+    values = [each for each in radii if each is not None and np.isfinite(each).all()]
+    if len(values) < len(segments):
         return None
     counts = tuple(len(value) for value in values)
     labels = np.repeat(np.arange(1, len(counts) + 1), counts).astype(np.uint8)
-    points = np.concatenate([part.segment.vertices for part in parts])
-    return Radii(points, labels, np.concatenate(values), counts, all(part.calibrated for part in parts))
+    points = np.concatenate([segment.vertices for segment in segments])
+    return Radii(points, labels, np.concatenate(values), counts, calibrated)

@@ -26,7 +26,7 @@ from mereo.geometry.transforms import checked_pose
 from mereo.io.errors import check_count, limited_memory, quiet, readable, without_output
 
 PLAUSIBLE_DEPTH_M = (0.05, 20.0)
-"""Range of an image's median depth, unless the caller says otherwise; beyond it the unit is wrong."""
+"""Range of an image's median depth; beyond it the unit is wrong, which is otherwise invisible."""
 
 MILLIMETRES, METRES = 1000.0, 1.0
 """Depth scales of integer and of floating images where nothing else is said, in units per metre."""
@@ -115,11 +115,7 @@ def valid_points(
 
 
 def read_depth_image(
-    path: str | Path,
-    camera: Camera,
-    depth_scale: float | None = None,
-    mask_path: str | Path | None = None,
-    plausible_m: tuple[float, float] = PLAUSIBLE_DEPTH_M,
+    path: str | Path, camera: Camera, depth_scale: float | None = None, mask_path: str | Path | None = None
 ) -> DepthImage:
     """Depth in metres of a PNG, TIFF, EXR or NPY image; 0 where nothing was measured or the mask is 0.
 
@@ -129,7 +125,6 @@ def read_depth_image(
         depth_scale: pixel value of one metre, so that metres = value / depth_scale; by default 1000 for integers and 1
             for floats (``mereo.io.intrinsics`` on BOP and RealSense).
         mask_path: image of the same size, not 0 on the object.
-        plausible_m: the median depth must lie in this range, because a wrong unit is otherwise invisible.
 
     Raises:
         FileNotFoundError, ValueError: the file is missing, damaged, of another kind or size, without any measured
@@ -142,7 +137,7 @@ def read_depth_image(
         raise ValueError(
             f"{path} has the suffix {path.suffix!r}; a depth image is one of {known}: convert or rename it"
         )
-    return usable_depth(depth_of(path, read_raw_depth(path), depth_scale, camera), path, mask_path, plausible_m)
+    return usable_depth(depth_of(path, read_raw_depth(path), depth_scale, camera), path, mask_path)
 
 
 def read_raw_depth(path: Path) -> Raw:
@@ -194,12 +189,7 @@ def depth_of(path: Path, raw: Raw, depth_scale: float | None, camera: Camera) ->
         raise ValueError(f"{path} cannot be used: {error}") from None
 
 
-def usable_depth(
-    image: DepthImage,
-    path: str | Path,
-    mask_path: str | Path | None = None,
-    plausible_m: tuple[float, float] = PLAUSIBLE_DEPTH_M,
-) -> DepthImage:
+def usable_depth(image: DepthImage, path: str | Path, mask_path: str | Path | None = None) -> DepthImage:
     """Depth image in metres without what its mask leaves out; raises ``ValueError`` as ``read_depth_image`` does."""
     depth = image.depth
     if mask_path is not None:
@@ -208,10 +198,11 @@ def usable_depth(
         where = "inside the mask" if image.valid.any() else "in the image"
         raise ValueError(f"{path} measures 0 pixels {where}; the object must be visible: check the image and the mask")
     median_m = float(np.median(depth[depth > 0]))
-    if not plausible_m[0] <= median_m <= plausible_m[1]:
+    least_m, most_m = PLAUSIBLE_DEPTH_M
+    if not least_m <= median_m <= most_m:
         raise ValueError(
-            f"the median depth of {path} is {median_m:.4g} m; it must be between {plausible_m[0]:g} and "
-            f"{plausible_m[1]:g} m: give the pixel value of one metre with --depth-scale (1000 for millimetres)"
+            f"the median depth of {path} is {median_m:.4g} m; it must be between {least_m:g} and {most_m:g} m: give "
+            "the pixel value of one metre with --depth-scale (1000 for millimetres)"
         )
     return DepthImage(depth, image.camera)
 
@@ -307,8 +298,7 @@ DEPTH_READERS: dict[str, Callable[[Path], Raw]] = {
 
 def _ply_points(path: Path) -> Float[np.ndarray, "n 3"]:
     """Vertices of a PLY file; trimesh returns those it finds, so a file cut short is only noticed by counting them."""
-    check_ply(path)
-    count = ply_counts(path).get("vertex", 0)
+    count = check_ply(path).get("vertex", 0)
     if count == 0:
         raise ValueError("it has 0 vertices")
     loaded: Any = trimesh.load(path, file_type="ply", process=False)
@@ -316,41 +306,27 @@ def _ply_points(path: Path) -> Float[np.ndarray, "n 3"]:
     return np.asarray(loaded.vertices, dtype=np.float64)
 
 
-def ply_counts(path: Path) -> dict[str, int]:
-    """Number of each kind of element (vertex, face) that a PLY file's header states."""
+def check_ply(path: Path) -> dict[str, int]:
+    """Number of each kind of element (vertex, face) that a PLY file's header states.
+
+    Raises ``ValueError`` for a file that trimesh would read in part: with a wrong header, or text cut short.
+    """
     with path.open("rb") as file:
-        return {name: count for name, count, _ in _ply_header(file.read(65536))[1]}
-
-
-def check_ply(path: Path) -> None:
-    """Raise ``ValueError`` for a PLY file that trimesh would read in part: with a wrong header, or text cut short."""
-    with path.open("rb") as file:
-        order, elements, start = _ply_header(file.read(65536))
-        file.seek(start)
-        rows = sum(1 for row in file if row.strip()) if order == "ascii" else 0
-    if order == "ascii":
-        check_count(sum(count for _, count, _ in elements), rows, "rows")
-
-
-def _ply_header(content: bytes) -> tuple[str, list[tuple[str, int, list[list[str]]]], int]:
-    """Header of a PLY file: format, name, count and properties (type and name) of each element, start of the data."""
-    match = re.search(rb"^end_header[ \t]*\r?\n?", content[:65536], re.MULTILINE)
-    if not content.startswith(b"ply") or match is None:
-        raise ValueError("it has no PLY header")
-    order, elements = "", []
-    for key, *values in filter(None, map(str.split, content[: match.end()].decode("latin-1").splitlines())):
-        if key == "format":
-            order = values[0]
-        elif key == "element":
-            count = int(values[1])
-            check_count(count, max(count, 0), f"of element {values[0]!r}")
-            elements.append((values[0], count, list[list[str]]()))
-        elif key == "property":
-            elements[-1][2].append(values)
-    orders = ("ascii", "binary_little_endian", "binary_big_endian")
-    if order not in orders:
-        raise ValueError(f"its format is {order!r}, not one of {', '.join(orders)}")
-    return order, elements, match.end()
+        head = file.read(65536)
+        end = re.search(rb"^end_header[ \t]*\r?\n?", head, re.MULTILINE)
+        if not head.startswith(b"ply") or end is None:
+            raise ValueError("it has no PLY header")
+        lines = [line.split() for line in head[: end.end()].decode("latin-1").splitlines()]
+        order = next((line[1] for line in lines if line[:1] == ["format"]), "")
+        if order not in ("ascii", "binary_little_endian", "binary_big_endian"):
+            raise ValueError(f"its format is {order!r}, not ascii, binary_little_endian or binary_big_endian")
+        counts = {line[1]: int(line[2]) for line in lines if line[:1] == ["element"]}
+        for name, count in counts.items():
+            check_count(count, max(count, 0), f"of element {name!r}")
+        if order == "ascii":
+            file.seek(end.end())
+            check_count(sum(counts.values()), sum(1 for row in file if row.strip()), "rows")
+    return counts
 
 
 def _text_points(path: Path) -> Float[np.ndarray, "n 3"]:
@@ -372,14 +348,12 @@ def _text_points(path: Path) -> Float[np.ndarray, "n 3"]:
 
 def _is_row(line: str) -> bool:
     """Whether a line holds at least three numbers; other cells may be words, and comments are never rows."""
-    if line.lstrip().startswith(("#", "//")):
-        return False
     numbers = 0
     for cell in re.split(r"[,;\s]+", line.strip()):
         with suppress(ValueError):
             float(cell)
             numbers += 1
-    return numbers >= 3
+    return numbers >= 3 and not line.lstrip().startswith(("#", "//"))
 
 
 def _array_points(path: Path) -> Float[np.ndarray, "n 3"]:
@@ -387,10 +361,9 @@ def _array_points(path: Path) -> Float[np.ndarray, "n 3"]:
         loaded = np.load(file, allow_pickle=False)
         if isinstance(loaded, np.ndarray):
             return _check_array(loaded)
-        if "points" in loaded:
-            return _check_array(loaded["points"])
-        arrays = [loaded[key] for key in loaded.files]
-        fitting = [array for array in arrays if array.ndim in (2, 3) and array.shape[-1] == 3]
+        names = ["points"] if "points" in loaded else loaded.files
+        arrays = [loaded[name] for name in names]
+    fitting = [array for array in arrays if names == ["points"] or (array.ndim in (2, 3) and array.shape[-1] == 3)]
     if len(fitting) != 1:
         raise ValueError(f"it holds {len(fitting)} arrays of shape [n, 3] and none called 'points'")
     return _check_array(fitting[0])
@@ -409,7 +382,14 @@ def _check_array(array: np.ndarray) -> Float[np.ndarray, "n 3"]:
 
 def _pcd_points(path: Path) -> Float[np.ndarray, "n 3"]:
     """Points of a PCD file: ascii, binary, binary_compressed; organized clouds come row by row, with their NaN rows."""
-    header, body = _pcd_header(path.read_bytes())
+    content = path.read_bytes()
+    match = re.search(rb"^DATA[ \t]+\S+[ \t]*\r?\n?", content[:65536], re.MULTILINE)
+    if match is None:
+        raise ValueError("it has no PCD header")
+    lines = [line.split() for line in content[: match.end()].decode("ascii").splitlines() if not line.startswith("#")]
+    header, body = {line[0]: line[1:] for line in lines if len(line) > 1}, content[match.end() :]
+    if missing := [key for key in ("FIELDS", "SIZE", "TYPE", "POINTS") if key not in header]:
+        raise ValueError(f"its header has no {missing[0]}")
     count, row = int(header["POINTS"][0]), _pcd_row(header)
     width, height = (int(header.get(key, [str(count)])[0]) for key in ("WIDTH", "HEIGHT"))
     if count < 0 or ({"WIDTH", "HEIGHT"} <= header.keys() and width * height != count):
@@ -428,37 +408,25 @@ def _pcd_points(path: Path) -> Float[np.ndarray, "n 3"]:
     return np.stack([records[axis].astype(np.float64).reshape(count) for axis in "xyz"], axis=1)
 
 
-def _pcd_header(content: bytes) -> tuple[dict[str, list[str]], bytes]:
-    match = re.search(rb"^DATA[ \t]+\S+[ \t]*\r?\n?", content[:65536], re.MULTILINE)
-    if match is None:
-        raise ValueError("it has no PCD header")
-    lines = [line.split() for line in content[: match.end()].decode("ascii").splitlines() if not line.startswith("#")]
-    header = {line[0]: line[1:] for line in lines if len(line) > 1}
-    missing = [key for key in ("FIELDS", "SIZE", "TYPE", "POINTS") if key not in header]
-    if missing:
-        raise ValueError(f"its header has no {missing[0]}")
-    return header, content[match.end() :]
-
-
 def _pcd_row(header: dict[str, list[str]]) -> np.dtype:
     """One point as a packed record; padding fields are all called ``_`` and get distinct names."""
     kinds = {"F": "f", "I": "i", "U": "u"}
     counts = header.get("COUNT", ["1"] * len(header["FIELDS"]))
     columns = zip(header["FIELDS"], header["TYPE"], header["SIZE"], counts, strict=True)
-    fields: list[Any] = []
-    for index, (name, kind, size, count) in enumerate(columns):
-        fields.append((name if name in "xyz" else f"{name}{index}", f"<{kinds[kind]}{size}", (int(count),)))
+    fields: list[Any] = [
+        (name if name in "xyz" else f"{name}{index}", f"<{kinds[kind]}{size}", (int(count),))
+        for index, (name, kind, size, count) in enumerate(columns)
+    ]
     return np.dtype(fields)
 
 
 def _pcd_ascii(body: bytes, row: np.dtype, count: int) -> Float[np.ndarray, "n 3"]:
-    sizes = [int(np.prod(row[name].shape)) for name in row.names or ()]
-    starts = dict(zip(row.names or (), np.cumsum([0, *sizes[:-1]]).tolist(), strict=True))
+    names = [name for name in row.names or () for _ in range(int(np.prod(row[name].shape)))]  # of the columns
     lines = [line for line in body.decode("ascii").splitlines() if line.strip()]
     check_count(count, len(lines), "points")
     if count == 0:
         return np.empty((0, 3))
-    return np.loadtxt(lines[:count], usecols=[starts[axis] for axis in "xyz"], ndmin=2)
+    return np.loadtxt(lines[:count], usecols=[names.index(axis) for axis in "xyz"], ndmin=2)
 
 
 def _pcd_compressed(body: bytes, row: np.dtype, count: int) -> Float[np.ndarray, "n 3"]:
@@ -468,13 +436,9 @@ def _pcd_compressed(body: bytes, row: np.dtype, count: int) -> Float[np.ndarray,
     packed, unpacked = (int(size) for size in np.frombuffer(body, "<u4", 2))
     check_count(count, unpacked // row.itemsize, "points")
     data = _lzf_decompress(body[8 : 8 + packed], unpacked)
-    axes, start = {}, 0
-    for name in row.names or ():
-        length = row[name].itemsize * count
-        if name in "xyz":
-            axes[name] = np.frombuffer(data[start : start + length], row[name].base).astype(np.float64)
-        start += length
-    return np.stack([axes[axis] for axis in "xyz"], axis=1)
+    starts = {name: count * offset for name, (_, offset, *_) in (row.fields or {}).items()}
+    axes = [np.frombuffer(data, row[axis].base, count, starts[axis]) for axis in "xyz"]
+    return np.stack([values.astype(np.float64) for values in axes], axis=1)
 
 
 def _lzf_decompress(data: bytes, size: int) -> bytes:

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mereo.geometry.camera import Camera, DepthImage
-from mereo.io.errors import SizeError, check_count, limited_memory, reason
+from mereo.io.errors import check_count, is_foreseen, limited_memory, reason
 from mereo.io.intrinsics import camera_from_fields, warn_of_distortion
 from mereo.io.readers import metres, open_image
 
@@ -46,18 +46,13 @@ class RecordedFrame:
 
     Attributes:
         topic: where it was published.
-        stamp_ns: when it was recorded, in nanoseconds.
+        time_s: when it was recorded, in seconds.
         read: decodes it; raises ``ValueError`` where its content is broken or not a depth.
     """
 
     topic: str
-    stamp_ns: int
+    time_s: float
     read: Callable[[], Content]
-
-    @property
-    def time_s(self) -> float:
-        """Time at which the message was recorded, in seconds."""
-        return self.stamp_ns / 1e9
 
     @property
     def name(self) -> str:
@@ -96,7 +91,7 @@ def recorded_frames(
         raise ValueError(f"{path} is not a regular file; a ROS bag is needed: save it to a file and name that")
     if find_spec("rosbags") is None:
         raise ImportError(f"{path} needs rosbags, which is not installed: pip install 'mereo[sensors]'")
-    with closing(_open(path)) as reader, _undamaged(path):
+    with _opened(path) as reader:
         topic = topic or _depth_topic(reader, path)
         connections = [c for c in reader.connections if c.topic == topic and c.msgtype in FRAMES]
         if not connections:
@@ -106,10 +101,11 @@ def recorded_frames(
         if connections[0].msgtype != CLOUD:
             image = _depth_image if connections[0].msgtype == IMAGE else _compressed_depth
             decode = partial(image, camera=camera or _camera(reader, topic, path), depth_scale=depth_scale)
-        store, ros2 = reader.typestore, reader.is2
+        store, ros2 = reader.typestore, reader.is2  # a frame may be read when the bag is closed
         for connection, stamp_ns, data in _messages(reader, connections, path):
             message = partial(store.deserialize_cdr if ros2 else store.deserialize_ros1, data, connection.msgtype)
-            yield RecordedFrame(topic, stamp_ns, partial(_read, decode, message, f"{path}, {topic} at {stamp_ns} ns"))
+            source = f"{path}, {topic} at {stamp_ns} ns"
+            yield RecordedFrame(topic, stamp_ns / 1e9, partial(_read, decode, message, source))
 
 
 def recorded_frame(
@@ -120,8 +116,6 @@ def recorded_frame(
     depth_scale: float | None = None,
 ) -> RecordedFrame:
     """Frame ``index`` (from 0) of ``recorded_frames``; ``ValueError`` where the recording is shorter."""
-    if index < 0:
-        raise ValueError(f"the frame index is {index}; frames count from 0: give 0 or more with --frame-index")
     with closing(recorded_frames(path, topic, camera, depth_scale)) as frames:  # type: ignore[type-var]
         count = 0
         for count, frame in enumerate(frames, start=1):
@@ -130,7 +124,9 @@ def recorded_frame(
     raise ValueError(f"{path} has {count} frames; frame {index} is asked for: give a lower --frame-index")
 
 
-def _open(path: Path) -> Any:
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Reader of a bag; whatever a damaged one raises, now or while it is read, becomes one sentence."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
@@ -139,26 +135,16 @@ def _open(path: Path) -> Any:
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         with limited_memory(path):
             reader.open()
-    except SizeError:
-        raise
+        with closing(reader):
+            yield reader
     except Exception as error:  # a damaged bag raises whatever its storage format does
+        if is_foreseen(error) and not isinstance(error, OSError):
+            raise
         raise ValueError(f"{path} cannot be read as a ROS bag ({reason(error)}): record or copy it again") from error
-    return reader
-
-
-@contextmanager
-def _undamaged(path: Path) -> Iterator[None]:
-    """One sentence of whatever a bag raises that could be opened but is damaged farther in."""
-    try:
-        yield
-    except (ValueError, ImportError):
-        raise
-    except Exception as error:
-        raise ValueError(f"{path} cannot be read any farther ({reason(error)}): record or copy it again") from error
 
 
 def _messages(reader: Any, connections: list[Any], source: str | Path) -> Iterator[Any]:
-    """Messages one after the other, each unpacked in limited memory; nothing is held between them."""
+    """Messages one after the other, each unpacked in limited memory."""
     messages = reader.messages(connections)
     while True:
         with limited_memory(source):
@@ -206,23 +192,20 @@ def _camera(reader: Any, topic: str, path: Path) -> Camera:
 
     nearest = max(infos, key=shared)
     try:
-        return _camera_of(_first(reader, nearest), topic, path)
+        info = _first(reader, nearest)
+        # ROS 1 has capital letters
+        stated = {name.lower(): np.asarray(getattr(info, name)) for name in "KkPpDd" if hasattr(info, name)}
+        rectified = "image_rect" in topic
+        matrix = stated["p"].reshape(3, 4)[:, :3] if rectified else stated["k"]
+        camera = camera_from_fields({"width": info.width, "height": info.height, "K": matrix})
+        if not rectified:
+            lens = {"d": stated["d"], "distortion_model": info.distortion_model}
+            warn_of_distortion(camera, lens, f"{path}, {topic}")
+        return camera
     except Exception as error:  # whatever a broken message makes of the parser
         raise ValueError(
             f"{path}, {nearest} is no camera ({reason(error)}): give --intrinsics FILE, or record it again"
         ) from error
-
-
-def _camera_of(info: Any, topic: str, path: Path) -> Camera:
-    matrix = getattr(info, "k", None) if hasattr(info, "k") else info.K
-    fields: dict[str, Any] = {"width": info.width, "height": info.height, "K": np.asarray(matrix)}
-    if "image_rect" in topic:
-        projection = np.asarray(info.p if hasattr(info, "p") else info.P).reshape(3, 4)
-        return camera_from_fields({**fields, "K": projection[:, :3]})
-    camera = camera_from_fields(fields)
-    coefficients = np.asarray(info.d if hasattr(info, "d") else info.D)
-    warn_of_distortion(camera, {"d": coefficients, "distortion_model": info.distortion_model}, f"{path}, {topic}")
-    return camera
 
 
 # --- messages --------------------------------------------------------------------------------------------------------
