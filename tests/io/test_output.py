@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from folder_contents import contents
 
-from mereo.io.atomic_files import atomic_file, claim_directory, new_directory, write_json
+from mereo.io.atomic_files import atomic_file, new_directory, write_json
 from mereo.io.errors import words_of
+from mereo.io.object_storage import claim
 
 INTERRUPTIONS = [ValueError("no"), KeyboardInterrupt(), SystemExit(1)]
 
@@ -116,14 +117,14 @@ def test_json_knows_arrays_and_has_no_nan(tmp_path: Path) -> None:
 def test_a_directory_is_claimed_once(tmp_path: Path) -> None:
     """Whoever comes later, with whatever settings, is told those of the first."""
     place = tmp_path / "deep" / "new"
-    assert claim_directory(place, "settings.json", {"a": [1, 2.5]}, "a run") is None
+    assert claim(place, "settings.json", {"a": [1, 2.5]}, "a run") is None
     (place / "result.txt").write_text("much work")
-    assert claim_directory(place, "settings.json", {"a": 3}, "a run") == {"a": [1, 2.5]}
+    assert claim(place, "settings.json", {"a": 3}, "a run") == {"a": [1, 2.5]}
 
 
 def test_what_a_killed_process_left_is_in_nobodys_way(tmp_path: Path) -> None:
     (tmp_path / ".settings.json.1a2b3c4d.mereo").mkdir()
-    assert claim_directory(tmp_path, "settings.json", {"a": 1}, "a run") is None
+    assert claim(tmp_path, "settings.json", {"a": 1}, "a run") is None
     assert json.loads((tmp_path / "settings.json").read_text()) == {"a": 1}
 
 
@@ -131,11 +132,11 @@ def test_a_directory_of_something_else_is_not_claimed(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("precious")
     before = contents(tmp_path)
     with pytest.raises(FileExistsError, match=r"is not empty and holds no settings\.json; choose another --output"):
-        claim_directory(tmp_path, "settings.json", {}, "a run")
+        claim(tmp_path, "settings.json", {}, "a run")
     with pytest.raises(FileExistsError, match="thesis.tex is a file; a run is a directory: choose another --output"):
-        claim_directory(tmp_path / "thesis.tex", "settings.json", {}, "a run")
+        claim(tmp_path / "thesis.tex", "settings.json", {}, "a run")
     assert contents(tmp_path) == before
     for text in ("{", "[1]"):
         (tmp_path / "settings.json").write_text(text)
         with pytest.raises(ValueError, match="holds no settings; .* cannot be continued: choose another --output"):
-            claim_directory(tmp_path, "settings.json", {}, "a run")
+            claim(tmp_path, "settings.json", {}, "a run")

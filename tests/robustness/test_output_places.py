@@ -10,7 +10,8 @@ from scene_files import HEAD, write_bar, write_mesh
 from shapes import box
 
 from mereo import __main__ as command_line
-from mereo.io.atomic_files import atomic_file, check_new_directory, claim_directory, new_directory
+from mereo.io.atomic_files import atomic_file, check_new_directory, new_directory
+from mereo.io.object_storage import claim
 
 NO_PLACES = {
     "": "the output '.' has no name of its own",
@@ -50,12 +51,12 @@ def test_a_run_may_lie_behind_a_link(tmp_path: Path) -> None:
     """Nothing is put in the place of a folder in which work is continued."""
     (tmp_path / "disk").mkdir()
     (tmp_path / "run").symlink_to("disk")
-    assert claim_directory(tmp_path / "run", "config.json", {"a": 1}, "a run") is None
+    assert claim(tmp_path / "run", "config.json", {"a": 1}, "a run") is None
     assert os.listdir(tmp_path / "disk") == ["config.json"] and (tmp_path / "run").is_symlink()
     os.mkfifo(tmp_path / "pipe")
     for path in (Path(""), Path(".."), tmp_path / "pipe"):
         with pytest.raises(ValueError, match="has no name|is a device"):
-            claim_directory(path, "config.json", {}, "a run")
+            claim(path, "config.json", {}, "a run")
 
 
 def test_a_mount_point_is_no_place_for_a_new_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

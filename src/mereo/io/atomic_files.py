@@ -337,52 +337,6 @@ def _stamps(folder: Path) -> dict[str, list[int] | None]:
     return stamps
 
 
-# --- folders in which work is continued -------------------------------------------------------------------------------
-
-
-def claim_directory(directory: Path, name: str, settings: dict[str, Any], kind: str) -> dict[str, Any] | None:
-    """Settings that a directory of earlier work holds, or None where it was made with ``settings`` just now.
-
-    Hidden files do not count: a process that was killed while writing leaves them, and they are removed here. It may
-    be a link to a directory, because nothing is put in its place.
-
-    Args:
-        directory: where work is done that may be stopped and continued; made when it is missing.
-        name: of the JSON file in it that says what the work is.
-        settings: what that file says of a new directory.
-        kind: of the directory, for messages: "a dataset".
-
-    Raises:
-        FileExistsError: it is a file, or holds something but no such file.
-        ValueError: its file holds no settings, or it is no place for a directory.
-    """
-    check_place(directory, may_be_link=True)
-    path = directory / name
-    if directory.exists() and not directory.is_dir():
-        raise FileExistsError(f"{directory} is a file; {kind} is a directory: choose another --output")
-    remove_all_abandoned(directory)
-    if path.is_file():
-        return read_settings(path)
-    if directory.is_dir() and any(not file.name.startswith(".") for file in directory.iterdir()):
-        raise FileExistsError(f"{directory} is not empty and holds no {name}; choose another --output")
-    try:
-        write_json(path, settings, force=False)
-    except FileExistsError:  # another process came first
-        return read_settings(path)
-    return None
-
-
-def read_settings(path: Any) -> dict[str, Any]:
-    """Settings in the file of earlier work, a local one or an ``ObjectPath``; ``ValueError`` where it holds none."""
-    try:
-        settings = json.loads(path.read_text("utf-8"))
-    except ValueError:
-        settings = None
-    if not isinstance(settings, dict):
-        raise ValueError(f"{path} holds no settings; what it belongs to cannot be continued: choose another --output")
-    return settings
-
-
 # --- JSON -------------------------------------------------------------------------------------------------------------
 
 

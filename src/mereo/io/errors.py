@@ -122,12 +122,6 @@ def max_bytes() -> int:
     return int(limit * 1e9)
 
 
-def check_bytes(path: str | Path, size: int) -> None:
-    """Raise ``SizeError`` where ``size``, the bytes of ``path``, is over the limit."""
-    if size > max_bytes():
-        raise _too_large(path)
-
-
 def _too_large(path: str | Path) -> SizeError:
     limit = max_bytes() / 1e9
     return SizeError(
@@ -188,9 +182,10 @@ def readable(path: Path, kind: str) -> Iterator[None]:
         raise ValueError(f"{path} is a directory; a {kind} is needed: name a file in it")
     if not path.is_file():
         raise ValueError(f"{path} is not a regular file; a {kind} is needed: save it to a file and name that")
-    if path.stat().st_size == 0:
+    if (size := path.stat().st_size) == 0:
         raise ValueError(f"{path} is empty (0 bytes); a {kind} is needed: export or download it again")
-    check_bytes(path, path.stat().st_size)
+    if size > max_bytes():
+        raise _too_large(path)
     try:
         with quiet(), limited_memory(path):
             yield

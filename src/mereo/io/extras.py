@@ -1,4 +1,4 @@
-"""The extra `network`: what torch is needed for, said in one sentence where it is not installed."""
+"""The extras `network` (torch) and `plots` (matplotlib), said in one sentence where they are not installed."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,22 +24,12 @@ def network_needed() -> Iterator[None]:
 
 def has_network() -> bool:
     """Whether torch is installed."""
-    try:
-        return find_spec("torch") is not None
-    except ModuleNotFoundError:
-        return False
+    return find_spec("torch") is not None
 
 
 def is_torch(error: BaseException) -> bool:
     """Whether an error says that torch is not installed."""
     return isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] == "torch"
-
-
-# --- matplotlib -------------------------------------------------------------------------------------------------------
-
-# matplotlib, which the extra `plots` brings: training curves and charts need it, and no answer does.
-
-CURE = "is not installed: pip install 'mereo[plots]'"
 
 
 def has_plots() -> bool:
@@ -52,7 +42,7 @@ def pyplot() -> Any:
     try:
         import matplotlib
     except ImportError:
-        raise ImportError(f"matplotlib, which draws charts, {CURE}") from None
+        raise ImportError("matplotlib, which draws charts, is not installed: pip install 'mereo[plots]'") from None
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 

@@ -8,6 +8,7 @@ A put of an object is atomic: others see all of it, or what was there before. Cr
 find by themselves (environment, profile, role of the machine); none is taken from a URL, and none is ever printed.
 """
 
+import json
 import os
 import re
 from collections.abc import Iterator
@@ -17,7 +18,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from mereo.io.atomic_files import atomic_file, claim_directory, json_text, read_settings
+from mereo.io.atomic_files import atomic_file, check_place, json_text, remove_all_abandoned, write_json
 
 LIBRARIES = {"s3": ("s3fs", "storage"), "gs": ("gcsfs", "gcs"), "memory": ("fsspec", "storage")}
 """Library of each protocol, and the extra that has it."""
@@ -176,20 +177,47 @@ def write_whole(place: Place, content: bytes) -> None:
 def claim(folder: Place, name: str, settings: dict[str, Any], kind: str) -> dict[str, Any] | None:
     """Settings that a place of earlier work holds, or None where it was made with ``settings`` just now.
 
-    As ``claim_directory``, for local folders and for those of a storage, where of several that come at a time one puts
-    its file and the others read that.
+    Of several processes or machines that come at a time one puts its file and the others read that. Hidden files do not
+    count: a process that was killed while writing leaves them, and they are removed here. A local place may be a link
+    to a directory, because nothing is put in its place.
+
+    Args:
+        folder: where work is done that may be stopped and continued; made when it is missing.
+        name: of the JSON file in it that says what the work is.
+        settings: what that file says of a new folder.
+        kind: of the folder, for messages: "a dataset".
+
+    Raises:
+        FileExistsError: it is a file, or holds something but no such file.
+        ValueError: its file holds no settings, or it is no place for a directory.
     """
+    path, content = folder / name, json_text(settings)
     if isinstance(folder, Path):
-        return claim_directory(folder, name, settings, kind)
-    path, names = folder / name, folder.names()
+        check_place(folder, may_be_link=True)
+        if folder.exists() and not folder.is_dir():
+            raise FileExistsError(f"{folder} is a file; {kind} is a directory: choose another --output")
+        remove_all_abandoned(folder)
+    names = names_in(folder)
     if name in names:
-        return read_settings(path)
-    if any(not file.startswith(".") for file in names):
+        return _settings(path)
+    if names:
         raise FileExistsError(f"{folder} is not empty and holds no {name}; choose another --output")
-    content = json_text(settings).encode()
     try:
-        path.write_bytes(content, force=False)
+        if isinstance(path, Path):
+            write_json(path, settings, force=False)
+        else:
+            path.write_bytes(content.encode(), force=False)
     except FileExistsError:  # another process came first
-        return read_settings(path)
-    stored = read_settings(path)  # a storage without conditional puts took both, and keeps the last
-    return None if json_text(stored).encode() == content else stored
+        return _settings(path)
+    stored = _settings(path)  # a storage without conditional puts took both, and keeps the last
+    return None if json_text(stored) == content else stored
+
+
+def _settings(path: Place) -> dict[str, Any]:
+    try:
+        settings = json.loads(path.read_text("utf-8"))
+    except ValueError:
+        settings = None
+    if not isinstance(settings, dict):
+        raise ValueError(f"{path} holds no settings; what it belongs to cannot be continued: choose another --output")
+    return settings

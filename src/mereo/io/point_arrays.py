@@ -93,10 +93,6 @@ def _is_frame(item: object) -> bool:
 def _positions(source: Any) -> tuple[Float[np.ndarray, "n 3"], str, bool]:
     """All points of a source, what to call it in sentences, and whether it is a grid of pixels."""
     kind = f"the {type(source).__name__}"
-    if isinstance(source, str | PathLike):
-        raise ValueError(
-            f"{str(source)!r} is a path; a frame in memory is needed: read it first, with mereo.read_point_cloud"
-        )
     if is_frame_list(source):
         raise ValueError(f"{kind} holds {counted(len(source), 'frame')}; one is needed: give its elements one by one")
     if _is_cloud_message(source):
@@ -183,7 +179,7 @@ def _array(source: Any, kind: str) -> np.ndarray:
 
 
 def _floats(values: np.ndarray) -> Float[np.ndarray, "..."]:
-    """Values as 64-bit floats, NaN where they are masked."""
+    """64-bit floats, NaN where values are masked."""
     return np.asarray(np.ma.filled(values.astype(np.float64), np.nan))
 
 
@@ -193,26 +189,19 @@ def _is_color_image(values: np.ndarray) -> bool:
 
 def _what_it_is(values: np.ndarray) -> str:
     """What numbers of a wrong shape are instead, and what to do: the end of a sentence about them."""
-    if values.ndim not in (2, 3):
-        return "is not a point cloud; that is n x 3, or h x w x 3 where it is organized: reshape or select its values"
+    flat, rows, columns = values.ndim == 2, values.shape[0], values.shape[-1]
     if _is_color_image(values):
         return "is a color image, which shows no positions; a depth image or point cloud is needed: give one of these"
-    flat, rows, columns = values.ndim == 2, values.shape[0], values.shape[-1]
     wide = columns > 16  # more than a point's position, normal, colour and labels: a row of pixels
-    if (wide and rows != 3) if flat else (columns == 1 or (wide and rows == 1)):
+    if values.ndim in (2, 3) and ((wide and rows != 3) if flat else (columns == 1 or (wide and rows == 1))):
         return (
             "is an image of depths, which needs the camera's intrinsics: give intrinsics=, a mereo.Camera or a file of "
             "one, or mereo.DepthImage(depth, camera)"
         )
-    if columns < 3:
-        return f"has {counted(columns, 'column')}; points have three, x, y and z: give all three"
-    if rows == 3 and flat:
-        return "has points as columns; they must be rows: give points.T"
-    if rows == 3:
-        return "has x, y and z on its first axis; they must be on the last: give np.moveaxis(points, 0, -1)"
-    if flat:
-        return (
-            f"has {columns} columns; points have three, x, y and z: take them out, as points[:, :3] (if these are "
-            "depths of pixels, give mereo.DepthImage(depth, camera))"
-        )
-    return f"has {columns} values in each pixel; points have three, x, y and z: take them out, as points[..., :3]"
+    if values.ndim in (2, 3) and rows == 3:
+        cure = "points.T" if flat else "np.moveaxis(points, 0, -1)"
+        return f"has x, y and z on its first axis; they must be on the last: give {cure}"
+    return (
+        "is not a point cloud; that is n x 3, or h x w x 3 where it is organized: reshape or select its values, as "
+        "points[..., :3]"
+    )

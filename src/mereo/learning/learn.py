@@ -25,9 +25,10 @@ from mereo.evaluation.calibrate import LEAST_VIEWS, VIEWS, calibrate
 from mereo.evaluation.metrics import format_score
 from mereo.evaluation.scoring import EvaluationConfig, evaluate
 from mereo.evaluation.tables import read_metrics
-from mereo.io.atomic_files import MARKER, atomic_file, check_place, claim_directory, scratch_folder, write_json
+from mereo.io.atomic_files import MARKER, atomic_file, check_place, scratch_folder, write_json
 from mereo.io.config import CONFIG
 from mereo.io.errors import words_of
+from mereo.io.object_storage import claim
 from mereo.io.progress import progress
 from mereo.learning.object_files import (
     FRAME,
@@ -308,7 +309,7 @@ def recipe_for(minutes: float) -> TrainConfig:
 
 def _claim(output: Path, settings: dict[str, Any]) -> None:
     """Take the folder, or check that it was begun with the same arguments: they bind once something is made of them."""
-    before = claim_directory(output, CONFIG, settings, "what is learnt")
+    before = claim(output, CONFIG, settings, "what is learnt")
     planned, written = (output / PLAN).is_file(), (output / SCENE).is_file()
     for name, value in settings.items():
         binds = planned or (written and name in ("object", "units"))
