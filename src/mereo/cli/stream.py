@@ -38,7 +38,7 @@ from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
 from mereo.geometry.solids import owned_centroids
-from mereo.io.atomic_files import atomic_file, check_file_place, check_place, remove_all_abandoned, to_json
+from mereo.io.atomic_files import atomic_file, check_file_place, check_place, remove_abandoned, to_json
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.io.writers.meshes import OUTER_OPACITY
 from mereo.models.trained import Trained
@@ -311,7 +311,7 @@ class SurfaceFolder:
         check_place(path, may_be_link=True)
         if path.exists() and not path.is_dir():
             raise FileExistsError(f"{path} is a file; surfaces are written into a folder: choose another --surfaces")
-        remove_all_abandoned(path)
+        remove_abandoned(path)
         if path.is_dir() and any(path.iterdir()) and not force:
             raise FileExistsError(
                 f"{path} exists and is not empty; nothing in it is overwritten: choose another --surfaces or pass "

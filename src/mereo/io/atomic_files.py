@@ -1,8 +1,7 @@
 """Files and folders of results: they appear whole or not at all, and replace only what mereo itself wrote.
 
-An output is first made in a scratch folder beside its destination and renamed at the end, so that a reader never sees
-half of it and an error, Ctrl-C or a full disk leaves nothing behind. A scratch folder (``.NAME.1a2b3c4d.mereo``) is
-locked by its process; the system frees locks when a process dies, however it does, so the next one that writes there
+An output is made in a scratch folder beside its destination (``.NAME.1a2b3c4d.mereo``) and renamed at the end. The
+scratch folder is locked by its process; the system frees locks when a process dies, so the next one that writes there
 can tell what a killed one left from work in progress.
 
 Each folder of results holds ``.mereo.json``, a list of all that is in it with the size and time of each file. A folder
@@ -71,12 +70,9 @@ def scratch_folder(path: Path) -> Iterator[Path]:
     """Yield a fresh folder beside ``path``, and remove it at the end, whatever happens; missing parents are made.
 
     Where the block fails (Ctrl-C too) the parents are removed again. What killed processes left here for ``path`` goes.
-
-    Raises:
-        OSError: the disk is full.
-        PermissionError: the place cannot be written to.
+    Raises ``OSError`` where the disk is full, and ``PermissionError``.
     """
-    remove_abandoned(path)
+    remove_abandoned(path.parent, path.name)
     missing = [folder for folder in path.parents if not folder.exists()]
     try:
         scratch, lock = _new_scratch(path)
@@ -115,38 +111,29 @@ def _new_scratch(path: Path) -> tuple[Path, int | None]:
         raise PermissionError(f"{path} cannot be written; its directory is read-only: choose another place") from error
 
 
-def remove_abandoned(path: Path) -> None:
-    """Remove what killed processes left for ``path``; an output that one of them had taken away is put back."""
-    _clear_dead(path.parent, re.escape(path.name))
+def remove_abandoned(directory: Path, name: str | None = None) -> bool:
+    """Remove what killed processes left for a name in a directory, or for any; whether a live one is writing that.
 
-
-def remove_all_abandoned(directory: Path) -> None:
-    """Remove what killed processes left for any file of a directory in which work is continued."""
-    _clear_dead(directory, ".+")
-
-
-def _clear_dead(directory: Path, names: str) -> bool:
-    """Remove what dead processes left for a pattern of names; whether one that lives, this one too, writes there.
-
-    Nothing is known, and nothing removed, where there are no locks.
+    An output that a killed one had taken away is put back. Without locks nothing is known, and nothing removed.
     """
-    is_written, scratches = False, list[tuple[Path, str]]()
+    is_written, names = False, ".+" if name is None else re.escape(name)
+    items = list[Path]()
     with suppress(OSError):  # it may be missing, or be no one's to list
-        matches = [
-            (item, re.fullmatch(rf"\.({names})\.[0-9a-z_]{{8}}\.mereo", item.name)) for item in directory.iterdir()
-        ]
-        scratches = [(item, match[1]) for item, match in matches if match and not item.is_symlink()]
-    for scratch, name in scratches:
+        items = list(directory.iterdir())
+    for scratch in items:
+        match = re.fullmatch(rf"\.({names})\.[0-9a-z_]{{8}}\.mereo", scratch.name)
+        if match is None or scratch.is_symlink():
+            continue
         try:
             lock = _lock(scratch)
         except BlockingIOError:
             is_written = True
-            continue
         except OSError:  # another user's, or gone by now
-            continue
-        if lock is not None:
-            _clear(scratch, directory / name)
-            os.close(lock)
+            pass
+        else:
+            if lock is not None:
+                _clear(scratch, directory / match[1])
+                os.close(lock)
     return is_written
 
 
@@ -188,11 +175,8 @@ def atomic_file(path: str | Path, *, force: bool = True, inputs: Iterable[str | 
         force: replace an existing file.
         inputs: files and folders that are read, which are never replaced.
 
-    Raises:
-        ValueError: ``path`` is a link, a device or no usable name.
-        FileExistsError: ``path`` exists and ``force`` is false, also where it came while the block ran; or it is a
-            directory, or one of the inputs.
-        OSError: the disk is full, or the place cannot be written to.
+    Raises ``ValueError`` for a link, a device or no usable name, ``FileExistsError`` for a directory, an input, or
+    without ``force`` for what exists or came while the block ran, and ``OSError`` where it cannot be written.
     """
     path = Path(path)
     check_file_place(path, force=force, inputs=inputs)
@@ -201,8 +185,13 @@ def atomic_file(path: str | Path, *, force: bool = True, inputs: Iterable[str | 
         yield partial
         if force:
             os.replace(partial, path)
-        else:
-            _place_new(partial, path)
+            return
+        try:
+            os.link(partial, path)  # in one step if nothing has the name by now, which a rename on POSIX is not
+        except OSError:  # also of a file system without hard links
+            if path.exists():
+                raise FileExistsError(f"{path} {EXISTS}") from None
+            os.rename(partial, path)
 
 
 def check_file_place(path: str | Path | None, *, force: bool = True, inputs: Iterable[str | Path] = ()) -> None:
@@ -214,7 +203,7 @@ def check_file_place(path: str | Path | None, *, force: bool = True, inputs: Ite
         return
     path = Path(path)
     check_place(path)
-    remove_abandoned(path)
+    remove_abandoned(path.parent, path.name)
     if path.is_dir():
         raise FileExistsError(f"{path} is a directory; a file is written there: choose another name")
     if path.exists() and not force:
@@ -225,18 +214,6 @@ def check_file_place(path: str | Path | None, *, force: bool = True, inputs: Ite
             raise FileExistsError(
                 f"{path} is read by this command; it is not replaced, not even by --force: choose another name"
             )
-
-
-def _place_new(partial: Path, path: Path) -> None:
-    """Give a file its name if nothing has that by now, which a link does in one step and a rename on POSIX does not."""
-    try:
-        os.link(partial, path)
-    except FileExistsError:
-        raise FileExistsError(f"{path} {EXISTS}") from None
-    except OSError:  # a file system without hard links
-        if path.exists():
-            raise FileExistsError(f"{path} {EXISTS}") from None
-        os.rename(partial, path)
 
 
 # --- folders of results ---------------------------------------------------------------------------------------------
@@ -251,11 +228,9 @@ def new_directory(path: str | Path, force: bool = False, inputs: Sequence[str | 
         force: replace an existing directory, once the new one is complete, if mereo wrote all that it holds.
         inputs: files that are read, which are never replaced.
 
-    Raises:
-        ValueError: ``path`` is a link, a device, a mount point or no usable name.
-        FileExistsError: ``path`` is a file, or a directory with content and ``force`` is false, or it holds what mereo
-            did not write; or one of these came to be while the block ran.
-        OSError: the disk is full, or the place cannot be written to.
+    Raises ``ValueError`` for a link, a device, a mount point or no usable name, ``FileExistsError`` for a file, for a
+    directory with content that mereo did not write, or without ``force`` with any, and ``OSError`` where it cannot be
+    written.
     """
     path = Path(path)
     check_new_directory(path, force, inputs)
@@ -290,7 +265,7 @@ def check_new_directory(path: Path, force: bool, inputs: Sequence[str | Path] = 
         raise FileExistsError(f"{path} is a file; a directory is written there: choose another --output")
     if os.path.ismount(path):
         raise ValueError(f"{path} is a mount point, which cannot be renamed: name a folder in it")
-    if _clear_dead(path.parent, re.escape(path.name)):
+    if remove_abandoned(path.parent, path.name):
         raise FileExistsError(f"{path} is being written by another process: wait for it, or choose another --output")
     if not _has_content(path):
         return
@@ -309,10 +284,7 @@ def _has_content(path: Path) -> bool:
 
 
 def _check_ours(folder: Path, path: Path) -> None:
-    """Raise ``FileExistsError`` where ``folder``, which is or was ``path``, holds what its list does not have as it is.
-
-    Links are never in that list.
-    """
+    """Raise ``FileExistsError`` where ``folder``, which is or was ``path``, holds what its list does not have so."""
     try:
         known = dict(json.loads((folder / MARKER).read_text("utf-8"))["files"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError):

@@ -18,7 +18,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from mereo.io.atomic_files import atomic_file, check_place, json_text, remove_all_abandoned, write_json
+from mereo.io.atomic_files import atomic_file, check_place, json_text, remove_abandoned, write_json
 
 LIBRARIES = {"s3": ("s3fs", "storage"), "gs": ("gcsfs", "gcs"), "memory": ("fsspec", "storage")}
 """Library of each protocol, and the extra that has it."""
@@ -196,7 +196,7 @@ def claim(folder: Place, name: str, settings: dict[str, Any], kind: str) -> dict
         check_place(folder, may_be_link=True)
         if folder.exists() and not folder.is_dir():
             raise FileExistsError(f"{folder} is a file; {kind} is a directory: choose another --output")
-        remove_all_abandoned(folder)
+        remove_abandoned(folder)
     names = names_in(folder)
     if name in names:
         return _settings(path)

@@ -75,8 +75,7 @@ def recorded_frames(
 
     Args:
         path: the bag.
-        topic: a depth image or point cloud topic; by default the first depth image topic by name, else the first of
-            clouds.
+        topic: by default the first depth image topic by name, else the first of clouds.
         camera: by default the first CameraInfo of the topic nearest by name, for ``image_rect`` topics with its matrix
             P. It is taken to hold for the whole recording.
         depth_scale: value of one metre in integer images; by default 1000.
@@ -88,7 +87,7 @@ def recorded_frames(
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; a ROS bag is needed: check the path")
     if not (path.is_dir() or path.is_file()):
-        raise ValueError(f"{path} is not a regular file; a ROS bag is needed: save it to a file and name that")
+        raise ValueError(f"{path} is not a regular file; a ROS bag is needed: name a file")
     if find_spec("rosbags") is None:
         raise ImportError(f"{path} needs rosbags, which is not installed: pip install 'mereo[sensors]'")
     with _opened(path) as reader:

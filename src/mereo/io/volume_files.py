@@ -21,7 +21,7 @@ from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.transforms import transform_points
 from mereo.io.errors import quiet, readable
 
-VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr")
+VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd")
 
 FEW = 32
 """Distinct values of whole numbers up to which they are labels whatever they look like."""
@@ -38,9 +38,7 @@ class Volume:
         values: as they are stored; what they mean is ``slope * values + intercept``.
         T_world_index: from voxel indices (whole numbers at voxel centres) to positions. Of a file that was read these
             are RAS in the file's unit; what is made of it says its own frame.
-        slope, intercept: scaling of the values that the file states.
-        header: of the file, for what else it says: that of NIfTI as nibabel has it, the fields of NRRD as pynrrd has
-            them; None for a volume without a file.
+        header: of the file, nibabel's or pynrrd's, for what else it says; None for a volume without a file.
     """
 
     values: Shaped[np.ndarray, "..."]
@@ -76,11 +74,7 @@ def is_volume(path: Path) -> bool:
 
 
 def read_volume(path: Path, kind: str = "volume") -> Volume:
-    """Volume of a NIfTI or NRRD file, with as many dimensions as it has.
-
-    Args:
-        path: the file, whose name ``is_volume``.
-        kind: what it should be, for messages: "label volume".
+    """Volume of a NIfTI or NRRD file, with as many dimensions as it has; ``kind`` is what messages call it.
 
     Raises ``FileNotFoundError``, ``ValueError`` for a file that is damaged or holds other than real numbers, and
     ``ImportError`` without the extra `medical`.
@@ -103,10 +97,10 @@ def read_volume(path: Path, kind: str = "volume") -> Volume:
 def _nifti(nibabel: Any, path: Path) -> Volume:
     image = nibabel.load(path)
     _check_sides(image.shape)
-    values = _in_memory(image.dataobj.get_unscaled())
+    values = image.dataobj.get_unscaled()
     values = values[..., 0] if values.ndim == 4 and values.shape[3] == 1 else values
     slope, intercept = float(image.dataobj.slope), float(image.dataobj.inter)
-    return Volume(values, np.asarray(image.affine, float), slope, intercept, image.header.copy())
+    return Volume(_in_memory(values), np.asarray(image.affine, float), slope, intercept, image.header.copy())
 
 
 def _nrrd(nrrd: Any, path: Path) -> Volume:
@@ -144,11 +138,7 @@ def _to_ras(space: str) -> Float[np.ndarray, "4 4"]:
 
 
 def read_scalar_volume(path: Path) -> Volume:
-    """Volume of one finite number for each voxel.
-
-    Raises as ``read_volume``, and ``ValueError`` for more than three dimensions, for values that are not finite and for
-    voxels without a place.
-    """
+    """Volume of three dimensions, of one finite number for each voxel, which has a place; raises as ``read_volume``."""
     volume = read_volume(path)
     if volume.values.ndim != 3:
         raise ValueError(
@@ -252,8 +242,7 @@ def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) 
     """Closed surface of each named label, smoothed, in the volume's world coordinates.
 
     Labels become shares of the cells of a coarser grid, each smoothed by a Gaussian. The object is where they add up to
-    more than a half, and in it a segment is where its share is the largest: marching cubes gives neighbours the same
-    interface, so that they touch without overlap, and no groove runs along it.
+    more than a half, and in it a segment is where its share is the largest: so neighbours share one interface.
 
     Args:
         volume: the labels; those without a name count as empty space.
@@ -294,11 +283,8 @@ def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) 
 class _Grid:
     """A coarser grid over part of a volume; a cell is a block of voxels.
 
-    Attributes:
-        first: voxel index of its lowest corner, before the margin.
-        counts: cells along each axis, without the margin.
-        block: voxels of a cell along each axis.
-        T_world_index: of the volume.
+    ``first`` is the voxel index of its lowest corner and ``counts`` the cells along each axis, without the margin;
+    ``block`` are the voxels of a cell along each axis.
     """
 
     first: Int[np.ndarray, "3"]

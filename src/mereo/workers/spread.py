@@ -18,6 +18,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from ipaddress import ip_address
 from itertools import islice
@@ -40,6 +41,8 @@ RayAddress = Annotated[str | None, arg(metavar="local|auto|HOST:PORT")]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Function = Callable[[Any], Any]
+"""Work on an item."""
 
 
 @dataclass(frozen=True)
@@ -113,9 +116,9 @@ def spread(
         Exception: what ``function`` raises.
     """
 
-    def attempt(item: Item, call: Callable[[Any], Result], argument: Any) -> Result:
+    def attempt(item: Item, call: Callable[[], Result]) -> Result:
         try:
-            return call(argument)
+            return call()
         except Exception as error:
             if failed is None:
                 raise
@@ -124,7 +127,7 @@ def spread(
     if not isinstance(workers, Cluster):
         items = list(items)
         if min(workers, len(items)) <= 1:
-            yield from ((item, attempt(item, function, item)) for item in items)
+            yield from ((item, attempt(item, partial(function, item))) for item in items)
             return
     waiting, running = iter(items), dict[Future[Result], Item]()
     with _ray_pool(function, workers) if isinstance(workers, Cluster) else process_pool(function, workers) as submit:
@@ -136,7 +139,7 @@ def spread(
                 return
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 item = running.pop(future)
-                yield item, attempt(item, _result, future)
+                yield item, attempt(item, partial(_result, future))
 
 
 def _result(future: Future[Result]) -> Result:
@@ -161,9 +164,6 @@ def _result(future: Future[Result]) -> Result:
 
 
 # --- processes of this machine ----------------------------------------------------------------------------------------
-
-Function = Callable[[Any], Any]
-"""Work on an item."""
 
 
 @contextmanager
@@ -201,17 +201,16 @@ def start_resource_tracker() -> None:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-_in_worker: Function | None = None
-"""Set once when a worker starts: it need not be sent with every item."""
+_in_worker = list[Function]()
+"""The function, from when a worker starts: it need not be sent with every item."""
 
 
 def _start_worker(function: Function, end: Connection) -> None:
-    global _in_worker
     # Ctrl-C and a closed terminal are the parent's business, which ends its workers; TERM is how the pool ends them
     for number in (signal.SIGINT, *((signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ())):
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=exit_with_parent, args=(end,), daemon=True).start()
-    _in_worker = function
+    _in_worker.append(function)
 
 
 def exit_with_parent(*ends: Connection) -> None:
@@ -226,8 +225,7 @@ def exit_with_parent(*ends: Connection) -> None:
 
 
 def _apply(item: Any) -> Any:
-    assert _in_worker is not None, "only called in a worker, which sets it first"
-    return _in_worker(item)
+    return _in_worker[0](item)
 
 
 def pickled(function: Function, dumps: Callable[[Function], bytes]) -> bytes:
@@ -245,16 +243,14 @@ def pickled(function: Function, dumps: Callable[[Function], bytes]) -> bytes:
 @contextmanager
 def limit_child_threads() -> Iterator[None]:
     """Let processes that are started in the block compute in one thread: libraries read this when they are loaded."""
-    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
+    before = {name: os.environ[name] for name in THREAD_VARIABLES if name in os.environ}
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+        for name in THREAD_VARIABLES:
+            os.environ.pop(name, None)
+        os.environ.update(before)
 
 
 # --- Ray --------------------------------------------------------------------------------------------------------------
@@ -289,16 +285,12 @@ def import_ray() -> ModuleType:
 
 def _check_reachable(address: str) -> None:
     host, _, port = address.rpartition(":")
-    if not host or not port.isdecimal() or "/" in host:
-        raise ValueError(
-            f"--ray is {address!r}; it must be local, auto, or the HOST:PORT that `ray start --head` prints: correct it"
-        )
     try:
         socket.create_connection((host.strip("[]"), int(port)), timeout=5.0).close()
-    except (OSError, OverflowError) as error:
+    except (OSError, OverflowError, ValueError) as error:
         raise ConnectionError(
-            f"there is no Ray cluster at {address} ({getattr(error, 'strerror', None) or error}): correct the address, "
-            "start one there with `ray start --head`, or use --ray local"
+            f"there is no Ray cluster at {address!r} ({getattr(error, 'strerror', None) or error}): give local, auto, "
+            "or the HOST:PORT that `ray start --head` prints"
         ) from None
 
 
