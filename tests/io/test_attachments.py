@@ -96,7 +96,7 @@ def test_files_that_cannot_be_carried_say_why(tmp_path: Path) -> None:
         read_attachments([tmp_path / "missing.stl"])
     with pytest.raises(ValueError, match=r"is empty \(0 bytes\)"):
         read_attachments([written(tmp_path / "empty.ply", "")])
-    with pytest.raises(ValueError, match=r"has the suffix '.dae'; what is carried is one of .stl, .ply"):
+    with pytest.raises(ValueError, match=r"has the suffix '.dae'; a file to carry is one of .stl, .ply"):
         read_attachments([written(tmp_path / "plan.dae", "x")])
     with pytest.raises(ValueError, match="cannot be read as a mesh"):
         read_attachments([written(tmp_path / "plan.stl", "no mesh at all")])

@@ -153,7 +153,9 @@ def test_the_same_result_gives_the_same_bytes(tmp_path: Path) -> None:
 
 def test_a_missing_library_is_named_with_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "nibabel", None)
-    with pytest.raises(ImportError, match=r"nibabel is needed to write NIfTI files: pip install 'mereo\[medical\]'"):
+    with pytest.raises(
+        ImportError, match=r"NIfTI needs nibabel, which is not installed: pip install 'mereo\[medical\]'"
+    ):
         write_labels_nifti(tmp_path / "l.nii.gz", grid(), COLORS)
     assert list(tmp_path.iterdir()) == []
 

@@ -104,7 +104,7 @@ CASES: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
     "a name of two lines": ("surfaces.npz", lambda c: npz(**{"b\n.npy": npy_of(1.0)}), r"states of 'b\\n' but not of"),
     "an image of another size": ("depth.npy", lambda c: npy_of(np.ones((12, 17), "u2")), "depth.npy cannot be used: "),
     "negative depth": ("depth.npy", lambda c: npy_of(-np.ones((12, 16))), "depth.npy cannot be used: "),
-    "a zero in YAML": ("bar.yaml", lambda c: c + b"\0", "this is not YAML .unacceptable character"),
+    "a zero in YAML": ("bar.yaml", lambda c: c + b"\0", "this is not YAML in UTF-8 .unacceptable character"),
     "a number beyond all": ("bar.yaml", replaced(b"[120, 5, 5]", b"[1e308, 5, 5]"), "`pivot` is .* less than"),
     "segments that are none": ("manifest.json", json_with(segments=None), "its 'segments': Input should be"),
     "a unit below zero": ("manifest.json", json_with(unit_m=-1), "its 'unit_m': Input should be"),

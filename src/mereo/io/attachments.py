@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.atomic_files import atomic_file
-from mereo.io.errors import readable
+from mereo.io.errors import check_suffix, readable
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.readers import check_ply, read_points
 from mereo.io.volume_files import VOLUME_SUFFIXES, Volume, is_volume, read_scalar_volume
@@ -138,11 +138,7 @@ def _read(path: Path) -> Content:
     if is_volume(path):
         return read_scalar_volume(path)
     suffix = path.suffix.lower()
-    known = dict.fromkeys((*MESHES, *CLOUDS, ".csv", *VOLUME_SUFFIXES))
-    if path.exists() and suffix not in known:
-        raise ValueError(
-            f"{path} has the suffix {path.suffix!r}; what is carried is one of {', '.join(known)}: convert it"
-        )
+    check_suffix(path, dict.fromkeys((*MESHES, *CLOUDS, ".csv", *VOLUME_SUFFIXES)), "file to carry")
     if suffix == ".csv":
         return read_pose_table(path)
     is_mesh = suffix in MESHES
@@ -190,9 +186,6 @@ def write_attachment(
     else:
         plain = {".ply": write_segments_ply, ".obj": write_segments_obj, ".stl": write_surface_stl}[suffix]
         plain(path, content.mesh.transformed(np.diag([factor] * 3 + [1.0])))
-
-
-# --- tables of positions and poses ------------------------------------------------------------------------------------
 
 
 def read_pose_table(path: Path) -> PoseTable:

@@ -28,10 +28,7 @@ def pack_tensors(tensors: Tensors, facts: Mapping[str, Any]) -> bytes:
 
 
 def read_content(path: Place) -> bytes:
-    """Bytes of a file of a dataset.
-
-    Raises ``FileNotFoundError``, ``ValueError`` (its reason only) where a disk cannot read it, and ``StorageError``.
-    """
+    """Bytes of a file of a dataset; ``ValueError`` (its reason only) where a disk cannot read it."""
     try:
         return path.read_bytes()
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
@@ -45,11 +42,8 @@ def read_content(path: Place) -> bytes:
 def unpack_tensors(content: bytes, dataset: str | None = None) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Tensors that ``pack_tensors`` has packed, and their facts, none where there is no header entry.
 
-    Args:
-        content: of the file.
-        dataset: key of the dataset that it should be of; None takes any.
-
-    Raises ``ValueError`` (its reason only) where the file is damaged, or states another dataset.
+    Raises ``ValueError`` (its reason only) where the content is damaged, or of another dataset than the one of this
+    key.
     """
     try:
         tensors = load(content)

@@ -12,7 +12,7 @@ import os
 import sys
 import sysconfig
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout
 from pathlib import Path
 from traceback import walk_tb
@@ -155,6 +155,13 @@ def limited_memory(path: str | Path) -> Iterator[None]:
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------
+
+
+def check_suffix(path: Path, known: Iterable[str], kind: str) -> None:
+    """Raise ``ValueError`` for a file whose suffix is none of those that a kind of files has."""
+    if path.exists() and path.suffix.lower() not in known:
+        suffixes = ", ".join(known)
+        raise ValueError(f"{path} has the suffix {path.suffix!r}; a {kind} is one of {suffixes}: convert or rename it")
 
 
 def check_count(count: int, available: int, what: str) -> None:

@@ -1,7 +1,8 @@
-"""The extras `network` (torch) and `plots` (matplotlib), said in one sentence where they are not installed."""
+"""Extras: what libraries are needed for, said in one sentence where they are not installed."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
@@ -32,6 +33,17 @@ def is_torch(error: BaseException) -> bool:
     return isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] == "torch"
 
 
+def library(name: str, extra: str, user: object) -> Any:
+    """Library that an extra brings; ``ImportError`` says that ``user``, a file or a purpose, needs it."""
+    try:
+        return import_module(name)
+    except ImportError:
+        raise ImportError(f"{user} needs {name}, which is not installed: pip install 'mereo[{extra}]'") from None
+
+
+CURE = "is not installed: pip install 'mereo[plots]'"
+
+
 def has_plots() -> bool:
     """Whether matplotlib is installed."""
     return find_spec("matplotlib") is not None
@@ -42,7 +54,7 @@ def pyplot() -> Any:
     try:
         import matplotlib
     except ImportError:
-        raise ImportError("matplotlib, which draws charts, is not installed: pip install 'mereo[plots]'") from None
+        raise ImportError(f"matplotlib, which draws charts, {CURE}") from None
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 

@@ -36,6 +36,9 @@ NAMED = (
 MATRICES = ("intrinsic_matrix", "K", "k", "cam_K", "camera_matrix")
 """Names of camera matrices, 3 x 3 or 9 numbers row by row; the first is Open3D's, column by column."""
 
+SIDES = (("width", "height"), ("image_width", "image_height"), ("w", "h"))
+"""Names of the size in pixels."""
+
 NESTED = ("intrinsic", "intrinsics", "depth_intrinsics")
 """Names of the blocks in which files that hold more keep intrinsics."""
 
@@ -113,12 +116,12 @@ def camera_from_fields(fields: Fields, size: tuple[int, int] | None = None) -> C
     Raises ``ValueError`` that says which fields are missing.
     """
     focal_x, focal_y, center_x, center_y = _pinhole(fields)
-    width, height = _image_size(fields, size)
+    sides = next((names for names in SIDES if all(fields.get(name) is not None for name in names)), None)
+    if sides is None and size is None:
+        raise ValueError("it has no width and height")
+    width, height = size if sides is None else [int(fields[name]) for name in sides]  # type: ignore[misc]
     shift = 0.5 - float(fields.get("pixel_center", 0.5 if "fl_x" in fields else 0.0))
     return Camera(width, height, focal_x, focal_y, center_x + shift, center_y + shift)
-
-
-# --- files of many frames --------------------------------------------------------------------------------------------
 
 
 def _frame(fields: Fields, stem: str, index: int | None) -> Fields:
@@ -156,9 +159,6 @@ def _states_a_camera(fields: object) -> bool:
     )
 
 
-# --- fields ----------------------------------------------------------------------------------------------------------
-
-
 def _pinhole(fields: Fields) -> tuple[float, float, float, float]:
     for names in NAMED:
         if all(name in fields for name in names):
@@ -178,16 +178,6 @@ def _pinhole(fields: Fields) -> tuple[float, float, float, float]:
     return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])
 
 
-def _image_size(fields: Fields, size: tuple[int, int] | None) -> tuple[int, int]:
-    for names in (("width", "height"), ("image_width", "image_height"), ("w", "h")):
-        if all(fields.get(name) is not None for name in names):
-            width, height = (int(fields[name]) for name in names)
-            return width, height
-    if size is None:
-        raise ValueError("it has no width and height")
-    return size
-
-
 def _depth_scale(fields: Fields) -> float | None:
     """Pixel value of one metre, whatever the file means by its number (the module's note)."""
     if "depth_units" in fields:  # RealSense's option: metres of one unit
@@ -205,9 +195,6 @@ def _depth_scale(fields: Fields) -> float | None:
             "unit (0.1) are known; correct it there"
         )
     return per_metre / value
-
-
-# --- lens distortion -------------------------------------------------------------------------------------------------
 
 
 def warn_of_distortion(camera: Camera, fields: Fields, source: str) -> None:

@@ -7,7 +7,6 @@ import re
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,8 @@ from jaxtyping import Float, Int, UInt8
 from mereo.geometry.conventions import LARGEST
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
 from mereo.geometry.radii import Radii
-from mereo.io.errors import check_count, readable
+from mereo.io.errors import check_count, check_suffix, readable
+from mereo.io.extras import library
 from mereo.io.readers import check_ply
 
 VIEWER_ROOT = "camera_frame"
@@ -32,36 +32,28 @@ MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", ".3mf")
 
 
 def read_segmented_mesh(*paths: str | Path) -> SegmentedMesh:
-    """Segments of one or more GLB, OBJ, 3MF, PLY, STL or OFF files, in label order.
+    """Segments of one or more GLB, OBJ, 3MF, PLY, STL or OFF files, in label order; they are not checked.
 
     A file with several named parts (GLB nodes, OBJ objects or groups, 3MF objects) gives one segment each; a file with
     one part gives one segment called after its GLB node, or as our own STL files say, or else after the file. A
-    directory stands for the mesh files in it, by name.
-    Node transforms are applied, except the root of GLB files written by mereo: those come back in the camera frame.
-    Vertices at the same position are merged, because exporters split them at normals and texture seams, which would
-    open a closed mesh. ``SegmentedMesh.check`` is left to the caller.
+    directory stands for the mesh files in it, by name. Node transforms are applied, except the root of GLB files
+    written by mereo: those come back in the camera frame. Vertices at the same position are merged, because exporters
+    split them at normals and texture seams, which would open a closed mesh.
 
-    Raises:
-        FileNotFoundError, ValueError: a file is missing, of another format, damaged or without faces, or two segments
-            have the same name.
-        ImportError: a 3MF file, without the extra `cad`.
+    Raises ``FileNotFoundError``, ``ValueError`` where a file is of another format, damaged or without faces, or two
+    segments have the same name, and ``ImportError`` for a 3MF file without the extra `cad`.
     """
-    files = [file for path in paths for file in _mesh_files(Path(path))]
-    parts = [part for file in files for part in _parts(file)]
+    parts = list[Part]()
+    for path in map(Path, paths):
+        files = [path]
+        if path.is_dir() and not (files := sorted(f for f in path.iterdir() if f.suffix.lower() in MESH_SUFFIXES)):
+            raise ValueError(f"{path} has no mesh files; a {', '.join(MESH_SUFFIXES)} per segment is needed: add them")
+        parts += [part for file in files for part in _parts(file)]
     segments = (
         Segment(name, color or PALETTE[index % len(PALETTE)], vertices, faces)
         for index, (name, color, vertices, faces) in enumerate(parts)
     )
     return SegmentedMesh(tuple(segments))
-
-
-def _mesh_files(path: Path) -> list[Path]:
-    if not path.is_dir():
-        return [path]
-    files = sorted(file for file in path.iterdir() if file.suffix.lower() in MESH_SUFFIXES)
-    if not files:
-        raise ValueError(f"{path} has no mesh files; one of {', '.join(MESH_SUFFIXES)} per segment is needed: add them")
-    return files
 
 
 Part = tuple[str, Color | None, Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
@@ -70,11 +62,9 @@ Part = tuple[str, Color | None, Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]
 
 def _parts(path: Path) -> list[Part]:
     suffix = path.suffix.lower()
-    if path.exists() and suffix not in MESH_SUFFIXES:
-        known = ", ".join(MESH_SUFFIXES)
-        raise ValueError(f"{path} has the suffix {path.suffix!r}; a mesh is one of {known}: convert or rename it")
-    if suffix == ".3mf" and find_spec("lxml") is None:
-        raise ImportError(f"{path} needs lxml, which reads 3MF files and is not installed: pip install 'mereo[cad]'")
+    check_suffix(path, MESH_SUFFIXES, "mesh")
+    if suffix == ".3mf":
+        library("lxml", "cad", path)
     with readable(path, "mesh"):
         if suffix == ".ply":
             check_ply(path)
@@ -113,20 +103,18 @@ def _obj_parts(path: Path) -> list[Part]:
     positions: list[list[float]] = []
     faces: list[list[int]] = []
     owners: list[tuple[str, str, str]] = []
-    name, library = {"o": "", "g": "", "usemtl": ""}, ""
+    name = {"o": "", "g": "", "usemtl": "", "mtllib": ""}
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         kind, *cells = line.split() or [""]
         if kind == "v":
             positions.append([float(cell) for cell in cells[:3]])
         elif kind in name:
             name[kind] = " ".join(cells)
-        elif kind == "mtllib":
-            library = " ".join(cells)
         elif kind == "f":
             corners = [_obj_index(cell, len(positions)) for cell in cells]
             faces += [[corners[0], corners[i], corners[i + 1]] for i in range(1, len(corners) - 1)]
             owners += [(name["o"], name["g"], name["usemtl"])] * (len(corners) - 2)
-    colors = _material_colors(path, library)
+    colors = _material_colors(path, name["mtllib"])
     return _split_parts(np.asarray(positions), np.asarray(faces, dtype=np.int64), owners, colors, path.stem)
 
 
@@ -146,10 +134,7 @@ def _split_parts(
     colors: dict[str, Color],
     stem: str,
 ) -> list[Part]:
-    """Parts of a file: one per object, or per group where there is only one object, with the colour of all its faces.
-
-    ``owners`` are object, group and material of each face; unused vertices are left out.
-    """
+    """Parts of a file, with the colour of all faces: one per object, or per group where there is only one object."""
     level = 0 if len({key[0] for key in owners}) > 1 else 1
     labels = [key[level] or key[0] for key in owners]
     names, parts = list(dict.fromkeys(labels)), list[Part]()
@@ -166,8 +151,7 @@ def _split_parts(
 def _material_colors(mesh: Path, library: str) -> dict[str, Color]:
     """Diffuse colour (``Kd``, taken as that on the screen) of each material without a texture in an OBJ file's library.
 
-    A library is no part of the shape: where it is missing or damaged, there are no colours, and no error. Only a file
-    in the same folder is read, because a downloaded mesh should not choose which files are opened.
+    Only a file in the same folder is read, because a downloaded mesh should not choose which files are opened.
     """
     path = mesh.parent / library
     if not library or Path(library).name != library or not path.is_file():
@@ -264,8 +248,8 @@ class GlbScene:
     """Content of a GLB file.
 
     Attributes:
-        mesh: each node with faces as a segment, its vertices merged where they have the same place and colour. Those of
-            our own files are in the input's frame and unit, others in glTF's, metres and y up.
+        mesh: each node with faces as a segment, its vertices merged where they have the same place and colour; of our
+            own files in the input's frame and unit, of others in glTF's, metres and y up.
         colors: of the vertices of each, where it has several; None where it has one.
         radii: how sure the surfaces are, where our own file says it.
         rotation: from the vertices' frame to glTF's.
@@ -287,10 +271,7 @@ def is_glb(path: Path) -> bool:
 
 
 def read_glb(path: str | Path) -> GlbScene:
-    """Meshes of any GLB file.
-
-    Raises ``FileNotFoundError`` where there is none, and ``ValueError`` for a damaged file or one without faces.
-    """
+    """Meshes of any GLB file; raises ``FileNotFoundError``, and ``ValueError`` where it is damaged or has no faces."""
     path = Path(path)
     with readable(path, "GLB file"):
         scene: Any = trimesh.load_scene(path, process=False)

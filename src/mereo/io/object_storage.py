@@ -4,8 +4,8 @@
     gs://BUCKET/FOLDER   Google Cloud Storage: gcsfs, the extra `gcs`
     memory://FOLDER      this process's memory, for tests
 
-A put of an object is atomic: others see all of it, or what was there before. Credentials are whatever these libraries
-find by themselves (environment, profile, role of the machine); none is taken from a URL, and none is ever printed.
+A put of an object is atomic. Credentials are whatever these libraries find by themselves (environment, profile, role of
+the machine); none is taken from a URL, and none is ever printed.
 """
 
 import json
@@ -14,17 +14,18 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from mereo.io.atomic_files import atomic_file, check_place, json_text, remove_abandoned, write_json
+from mereo.io.extras import library
 
 LIBRARIES = {"s3": ("s3fs", "storage"), "gs": ("gcsfs", "gcs"), "memory": ("fsspec", "storage")}
 """Library of each protocol, and the extra that has it."""
 
 TIMEOUTS = {"connect_timeout": 3, "read_timeout": 15, "retries": {"total_max_attempts": 2, "mode": "standard"}}
-"""What S3 is given, in seconds, so that a wrong address is known in ten."""
+S3 = {"use_listings_cache": False, "max_concurrency": 1, "config_kwargs": TIMEOUTS}
+"""What S3 is given, so that a wrong address is known in ten seconds."""
 
 
 class StorageError(OSError):
@@ -101,10 +102,7 @@ class ObjectPath:
         return self.read_bytes().decode(encoding)
 
     def write_bytes(self, content: bytes, *, force: bool = True) -> None:
-        """Put the object; without ``force`` only if there is none of its name, else ``FileExistsError``.
-
-        A storage that does not know this condition (If-None-Match) puts it all the same: read back whose it is.
-        """
+        """Put the object; without ``force`` only if there is none of its name, else ``FileExistsError``."""
         with self._system() as system:
             system.pipe_file(self.url, content, mode="overwrite" if force else "create")
 
@@ -112,15 +110,11 @@ class ObjectPath:
     def _system(self) -> Iterator[Any]:
         """The protocol's file system, whose errors become one sentence."""
         protocol, bucket = self.url.split("://")[0], self.url.split("/")[2]
-        library, extra = LIBRARIES[protocol]
+        name, extra = LIBRARIES[protocol]
+        library(name, extra, self)
+        fsspec = library("fsspec", extra, self)
         try:
-            fsspec = import_module("fsspec")
-            import_module(library)
-        except ImportError:
-            raise ImportError(f"{library} is needed for {protocol}:// places: pip install 'mereo[{extra}]'") from None
-        try:
-            options = {"use_listings_cache": False, "max_concurrency": 1, "config_kwargs": TIMEOUTS}
-            system = fsspec.filesystem(protocol, **(options if protocol == "s3" else {}))
+            system = fsspec.filesystem(protocol, **(S3 if protocol == "s3" else {}))
             if protocol == "s3":
                 system.retries = 2
             yield system
@@ -140,10 +134,7 @@ Place = Path | ObjectPath
 
 
 def place_of(given: str | Path | ObjectPath) -> Place:
-    """Place that a text means: with a protocol a folder of a storage, without one a local one.
-
-    Raises ``ValueError`` for a URL that is none.
-    """
+    """Place that a text means: with a protocol a folder of a storage (raises as ``ObjectPath``), else a local one."""
     if not isinstance(given, str):
         return given
     # one letter is a drive of Windows
@@ -151,20 +142,14 @@ def place_of(given: str | Path | ObjectPath) -> Place:
 
 
 def names_in(folder: Place) -> list[str]:
-    """Names of what lies in a folder, sorted, but for hidden files; none where it does not exist.
-
-    Raises as the file system or the storage does.
-    """
+    """Names of what lies in a folder, sorted, but for hidden files; none where it does not exist."""
     if isinstance(folder, ObjectPath):
         return folder.names()
     return sorted(file.name for file in folder.iterdir() if not file.name.startswith(".")) if folder.is_dir() else []
 
 
 def write_whole(place: Place, content: bytes) -> None:
-    """Write a file, whole or not at all, also where the machine loses its power.
-
-    Raises as ``atomic_file`` does, or ``StorageError``.
-    """
+    """Write a file, whole or not at all, also where the machine loses its power; raises as the place does."""
     if isinstance(place, ObjectPath):
         place.write_bytes(content)
         return
@@ -178,8 +163,7 @@ def claim(folder: Place, name: str, settings: dict[str, Any], kind: str) -> dict
     """Settings that a place of earlier work holds, or None where it was made with ``settings`` just now.
 
     Of several processes or machines that come at a time one puts its file and the others read that. Hidden files do not
-    count: a process that was killed while writing leaves them, and they are removed here. A local place may be a link
-    to a directory, because nothing is put in its place.
+    count, and what killed processes left is removed. A local place may be a link to a directory.
 
     Args:
         folder: where work is done that may be stopped and continued; made when it is missing.
@@ -187,9 +171,8 @@ def claim(folder: Place, name: str, settings: dict[str, Any], kind: str) -> dict
         settings: what that file says of a new folder.
         kind: of the folder, for messages: "a dataset".
 
-    Raises:
-        FileExistsError: it is a file, or holds something but no such file.
-        ValueError: its file holds no settings, or it is no place for a directory.
+    Raises ``FileExistsError`` for a file, or a folder that holds something but no such file, and ``ValueError`` where
+    that holds no settings.
     """
     path, content = folder / name, json_text(settings)
     if isinstance(folder, Path):

@@ -3,8 +3,7 @@
     anything -points_of-> PointCloud (or the DepthImage that it was), number of points left out
 
 Libraries are recognized by what their objects have, so that none of them is imported. What could be meant in two ways
-is refused: an image of depths has no positions without its camera, and the columns of a table name no axes. Which
-points are measurements is decided in ``mereo.io.readers.valid_points``, as for files.
+is refused: an image of depths has no positions without its camera, and the columns of a table name no axes.
 """
 
 from os import PathLike
@@ -47,9 +46,8 @@ def points_of(source: object, drop_invalid: bool = False) -> tuple[PointCloud | 
         drop_invalid: leave out points that are NaN, infinite or beyond 1e12, and points at exactly (0, 0, 0): sensors
             mark missing measurements so.
 
-    Raises:
-        ValueError: the source is none of these, empty, of another shape or not of real numbers; or it has points
-            without a measurement and ``drop_invalid`` is false; or all of its points are such.
+    Raises ``ValueError`` where the source is none of these, empty, of another shape or not of real numbers, or has
+    points without a measurement that are not to be dropped, or no others.
     """
     if isinstance(source, PointCloud | DepthImage):
         return source, 0
@@ -65,12 +63,10 @@ def points_of(source: object, drop_invalid: bool = False) -> tuple[PointCloud | 
 def is_frame_list(source: object) -> bool:
     """Whether a list or tuple holds frames, and not the rows of one cloud.
 
-    It does where at least one element cannot be a row of numbers, but is a frame: a path or string, a ``PointCloud``
-    or ``DepthImage``, an array of two or more dimensions (of one, where it is structured), a list or tuple whose first
-    element is itself a list, tuple or array, an object with points or vertices, or a PointCloud2 message. So
-    ``[a, b]`` of two arrays n x 3 are two frames, even of equal length, ``[[x, y, z], [x, y, z]]`` is one cloud of two
-    points, and ``[[[x, y, z]]]`` is one frame of one point. What is no list or tuple, a generator or an array among
-    them, and what is empty is no list of frames.
+    It does where at least one element cannot be a row of numbers, but is a frame: a path, what ``points_of`` takes, an
+    array of two or more dimensions (of one, where it is structured), or a list or tuple of such rows. So ``[a, b]`` of
+    two arrays n x 3 are two frames, ``[[x, y, z], [x, y, z]]`` is one cloud of two points, and ``[[[x, y, z]]]`` is one
+    frame of one point. What is no list or tuple, an array among them, and what is empty is no list of frames.
     """
     return isinstance(source, list | tuple) and any(map(_is_frame, source))
 
@@ -85,9 +81,6 @@ def _is_frame(item: object) -> bool:
     if isinstance(dimensions, int):
         return dimensions >= (1 if getattr(getattr(item, "dtype", None), "names", None) else 2)
     return _is_cloud_message(item) or _carried(item) is not None
-
-
-# --- kinds of sources ------------------------------------------------------------------------------------------------
 
 
 def _positions(source: Any) -> tuple[Float[np.ndarray, "n 3"], str, bool]:
@@ -152,9 +145,6 @@ def _structured_points(records: np.ndarray, name: str) -> Float[np.ndarray, "n 3
         if records[axis].shape != records.shape:
             raise ValueError(f"{what} holds several numbers; x, y and z are one each: name the fields of the positions")
     return np.stack([_floats(records[axis]).reshape(-1) for axis in "xyz"], axis=1)
-
-
-# --- arrays ----------------------------------------------------------------------------------------------------------
 
 
 def _array(source: Any, kind: str) -> np.ndarray:

@@ -1,16 +1,13 @@
 """Readers of point clouds, depth images and masks; ``mereo.io.sensor_frame`` reads whichever a file holds.
 
-Every reader raises ``FileNotFoundError`` or a ``ValueError`` of one sentence (value, rule, cure), whatever the parsing
-library raised: a parser of a format raises any exception whose text completes "cannot be read as a point cloud (...)".
-Nothing is repaired silently: missing points are refused unless the caller asks to drop them. Depth scales and pixel
-centres are explained in ``mereo.io.intrinsics``.
+Every reader raises ``FileNotFoundError`` or a ``ValueError`` of one sentence (value, rule, cure); a parser of a format
+raises any exception whose text completes "cannot be read as a point cloud (...)". Nothing is repaired silently.
 """
 
 import json
 import re
 from collections.abc import Callable
 from contextlib import suppress
-from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -23,13 +20,14 @@ from PIL import Image
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import LARGEST
 from mereo.geometry.transforms import checked_pose
-from mereo.io.errors import check_count, limited_memory, quiet, readable, without_output
+from mereo.io.errors import check_count, check_suffix, limited_memory, quiet, readable, without_output
+from mereo.io.extras import library
 
 PLAUSIBLE_DEPTH_M = (0.05, 20.0)
 """Range of an image's median depth; beyond it the unit is wrong, which is otherwise invisible."""
 
-MILLIMETRES, METRES = 1000.0, 1.0
-"""Depth scales of integer and of floating images where nothing else is said, in units per metre."""
+MILLIMETRES = 1000.0
+"""Depth scale of images of integers where nothing else is said, in units per metre; that of floats is 1."""
 
 NOTHING_M = 1e9
 """Depth from which on nothing was measured: renderers store 1e10 where a ray met nothing."""
@@ -54,11 +52,8 @@ def read_point_cloud(path: str | Path, drop_invalid: bool = False) -> PointCloud
         drop_invalid: leave out points that are NaN, infinite or beyond 1e12, and points at exactly (0, 0, 0): sensors
             mark missing measurements so.
 
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is of another format, empty, truncated or not numeric, or has invalid points and
-            ``drop_invalid`` is false.
-        ImportError: a ZDF file, without the extra `sensors`.
+    Raises ``FileNotFoundError``, ``ValueError`` where it is of another format, empty, truncated or not numeric, or has
+    invalid points that are not to be dropped, and ``ImportError`` for a ZDF file without the extra `sensors`.
     """
     return PointCloud(valid_points(read_points(path), path, drop_invalid))
 
@@ -66,15 +61,9 @@ def read_point_cloud(path: str | Path, drop_invalid: bool = False) -> PointCloud
 def read_points(path: str | Path) -> Float[np.ndarray, "n 3"]:
     """Points of a file as ``read_point_cloud`` reads them, those without a measurement included."""
     path = Path(path)
-    reader = CLOUD_READERS.get(path.suffix.lower())
-    if reader is None and path.exists():
-        known = ", ".join(CLOUD_READERS)
-        raise ValueError(
-            f"{path} has the suffix {path.suffix!r}; a point cloud is one of {known}: convert or rename it"
-        )
+    check_suffix(path, CLOUD_READERS, "point cloud")
     with readable(path, "point cloud"):
-        assert reader is not None
-        return np.asarray(reader(path), dtype=np.float64).reshape(-1, 3)
+        return np.asarray(CLOUD_READERS[path.suffix.lower()](path), dtype=np.float64).reshape(-1, 3)
 
 
 def valid_points(
@@ -85,11 +74,7 @@ def valid_points(
 ) -> Float[np.ndarray, "m 3"]:
     """Points that are measurements, as a copy. Raises as ``read_point_cloud`` does.
 
-    Args:
-        points: any unit.
-        path: where they come from, for the sentences.
-        drop_invalid: leave the others out.
-        cure: what to do where they are not to be left out, for the end of that sentence.
+    ``path`` is where they come from, and ``cure`` what to do where others are not to be left out, for the sentences.
     """
     if len(points) == 0:
         raise ValueError(f"{path} holds 0 points; the object must be visible: check where they come from")
@@ -126,17 +111,11 @@ def read_depth_image(
             for floats (``mereo.io.intrinsics`` on BOP and RealSense).
         mask_path: image of the same size, not 0 on the object.
 
-    Raises:
-        FileNotFoundError, ValueError: the file is missing, damaged, of another kind or size, without any measured
-            pixel, or its median depth is not plausible.
-        ImportError: an EXR file, without the extra `sensors`.
+    Raises ``FileNotFoundError``, ``ValueError`` where it is damaged, of another kind or size, without any measured
+    pixel, or of an implausible median depth, and ``ImportError`` for an EXR file without the extra `sensors`.
     """
     path = Path(path)
-    if path.exists() and path.suffix.lower() not in DEPTH_READERS:
-        known = ", ".join(DEPTH_READERS)
-        raise ValueError(
-            f"{path} has the suffix {path.suffix!r}; a depth image is one of {known}: convert or rename it"
-        )
+    check_suffix(path, DEPTH_READERS, "depth image")
     return usable_depth(depth_of(path, read_raw_depth(path), depth_scale, camera), path, mask_path)
 
 
@@ -163,15 +142,11 @@ def is_depth_image(path: Path) -> bool:
 def metres(raw: Raw, depth_scale: float | None) -> Float[np.ndarray, "h w"]:
     """Depth in metres from stored values, 0 where nothing was measured.
 
-    In floats NaN and infinity say so (ROS REP 118), and values from ``NOTHING_M`` up.
-
-    Args:
-        raw: 0 means no measurement.
-        depth_scale: pixel value of one metre; by default 1000 for integers and 1 for floats.
+    In floats NaN and infinity say so (ROS REP 118), and values from ``NOTHING_M`` up. ``depth_scale`` is the pixel
+    value of one metre, by default 1000 for integers and 1 for floats.
     """
-    floating = raw.dtype.kind == "f"
     if depth_scale is None:
-        depth_scale = METRES if floating else MILLIMETRES
+        depth_scale = 1.0 if raw.dtype.kind == "f" else MILLIMETRES
     if not (np.isfinite(depth_scale) and depth_scale > 0):
         raise ValueError(
             f"the depth scale is {depth_scale}; it must be positive, in units per metre: 1000 for millimetres"
@@ -226,12 +201,7 @@ def read_mask(path: str | Path, size: tuple[int, int] | None = None) -> Bool[np.
 
 
 def open_image(source: Path | BytesIO, formats: tuple[str, ...] | None = None) -> Image.Image:
-    """Open an image, which is to be closed by the caller; Pillow does not compare the checksums of a PNG by itself.
-
-    Args:
-        source: the file.
-        formats: those that Pillow may take it for.
-    """
+    """Open an image of one of some formats, to be closed by the caller, and compare the checksums of a PNG."""
     with Image.open(source, formats=formats) as image:
         if image.format == "PNG":
             image.verify()
@@ -240,11 +210,16 @@ def open_image(source: Path | BytesIO, formats: tuple[str, ...] | None = None) -
     return Image.open(source, formats=formats)
 
 
+def in_memory(values: np.ndarray) -> np.ndarray:
+    """Values that no longer lie in the file, with the machine's own order of bytes."""
+    return np.array(values, dtype=values.dtype.newbyteorder("="))
+
+
 def _png(path: Path) -> Raw:
     with open_image(path) as image:
         if image.format != "PNG" or image.mode not in ("I;16", "I;16B", "I"):
             raise ValueError(f"it is {image.format} of mode {image.mode}, not a 16-bit grey PNG")
-        return np.asarray(image).astype(np.asarray(image).dtype.newbyteorder("="))
+        return in_memory(np.asarray(image))
 
 
 def _tiff(path: Path) -> Raw:
@@ -258,20 +233,16 @@ def _tiff(path: Path) -> Raw:
         if image.mode == "F" and is_big_endian and image.info.get("compression") != "raw":
             # Pillow 13 swaps no bytes here and returns noise
             raise ValueError("it is compressed, floating and big-endian, which is not supported: save it uncompressed")
-        return np.asarray(image).astype(np.asarray(image).dtype.newbyteorder("="))
+        return in_memory(np.asarray(image))
 
 
 def _exr(path: Path) -> Raw:
-    if find_spec("OpenEXR") is None:
-        raise ImportError(f"{path} needs OpenEXR, which is not installed: pip install 'mereo[sensors]'")
-    import OpenEXR
-
+    OpenEXR: Any = library("OpenEXR", "sensors", path)
     with without_output(), OpenEXR.File(str(path), separate_channels=True) as file:
         channels = {str(name): np.array(channel.pixels) for name, channel in file.channels().items()}
     known = ("z", "v", "y", "r", "depth", "distance")  # v is Blender's, r that of an image saved as grey colour
     depths = [name for last in known for name in channels if name.lower().split(".")[-1] == last]
-    if not depths and len(channels) == 1:
-        depths = list(channels)
+    depths = depths or (list(channels) if len(channels) == 1 else [])
     if not depths:
         raise ValueError(f"its channels are {', '.join(channels)}, none of them a depth such as Z")
     return channels[depths[0]]
@@ -465,16 +436,9 @@ def _lzf_decompress(data: bytes, size: int) -> bytes:
     return bytes(output)
 
 
-# --- ZDF (Zivid; NetCDF 4) -------------------------------------------------------------------------------------------
-
-
 def _zdf_points(path: Path) -> Float[np.ndarray, "n 3"]:
     """Points of a ZDF file: organized, millimetres, NaN where nothing was measured."""
-    if find_spec("netCDF4") is None:
-        raise ImportError(f"{path} needs netCDF4, which is not installed: pip install 'mereo[sensors]'")
-    import netCDF4
-
-    with netCDF4.Dataset(path) as file:
+    with library("netCDF4", "sensors", path).Dataset(path) as file:
         cloud = file["data"]["pointcloud"][:]
     return _check_array(np.ma.filled(np.ma.asarray(cloud, dtype=np.float64), np.nan))
 
@@ -489,14 +453,8 @@ CLOUD_READERS: dict[str, Callable[[Path], Float[np.ndarray, "n 3"]]] = {
 """Parser of each suffix of point clouds."""
 
 
-# --- poses ------------------------------------------------------------------------------------------------------------
-
-
 def read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
-    """Rigid pose of a file: 4 x 4 numbers as text or NPY, or ``pose`` of a result's summary.json.
-
-    Raises ``ValueError`` and ``FileNotFoundError`` with the file's name.
-    """
+    """Rigid pose of a file: 4 x 4 numbers as text or NPY, or ``pose`` of a result's summary.json."""
     with readable(path, "pose"):
         if path.suffix.lower() == ".npy":
             content = np.load(path, allow_pickle=False)
@@ -506,9 +464,6 @@ def read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
         else:
             content = np.loadtxt(path, ndmin=2)
         return checked_pose(content)
-
-
-# --- arrays -----------------------------------------------------------------------------------------------------------
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:

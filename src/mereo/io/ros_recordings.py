@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
-from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from jaxtyping import Float, UInt8
 
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.io.errors import check_count, is_foreseen, limited_memory, reason
+from mereo.io.extras import library
 from mereo.io.intrinsics import camera_from_fields, warn_of_distortion
 from mereo.io.readers import metres, open_image
 
@@ -88,8 +88,7 @@ def recorded_frames(
         raise FileNotFoundError(f"{path} does not exist; a ROS bag is needed: check the path")
     if not (path.is_dir() or path.is_file()):
         raise ValueError(f"{path} is not a regular file; a ROS bag is needed: name a file")
-    if find_spec("rosbags") is None:
-        raise ImportError(f"{path} needs rosbags, which is not installed: pip install 'mereo[sensors]'")
+    library("rosbags", "sensors", path)
     with _opened(path) as reader:
         topic = topic or _depth_topic(reader, path)
         connections = [c for c in reader.connections if c.topic == topic and c.msgtype in FRAMES]
@@ -205,9 +204,6 @@ def _camera(reader: Any, topic: str, path: Path) -> Camera:
         raise ValueError(
             f"{path}, {nearest} is no camera ({reason(error)}): give --intrinsics FILE, or record it again"
         ) from error
-
-
-# --- messages --------------------------------------------------------------------------------------------------------
 
 
 def _read(decode: Callable[[Any], Content], message: Callable[[], Any], source: str) -> Content:

@@ -8,7 +8,6 @@ space they stay as they are.
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,8 @@ from skimage.measure import marching_cubes
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.transforms import transform_points
 from mereo.io.errors import quiet, readable
+from mereo.io.extras import library
+from mereo.io.readers import in_memory
 
 VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd")
 
@@ -80,13 +81,9 @@ def read_volume(path: Path, kind: str = "volume") -> Volume:
     ``ImportError`` without the extra `medical`.
     """
     nifti = ".nii" in path.name.lower()
-    name = "nibabel" if nifti else "nrrd"
-    try:
-        library: Any = import_module(name)
-    except ImportError:
-        raise ImportError(f"{name} is needed to read {kind}s: pip install 'mereo[medical]'") from None
+    module = library("nibabel" if nifti else "nrrd", "medical", path)
     with readable(path, kind):
-        volume = _nifti(library, path) if nifti else _nrrd(library, path)
+        volume = _nifti(module, path) if nifti else _nrrd(module, path)
     if volume.values.dtype.kind not in "iuf":
         raise ValueError(
             f"{path} has voxels of the type {volume.values.dtype}; each must be one real number: export one channel"
@@ -100,7 +97,7 @@ def _nifti(nibabel: Any, path: Path) -> Volume:
     values = image.dataobj.get_unscaled()
     values = values[..., 0] if values.ndim == 4 and values.shape[3] == 1 else values
     slope, intercept = float(image.dataobj.slope), float(image.dataobj.inter)
-    return Volume(_in_memory(values), np.asarray(image.affine, float), slope, intercept, image.header.copy())
+    return Volume(in_memory(values), np.asarray(image.affine, float), slope, intercept, image.header.copy())
 
 
 def _nrrd(nrrd: Any, path: Path) -> Volume:
@@ -114,12 +111,7 @@ def _nrrd(nrrd: Any, path: Path) -> Volume:
     elif "spacings" in header:
         transform[:3, :3] = np.diag(header["spacings"][-3:])
     transform[:3, 3] = header.get("space origin", np.zeros(3))
-    return Volume(_in_memory(values), _to_ras(str(header.get("space", ""))) @ transform, header=header)
-
-
-def _in_memory(values: np.ndarray) -> np.ndarray:
-    """Values that no longer lie in the file, with the machine's own order of bytes."""
-    return np.array(values, dtype=values.dtype.newbyteorder("="))
+    return Volume(in_memory(values), _to_ras(str(header.get("space", ""))) @ transform, header=header)
 
 
 def _check_sides(sizes: Iterable[Any]) -> None:
@@ -164,7 +156,7 @@ def segment_fields(header: Any) -> dict[str, str]:
 def is_labels(volume: Volume) -> bool:
     """Whether the values are labels: whole numbers, few different ones or mostly equal to their neighbours.
 
-    Judged by evenly spread slices. Neighbours that both have the least value are left out, as air is even everywhere.
+    Neighbours that both have the least value are left out, as air is even everywhere.
     """
     if volume.values.dtype.kind not in "iu":
         return False
@@ -178,9 +170,6 @@ def is_labels(volume: Volume) -> bool:
         seen = (first != least) | (second != least)
         equal, counted = equal + int((seen & (first == second)).sum()), counted + int(seen.sum())
     return 2 * equal > counted
-
-
-# --- labels -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,11 +188,7 @@ class LabelVolume:
 
 
 def read_label_volume(path: Path) -> LabelVolume:
-    """Label volume from a NIfTI or NRRD file of whole numbers.
-
-    Raises ``FileNotFoundError``, ``ValueError`` for anything but three dimensions of whole numbers from 0 up, and
-    ``ImportError`` without the extra `medical`.
-    """
+    """Label volume of three dimensions of whole numbers from 0 up; raises as ``read_volume``."""
     if path.exists() and not is_volume(path):
         raise ValueError(f"{path} is no label volume; its name must end in {', '.join(VOLUME_SUFFIXES)}: convert it")
     volume = read_volume(path, "label volume")
@@ -244,12 +229,9 @@ def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) 
     Labels become shares of the cells of a coarser grid, each smoothed by a Gaussian. The object is where they add up to
     more than a half, and in it a segment is where its share is the largest: so neighbours share one interface.
 
-    Args:
-        volume: the labels; those without a name count as empty space.
-        names: of the values; several may share one.
-        cells: of the grid along the longest side, roughly: a cell is a whole number of voxels.
-
-    Raises ``ValueError`` for a value that does not occur, and for a segment too thin for the grid.
+    Labels without a name count as empty space, and several may share one. ``cells`` are those of the grid along the
+    longest side, roughly: a cell is a whole number of voxels. Raises ``ValueError`` for a value that does not occur,
+    and for a segment too thin for the grid.
     """
     present = np.unique(volume.labels)
     if missing := [value for value in names if value not in present]:

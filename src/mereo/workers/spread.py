@@ -32,6 +32,7 @@ from tyro.conf import arg
 
 from mereo.io.bounds import Count, NotNegative
 from mereo.io.cores import THREAD_VARIABLES, cores, use_threads
+from mereo.io.extras import library
 
 LOCAL = "local"
 """Address of a cluster of this machine alone, started for the run."""
@@ -68,8 +69,7 @@ class Cluster:
     Attributes:
         address: "local" for one of this machine that is started for the run, "auto" for the one that this machine is a
             node of, or HOST:PORT of that one; a cluster that was there before stays.
-        cpus: of a task, which computes in as many threads.
-        gpus: of a task.
+        cpus, gpus: of a task, which computes in as many threads.
         local_cpus: of a cluster that is started; 0 means one per core.
     """
 
@@ -104,16 +104,12 @@ def spread(
 
     Args:
         function: what to do; sent once to every worker.
-        items: also sent; ``AHEAD`` times as many as can be computed at a time are on their way, and for a cluster no
-            more are taken.
+        items: also sent; for a cluster only as many are taken as are computed or waited for.
         workers: number of processes, each with one thread; or a cluster.
         failed: result of an item for which ``function`` raises, or whose workers died; without it that ends all.
 
-    Raises:
-        ValueError: ``function`` cannot be pickled, or this machine has less than a task needs.
-        ConnectionError: there is no such cluster.
-        ChildProcessError: a worker was killed; in a cluster ``DEATHS`` workers or nodes, one after the other.
-        Exception: what ``function`` raises.
+    Raises what ``function`` raises, ``ValueError`` where it cannot be pickled, or this machine has less than a task
+    needs, ``ConnectionError`` where there is no such cluster, and ``ChildProcessError`` where workers were killed.
     """
 
     def attempt(item: Item, call: Callable[[], Result]) -> Result:
@@ -143,7 +139,6 @@ def spread(
 
 
 def _result(future: Future[Result]) -> Result:
-    """Result of work that is done; raises what the function raised, and ``ChildProcessError`` for killed workers."""
     try:
         return future.result()
     except BrokenProcessPool:
@@ -170,8 +165,7 @@ def _result(future: Future[Result]) -> Result:
 def process_pool(function: Function, workers: int) -> Iterator[Callable[[Any], Future[Any]]]:
     """Open a pool of processes, each with one thread; yields what submits an item to ``function`` there.
 
-    An exception in the block ends the processes at once. Raises ``ValueError`` where ``function``, which is sent once
-    to every process, cannot be pickled.
+    An exception in the block ends the processes at once.
     """
     pickled(function, pickle.dumps)
     # spawned, not forked: threads of libraries that this process has used do not survive a fork
@@ -188,10 +182,7 @@ def process_pool(function: Function, workers: int) -> Iterator[Callable[[Any], F
 
 
 def start_resource_tracker() -> None:
-    """Start Python's process that frees shared things, once; it ignores INT and TERM by itself, with HUP blocked too.
-
-    A closed terminal would end it before the others, which then complain that what they free is gone.
-    """
+    """Start Python's process that frees shared things, once, with HUP blocked: else a closed terminal ends it first."""
     if not hasattr(signal, "SIGHUP"):
         return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGHUP])  # what is blocked stays so in a new process
@@ -214,10 +205,7 @@ def _start_worker(function: Function, end: Connection) -> None:
 
 
 def exit_with_parent(*ends: Connection) -> None:
-    """End this process when its parent ends, as one that was killed cannot stop its workers, or closes a pipe.
-
-    Blocks, for a thread.
-    """
+    """End this process when its parent ends, also by a kill, or closes a pipe; blocks, for a thread."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         connection.wait([parent.sentinel, *ends])
@@ -229,7 +217,7 @@ def _apply(item: Any) -> Any:
 
 
 def pickled(function: Function, dumps: Callable[[Function], bytes]) -> bytes:
-    """Pickle a function, by ``pickle.dumps`` or one like it; ``ValueError`` where it cannot be."""
+    """Pickle a function by ``dumps``; ``ValueError`` where it cannot be."""
     try:
         return dumps(function)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
@@ -259,10 +247,8 @@ def limit_child_threads() -> Iterator[None]:
 def choose_cluster(address: str | None, local_cpus: int = 0, task: TaskResources = DEFAULT_TASK) -> Cluster | None:
     """Cluster that options name, None where they name none; a wrong address is an error before any work.
 
-    Raises:
-        ImportError: Ray is not installed.
-        ValueError: resources of tasks without a cluster, or something that is no address.
-        ConnectionError: nothing answers at the address.
+    Raises ``ImportError`` without Ray, ``ValueError`` for resources of tasks without a cluster, and ``ConnectionError``
+    where nothing answers at the address.
     """
     if address is None and task != DEFAULT_TASK:
         raise ValueError("--cpus-per-task and --gpus-per-task are for tasks of a cluster: give --ray local")
@@ -270,28 +256,22 @@ def choose_cluster(address: str | None, local_cpus: int = 0, task: TaskResources
         return None
     import_ray()
     if address not in (LOCAL, "auto"):
-        _check_reachable(address)
+        host, _, port = address.rpartition(":")
+        try:
+            socket.create_connection((host.strip("[]"), int(port)), timeout=5.0).close()
+        except (OSError, OverflowError, ValueError) as error:
+            raise ConnectionError(
+                f"there is no Ray cluster at {address!r} ({getattr(error, 'strerror', None) or error}): give local, "
+                "auto, or the HOST:PORT that `ray start --head` prints"
+            ) from None
     return Cluster(address, task.cpus_per_task, task.gpus_per_task, local_cpus)
 
 
 def import_ray() -> ModuleType:
     """Import Ray, which then sends no statistics; ``ImportError`` where it is not installed."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    try:
-        return import_module("ray")
-    except ImportError:
-        raise ImportError("Ray, which --ray needs, is not installed: run pip install 'mereo[cluster]'") from None
-
-
-def _check_reachable(address: str) -> None:
-    host, _, port = address.rpartition(":")
-    try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=5.0).close()
-    except (OSError, OverflowError, ValueError) as error:
-        raise ConnectionError(
-            f"there is no Ray cluster at {address!r} ({getattr(error, 'strerror', None) or error}): give local, auto, "
-            "or the HOST:PORT that `ray start --head` prints"
-        ) from None
+    ray: ModuleType = library("ray", "cluster", "--ray")
+    return ray
 
 
 def task_slots(cluster: Cluster) -> int:
@@ -303,11 +283,7 @@ def task_slots(cluster: Cluster) -> int:
 
 @contextmanager
 def connect(cluster: Cluster) -> Iterator[None]:
-    """Connect this process to a cluster while the block runs; where its caller has done so already, that stays.
-
-    Raises ``ConnectionError`` where there is no such cluster, ``ValueError`` where a local one has less than a task
-    needs.
-    """
+    """Connect this process to a cluster while the block runs; where its caller has done so already, that stays."""
     ray = import_ray()
     if ray.is_initialized():
         yield
@@ -346,8 +322,7 @@ def connect(cluster: Cluster) -> Iterator[None]:
 def _loopback(ray: ModuleType) -> Iterator[None]:
     """Let a cluster that starts in the block listen on this machine's own address alone: who reaches it runs code.
 
-    Ray takes an address of the network on Linux, also where ``init`` names the loopback, but for this constant, by
-    which it spares users of macOS and Windows the firewall's question. Raises ``ConnectionError`` where that fails.
+    Ray takes an address of the network on Linux, also where ``init`` names the loopback, but for this constant.
     """
     constants: Any = import_module("ray._private.ray_constants")
     before, constants.ENABLE_RAY_CLUSTER = constants.ENABLE_RAY_CLUSTER, False

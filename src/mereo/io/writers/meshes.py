@@ -109,7 +109,7 @@ def write_segments_ply(path: str | Path, surfaces: SegmentedMesh, radii: Radii |
 
 
 def write_points_ply(path: str | Path, cloud: SegmentedCloud) -> None:
-    """Write the observed points with ``label``, its colour, and ``confidence`` and ``occupancy`` where they are known."""
+    """Write the observed points with ``label``, its colour, and a network's ``confidence`` and ``occupancy``."""
     colors = np.array(cloud.colors, dtype=np.uint8)[cloud.labels - 1]
     sure = {name: ("f4", values) for name, values in cloud.chances.items()}
     vertices = _records(_positions(cloud.points) | _colors(colors) | {"label": ("u1", cloud.labels)} | sure)

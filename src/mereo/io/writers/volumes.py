@@ -15,7 +15,6 @@ import json
 import struct
 import zlib
 from collections.abc import Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ from jaxtyping import Float, Float32
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import Color
 from mereo.io.atomic_files import atomic_file
+from mereo.io.extras import library
 from mereo.io.volume_files import Volume, segment_fields
 from mereo.io.writers.meshes import segment_table
 
@@ -186,10 +186,7 @@ def _write_nifti(path: Path, image: Any, level: int) -> None:
 
 def nibabel() -> Any:
     """Library that writes NIfTI; ``ImportError`` says how to get it."""
-    try:
-        return import_module("nibabel")
-    except ImportError:
-        raise ImportError("nibabel is needed to write NIfTI files: pip install 'mereo[medical]'") from None
+    return library("nibabel", "medical", "NIfTI")
 
 
 def _T_lps_index(grid: LabelGrid, unit_m: float) -> Float[np.ndarray, "4 4"]:
@@ -255,9 +252,6 @@ def _segment_fields(grid: LabelGrid, index: int, color: Color) -> dict[str, str]
 def _vector(values: Float[np.ndarray, "3"]) -> str:
     """A vector as NRRD writes it."""
     return f"({','.join(repr(float(value)) for value in values)})"
-
-
-# --- volumes of numbers -----------------------------------------------------------------------------------------------
 
 
 def write_volume(path: Path, volume: Volume, unit_m: float = 1.0) -> None:
