@@ -1,6 +1,5 @@
 """Folders of results replace what mereo wrote and nothing else, whoever comes between or dies half-way."""
 
-import json
 import os
 import shutil
 import signal
@@ -14,7 +13,6 @@ import pytest
 from folder_contents import contents
 
 from mereo import __main__ as command_line
-from mereo.io import atomic_files
 from mereo.io.atomic_files import MARKER, OLD, atomic_file, new_directory
 
 
@@ -38,60 +36,38 @@ def test_what_mereo_wrote_is_replaced_when_forced(tmp_path: Path) -> None:
     assert read(tmp_path / "elsewhere") == "third"
 
 
-def add(folder: Path) -> None:
-    (folder / "deep" / "mine.txt").write_text("precious")
-
-
-def edit(folder: Path) -> None:
-    (folder / "deep" / "a.txt").write_text("corrected by hand")
-
-
-def add_link(folder: Path) -> None:
-    (folder / "deep" / "link").symlink_to(folder)
-
-
-def add_folder(folder: Path) -> None:
-    (folder / "mine").mkdir()
-
-
-def forget(folder: Path) -> None:
-    (folder / MARKER).unlink()
-
-
-def spoil(folder: Path) -> None:
-    (folder / MARKER).write_text('{"files": 3}')
-
-
-CHANGES = {
-    add: r"holds deep/mine\.txt, not written by this version of mereo or .*: move that away, or choose another",
-    edit: r"holds deep/a\.txt, not written by this version of mereo or changed since",
-    add_link: r"holds deep/link, not written",
-    add_folder: r"holds mine, not written",
-    forget: r"holds deep and 1 more, not written",
-    spoil: r"holds deep and 1 more, not written",
+CHANGES: dict[str, tuple[Callable[[Path], object], str]] = {
+    "another file": (
+        lambda folder: (folder / "deep/mine.txt").write_text("precious"),
+        r"holds deep/mine\.txt, not written by this version of mereo or .*: move that away, or choose another",
+    ),
+    "an edit": (lambda folder: (folder / "deep/a.txt").write_text("corrected"), r"holds deep/a\.txt, not written by"),
+    "a link": (lambda folder: (folder / "deep/link").symlink_to(folder), r"holds deep/link, not written"),
+    "a folder": (lambda folder: (folder / "mine").mkdir(), r"holds mine, not written"),
+    "no list": (lambda folder: (folder / MARKER).unlink(), r"holds deep and 1 more, not written"),
+    "a bad list": (lambda folder: (folder / MARKER).write_text('{"files": 3}'), r"holds deep and 1 more, not written"),
 }
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_a_folder_with_anything_else_in_it_is_refused_before_the_work(
-    change: Callable[[Path], None], tmp_path: Path
-) -> None:
+def test_a_folder_with_anything_else_in_it_is_refused_before_the_work(change: str, tmp_path: Path) -> None:
+    make, sentence = CHANGES[change]
     write(tmp_path / "out", "first")
-    change(tmp_path / "out")
+    make(tmp_path / "out")
     before = contents(tmp_path)
-    with pytest.raises(FileExistsError, match=CHANGES[change]), new_directory(tmp_path / "out", force=True):
+    with pytest.raises(FileExistsError, match=sentence), new_directory(tmp_path / "out", force=True):
         pytest.fail("the work was begun")
     assert contents(tmp_path) == before
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_what_comes_into_a_folder_during_the_work_is_kept(change: Callable[[Path], None], tmp_path: Path) -> None:
+def test_what_comes_into_a_folder_during_the_work_is_kept(change: str, tmp_path: Path) -> None:
     out = tmp_path / "out"
     write(out, "first")
     before: dict[str, bytes] = {}
     with pytest.raises(FileExistsError, match="out (holds|was written)"), new_directory(out, force=True) as folder:
         (folder / "b.txt").write_text("second")
-        change(out)
+        CHANGES[change][0](out)
         before = contents(out)
     assert contents(out) == before and os.listdir(tmp_path) == ["out"]
 
@@ -116,16 +92,6 @@ def test_two_runs_at_once_into_one_folder_are_refused_at_once(tmp_path: Path) ->
         new_directory(tmp_path / "out"),
     ):
         pass
-
-
-def test_a_list_that_names_places_elsewhere_removes_nothing_there(tmp_path: Path) -> None:
-    (tmp_path / "precious.txt").write_text("precious")
-    write(tmp_path / "out", "first")
-    listed = json.loads((tmp_path / "out" / MARKER).read_text())
-    listed["files"] |= {"../precious.txt": [8, 0], str(tmp_path / "precious.txt"): [8, 0]}
-    (tmp_path / "out" / MARKER).write_text(json.dumps(listed))
-    write(tmp_path / "out", "second", force=True)
-    assert read(tmp_path / "out") == "second" and (tmp_path / "precious.txt").read_text() == "precious"
 
 
 def test_the_input_is_never_replaced(tmp_path: Path) -> None:
@@ -205,7 +171,7 @@ def test_a_process_killed_while_it_replaces_loses_neither_result(renames: int, t
     assert os.listdir(tmp_path) == ["out"]
 
 
-@pytest.mark.parametrize("unlinked", range(4))
+@pytest.mark.parametrize("unlinked", [0, 2])
 def test_a_result_that_was_being_removed_is_not_put_back(unlinked: int, tmp_path: Path) -> None:
     """Not even where the user has deleted the new one meanwhile: it lacks files. The next run removes what is left."""
     out = tmp_path / "out"
@@ -225,14 +191,6 @@ def test_a_result_that_was_being_removed_is_not_put_back(unlinked: int, tmp_path
     write(out, "second")
     assert read(out) == "second" and {path.name for path in out.iterdir()} == {"deep", MARKER}
     assert os.listdir(tmp_path) == ["out"]
-
-
-def test_without_locks_leftovers_stay_and_are_in_nobodys_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    killed(f"with atomic_files.new_directory({str(tmp_path / 'out')!r}): die()")
-    monkeypatch.setattr(atomic_files, "HAS_LOCKS", False)
-    write(tmp_path / "out", "whole")
-    write(tmp_path / "out", "again", force=True)
-    assert read(tmp_path / "out") == "again" and len(os.listdir(tmp_path)) == 2
 
 
 def test_a_living_process_keeps_what_it_is_writing(tmp_path: Path) -> None:

