@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
-from shapes import ball
+from shapes import ball, box
 
+from mereo.geometry.subdivision import split_long_edges
 from mereo.io.attachments import Positions, Surfaces, read_attachments, read_pose_table, write_attachment
 from mereo.io.writers.glb import viewer_rotation
 
@@ -107,3 +108,15 @@ def test_files_that_cannot_be_carried_say_why(tmp_path: Path) -> None:
     np.save(tmp_path / "nan.npy", np.full((4, 3), np.nan))
     with pytest.raises(ValueError, match="has no positions, or NaN or infinite ones"):
         read_attachments([tmp_path / "nan.npy"])
+
+
+def test_splitting_long_edges_keeps_the_surface() -> None:
+    """No edge is long, the body stays closed with its volume, and the given vertices stay where they are."""
+    part = box((0, 0, 0), (8, 3, 1), "a")
+    vertices, faces = split_long_edges(part.vertices, part.faces, 0.7, 100_000)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    assert mesh.edges_unique_length.max() <= 0.7 and mesh.is_watertight
+    assert mesh.volume == pytest.approx(24.0) and mesh.area == pytest.approx(70.0)
+    np.testing.assert_array_equal(vertices[: len(part.vertices)], part.vertices)
+    with pytest.raises(ValueError, match="would take 1,000 triangles or more to have no edge over 0.05; it"):
+        split_long_edges(part.vertices, part.faces, 0.05, 1000)

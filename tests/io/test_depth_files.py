@@ -76,8 +76,6 @@ def test_masks_of_all_kinds_agree(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read_mask(tmp_path / f"{name}.png"), truth, err_msg=name)
 
 
-# --- formats other than PNG ------------------------------------------------------------------------------------------
-
 MILLIMETRES = np.random.default_rng(5).integers(400, 9000, (6, 8)).astype(np.uint16)
 MILLIMETRES[2, 3] = 0
 METRES = np.where(MILLIMETRES > 0, MILLIMETRES / np.float32(1000), np.nan).astype(np.float32)
@@ -117,9 +115,7 @@ def test_exr(tmp_path: Path, channels: dict[str, float], monkeypatch: pytest.Mon
     openexr.File(header, pixels).write(str(tmp_path / "d.exr"))
     np.testing.assert_allclose(read_depth_image(tmp_path / "d.exr", CAMERA).depth, MILLIMETRES / 1000, rtol=1e-6)
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    with pytest.raises(
-        ImportError, match=r"d.exr needs OpenEXR, which is not installed: pip install 'mereo\[sensors\]'"
-    ):
+    with pytest.raises(ImportError, match=r"d.exr needs OpenEXR, .*: pip install 'mereo\[sensors\]'"):
         read_depth_image(tmp_path / "d.exr", CAMERA)
 
 

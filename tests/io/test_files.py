@@ -50,18 +50,6 @@ def test_arrays_in_numpy_files(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read_point_cloud(tmp_path / name).points, POINTS[:count])
 
 
-def test_a_ply_with_faces_before_or_behind_its_vertices(tmp_path: Path) -> None:
-    faces = "element face 1\nproperty list uchar int vertex_indices\n"
-    vertices = f"element vertex {len(POINTS)}\nproperty float x\nproperty float y\nproperty float z\n"
-    rows, triangle = text(POINTS, " "), "3 0 1 2\n"
-    for name, head, body in (
-        ("behind", vertices + faces, rows + triangle),
-        ("before", faces + vertices, triangle + rows),
-    ):
-        (tmp_path / f"{name}.ply").write_text(f"ply\nformat ascii 1.0\n{head}end_header\n{body}")
-        np.testing.assert_array_equal(read_point_cloud(tmp_path / f"{name}.ply").points, POINTS)
-
-
 def test_missing_points_are_refused_with_the_cure_or_dropped(tmp_path: Path) -> None:
     points = POINTS.copy()
     points[3], points[5, 1], points[9] = np.nan, np.inf, 0
@@ -122,9 +110,6 @@ def test_missing_files_and_directories(tmp_path: Path) -> None:
     (tmp_path / "folder.ply").mkdir()
     with pytest.raises(ValueError, match="is a directory"):
         read_point_cloud(tmp_path / "folder.ply")
-
-
-# --- meshes ----------------------------------------------------------------------------------------------------------
 
 
 def test_parts_of_an_obj_keep_their_order_names_and_closedness(tmp_path: Path) -> None:

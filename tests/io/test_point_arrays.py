@@ -140,7 +140,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "frames in lists": ((POINTS.tolist(),), "^the tuple holds 1 frame; one"),
     "four columns": (
         np.ones((9, 4)),
-        r"^the ndarray of shape .9, 4. is not a point cloud; that is n x 3.*as points\[..., :3\]",
+        r"^the ndarray of shape .9, 4. is not a point cloud.*as points\[..., :3\]",
     ),
     "transposed": (np.ones((3, 500)), "has x, y and z on its first axis; they must be on the last: give points.T"),
     "depths": (np.ones((480, 640), np.float32), f"^the ndarray of shape .480, 640. {IMAGE}"),

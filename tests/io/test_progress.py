@@ -40,20 +40,6 @@ def test_lines_say_stage_rate_and_time_left(wait: Callable[[float], None], capsy
     ]
 
 
-def test_lines_come_now_and_then(
-    wait: Callable[[float], None], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(module, "LINE_EVERY_S", 10.0)
-    for _ in tracked("evaluate", 24, "views"):
-        wait(1.0)
-    lines = capsys.readouterr().err.splitlines()
-    assert [line.partition(" of")[0] for line in lines] == [
-        "evaluate: 10",
-        "evaluate: 20",
-        "evaluate: 24 views in 24 s",
-    ]
-
-
 def test_pauses_count_for_the_end_and_not_for_the_rate(
     wait: Callable[[float], None], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -24,22 +24,6 @@ from mereo.io.writers.volumes import (
 )
 
 RAS_OF_INPUT = np.array([-1.0, -1.0, 1.0])
-PYVISTA = "pyvista is not installed: pip install 'mereo[dev]'"
-
-
-# --- VTI -------------------------------------------------------------------------------------------------------------
-
-
-def test_vtk_reads_the_vti(tmp_path: Path) -> None:
-    pyvista = pytest.importorskip("pyvista", reason=PYVISTA)
-    write_labels_vti(tmp_path / "l.vti", grid(), COLORS)
-    image = pyvista.read(tmp_path / "l.vti")
-    np.testing.assert_array_equal(image["label"].reshape(image.dimensions, order="F"), grid().labels)
-    assert image["label"].dtype == np.uint8
-    for label in (1, 3):
-        np.testing.assert_allclose(image.points[image["label"] == label].mean(axis=0), centroid(label), atol=1e-6)
-    assert tuple(image.field_data["segment_names"]) == NAMES
-    np.testing.assert_array_equal(image.field_data["segment_colors"], COLORS)
 
 
 def test_a_vti_is_the_format_that_vtk_documents(tmp_path: Path) -> None:
@@ -53,9 +37,6 @@ def test_a_vti_is_the_format_that_vtk_documents(tmp_path: Path) -> None:
     packed = base64.b64decode(block[44:])
     assert head.tolist() == [1, grid().labels.size, 0, len(packed)]
     np.testing.assert_array_equal(np.frombuffer(zlib.decompress(packed), np.uint8), np.ravel(grid().labels, order="F"))
-
-
-# --- NIfTI and seg.nrrd ----------------------------------------------------------------------------------------------
 
 
 def test_nibabel_sees_the_labels_in_ras_millimetres(tmp_path: Path) -> None:
@@ -140,7 +121,12 @@ def test_a_missing_library_is_named_with_its_extra(tmp_path: Path, monkeypatch: 
     assert list(tmp_path.iterdir()) == []
 
 
-# --- points ----------------------------------------------------------------------------------------------------------
+def test_labels_have_names(tmp_path: Path) -> None:
+    write_labels_npz(tmp_path / "l.npz", grid())
+    with np.load(tmp_path / "l.npz", allow_pickle=False) as loaded:
+        assert all(np.array_equal(loaded[name], getattr(grid(), name)) for name in loaded.files) and len(loaded) == 4
+    with pytest.raises(ValueError, match="label 3 has no name among 2"):
+        write_labels_npz(tmp_path / "l.npz", replace(grid(), names=("a", "b")))
 
 
 def test_labelled_points_come_back(tmp_path: Path) -> None:

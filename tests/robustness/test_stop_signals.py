@@ -79,14 +79,6 @@ def test_what_is_ignored_stays_ignored() -> None:
         signal.signal(number, before)
 
 
-def test_a_command_runs_outside_the_main_thread_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
-    codes: list[int] = []
-    thread = threading.Thread(target=lambda: codes.append(run(lambda: None, monkeypatch)))
-    thread.start()
-    thread.join(20)
-    assert codes == [0]
-
-
 def test_a_stream_ends_with_its_summary(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
