@@ -27,23 +27,13 @@ def test_every_form_gives_the_same_points(form: str) -> None:
     assert not is_frame_list(FORMS[form])
 
 
-def test_own_types_are_returned_as_they_are() -> None:
-    cloud = PointCloud(POINTS)
-    assert points_of(cloud) == (cloud, 0)
+def test_own_types_are_returned_and_others_are_copied_in_all_their_digits() -> None:
     assert points_of(DEPTH, drop_invalid=True) == (DEPTH, 0)
-
-
-def test_the_points_are_a_copy_in_all_their_digits() -> None:
     fine = np.random.default_rng(1).normal(size=(9, 3))
     cloud, _ = points_of(fine)
     assert isinstance(cloud, PointCloud)
     np.testing.assert_array_equal(cloud.points, fine)
     assert not np.shares_memory(cloud.points, fine)
-
-
-def test_pyvista_itself() -> None:
-    pyvista = pytest.importorskip("pyvista")
-    np.testing.assert_array_equal(points_of(pyvista.PolyData(POINTS))[0].points, POINTS)
 
 
 @pytest.mark.parametrize("ros", ["ROS1_NOETIC", "ROS2_HUMBLE"])
@@ -55,9 +45,6 @@ def test_messages_of_rosbags(ros: str) -> None:
     cloud = types["sensor_msgs/msg/PointCloud2"](**{**vars(made), "fields": fields})
     np.testing.assert_array_equal(points_of(cloud)[0].points, POINTS)
     assert is_frame_list([cloud])
-
-
-# --- missing measurements --------------------------------------------------------------------------------------------
 
 
 def broken(points: np.ndarray) -> np.ndarray:
@@ -113,9 +100,6 @@ def test_other_marks_of_missing_points() -> None:
         points_of(wide, drop_invalid=True)
 
 
-# --- refusals --------------------------------------------------------------------------------------------------------
-
-
 def generated() -> Iterator[list[float]]:
     yield [1.0, 2.0, 3.0]
 
@@ -138,10 +122,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "class": (trimesh.PointCloud, "^the ABCMeta cannot be read as a frame"),
     "table": (SimpleNamespace(columns=["z", "y", "x"], points=POINTS), r"is a table.*give table\[\['x', 'y', 'z'\]\]"),
     "frames in lists": ((POINTS.tolist(),), "^the tuple holds 1 frame; one"),
-    "four columns": (
-        np.ones((9, 4)),
-        r"^the ndarray of shape .9, 4. is not a point cloud.*as points\[..., :3\]",
-    ),
+    "four columns": (np.ones((9, 4)), r"^the ndarray of shape .9, 4. is not a point cloud.*as points\[..., :3\]"),
     "transposed": (np.ones((3, 500)), "has x, y and z on its first axis; they must be on the last: give points.T"),
     "depths": (np.ones((480, 640), np.float32), f"^the ndarray of shape .480, 640. {IMAGE}"),
     "depths in millimetres": (np.ones((6, 17), np.uint16), IMAGE),
@@ -180,8 +161,6 @@ def test_what_is_no_frame_gets_one_sentence(case: str) -> None:
     sentence = str(caught.value)
     assert "\n" not in sentence and ": " in sentence and not sentence.endswith(".") and "--" not in sentence
 
-
-# --- lists of frames -------------------------------------------------------------------------------------------------
 
 FRAME_LISTS: dict[str, Any] = {
     "arrays of equal length": (POINTS, POINTS),

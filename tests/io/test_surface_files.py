@@ -185,15 +185,3 @@ def test_names_of_files_and_materials_are_safe_and_distinct() -> None:
     part = segments().segments[0]
     found = [(label, replace(part, name=name)) for label, name in ((1, "a b"), (2, "a/b"), (3, "//"), (7, "c"))]
     assert material_names(found) == ["a_b_label_1", "a_b_label_2", "label_3", "c"]
-
-
-@pytest.mark.parametrize("suffix", ["ply", "obj", "stl"])
-def test_vtk_sees_the_surfaces_where_they_are(tmp_path: Path, suffix: str) -> None:
-    pyvista = pytest.importorskip("pyvista", reason="pyvista is not installed: pip install 'mereo[dev]'")
-    writers = {"ply": write_segments_ply, "obj": write_segments_obj, "stl": write_segments_stl}
-    writers[suffix](tmp_path / f"s.{suffix}", segments())
-    found = pyvista.read(tmp_path / (f"s.{suffix}" if suffix != "stl" else "s.stl/3-Öhrchen.stl"))
-    box = BOX if suffix == "stl" else segments().merged()[0]
-    np.testing.assert_allclose(np.reshape(found.bounds, (3, 2)).T, [box.min(axis=0), box.max(axis=0)], atol=1e-6)
-    if suffix == "ply":
-        assert {tuple(color[:3]) for color in found.point_data["RGB"]} == {COLORS[0], COLORS[2]}

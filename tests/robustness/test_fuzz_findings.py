@@ -1,6 +1,5 @@
 """What the damage of ``test_fuzz`` once got through: each input as small as it can be, and what is said of it now."""
 
-import io
 import json
 import os
 import struct
@@ -16,16 +15,6 @@ from safetensors import numpy as arrays
 from safetensors.torch import load_file, save_file
 
 from mereo.io.errors import quiet, reason, without_output, words_of
-
-
-def npy(header: str) -> bytes:
-    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header.encode()
-
-
-def npy_of(values: object) -> bytes:
-    file = io.BytesIO()
-    np.save(file, np.asarray(values))
-    return file.getvalue()
 
 
 def at(place: int, piece: bytes) -> Callable[[bytes], bytes]:
@@ -60,24 +49,14 @@ def labels_of_infinity(content: bytes) -> bytes:
     return bytes(nibabel.Nifti1Image(np.full((4, 4, 4), np.inf, "f4"), np.eye(4)).to_bytes())
 
 
-EMPTY = npy("{'descr': '<f8', 'fortran_order': False, 'shape': (2147483647, 0, 3), }\n")
-PYTHON_2 = npy("{'descr': '<f8', 'fortran_order': False, 'shape': (1L,), }\n") + bytes(8)  # of which numpy warns
 CASES: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
     "pixels that OpenEXR prints about": ("depth.exr", chunk_size, "cannot be read as a depth image"),
     "a header of 4 GB": ("cloud.npy", at(6, b"\2\0" + b"\xff" * 4), "expected 4294967295 bytes"),
     "no array": ("surfaces.npz", lambda c: zipped({"a": b"text"}), "its entry 'a' is no array"),
-    "no array in a view": ("view.npz", lambda c: zipped({"depth": b"text"}), "its entry 'depth' is no array"),
-    "arrays as of Python 2": ("view.npz", lambda c: zipped({"depth.npy": PYTHON_2}), "view.npz is not a sample view"),
-    "no values, two billion rows": ("tetrahedra.npz", lambda c: zipped({"nodes.npy": EMPTY}), "states of 'nodes'"),
-    "a name of two lines": ("surfaces.npz", lambda c: zipped({"b\n.npy": npy_of(1.0)}), r"states of 'b\\n' but not of"),
-    "negative depth": ("depth.npy", lambda c: npy_of(-np.ones((12, 16))), "depth.npy cannot be used: "),
     "a zero in YAML": ("bar.yaml", lambda c: c + b"\0", "this is not YAML in UTF-8 .unacceptable character"),
     "a number beyond all": ("bar.yaml", lambda c: c.replace(b"[120, 5", b"[1e308, 5", 1), "`pivot` is .* less than"),
-    "segments that are none": ("manifest.json", json_with(segments=None), "its 'segments': Input should be"),
-    "another model": ("state.json", json_with(model="0" * 64), "state.json does not lead to a registration: "),
     "a pose that no rotation fits": ("start.json", json_with(object=np.ones((4, 4)).tolist()), "start.json cannot"),
     "a point at infinity": ("start.json", pair_at_infinity, "scan of the start of the object must be rows of 3 finite"),
-    "a cloud as wide as numbers": ("cloud.npy", lambda c: npy_of(np.full((40, 3), 1e300)), "or beyond 1e.12"),
     "a camera of no size": (
         "frames.mcap",
         lambda c: c.replace(struct.pack("<d", 10.0), struct.pack("<d", np.nan)),
@@ -85,8 +64,6 @@ CASES: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
     ),
     "complex places": ("shard-00000.safetensors", complex_centres, "its tensor 'center' has complex numbers"),
     "labels beyond all numbers": ("labels.nii", labels_of_infinity, "holds values that are no labels"),
-    "a recipe that is a number": ("config.json", json_with(train=3), "holds a run with another train setting"),
-    "a score that is a word": ("metrics.json", json_with(iou="high"), "metrics.json is not what .*'iou': Input should"),
     "a scan of two lines": ("truth.json", json_with(scan="\u2028"), r"the name of its scan is '.u2028'"),
     "an extension of 2 GB": ("labels.nii", at(352, struct.pack("<i", 2**31 - 16)), "labels.nii cannot be read"),
 }

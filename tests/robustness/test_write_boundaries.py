@@ -58,9 +58,7 @@ CASES = {
         "scene export rope --output out.ply --force", first="scene export shapes --output out.ply"
     ),
     "scene check": Case(
-        "scene check out.yaml --repair",
-        again="move or remove it",
-        first="scene new INPUTS/open.ply --output out.yaml",
+        "scene check out.yaml --repair", again="move or remove it", first="scene new INPUTS/open.ply --output out.yaml"
     ),
     "export": Case("export INPUTS/tiny.safetensors --output out --format torch", again="--force", dear=True),
 }
