@@ -86,16 +86,14 @@ def _check_places(name: str, vertices: Float[np.ndarray, "v 3"]) -> None:
 
 def _check_off(path: Path) -> None:
     """Raise ``ValueError`` for an OFF file that was cut short, of which trimesh would return a part."""
-    lines = (line.partition("#")[0].strip() for line in path.read_text("utf-8", errors="replace").splitlines())
-    rows = [line for line in lines if line]
-    keyword = re.match(r"[A-Za-z0-9]*OFF\b", rows[0]) if rows else None
-    if keyword is None:
+    text = re.sub(r"#.*", "", path.read_text("utf-8", errors="replace"))
+    head = re.match(r"\s*[A-Za-z0-9]*OFF\s+(-?\d+)\s+(-?\d+).*", text)
+    if head is None:
         raise ValueError("it has no OFF header")
-    rest = rows[0][keyword.end() :].split()
-    counts, body = (rest, rows[1:]) if rest else (rows[1].split(), rows[2:])
-    vertices, faces = int(counts[0]), int(counts[1])
-    check_count(vertices, len(body), "vertices")
-    check_count(faces, len(body) - vertices, "faces")
+    vertices, faces = int(head[1]), int(head[2])
+    rows = len([line for line in text[head.end() :].splitlines() if line.strip()])
+    check_count(vertices, rows, "vertices")
+    check_count(faces, rows - vertices, "faces")
 
 
 def _obj_parts(path: Path) -> list[Part]:

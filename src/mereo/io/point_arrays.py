@@ -6,6 +6,7 @@ Libraries are recognized by what their objects have, so that none of them is imp
 is refused: an image of depths has no positions without its camera, and the columns of a table name no axes.
 """
 
+from contextlib import suppress
 from os import PathLike
 from typing import Any
 
@@ -112,8 +113,8 @@ def _positions(source: Any) -> tuple[Float[np.ndarray, "n 3"], str, bool]:
     check_real(values, name)
     if values.size == 0:
         return np.empty((0, 3)), name, False
-    if values.ndim not in (2, 3) or values.shape[-1] != 3 or _is_color_image(values):
-        raise ValueError(f"{name} {_what_it_is(values)}")
+    if wrong := _what_else(values):
+        raise ValueError(f"{name} {wrong}")
     return _floats(values).reshape(-1, 3), name, values.ndim == 3
 
 
@@ -154,12 +155,9 @@ def _array(source: Any, kind: str) -> np.ndarray:
     try:
         for step in ("detach", "cpu"):  # torch's tensors need both before numpy takes them, Open3D's the second
             source = getattr(source, step)() if hasattr(source, step) else source
-        if not hasattr(source, "numpy"):
-            return np.asarray(source)
-        try:
-            return np.asarray(source.numpy())
-        except TypeError:  # bfloat16 and 8-bit floats, which numpy does not have
-            return np.asarray(source.double().numpy())
+        with suppress(TypeError):  # of bfloat16 and 8-bit floats, which numpy does not have
+            return np.asarray(source.numpy() if hasattr(source, "numpy") else source)
+        return np.asarray(source.double().numpy())
     except Exception as error:  # whatever the library says of values that it does not hand over
         ragged = isinstance(source, list | tuple) and isinstance(error, ValueError)
         why = "its rows differ in length" if ragged else reason(error)
@@ -173,24 +171,23 @@ def _floats(values: np.ndarray) -> Float[np.ndarray, "..."]:
     return np.asarray(np.ma.filled(values.astype(np.float64), np.nan))
 
 
-def _is_color_image(values: np.ndarray) -> bool:
-    return values.ndim == 3 and values.shape[-1] in (3, 4) and values.dtype == np.uint8
-
-
-def _what_it_is(values: np.ndarray) -> str:
-    """What numbers of a wrong shape are instead, and what to do: the end of a sentence about them."""
-    flat, rows, columns = values.ndim == 2, values.shape[0], values.shape[-1]
-    if _is_color_image(values):
-        return "is a color image, which shows no positions; a depth image or point cloud is needed: give one of these"
-    wide = columns > 16  # more than a point's position, normal, colour and labels: a row of pixels
-    if values.ndim in (2, 3) and ((wide and rows != 3) if flat else (columns == 1 or (wide and rows == 1))):
-        return (
-            "is an image of depths, which needs the camera's intrinsics: give intrinsics=, a mereo.Camera or a file of "
-            "one, or mereo.DepthImage(depth, camera)"
-        )
-    if values.ndim in (2, 3) and rows == 3:
-        cure = "points.T" if flat else "np.moveaxis(points, 0, -1)"
-        return f"has x, y and z on its first axis; they must be on the last: give {cure}"
+def _what_else(values: np.ndarray) -> str:
+    """What numbers are instead of points, and what to do: the end of a sentence about them; empty for points."""
+    if values.ndim in (2, 3):
+        flat, rows, columns = values.ndim == 2, values.shape[0], values.shape[-1]
+        if not flat and columns in (3, 4) and values.dtype == np.uint8:
+            return "is a color image, which shows no positions; a depth image or cloud is needed: give one of these"
+        if columns == 3:
+            return ""
+        wide = columns > 16  # more than a point's position, normal, colour and labels: a row of pixels
+        if (wide and rows != 3) if flat else (columns == 1 or (wide and rows == 1)):
+            return (
+                "is an image of depths, which needs the camera's intrinsics: give intrinsics=, a mereo.Camera or a "
+                "file of one, or mereo.DepthImage(depth, camera)"
+            )
+        if rows == 3:
+            cure = "points.T" if flat else "np.moveaxis(points, 0, -1)"
+            return f"has x, y and z on its first axis; they must be on the last: give {cure}"
     return (
         "is not a point cloud; that is n x 3, or h x w x 3 where it is organized: reshape or select its values, as "
         "points[..., :3]"

@@ -7,7 +7,7 @@ raises any exception whose text completes "cannot be read as a point cloud (...)
 import json
 import re
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -131,12 +131,11 @@ def is_depth_image(path: Path) -> bool:
         return path.suffix.lower() in DEPTH_READERS
     if not path.is_file():  # a pipe would be waited for
         return False
-    try:
-        with quiet():
-            array = np.lib.format.open_memmap(path, mode="r")
-    except Exception:  # a damaged header raises what Python's own parser does, too
-        return False  # the reader of clouds says what is wrong
-    return array.ndim == 2 and array.shape[1] >= NARROWEST
+    # a damaged header raises what Python's own parser does, too; the reader of clouds says what is wrong
+    with suppress(Exception), quiet():
+        array = np.lib.format.open_memmap(path, mode="r")
+        return array.ndim == 2 and array.shape[1] >= NARROWEST
+    return False
 
 
 def metres(raw: Raw, depth_scale: float | None) -> Float[np.ndarray, "h w"]:
@@ -215,21 +214,18 @@ def in_memory(values: np.ndarray) -> np.ndarray:
     return np.array(values, dtype=values.dtype.newbyteorder("="))
 
 
-def _png(path: Path) -> Raw:
-    with open_image(path) as image:
-        if image.format != "PNG" or image.mode not in ("I;16", "I;16B", "I"):
-            raise ValueError(f"it is {image.format} of mode {image.mode}, not a 16-bit grey PNG")
-        return in_memory(np.asarray(image))
-
-
-def _tiff(path: Path) -> Raw:
+def _grey(path: Path) -> Raw:
+    """Values of a grey PNG or TIFF, as the suffix says."""
+    kind = "PNG" if path.suffix.lower() == ".png" else "TIFF"
     with path.open("rb") as file:
         is_big_endian = file.read(2) == b"MM"
-    with without_output(), open_image(path) as image:  # libtiff prints what Pillow says again
-        if image.format != "TIFF" or image.mode not in ("I;16", "I;16B", "I", "F"):
-            raise ValueError(f"it is {image.format} of mode {image.mode}, not a grey TIFF of 16-bit or float values")
-        if getattr(image, "n_frames", 1) != 1:
-            raise ValueError(f"it has {image.n_frames} pages instead of one")  # type: ignore[attr-defined]
+    # libtiff prints what Pillow says again
+    with without_output() if kind == "TIFF" else nullcontext(), open_image(path) as image:
+        if image.format != kind or image.mode not in ("I;16", "I;16B", "I", "F"):
+            needed = "16-bit grey PNG" if kind == "PNG" else "grey TIFF of 16-bit or float values"
+            raise ValueError(f"it is {image.format} of mode {image.mode}, not a {needed}")
+        if (pages := getattr(image, "n_frames", 1)) != 1:
+            raise ValueError(f"it has {pages} pages instead of one")
         if image.mode == "F" and is_big_endian and image.info.get("compression") != "raw":
             # Pillow 13 swaps no bytes here and returns noise
             raise ValueError("it is compressed, floating and big-endian, which is not supported: save it uncompressed")
@@ -256,8 +252,7 @@ def _npy(path: Path) -> Raw:
 
 
 DEPTH_READERS: dict[str, Callable[[Path], Raw]] = {
-    ".png": _png,
-    **dict.fromkeys((".tif", ".tiff"), _tiff),
+    **dict.fromkeys((".png", ".tif", ".tiff"), _grey),
     ".exr": _exr,
     ".npy": _npy,
 }
@@ -457,18 +452,15 @@ def read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
     """Rigid pose of a file: 4 x 4 numbers as text or NPY, or ``pose`` of a result's summary.json."""
     with readable(path, "pose"):
         if path.suffix.lower() == ".npy":
-            content = np.load(path, allow_pickle=False)
-        elif path.suffix.lower() == ".json":
-            content = json.loads(path.read_text("utf-8"))
-            content = content["pose"] if isinstance(content, dict) else content
-        else:
-            content = np.loadtxt(path, ndmin=2)
-        return checked_pose(content)
+            return checked_pose(np.load(path, allow_pickle=False))
+        if path.suffix.lower() != ".json":
+            return checked_pose(np.loadtxt(path, ndmin=2))
+        content = json.loads(path.read_text("utf-8"))
+        return checked_pose(content["pose"] if isinstance(content, dict) else content)
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """All arrays of an NPZ file; raises ``SizeError``, and whatever damage makes of the parser."""
-    # by its name, numpy would leave a damaged file open
     with limited_memory(path), path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
         arrays = {key: file[key] for key in file.files}
     if strange := [key for key, value in arrays.items() if not isinstance(value, np.ndarray)]:

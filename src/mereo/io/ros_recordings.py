@@ -1,8 +1,8 @@
 """ROS recordings: depth images or point clouds, one message at a time, from ROS 1 bags, ROS 2 bags and MCAP files.
 
-A message is only decoded when it is asked for, so that a reader may skip what comes too fast, and a broken message
-stops nothing but itself. Depth follows ROS REP 118: 16UC1 in millimetres with 0, or 32FC1 in metres with NaN, where
-nothing was measured; compressed depth that of ROS's compressed_depth_image_transport.
+A message is only decoded when it is asked for, so that a broken one stops nothing but itself. Depth follows ROS REP
+118 (16UC1 in millimetres with 0, or 32FC1 in metres with NaN, where nothing was measured), and compressed depth
+compressed_depth_image_transport.
 """
 
 from collections.abc import Callable, Iterator

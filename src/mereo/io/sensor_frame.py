@@ -81,8 +81,7 @@ def read_frame(path: str | Path, reading: InputConfig = InputConfig()) -> Sensor
     kind = "recording" if is_recording(path) else "depth image" if is_depth_image(path) else "point cloud"
     _check_options(path, kind, reading)
     if kind == "recording":
-        index = reading.frame_index or 0
-        return _recorded(recorded_frame(path, index, *_recording_options(reading)), path, reading)
+        return _recorded(recorded_frame(path, reading.frame_index or 0, *_recording_options(reading)), path, reading)
     if kind == "depth image":
         return _depth_image(path, reading)
     unit_m = reading.unit_m
@@ -128,11 +127,9 @@ def _depth_image(path: Path, reading: InputConfig) -> SensorFrame:
 
 def _recording_options(reading: InputConfig) -> tuple[str | None, Camera | None, float | None]:
     """Topic, camera and depth scale, as ``recorded_frames`` takes them."""
-    if reading.intrinsics is None:
-        return reading.topic, None, reading.depth_scale
-    intrinsics = read_intrinsics(reading.intrinsics)
-    scale = intrinsics.depth_scale if reading.depth_scale is None else reading.depth_scale
-    return reading.topic, intrinsics.camera, scale
+    known = None if reading.intrinsics is None else read_intrinsics(reading.intrinsics)
+    scale = known.depth_scale if known and reading.depth_scale is None else reading.depth_scale
+    return reading.topic, known and known.camera, scale
 
 
 def _recorded(message: RecordedFrame, path: Path, reading: InputConfig) -> SensorFrame:

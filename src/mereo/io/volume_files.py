@@ -174,13 +174,7 @@ def is_labels(volume: Volume) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class LabelVolume:
-    """Voxel labels with their place in space.
-
-    Attributes:
-        labels: 0 is empty space.
-        T_world_index: from voxel indices (whole numbers at voxel centres) to RAS coordinates in the file's unit.
-        names: of the values, where the file has them (``.seg.nrrd`` of 3D Slicer).
-    """
+    """Voxel labels, 0 in empty space, with their place (see ``Volume``), and the names of values that the file has."""
 
     labels: Int[np.ndarray, "x y z"]
     T_world_index: Float[np.ndarray, "4 4"]
@@ -263,11 +257,7 @@ def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) 
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """A coarser grid over part of a volume; a cell is a block of voxels.
-
-    ``first`` is the voxel index of its lowest corner and ``counts`` the cells along each axis, without the margin;
-    ``block`` are the voxels of a cell along each axis.
-    """
+    """A coarser grid over part of a volume, from the voxel ``first`` on: ``counts`` cells of ``block`` voxels each."""
 
     first: Int[np.ndarray, "3"]
     counts: Int[np.ndarray, "3"]

@@ -107,9 +107,8 @@ class Document:
 
     def _sentence(self, problem: ErrorDetails, model: type[BaseModel]) -> str:
         """Sentence of value, rule and cure."""
-        place, kind = problem["loc"], problem["type"]
-        key, value = str(place[-1]) if place else "the file", problem["input"]
-        context = problem.get("ctx", {})
+        place, kind, value, context = problem["loc"], problem["type"], problem["input"], problem.get("ctx", {})
+        key = str(place[-1]) if place else "the file"
         rule = problem["msg"].removeprefix("Value error, ").replace("Input should", "it must").replace("should", "must")
         if kind == "missing" and isinstance(place[-1], int):
             return f"`{_key_of(place)}` has too few entries; it must have more than {place[-1]}: add the others"
@@ -131,11 +130,10 @@ class Document:
         return f"`{_key_of(place)}` is {_short(repr(value))}; {rule}: correct it"
 
     def _known_keys(self, place: Place, model: type[BaseModel]) -> list[str]:
-        """Keys that are allowed where an unknown one is, found by asking the models for a block like that."""
-        fields = _fields_at(place[:-1], model)
-        used = self.pair(place[:-1])[1]
+        """Keys that are allowed where an unknown one is, and not yet there."""
+        fields, used = _fields_at(place[:-1], model), self.pair(place[:-1])[1]
         have = {k.value for k, _ in used.value} if isinstance(used, yaml.MappingNode) else set()
-        return [name for name in fields if name not in have] or list(fields)
+        return [name for name in fields if name not in have] or fields
 
 
 def _count(node: yaml.Node | None, known: dict[int, int]) -> int:
@@ -167,8 +165,7 @@ def _types(model: type[BaseModel]) -> list[str]:
 
 def _fields_at(place: Place, model: type[BaseModel]) -> list[str]:
     """Names of the fields of the block at ``place``, from the model's JSON schema."""
-    schema = model.model_json_schema()
-    block: dict[str, Any] = schema
+    schema = block = model.model_json_schema()
     for step in place:  # a key, a list's item, or the item of a named type
         if "discriminator" in block and isinstance(step, str):
             block = {"$ref": block["discriminator"]["mapping"][step]}

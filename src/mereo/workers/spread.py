@@ -288,7 +288,7 @@ def connect(cluster: Cluster) -> Iterator[None]:
     if ray.is_initialized():
         yield
         return
-    quiet = {"log_to_driver": False, "logging_level": logging.CRITICAL}
+    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
     handler = signal.getsignal(signal.SIGTERM)
     # in /tmp, as paths of sockets must be shorter than some systems' folders for temporary files allow
     with TemporaryDirectory(prefix=f"mereo-ray-{os.getpid()}-", dir="/tmp" if os.name == "posix" else None) as folder:
@@ -333,8 +333,8 @@ def _loopback(ray: ModuleType) -> Iterator[None]:
     address = ray.nodes()[0]["NodeManagerAddress"]
     if not ip_address(address).is_loopback:
         raise ConnectionError(
-            f"the servers of --ray local listen on {address}; they must listen on this machine's loopback alone: "
-            "install the Ray of constraints.txt, or start a cluster with `ray start --head` and give --ray auto"
+            f"the servers of --ray local listen on {address}; they must listen on the loopback alone: install the "
+            "Ray of constraints.txt, or start a cluster with `ray start --head` and give --ray auto"
         )
 
 

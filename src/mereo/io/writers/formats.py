@@ -35,13 +35,11 @@ class Results:
     """Reconstruction to be written, in the input's frame and unit.
 
     Attributes:
-        surfaces, labels: of a reconstruction.
+        surfaces, labels, summary, radii: of a reconstruction; the last say how sure it is.
         observed: the input's points with their segments; needed for the format "points" only.
         frame_rotation: from the input's frame to glTF's (y up).
         unit_m: metres per unit of the input.
         millimetres: write files that have no unit of their own in millimetres, and not in the input's unit.
-        summary: what the JSON file holds.
-        radii: how sure the surfaces and what is inside them are, in the input's frame and unit; None where not known.
     """
 
     surfaces: SegmentedMesh
@@ -123,8 +121,7 @@ WRITERS: dict[Format, Writer] = {
 def chosen_formats(names: Iterable[str]) -> tuple[Format, ...]:
     """Formats that these names mean, in the table's order; "all" means every one.
 
-    Raises ``ValueError`` for an unknown name and ``ImportError`` for a format whose extra is not installed, so that
-    nobody waits for a reconstruction that cannot be written.
+    Raises ``ValueError`` for an unknown name and ``ImportError`` for a format whose extra is not installed.
     """
     wanted = set(names)
     if unknown := sorted(wanted - {"all", *get_args(Format)}):
