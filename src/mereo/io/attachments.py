@@ -108,23 +108,14 @@ Content = Placeable | Volume
 
 @dataclass(frozen=True, eq=False)
 class Attachment:
-    """File that belongs to an object's rest model.
-
-    Attributes:
-        name: of the file, without its folder.
-        content: what it holds, in any frame and unit.
-    """
+    """File that belongs to an object's rest model: its name without the folder, and what it holds, in any frame."""
 
     name: str
     content: Content
 
 
 def read_attachments(paths: Sequence[str | Path]) -> tuple[Attachment, ...]:
-    """Attachments of files, whose names must differ.
-
-    Raises ``FileNotFoundError``, ``ValueError`` for files that are empty, damaged, without points or of another format,
-    and ``ImportError`` for volumes without the extra `medical`.
-    """
+    """Attachments of files, whose names must differ; raises as their readers."""
     files = [Path(path) for path in paths]
     names = [file.name.lower() for file in files]
     if repeated := [name for name in names if names.count(name) > 1]:
@@ -145,11 +136,7 @@ def _read(path: Path) -> Content:
     if suffix == ".ply":
         with readable(path, "mesh or point cloud"):
             is_mesh = check_ply(path).get("face", 0) > 0
-    content: Surfaces | Positions
-    if is_mesh:
-        content = Surfaces(read_segmented_mesh(path))
-    else:
-        content = Positions(read_points(path))
+    content = Surfaces(read_segmented_mesh(path)) if is_mesh else Positions(read_points(path))
     if not len(content.points) or not np.isfinite(content.points).all():
         raise ValueError(f"{path} has no positions, or NaN or infinite ones; all must be finite: export it again")
     return content
@@ -158,11 +145,11 @@ def _read(path: Path) -> Content:
 def write_attachment(
     path: Path, content: Content, factor: float, frame_rotation: Float[np.ndarray, "3 3"], unit_m: float
 ) -> None:
-    """Write an attachment in the format of its name.
+    """Write an attachment, which is in the input's frame and unit, in the format of its name.
 
     Args:
         path: the file.
-        content: in the input's frame and unit.
+        content: of it.
         factor: of positions in files that have no unit of their own.
         frame_rotation: from the input's frame to glTF's (y up), for the root node of glTF.
         unit_m: metres per unit of the input, for the same and for volumes, which are in millimetres.

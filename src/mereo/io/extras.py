@@ -18,9 +18,7 @@ def network_needed() -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        if not is_torch(error):
-            raise
-        raise ImportError(NEEDED) from None
+        raise (ImportError(NEEDED) if is_torch(error) else error) from None
 
 
 def has_network() -> bool:

@@ -79,7 +79,6 @@ def _parts(path: Path) -> list[Part]:
 
 
 def _check_places(name: str, vertices: Float[np.ndarray, "v 3"]) -> None:
-    """Raise ``ValueError`` (its reason only) for places that are not finite, or beyond ``LARGEST``."""
     if not (np.abs(vertices) <= LARGEST).all():
         raise ValueError(f"its part {name!r} has vertices that are NaN, infinite or beyond {LARGEST:g}")
 
@@ -119,7 +118,7 @@ def _obj_parts(path: Path) -> list[Part]:
 def _obj_index(cell: str, count: int) -> int:
     """Index of a vertex from ``vertex/texture/normal``, counted from 1, or from the end when negative."""
     index = int(cell.split("/")[0])
-    index = index - 1 if index > 0 else count + index
+    index += -1 if index > 0 else count
     if not 0 <= index < count:
         raise ValueError(f"a face refers to vertex {cell} of {count}")
     return index

@@ -115,7 +115,6 @@ def _nrrd(nrrd: Any, path: Path) -> Volume:
 
 
 def _check_sides(sizes: Iterable[Any]) -> None:
-    """Raise ``ValueError`` (its reason only) for sizes in a header that are none."""
     sides = [int(side) for side in sizes]
     if min(sides, default=0) < 1:
         raise ValueError(f"its header states the size {' x '.join(map(str, sides))}")
@@ -124,9 +123,9 @@ def _check_sides(sizes: Iterable[Any]) -> None:
 def _to_ras(space: str) -> Float[np.ndarray, "4 4"]:
     """Transform to RAS from an anatomical frame, such as left-posterior-superior or LPS; others stay as they are."""
     words = space.lower().split("-") if "-" in space else list(space.lower())
-    words = [{"l": "left", "r": "right", "p": "posterior", "a": "anterior", "i": "inferior"}.get(w, w) for w in words]
-    negative = [word in ("left", "posterior", "inferior") for word in words[:3]]
-    return np.diag([*(-1.0 if flip else 1.0 for flip in negative), *[1.0] * (4 - len(negative))])
+    negative = ("left", "posterior", "inferior", "l", "p", "i")
+    signs = [-1.0 if word in negative else 1.0 for word in words[:3]]
+    return np.diag([*signs, *[1.0] * (4 - len(signs))])
 
 
 def read_scalar_volume(path: Path) -> Volume:

@@ -202,12 +202,9 @@ def write_segments_obj(path: str | Path, surfaces: SegmentedMesh) -> None:
 
 def material_names(solid: Sequence[tuple[int, Segment]]) -> list[str]:
     """Name of each segment's material: one word, and no other's; those that would be alike get their labels."""
-    words = [re.sub(r"\W+", "_", segment.name).strip("_") for _, segment in solid]
-    alike = Counter(words)
-    return [
-        word if word and alike[word] == 1 else f"{word}_label_{label}".lstrip("_")
-        for (label, _), word in zip(solid, words, strict=True)
-    ]
+    words = [(label, re.sub(r"\W+", "_", segment.name).strip("_")) for label, segment in solid]
+    alike = Counter(word for _, word in words)
+    return [word if word and alike[word] == 1 else f"{word}_label_{label}".lstrip("_") for label, word in words]
 
 
 def _materials(solid: list[tuple[int, Segment]], names: list[str], opaque: tuple[bool, ...]) -> str:

@@ -51,9 +51,8 @@ def write_labels_npz(path: str | Path, grid: LabelGrid, radii: Float32[np.ndarra
     """Write a label grid for numpy: the arrays ``labels``, ``origin``, ``spacing`` and ``names``.
 
     Voxel [i, j, k] is centred at ``origin + [i, j, k] * spacing``, in the input's frame and units. ``names[k]`` is the
-    segment of label k + 1; label 0 is empty space. Where ``radii`` are known, ``radius95`` is the radius around each
-    voxel that holds the true place of what is there with probability 0.95, in the input's unit, NaN in empty space.
-    Raises ``ValueError`` for a label without a name.
+    segment of label k + 1; label 0 is empty space. ``radii`` become ``radius95``, in the input's unit, NaN in empty
+    space. Raises ``ValueError`` for a label without a name.
     """
     if (most := int(grid.labels.max(initial=0))) > len(grid.names):
         raise ValueError(f"label {most} has no name among {len(grid.names)}; name every segment")
@@ -95,15 +94,14 @@ def write_labels_vti(
 ) -> None:
     """Write VTK image data: the array ``label`` at voxel centres; field data ``segment_names``, ``segment_colors``.
 
-    ``segment_names[k]`` is the segment of label k + 1; label 0 is empty space. Coordinates are in the grid's frame and
-    unit, and so are ``radii``, which become the array ``radius95``.
+    Coordinates are in the grid's frame and unit, and so are ``radii``, which become the array ``radius95``.
     """
     array = '        <DataArray type="Float32" Name="radius95" format="binary">{}</DataArray>\n'
     codes = (str(code) for name in grid.names for code in (*name.encode("utf-8"), 0))
     text = VTI.format(
         extent=" ".join(f"0 {n - 1}" for n in grid.labels.shape),
-        origin=_numbers(grid.origin),
-        spacing=_numbers(grid.spacing),
+        origin=" ".join(map(repr, grid.origin.tolist())),
+        spacing=" ".join(map(repr, grid.spacing.tolist())),
         count=len(grid.names),
         names=" ".join(codes),
         colors=" ".join(str(value) for color in colors for value in color),
@@ -114,15 +112,8 @@ def write_labels_vti(
         partial.write_text(text, "utf-8")
 
 
-def _numbers(values: Float[np.ndarray, "3"]) -> str:
-    return " ".join(repr(float(value)) for value in values)
-
-
 def _compressed(values: np.ndarray) -> str:
-    """Values of voxels as one zlib block, x running fastest.
-
-    The head has the number of blocks, the bytes of each and of a partial one, and those that are packed.
-    """
+    """Values as one zlib block; its head has the number of blocks, the bytes of each, of a partial one, and packed."""
     packed = zlib.compress(values.tobytes(order="F"))
     head = struct.pack("<4Q", 1, values.nbytes, 0, len(packed))
     return base64.b64encode(head).decode() + base64.b64encode(packed).decode()
@@ -161,7 +152,6 @@ def write_labels_nifti(path: str | Path, grid: LabelGrid, colors: Sequence[Color
     """
     nifti: Any = nibabel()
     image = nifti.Nifti1Image(grid.labels, RAS_FROM_LPS * _T_lps_index(grid, unit_m) + 0.0)  # no -0
-    _place_in_scanner(image)
     image.header.set_intent("label", name="mereo")
     table = json.dumps({"segments": segment_table(grid.names, colors)})
     # code 6: a comment of plain text
@@ -169,14 +159,11 @@ def write_labels_nifti(path: str | Path, grid: LabelGrid, colors: Sequence[Color
     _write_nifti(Path(path), image, 9)
 
 
-def _place_in_scanner(image: Any) -> None:
-    """State millimetres, and the image's affine in both of NIfTI's ways."""
+def _write_nifti(path: Path, image: Any, level: int) -> None:
+    """Write an image with its affine, in millimetres, in both of NIfTI's ways."""
     image.header.set_xyzt_units("mm")
     image.set_qform(image.affine, code="scanner")
     image.set_sform(image.affine, code="scanner")
-
-
-def _write_nifti(path: Path, image: Any, level: int) -> None:
     content = image.to_bytes()
     with atomic_file(path) as partial:
         # mtime: the same result gives the same bytes
@@ -251,7 +238,7 @@ def _segment_fields(grid: LabelGrid, index: int, color: Color) -> dict[str, str]
 
 def _vector(values: Float[np.ndarray, "3"]) -> str:
     """A vector as NRRD writes it."""
-    return f"({','.join(repr(float(value)) for value in values)})"
+    return f"({','.join(map(repr, values.tolist()))})"
 
 
 def write_volume(path: Path, volume: Volume, unit_m: float = 1.0) -> None:
@@ -286,5 +273,4 @@ def _write_volume_nifti(path: Path, volume: Volume, T_ras_index: Float[np.ndarra
     image = nifti.Nifti1Image(volume.values, T_ras_index, header, dtype=volume.values.dtype)
     image.header.set_data_dtype(volume.values.dtype)
     image.header.set_slope_inter(volume.slope, volume.intercept)  # of values that are stored as they are
-    _place_in_scanner(image)
     _write_nifti(path, image, LEVEL)
