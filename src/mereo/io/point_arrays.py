@@ -20,13 +20,6 @@ from mereo.io.errors import reason
 from mereo.io.readers import valid_points
 from mereo.io.ros_recordings import cloud_points
 
-ACCEPTED = (
-    "an array, tensor or nested list of n x 3 numbers, an organized array of h x w x 3, a structured array with fields "
-    "x, y and z, an object with points or vertices (Open3D, trimesh, PyVista), a PointCloud2 message, or a "
-    "mereo.PointCloud or mereo.DepthImage"
-)
-"""Forms that ``points_of`` takes, for sentences."""
-
 
 def points_of(source: object, drop_invalid: bool = False) -> tuple[PointCloud | DepthImage, int]:
     """Observed points of whatever holds a frame in memory, and how many points were left out.
@@ -38,14 +31,13 @@ def points_of(source: object, drop_invalid: bool = False) -> tuple[PointCloud | 
       itself into a numpy array; masked values are points without a measurement;
     - lists or tuples of rows of three numbers;
     - structured arrays with fields x, y and z in any order among others, in one or two dimensions;
-    - objects with ``points`` or ``vertices`` (Open3D, trimesh, PyVista), or with ``point["positions"]`` or
-      ``vertex["positions"]`` (Open3D's tensors);
+    - objects with ``points`` or ``vertices`` (Open3D and its tensors, trimesh, PyVista);
     - messages of the type sensor_msgs/PointCloud2, of ROS 1, ROS 2 or rosbags.
 
     Args:
         source: one frame; a list of frames is recognized by ``is_frame_list`` and refused here.
-        drop_invalid: leave out points that are NaN, infinite or beyond 1e12, and points at exactly (0, 0, 0): sensors
-            mark missing measurements so.
+        drop_invalid: leave out points that are NaN, infinite, beyond 1e12 or exactly (0, 0, 0), as
+        ``read_point_cloud``.
 
     Raises ``ValueError`` where the source is none of these, empty, of another shape or not of real numbers, or has
     points without a measurement that are not to be dropped, or no others.
@@ -73,7 +65,6 @@ def is_frame_list(source: object) -> bool:
 
 
 def _is_frame(item: object) -> bool:
-    """Whether an element of a list is a frame; else it is a row, or neither."""
     if isinstance(item, list | tuple):
         return bool(item) and (isinstance(item[0], list | tuple) or getattr(item[0], "ndim", 0) > 0)
     if isinstance(item, str | PathLike | PointCloud | DepthImage):
@@ -104,7 +95,12 @@ def _positions(source: Any) -> tuple[Float[np.ndarray, "n 3"], str, bool]:
             )
         carried = _carried(source)
         if carried is None and not any(hasattr(source, name) for name in ("__array__", "numpy")):
-            raise ValueError(f"{kind} cannot be read as a frame; one of these is needed: {ACCEPTED}")
+            raise ValueError(
+                f"{kind} cannot be read as a frame; one of these is needed: an array, tensor or nested list of n x 3 "
+                "numbers, an organized array of h x w x 3, a structured array with fields x, y and z, an object with "
+                "points or vertices (Open3D, trimesh, PyVista), a PointCloud2 message, or a mereo.PointCloud or "
+                "mereo.DepthImage"
+            )
         source = source if carried is None else carried
     values = _array(source, kind)
     name = f"{kind} of shape {values.shape}"

@@ -10,6 +10,7 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from io import BytesIO
+from os.path import commonpath
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ COMPRESSED = "sensor_msgs/msg/CompressedImage"
 FRAMES = (IMAGE, COMPRESSED, CLOUD)
 """Types of messages that hold frames."""
 
-COMPRESSED_DEPTH, COMPRESSED_HEADER = "compressedDepth", 12
+COMPRESSED_DEPTH, HEADER = "compressedDepth", 12
 """Word in the format of a compressed depth image, and the bytes before its PNG: a number and two quantizations."""
 
 DEPTH_ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
@@ -61,7 +62,7 @@ class RecordedFrame:
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a file is a bag: .bag, .mcap, .db3, or the directory of a ROS 2 bag."""
+    """Whether a path is a bag: .bag, .mcap, .db3, or the directory of a ROS 2 bag."""
     return path.suffix.lower() in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").is_file()
 
 
@@ -157,19 +158,15 @@ def _depth_topic(reader: Any, path: Path) -> str:
     images, compressed, clouds = (
         sorted({c.topic for c in reader.connections if c.msgtype == kind and c.msgcount}) for kind in FRAMES
     )
-    for topic in images:
-        if _first(reader, topic).encoding in DEPTH_ENCODINGS:
-            return topic
-    for topic in compressed:
-        if COMPRESSED_DEPTH in _first(reader, topic).format:
-            return topic
-    if not clouds:
+    depths = [topic for topic in images if _first(reader, topic).encoding in DEPTH_ENCODINGS]
+    depths = depths or [topic for topic in compressed if COMPRESSED_DEPTH in _first(reader, topic).format] or clouds
+    if not depths:
         have = ", ".join(sorted({f"{c.topic} ({c.msgtype})" for c in reader.connections})) or "nothing"
         raise ValueError(
             f"{path} has neither depth images ({', '.join(DEPTH_ENCODINGS)}) nor point clouds, only {have}: record the "
             "depth topic and its camera_info"
         )
-    return clouds[0]
+    return depths[0]
 
 
 def _first(reader: Any, topic: str) -> Any:
@@ -183,12 +180,7 @@ def _camera(reader: Any, topic: str, path: Path) -> Camera:
     infos = sorted({c.topic for c in reader.connections if c.msgtype == INFO and c.msgcount})
     if not infos:
         raise ValueError(f"{path} has no CameraInfo; the intrinsics of {topic} are needed: give --intrinsics FILE")
-    names = topic.split("/")
-
-    def shared(info: str) -> int:
-        return next((i for i, (a, b) in enumerate(zip(info.split("/"), names, strict=False)) if a != b), len(names))
-
-    nearest = max(infos, key=shared)
+    nearest = max(infos, key=lambda info: len(commonpath([f"/{info}", f"/{topic}"])))
     try:
         info = _first(reader, nearest)
         # ROS 1 has capital letters
@@ -231,11 +223,11 @@ def _compressed_depth(message: Any, camera: Camera, depth_scale: float | None) -
             f"its format is {message.format!r}, not PNG-compressed depth ('16UC1; compressedDepth png' or 32FC1)"
         )
     data = np.asarray(message.data, dtype=np.uint8).tobytes()
-    with open_image(BytesIO(data[COMPRESSED_HEADER:]), ("PNG",)) as image:
+    with open_image(BytesIO(data[HEADER:]), ("PNG",)) as image:
         raw = np.asarray(image).astype(np.uint16)
     if DEPTH_ENCODINGS[encoding] == "u2":
         return DepthImage(metres(raw, depth_scale), camera)
-    a, b = np.frombuffer(data[4:COMPRESSED_HEADER], "<f4").astype(np.float64)
+    a, b = np.frombuffer(data[4:HEADER], "<f4").astype(np.float64)
     with np.errstate(divide="ignore"):
         depth = np.where(raw > 0, a / (raw - b), 0.0)
     return DepthImage(depth, camera)
@@ -268,7 +260,6 @@ def cloud_points(message: Any) -> Float[np.ndarray, "n 3"]:
     formats = [f"{end}{FIELD_TYPES[field.datatype]}" for field in fields.values()]
     offsets = [field.offset for field in fields.values()]
     layout: Any = {"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": message.point_step}
-    point = np.dtype(layout)
-    rows = _rows(message, message.row_step, message.point_step)
-    points = np.ascontiguousarray(rows[:, : message.width * message.point_step]).view(point).reshape(-1)
+    rows = _rows(message, message.row_step, message.point_step)[:, : message.width * message.point_step]
+    points = np.ascontiguousarray(rows).view(np.dtype(layout)).reshape(-1)
     return np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=1)

@@ -1,7 +1,5 @@
 """One frame of a sensor from whatever file holds it: a depth image, a point cloud or a ROS recording.
 
-    path, InputConfig -read_frame-> SensorFrame (points, metres per unit, axes, source, depth image where there is one)
-
 Options that do not belong to a file's kind are refused, because ignored ones are wrong results that nobody notices.
 """
 

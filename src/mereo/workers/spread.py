@@ -149,8 +149,7 @@ def _result(future: Future[Result]) -> Result:
     except Exception as error:
         if not type(error).__module__.startswith("ray."):
             raise
-        cause = getattr(error, "cause", None)
-        if isinstance(cause, Exception):
+        if isinstance(cause := getattr(error, "cause", None), Exception):
             raise cause from error
         raise ChildProcessError(
             f"{DEATHS + 1} workers or nodes died of one task ({type(error).__name__}), most often for memory; what is "
@@ -339,7 +338,7 @@ def _loopback(ray: ModuleType) -> Iterator[None]:
 
 
 @contextmanager
-def _ray_pool(function: Callable[[Any], Any], cluster: Cluster) -> Iterator[Callable[[Any], Future[Any]]]:
+def _ray_pool(function: Function, cluster: Cluster) -> Iterator[Callable[[Any], Future[Any]]]:
     """Connect to a cluster; yields what submits an item to ``function`` there."""
     ray = import_ray()
     from ray import cloudpickle
@@ -365,15 +364,15 @@ def _ray_pool(function: Callable[[Any], Any], cluster: Cluster) -> Iterator[Call
                 ray.cancel(reference, force=True)
 
 
-_loaded: tuple[str, Callable[[Any], Any]] | None = None
+_loaded = dict[str, Function]()
 """The function of this worker process, unpickled once: a model takes longer for that than a view to be rendered."""
 
 
 def _apply_in_task(shared: list[Any], item: Any) -> Any:
     """Task: the result for an item. ``shared`` holds a reference, as Ray would unpickle a value for each task."""
-    global _loaded
     (reference,) = shared
-    if _loaded is None or _loaded[0] != reference.hex():
+    key: str = reference.hex()
+    if key not in _loaded:
         function, cluster, folder, path = import_ray().get(reference)
         use_threads(cluster.cpus)
         if not cluster.gpus:  # Ray shows all of a node's GPUs to a task without any
@@ -381,5 +380,6 @@ def _apply_in_task(shared: list[Any], item: Any) -> Any:
         with suppress(OSError):
             os.chdir(folder)
         sys.path.extend(item for item in path if item not in sys.path)
-        _loaded = reference.hex(), pickle.loads(function)
-    return _loaded[1](item)
+        _loaded.clear()
+        _loaded[key] = pickle.loads(function)
+    return _loaded[key](item)
