@@ -94,7 +94,6 @@ def scratch_folder(path: Path) -> Iterator[Path]:
 
 
 def _new_scratch(path: Path) -> tuple[Path, int | None]:
-    """A new scratch folder and the descriptor of its lock, if there are locks."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         while True:

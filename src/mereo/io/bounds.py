@@ -46,7 +46,6 @@ class Bounds:
 
 
 def _within(least: float, most: float = math.inf, *, above: bool = False, below: bool = False) -> tuple[Bounds, Any]:
-    """Bounds, and the help of options with their rule behind the default."""
     bounds = Bounds(least, most, above, below)
     return bounds, arg(help_behavior_hint=lambda default: f"(default: {default}; {bounds.rule})")
 

@@ -169,7 +169,6 @@ def _material_colors(mesh: Path, library: str) -> dict[str, Color]:
 
 
 def _scene_parts(path: Path) -> list[Part]:
-    """Parts of a file of any other format, by trimesh."""
     scene: Any = trimesh.load_scene(path, process=False)
     base = VIEWER_ROOT if VIEWER_ROOT in scene.graph.nodes else scene.graph.base_frame
     nodes, parts = _nodes_with_faces(scene), list[Part]()
@@ -347,7 +346,6 @@ def _renamed(segments: Sequence[Segment]) -> tuple[Segment, ...]:
 def _radii(
     segments: Sequence[Segment], radii: Sequence[Float[np.ndarray, " _"] | None], calibrated: bool
 ) -> Radii | None:
-    """Radii of all parts; None where one of them has none."""
     values = [each for each in radii if each is not None and np.isfinite(each).all()]
     if len(values) < len(segments):
         return None

@@ -36,8 +36,7 @@ def points_of(source: object, drop_invalid: bool = False) -> tuple[PointCloud | 
 
     Args:
         source: one frame; a list of frames is recognized by ``is_frame_list`` and refused here.
-        drop_invalid: leave out points that are NaN, infinite, beyond 1e12 or exactly (0, 0, 0), as
-        ``read_point_cloud``.
+        drop_invalid: leave out points that are NaN, infinite, beyond 1e12 or exactly (0, 0, 0), as sensors mark them.
 
     Raises ``ValueError`` where the source is none of these, empty, of another shape or not of real numbers, or has
     points without a measurement that are not to be dropped, or no others.
@@ -145,7 +144,6 @@ def _structured_points(records: np.ndarray, name: str) -> Float[np.ndarray, "n 3
 
 
 def _array(source: Any, kind: str) -> np.ndarray:
-    """Values as numpy's, in the memory of the processor; ``kind`` is what to call them."""
     if isinstance(source, np.ma.MaskedArray):
         return source
     try:
@@ -163,7 +161,6 @@ def _array(source: Any, kind: str) -> np.ndarray:
 
 
 def _floats(values: np.ndarray) -> Float[np.ndarray, "..."]:
-    """64-bit floats, NaN where values are masked."""
     return np.asarray(np.ma.filled(values.astype(np.float64), np.nan))
 
 

@@ -215,7 +215,6 @@ def in_memory(values: np.ndarray) -> np.ndarray:
 
 
 def _grey(path: Path) -> Raw:
-    """Values of a grey PNG or TIFF, as the suffix says."""
     kind = "PNG" if path.suffix.lower() == ".png" else "TIFF"
     with path.open("rb") as file:
         is_big_endian = file.read(2) == b"MM"
@@ -432,7 +431,6 @@ def _lzf_decompress(data: bytes, size: int) -> bytes:
 
 
 def _zdf_points(path: Path) -> Float[np.ndarray, "n 3"]:
-    """Points of a ZDF file: organized, millimetres, NaN where nothing was measured."""
     with library("netCDF4", "sensors", path).Dataset(path) as file:
         cloud = file["data"]["pointcloud"][:]
     return _check_array(np.ma.filled(np.ma.asarray(cloud, dtype=np.float64), np.nan))

@@ -143,7 +143,6 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def _messages(reader: Any, connections: list[Any], source: str | Path) -> Iterator[Any]:
-    """Messages one after the other, each unpacked in limited memory."""
     messages = reader.messages(connections)
     while True:
         with limited_memory(source):

@@ -124,7 +124,6 @@ def _depth_image(path: Path, reading: InputConfig) -> SensorFrame:
 
 
 def _recording_options(reading: InputConfig) -> tuple[str | None, Camera | None, float | None]:
-    """Topic, camera and depth scale, as ``recorded_frames`` takes them."""
     known = None if reading.intrinsics is None else read_intrinsics(reading.intrinsics)
     scale = known.depth_scale if known and reading.depth_scale is None else reading.depth_scale
     return reading.topic, known and known.camera, scale

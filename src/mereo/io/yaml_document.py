@@ -106,7 +106,6 @@ class Document:
         raise self.error(problems[0]["loc"], self._sentence(problems[0], model) + more)
 
     def _sentence(self, problem: ErrorDetails, model: type[BaseModel]) -> str:
-        """Sentence of value, rule and cure."""
         place, kind, value, context = problem["loc"], problem["type"], problem["input"], problem.get("ctx", {})
         key = str(place[-1]) if place else "the file"
         rule = problem["msg"].removeprefix("Value error, ").replace("Input should", "it must").replace("should", "must")
@@ -158,7 +157,6 @@ def _key_of(place: Place) -> str:
 
 
 def _types(model: type[BaseModel]) -> list[str]:
-    """Types of deformation, from the schema."""
     schema = model.model_json_schema()
     return list(schema["properties"]["deformations"]["anyOf"][0]["items"]["discriminator"]["mapping"])
 

@@ -339,7 +339,6 @@ def _loopback(ray: ModuleType) -> Iterator[None]:
 
 @contextmanager
 def _ray_pool(function: Function, cluster: Cluster) -> Iterator[Callable[[Any], Future[Any]]]:
-    """Connect to a cluster; yields what submits an item to ``function`` there."""
     ray = import_ray()
     from ray import cloudpickle
 

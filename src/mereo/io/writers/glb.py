@@ -121,7 +121,6 @@ class _Arrays:
 
 
 def _material(segment: Segment, opaque: bool) -> dict[str, Any]:
-    """Material of a segment's colour, in linear light."""
     color = [*_linear(np.array(segment.color, dtype=np.uint8)).round(6).tolist(), 1.0 if opaque else OUTER_OPACITY]
     surface = {"baseColorFactor": color, "metallicFactor": 0.0, "roughnessFactor": 0.7}
     material = {"name": segment.name, "doubleSided": True, "pbrMetallicRoughness": surface}

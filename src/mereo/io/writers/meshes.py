@@ -152,7 +152,6 @@ def _comments(names: Sequence[str], colors: Sequence[Color]) -> list[str]:
 
 
 def _records(columns: Columns) -> np.ndarray:
-    """Little-endian records without padding."""
     fields = [(name, f"<{kind}", values.shape[1:]) for name, (kind, values) in columns.items()]
     records = np.zeros(len(next(iter(columns.values()))[1]), np.dtype(fields))
     for name, (_, values) in columns.items():

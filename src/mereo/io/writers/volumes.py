@@ -160,7 +160,6 @@ def write_labels_nifti(path: str | Path, grid: LabelGrid, colors: Sequence[Color
 
 
 def _write_nifti(path: Path, image: Any, level: int) -> None:
-    """Write an image with its affine, in millimetres, in both of NIfTI's ways."""
     image.header.set_xyzt_units("mm")
     image.set_qform(image.affine, code="scanner")
     image.set_sform(image.affine, code="scanner")
@@ -207,7 +206,6 @@ def write_labels_seg_nrrd(path: str | Path, grid: LabelGrid, colors: Sequence[Co
 def _nrrd(
     magic: str, values: np.ndarray, T_lps_index: Float[np.ndarray, "4 4"], fields: dict[str, str], level: int
 ) -> bytes:
-    """Content of an NRRD file of values as they are stored, with fields of its own."""
     header = NRRD_HEADER.format(
         magic=magic,
         type={"float32": "float", "float64": "double"}.get(values.dtype.name, values.dtype.name),
@@ -237,7 +235,6 @@ def _segment_fields(grid: LabelGrid, index: int, color: Color) -> dict[str, str]
 
 
 def _vector(values: Float[np.ndarray, "3"]) -> str:
-    """A vector as NRRD writes it."""
     return f"({','.join(map(repr, values.tolist()))})"
 
 
