@@ -127,7 +127,7 @@ def _broken_rule(kind: Any, value: Any) -> str | None:
     many = get_origin(plain) is tuple
     whole = plain is int or int in get_args(plain)
     values = value if many and isinstance(value, tuple) else (value,) if not many else ()
-    number = Integral if whole else Real
+    number: Any = Integral if whole else Real
     if values and all(isinstance(v, number) and not isinstance(v, bool) and bounds.holds(v) for v in values):
         return None
     return f"{'whole numbers, each ' if many and whole else 'a whole number, ' if whole else ''}{bounds.rule}"
