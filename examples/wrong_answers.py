@@ -25,7 +25,7 @@ from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor
 from mereo.synthesis.examples import sample_view
 from mereo.visualization.contact_sheets import INK, Picture, fit_font, save_png
 from mereo.visualization.previews import points_on_segments
-from mereo.visualization.report_words import VERDICTS, trust
+from mereo.visualization.reconstruction_report import VERDICTS, trust
 from mereo.visualization.result_files import frame_facts
 
 SIDE, TEXT = 300, 96

@@ -26,9 +26,10 @@ import numpy as np
 import torch
 
 from mereo.geometry.metrics import format_score
-from mereo.io.atomic_files import MARKER, atomic_file, check_place, claim_directory, scratch_folder, write_json
+from mereo.io.atomic_files import MARKER, atomic_file, check_place, scratch_folder, write_json
 from mereo.io.config import CONFIG
 from mereo.io.errors import words_of
+from mereo.io.object_storage import claim
 from mereo.io.progress import Progress, progress
 from mereo.io.writers.meshes import write_positions_ply
 from mereo.models.device import keep_freed_memory, pick_device
@@ -312,7 +313,7 @@ def recipe_for(minutes: float) -> TrainConfig:
 
 def _claim(output: Path, settings: dict[str, Any]) -> None:
     """Take the folder, or check that it was begun with the same arguments: they bind once something is made of them."""
-    before = claim_directory(output, CONFIG, settings, "what is learnt")
+    before = claim(output, CONFIG, settings, "what is learnt")
     planned, written = (output / PLAN).is_file(), (output / SCENE).is_file()
     for name, value in settings.items():
         binds = planned or (written and name in ("object", "units"))

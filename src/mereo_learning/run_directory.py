@@ -13,8 +13,9 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
-from mereo.io.atomic_files import atomic_file, claim_directory
+from mereo.io.atomic_files import atomic_file
 from mereo.io.errors import reason
+from mereo.io.object_storage import claim
 from mereo.models.config import NetworkConfig
 from mereo.models.encoders import Autodecoder
 from mereo.models.model import Model
@@ -169,7 +170,7 @@ def claim_run(run_dir: Path, config: TrainConfig, data: Dataset, process: Proces
         if process.is_main:
             dataset = {key: data.manifest[key] for key in ("scene", "seed", "examples")}
             settings = json.loads(json.dumps({"dataset": dataset, "train": config.to_dict()}))
-            before = claim_directory(run_dir, "config.json", settings, "a training run")
+            before = claim(run_dir, "config.json", settings, "a training run")
             if before is not None and before != settings:
                 raise ValueError(
                     f"{run_dir} holds a run with another {_first_difference(before, settings)}; continuing needs equal "

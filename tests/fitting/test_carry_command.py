@@ -110,7 +110,7 @@ def test_a_wrong_unit_is_not_believed(weights: Model, view: SampleView) -> None:
     [
         (["--method", "network"], "--method is network, but --carry needs a registration"),
         (["--carry", "nowhere.stl"], "nowhere.stl does not exist"),
-        (["--carry", "."], "has the suffix ''; what is carried is one of .stl"),
+        (["--carry", "."], "has the suffix ''; a file to carry is one of .stl"),
     ],
 )
 def test_the_command_refuses_before_any_work(

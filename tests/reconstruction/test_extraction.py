@@ -20,7 +20,8 @@ from mereo.reconstruction.isosurfaces import (
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import AssetUnavailable
 from mereo.scenes.seeds import example_rng
-from mereo.synthesis.examples import GenerateConfig, sample_view
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.examples import sample_view
 from mereo_learning.scoring import trained_scene
 
 BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])

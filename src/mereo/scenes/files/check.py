@@ -202,7 +202,7 @@ def _ply(mesh: SegmentedMesh, name: str) -> bytes:
 
 
 def _holds(place: Path, content: bytes) -> bool:
-    remove_abandoned(place)
+    remove_abandoned(place.parent, place.name)
     return place.is_file() and not place.is_symlink() and place.read_bytes() == content
 
 
