@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import tyro
+from mereo.synthesis.occluded_views import occlude
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.evidence import Evidence
@@ -24,7 +25,6 @@ from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
-from mereo.synthesis.occluded_views import occlude
 from mereo.visualization.contact_sheets import save_png
 from mereo.visualization.renderer import Viewpoint, shaded_canvas
 

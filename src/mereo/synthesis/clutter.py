@@ -89,31 +89,10 @@ class Backdrop:
 
 
 @dataclass(frozen=True, eq=False)
-class Screen:
-    """Flat occluder with one straight edge: all points of a depth whose slope (x/z, y/z) along an axis is small enough.
-
-    Attributes:
-        depth: z of its points.
-        axis: unit vector in the image plane, across the edge.
-        limit: largest slope along the axis.
-    """
-
-    depth: float
-    axis: Float[np.ndarray, "2"]
-    limit: float
-
-    def first_hit(self, directions: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Hits]:
-        """Rows of the rays from the origin that hit the screen, and where."""
-        slope = directions[:, :2] / directions[:, 2:]
-        rows = np.flatnonzero(slope @ self.axis <= self.limit)
-        return rows, Hits(self.depth / directions[rows, 2], np.tile([0.0, 0.0, 1.0], (len(rows), 1)))
-
-
-@dataclass(frozen=True, eq=False)
 class Surroundings:
-    """Everything in a view that is not the object: tools, hands, screens, a plane behind."""
+    """Everything in a view that is not the object: tools, hands, a plane behind."""
 
-    occluders: tuple[Capsule | Screen, ...] = ()
+    occluders: tuple[Capsule, ...] = ()
     background: Backdrop | None = None
 
     def join(self, hits: Hits, directions: Float[np.ndarray, "n 3"]) -> tuple[Hits, UInt8[np.ndarray, " n"]]:

@@ -6,7 +6,7 @@ docs/design/0006-sensors.md has the sources and figures. Notation: h x w pixels,
 ray and surface normal.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -17,7 +17,7 @@ from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Hits, Solids
-from mereo.synthesis.clutter import NOTHING, OBJECT, Capsule, Surroundings, sample_surroundings
+from mereo.synthesis.clutter import NOTHING, OBJECT, Surroundings, sample_surroundings
 from mereo.synthesis.config import SENSOR_TERMS, SensorConfig, SensorModel
 
 STEEPEST_RAD = float(np.deg2rad(80.0))
@@ -65,21 +65,20 @@ def observe(
     sensor: SensorConfig,
     rng: np.random.Generator,
     *,
-    occluders: tuple[Capsule, ...] = (),
     around: Surroundings | None = None,
 ) -> SimulatedView:
-    """Measurement of an object in the camera frame by a simulated sensor; ``occluders`` stand in front of it.
+    """Measurement of an object in the camera frame by a simulated sensor.
 
     The Gaussian noise of ``noise_std`` is drawn from ``rng`` itself, every other term from a stream of its own that is
     spawned from it. So whatever is drawn from ``rng`` afterwards is the same with any sensor, and switching one term on
     or off leaves the others as they were. Where ``around`` is given, it is what stands around the object, and no
     surroundings are drawn.
     """
-    if not sensor.on and not occluders and around is None:
+    if not sensor.on and around is None:
         image = add_depth_noise(render_depth(solids, camera), noise_std, rng)
         return SimulatedView(image, image.valid, np.where(image.valid, OBJECT, NOTHING).astype(np.uint8))
     streams = dict(zip(SENSOR_TERMS, rng.spawn(len(SENSOR_TERMS)), strict=True))
-    hits, source = _look(solids, camera, sensor, streams, occluders, around)
+    hits, source = _look(solids, camera, sensor, streams, around)
     shape = (camera.height, camera.width)
     depth = np.where(np.isfinite(hits.distance), hits.distance, 0.0).reshape(shape)
     angle_rad = _incidence(hits, camera.directions().reshape(-1, 3)).reshape(shape)
@@ -103,7 +102,6 @@ def _look(
     camera: Camera,
     sensor: SensorConfig,
     streams: dict[str, np.random.Generator],
-    occluders: tuple[Capsule, ...],
     around: Surroundings | None,
 ) -> tuple[Hits, UInt8[np.ndarray, " n"]]:
     """What each pixel's ray meets, with the surroundings and lateral noise."""
@@ -115,7 +113,6 @@ def _look(
     seen = directions[visible] * hits.distance[visible, None]
     reach = float(np.linalg.norm(directions[:, :2], axis=1).max())
     around = sample_surroundings(sensor, solids, seen, reach, streams) if around is None else around
-    around = replace(around, occluders=(*around.occluders, *occluders))
     hits, source = around.join(hits, directions)
     if sensor.lateral == 0:
         return hits, source
