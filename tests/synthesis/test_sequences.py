@@ -14,10 +14,17 @@ from mereo.io.config import InputConfig
 from mereo.io.sensor_frame import read_frame
 from mereo.scenes.parameters import played_back, random_state
 from mereo.scenes.scene import Scene
-from mereo.scenes.walks import process_weights, switches, walk
 from mereo.synthesis.clutter import OCCLUDER
 from mereo.synthesis.config import SENSORS, SequenceConfig
-from mereo.synthesis.recording import Moment, is_recording_folder, sequence, write_recording
+from mereo.synthesis.recording import (
+    Moment,
+    is_recording_folder,
+    process_weights,
+    sequence,
+    switches,
+    walk,
+    write_recording,
+)
 
 SHORT = SequenceConfig(seconds=1.0, rate=12.0, occluded=0.5, image_size=48)
 

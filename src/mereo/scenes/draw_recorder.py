@@ -2,9 +2,8 @@
 
 A scene says how it deforms by drawing from a generator. ``Recorder`` is a generator that writes down every draw as
 *shares*: where each number lies in its distribution, uniform in 0..1. Played back with other shares, the same scene
-gives the state that lies there. So every scene has sliders, a user's own YAML or Python file as well, and each stays
-within the scene's own bounds. docs/design/0013-viewer.md tells how draws are told apart and what happens in loops that
-draw again.
+gives the state that lies there, within its own bounds. docs/design/0013-viewer.md tells how draws are told apart and
+what happens in loops that draw again.
 """
 
 import sys
@@ -164,8 +163,7 @@ class Recorder(NamedGenerator):
         self._ends = ends = np.cumsum(np.full(count, 1 / count) if p is None else p)
         shares = self._take("choice", shape, 0, count).reshape(shape)
         index = np.minimum(np.searchsorted(ends, shares, side="right"), count - 1)
-        chosen = np.take(options, index, axis=axis)
-        return _plain(chosen)
+        return _plain(np.take(options, index, axis=axis))
 
     def permutation(self, x: Any, axis: int = 0) -> Any:
         """The elements of ``x`` in random order; recorded as sort keys."""
@@ -186,16 +184,15 @@ def _plain(values: Any) -> Any:
 
 
 def _trail() -> Trail:
-    """The calls from ``parameters.play`` down to the recorder, which are what a draw is known by."""
+    """The calls from ``parameters.play`` down to the recorder, which are what a draw is known by.
+
+    Without the recorder's own steps, and those of the tests' shape checks around every function.
+    """
     frame: FrameType | None = sys._getframe(1)
     trail: list[tuple[CodeType, int]] = []
     while frame is not None and frame.f_code.co_name != "play":
-        if not _is_ours(frame.f_code):
-            trail.append((frame.f_code, frame.f_lasti))
+        code, file = frame.f_code, frame.f_code.co_filename
+        if file != __file__ and not file.startswith("<@") and "jaxtyping" not in file:
+            trail.append((code, frame.f_lasti))
         frame = frame.f_back
     return tuple(trail[::-1])
-
-
-def _is_ours(code: CodeType) -> bool:
-    """Whether these are the recorder's own steps, or those of the tests' shape checks around every function."""
-    return code.co_filename == __file__ or code.co_filename.startswith("<@") or "jaxtyping" in code.co_filename
