@@ -368,9 +368,9 @@ def _source(files: Sequence[Path], folder: Path) -> _Source:
     parts = [Segment(name, PALETTE[0], *mesh.merged()[:2]) for name, mesh in zip(names, meshes, strict=True)]
     mesh = SegmentedMesh(tuple(parts))
     lines = ["segments:  # one closed mesh for each; their order is that of the labels"]
-    for number, (name, file) in enumerate(zip(names, relative, strict=True)):
+    for number, (name, text) in enumerate(zip(names, relative, strict=True)):
         color = list(PALETTE[number % len(PALETTE)])
-        lines += [f"  - name: {quoted(name)}", f"    file: {quoted(file)}", f"    color: {color}"]
+        lines += [f"  - name: {quoted(name)}", f"    file: {quoted(text)}", f"    color: {color}"]
     lines.append("    # nested_in: NAME  # for a segment that lies inside another one, which has to come after it")
     return _Source("\n".join(lines), mesh, *_likely_frame(files[0], mesh.bounds))
 
