@@ -56,13 +56,6 @@ def test_twist_and_squash_preserve_volume_and_taper_scales_by_the_square() -> No
     assert np.allclose(jacobian_determinant(taper, points), factor**2, atol=1e-4)
 
 
-def test_twist_turns_each_end_as_a_whole() -> None:
-    twist = Twist(np.zeros(3), np.array([0.0, 0, 1]), 6.0, 0.7)
-    ends = np.array([[1.0, 2, -1], [3.0, -1, 7], [3.0, -1, 12]])
-    expected = np.concatenate([ends[:1], Rotation.from_rotvec([0, 0, 0.7]).apply(ends[1:])])
-    assert np.allclose(twist(ends), expected)
-
-
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1), strength=st.floats(0.05, 0.95))
 def test_smooth_field_changes_distances_within_its_bound(seed: int, strength: float) -> None:

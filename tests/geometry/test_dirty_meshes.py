@@ -9,7 +9,7 @@ from scene_files import write_mesh
 from shapes import ball, box
 
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.solids import _DIRECTIONS, Solids, label_grid
+from mereo.geometry.solids import Solids, label_grid
 from mereo.scenes.files.build import MeshWarning
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import example_rng
@@ -51,16 +51,6 @@ def test_points_and_grids_are_labelled_as_of_the_solid(part: Segment) -> None:
     np.testing.assert_array_equal(grid[clear], truth(nodes, part)[clear] < 0)
 
 
-def test_without_the_mark_rays_are_misled() -> None:
-    """Knobs reach into a ball wherever the two rays of an inside test leave it: both first meet a face from outside."""
-    parts = [WHOLE, *(ball(tuple(2.0 * direction), 1.2, level=3) for direction in _DIRECTIONS)]
-    vertices, faces, _ = SegmentedMesh(tuple(replace(p, name=str(i)) for i, p in enumerate(parts))).merged()
-    knobbly = Segment("ball", (1, 2, 3), vertices, faces)
-    points = np.random.default_rng(0).uniform(-0.1, 0.1, size=(500, 3))
-    assert not Solids(SegmentedMesh((knobbly,))).label(points).any()
-    assert Solids(SegmentedMesh((replace(knobbly, solid=False),))).label(points).all()
-
-
 def test_the_mark_travels_and_relaxes_the_check_only_for_marked_segments() -> None:
     mesh = SegmentedMesh((holed(),)).transformed(np.eye(4))
     mesh.check()
@@ -86,11 +76,3 @@ def test_a_scene_with_a_hole_warns_and_makes_examples(tmp_path: Path) -> None:
     settings = GenerateConfig(points=64, sampling=SamplingConfig(per_segment=32))
     queries = synthesize(scene, settings, example_rng(0, 0)).queries
     assert (queries.labels == 1).sum() >= 16 and np.isfinite(queries.distances).all()
-
-
-def test_a_mesh_inside_out_has_no_inside(tmp_path: Path) -> None:
-    write_mesh(replace(WHOLE, faces=WHOLE.faces[:, ::-1]), tmp_path / "ball.ply")
-    path = tmp_path / "inside_out.yaml"
-    path.write_text("name: ball\nunits: m\nsegments: [{name: ball, file: ball.ply}]\n")
-    with pytest.raises(ValueError, match="'ball' has 100% of its surface facing inwards: repair it with `mereo scene"):
-        load_scene(path)

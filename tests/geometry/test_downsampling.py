@@ -20,13 +20,6 @@ def test_a_random_subset_is_the_same_every_time(limit: int) -> None:
     assert limit < 50 or chosen is points
 
 
-def test_every_row_is_as_likely() -> None:
-    """A tenth of a line's points lie as its points do: no corner of the cloud is preferred."""
-    line = np.linspace(0, 1, 100_000)
-    kept = np.sort(random_subset(line, 10_000))
-    assert np.abs(kept - np.linspace(0, 1, 10_000)).max() < 0.02
-
-
 def wall(pixels: int, depth: float, noise: float) -> Float[np.ndarray, "n 3"]:
     """What a camera sees of a wall."""
     directions = Camera.from_fov(pixels, pixels, 0.6).directions().reshape(-1, 3)

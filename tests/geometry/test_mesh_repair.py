@@ -10,10 +10,10 @@ import trimesh
 import yaml
 from overlapping import check_overlap
 from scene_files import write_bar, write_mesh
-from shapes import ball, box, knobbly_torus, segment
+from shapes import ball, box, knobbly_torus
 
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.mesh_check import examine, likely_unit, mesh_of, overlaps, solid_of
+from mereo.geometry.mesh_check import examine, mesh_of, overlaps, solid_of
 from mereo.geometry.mesh_repair import farthest, repaired, without_overlaps
 from mereo.geometry.solids import Solids
 from mereo.scenes.files import check
@@ -55,41 +55,23 @@ def test_sound_meshes_are_left_alone(part: Segment) -> None:
 
 
 TORUS = knobbly_torus(1)
+FLECK = Segment("fleck", (0, 0, 0), np.eye(3) * 0.01 + 4, np.array([[0, 1, 2]]))
 
 
 @pytest.mark.parametrize(
     ("faulty", "fault", "change", "volume"),
     [
         (replace(TORUS, faces=TORUS.faces[5:]), "open edges", "filled 1 hole with", TORUS.volume),
-        (
-            replace(TORUS, faces=np.delete(TORUS.faces, [0, 900], axis=0)),
-            "6 open edges",
-            "filled 2 holes",
-            TORUS.volume,
-        ),
         (replace(TORUS, faces=TORUS.faces[:, ::-1]), "100% of its surface facing inwards", "turned 1920", TORUS.volume),
         (half_turned(TORUS), "disagree in orientation", "turned 640 faces", TORUS.volume),
-        (soup(TORUS, 1e-9), "open edges", "merged 4800 vertices", TORUS.volume),
         (soup(TORUS, 1e-5), "open edges", "merged 4800 vertices", TORUS.volume),
         (
-            replace(TORUS, faces=np.concatenate([TORUS.faces, TORUS.faces[:7]])),
-            "edges with more than two faces",
-            "dropped 7",
+            replace(TORUS, faces=TORUS.faces[[*range(1920), 0, 5]]),
+            "with more than two faces",
+            "dropped 2",
             TORUS.volume,
         ),
-        (
-            joined(
-                TORUS,
-                replace(
-                    segment(trimesh.creation.icosahedron()),
-                    vertices=np.eye(12, 3) * 0.01 + 4,
-                    faces=np.array([[0, 1, 2]]),
-                ),
-            ),
-            "3 open edges",
-            "removed 1 fragment (1 face), 0.01 long, near [4.0",
-            TORUS.volume,
-        ),
+        (joined(TORUS, FLECK), "3 open edges", "removed 1 fragment (1 face), 0.01 long, near [4.0", TORUS.volume),
         (
             joined(ball((0, 0, 0), 2.0), ball((2, 0, 0), 2.0)),
             "intersects itself",
@@ -106,12 +88,6 @@ def test_each_fault_is_found_repaired_and_said(faulty: Segment, fault: str, chan
     assert examine(fixed.segment).sound
     SegmentedMesh((fixed.segment,)).check()
     assert fixed.segment.volume == pytest.approx(volume, rel=0.01)
-
-
-def test_a_cavity_survives_the_repair_of_a_hole() -> None:
-    part = hollow()
-    fixed = repaired(replace(part, faces=part.faces[4:]))
-    assert fixed.segment.volume == pytest.approx(part.volume, rel=0.01)
 
 
 @pytest.mark.slow
@@ -201,13 +177,6 @@ def test_all_faults_of_a_segment_are_named_at_once() -> None:
     assert any("1 fragment" in note and "near [9, 0, 0] mm" in note for note in health.notes), health.notes
 
 
-def test_a_mesh_inside_out_with_a_hole_and_a_crossing_is_all_of_that() -> None:
-    part = joined(ball((0, 0, 0), 2.0), ball((2, 0, 0), 2.0))
-    health = examine(replace(part, faces=part.faces[1:, ::-1]), "m")
-    assert health.hopeless[0].startswith("has 100% of its surface facing inwards")
-    assert "has 3 open edges (1 hole, near [" in health.dirty[0] and "intersects itself (" in health.dirty[1]
-
-
 def test_nothing_is_made_of_nothing() -> None:
     empty = Segment("part", (1, 2, 3), np.full((3, 3), np.nan), np.array([[0, 1, 2]]))
     assert examine(empty).hopeless
@@ -229,18 +198,6 @@ def test_overlaps_are_cut_from_the_larger_segment() -> None:
     fixed, changes = without_overlaps(nested)
     check_overlap(fixed)
     assert list(changes) == ["small"] and fixed.segments[1] is large
-
-
-def test_a_segment_within_another_becomes_its_cavity() -> None:
-    mesh = SegmentedMesh((ball((0, 0, 0), 2.0, "outer"), ball((0, 0, 0), 1.0, "inner")))
-    fixed, _ = without_overlaps(mesh)
-    check_overlap(fixed)
-    assert fixed.segments[0].volume == pytest.approx(4 / 3 * np.pi * 7, rel=0.01)
-
-
-def test_likely_units() -> None:
-    assert likely_unit(np.array([[0.0, 0, 0], [0.3, 0.1, 0.1]])) == "m"
-    assert likely_unit(np.array([[0.0, 0, 0], [300, 100, 100]])) == "mm"
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
@@ -323,8 +280,3 @@ def test_a_mesh_without_an_inside_is_reported_and_turned(tmp_path: Path, capsys:
     assert "  longest side 20 mm before, 20 now; the old surface reaches at most 0 mm out of the new one\n" in printed
     files = [block["file"] for block in yaml.safe_load((tmp_path / "bar-repaired.yaml").read_text())["segments"]]
     assert files == ["left-repaired.ply", "right.stl"]
-
-
-def test_only_yaml_files_are_repaired() -> None:
-    with pytest.raises(ValueError, match="'rope' is none"):
-        check_scene("rope", repair=True)

@@ -1,13 +1,8 @@
 """Farthest-point order: greedy and exact, a prefix for every size, the same whatever order the points come in."""
 
-from collections.abc import Callable
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 import pytest
 
-from mereo.geometry import downsampling
 from mereo.geometry.downsampling import farthest_point_order
 
 
@@ -79,31 +74,3 @@ def test_where_a_small_cloud_lies_does_not_matter() -> None:
     points = np.round(np.random.default_rng(6).normal(size=(300, 3)), 3)
     far = points + 4096.0
     assert np.array_equal(farthest_point_order(points, 300)[:100], farthest_point_order(far, 300)[:100])
-
-
-@pytest.mark.parametrize("count, points, expected", [(0, 5, 0), (5, 0, 0), (9, 4, 4), (1, 1, 1)])
-def test_as_many_as_there_are(count: int, points: int, expected: int) -> None:
-    assert len(farthest_point_order(np.zeros((points, 3)), count)) == expected
-
-
-def test_each_point_costs_eight_operations_for_each_one_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Differences and squares of three coordinates, a sum, a minimum; a further pass would be a tenth of the time."""
-    written = []
-
-    def counted(function: Callable[..., Any]) -> Callable[..., Any]:
-        def run(*arguments: Any, out: np.ndarray, **options: Any) -> Any:
-            written.append(out.size)
-            return function(*arguments, out=out, **options)
-
-        return run
-
-    names = ("subtract", "multiply", "minimum")
-    functions = {name: counted(getattr(np, name)) for name in names} | {
-        "add": SimpleNamespace(reduce=counted(np.add.reduce))
-    }
-    points = np.random.default_rng(7).normal(size=(1500, 3))
-    expected = farthest_point_order(points, 1024, 0)
-    others = {name: getattr(np, name) for name in dir(np) if name not in functions and not name.startswith("_")}
-    monkeypatch.setattr(downsampling, "np", SimpleNamespace(**others | functions))
-    assert np.array_equal(farthest_point_order(points, 1024, 0), expected)
-    assert sum(written) == 8 * 1024 * 1500

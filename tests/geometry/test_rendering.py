@@ -6,7 +6,6 @@ from shapes import ball, box, one
 
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.solids import Solids
 from mereo.synthesis.depth_sensor import add_depth_noise, render_depth
 
 CAMERA = Camera.from_fov(96, 96, float(np.deg2rad(30)))
@@ -28,27 +27,11 @@ def test_depth_of_a_sphere_is_the_smaller_root_of_the_ray_equation() -> None:
     assert error.min() > -1e-3 and error.max() < 0.05
 
 
-def test_depth_is_z_and_not_ray_length() -> None:
-    depth = render_depth(one(box((-200, -200, 120), (200, 200, 140))), CAMERA).depth
-    assert np.allclose(depth, 120, rtol=1e-6)
-
-
 def test_the_nearer_surface_hides_the_other() -> None:
     mesh = SegmentedMesh((box((-50, -50, 130), (50, 50, 140), "wall"), box((-5, -5, 100), (5, 5, 110), "block", 1)))
     depth = render_depth(mesh, CAMERA).depth
     block = np.abs(CAMERA.directions()[..., :2] * 100).max(axis=-1) < 5
     assert np.allclose(depth[block], 100, rtol=1e-6) and np.allclose(depth[~block], 130, rtol=1e-6)
-
-
-def test_unprojected_pixels_lie_on_the_surface() -> None:
-    mesh = SegmentedMesh((ball((0, 5, 150), 15.0), box((10, -20, 140), (25, -5, 170), color=1)))
-    points = render_depth(mesh, CAMERA).to_points().points
-    assert len(points) > 300
-    assert Solids(mesh).nearest(points).distance.max() < 1e-4
-
-
-def test_what_lies_behind_the_camera_is_not_seen() -> None:
-    assert not render_depth(one(ball((0, 0, -100), 20.0)), CAMERA).valid.any()
 
 
 def test_noise_has_the_asked_deviation_on_hits_only() -> None:
@@ -62,11 +45,6 @@ def test_noise_has_the_asked_deviation_on_hits_only() -> None:
     assert abs(hits.std() / 0.1 - 1) < 5 / np.sqrt(2 * count)
     # Gaussian tails: P(|x| > 2 sd) = 0.0455
     assert abs((np.abs(hits) > 0.2).mean() - 0.0455) < 5 * np.sqrt(0.0455 / count)
-
-
-def test_without_noise_the_image_stays_as_it_is() -> None:
-    image = render_depth(one(ball((0, 0, 150), 30.0)), CAMERA)
-    assert np.array_equal(add_depth_noise(image, 0.0, np.random.default_rng(0)).depth, image.depth)
 
 
 def test_strong_noise_neither_loses_nor_invents_hits() -> None:

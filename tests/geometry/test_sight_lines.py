@@ -9,7 +9,7 @@ from sight_parts import pixels
 from tracked_views import whole
 
 from mereo.fitting.problem.evidence import Evidence
-from mereo.geometry.camera import Camera, DepthImage, SightLines
+from mereo.geometry.camera import DepthImage, SightLines
 from mereo.geometry.solids import Solids
 from mereo.reconstruction.observation import Observation
 from mereo.scenes.registry import load_scene
@@ -28,8 +28,8 @@ from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor, SensorConfig
 from mereo.synthesis.depth_sensor import SimulatedView, observe, render_depth
 from mereo.synthesis.examples import View, sample_view
 
-Cut = Literal["none", "picture", "tool", "hand"]
-CUTS: tuple[Cut, ...] = ("none", "picture", "tool", "hand")
+Cut = Literal["none", "tool", "hand"]
+CUTS: tuple[Cut, ...] = ("none", "tool", "hand")
 AWAY = np.array([0.0, 0.0, 1.0])
 
 
@@ -62,15 +62,12 @@ class Occluded:
 
 
 def occlude(view: View, kind: Cut, sensor: SensorConfig = SENSORS["paper"], wall: bool = True) -> Occluded:
-    """Same state before a far wall: alone, cut by the picture's edge, or behind the tool or hand that hides most."""
+    """The same state before a far wall, alone or behind the tool or hand that hides most."""
     solids, camera, rng = Solids(view.mesh), view.depth.camera, np.random.default_rng(1)
-    if kind == "picture":  # its right half is left out, from the middle of the object on
-        width = int(np.median(np.nonzero(view.depth.valid)[1]))
-        camera = Camera(width, camera.height, *(camera.focal_x_px,) * 2, camera.center_x_px, camera.center_y_px)
     rays = camera.directions().reshape(-1, 3)
     backdrop = Backdrop(AWAY, farthest(solids, AWAY) + 60.0) if wall else None
     choices = [Surroundings((), backdrop)]
-    if kind in ("tool", "hand"):
+    if kind != "none":
         points, reach = view.depth.to_points().points, float(np.linalg.norm(rays[:, :2], axis=1).max())
         occluders = [sample_occluder(kind, points, reach, 1 / sensor.metres_per_unit, rng) for _ in range(8)]
         choices = [Surroundings(each, backdrop) for each in occluders]
@@ -98,7 +95,7 @@ def test_past_is_empty_and_nothing_is_known_where_the_object_is_hidden(views: li
         labels = cut.kinds(lines)
         assert (labels[seen.mask] == "").all()
         hidden = (cut.alone.depth > 0) & (seen.source == OCCLUDER)
-        assert (labels[hidden] != "p").all() and hidden.any() == (kind in ("tool", "hand"))
+        assert (labels[hidden] != "p").all() and hidden.any() == (kind != "none")
         # the wall is past the object, wherever nothing else is near
         assert (labels[surrounded(seen.source == BACKGROUND)] != "u").all() and (labels == "p").sum() > 1000
         # an occlusion edge is no silhouette: hidden pixels beside the visible ones are there, and unknown
@@ -135,21 +132,6 @@ def test_a_rendered_image_leaves_open_what_is_beside_the_object(views: list[View
         assert cut.found.lines.other_lines is None and (labels[cut.seen.source == NOTHING] == "").all()
         hidden = (cut.alone.depth > 0) & (cut.seen.source == OCCLUDER)
         assert hidden.any() and (labels[hidden] == "u").all()
-
-
-@pytest.mark.parametrize("wall", [True, False])
-def test_outside_the_picture_is_unknown_where_the_object_reaches_its_edge(views: list[View], wall: bool) -> None:
-    cut = occlude(views[0], "picture", wall=wall)
-    camera, lines = cut.seen.whole.camera, cut.found.lines
-    columns = pixels(lines.unknown, camera)[1]
-    # every pixel of the object that is lost, and near, has an unknown line of sight
-    lost = views[0].depth.to_points().points
-    lost = lost[camera.project(lost)[:, 0] >= camera.width]
-    assert len(lost) > 50
-    sight = (lines.unknown[:, :2] / lines.unknown[:, 2:])[columns >= camera.width]
-    gap = np.linalg.norm(sight[:, None] - (lost[:, :2] / lost[:, 2:])[None], axis=2).min(axis=0)
-    assert gap.max() < 4 / camera.focal_x_px and np.median(gap) < 1e-9 + 1 / camera.focal_x_px
-    assert lines.other_lines == ("unknown" if wall else None)
 
 
 def test_what_a_bare_cloud_is_cut_by_is_what_it_is_declared_to_be(views: list[View]) -> None:

@@ -52,13 +52,6 @@ def test_what_is_wide_is_a_surface_wherever_it_lies() -> None:
     assert patch[genuine][0] != patch[~genuine][0]
 
 
-def test_a_ball_loses_slivers_of_its_outline_at_most() -> None:
-    """Its outermost rows of pixels are four of their widths behind the next ones."""
-    points = ball()
-    keep = surface_points(points)
-    assert keep.mean() > 0.985 and longest_side(points) < 1.04 * longest_side(points[keep])
-
-
 def test_parts_of_different_density_lose_nothing() -> None:
     """A ball of 1,800 random points beside a plate of 600, which are farther apart."""
     rng = np.random.default_rng(4)
@@ -73,22 +66,12 @@ def test_neither_unit_nor_turn_nor_order_matters(factor: float) -> None:
     np.testing.assert_array_equal(surface_points(turned), PLATE[order])
 
 
-@pytest.mark.parametrize("times", [2, 5, 30])
-def test_points_given_more_than_once_change_nothing(times: int) -> None:
-    np.testing.assert_array_equal(surface_points(np.repeat(POINTS, times, axis=0)), np.repeat(PLATE, times))
-
-
 def test_too_few_points_to_tell_are_all_kept() -> None:
     rng = np.random.default_rng(2)
     for count in (0, 1, 2, 25):
         assert surface_points(rng.normal((0, 0, 9), 1, (count, 3))).all()
     for place in ([0.0, 0, 0], [0, 0, 3.0]):
         assert surface_points(np.tile(place, (100, 1))).all()
-
-
-def test_a_thin_line_alone_is_kept() -> None:
-    """Nothing is a surface: then nothing is a stray."""
-    assert surface_points(np.column_stack([np.linspace(-1, 1, 200), np.zeros(200), np.full(200, 4.0)])).all()
 
 
 def test_points_closer_than_their_noise_are_a_surface() -> None:

@@ -63,12 +63,6 @@ def test_all_but_the_choice_and_what_it_asks_for_is_kept(seed: int) -> None:
             np.testing.assert_allclose(other.z[4:], drawn.z[4:])
 
 
-def test_the_same_state_gives_the_same_others() -> None:
-    drawn = Drawn.of(SCENE, 1001)
-    first, second = (np.concatenate([other.z for other in redraw_choices(SCENE, drawn, 10)]) for _ in range(2))
-    np.testing.assert_array_equal(first, second)
-
-
 def test_a_scene_without_discrete_draws_has_no_others() -> None:
     assert redraw_choices(toy_scene(), Drawn.of(toy_scene(), 1001), 10) == []
 
@@ -107,12 +101,3 @@ def test_a_choice_that_no_start_has_made_is_found() -> None:
     assert found.method == "draws" and found.drawn is not None
     assert box_of(found.drawn) == 1
     assert np.median(np.linalg.norm(found.material - material, axis=1)) < 0.05
-
-
-def test_draws_far_beyond_the_bounds_are_kept_as_they_are_played() -> None:
-    """A fit may push a draw farther than its share can say; then the state is played at the bound."""
-    drawn = Drawn.of(SCENE, 1001)
-    far = replace(drawn, z=np.where(np.arange(len(drawn.z)) == 0, 9.0, drawn.z))
-    others = redraw_choices(SCENE, far, 10)
-    assert others
-    np.testing.assert_allclose([other.z[0] for other in others], 4.0)

@@ -10,7 +10,6 @@ from scene_files import write_bar
 
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.simulation_states import files_of_states
-from mereo.scenes.files.check import check_scene
 from mereo.scenes.registry import files_of, load_scene
 from mereo.scenes.seeds import TEST_SEED_START
 
@@ -57,13 +56,6 @@ def drawn(path: Path, seed: int) -> set[int]:
 def test_states_are_the_files_and_test_seeds_see_others(bar: Path) -> None:
     assert drawn(bar, 0) == set(range(7))
     assert drawn(bar, TEST_SEED_START) == {7, 8, 9}
-
-
-def test_the_scene_is_placed_and_checked_as_any_other(bar: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    scene = load_scene(bar)
-    assert scene.unit_m == pytest.approx(0.0005) and scene.rest.names == ("left", "right")
-    check_scene(str(bar), repair=False)
-    assert "fault" not in capsys.readouterr().out
 
 
 def test_other_states_are_another_scene(bar: Path) -> None:

@@ -1,6 +1,5 @@
 """Scenes of a user's own, from YAML and from Python: what the file says is what the scene is, and errors name lines."""
 
-import pickle
 from pathlib import Path
 from typing import get_args
 
@@ -44,8 +43,9 @@ def test_without_deformations_it_is_a_soft_elastic_solid(tmp_path: Path) -> None
     assert scene.definition != load_scene(write_bar(tmp_path, "deformations: [{type: lattice}]\n")).definition
 
 
-def test_segments_that_do_not_touch_bend_as_much_as_they_should_in_a_box_of_rubber() -> None:
-    apart = SegmentedMesh((box((0, 0, 0), (20, 10, 10), "left", 0), box((30, 0, 0), (50, 10, 10), "right", 1)))
+@pytest.mark.parametrize("sides", [(20, 10, 10), (20, 4, 1)])
+def test_segments_that_do_not_touch_bend_as_much_as_they_should_in_a_box_of_rubber(sides: tuple[int, ...]) -> None:
+    apart = SegmentedMesh((box((0, 0, 0), sides, "left", 0), box((30, 0, 0), np.add(sides, [30, 0, 0]), "right", 1)))
     blocks = default_deformations(apart)
     assert [block.type for block in blocks] == ["bend", "lattice", "lattice"]
     assert measure_motion(apart, random_motion(apart, blocks, UNPLACED)).mean == pytest.approx(0.05, rel=0.1)
@@ -55,7 +55,7 @@ def test_a_scene_that_is_loaded_again_is_not_refined_again(tmp_path: Path, monke
     """By its content: not by its path, and other deformations are another scene."""
     refined, calls = build.refined, []
     monkeypatch.setattr(build, "refined", lambda *scene: (calls.append(1), refined(*scene))[1])
-    build._refined.cache_clear()
+    build._kept.cache_clear()
     scenes = []
     for folder, text in (("a", ""), ("b", ""), ("c", "deformations:\n  - {type: squash, factor: [0.5, 2.0]}\n")):
         (tmp_path / folder).mkdir()
@@ -116,12 +116,6 @@ def test_segments_with_the_same_deformations_stay_in_contact(tmp_path: Path) -> 
     check_overlap(mesh)
 
 
-def test_a_scene_file_can_be_sent_to_workers(tmp_path: Path) -> None:
-    scene = load_scene(write_bar(tmp_path, EVERYTHING))
-    states = [one.sample_state(np.random.default_rng(1)).mesh for one in (scene, pickle.loads(pickle.dumps(scene)))]
-    np.testing.assert_array_equal(states[0].merged()[0], states[1].merged()[0])
-
-
 def test_parts_of_a_model_are_renamed_joined_and_left_out(tmp_path: Path) -> None:
     scene = trimesh.Scene()
     for name, part in {
@@ -154,28 +148,21 @@ def test_parts_of_a_model_are_renamed_joined_and_left_out(tmp_path: Path) -> Non
         ("units: mm\n", "", 1, ("`units` is missing", "add a line `units: ...`")),
         ("units: mm", "unitz: mm", 2, ("`unitz` means nothing here", "did you mean 'units'?")),
         ("units: mm", "units: furlong", 2, ("'furlong'", "mm, cm, m, in")),
-        ("units: mm", "units: -1", 2, ("`units` is -1", "must be greater than 0")),
         ("name: bar", "name: rope", 1, ("built-in scene", "choose another name")),
         ("name: bar", "name: a b", 1, ("'a b'", "letters, digits")),
         ("left.stl", "lift.stl", 5, ("lift.stl does not exist", "check the path")),
         ("[1, 2, 3]", "[1, 2, 300]", 8, ("300", "less than or equal to 255")),
-        ("[1, 2, 3]", "[1, 2]", 8, ("`color` has too few entries",)),
         ("    color", "    nested_in: lefd\n    color", 8, ("'lefd'", "did you mean 'left'?")),
         ("    color", "    nested_in: left\n    color", 3, ("put 'right' first",)),
-        ("size: 20", "size: big", 9, ("'big'", "valid number")),
         ("size: 20", "size: 20\nsize: 10", 10, ("`size` is given twice", "remove one")),
-        ("size: 20", "size: 20: 10", 9, ("not YAML",)),
         ("size: 20", "size: 20\nmodel: a.glb", 1, ("segments and model", "exactly one")),
         ("size: 20", "size: 20\nparts: [{name: a}]", 1, ("parts", "belongs to model")),
         ("size: 20", "size: 20\ncamera: {distance: [30, 200]}", 10, ("`distance` starts at 30", "outside the object")),
         ("type: lattice", "type: latice", 11, ("'latice'", "did you mean 'lattice'?")),
         ("type: lattice", "strength: 0.1", 11, ("`type` is missing", "bend", "waves")),
-        ("type: lattice", "type: lattice\n    strength: 1", 12, ("`strength` is 1", "less than 1")),
         ("type: lattice", "type: lattice\n    segments: [rigth]", 12, ("'rigth'", "did you mean 'right'?")),
         ("angle: [0, 100]", "angle: [100, 0]", 16, ("[least, most]",)),
         ("angle: [0, 100]", "angle: [0, 300]", 16, ("reaches 300 degrees", "folds over beyond", "bend less")),
-        ("axis: [1, 0, 0]", "axis: [0, 0, 0]", 14, ("direction",)),
-        ("    angle: [0, 100]", "    angle: [0, 100]\n    toward: [3, 0, 0]", 17, ("along the axis",)),
         ("type: lattice", "{type: push, distance: [0, 5], tip: 1, reach: 6}", 11, ("reach must be above 10.8",)),
     ],
 )
@@ -199,16 +186,13 @@ def test_errors_name_file_line_value_rule_and_cure(
     ("text", "message"),
     [
         ("deformations: &d [*d]\n", ":9: this value contains itself by an alias; it must end: spell it out"),
-        ("a: &a {<<: *a}\n", ":9: this value contains itself"),
         (
             "a0: &a0 [1,1,1,1,1,1,1,1,1]\n"
             + "".join(f"a{i}: &a{i} [{','.join(9 * [f'*a{i - 1}'])}]\n" for i in range(1, 30)),
             "values; at most 100000 can be read: use fewer aliases",
         ),
         ("deformations: " + "[" * 3000 + "]" * 3000, "is nested too deeply"),
-        ("deformations: " + "[" * 90 + "]" * 90, "...; it must be a block of keys"),
         ("source: 2001-99-99\n", "has a value that YAML cannot read (month must be in 1..12): put it in quotes"),
-        ("size: !!bool 3\n", "has a value that YAML cannot read ('3'): put it in quotes"),
     ],
 )
 def test_documents_without_an_end_are_refused(text: str, message: str, tmp_path: Path) -> None:
@@ -226,11 +210,6 @@ def test_what_is_no_mapping_is_refused(text: str, tmp_path: Path) -> None:
         load_scene(path)
     with pytest.raises(FileNotFoundError, match="b.yaml does not exist"):
         load_scene(tmp_path / "b.yaml")
-
-
-def test_unknown_names_say_what_a_file_would_be() -> None:
-    with pytest.raises(ValueError, match="'hare' is unknown; it must be one of .*rope.*, or a file of your own"):
-        load_scene("hare")
 
 
 # --- Python -----------------------------------------------------------------------------------------------------------

@@ -1,6 +1,5 @@
 """Simulated states: recorded frames are met exactly, undone exactly, and never shared by training and testing."""
 
-import pickle
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,6 @@ from mereo.deformation.maps import invert, jacobian_determinant
 from mereo.deformation.tetrahedral import Surface, SurfaceMap, Tetrahedra, TetrahedralMap
 from mereo.evaluation.scoring import EvaluationConfig, evaluate
 from mereo.io.simulation_states import TetrahedralRecord, read_states
-from mereo.scenes.recorded_states import load_states
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START
 from mereo.synthesis import shards
@@ -106,30 +104,6 @@ def test_the_interior_estimate_is_near_the_solid_that_made_the_surface() -> None
 # --- training and testing ---------------------------------------------------------------------------------------------
 
 
-def tetrahedral_file(path: Path) -> Path:
-    mesh = lattice()
-    np.savez(path, rest_nodes=mesh.nodes, tetrahedra=mesh.elements, nodes=states())
-    return path
-
-
-def test_the_last_tenth_of_the_frames_is_for_testing(tmp_path: Path) -> None:
-    split = load_states(tetrahedral_file(tmp_path / "s.npz"), boxes(), held_out=0.2)
-    scene = split.scene("boxes", boxes(), toy_scene().workspace, "test")
-    assert scene.held_out is not None
-
-    def drawn(source: Scene) -> set[int]:
-        rng = np.random.default_rng(0)
-        corner = boxes().segments[0].vertices[:1]
-        places = np.concatenate([TetrahedralMap(lattice(), nodes)(corner) for nodes in states()])
-        found = [source.sample_state(rng).mesh.segments[0].vertices[:1] for _ in range(100)]
-        return {int(np.linalg.norm(places - place, axis=1).argmin()) for place in found}
-
-    assert drawn(scene.for_seed(5)) == set(range(8))
-    assert drawn(scene.for_seed(TEST_SEED_START)) == {8, 9}
-    endless = load_states(tmp_path / "s.npz", boxes(), held_out=0.0).scene("b", boxes(), scene.workspace, "test")
-    assert endless.held_out is None and endless.for_seed(TEST_SEED_START) is endless
-
-
 def test_generation_and_evaluation_take_held_out_states_for_test_seeds_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -155,15 +129,6 @@ def test_held_out_states_are_of_the_same_object() -> None:
     toy = toy_scene()
     with pytest.raises(ValueError, match="held-out states left, right; they must be one object"):
         Scene("toy", toy.rest, toy.sample_deformations, held_out=Scene("b", boxes(), toy.sample_deformations))
-
-
-def test_states_reach_workers_with_the_same_result(tmp_path: Path) -> None:
-    split = load_states(tetrahedral_file(tmp_path / "s.npz"), boxes())
-    scene = split.scene("boxes", boxes(), toy_scene().workspace, "test")
-    first = scene.sample_state(np.random.default_rng(0)).mesh  # builds the search trees
-    again = pickle.loads(pickle.dumps(scene)).sample_state(np.random.default_rng(0)).mesh
-    for a, b in zip(first.segments, again.segments, strict=True):
-        assert np.array_equal(a.vertices, b.vertices)
 
 
 def test_shipped_states_are_sane() -> None:
