@@ -3,6 +3,7 @@
 import functools
 import hashlib
 import http.server
+import re
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -145,3 +146,32 @@ def test_posed_scans_lie_on_the_bunny(scan: str, require_asset: Callable[[str], 
     distance_mm = 1000 * np.sqrt(squared)
     assert np.median(distance_mm) < 0.12
     assert np.quantile(distance_mm, 0.95) < 0.5
+
+
+def test_every_entry_is_complete_and_pinned_to_a_commit() -> None:
+    for name, asset in ASSETS.items():
+        assert name == asset.name
+        assert re.fullmatch(r"[a-z]+/[A-Za-z0-9_]+\.[a-z]+", name)
+        assert re.fullmatch(r"[0-9a-f]{64}", asset.sha256)
+        assert re.fullmatch(r"https://[^ ]+/[0-9a-f]{40}/[^ ]+", asset.url)
+        assert asset.url.rsplit(".", 1)[1] == name.rsplit(".", 1)[1]
+        assert asset.licence
+        assert asset.credit
+        assert asset.description
+    assert len({asset.sha256 for asset in ASSETS.values()}) == len(ASSETS)
+    assert len({asset.url for asset in ASSETS.values()}) == len(ASSETS)
+
+
+def test_mirror_that_is_no_folder_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("MEREO_ASSETS", str(tmp_path / "absent"))
+    with pytest.raises(AssetUnavailable, match="not a folder: correct or unset it"):
+        assets.get("bunny/bunny.off")
+
+
+def test_unwritable_cache_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, server: str) -> None:
+    asset = register(monkeypatch, f"{server}/toy.off")
+    (tmp_path / "web" / "toy.off").write_bytes(CONTENT)
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setattr(assets, "_cache", lambda: tmp_path / "file")
+    with pytest.raises(AssetUnavailable, match="cannot be stored at .*file.*XDG_CACHE_HOME"):
+        assets.get(asset.name)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from scipy.stats import kstest
-from toy_scene import rest_mesh
+from toy_scene import rest_mesh, toy_scene
 
 from mereo.deformation.draw_names import DrawName, named, part
 from mereo.deformation.maps import Deformation, Rigid
@@ -22,6 +22,7 @@ from mereo.scenes.parameters import (
     set_value,
     turned,
 )
+from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 
 STILL = np.zeros(3)
