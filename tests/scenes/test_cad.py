@@ -87,15 +87,17 @@ def test_neighbours_split_a_shared_edge_alike(pliers: Scene) -> None:
 
 def test_edges_are_asked_once_and_faces_are_bounded() -> None:
     part = box((0, 0, 0), (4, 4, 4))
-    asked: list[int] = []
+    asked: list[tuple[tuple[float, ...], ...]] = []
 
     def longer(ends: np.ndarray) -> np.ndarray:
-        asked.append(len(ends))
-        return np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > 3.0
+        asked.extend(tuple(sorted(map(tuple, pair))) for pair in ends.tolist())
+        return np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > 2.5  # the halves of diagonals are halved again
 
     vertices, faces = split_edges(part.vertices, part.faces, longer, 1000)
-    assert replace(part, vertices=vertices, faces=faces).edge_imbalance() == (0, 0)
-    assert asked[0] == 18 and sum(asked) == 18 + 2 * 18 + 3 * 12  # each once: halves, and those across the faces
+    whole = replace(part, vertices=vertices, faces=faces)
+    assert whole.edge_imbalance() == (0, 0) and whole.volume == pytest.approx(64) and len(asked) == len(set(asked))
+    corners = vertices[faces]
+    assert np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max() <= 2.5
     with pytest.raises(TooManyFaces, match="1,000 triangles or more"):
         split_edges(part.vertices, part.faces, lambda ends: np.ones(len(ends), dtype=bool), 1000)
 
