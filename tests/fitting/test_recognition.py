@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from answers import answer_to
-from toy_scene import Shear, toy_scene
+from toy_scene import toy_scene
 
 from mereo.fitting.problem.problem import ACCEPTED
 from mereo.fitting.registration.recognition import (
@@ -21,7 +21,6 @@ from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.models.calibration import Calibration, Recognizing, Usual
 from mereo.models.weights import load_model
-from mereo.scenes.draw_recorder import FartherDraws, with_farther_states
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene, SourceFrame
 from mereo.scenes.seeds import example_rng
@@ -167,18 +166,6 @@ def test_a_view_that_was_not_understood_moves_no_limit() -> None:
 
 
 # --- what is seen -----------------------------------------------------------------------------------------------------
-
-
-def test_states_beyond_have_their_draws_beyond_their_bounds() -> None:
-    """Two-sided intervals on the drawn side, one-sided ones away from zero; choices and full turns stay."""
-    far = FartherDraws(3, 1.5)
-    assert set(np.round(far.uniform(-2.0, 2.0, 50), 9)) == {-3.0, 3.0}
-    assert far.uniform(2.0, 6.0) == 7.0 and far.uniform(-6.0, -2.0) == -7.0 and far.triangular(0.0, 1.0, 3.0) == 4.0
-    assert 0 <= far.uniform(0.0, 2 * np.pi) <= 2 * np.pi and far.integers(5) in range(5)
-    assert far.normal(10.0, 2.0, 4000).std() == pytest.approx(3.0, rel=0.05)
-    assert far.standard_normal(4000).std() == pytest.approx(1.5, rel=0.05)
-    shear = with_farther_states(SCENE, 1.5).sample_deformations(np.random.default_rng(0))[0]
-    assert isinstance(shear, Shear) and np.abs([shear.a, shear.b, shear.c]) == pytest.approx([4.5, 0.45, 0.3])
 
 
 def test_views_are_clean_and_noisy_in_turn_and_the_same_every_time() -> None:

@@ -23,8 +23,8 @@ from mereo.reconstruction.observation import observe
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
-from mereo.scenes.walks import walk
 from mereo.synthesis.depth_sensor import add_depth_noise, render_depth
+from mereo.synthesis.recording import walk
 
 SEED, RATE_HZ = 740_000, 30.0
 
