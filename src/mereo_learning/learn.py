@@ -710,7 +710,14 @@ def check_object(files: Sequence[Path], units: str | None) -> None:
         except ValueError as error:
             if not is_yaml(scene) or "listed above" not in str(error):
                 raise
-            raise ValueError(_refusal(files)) from None
+            named = names_scene(files)
+            path = files[0] if named else Path(f"{files[0].stem}.yaml")
+            new = "" if named else f"`mereo scene new {shlex.join(map(str, files))} --output {path}` and "
+            raise ValueError(
+                f"{files[0] if named else 'the object'} has faults, listed above, and nothing is learnt of a wrong "
+                f"object: correct them, or let {new}`mereo scene check {path} --repair` try, and learn "
+                f"{path.with_name(f'{path.stem}-repaired{path.suffix}')}"
+            ) from None
         loaded = load_scene(scene)
     way = deformation(loaded)
     if way < 0.005:
@@ -719,18 +726,6 @@ def check_object(files: Sequence[Path], units: str | None) -> None:
             f"warning: {loaded.name} hardly deforms: by {way:.2%} of its length; if it does more than that, widen its "
             f"deformations{place}"
         )
-
-
-def _refusal(files: Sequence[Path]) -> str:
-    """Sentence about an object with faults: which commands may mend it."""
-    named = names_scene(files)
-    path = files[0] if named else Path(f"{files[0].stem}.yaml")
-    new = "" if named else f"`mereo scene new {shlex.join(map(str, files))} --output {path}` and "
-    return (
-        f"{files[0] if named else 'the object'} has faults, listed above, and nothing is learnt of a wrong object: "
-        f"correct them, or let {new}`mereo scene check {path} --repair` try, and learn "
-        f"{path.with_name(f'{path.stem}-repaired{path.suffix}')}"
-    )
 
 
 def deformation(scene: Scene) -> float:

@@ -32,7 +32,7 @@ def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
     scores, (iou, miou), errors = evaluation.scores, evaluation.example_mean, evaluation.errors
     count = len(evaluation.examples)
     sources = evaluation.sources if len(evaluation.sources) == count else (None,) * count
-    said = [str(known).lower() for known in evaluation.known]
+    words = [str(known).lower() for known in evaluation.known]
     known = evaluation.known if len(evaluation.known) == count else (None,) * count
     return {
         **facts,
@@ -60,7 +60,7 @@ def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
         "better": {name: _share_better(answer, evaluation) for name, answer in evaluation.answers.items()},
         "registration_error": None if errors is None else errors.summary(evaluation.unit_mm),
         "coverage95": None if errors is None else errors.coverage(evaluation.unit_mm),
-        "known": {word: said.count(word) / len(said) for word in ("true", "unsure", "false")} if said else None,
+        "known": {word: words.count(word) / len(words) for word in ("true", "unsure", "false")} if words else None,
     }
 
 

@@ -45,6 +45,11 @@ def mereo() -> Package:
     return read_package(TOP / "src" / "mereo")
 
 
+@pytest.fixture(scope="module", params=["mereo", *SATELLITES])
+def each_package(request: pytest.FixtureRequest) -> Package:
+    return read_package(TOP / "src" / request.param)
+
+
 def test_rooms_import_only_from_rooms_before_them(mereo: Package) -> None:
     assert_none(differences(upward_imports(mereo), EXCEPTIONS))
 
@@ -53,8 +58,8 @@ def test_torch_stays_where_networks_are(mereo: Package) -> None:
     assert_none(torch_imports(mereo))
 
 
-def test_settings_are_light(mereo: Package) -> None:
-    assert_none(heavy_settings(mereo))
+def test_settings_are_light(each_package: Package) -> None:
+    assert_none(heavy_settings(each_package))
 
 
 def test_only_charts_ask_for_the_extra_plots(mereo: Package) -> None:
@@ -62,8 +67,8 @@ def test_only_charts_ask_for_the_extra_plots(mereo: Package) -> None:
     assert asking == {"io/extras"}
 
 
-def test_no_module_needs_itself(mereo: Package) -> None:
-    assert_none(cycles(mereo))
+def test_no_module_needs_itself(each_package: Package) -> None:
+    assert_none(cycles(each_package))
 
 
 def test_init_files_are_docstrings(mereo: Package) -> None:
@@ -84,11 +89,6 @@ def test_the_core_does_without_its_satellites(mereo: Package) -> None:
 
 def test_tests_lie_in_the_rooms_they_test() -> None:
     assert_none(misplaced_tests(TOP / "tests"))
-
-
-@pytest.fixture(scope="module", params=["mereo", *SATELLITES])
-def each_package(request: pytest.FixtureRequest) -> Package:
-    return read_package(TOP / "src" / request.param)
 
 
 def test_names_are_nouns_and_verbs(each_package: Package) -> None:
