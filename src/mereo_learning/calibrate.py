@@ -40,7 +40,7 @@ from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor
 from mereo.synthesis.depth_sensor import observe as observe_scene
 from mereo.synthesis.examples import sample_view
-from mereo_learning.cases import RegistrationErrors, Reliability, sample_cells, seen_points
+from mereo_learning.cases import RegistrationErrors, Reliability, nearest_truth, sample_cells, seen_points
 from mereo_learning.scoring import check_names, trained_scene, true_material
 
 SEED = 900_000
@@ -272,7 +272,7 @@ class MeasuredRadii:
     @classmethod
     def of(cls, view: CalibrationView, candidate: Candidate, registration: Registration) -> "MeasuredRadii":
         """Measurement of a registration that was made of a candidate, by weights that are not calibrated."""
-        truth = view.material(registration.model)
+        truth = nearest_truth(registration, view.material(registration.model))
         errors = RegistrationErrors.of(registration, truth, seen_points(truth, view.seen, 1.0), 1.0)
         assert registration.optimum is not None and candidate.modes is not None
         misfit = candidate.modes.problem.cloud_misfit(registration.optimum.surface)

@@ -25,8 +25,15 @@ from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import Color
-from mereo.geometry.metrics import Scores, TruthGrid, grid_confusion, intersection_over_union
+from mereo.geometry.metrics import (
+    Scores,
+    TruthGrid,
+    grid_confusion,
+    intersection_over_union,
+    with_segments_exchanged,
+)
 from mereo.geometry.solids import label_grid
+from mereo.geometry.transforms import transform_points
 from mereo.models.trained import EncodedCloud, Trained
 from mereo.reconstruction.isosurfaces import sample_coarse_to_fine
 from mereo.reconstruction.observation import observe
@@ -34,6 +41,24 @@ from mereo.reconstruction.pipeline import segment_names
 from mereo.scenes.statistical_model import StatisticalModel
 
 # --- errors of a registration, and their radii ------------------------------------------------------------------------
+
+
+def nearest_truth(registration: Registration, truth: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
+    """Choose the true positions that an answer is nearest to, of those that no frame tells apart.
+
+    Of an object that looks the same turned, a place of the answer is as right where the true object has its turned
+    place. Turns by any angle are not tried, and of a part of the material points the positions are those given.
+    """
+    model = registration.model
+    if len(truth) < len(model.rest_points):
+        return truth
+    truths = [truth]
+    for symmetry in model.symmetries:
+        if symmetry.angle is not None and None not in symmetry.lands_on:
+            landing = np.array([index for index in symmetry.lands_on if index is not None])
+            labels = (landing[model.labels - 1] + 1).astype(np.uint8)
+            truths.append(model.weights(transform_points(symmetry.turn, model.rest_points), labels)(truth))
+    return min(truths, key=lambda each: float(np.median(np.linalg.norm(registration.material - each, axis=1))))
 
 
 def seen_points(truth: Float[np.ndarray, "m 3"], cloud: PointCloud, scene_unit: float) -> Bool[np.ndarray, " m"]:
@@ -348,17 +373,28 @@ class AnswerScores:
         confusion: points by true (row) and predicted (column) label, summed over the set.
         examples: scores of each test case, in order.
         seconds: of each, from the cloud to the answer.
+        miou_up_to_symmetry: mIoU of the set with segments exchanged that no frame tells apart, in each case as it suits
+            the answer; where there are none such, the mIoU.
     """
 
     confusion: Int[np.ndarray, "c c"]
     examples: tuple[Scores, ...]
     seconds: tuple[float, ...]
+    miou_up_to_symmetry: float
 
     @classmethod
-    def of(cls, cases: Sequence[tuple[Int[np.ndarray, "c c"], float]], segmented: bool) -> "AnswerScores":
-        """Scores of a set by the confusion matrix and the seconds of each case."""
+    def of(
+        cls, cases: Sequence[tuple[Int[np.ndarray, "c c"], float]], segmented: bool, swaps: Sequence[Sequence[int]]
+    ) -> "AnswerScores":
+        """Scores of a set by the confusion matrix and the seconds of each case; swaps are ``StatisticalModel.swaps``."""
         each = tuple(intersection_over_union(confusion, segmented) for confusion, _ in cases)
-        return cls(np.sum([confusion for confusion, _ in cases], axis=0), each, tuple(seconds for _, seconds in cases))
+        exchanged = sum(with_segments_exchanged(confusion, swaps) for confusion, _ in cases)
+        return cls(
+            np.sum([confusion for confusion, _ in cases], axis=0),
+            each,
+            tuple(seconds for _, seconds in cases),
+            intersection_over_union(np.asarray(exchanged), segmented).miou,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -379,6 +415,7 @@ class Evaluation:
         reliability: of the network's probabilities.
         calibrated: whether these are.
         seconds: of each example, from the cloud to the answer that a user gets.
+        miou_up_to_symmetry: as in ``AnswerScores``.
     """
 
     names: tuple[str, ...]
@@ -394,6 +431,7 @@ class Evaluation:
     reliability: Reliability = field(default_factory=Reliability)
     calibrated: bool = False
     seconds: tuple[float, ...] = ()
+    miou_up_to_symmetry: float = float("nan")
 
     def __repr__(self) -> str:
         scores, count = self.scores, counted(len(self.examples), "example")
@@ -503,7 +541,7 @@ class Scoring:
         names, colors = segment_names(model)
         registration, errors = candidates.answer.registration, None
         if registration is not None and case.material is not None and case.scene_unit is not None:
-            truth = case.material(registration.model)
+            truth = nearest_truth(registration, case.material(registration.model))
             seen = seen_points(truth, case.cloud, case.scene_unit)
             errors = RegistrationErrors.of(registration, truth, seen, case.scene_unit)
         return ScoredCase(
@@ -540,7 +578,8 @@ def _evaluated_view(case: TestCase, model: Trained, candidates: Candidates, colo
 
 def evaluation_of(model: Trained, cases: Sequence[ScoredCase], answers: Sequence[AnswerName]) -> Evaluation:
     """Result of a test set from its cases, in order, which all have these answers."""
-    scores = AnswerScores.of([case.each[case.default] for case in cases], model.segmented)
+    swaps = () if model.statistical_model is None else model.statistical_model.swaps
+    scores = AnswerScores.of([case.each[case.default] for case in cases], model.segmented, swaps)
     errors = [case.errors for case in cases if case.errors is not None]
     return Evaluation(
         names=segment_names(model)[0],
@@ -548,11 +587,14 @@ def evaluation_of(model: Trained, cases: Sequence[ScoredCase], answers: Sequence
         examples={case.name: example for case, example in zip(cases, scores.examples, strict=True)},
         views=tuple(case.view for case in cases if case.view is not None),
         segmented=model.segmented,
-        answers={name: AnswerScores.of([case.each[name] for case in cases], model.segmented) for name in answers},
+        answers={
+            name: AnswerScores.of([case.each[name] for case in cases], model.segmented, swaps) for name in answers
+        },
         sources=tuple(case.source for case in cases),
         known=tuple(case.known for case in cases if case.known is not None),
         errors=RegistrationErrors.together(errors) if errors else None,
         reliability=Reliability(np.sum([case.reliability.bins for case in cases], axis=0)),
         calibrated=model.calibrates,
         seconds=tuple(case.seconds for case in cases),
+        miou_up_to_symmetry=scores.miou_up_to_symmetry,
     )

@@ -130,12 +130,19 @@ def write_evaluation_report(
     below = {"iou", "miou", "definition", "ece", "calibrated"}
     facts = {k: v for k, v in metrics.items() if isinstance(v, str | int | float) and k not in below}
     shown = [f"{key.replace('_', ' ')}: {value}" for key, value in facts.items()]
+    scores = {"IoU, whole set": metrics["iou"], "mIoU, whole set": metrics["miou"]}
+    scores |= {"IoU, mean over examples": mean["iou"], "mIoU, mean over examples": mean["miou"]}
+    overall = "".join(
+        f"<div><b>{format_score(value, DASH)}</b><span>{title}</span></div>" for title, value in scores.items()
+    )
+    # how often true positions lie within a registration's radii, and frames are said to show the object
+    sure = "".join(f"<p>{escape(line)}</p>" for line in certainty_lines(metrics))
     text = "".join(
         (
             f"<h1>{escape(title)}</h1>",
             f"<p>{escape('  ·  '.join(shown))}</p>",
-            _overall(metrics["iou"], metrics["miou"], mean["iou"], mean["miou"]),
-            _sure(metrics),
+            f'<section><div class="big">{overall}</div></section>',
+            f"<section><h2>How sure</h2>{sure}</section>" if sure else "",
             f'<div class="pair">{_segments(metrics["per_segment"], colors)}{_examples(metrics["per_example"])}</div>',
             _confusion(("empty", *names), metrics["confusion"]),
             _reliability(metrics.get("reliability") or [], metrics.get("ece"), metrics.get("calibrated") is True),
@@ -161,19 +168,6 @@ def write_evaluation_report(
     ).encode("utf-8", errors="replace")
     with atomic_file(path) as partial:
         partial.write_bytes(page)
-
-
-def _overall(*figures: float) -> str:
-    titles = ("IoU, whole set", "mIoU, whole set", "IoU, mean over examples", "mIoU, mean over examples")
-    each = zip(titles, figures, strict=True)
-    shown = "".join(f"<div><b>{format_score(value, DASH)}</b><span>{title}</span></div>" for title, value in each)
-    return f'<section><div class="big">{shown}</div></section>'
-
-
-def _sure(metrics: Mapping[str, Any]) -> str:
-    """How often true positions lie within a registration's radii, and frames are said to show the object."""
-    text = "".join(f"<p>{escape(line)}</p>" for line in certainty_lines(metrics))
-    return f"<section><h2>How sure</h2>{text}</section>" if text else ""
 
 
 def _segments(per_segment: Mapping[str, float], colors: Sequence[Color]) -> str:
@@ -205,7 +199,13 @@ def _reliability(bins: Sequence[Mapping[str, float]], ece: float | None, calibra
     """Reliability diagram of the network's probabilities: share of right answers over confidence, and the diagonal."""
     if not bins:
         return ""
-    side = 260
+    side, foot, middle = 260, 274, 130
+    axes = (
+        f'<text y="{foot}">0</text><text class="e" x="{side}" y="{foot}">1</text>'
+        f'<text class="m" x="{middle}" y="{foot + 14}">confidence in a cell\'s label</text>'
+        f'<text class="e" x="-5" y="{side}">0</text><text class="e" x="-5" y="9">1</text>'
+        f'<text class="m" transform="translate(-18 {middle}) rotate(-90)">share that is right</text>'
+    )
     points = " ".join(f"{side * b['confidence']:.1f},{side * (1 - b['right']):.1f}" for b in bins)
     dots = "".join(
         f'<circle cx="{side * b["confidence"]:.1f}" cy="{side * (1 - b["right"]):.1f}" '
@@ -217,24 +217,13 @@ def _reliability(bins: Sequence[Mapping[str, float]], ece: float | None, calibra
         f'<svg class="rel" viewBox="-34 -12 {side + 46} {side + 46}" role="img" '
         f'aria-label="share of right answers over confidence"><rect width="{side}" height="{side}"/>'
         f'<line x1="0" y1="{side}" x2="{side}" y2="0"/>'
-        f'<polyline points="{points}"/>{dots}{_axes(side)}</svg>'
+        f'<polyline points="{points}"/>{dots}{axes}</svg>'
     )
     kind = "calibrated" if calibrated else "not calibrated"
     return (
         f"<section><h2>Reliability of the network's probabilities ({kind})</h2><p>Expected calibration error "
         f"{format_score(ece, DASH)}. A point's size: how many cells. On "
         f"the diagonal the network is as often right as it says.</p>{svg}</section>"
-    )
-
-
-def _axes(side: int) -> str:
-    """Words along two sides of a square from 0 to 1."""
-    foot, middle = side + 14, side // 2
-    return (
-        f'<text y="{foot}">0</text><text class="e" x="{side}" y="{foot}">1</text>'
-        f'<text class="m" x="{middle}" y="{foot + 14}">confidence in a cell\'s label</text>'
-        f'<text class="e" x="-5" y="{side}">0</text><text class="e" x="-5" y="9">1</text>'
-        f'<text class="m" transform="translate(-18 {middle}) rotate(-90)">share that is right</text>'
     )
 
 

@@ -62,10 +62,11 @@ from mereo_learning.search_stage import (
     search_line,
     search_scores,
     shortcomings,
+    symmetry_lines,
     training_reason,
 )
 from mereo_learning.shards import DatasetConfig, generate
-from mereo_learning.tables import read_metrics
+from mereo_learning.tables import CLEARLY, read_metrics
 from mereo_learning.trainer import VALIDATIONS, Trainer
 from mereo_learning.trainer import train as train_network
 from mereo_learning.validation import validate
@@ -258,7 +259,7 @@ def learn(
     clock.stage(2, "score the search alone, without training")
     searched = search_scores(output, loaded, named, SEARCH_SHARE * clock.budget_s)
     reasons = shortcomings(searched.summary())
-    print(search_line(searched), flush=True)
+    print(search_line(searched), *symmetry_lines(loaded), sep="\n", flush=True)
     if is_begun or is_to_train(train, reasons):
         print(f"it is trained: {training_reason(train, reasons, is_begun)}", flush=True)
         _train(scene, output, clock, config, searched.summary()["seconds"])
@@ -514,10 +515,11 @@ def _comparison(search: Mapping[str, Any], test: Mapping[str, Any]) -> dict[str,
     both = {
         "iou": test["iou"],
         "miou": test["miou"],
+        "miou_up_to_symmetry": test["miou_up_to_symmetry"],
         "explained": 1 - test["chosen"]["network"],
         "seconds": test.get("seconds") or slowest["seconds"],  # files of older versions have no seconds of their own
     }
-    network = {name: test["network"][name] for name in ("iou", "miou", "seconds")}
+    network = {name: test["network"][name] for name in ("iou", "miou", "miou_up_to_symmetry", "seconds")}
     table = {"search": search, "network": network, "both": both}
     method, reason = best_method(table)
     best = table["both" if method == "auto" else method]
@@ -528,6 +530,7 @@ def _comparison(search: Mapping[str, Any], test: Mapping[str, Any]) -> dict[str,
         "examples": test["examples"],
         "iou": best["iou"],
         "miou": best["miou"],
+        "miou_up_to_symmetry": best["miou_up_to_symmetry"],
         **table,
     }
 
@@ -545,6 +548,9 @@ def _show_outcome(
             explained = f"{scores['explained']:.0%}" if "explained" in scores else "-"
             figures = f"{format_score(scores['iou'])}  {format_score(scores['miou']):>5} {explained:>9}"
             print(f"{title:<45} {figures} {scores['seconds']:10.2f}")
+    if metrics["miou"] is not None and metrics["miou_up_to_symmetry"] > metrics["miou"] + CLEARLY:
+        either = format_score(metrics["miou_up_to_symmetry"])
+        print(f"where segments that no frame tells apart count as right either way, the best has an mIoU of {either}")
     print(*([metrics["reason"]] if metrics["trained"] else []), *advice, "", sep="\n")
     if metrics["trained"]:
         print(f"report   {output / 'test' / 'report.html'}")
@@ -593,7 +599,7 @@ def advice_after_training(
     metrics: Mapping[str, Any], per_segment: Mapping[str, float | None], minutes: float
 ) -> list[str]:
     """What to do about scores that will not do; nothing about others."""
-    score = metrics["iou"] if metrics["miou"] is None else metrics["miou"]
+    score = metrics["iou"] if metrics["miou"] is None else metrics["miou_up_to_symmetry"]
     if score >= GOOD:
         return []
     weakest = min(per_segment, key=lambda name: per_segment[name] or 0.0)
@@ -711,7 +717,14 @@ def check_object(files: Sequence[Path], units: str | None) -> None:
         except ValueError as error:
             if not is_yaml(scene) or "listed above" not in str(error):
                 raise
-            raise ValueError(_refusal(files)) from None
+            named = names_scene(files)
+            path = files[0] if named else Path(f"{files[0].stem}.yaml")
+            new = "" if named else f"`mereo scene new {shlex.join(map(str, files))} --output {path}` and "
+            raise ValueError(
+                f"{files[0] if named else 'the object'} has faults, listed above, and nothing is learnt of a wrong "
+                f"object: correct them, or let {new}`mereo scene check {path} --repair` try, and learn "
+                f"{path.with_name(f'{path.stem}-repaired{path.suffix}')}"
+            ) from None
         loaded = load_scene(scene)
     way = deformation(loaded)
     if way < 0.005:
@@ -720,18 +733,6 @@ def check_object(files: Sequence[Path], units: str | None) -> None:
             f"warning: {loaded.name} hardly deforms: by {way:.2%} of its length; if it does more than that, widen its "
             f"deformations{place}"
         )
-
-
-def _refusal(files: Sequence[Path]) -> str:
-    """Sentence about an object with faults: which commands may mend it."""
-    named = names_scene(files)
-    path = files[0] if named else Path(f"{files[0].stem}.yaml")
-    new = "" if named else f"`mereo scene new {shlex.join(map(str, files))} --output {path}` and "
-    return (
-        f"{files[0] if named else 'the object'} has faults, listed above, and nothing is learnt of a wrong object: "
-        f"correct them, or let {new}`mereo scene check {path} --repair` try, and learn "
-        f"{path.with_name(f'{path.stem}-repaired{path.suffix}')}"
-    )
 
 
 def deformation(scene: Scene) -> float:

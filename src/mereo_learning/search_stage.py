@@ -12,8 +12,14 @@ import numpy as np
 
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.register import Registrar
-from mereo.geometry.metrics import format_score, grid_confusion, intersection_over_union
+from mereo.geometry.metrics import (
+    format_score,
+    grid_confusion,
+    intersection_over_union,
+    with_segments_exchanged,
+)
 from mereo.geometry.solids import label_grid
+from mereo.geometry.symmetry import TOLERANCE, describe_symmetries, find_symmetries
 from mereo.io.atomic_files import write_json
 from mereo.io.progress import progress
 from mereo.reconstruction.observation import observe
@@ -37,24 +43,28 @@ class SearchScores:
         names: names of the segments.
         views: of each view "confusion", cells by true (row) and answered (column) label, "explained", whether the fit
             explains it, and "seconds" from the cloud to the answer.
+        swaps: exchanges of segments that no frame tells apart (``StatisticalModel.swaps``).
     """
 
     names: tuple[str, ...]
     views: Sequence[Mapping[str, Any]]
+    swaps: tuple[tuple[int, ...], ...] = ()
 
     def summary(self) -> dict[str, Any]:
-        """IoU, mIoU, the share of views that are explained, the lowest mIoU of a view, and median seconds.
+        """IoU, mIoU, that up to symmetry and its lowest of a view, the share of views explained, and median seconds.
 
         Raises ``KeyError``, ``TypeError`` or ``ValueError`` for views that are none.
         """
         classes = len(self.names) + 1
         confusions = np.array([view["confusion"] for view in self.views], dtype=np.int64).reshape(-1, classes, classes)
         scores = intersection_over_union(confusions.sum(axis=0))
+        exchanged = [with_segments_exchanged(view, self.swaps) for view in confusions]
         return {
             "examples": len(self.views),
             "iou": scores.iou,
             "miou": scores.miou,
-            "lowest_miou": min(intersection_over_union(view).miou for view in confusions),
+            "miou_up_to_symmetry": intersection_over_union(np.sum(exchanged, axis=0)).miou,
+            "lowest_miou": min(intersection_over_union(view).miou for view in exchanged),
             "explained": float(np.mean([bool(view["explained"]) for view in self.views])),
             "seconds": float(np.median([float(view["seconds"]) for view in self.views])),
         }
@@ -86,7 +96,7 @@ def score_search(
         while len(scored) < views and (len(scored) < least or time.monotonic() - started < budget_s):
             scored.append(_scored(scene, registrar, cells, len(scored)))
             shown.advance()
-    return SearchScores(scene.rest.names, scored)
+    return SearchScores(scene.rest.names, scored, registrar.model.swaps)
 
 
 def _scored(scene: Scene, registrar: Registrar, cells: int, index: int) -> dict[str, Any]:
@@ -141,10 +151,19 @@ def search_line(scores: SearchScores) -> str:
     """Sentence on the scores, for the terminal."""
     summary = scores.summary()
     count, seconds = summary["examples"], summary["seconds"]
+    either = summary["miou_up_to_symmetry"]
+    symmetric = f" ({format_score(either)} up to symmetry)" if either > summary["miou"] + CLEARLY else ""
     return (
-        f"search alone, without training: IoU {format_score(summary['iou'])}, mIoU {format_score(summary['miou'])} on "
-        f"{count} test views, {round(count * summary['explained'])} of them explained, {seconds:.2f} s a frame"
+        f"search alone, without training: IoU {format_score(summary['iou'])}, mIoU {format_score(summary['miou'])}"
+        f"{symmetric} on {count} test views, {round(count * summary['explained'])} of them explained, "
+        f"{seconds:.2f} s a frame"
     )
+
+
+def symmetry_lines(scene: Scene) -> list[str]:
+    """Sentences on segments that no frame tells apart, and so no training either."""
+    exchanged = [each for each in find_symmetries(scene.rest, TOLERANCE) if not each.keeps_segments]
+    return [f"{sentence}, so no training can" for sentence in describe_symmetries(exchanged, scene.rest.names)]
 
 
 def _digests(scene: Scene) -> dict[str, str | None]:
@@ -155,14 +174,15 @@ def _digests(scene: Scene) -> dict[str, str | None]:
 
 def _write(output: Path, scene: Scene, named: str, scores: SearchScores) -> None:
     facts = {"scene": named, **_digests(scene), "seed": TEST_SEED_START}
-    write_json(output / SEARCH, {**facts, "names": scores.names, "views": scores.views})
+    write_json(output / SEARCH, {**facts, "names": scores.names, "swaps": scores.swaps, "views": scores.views})
 
 
 def _read(output: Path, scene: Scene) -> SearchScores:
     path = output / SEARCH
     try:
         content = json.loads(path.read_text("utf-8"))
-        scores = SearchScores(tuple(content["names"]), content["views"])
+        swaps = tuple(tuple(int(index) for index in swap) for swap in content["swaps"])
+        scores = SearchScores(tuple(content["names"]), content["views"], swaps)
         scores.summary()
     except (ValueError, KeyError, TypeError):
         raise ValueError(f"{path} holds no scores; remove it, and they are made again") from None
@@ -183,10 +203,10 @@ Method = Literal["auto", "search", "network"]
 """Who is to answer, as ``--method`` says it: both, the search alone, or the network alone."""
 
 GOOD_ENOUGH = 0.85
-"""mIoU from which the search alone is good enough; IoU of an object in one segment."""
+"""mIoU up to symmetry from which the search alone is good enough; IoU of an object in one segment."""
 
 LOWEST = 0.5
-"""mIoU that each view must have: in one with less, segments that look alike are exchanged."""
+"""mIoU up to symmetry that each view must have: in one with less, segments that look alike are exchanged."""
 
 
 def shortcomings(search: Mapping[str, Any]) -> list[str]:
@@ -195,8 +215,8 @@ def shortcomings(search: Mapping[str, Any]) -> list[str]:
     reasons = []
     if missed:
         reasons.append(f"{missed} of {views} views are not explained")
-    if search["miou"] < GOOD_ENOUGH:
-        reasons.append(f"mIoU {format_score(search['miou'])} is below {GOOD_ENOUGH}")
+    if search["miou_up_to_symmetry"] < GOOD_ENOUGH:
+        reasons.append(f"mIoU {format_score(search['miou_up_to_symmetry'])} is below {GOOD_ENOUGH}")
     if search["lowest_miou"] < LOWEST:
         reasons.append(f"mIoU of the worst view, {format_score(search['lowest_miou'])}, is below {LOWEST}")
     return reasons
@@ -221,9 +241,11 @@ def best_method(table: Mapping[str, Mapping[str, Any]]) -> tuple[Method, str]:
     more views, else the faster one; the network alone, which registers nothing, only where it is clearly better still.
 
     Args:
-        table: IoU, mIoU, explained share and seconds of "search", "network" and "both", on the same views.
+        table: IoU, mIoU up to symmetry, explained share and seconds of "search", "network" and "both", on the same
+            views.
     """
-    scores = {name: float(row["miou"] if row["miou"] is not None else row["iou"]) for name, row in table.items()}
+    miou = {name: row["miou_up_to_symmetry"] for name, row in table.items()}
+    scores = {name: float(row["iou"] if miou[name] is None else miou[name]) for name, row in table.items()}
     search, both = table["search"], table["both"]
     if scores["network"] > max(scores["search"], scores["both"]) + CLEARLY:
         return "network", f"use the network alone: mIoU {_than(scores, 'network', 'both')}"

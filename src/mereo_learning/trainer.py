@@ -235,17 +235,15 @@ class Trainer:
         if not (due and self.config.holdout):
             return
         with self._no_step(), meeting(self.process):
-            if self.log is not None:
-                self._validate(self.log)
-
-    def _validate(self, log: MetricsLog) -> None:
-        self._update_codes()
-        scores = validate(self.average, self.data, self.config)
-        log.add_validation(self.step, scores.iou, scores.miou)
-        if self.data.further:
-            scores = validate(self.average, self.data, self.config, further=True)
-            log.add_validation(self.step, scores.iou, scores.miou, "sensor")
-        self.say(f"held-out examples at step {self.step}: {log.summary()}")
+            if self.log is None:
+                return
+            self._update_codes()
+            scores = validate(self.average, self.data, self.config)
+            self.log.add_validation(self.step, scores.iou, scores.miou)
+            if self.data.further:
+                scores = validate(self.average, self.data, self.config, further=True)
+                self.log.add_validation(self.step, scores.iou, scores.miou, "sensor")
+            self.say(f"held-out examples at step {self.step}: {self.log.summary()}")
 
     def save(self, finished: bool = False) -> None:
         """Write metrics, curves, the weights and the checkpoint; every file atomically.

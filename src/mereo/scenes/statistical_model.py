@@ -160,6 +160,11 @@ class StatisticalModel:
         return find_symmetries(self.rest, TOLERANCE)
 
     @property
+    def swaps(self) -> tuple[tuple[int, ...], ...]:
+        """Exchanges of segments that no frame tells from the rest pose: for each segment the one in its place."""
+        return tuple(tuple(i for i in each.lands_on if i is not None) for each in self.symmetries if each.swaps)
+
+    @property
     def count(self) -> int:
         """Number of modes."""
         return self.modes.shape[2]
