@@ -272,7 +272,7 @@ class MeasuredRadii:
     @classmethod
     def of(cls, view: CalibrationView, candidate: Candidate, registration: Registration) -> "MeasuredRadii":
         """Measurement of a registration that was made of a candidate, by weights that are not calibrated."""
-        truth = nearest_truth(registration, view.material(registration.model))
+        truth = nearest_truth(registration.model, registration.material, view.material(registration.model))
         errors = RegistrationErrors.of(registration, truth, seen_points(truth, view.seen, 1.0), 1.0)
         assert registration.optimum is not None and candidate.modes is not None
         misfit = candidate.modes.problem.cloud_misfit(registration.optimum.surface)

@@ -43,13 +43,14 @@ from mereo.scenes.statistical_model import StatisticalModel
 # --- errors of a registration, and their radii ------------------------------------------------------------------------
 
 
-def nearest_truth(registration: Registration, truth: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
-    """Choose the true positions that an answer is nearest to, of those that no frame tells apart.
+def nearest_truth(
+    model: StatisticalModel, answer: Float[np.ndarray, "m 3"], truth: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Choose the true positions of material points that an answer is nearest to, of those that no frame tells apart.
 
     Of an object that looks the same turned, a place of the answer is as right where the true object has its turned
     place. Turns by any angle are not tried, and of a part of the material points the positions are those given.
     """
-    model = registration.model
     if len(truth) < len(model.rest_points):
         return truth
     truths = [truth]
@@ -58,7 +59,7 @@ def nearest_truth(registration: Registration, truth: Float[np.ndarray, "m 3"]) -
             landing = np.array([index for index in symmetry.lands_on if index is not None])
             labels = (landing[model.labels - 1] + 1).astype(np.uint8)
             truths.append(model.weights(transform_points(symmetry.turn, model.rest_points), labels)(truth))
-    return min(truths, key=lambda each: float(np.median(np.linalg.norm(registration.material - each, axis=1))))
+    return min(truths, key=lambda each: float(np.median(np.linalg.norm(answer - each, axis=1))))
 
 
 def seen_points(truth: Float[np.ndarray, "m 3"], cloud: PointCloud, scene_unit: float) -> Bool[np.ndarray, " m"]:
@@ -386,7 +387,7 @@ class AnswerScores:
     def of(
         cls, cases: Sequence[tuple[Int[np.ndarray, "c c"], float]], segmented: bool, swaps: Sequence[Sequence[int]]
     ) -> "AnswerScores":
-        """Scores of a set by the confusion matrix and the seconds of each case; swaps are ``StatisticalModel.swaps``."""
+        """Scores of a set by each case's confusion matrix and seconds; swaps are those of ``StatisticalModel``."""
         each = tuple(intersection_over_union(confusion, segmented) for confusion, _ in cases)
         exchanged = sum(with_segments_exchanged(confusion, swaps) for confusion, _ in cases)
         return cls(
@@ -541,7 +542,7 @@ class Scoring:
         names, colors = segment_names(model)
         registration, errors = candidates.answer.registration, None
         if registration is not None and case.material is not None and case.scene_unit is not None:
-            truth = nearest_truth(registration, case.material(registration.model))
+            truth = nearest_truth(registration.model, registration.material, case.material(registration.model))
             seen = seen_points(truth, case.cloud, case.scene_unit)
             errors = RegistrationErrors.of(registration, truth, seen, case.scene_unit)
         return ScoredCase(

@@ -38,8 +38,8 @@ def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
         **facts,
         "examples": count,
         "definition": f"{CELLS}^3 cell centres of the joint box, kept inside any segment's box enlarged by 50 %; one "
-        "confusion matrix over the set; miou is the mean over the segments without empty space; up to symmetry, segments "
-        "that no frame tells apart are exchanged in an example where that suits the answer",
+        "confusion matrix over the set; miou is the mean over the segments without empty space; up to symmetry, "
+        "segments that no frame tells apart are exchanged in an example where that suits the answer",
         "iou": scores.iou,
         "miou": scores.miou,
         "miou_up_to_symmetry": evaluation.miou_up_to_symmetry,

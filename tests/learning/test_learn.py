@@ -156,10 +156,10 @@ def test_the_example_frame_is_as_long_as_the_object(tmp_path: Path) -> None:
 
 
 def test_bad_scores_come_with_advice_and_good_ones_without() -> None:
-    bad, each = {"iou": 0.5, "miou": 0.1}, {"left": 0.1, "right": None}
+    bad, each = {"iou": 0.5, "miou": 0.1, "miou_up_to_symmetry": 0.1}, {"left": 0.1, "right": None}
     lines = "\n".join(learning.advice_after_training(bad, each, 10.0))
     assert "0.10 is too low to rely on" in lines and "right is the weakest" in lines and "--minutes 30" in lines
-    assert not learning.advice_after_training({**bad, "miou": 0.8}, each, 10.0)
+    assert not learning.advice_after_training({**bad, "miou_up_to_symmetry": 0.8}, each, 10.0)
     assert learning.advice_after_training({**bad, "miou": None, "iou": 0.9}, each, 10.0) == []
 
 

@@ -162,7 +162,8 @@ class StatisticalModel:
     @property
     def swaps(self) -> tuple[tuple[int, ...], ...]:
         """Exchanges of segments that no frame tells from the rest pose: for each segment the one in its place."""
-        return tuple(tuple(i for i in each.lands_on if i is not None) for each in self.symmetries if each.swaps)
+        swaps = (tuple(i for i in each.lands_on if i is not None) for each in self.symmetries if each.swaps)
+        return tuple(dict.fromkeys(swaps))
 
     @property
     def count(self) -> int:
