@@ -3,13 +3,14 @@
     python benchmarks/recognition.py [OBJECT ...] [--views N] [--strangers N] [--seed S] [--calibration-views N]
                                      [--method modes|auto] [--output FOLDER]
 
-For each object, with its shipped weights or a file of weights: the area under the receiver operating characteristic
-(AUROC) by which ``Recognition.strangeness`` tells N clean views of the object from N views of every other shipped
-object, from planes and heaps, from clouds in another unit than is stated, from states with all draws 1.5 times as far,
-and from the object's own views as a network of the preset `tiny` understands them after ten steps; the shares of
-clean and of simulated cameras' views that are "unsure" and refused; and the expected calibration error of the network's
-probabilities as they are and calibrated. Weights without a calibration are calibrated here, on training seeds, and not
-written. Test seeds begin at 1,000,000: tune on others.
+For each object, with its shipped weights, a file of weights, or none (a scene file, meshes): the area under the receiver
+operating characteristic (AUROC) by which ``Recognition.strangeness`` tells N clean views of the object from N views of
+every other shipped object, from planes and heaps, from balls and random points as large as it is, from two of it side
+by side, from the half of its points on one side, from clouds in another unit than is stated, from states with all draws
+1.5 times as far and, with weights, from its own views as a network of the preset `tiny` understands them after ten
+steps; the shares of clean and of simulated cameras' views that are "unsure" and refused; and the expected calibration
+error of the network's probabilities as they are and calibrated. Weights without a calibration are calibrated here, on
+training seeds, and not written. Test seeds begin at 1,000,000: tune on others.
 
 With `--output` each object's row is kept in FOLDER/OBJECT.json as soon as it is measured and FOLDER/table.md has those
 of the objects named, so that a run that was cut off goes on where it was: rows of the same settings are not measured
@@ -31,10 +32,10 @@ import numpy as np
 import torch
 
 from mereo.api.generate import generate
+from mereo.api.objects import load_object
 from mereo.deformation.maps import Deformation
-from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.answer_frame import answer_frame
-from mereo.fitting.registration.recognition import Recognition
+from mereo.fitting.registration.recognition import MOST, Recognition
 from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.metrics import truth_grid
@@ -65,7 +66,10 @@ from mereo_learning.trainer import train
 FACTORS = (25.4, 0.1, 1000.0, 0.0254, 10.0, 1 / 25.4, 0.001, 2.54)
 """Units that are mistaken for each other: inches, millimetres, centimetres, metres."""
 
-KINDS = ("other object", "plane or clutter", "wrong unit", "state beyond", "ten steps")
+KINDS = (
+    *("other object", "plane or clutter", "ball or noise", "two of it", "half of it"),
+    *("wrong unit", "state beyond", "ten steps"),
+)
 
 STEPS, EXAMPLES = 10, 40
 
@@ -98,15 +102,32 @@ def auroc(own: Sequence[float], strange: Sequence[float]) -> float:
     return float((ahead > 0).mean() + 0.5 * (ahead == 0).mean())
 
 
-def said_of(cloud: PointCloud, model: Model, registrar: Registrar, unit_m: float | None = 1.0) -> Recognition:
-    """What `mereo.reconstruct` says of a cloud of this unit; a scene unit is a metre (``registrar_of``)."""
-    return answer_frame(observe(cloud, unit_m=unit_m), model, registrar).recognition
+def said_of(cloud: PointCloud, model: Model | None, registrar: Registrar, unit_m: float | None = 1.0) -> Recognition:
+    """What `mereo.reconstruct` says of a cloud of this unit; a scene unit is a metre (``sized``)."""
+    try:
+        return answer_frame(observe(cloud, unit_m=unit_m), model, registrar).recognition
+    except ValueError as error:  # nothing is found, and no network answers
+        return Recognition(False, str(error), MOST)
 
 
-def registrar_of(model: Model, method: AnswerMethod, scene: Scene) -> Registrar:
+def sized(registrar: Registrar) -> Registrar:
     """Registrar of an object whose scene unit is said to be a metre, so that the unit of its views is known."""
-    own = Registrar.of(model, method, scene)
-    return replace(own, model=replace(own.model, source_frame=SourceFrame(np.eye(4), 1.0)))
+    return replace(registrar, model=replace(registrar.model, source_frame=SourceFrame(np.eye(4), 1.0)))
+
+
+def clouds_like(own: Sequence[PointCloud], seed: int) -> Iterator[tuple[str, PointCloud]]:
+    """Clouds made of views of the object, or as large as them, that do not show it whole and alone."""
+    for index, cloud in enumerate(own):
+        rng, points = example_rng(seed + 5, index), cloud.points
+        middle, size = points.mean(axis=0), float(np.ptp(points, axis=0).max())
+        across = int(np.ptp(points, axis=0)[:2].argmax())  # of the picture, not along the rays
+        ball = rng.normal(size=points.shape)
+        ball *= size / 2 / np.linalg.norm(ball, axis=1, keepdims=True)
+        noise = rng.uniform(-size / 2, size / 2, points.shape)
+        beside = points + 1.1 * size * np.eye(3)[across]
+        yield "ball or noise", PointCloud(middle + (ball[ball[:, 2] < 0] if index % 2 else noise))
+        yield "two of it", PointCloud(np.concatenate([points, beside]))
+        yield "half of it", PointCloud(points[points[:, across] < np.median(points[:, across])])
 
 
 ATTEMPTS = 50
@@ -204,11 +225,18 @@ def barely_trained(scene: Scene, folder: Path) -> Model:
 
 def measured(name: str, arguments: argparse.Namespace) -> Found:
     """All frames of one object."""
-    model = load_model(name)
-    scene = load_scene(arguments.scene or trained_scene(model))
-    if model.calibration is None:
-        model = replace(model, calibration=calibrate(model, scene, views=arguments.calibration_views, quiet=False))
-    registrar, unsized = registrar_of(model, arguments.method, scene), Registrar.of(model, arguments.method, scene)
+    thing = load_object(name)
+    model = thing.network
+    assert model is None or isinstance(model, Model)
+    if model is None:
+        assert thing.scene is not None and thing.model is not None
+        scene, unsized = thing.scene, Registrar(None, thing.model, given=thing.scene)
+    else:
+        scene = load_scene(arguments.scene or trained_scene(model))
+        if model.calibration is None:
+            model = replace(model, calibration=calibrate(model, scene, views=arguments.calibration_views, quiet=False))
+        unsized = Registrar.of(model, arguments.method, scene)
+    registrar = sized(unsized)
     found, seed = Found(), arguments.seed
     views = list(object_views(scene, 2 * arguments.views, seed))
     clean = [view for view in views if view.is_clean]
@@ -219,11 +247,15 @@ def measured(name: str, arguments: argparse.Namespace) -> Found:
         found.strange["wrong unit"].append(said_of(wrong, model, registrar))
     for kind, cloud in strange_frames(scene, other_objects(scene), arguments.strangers, seed):
         found.strange[kind].append(said_of(cloud, model, unsized, unit_m=None))
+    for kind, cloud in clouds_like([view.seen for view in clean], seed):
+        found.strange[kind].append(said_of(cloud, model, registrar))
     for cloud in clouds_beyond(scene, arguments.views, seed):
         found.strange["state beyond"].append(said_of(cloud, model, registrar))
+    if model is None:
+        return found
     with TemporaryDirectory() as folder:
         poor = barely_trained(scene, Path(folder))
-        of_poor = registrar_of(poor, "modes", scene)
+        of_poor = sized(Registrar.of(poor, "modes", scene))
         found.strange["ten steps"] = [said_of(view.seen, poor, of_poor) for view in clean]
     found.ece = calibration_error(model, clean)
     return found
