@@ -3,14 +3,14 @@
     python benchmarks/recognition.py [OBJECT ...] [--views N] [--strangers N] [--seed S] [--calibration-views N]
                                      [--method modes|auto] [--output FOLDER]
 
-For each object, with its shipped weights, a file of weights, or none (a scene file, meshes): the area under the receiver
-operating characteristic (AUROC) by which ``Recognition.strangeness`` tells N clean views of the object from N views of
-every other shipped object, from planes and heaps, from balls and random points as large as it is, from two of it side
-by side, from the half of its points on one side, from clouds in another unit than is stated, from states with all draws
-1.5 times as far and, with weights, from its own views as a network of the preset `tiny` understands them after ten
-steps; the shares of clean and of simulated cameras' views that are "unsure" and refused; and the expected calibration
-error of the network's probabilities as they are and calibrated. Weights without a calibration are calibrated here, on
-training seeds, and not written. Test seeds begin at 1,000,000: tune on others.
+For each object, with its shipped weights, a file of weights, or none (a scene file, meshes): the area under the
+receiver operating characteristic (AUROC) by which ``Recognition.strangeness`` tells N clean views of the object from
+N views of every other shipped object, from planes and heaps, from balls and random points as large as it is, from two
+of it side by side, from the half of its points on one side, from clouds in another unit than is stated, from states
+with all draws 1.5 times as far and, with weights, from its own views as a network of the preset `tiny` understands
+them after ten steps; the shares of clean and of simulated cameras' views that are "unsure" and refused; and the
+expected calibration error of the network's probabilities as they are and calibrated. Weights without a calibration
+are calibrated here, on training seeds, and not written. Test seeds begin at 1,000,000: tune on others.
 
 With `--output` each object's row is kept in FOLDER/OBJECT.json as soon as it is measured and FOLDER/table.md has those
 of the objects named, so that a run that was cut off goes on where it was: rows of the same settings are not measured
