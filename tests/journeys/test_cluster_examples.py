@@ -70,11 +70,6 @@ def objects() -> Iterator[tuple[Path, dict[str, Any]]]:
             yield file, item
 
 
-def test_all_files_are_checked() -> None:
-    assert {path.name for path in FOLDER.iterdir()} == {path.name for path in (*SCRIPTS, *FILES)}
-    assert len(SCRIPTS) == len(FILES) == 2
-
-
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.name)
 def test_scripts_are_shell(script: Path) -> None:
     bash = shutil.which("bash")
