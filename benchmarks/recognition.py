@@ -20,7 +20,7 @@ import argparse
 import json
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -31,6 +31,7 @@ import numpy as np
 import torch
 
 from mereo.api.generate import generate
+from mereo.deformation.maps import Deformation
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.recognition import Recognition
@@ -41,7 +42,7 @@ from mereo.io.atomic_files import atomic_file
 from mereo.models.model import Model
 from mereo.models.weights import load_model
 from mereo.reconstruction.observation import observe
-from mereo.scenes.draw_recorder import with_farther_states
+from mereo.scenes.draw_recorder import OutOfDraws, Recorder
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene, SourceFrame
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
@@ -106,6 +107,83 @@ def registrar_of(model: Model, method: AnswerMethod, scene: Scene) -> Registrar:
     """Registrar of an object whose scene unit is said to be a metre, so that the unit of its views is known."""
     own = Registrar.of(model, method, scene)
     return replace(own, model=replace(own.model, source_frame=SourceFrame(np.eye(4), 1.0)))
+
+
+ATTEMPTS = 50
+"""States that are drawn before giving up on a scene that refuses what is beyond its bounds."""
+
+MOST_CALLS = 20_000
+"""Calls of the generator after which a scene that draws again and again has refused."""
+
+
+FULL_TURN = 2 * np.pi
+"""Width of an interval of angles that has no end."""
+
+
+class FartherDraws(Recorder):
+    """Generator whose numbers lie beyond what they are drawn from.
+
+    A uniform or triangular number lies farther from the middle (the mode) than its bound does, by a factor: on the side
+    on which it was drawn, or, of an interval on one side of zero, on that which is away from zero. A normal one is the
+    factor times as far from the mean. Directions of a full turn stay.
+    """
+
+    def __init__(self, seed: int, factor: float) -> None:
+        super().__init__(seed, {}, MOST_CALLS)
+        self.factor = factor
+
+    def _beyond(self, values: Any, low: Any, middle: Any, high: Any) -> Any:
+        drawn, low, middle, high = (np.asarray(value, dtype=float) for value in (values, low, middle, high))
+        upwards = np.where(low >= 0, True, np.where(high <= 0, False, drawn >= middle))
+        return middle + self.factor * (np.where(upwards, high, low) - middle)
+
+    def uniform(self, low: Any = 0.0, high: Any = 1.0, size: Any = None) -> Any:
+        """Numbers beyond an interval."""
+        drawn = super().uniform(low, high, size)
+        low, high = np.minimum(low, high), np.maximum(low, high)
+        beyond = self._beyond(drawn, low, (low + high) / 2, high)
+        return _plain_value(np.where(np.isclose(high - low, FULL_TURN), drawn, beyond))
+
+    def normal(self, loc: Any = 0.0, scale: Any = 1.0, size: Any = None) -> Any:
+        """Normal numbers of a greater standard deviation."""
+        middle = np.asarray(loc, dtype=float)
+        return _plain_value(middle + self.factor * (np.asarray(super().normal(loc, scale, size)) - middle))
+
+    def standard_normal(self, size: Any = None, dtype: Any = np.float64, out: Any = None) -> Any:
+        """Normal numbers of mean 0 and the factor as their standard deviation."""
+        return _plain_value(self.factor * np.asarray(super().standard_normal(size, dtype, out)))
+
+    def triangular(self, left: Any, mode: Any, right: Any, size: Any = None) -> Any:
+        """Numbers beyond the bounds of a triangular distribution."""
+        return _plain_value(self._beyond(super().triangular(left, mode, right, size), left, mode, right))
+
+
+def _plain_value(values: Any) -> Any:
+    """A single number as numpy's generators return it."""
+    return values if np.ndim(values) else float(values)
+
+
+def with_farther_states(scene: Scene, factor: float) -> Scene:
+    """The scene with all its draws ``factor`` times as far from their middle as their bounds.
+
+    Its ``sample_deformations`` raises ``ValueError`` where the scene refuses ``ATTEMPTS`` such states.
+    """
+    return replace(scene, sample_deformations=_farther_sampler(scene, factor))
+
+
+def _farther_sampler(scene: Scene, factor: float) -> Callable[[np.random.Generator], tuple[Deformation, ...]]:
+    def sample(rng: np.random.Generator) -> tuple[Deformation, ...]:
+        for _ in range(ATTEMPTS):
+            try:
+                return scene.sample_deformations(FartherDraws(int(rng.integers(2**31)), factor))
+            except (OutOfDraws, ValueError):
+                continue
+        raise ValueError(
+            f"the scene {scene.name!r} allows no state with its draws {factor:g} times as far from their middle as "
+            "their bounds: take a smaller factor"
+        )
+
+    return sample
 
 
 def clouds_beyond(scene: Scene, count: int, seed: int) -> Iterator[PointCloud]:

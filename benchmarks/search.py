@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from occluded_views import Cut, occlude
 
 from mereo.api.objects import Object, load_object
 from mereo.fitting.config import AnswerMethod
@@ -40,7 +41,6 @@ from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis.config import OBSERVATIONS, GenerateConfig
 from mereo.synthesis.examples import sample_view
-from mereo.synthesis.occluded_views import Cut, occlude
 
 OBJECTS = ("bunny", "engine", "human", "liver", "lizard", "robot", "rope", "shapes", "sheet", "skull", "tumor")
 

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import chain
 from typing import Any, Literal
 
 import numpy as np
@@ -41,7 +40,7 @@ from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor
 from mereo.synthesis.depth_sensor import observe as observe_scene
 from mereo.synthesis.examples import sample_view
-from mereo_learning.cases import RegistrationErrors, Reliability, sample_cells, seen_points
+from mereo_learning.cases import RegistrationErrors, Reliability, nearest_truth, sample_cells, seen_points
 from mereo_learning.scoring import check_names, trained_scene, true_material
 
 SEED = 900_000
@@ -90,9 +89,8 @@ def calibrate(
     others = other_objects(scene) if each else []
     logits, truth, signs = [], [], RecognitionSigns()
     radii = ViewRadii() if registrar is None else ViewRadii(replace(registrar, method="auto"))
-    every_view = chain(object_views(scene, views, seed), clean_views(scene, more, seed, first=views))
     with progress("calibrate", views + more + each * (len(others) + 8), "views", quiet=quiet) as shown:
-        for number, view in enumerate(every_view):
+        for number, view in enumerate(object_views(scene, views, seed, more)):
             answer = answer_frame(observe(view.seen), bare, registrar, scene_unit=view.scene_unit)
             radii.add(view, answer)
             if number < views:
@@ -121,8 +119,6 @@ def calibrate(
 
 
 # --- views ------------------------------------------------------------------------------------------------------------
-
-# Views that weights are calibrated with: the object as cameras see it, clean and noisy, and what is not it.
 
 CAMERAS: tuple[Sensor, ...] = ("paper", "structured-light", "paper", "time-of-flight")
 """Cameras of the views, in turn: half of them clean."""
@@ -153,22 +149,13 @@ class CalibrationView:
         return self.camera == "paper"
 
 
-def object_views(scene: Scene, count: int, seed: int) -> Iterator[CalibrationView]:
-    """Views of a scene; view i is made from (seed, i) alone."""
-    for index in range(count):
-        scene_unit = 1.0 if index // len(CAMERAS) % 2 == 0 else None
-        yield _object_view(scene, seed, index, CAMERAS[index % len(CAMERAS)], scene_unit)
-
-
-def clean_views(scene: Scene, count: int, seed: int, first: int) -> Iterator[CalibrationView]:
-    """Views of a scene by the paper's camera, with the unit known, from view ``first`` on."""
-    for index in range(first, first + count):
-        yield _object_view(scene, seed, index, "paper", 1.0)
-
-
-def _object_view(scene: Scene, seed: int, index: int, camera: Sensor, scene_unit: float | None) -> CalibrationView:
-    view = sample_view(scene.for_seed(seed), GenerateConfig(sensor=SENSORS[camera]), example_rng(seed, index))
-    return CalibrationView(view.mesh, view.depth.to_points(), camera, scene_unit, partial(true_material, view))
+def object_views(scene: Scene, count: int, seed: int, clean: int = 0) -> Iterator[CalibrationView]:
+    """Views of a scene, then ``clean`` by the paper's camera, the unit known; view i is made from (seed, i) alone."""
+    for index in range(count + clean):
+        camera = CAMERAS[index % len(CAMERAS)] if index < count else "paper"
+        scene_unit = 1.0 if index // len(CAMERAS) % 2 == 0 or index >= count else None
+        view = sample_view(scene.for_seed(seed), GenerateConfig(sensor=SENSORS[camera]), example_rng(seed, index))
+        yield CalibrationView(view.mesh, view.depth.to_points(), camera, scene_unit, partial(true_material, view))
 
 
 def strange_frames(
@@ -256,8 +243,6 @@ def _most_likely(logits: Float[np.ndarray, "n c"], truth: UInt8[np.ndarray, " n"
 
 # --- radii ------------------------------------------------------------------------------------------------------------
 
-# Factors with which 95 % of the true positions lie within the radii that the posterior of a fit gives.
-
 FIELDS = (
     ("radius_scale", "usual_misfit", "usual_displaced", "noisy_radius_scale"),
     ("draws_radius_scale", "draws_usual_misfit", "draws_usual_displaced", "noisy_draws_radius_scale"),
@@ -287,7 +272,7 @@ class MeasuredRadii:
     @classmethod
     def of(cls, view: CalibrationView, candidate: Candidate, registration: Registration) -> "MeasuredRadii":
         """Measurement of a registration that was made of a candidate, by weights that are not calibrated."""
-        truth = view.material(registration.model)
+        truth = nearest_truth(registration, view.material(registration.model))
         errors = RegistrationErrors.of(registration, truth, seen_points(truth, view.seen, 1.0), 1.0)
         assert registration.optimum is not None and candidate.modes is not None
         misfit = candidate.modes.problem.cloud_misfit(registration.optimum.surface)
@@ -352,8 +337,6 @@ def factors_of(views: Sequence[MeasuredRadii]) -> RadiusFactors:
 
 
 # --- recognition ------------------------------------------------------------------------------------------------------
-
-# What is usual of the object's views, and how strange a frame may be.
 
 MEASURED: tuple[SignName, ...] = tuple(name for name in LEAST_SIGNS if name != "size")
 """Signs that are measured; what is usual of the size follows from how far units are apart."""

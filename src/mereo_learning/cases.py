@@ -25,8 +25,15 @@ from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import Color
-from mereo.geometry.metrics import Scores, TruthGrid, grid_confusion, intersection_over_union
+from mereo.geometry.metrics import (
+    Scores,
+    TruthGrid,
+    grid_confusion,
+    intersection_over_union,
+    with_segments_exchanged,
+)
 from mereo.geometry.solids import label_grid
+from mereo.geometry.transforms import transform_points
 from mereo.models.trained import EncodedCloud, Trained
 from mereo.reconstruction.isosurfaces import sample_coarse_to_fine
 from mereo.reconstruction.observation import observe
@@ -35,9 +42,23 @@ from mereo.scenes.statistical_model import StatisticalModel
 
 # --- errors of a registration, and their radii ------------------------------------------------------------------------
 
-# Coverage: how often true positions lie within the radii of a registration, and the factor with which 95 % of them do.
-#
-# Registration, truth -RegistrationErrors.of-> errors of each view -together, scale-> Calibration.radius_scale
+
+def nearest_truth(registration: Registration, truth: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
+    """Choose the true positions that an answer is nearest to, of those that no frame tells apart.
+
+    Of an object that looks the same turned, a place of the answer is as right where the true object has its turned
+    place. Turns by any angle are not tried, and of a part of the material points the positions are those given.
+    """
+    model = registration.model
+    if len(truth) < len(model.rest_points):
+        return truth
+    truths = [truth]
+    for symmetry in model.symmetries:
+        if symmetry.angle is not None and None not in symmetry.lands_on:
+            landing = np.array([index for index in symmetry.lands_on if index is not None])
+            labels = (landing[model.labels - 1] + 1).astype(np.uint8)
+            truths.append(model.weights(transform_points(symmetry.turn, model.rest_points), labels)(truth))
+    return min(truths, key=lambda each: float(np.median(np.linalg.norm(registration.material - each, axis=1))))
 
 
 def seen_points(truth: Float[np.ndarray, "m 3"], cloud: PointCloud, scene_unit: float) -> Bool[np.ndarray, " m"]:
@@ -163,8 +184,6 @@ def _quantile(values: Float[np.ndarray, " n"], share: float, factor: float | Non
 
 # --- reliability of probabilities -------------------------------------------------------------------------------------
 
-# Reliability of probabilities: how often answers that are given with so much confidence are right.
-#
 # The expected calibration error (Naeini et al., AAAI 2015; Guo et al., ICML 2017) is the mean distance of the share of
 # right answers from their confidence, over bins of equal width, weighed by how many answers fall into each. Confidence
 # is the probability of the answered label, over the cells of the paper's metric (``geometry.metrics``).
@@ -191,14 +210,10 @@ class Reliability:
     """Answers counted by their confidence.
 
     Attributes:
-        count: of answers in each bin.
-        confidence: sum of theirs.
-        right: how many are right.
+        bins: of each bin how many answers it has, the sum of their confidence, and how many are right.
     """
 
-    count: Float[np.ndarray, " b"] = field(default_factory=lambda: np.zeros(BINS))
-    confidence: Float[np.ndarray, " b"] = field(default_factory=lambda: np.zeros(BINS))
-    right: Float[np.ndarray, " b"] = field(default_factory=lambda: np.zeros(BINS))
+    bins: Float[np.ndarray, "3 b"] = field(default_factory=lambda: np.zeros((3, BINS)))
 
     @classmethod
     def of_view(cls, model: Trained, code: EncodedCloud, truth: TruthGrid) -> "Reliability":
@@ -212,31 +227,23 @@ class Reliability:
     def add(self, confidence: Float[np.ndarray, " n"], right: Bool[np.ndarray, " n"]) -> None:
         """Count further answers, by the probability of what was answered and whether that is right."""
         index = np.minimum((confidence * BINS).astype(np.int64), BINS - 1)
-        self.count += np.bincount(index, minlength=BINS)
-        self.confidence += np.bincount(index, weights=confidence, minlength=BINS)
-        self.right += np.bincount(index, weights=right, minlength=BINS)
-
-    def add_all(self, other: "Reliability") -> None:
-        """Count what another one has counted."""
-        self.count += other.count
-        self.confidence += other.confidence
-        self.right += other.right
+        weights = (np.ones(len(index)), confidence, right)
+        self.bins += [np.bincount(index, weights=each, minlength=BINS) for each in weights]
 
     @property
     def ece(self) -> float:
         """Expected calibration error, 0 to 1; NaN without answers."""
-        total = self.count.sum()
-        return float(np.abs(self.right - self.confidence).sum() / total) if total else float("nan")
+        count, confidence, right = self.bins
+        total = count.sum()
+        return float(np.abs(right - confidence).sum() / total) if total else float("nan")
 
     def facts(self) -> list[dict[str, Any]]:
         """Bins that have answers: their share of all, mean confidence and share of right ones."""
+        total, filled = self.bins[0].sum(), self.bins[:, self.bins[0] > 0]
+        names = ("share", "confidence", "right")
         return [
-            {
-                "share": float(self.count[i] / self.count.sum()),
-                "confidence": float(self.confidence[i] / self.count[i]),
-                "right": float(self.right[i] / self.count[i]),
-            }
-            for i in np.flatnonzero(self.count)
+            dict(zip(names, map(float, row), strict=True))
+            for row in zip(filled[0] / total, filled[1] / filled[0], filled[2] / filled[0], strict=True)
         ]
 
 
@@ -334,8 +341,6 @@ def names_for(registrar: Registrar | None) -> tuple[AnswerName, ...]:
 
 # --- results of a test set --------------------------------------------------------------------------------------------
 
-# Result of a test set: scores of the answer that a user gets, and of each that could have answered.
-
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedView:
@@ -368,17 +373,28 @@ class AnswerScores:
         confusion: points by true (row) and predicted (column) label, summed over the set.
         examples: scores of each test case, in order.
         seconds: of each, from the cloud to the answer.
+        miou_up_to_symmetry: mIoU of the set with segments exchanged that no frame tells apart, in each case as it suits
+            the answer; where there are none such, the mIoU.
     """
 
     confusion: Int[np.ndarray, "c c"]
     examples: tuple[Scores, ...]
     seconds: tuple[float, ...]
+    miou_up_to_symmetry: float
 
     @classmethod
-    def of(cls, cases: Sequence[tuple[Int[np.ndarray, "c c"], float]], segmented: bool) -> "AnswerScores":
-        """Scores of a set by the confusion matrix and the seconds of each case."""
+    def of(
+        cls, cases: Sequence[tuple[Int[np.ndarray, "c c"], float]], segmented: bool, swaps: Sequence[Sequence[int]]
+    ) -> "AnswerScores":
+        """Scores of a set by the confusion matrix and the seconds of each case; swaps are ``StatisticalModel.swaps``."""
         each = tuple(intersection_over_union(confusion, segmented) for confusion, _ in cases)
-        return cls(np.sum([confusion for confusion, _ in cases], axis=0), each, tuple(seconds for _, seconds in cases))
+        exchanged = sum(with_segments_exchanged(confusion, swaps) for confusion, _ in cases)
+        return cls(
+            np.sum([confusion for confusion, _ in cases], axis=0),
+            each,
+            tuple(seconds for _, seconds in cases),
+            intersection_over_union(np.asarray(exchanged), segmented).miou,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -399,6 +415,7 @@ class Evaluation:
         reliability: of the network's probabilities.
         calibrated: whether these are.
         seconds: of each example, from the cloud to the answer that a user gets.
+        miou_up_to_symmetry: as in ``AnswerScores``.
     """
 
     names: tuple[str, ...]
@@ -414,6 +431,7 @@ class Evaluation:
     reliability: Reliability = field(default_factory=Reliability)
     calibrated: bool = False
     seconds: tuple[float, ...] = ()
+    miou_up_to_symmetry: float = float("nan")
 
     def __repr__(self) -> str:
         scores, count = self.scores, counted(len(self.examples), "example")
@@ -511,7 +529,7 @@ class Scoring:
         """Model and registrar on the device of whoever scores, moved there once."""
         if not self.gpu:
             return self.model, self.registrar
-        from mereo.models.remote import to_gpu  # needs torch, and results do not
+        from mereo.models.weights import to_gpu  # needs torch, and results do not
 
         model = to_gpu(self.model)
         return model, None if self.registrar is None else self.registrar.asking(model)
@@ -521,6 +539,11 @@ class Scoring:
         case, (model, registrar) = self.case(index), self.moved
         candidates = find_candidates(model, case.cloud, case.truth.grid, registrar, case.scene_unit)
         names, colors = segment_names(model)
+        registration, errors = candidates.answer.registration, None
+        if registration is not None and case.material is not None and case.scene_unit is not None:
+            truth = nearest_truth(registration, case.material(registration.model))
+            seen = seen_points(truth, case.cloud, case.scene_unit)
+            errors = RegistrationErrors.of(registration, truth, seen, case.scene_unit)
         return ScoredCase(
             name=case.name,
             each={
@@ -533,19 +556,11 @@ class Scoring:
             default=candidates.default,
             source=candidates.source,
             reliability=Reliability.of_view(model, candidates.code, case.truth),
-            errors=_errors(case, candidates.answer.registration),
+            errors=errors,
             view=_evaluated_view(case, model, candidates, colors) if index < self.kept else None,
             known=candidates.known,
             seconds=candidates.seconds,
         )
-
-
-def _errors(case: TestCase, registration: Registration | None) -> RegistrationErrors | None:
-    if registration is None or case.material is None or case.scene_unit is None:
-        return None
-    truth = case.material(registration.model)
-    seen = seen_points(truth, case.cloud, case.scene_unit)
-    return RegistrationErrors.of(registration, truth, seen, case.scene_unit)
 
 
 def _evaluated_view(case: TestCase, model: Trained, candidates: Candidates, colors: Sequence[Color]) -> EvaluatedView:
@@ -563,22 +578,23 @@ def _evaluated_view(case: TestCase, model: Trained, candidates: Candidates, colo
 
 def evaluation_of(model: Trained, cases: Sequence[ScoredCase], answers: Sequence[AnswerName]) -> Evaluation:
     """Result of a test set from its cases, in order, which all have these answers."""
-    scores = AnswerScores.of([case.each[case.default] for case in cases], model.segmented)
+    swaps = () if model.statistical_model is None else model.statistical_model.swaps
+    scores = AnswerScores.of([case.each[case.default] for case in cases], model.segmented, swaps)
     errors = [case.errors for case in cases if case.errors is not None]
-    reliability = Reliability()
-    for case in cases:
-        reliability.add_all(case.reliability)
     return Evaluation(
         names=segment_names(model)[0],
         confusion=scores.confusion,
         examples={case.name: example for case, example in zip(cases, scores.examples, strict=True)},
         views=tuple(case.view for case in cases if case.view is not None),
         segmented=model.segmented,
-        answers={name: AnswerScores.of([case.each[name] for case in cases], model.segmented) for name in answers},
+        answers={
+            name: AnswerScores.of([case.each[name] for case in cases], model.segmented, swaps) for name in answers
+        },
         sources=tuple(case.source for case in cases),
         known=tuple(case.known for case in cases if case.known is not None),
         errors=RegistrationErrors.together(errors) if errors else None,
-        reliability=reliability,
+        reliability=Reliability(np.sum([case.reliability.bins for case in cases], axis=0)),
         calibrated=model.calibrates,
         seconds=tuple(case.seconds for case in cases),
+        miou_up_to_symmetry=scores.miou_up_to_symmetry,
     )

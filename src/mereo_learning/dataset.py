@@ -9,8 +9,8 @@ Notation: e examples, b of them in a batch, p stored points, n points that the n
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -46,13 +46,13 @@ class Draws:
     """
 
     rng: torch.Generator
-    batch: int | None = None
-    rows: slice = field(default_factory=lambda: slice(None))
+    batch: int | None
+    rows: slice
 
     @classmethod
-    def of(cls, seed: int, batch: int | None = None, rows: slice | None = None) -> "Draws":
+    def of(cls, seed: int, batch: int | None = None, rows: slice = slice(None)) -> "Draws":
         """Numbers of a seed, for these ``rows`` of a ``batch`` or for a whole one."""
-        return cls(torch.Generator().manual_seed(seed), batch, slice(None) if rows is None else rows)
+        return cls(torch.Generator().manual_seed(seed), batch, rows)
 
     def rand(self, count: int, *shape: int) -> Float[Tensor, "b *s"]:
         """Uniform numbers in [0, 1), so many for each example."""
@@ -171,7 +171,7 @@ Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Lower and upper corner."""
 
 Tensors = dict[str, Tensor]
-"""Examples by the names of a shard's tensors (``dataset_contents.SHARD`` and ``OBSERVED``)."""
+"""Examples by the names of a shard's tensors (``shards.SHARD`` and ``OBSERVED``)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +211,6 @@ class Dataset:
                 f"{directory} holds {have} of {manifest['examples']} examples; training needs all of them: "
                 "finish it with mereo generate ... --resume"
             )
-        _check_alike(shards)
         with _part_of_dataset(directory / TEMPLATE):
             template = torch.from_numpy(read_template(directory / TEMPLATE, manifest)).float()
         model = directory / STATISTICAL_MODEL
@@ -309,28 +308,18 @@ class Dataset:
         return augment_batch(batch, augment, draws)
 
 
-class ShuffledOrder:
-    """Order in which examples are learnt from: a permutation for each pass, by its seed and number alone.
+def shuffled_index(step: int, examples: int, batch: int, seed: int) -> Int[Tensor, " b"]:
+    """Numbers of the examples in the batch of a step: by a permutation for each pass, by its seed and number alone.
 
     So resuming needs no state. A batch may straddle two passes.
     """
+    positions = range(step * batch, (step + 1) * batch)
+    return torch.stack([_shuffled(p // examples, examples, seed)[p % examples] for p in positions])
 
-    def __init__(self, examples: int, batch: int, seed: int) -> None:
-        self.examples, self.batch, self.seed = examples, batch, seed
-        self.passes: dict[int, Tensor] = {}
 
-    def index(self, step: int) -> Int[Tensor, " b"]:
-        """Numbers of the examples in the batch of a step."""
-        positions = range(step * self.batch, (step + 1) * self.batch)
-        return torch.stack([self._pass(p // self.examples)[p % self.examples] for p in positions])
-
-    def _pass(self, number: int) -> Tensor:
-        """The shuffled examples of a pass; the two latest are kept."""
-        if number not in self.passes:
-            rng = torch.Generator().manual_seed(seed_of(self.seed, number, PASS))
-            kept = {n: order for n, order in self.passes.items() if n == number - 1}
-            self.passes = kept | {number: torch.randperm(self.examples, generator=rng)}
-        return self.passes[number]
+@lru_cache(maxsize=4)
+def _shuffled(number: int, examples: int, seed: int) -> Int[Tensor, " e"]:
+    return torch.randperm(examples, generator=torch.Generator().manual_seed(seed_of(seed, number, PASS)))
 
 
 def _observed_clouds(
@@ -352,19 +341,6 @@ def _open_shard(path: Place, manifest: Mapping[str, Any]) -> Tensors:
     names = SHARD | (OBSERVED if OBSERVED.keys() <= checked.keys() else {})
     tensors = load_file(path) if isinstance(path, Path) else {n: torch.from_numpy(v) for n, v in checked.items()}
     return {name: tensors[name] for name in names}
-
-
-def _check_alike(shards: Mapping[Place, Tensors]) -> None:
-    """Raise ``ValueError`` where examples of different shards cannot be in one batch."""
-    shapes = {path: {name: tuple(v.shape[1:]) for name, v in tensors.items()} for path, tensors in shards.items()}
-    first = next(iter(shapes.values()))
-    for path, each in shapes.items():
-        for name in first.keys() | each.keys():
-            if each.get(name) != first.get(name):
-                raise ValueError(
-                    f"{path} has the shape {each.get(name)} of {name!r} in an example, the first shard "
-                    f"{first.get(name)}; they must be equal: delete it and run mereo generate ... --resume"
-                )
 
 
 @contextmanager

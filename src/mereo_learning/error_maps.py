@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 
 from mereo.geometry.camera import PointCloud, camera_axes
@@ -240,58 +241,30 @@ def voxel_triangles(
     Normals are those of the smoothed occupancy, so that a curved body does not look like a staircase.
     """
     padded = np.pad(grid, 1)
-    cells, axes, signs = _exposed_faces(padded > 0)
-    quads = _quad_corners(cells, axes, signs)
+    occupied = padded > 0
+    faces_of: list[tuple[np.ndarray, ...]] = []
+    for axis, sign in product(range(3), (-1, 1)):
+        exposed = np.argwhere(occupied & ~np.roll(occupied, -sign, axis=axis))
+        corners = np.zeros((4, 3))  # counter-clockwise from outside
+        corners[:, axis] = 0.5 * sign
+        corners[:, (axis + 1) % 3] = np.array([-0.5, 0.5, 0.5, -0.5]) * sign
+        corners[:, (axis + 2) % 3] = [-0.5, -0.5, 0.5, 0.5]
+        faces_of.append((exposed, exposed[:, None] + corners, np.tile(sign * np.eye(3)[axis], (len(exposed), 1))))
+    cells, quads, flat = (np.concatenate(column) for column in zip(*faces_of, strict=True))
     vertices = origin + (quads.reshape(-1, 3) - 1) * spacing
     first = 4 * np.arange(len(cells))[:, None]
     faces = np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])], axis=1).reshape(-1, 3)
     value = padded[tuple(cells.T)].astype(np.int64)
-    normals = _smooth_normals(padded > 0, quads.mean(axis=1), axes, signs, spacing)
+    # normals: the unit gradient of the blurred occupancy, or the face's own where that vanishes
+    blurred = gaussian_filter(occupied.astype(np.float32), 1.5)
+    index = tuple(np.clip(np.rint(quads.mean(axis=1)).astype(int), 0, np.asarray(occupied.shape) - 1).T)
+    normals = np.stack([-slope[index] for slope in np.gradient(blurred)], axis=1) / spacing
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.where(length > 1e-6 / np.min(spacing), normals / np.maximum(length, 1e-30), flat)
     twice = np.repeat(np.arange(len(cells)), 2)
     return Triangles(
         vertices, faces, colors[value - 1][twice], np.repeat(normals[twice, None], 3, axis=1), value[twice]
     )
-
-
-def _exposed_faces(
-    occupied: Bool[np.ndarray, "x y z"],
-) -> tuple[Int[np.ndarray, "n 3"], Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-    """Voxel, axis and side (-1, 1) of every face next to empty space; the border must be empty."""
-    faces = []
-    for axis in range(3):
-        for sign in (-1, 1):
-            cells = np.argwhere(occupied & ~np.roll(occupied, -sign, axis=axis))
-            faces.append((cells, np.full(len(cells), axis), np.full(len(cells), sign)))
-    cells, axes, signs = (np.concatenate(column) for column in zip(*faces, strict=True))
-    return cells, axes, signs
-
-
-def _quad_corners(
-    cells: Int[np.ndarray, "n 3"], axes: Int[np.ndarray, " n"], signs: Int[np.ndarray, " n"]
-) -> Float[np.ndarray, "n 4 3"]:
-    """Corners of each face in grid coordinates, voxel centres at whole numbers, counter-clockwise from outside."""
-    row = np.arange(len(cells))
-    corners = np.repeat(cells[:, None].astype(float), 4, axis=1)
-    corners[row, :, axes] += 0.5 * signs[:, None]
-    corners[row, :, (axes + 1) % 3] += np.array([-0.5, 0.5, 0.5, -0.5]) * signs[:, None]
-    corners[row, :, (axes + 2) % 3] += np.array([-0.5, -0.5, 0.5, 0.5])
-    return corners
-
-
-def _smooth_normals(
-    occupied: Bool[np.ndarray, "x y z"],
-    places: Float[np.ndarray, "n 3"],
-    axes: Int[np.ndarray, " n"],
-    signs: Int[np.ndarray, " n"],
-    spacing: Float[np.ndarray, "3"],
-) -> Float[np.ndarray, "n 3"]:
-    """Unit gradient of the blurred occupancy at each face, or the face's normal where that vanishes."""
-    blurred = gaussian_filter(occupied.astype(np.float32), 1.5)
-    index = tuple(np.clip(np.rint(places).astype(int), 0, np.asarray(occupied.shape) - 1).T)
-    normals = np.stack([-slope[index] for slope in np.gradient(blurred)], axis=1) / spacing
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    flat = np.eye(3)[axes] * signs[:, None]
-    return np.where(length > 1e-6 / np.min(spacing), normals / np.maximum(length, 1e-30), flat)
 
 
 # --- distances between surfaces on grids ------------------------------------------------------------------------------

@@ -22,8 +22,7 @@ from mereo.io.atomic_files import atomic_file, new_directory, write_json
 from mereo.io.config import CONFIG
 from mereo.models.config import EXACT, InferenceConfig
 from mereo.models.model import Model
-from mereo.models.remote import settings_for
-from mereo.models.weights import load_for
+from mereo.models.weights import load_for, settings_for
 from mereo.scenes.registry import files_of
 from mereo.scenes.scene import Scene
 from mereo.visualization.reconstruction_report import BUDGET_BYTES
@@ -118,60 +117,57 @@ DASH = "–"
 def write_evaluation_report(
     path: str | Path, metrics: Mapping[str, Any], colors: Sequence[Color], picture: str | Path
 ) -> None:
-    """Write the page of an evaluation's scores, under ``BUDGET_BYTES``.
+    """Write the page of an evaluation's scores.
 
     Args:
         path: the .html file.
         metrics: what ``metrics.json`` holds, see ``scoring.metrics``; NaN is shown as a dash.
         colors: colours of the segments.
-        picture: a PNG file; it is made smaller where it is too large for the page.
-
-    Raises ``ValueError`` where even then the page is too large.
+        picture: a PNG file, which the page has as a JPEG, made smaller until it fits into ``BUDGET_BYTES``.
     """
     names, mean = tuple(metrics["per_segment"]), metrics["example_mean"]
     title = " on ".join(str(metrics[key]) for key in ("weights", "scene") if key in metrics) or "mereo evaluation"
     below = {"iou", "miou", "definition", "ece", "calibrated"}
     facts = {k: v for k, v in metrics.items() if isinstance(v, str | int | float) and k not in below}
     shown = [f"{key.replace('_', ' ')}: {value}" for key, value in facts.items()]
+    scores = {"IoU, whole set": metrics["iou"], "mIoU, whole set": metrics["miou"]}
+    scores |= {"IoU, mean over examples": mean["iou"], "mIoU, mean over examples": mean["miou"]}
+    overall = "".join(
+        f"<div><b>{format_score(value, DASH)}</b><span>{title}</span></div>" for title, value in scores.items()
+    )
+    # how often true positions lie within a registration's radii, and frames are said to show the object
+    sure = "".join(f"<p>{escape(line)}</p>" for line in certainty_lines(metrics))
     text = "".join(
         (
             f"<h1>{escape(title)}</h1>",
             f"<p>{escape('  ·  '.join(shown))}</p>",
-            _overall(metrics["iou"], metrics["miou"], mean["iou"], mean["miou"]),
-            _sure(metrics),
+            f'<section><div class="big">{overall}</div></section>',
+            f"<section><h2>How sure</h2>{sure}</section>" if sure else "",
             f'<div class="pair">{_segments(metrics["per_segment"], colors)}{_examples(metrics["per_example"])}</div>',
             _confusion(("empty", *names), metrics["confusion"]),
             _reliability(metrics.get("reliability") or [], metrics.get("ece"), metrics.get("calibrated") is True),
         )
     )
     words = escape(str(metrics.get("definition", "")))
-    room = BUDGET_BYTES - len(text.encode()) - len(STYLE) - len(words) - 2000
-    kind, data = _fitting(Path(picture), room * 3 // 4)
+    room, encoded = BUDGET_BYTES - len(text.encode()) - len(STYLE) - len(words) - 2000, io.BytesIO()
+    with Image.open(picture) as image:
+        small = image.convert("RGB")
+    small.save(encoded, "JPEG", quality=85)
+    while len(encoded.getvalue()) > room * 3 // 4 and min(small.size) > 16:
+        small = small.resize((max(1, small.width * 3 // 4), max(1, small.height * 3 // 4)))
+        encoded = io.BytesIO()
+        small.save(encoded, "JPEG", quality=85)
+    data = base64.b64encode(encoded.getvalue()).decode("ascii")
     page = (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{escape(title)}</title><style>{STYLE}</style></head><body><main>{text}"
         '<section><h2>Errors of the first examples</h2><img alt="clouds, reconstructions, errors and references" '
-        f'src="data:image/{kind};base64,{data}"></section><footer>Made by mereo: {words}.</footer></main></body>'
+        f'src="data:image/jpeg;base64,{data}"></section><footer>Made by mereo: {words}.</footer></main></body>'
         "</html>\n"
     ).encode("utf-8", errors="replace")
-    if len(page) > BUDGET_BYTES:
-        raise ValueError(f"the report has {len(page)} bytes; at most {BUDGET_BYTES}: evaluate fewer examples")
     with atomic_file(path) as partial:
         partial.write_bytes(page)
-
-
-def _overall(*figures: float) -> str:
-    titles = ("IoU, whole set", "mIoU, whole set", "IoU, mean over examples", "mIoU, mean over examples")
-    each = zip(titles, figures, strict=True)
-    shown = "".join(f"<div><b>{format_score(value, DASH)}</b><span>{title}</span></div>" for title, value in each)
-    return f'<section><div class="big">{shown}</div></section>'
-
-
-def _sure(metrics: Mapping[str, Any]) -> str:
-    """How often true positions lie within a registration's radii, and frames are said to show the object."""
-    text = "".join(f"<p>{escape(line)}</p>" for line in certainty_lines(metrics))
-    return f"<section><h2>How sure</h2>{text}</section>" if text else ""
 
 
 def _segments(per_segment: Mapping[str, float], colors: Sequence[Color]) -> str:
@@ -203,7 +199,13 @@ def _reliability(bins: Sequence[Mapping[str, float]], ece: float | None, calibra
     """Reliability diagram of the network's probabilities: share of right answers over confidence, and the diagonal."""
     if not bins:
         return ""
-    side = 260
+    side, foot, middle = 260, 274, 130
+    axes = (
+        f'<text y="{foot}">0</text><text class="e" x="{side}" y="{foot}">1</text>'
+        f'<text class="m" x="{middle}" y="{foot + 14}">confidence in a cell\'s label</text>'
+        f'<text class="e" x="-5" y="{side}">0</text><text class="e" x="-5" y="9">1</text>'
+        f'<text class="m" transform="translate(-18 {middle}) rotate(-90)">share that is right</text>'
+    )
     points = " ".join(f"{side * b['confidence']:.1f},{side * (1 - b['right']):.1f}" for b in bins)
     dots = "".join(
         f'<circle cx="{side * b["confidence"]:.1f}" cy="{side * (1 - b["right"]):.1f}" '
@@ -215,24 +217,13 @@ def _reliability(bins: Sequence[Mapping[str, float]], ece: float | None, calibra
         f'<svg class="rel" viewBox="-34 -12 {side + 46} {side + 46}" role="img" '
         f'aria-label="share of right answers over confidence"><rect width="{side}" height="{side}"/>'
         f'<line x1="0" y1="{side}" x2="{side}" y2="0"/>'
-        f'<polyline points="{points}"/>{dots}{_axes(side)}</svg>'
+        f'<polyline points="{points}"/>{dots}{axes}</svg>'
     )
     kind = "calibrated" if calibrated else "not calibrated"
     return (
         f"<section><h2>Reliability of the network's probabilities ({kind})</h2><p>Expected calibration error "
         f"{format_score(ece, DASH)}. A point's size: how many cells. On "
         f"the diagonal the network is as often right as it says.</p>{svg}</section>"
-    )
-
-
-def _axes(side: int) -> str:
-    """Words along two sides of a square from 0 to 1."""
-    foot, middle = side + 14, side // 2
-    return (
-        f'<text y="{foot}">0</text><text class="e" x="{side}" y="{foot}">1</text>'
-        f'<text class="m" x="{middle}" y="{foot + 14}">confidence in a cell\'s label</text>'
-        f'<text class="e" x="-5" y="{side}">0</text><text class="e" x="-5" y="9">1</text>'
-        f'<text class="m" transform="translate(-18 {middle}) rotate(-90)">share that is right</text>'
     )
 
 
@@ -253,16 +244,3 @@ def _bar(value: float) -> str:
 
 def _percent(share: float) -> str:
     return "·" if share < 0.0005 else f"{100 * share:.1f}"
-
-
-def _fitting(path: Path, room_bytes: int) -> tuple[str, str]:
-    """The picture as it is, or as a JPEG that is made smaller until it fits: kind and base64 text."""
-    data, kind = path.read_bytes(), "png"
-    with Image.open(path) as image:
-        small = image.convert("RGB")
-    while len(data) > room_bytes and min(small.size) > 16:
-        encoded = io.BytesIO()
-        small.save(encoded, "JPEG", quality=85)
-        data, kind = encoded.getvalue(), "jpeg"
-        small = small.resize((max(1, small.width * 3 // 4), max(1, small.height * 3 // 4)))
-    return kind, base64.b64encode(data).decode("ascii")

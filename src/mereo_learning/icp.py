@@ -26,16 +26,11 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from mereo.geometry.downsampling import first_in_cell
-from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
 
 # --- the visible surface ----------------------------------------------------------------------------------------------
-
-# What a scan can show of a placed object: the faces towards the scanner, and samples of them.
-#
-# Notation: ``T_scan_segment`` maps rest coordinates (scene units) to the scan's frame and unit: a similarity. s
-# segments.
 
 Poses = Float[np.ndarray, "s 4 4"]
 """``T_scan_segment`` of each segment, in label order."""
@@ -51,11 +46,6 @@ def diagonal(mesh: SegmentedMesh) -> float:
     """Length of the diagonal of the joint box of all segments."""
     low, high = mesh.bounds
     return float(np.linalg.norm(high - low))
-
-
-def thinned(points: Float[np.ndarray, "n 3"], spacing: float) -> Float[np.ndarray, "p 3"]:
-    """One of the points in each cell of a grid; not their mean, which would lie off a curved surface."""
-    return points[first_in_cell(points - points.min(axis=0), spacing)]
 
 
 def exposed(rest: SegmentedMesh) -> SegmentedMesh:
@@ -80,16 +70,15 @@ def moved(mesh: SegmentedMesh, poses: Poses) -> SegmentedMesh:
 
 def facing(placed: SegmentedMesh, viewpoint: Float[np.ndarray, "3"]) -> SegmentedMesh:
     """Faces that are turned towards ``viewpoint``, or nearly."""
-    return replace(placed, segments=tuple(_facing(segment, viewpoint) for segment in placed.segments))
-
-
-def _facing(segment: Segment, viewpoint: Float[np.ndarray, "3"]) -> Segment:
-    corners = segment.vertices[segment.faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    way = viewpoint - corners.mean(axis=1)
-    size = np.linalg.norm(normal, axis=1) * np.linalg.norm(way, axis=1)
-    is_facing = np.einsum("ij,ij->i", normal, way) > -0.1 * size  # below 0, as the pose is not right yet
-    return replace(segment, faces=segment.faces[is_facing])
+    segments = []
+    for segment in placed.segments:
+        corners = segment.vertices[segment.faces]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        way = viewpoint - corners.mean(axis=1)
+        size = np.linalg.norm(normal, axis=1) * np.linalg.norm(way, axis=1)
+        is_facing = np.einsum("ij,ij->i", normal, way) > -0.1 * size  # below 0, as the pose is not right yet
+        segments.append(replace(segment, faces=segment.faces[is_facing]))
+    return replace(placed, segments=tuple(segments))
 
 
 def face_areas(mesh: SegmentedMesh) -> Float[np.ndarray, " f"]:
@@ -180,7 +169,8 @@ class Scan:
         Raises ``ValueError`` where fewer than ``LEAST_POINTS`` points are left.
         """
         spacing = size / 200
-        kept = thinned(points, spacing)
+        # one of the points in each cell, not their mean, which would lie off a curved surface
+        kept = points[first_in_cell(points - points.min(axis=0), spacing)]
         if len(kept) < LEAST_POINTS:
             raise ValueError(
                 f"the scan has {len(kept)} points that are {spacing:.3g} apart; at least {LEAST_POINTS} are "
@@ -264,17 +254,13 @@ def register(
         for body in map(list, bodies):
             points = scan.points[np.isin(matches.owner, body)]
             surface = SegmentedMesh(tuple(surfaces.segments[index] for index in body))
-            fitted[body] = shows(points, surface, scan.area)
+            shown_area = len(points) * scan.area
+            fitted[body] = len(points) >= LEAST_POINTS and shown_area >= LEAST_SHARE * face_areas(surface).sum()
             if fitted[body[0]]:
                 motion, held[body] = icp(points, surface, matches.limit, scan.area, hold)
                 poses[body] = motion @ poses[body]
     surfaces = facing(moved(shown, poses), scan.viewpoint)
     return Registration(poses, fitted, held, match(scan.points, surfaces, limits[-1] * scan.size))
-
-
-def shows(points: Float[np.ndarray, "p 3"], surface: SegmentedMesh, area: float) -> bool:
-    """Whether points of a scan, each standing for ``area``, cover enough of the surface that faces the scanner."""
-    return len(points) >= LEAST_POINTS and len(points) * area >= LEAST_SHARE * float(face_areas(surface).sum())
 
 
 def icp(

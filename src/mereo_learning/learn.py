@@ -23,15 +23,18 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import torch
 
 from mereo.geometry.metrics import format_score
-from mereo.io.atomic_files import MARKER, atomic_file, check_place, claim_directory, scratch_folder, write_json
+from mereo.io.atomic_files import MARKER, atomic_file, check_place, scratch_folder, write_json
 from mereo.io.config import CONFIG
 from mereo.io.errors import words_of
-from mereo.io.progress import progress
+from mereo.io.object_storage import claim
+from mereo.io.progress import Progress, progress
 from mereo.io.writers.meshes import write_positions_ply
+from mereo.models.device import keep_freed_memory, pick_device
 from mereo.models.weights import load_model, with_calibration
-from mereo.models.weights_place import WEIGHTS, find_weights
+from mereo.models.weights_place import WEIGHTS, find_weights, shipped_names
 from mereo.scenes.files.check import check_scene
 from mereo.scenes.files.object_files import SCENE, SEARCH, names_scene, scene_of_folder, shapes_in
 from mereo.scenes.files.template import write_scene_file
@@ -43,7 +46,10 @@ from mereo.synthesis.examples import sample_view
 from mereo.workers.spread import Cluster, spread
 from mereo_learning.calibrate import LEAST_VIEWS, VIEWS, calibrate
 from mereo_learning.config import PRESETS, TrainConfig
+from mereo_learning.dataset import Dataset, Draws
 from mereo_learning.evaluation_report import evaluate_weights
+from mereo_learning.processes import Process
+from mereo_learning.run_directory import fit_config, start_network
 from mereo_learning.scoring import EvaluationConfig, evaluate
 from mereo_learning.search_stage import (
     GOOD_ENOUGH,
@@ -56,17 +62,16 @@ from mereo_learning.search_stage import (
     search_line,
     search_scores,
     shortcomings,
+    symmetry_lines,
     training_reason,
 )
 from mereo_learning.shards import DatasetConfig, generate
-from mereo_learning.tables import read_metrics
-from mereo_learning.trainer import VALIDATIONS
+from mereo_learning.tables import CLEARLY, read_metrics
+from mereo_learning.trainer import VALIDATIONS, Trainer
 from mereo_learning.trainer import train as train_network
-from mereo_learning.trial import STEPS, nearest, small_dataset, timed, trial_steps
+from mereo_learning.validation import validate
 
 # --- schedule ---------------------------------------------------------------------------------------------------------
-
-# How a budget of minutes is shared: arithmetic alone, on rates that were measured on this machine and this object.
 
 EVALUATION_SHARE = 0.15
 """Of the time that is left after the measurements, for the scores: whose number says how far they can be trusted."""
@@ -114,8 +119,13 @@ def plan_for(left_s: float, rates: Rates, init: str, batch: int) -> Plan:
     """
     left_s = max(left_s, 0.0)
     work_s = left_s * (1 - EVALUATION_SHARE)
+
+    def fits(examples: int) -> bool:
+        steps_s = PASSES * (examples - holdout(examples)) * rates.train_s
+        return examples * rates.generate_s + (steps_s + _scored_s(examples, rates)) / MARGIN <= work_s
+
     examples = LEAST_EXAMPLES
-    while examples < MOST_EXAMPLES and _work_s(examples + 1, rates) <= work_s:
+    while examples < MOST_EXAMPLES and fits(examples + 1):
         examples += 1
     generation_s = examples * rates.generate_s
     return epochs_for(work_s - generation_s, rates, init, examples, batch, generation_s, left_s * EVALUATION_SHARE)
@@ -147,12 +157,6 @@ def holdout(examples: int) -> int:
 def views_for(left_s: float, each_s: float) -> int:
     """Number of test views that can be scored in ``left_s`` seconds at ``each_s`` for one."""
     return int(max(LEAST_TESTS, min(MOST_TESTS, left_s / max(each_s, 1e-3))))
-
-
-def _work_s(examples: int, rates: Rates) -> float:
-    """Seconds in which so many examples are made, and learnt from ``PASSES`` times."""
-    steps_s = PASSES * (examples - holdout(examples)) * rates.train_s
-    return examples * rates.generate_s + (steps_s + _scored_s(examples, rates)) / MARGIN
 
 
 def _scored_s(examples: int, rates: Rates) -> float:
@@ -255,16 +259,16 @@ def learn(
     clock.stage(2, "score the search alone, without training")
     searched = search_scores(output, loaded, named, SEARCH_SHARE * clock.budget_s)
     reasons = shortcomings(searched.summary())
-    print(search_line(searched), flush=True)
+    print(search_line(searched), *symmetry_lines(loaded), sep="\n", flush=True)
     if is_begun or is_to_train(train, reasons):
         print(f"it is trained: {training_reason(train, reasons, is_begun)}", flush=True)
-        _train(scene, output, clock, config, searched.median_s)
+        _train(scene, output, clock, config, searched.summary()["seconds"])
         test = read_metrics(output / TEST / "metrics.json")
         metrics = _comparison(scores_of_views(output, loaded, named, test["examples"]).summary(), test)
         advice = advice_after_training(metrics, test["per_segment"], config.minutes)
     else:
         metrics = {"trained": False, "method": "search", **searched.summary(), "search": searched.summary()}
-        advice = _advice_without_training(reasons, _repeated_command(files, output, config))
+        advice = _advice_without_training(reasons, files, output, config)
     write_json(output / METRICS, metrics)
     frame = write_example_frame(loaded, output / FRAME)
     _show_outcome(metrics, advice, output, scene, frame, (time.monotonic() - clock.started) / 60)
@@ -301,9 +305,8 @@ def _train(scene: str, output: Path, clock: Clock, config: LearnConfig, search_s
 
 def recipe_for(minutes: float) -> TrainConfig:
     """Recipe for a budget, but for what the plan decides."""
-    base = PRESETS["base"]
     # compiling takes a minute or two; in an hour that is left to ``compiling_pays``
-    return replace(base, compile=base.compile if minutes >= 60 else "off", seed=SEED)
+    return replace(PRESETS["base"], compile="auto" if minutes >= 60 else "off", seed=SEED)
 
 
 # --- what is kept between runs of the command -------------------------------------------------------------------------
@@ -311,7 +314,7 @@ def recipe_for(minutes: float) -> TrainConfig:
 
 def _claim(output: Path, settings: dict[str, Any]) -> None:
     """Take the folder, or check that it was begun with the same arguments: they bind once something is made of them."""
-    before = claim_directory(output, CONFIG, settings, "what is learnt")
+    before = claim(output, CONFIG, settings, "what is learnt")
     planned, written = (output / PLAN).is_file(), (output / SCENE).is_file()
     for name, value in settings.items():
         binds = planned or (written and name in ("object", "units"))
@@ -376,8 +379,6 @@ def _duration(seconds: float) -> str:
 
 # --- speed of this machine --------------------------------------------------------------------------------------------
 
-# Measurements on a few examples before the work is planned: how long they take, and from which weights to start.
-
 MADE_AS = GenerateConfig(sampling=SamplingConfig(uniform_fraction=0.15))
 """How examples are made: with the share of uniform queries that the schedule was measured with; the paper's is more."""
 
@@ -396,7 +397,8 @@ def measure(scene: str, folder: Path, recipe: TrainConfig, *, init: str, workers
         generate(scene, folder / "data", DatasetConfig(MADE_AS, EXAMPLES, SEED))
     # with the template and 100 states, so a little too long; another process adds 0.8, as cores share memory and caches
     generate_s = (time.monotonic() - started) / EXAMPLES / (1 + 0.8 * (workers - 1))
-    data = small_dataset(folder / "data")
+    keep_freed_memory()
+    data = Dataset.load(folder / "data", pick_device())
     with progress("measure", trial_steps(compared=not init), "steps") as shown:
         losses = {} if init else nearest(data, recipe, folder, shown)
         init = init or next(iter(losses))
@@ -407,9 +409,99 @@ def measure(scene: str, folder: Path, recipe: TrainConfig, *, init: str, workers
     return rates, init
 
 
-# --- outcome ----------------------------------------------------------------------------------------------------------
+# --- short trainings --------------------------------------------------------------------------------------------------
 
-# The end of learning in words: scores, what to use, whether that will do, and the command for it.
+COMPARED = 24
+"""Examples on which all shipped weights are compared as they are."""
+
+FINALISTS = 3
+"""How many of these, those with the lowest loss, are then trained."""
+
+STEPS = 12
+"""Steps of a trial: a training of its own, with warm-up and decay."""
+
+JUDGED = 4
+"""Steps, the last ones, whose mean loss is compared."""
+
+SCORED = 16
+"""Examples from which the time of an answer is taken."""
+
+
+def trial_steps(compared: bool) -> int:
+    """Steps of ``timed``, and before it of ``nearest`` where weights are ``compared``, as progress counts them."""
+    shipped = len(shipped_names())
+    return STEPS + (shipped + min(FINALISTS, shipped) * STEPS if compared else 0)
+
+
+def nearest(data: Dataset, recipe: TrainConfig, folder: Path, shown: Progress) -> dict[str, float]:
+    """Shipped weights nearest to a dataset, the best first, each with its loss after a trial.
+
+    All are compared by their loss as they are; the ``FINALISTS`` among them then by that after a trial.
+
+    Args:
+        data: a few examples.
+        recipe: of the training to come.
+        folder: for what a run writes.
+        shown: progress, in steps; a comparison counts as one.
+    """
+    before = {}
+    for name in shipped_names():
+        before[name] = Trial.of(data, replace(recipe, init=name), folder).loss_now()
+        shown.advance()
+    after = {}
+    for name in sorted(before, key=lambda name: before[name])[:FINALISTS]:
+        after[name] = Trial.of(data, replace(recipe, init=name), folder).run(shown)[0]
+    return dict(sorted(after.items(), key=lambda item: item[1]))
+
+
+def timed(data: Dataset, recipe: TrainConfig, folder: Path, shown: Progress) -> tuple[float, float]:
+    """Seconds that an example takes in a step of training, and to be answered at all its queries.
+
+    The steps are counted by ``shown``.
+
+    Raises ``ValueError`` where the weights that ``recipe`` starts from are of another architecture.
+    """
+    trial = Trial.of(data, recipe, folder)
+    (_, step_s), rounds = trial.run(shown), []
+    for _ in range(2):  # the first one also sets up what later ones find
+        started = time.monotonic()
+        validate(trial.average, data, replace(trial.config, holdout=SCORED))
+        rounds.append((time.monotonic() - started) / SCORED)
+    return step_s / recipe.batch, min(rounds)
+
+
+class Trial(Trainer):
+    """Training of ``STEPS`` steps on all of its data, of which only losses and speed are asked."""
+
+    @classmethod
+    def of(cls, data: Dataset, recipe: TrainConfig, folder: Path) -> "Trial":
+        """Trial of a recipe, but for its length and what is held out."""
+        config = replace(recipe, holdout=0, epochs=STEPS * recipe.batch / len(data), compile="off")
+        config = fit_config(config, data)
+        return cls(config, data, start_network(config, data), folder, Process(), data.device)
+
+    def run(self, shown: Progress) -> tuple[float, float]:
+        """Take all steps, each counted; returns the mean loss of the last ``JUDGED`` and the median seconds of one."""
+        times_s = []
+        for batch in self.batches():
+            started = time.monotonic()
+            self.train_step(batch)
+            times_s.append(time.monotonic() - started)
+            shown.advance()
+        assert self.log is not None
+        return float(np.mean([row["loss"] for row in self.log.rows[-JUDGED:]])), float(np.median(times_s))
+
+    @torch.no_grad()
+    def loss_now(self) -> float:
+        """Mean loss of the first examples, without a step."""
+        self.network.train()
+        config = self.config
+        index = torch.arange(min(COMPARED, len(self.data)))
+        batch = self.data.batch(index, config.network.points, config.queries, config.augment, Draws.of(config.seed))
+        return float(self._loss(batch)[0])
+
+
+# --- outcome ----------------------------------------------------------------------------------------------------------
 
 GOOD = 0.7
 """mIoU (IoU of an object in one piece) below which an answer is not to be relied upon."""
@@ -423,10 +515,11 @@ def _comparison(search: Mapping[str, Any], test: Mapping[str, Any]) -> dict[str,
     both = {
         "iou": test["iou"],
         "miou": test["miou"],
+        "miou_up_to_symmetry": test["miou_up_to_symmetry"],
         "explained": 1 - test["chosen"]["network"],
         "seconds": test.get("seconds") or slowest["seconds"],  # files of older versions have no seconds of their own
     }
-    network = {name: test["network"][name] for name in ("iou", "miou", "seconds")}
+    network = {name: test["network"][name] for name in ("iou", "miou", "miou_up_to_symmetry", "seconds")}
     table = {"search": search, "network": network, "both": both}
     method, reason = best_method(table)
     best = table["both" if method == "auto" else method]
@@ -437,6 +530,7 @@ def _comparison(search: Mapping[str, Any], test: Mapping[str, Any]) -> dict[str,
         "examples": test["examples"],
         "iou": best["iou"],
         "miou": best["miou"],
+        "miou_up_to_symmetry": best["miou_up_to_symmetry"],
         **table,
     }
 
@@ -454,6 +548,9 @@ def _show_outcome(
             explained = f"{scores['explained']:.0%}" if "explained" in scores else "-"
             figures = f"{format_score(scores['iou'])}  {format_score(scores['miou']):>5} {explained:>9}"
             print(f"{title:<45} {figures} {scores['seconds']:10.2f}")
+    if metrics["miou"] is not None and metrics["miou_up_to_symmetry"] > metrics["miou"] + CLEARLY:
+        either = format_score(metrics["miou_up_to_symmetry"])
+        print(f"where segments that no frame tells apart count as right either way, the best has an mIoU of {either}")
     print(*([metrics["reason"]] if metrics["trained"] else []), *advice, "", sep="\n")
     if metrics["trained"]:
         print(f"report   {output / 'test' / 'report.html'}")
@@ -477,17 +574,15 @@ def command(output: Path, scene: str, is_trained: bool = True, method: str = "au
     return shlex.join(map(str, [*words, "--output", output / "result"]))
 
 
-def _repeated_command(files: Sequence[Path], output: Path, config: LearnConfig) -> str:
-    """Command that goes on in the folder with training."""
+def _advice_without_training(
+    reasons: Sequence[str], files: Sequence[Path], output: Path, config: LearnConfig
+) -> list[str]:
+    """Why nothing was trained, with the shortcomings of the search alone, and the command that would train it."""
     words = ["mereo", "learn", *files, "--output", output]
     words += [] if config.minutes == 10 else ["--minutes", f"{config.minutes:g}"]
     words += ["--init", config.init] if config.init else []
     words += ["--units", config.units] if config.units else []
-    return shlex.join(map(str, [*words, "--train", "always"]))
-
-
-def _advice_without_training(reasons: Sequence[str], training: str) -> list[str]:
-    """Why nothing was trained, with the shortcomings of the search alone, and the command that would train it."""
+    training = shlex.join(map(str, [*words, "--train", "always"]))
     if reasons:
         return [
             f"nothing is trained, as --train is never; the search alone is not good enough: {', '.join(reasons)}.",
@@ -504,7 +599,7 @@ def advice_after_training(
     metrics: Mapping[str, Any], per_segment: Mapping[str, float | None], minutes: float
 ) -> list[str]:
     """What to do about scores that will not do; nothing about others."""
-    score = metrics["iou"] if metrics["miou"] is None else metrics["miou"]
+    score = metrics["iou"] if metrics["miou"] is None else metrics["miou_up_to_symmetry"]
     if score >= GOOD:
         return []
     weakest = min(per_segment, key=lambda name: per_segment[name] or 0.0)
@@ -622,7 +717,14 @@ def check_object(files: Sequence[Path], units: str | None) -> None:
         except ValueError as error:
             if not is_yaml(scene) or "listed above" not in str(error):
                 raise
-            raise ValueError(_refusal(files)) from None
+            named = names_scene(files)
+            path = files[0] if named else Path(f"{files[0].stem}.yaml")
+            new = "" if named else f"`mereo scene new {shlex.join(map(str, files))} --output {path}` and "
+            raise ValueError(
+                f"{files[0] if named else 'the object'} has faults, listed above, and nothing is learnt of a wrong "
+                f"object: correct them, or let {new}`mereo scene check {path} --repair` try, and learn "
+                f"{path.with_name(f'{path.stem}-repaired{path.suffix}')}"
+            ) from None
         loaded = load_scene(scene)
     way = deformation(loaded)
     if way < 0.005:
@@ -631,18 +733,6 @@ def check_object(files: Sequence[Path], units: str | None) -> None:
             f"warning: {loaded.name} hardly deforms: by {way:.2%} of its length; if it does more than that, widen its "
             f"deformations{place}"
         )
-
-
-def _refusal(files: Sequence[Path]) -> str:
-    """Sentence about an object with faults: which commands may mend it."""
-    named = names_scene(files)
-    path = files[0] if named else Path(f"{files[0].stem}.yaml")
-    new = "" if named else f"`mereo scene new {shlex.join(map(str, files))} --output {path}` and "
-    return (
-        f"{files[0] if named else 'the object'} has faults, listed above, and nothing is learnt of a wrong object: "
-        f"correct them, or let {new}`mereo scene check {path} --repair` try, and learn "
-        f"{path.with_name(f'{path.stem}-repaired{path.suffix}')}"
-    )
 
 
 def deformation(scene: Scene) -> float:

@@ -3,6 +3,7 @@
 import csv
 import io
 import math
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
@@ -28,14 +29,19 @@ class MetricsLog:
         self.run_dir = run_dir
         self.fields = FIELDS + (SENSOR_FIELDS if sensors else ())
         self.rows: list[Row] = []
-        self.board = _tensorboard(run_dir)
+        self.board: Any = None
+        with suppress(ImportError):  # the extra `track`
+            from torch.utils.tensorboard import SummaryWriter
+
+            self.board = SummaryWriter(str(run_dir / "tensorboard"))
         self.draws = has_plots()
         if not self.draws:
             _say_left_out()
 
     def add_step(self, step: int, rate: float, losses: dict[str, float]) -> None:
         """Add the row of a step; ``losses`` are the total under "loss" and its terms."""
-        self._add({"step": step, "rate": rate, **losses})
+        self.rows.append({"step": step, "rate": rate, **losses})
+        self._to_board(self.rows[-1])
 
     def add_validation(self, step: int, iou: float, miou: float, of: Literal["val", "sensor"] = "val") -> None:
         """Add scores of the state after ``step`` to the row of that step; an undefined mIoU (NaN) is left out."""
@@ -45,10 +51,6 @@ class MetricsLog:
             self.rows.append({"step": step})
         self.rows[-1] |= scores
         self._to_board({"step": step, **scores})
-
-    def _add(self, row: Row) -> None:
-        self.rows.append(row)
-        self._to_board(row)
 
     def _to_board(self, row: Row) -> None:
         if self.board is not None:
@@ -66,7 +68,7 @@ class MetricsLog:
         text = io.StringIO()
         writer = csv.DictWriter(text, self.fields, restval="", lineterminator="\n")
         writer.writeheader()
-        writer.writerows({k: _exact(k, v) for k, v in row.items()} for row in self.rows)
+        writer.writerows({k: int(v) if k == "step" else repr(v) for k, v in row.items()} for row in self.rows)
         with atomic_file(self.run_dir / TABLE) as temporary:
             temporary.write_text(text.getvalue())
         if self.draws:
@@ -95,19 +97,6 @@ class MetricsLog:
 def _say_left_out() -> None:
     """Once for a process, which may train many networks."""
     print(f"{CURVES} is left out, for matplotlib, which draws it, {CURE}", flush=True)
-
-
-def _exact(name: str, value: float) -> str:
-    return str(int(value)) if name == "step" else repr(value)
-
-
-def _tensorboard(run_dir: Path) -> Any:
-    """A TensorBoard writer where the extra `track` is installed."""
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        return None
-    return SummaryWriter(str(run_dir / "tensorboard"))
 
 
 def draw_curves(rows: list[Row], path: Path) -> None:

@@ -212,5 +212,4 @@ def _without_places(model: Model) -> Model:
     recipe: Any = model.provenance.get("recipe")
     if not recipe or not recipe.get("init"):
         return model
-    kept = {**recipe, "init": Path(recipe["init"]).name}
-    return replace(model, provenance={**model.provenance, "recipe": kept})
+    return replace(model, provenance={**model.provenance, "recipe": recipe | {"init": Path(recipe["init"]).name}})

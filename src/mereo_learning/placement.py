@@ -145,14 +145,12 @@ def place(
     together = [int(index) for index in np.flatnonzero(~start.separate)]
     alone = [[int(index)] for index in np.flatnonzero(start.separate & ~held)]
     whole = register(shown, scan, start.poses, [together, *alone] if together else alone, WHOLE_LIMITS)
-    _check_explained(whole, scan)
-    _check_runaway(rest, start.poses, whole, diagonal(rest))
+    _check(rest, start.poses, whole, scan, diagonal(rest))
     if is_rigid:
         return _measured(rest, shown, points, scan, start, whole, ["object"] * len(held))
     others = [[index] for index in range(len(held)) if not held[index]]
     each = register(shown, scan, whole.poses, others, SEGMENT_LIMITS, hold=True)
-    _check_explained(each, scan)
-    _check_runaway(rest, np.where(start.separate[:, None, None], start.poses, whole.poses), each)
+    _check(rest, np.where(start.separate[:, None, None], start.poses, whole.poses), each, scan)
     # segments that are not seen get their start or their neighbour's pose
     poses, placed_by = each.poses.copy(), ["scan"] * len(each.poses)
     counts = np.bincount(each.matches.owner[each.matches.owner >= 0], minlength=len(poses))
@@ -167,7 +165,8 @@ def place(
     return _measured(rest, shown, points, scan, start, replace(each, poses=poses), placed_by)
 
 
-def _check_explained(result: Registration, scan: Scan) -> None:
+def _check(rest: SegmentedMesh, before: Poses, result: Registration, scan: Scan, least: float = 0.0) -> None:
+    """Most of the scan is explained, and no segment has moved farther than its own size, or ``least`` (scene units)."""
     share = float((result.matches.owner >= 0).mean())
     if not (share >= 0.4 and result.matches.limit < 0.1 * scan.size):
         raise ValueError(
@@ -176,9 +175,6 @@ def _check_explained(result: Registration, scan: Scan) -> None:
             "give a better start"
         )
 
-
-def _check_runaway(rest: SegmentedMesh, before: Poses, result: Registration, least: float = 0.0) -> None:
-    """No segment may move farther than its own size, or than ``least`` (scene units)."""
     for index, segment in enumerate(rest.segments):
         low, high = segment.bounds
         shift = _shift(before[index], result.poses[index], (low + high) / 2)
@@ -241,8 +237,6 @@ def _measured(
 
 # --- initial poses ----------------------------------------------------------------------------------------------------
 
-# Rough starts for ``mereo align``, from a JSON file with poses or picked point pairs, or from trained weights.
-#
 #     {"object": {"model": [[x, y, z], ...], "scan": [[x, y, z], ...]},
 #      "segments": {"tail": [[r, r, r, t], [r, r, r, t], [r, r, r, t], [0, 0, 0, 1]]}}
 #

@@ -37,8 +37,6 @@ def join_processes() -> Process:
     if world == 1:
         return Process()
     process = Process(int(os.environ["RANK"]), world)
-    if process.is_main and _keeps_addresses():
-        print(f"processes may not find each other again after a restart: give torchrun {SEPARATE}=1", flush=True)
     with connected(process):
         dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
     return process
@@ -54,19 +52,6 @@ def leave_processes(process: Process) -> None:
         return
     gc.collect()
     dist.destroy_process_group()
-
-
-SEPARATE = "TORCH_DISABLE_SHARE_RDZV_TCP_STORE"
-"""Variable by which torchrun's processes get a new store of addresses at each restart, instead of its own."""
-
-
-def _keeps_addresses() -> bool:
-    """Whether nodes that torchrun starts again would meet the addresses of processes that have ended.
-
-    It does since 2.5 unless told otherwise, and no restart of several nodes succeeds then (docs/many-machines.md).
-    """
-    several = int(os.environ.get("GROUP_WORLD_SIZE", "1")) > 1
-    return several and os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
 
 
 T = TypeVar("T")
@@ -139,11 +124,7 @@ def connected(process: Process) -> Iterator[None]:
         ) from error
 
 
-# --- batch_normalization ----------------------------------------------------------------------------------------------
-
-# Batch normalization of a batch that several processes share.
-#
-# Notation: n rows, c channels.
+# --- batch normalization ----------------------------------------------------------------------------------------------
 
 
 def share_statistics(network: nn.Module, process: Process, device: torch.device) -> nn.Module:
@@ -170,52 +151,28 @@ class SharedBatchNorm(nn.BatchNorm1d):
         if not self.training:
             return super().forward(rows)
         assert self.momentum is not None and self.running_mean is not None and self.running_var is not None
-        normalized, mean, variance = _Normalize.apply(rows, self.weight, self.bias, self.eps)
-        count = len(rows) * dist.get_world_size()
+        exact, world = rows.float(), dist.get_world_size()
+        mean = _Sum.apply(exact.mean(dim=0)) / world
+        # by distances from the mean, not by squares: a mean may be hundreds of spreads
+        variance = _Sum.apply((exact - mean).square().mean(dim=0)) / world
+        count = len(rows) * world
         with torch.no_grad():
             self.running_mean.lerp_(mean, self.momentum)
             self.running_var.lerp_(variance * (count / (count - 1)), self.momentum)
             if self.num_batches_tracked is not None:
                 self.num_batches_tracked.add_(1)
-        return normalized
+        return ((exact - mean) * (variance + self.eps).rsqrt() * self.weight + self.bias).to(rows.dtype)
 
 
-class _Normalize(torch.autograd.Function):
-    """Normalization of Ioffe and Szegedy (2015), whose sums run over the rows of all processes."""
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        rows: Float[Tensor, "n c"],
-        weight: Float[Tensor, " c"],
-        bias: Float[Tensor, " c"],
-        eps: float,
-    ) -> tuple[Float[Tensor, "n c"], Float[Tensor, " c"], Float[Tensor, " c"]]:
-        exact = rows.float()
-        variance, mean = torch.var_mean(exact, dim=0, correction=0)
-        local = torch.stack([mean, variance])
-        every = [torch.empty_like(local) for _ in range(dist.get_world_size())]
-        dist.all_gather(every, local)
-        means, variances = torch.stack(every).unbind(1)
-        mean = means.mean(dim=0)
-        # by differences of means, not of squares: a mean may be hundreds of spreads
-        variance = (variances + (means - mean).square()).mean(dim=0)
-        inverse = (variance + eps).rsqrt()
-        standard = (exact - mean) * inverse
-        ctx.save_for_backward(standard, inverse, weight)
-        ctx.mark_non_differentiable(mean, variance)
-        return (standard * weight + bias).to(rows.dtype), mean, variance
+class _Sum(torch.autograd.Function):
+    """Sum over all processes, and so is its gradient."""
 
     @staticmethod
-    def backward(
-        ctx: Any, gradient: Float[Tensor, "n c"], *_: Tensor
-    ) -> tuple[Float[Tensor, "n c"], Float[Tensor, " c"], Float[Tensor, " c"], None]:
-        standard, inverse, weight = ctx.saved_tensors
-        exact = gradient.float()
-        # of bias and weight, which DDP averages
-        local = torch.stack([exact.sum(dim=0), (exact * standard).sum(dim=0)])
-        every = local.clone()
-        dist.all_reduce(every)
-        shift, slope = every / (len(standard) * dist.get_world_size())
-        rows = (exact - shift - standard * slope) * (inverse * weight)
-        return rows.to(gradient.dtype), local[1], local[0], None
+    def forward(ctx: Any, value: Float[Tensor, " c"]) -> Float[Tensor, " c"]:
+        total = value.clone()
+        dist.all_reduce(total)
+        return total
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Float[Tensor, " c"]) -> Tensor:
+        return _Sum.apply(gradient)

@@ -13,8 +13,9 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
-from mereo.io.atomic_files import atomic_file, claim_directory
+from mereo.io.atomic_files import atomic_file
 from mereo.io.errors import reason
+from mereo.io.object_storage import claim
 from mereo.models.config import NetworkConfig
 from mereo.models.encoders import Autodecoder
 from mereo.models.model import Model
@@ -169,7 +170,7 @@ def claim_run(run_dir: Path, config: TrainConfig, data: Dataset, process: Proces
         if process.is_main:
             dataset = {key: data.manifest[key] for key in ("scene", "seed", "examples")}
             settings = json.loads(json.dumps({"dataset": dataset, "train": config.to_dict()}))
-            before = claim_directory(run_dir, "config.json", settings, "a training run")
+            before = claim(run_dir, "config.json", settings, "a training run")
             if before is not None and before != settings:
                 raise ValueError(
                     f"{run_dir} holds a run with another {_first_difference(before, settings)}; continuing needs equal "
@@ -189,10 +190,9 @@ def _first_difference(before: dict[str, Any], now: dict[str, Any]) -> str:
 
 # --- examples seen ----------------------------------------------------------------------------------------------------
 
-# Examples that weights have seen in training, those of the weights that they started from included. A training writes
-# how many their start had seen into its weights (``provenance["examples_before"]``), so chains of any length add up.
+# A training writes how many examples its start had seen into its weights (``examples_before``), so chains add up.
 
-_BEFORE: Mapping[tuple[str, str, str], int] = {
+_BEFORE: Mapping[tuple[str, ...], int] = {
     ("bunny", "3", "6530"): 132_320,
     ("engine", "11", "6240"): 438_448,
     ("human", "7", "4872"): 423_730,
@@ -211,33 +211,17 @@ all but the liver and the rope began with the bunny's 393,520, the tumour with t
 """
 
 
-def seen_in_training(provenance: Mapping[str, Any]) -> int | None:
-    """Number of examples that a training has shown, repeated ones each time; None where the weights do not say."""
-    recipe = provenance.get("recipe") or {}
-    steps, batch = provenance.get("steps"), recipe.get("batch")
-    return steps * batch if isinstance(steps, int) and isinstance(batch, int) else None
+def seen_in_training(provenance: Mapping[str, Any]) -> tuple[int | None, int | None]:
+    """Number of examples that a training has shown, repeated ones each time, and of those that its start had seen.
 
-
-def seen_before(provenance: Mapping[str, Any]) -> int | None:
-    """Number of examples that the weights from which a training started had seen, and those before them.
-
-    0 for a start from random weights; None where a chain cannot be told: an older mereo did not write it.
+    None where the weights do not say, as those of an older mereo.
     """
-    stated = provenance.get("examples_before")
-    if isinstance(stated, int):
-        return stated
-    recipe = provenance.get("recipe")
-    if recipe and not recipe.get("init"):
-        return 0
-    return _BEFORE.get(
-        (str(provenance.get("scene")), str(provenance.get("training_seed")), str(provenance.get("steps")))
-    )
-
-
-def seen_in_all(provenance: Mapping[str, Any]) -> int | None:
-    """Number of examples of a training and of the chain behind it; None where the weights do not say."""
-    latest, before = seen_in_training(provenance), seen_before(provenance)
-    return None if latest is None or before is None else latest + before
+    recipe, steps, before = provenance.get("recipe") or {}, provenance.get("steps"), provenance.get("examples_before")
+    if not isinstance(before, int):
+        facts = (str(provenance.get(name)) for name in ("scene", "training_seed", "steps"))
+        before = 0 if recipe and not recipe.get("init") else _BEFORE.get(tuple(facts))
+    batch = recipe.get("batch")
+    return (steps * batch if isinstance(steps, int) and isinstance(batch, int) else None), before
 
 
 def seen_by(init: str) -> int | None:
@@ -245,22 +229,22 @@ def seen_by(init: str) -> int | None:
 
     None where they do not say. Raises as ``load_model`` does.
     """
-    return seen_in_all(load_model(init).provenance) if init else 0
+    latest, before = seen_in_training(load_model(init).provenance) if init else (0, 0)
+    return None if latest is None or before is None else latest + before
 
 
 def describe_seen(provenance: Mapping[str, Any]) -> str:
     """Words for the examples of a training and of the chain behind it; empty where the weights do not say."""
-    latest, before = seen_in_training(provenance), seen_before(provenance)
-    if latest is None or before == 0:
-        return "" if latest is None else f"{latest:,} examples seen"
+    latest, before = seen_in_training(provenance)
+    if latest is None:
+        return ""
     if before is None:
         return f"{latest:,} examples seen, and those of the weights that it started from, which do not say how many"
-    return f"{latest:,} examples seen, {latest + before:,} with those of the weights that it started from"
+    chain = f", {latest + before:,} with those of the weights that it started from" if before else ""
+    return f"{latest:,} examples seen{chain}"
 
 
 # --- checkpoint -------------------------------------------------------------------------------------------------------
-
-# Checkpoints of a training run as safetensors: network, averaged network, optimizer and step. No pickles.
 
 CHECKPOINT = "checkpoint.safetensors"
 
@@ -306,25 +290,21 @@ def load_checkpoint(run_dir: Path, checkpoint: Checkpoint, process: Process | No
 
 def _fill(checkpoint: Checkpoint, tensors: dict[str, Tensor]) -> None:
     """Give a checkpoint's objects their state; raises whatever torch does for one that is not theirs."""
+
+    def below(prefix: str) -> dict[str, Tensor]:
+        return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+
     for prefix, module in (("network", checkpoint.network), ("average", checkpoint.average)):
-        module.load_state_dict(_below(tensors, prefix + "/"))
+        module.load_state_dict(below(f"{prefix}/"))
     states: dict[int, dict[str, Tensor]] = {}
-    for name, value in _below(tensors, "optimizer/").items():
+    for name, value in below("optimizer/").items():
         index, key = name.split("/")
         states.setdefault(int(index), {})[key] = value
-    _check_optimizer(checkpoint.optimizer, states)
+    # torch would take states of another network now, and fail over them at the next step
+    parameters = [value for group in checkpoint.optimizer.param_groups for value in group["params"]]
+    for number, state in states.items():
+        shapes = {"step": torch.Size(()), "exp_avg": parameters[number].shape, "exp_avg_sq": parameters[number].shape}
+        if {name: value.shape for name, value in state.items()} != shapes:
+            raise ValueError(f"the optimizer's state {number} is of another network")
     groups = checkpoint.optimizer.state_dict()["param_groups"]
     checkpoint.optimizer.load_state_dict({"state": states, "param_groups": groups})
-
-
-def _check_optimizer(optimizer: torch.optim.Optimizer, states: dict[int, dict[str, Tensor]]) -> None:
-    """Raise ``ValueError`` for states that the optimizer would take now and fail over at its next step."""
-    parameters = [value for group in optimizer.param_groups for value in group["params"]]
-    for index, state in states.items():
-        shapes = {"step": torch.Size(()), "exp_avg": parameters[index].shape, "exp_avg_sq": parameters[index].shape}
-        if {name: value.shape for name, value in state.items()} != shapes:
-            raise ValueError(f"the optimizer's state {index} is of another network")
-
-
-def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}

@@ -131,8 +131,6 @@ def scan_in_camera(name: str) -> tuple[PointCloud, SegmentedMesh, Float[np.ndarr
 
 # --- truth files ------------------------------------------------------------------------------------------------------
 
-# Ground truth of a scan as a file: what ``mereo align`` writes and ``mereo evaluate --scans`` takes.
-
 TRUTH = "truth.json"
 """Name of the file."""
 
@@ -165,7 +163,7 @@ def write_truth(
         "format": FORMAT,
         "scene": scene if scene in SCENES else _relative(Path(scene), place),
         "scan": _relative(scan.path, place),
-        "scan_sha256": _sha256_of(scan.path),
+        "scan_sha256": hashlib.sha256(scan.path.read_bytes()).hexdigest(),
         "unit": scan.unit,
         "frame": scan.frame,
         "drop_invalid": scan.drop_invalid,
@@ -190,11 +188,6 @@ def write_truth(
 
 def _relative(path: Path, folder: Path) -> str:
     return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
-
-
-def _sha256_of(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def read_truth(path: str | Path, scene: Scene | None = None) -> PosedScan:
@@ -223,11 +216,13 @@ def read_truth(path: str | Path, scene: Scene | None = None) -> PosedScan:
         name, scan_sha256 = str(facts["scene"]), facts["scan_sha256"]
     loaded = scene_named_in(path, name) if scene is None else scene
     rest, unit_m = loaded.rest, loaded.unit_m
-    if rest.names != tuple(poses) or not _same_place(rest, boxes):
+    # not the same bytes: other versions of the libraries cut the same solid into other triangles
+    slack = 1e-3 * diagonal(rest)
+    if rest.names != tuple(poses) or not all(np.allclose(s.bounds, boxes[s.name], 0, slack) for s in rest.segments):
         raise ValueError(f"the meshes of the scene {name!r} are not those that {path} was made with: align again")
     if not scan.path.is_file():
         raise FileNotFoundError(f"{scan.path}, the scan of {path}, does not exist: put it there, or align again")
-    if _sha256_of(scan.path) != scan_sha256:
+    if hashlib.sha256(scan.path.read_bytes()).hexdigest() != scan_sha256:
         raise ValueError(f"{scan.path} is not the file that {path} was made from (another SHA-256): align it again")
     cloud = read_point_cloud(scan.path, scan.drop_invalid)
     title = path.resolve().parent.name if path.name == TRUTH else path.stem
@@ -240,9 +235,3 @@ def _array(value: Any, shape: tuple[int, int]) -> np.ndarray:
     if array.shape != shape or not (np.abs(array) <= LARGEST).all():
         raise ValueError(f"an array in it is not {shape[0]} x {shape[1]} numbers up to {LARGEST:g}")
     return array
-
-
-def _same_place(rest: SegmentedMesh, boxes: dict[str, np.ndarray]) -> bool:
-    """Not the same bytes: other versions of the libraries cut the same solid into other triangles."""
-    slack = 1e-3 * diagonal(rest)
-    return all(np.allclose(segment.bounds, boxes[segment.name], rtol=0, atol=slack) for segment in rest.segments)

@@ -22,8 +22,8 @@ from mereo.geometry.metrics import Scores, TruthGrid, grid_confusion, intersecti
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.progress import progress as stage
 from mereo.models.model import Model
-from mereo.models.remote import to_cpu
 from mereo.models.trained import Trained
+from mereo.models.weights import to_cpu
 from mereo.reconstruction.pipeline import segment_names
 from mereo.scenes.random_states import state_points
 from mereo.scenes.registry import load_scene
@@ -204,8 +204,6 @@ def score_cases(
 
 
 # --- real scans -------------------------------------------------------------------------------------------------------
-
-# Scores on real scans (paper, section 4.3): the four of the bunny, or those with a truth from ``mereo align``.
 
 
 def _evaluate_scans(model: Model, config: EvaluationConfig, truths: Sequence[str | Path], progress: bool) -> Evaluation:

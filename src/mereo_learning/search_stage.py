@@ -3,18 +3,23 @@
 import hashlib
 import json
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
 
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.register import Registrar
-from mereo.geometry.metrics import Scores, format_score, grid_confusion, intersection_over_union
+from mereo.geometry.metrics import (
+    format_score,
+    grid_confusion,
+    intersection_over_union,
+    with_segments_exchanged,
+)
 from mereo.geometry.solids import label_grid
+from mereo.geometry.symmetry import TOLERANCE, describe_symmetries, find_symmetries
 from mereo.io.atomic_files import write_json
 from mereo.io.progress import progress
 from mereo.reconstruction.observation import observe
@@ -30,73 +35,39 @@ from mereo_learning.tables import CLEARLY
 # --- scores of the search ---------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class SearchScores:
-    """Scores of the search alone, view by view.
+    """Scores of the search alone, view by view, as ``search.json`` has them.
 
     Attributes:
         names: names of the segments.
-        confusions: cells by true (row) and answered (column) label, of each view.
-        explained: whether the fit explains the view.
-        seconds: of each view, from the cloud to the answer.
+        views: of each view "confusion", cells by true (row) and answered (column) label, "explained", whether the fit
+            explains it, and "seconds" from the cloud to the answer.
+        swaps: exchanges of segments that no frame tells apart (``StatisticalModel.swaps``).
     """
 
     names: tuple[str, ...]
-    confusions: Int[np.ndarray, "n c c"]
-    explained: Bool[np.ndarray, " n"]
-    seconds: Float[np.ndarray, " n"]
-
-    def __len__(self) -> int:
-        return len(self.seconds)
-
-    @property
-    def scores(self) -> Scores:
-        """Scores of all views together, from the sum of their confusion matrices."""
-        return intersection_over_union(self.confusions.sum(axis=0))
-
-    @property
-    def median_s(self) -> float:
-        """Median seconds of a view."""
-        return float(np.median(self.seconds))
-
-    def first(self, count: int) -> "SearchScores":
-        """Scores of the first views alone."""
-        return SearchScores(self.names, self.confusions[:count], self.explained[:count], self.seconds[:count])
+    views: Sequence[Mapping[str, Any]]
+    swaps: tuple[tuple[int, ...], ...] = ()
 
     def summary(self) -> dict[str, Any]:
-        """IoU, mIoU, the share of views that are explained, the lowest mIoU of a view, and median seconds."""
-        scores = self.scores
+        """IoU, mIoU, that up to symmetry and its lowest of a view, the share of views explained, and median seconds.
+
+        Raises ``KeyError``, ``TypeError`` or ``ValueError`` for views that are none.
+        """
+        classes = len(self.names) + 1
+        confusions = np.array([view["confusion"] for view in self.views], dtype=np.int64).reshape(-1, classes, classes)
+        scores = intersection_over_union(confusions.sum(axis=0))
+        exchanged = [with_segments_exchanged(view, self.swaps) for view in confusions]
         return {
-            "examples": len(self),
+            "examples": len(self.views),
             "iou": scores.iou,
             "miou": scores.miou,
-            "lowest_miou": min(intersection_over_union(view).miou for view in self.confusions),
-            "explained": float(self.explained.mean()),
-            "seconds": self.median_s,
+            "miou_up_to_symmetry": intersection_over_union(np.sum(exchanged, axis=0)).miou,
+            "lowest_miou": min(intersection_over_union(view).miou for view in exchanged),
+            "explained": float(np.mean([bool(view["explained"]) for view in self.views])),
+            "seconds": float(np.median([float(view["seconds"]) for view in self.views])),
         }
-
-    def content(self) -> dict[str, Any]:
-        """All of it in terms that JSON knows, as ``of_content`` reads it."""
-        views = zip(self.confusions.tolist(), self.explained.tolist(), self.seconds.tolist(), strict=True)
-        return {
-            "names": list(self.names),
-            "views": [
-                {"confusion": confusion, "explained": explained, "seconds": seconds}
-                for confusion, explained, seconds in views
-            ],
-        }
-
-    @classmethod
-    def of_content(cls, content: Mapping[str, Any]) -> "SearchScores":
-        """Scores that ``content`` has made; raises ``KeyError``, ``TypeError`` or ``ValueError`` for anything else."""
-        names, views = tuple(content["names"]), content["views"]
-        classes = len(names) + 1
-        return cls(
-            names,
-            np.array([view["confusion"] for view in views], dtype=np.int64).reshape(len(views), classes, classes),
-            np.array([view["explained"] for view in views], dtype=bool),
-            np.array([view["seconds"] for view in views], dtype=float),
-        )
 
 
 def score_search(
@@ -120,20 +91,16 @@ def score_search(
     """
     registrar = Registrar(None, kept_model(scene), given=scene)
     registrar.prepare()  # no part of a frame's seconds
-    names, started = scene.rest.names, time.monotonic()
-    rows: list[tuple[Int[np.ndarray, "c c"], bool, float]] = []
-    if begun is not None:
-        rows += zip(begun.confusions, begun.explained.tolist(), begun.seconds.tolist(), strict=True)
-    with progress("score the search", views - len(rows), "views") as shown:
-        while len(rows) < views and (len(rows) < least or time.monotonic() - started < budget_s):
-            rows.append(_scored(scene, registrar, cells, len(rows)))
+    started, scored = time.monotonic(), [] if begun is None else list(begun.views)
+    with progress("score the search", views - len(scored), "views") as shown:
+        while len(scored) < views and (len(scored) < least or time.monotonic() - started < budget_s):
+            scored.append(_scored(scene, registrar, cells, len(scored)))
             shown.advance()
-    confusions, explained, seconds = zip(*rows, strict=True)
-    return SearchScores(names, np.stack(confusions), np.array(explained), np.array(seconds))
+    return SearchScores(scene.rest.names, scored, registrar.model.swaps)
 
 
-def _scored(scene: Scene, registrar: Registrar, cells: int, index: int) -> tuple[Int[np.ndarray, "c c"], bool, float]:
-    """Confusion matrix, whether the view is explained, and seconds; a view in which nothing is found scores 0."""
+def _scored(scene: Scene, registrar: Registrar, cells: int, index: int) -> dict[str, Any]:
+    """Scores of a view, as ``SearchScores.views`` has them; one in which nothing is found scores 0."""
     case = scene_case(scene, GenerateConfig(), TEST_SEED_START, cells, index)
     started = time.perf_counter()
     labels, explained = np.zeros_like(case.truth.grid.labels), False
@@ -144,7 +111,8 @@ def _scored(scene: Scene, registrar: Registrar, cells: int, index: int) -> tuple
         explained = answer.registration is not None and answer.registration.accepted
     except ValueError:  # too few points, or nothing is found in them
         seconds = time.perf_counter() - started
-    return grid_confusion(case.truth, labels, len(scene.rest.names)), explained, seconds
+    confusion = grid_confusion(case.truth, labels, len(scene.rest.names))
+    return {"confusion": confusion.tolist(), "explained": explained, "seconds": seconds}
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------
@@ -173,19 +141,29 @@ def search_scores(output: Path, scene: Scene, named: str, budget_s: float, cells
 def scores_of_views(output: Path, scene: Scene, named: str, views: int, cells: int = CELLS) -> SearchScores:
     """Scores of the search alone on so many views, of which the folder has some already; the others are added to it."""
     scores = _read(output, scene)
-    if len(scores) < views:
+    if len(scores.views) < views:
         scores = score_search(scene, views=views, least=views, cells=cells, begun=scores)
         _write(output, scene, named, scores)
-    return scores.first(views)
+    return replace(scores, views=scores.views[:views])
 
 
 def search_line(scores: SearchScores) -> str:
     """Sentence on the scores, for the terminal."""
     summary = scores.summary()
+    count, seconds = summary["examples"], summary["seconds"]
+    either = summary["miou_up_to_symmetry"]
+    symmetric = f" ({format_score(either)} up to symmetry)" if either > summary["miou"] + CLEARLY else ""
     return (
-        f"search alone, without training: IoU {format_score(summary['iou'])}, mIoU {format_score(summary['miou'])} on "
-        f"{len(scores)} test views, {int(scores.explained.sum())} of them explained, {scores.median_s:.2f} s a frame"
+        f"search alone, without training: IoU {format_score(summary['iou'])}, mIoU {format_score(summary['miou'])}"
+        f"{symmetric} on {count} test views, {round(count * summary['explained'])} of them explained, "
+        f"{seconds:.2f} s a frame"
     )
+
+
+def symmetry_lines(scene: Scene) -> list[str]:
+    """Sentences on segments that no frame tells apart, and so no training either."""
+    exchanged = [each for each in find_symmetries(scene.rest, TOLERANCE) if not each.keeps_segments]
+    return [f"{sentence}, so no training can" for sentence in describe_symmetries(exchanged, scene.rest.names)]
 
 
 def _digests(scene: Scene) -> dict[str, str | None]:
@@ -195,14 +173,17 @@ def _digests(scene: Scene) -> dict[str, str | None]:
 
 
 def _write(output: Path, scene: Scene, named: str, scores: SearchScores) -> None:
-    write_json(output / SEARCH, {"scene": named, **_digests(scene), "seed": TEST_SEED_START, **scores.content()})
+    facts = {"scene": named, **_digests(scene), "seed": TEST_SEED_START}
+    write_json(output / SEARCH, {**facts, "names": scores.names, "swaps": scores.swaps, "views": scores.views})
 
 
 def _read(output: Path, scene: Scene) -> SearchScores:
     path = output / SEARCH
     try:
         content = json.loads(path.read_text("utf-8"))
-        scores = SearchScores.of_content(content)
+        swaps = tuple(tuple(int(index) for index in swap) for swap in content["swaps"])
+        scores = SearchScores(tuple(content["names"]), content["views"], swaps)
+        scores.summary()
     except (ValueError, KeyError, TypeError):
         raise ValueError(f"{path} holds no scores; remove it, and they are made again") from None
     if any(content.get(key) != value for key, value in _digests(scene).items()):
@@ -222,10 +203,10 @@ Method = Literal["auto", "search", "network"]
 """Who is to answer, as ``--method`` says it: both, the search alone, or the network alone."""
 
 GOOD_ENOUGH = 0.85
-"""mIoU from which the search alone is good enough; IoU of an object in one segment."""
+"""mIoU up to symmetry from which the search alone is good enough; IoU of an object in one segment."""
 
 LOWEST = 0.5
-"""mIoU that each view must have: in one with less, segments that look alike are exchanged."""
+"""mIoU up to symmetry that each view must have: in one with less, segments that look alike are exchanged."""
 
 
 def shortcomings(search: Mapping[str, Any]) -> list[str]:
@@ -234,8 +215,8 @@ def shortcomings(search: Mapping[str, Any]) -> list[str]:
     reasons = []
     if missed:
         reasons.append(f"{missed} of {views} views are not explained")
-    if search["miou"] < GOOD_ENOUGH:
-        reasons.append(f"mIoU {format_score(search['miou'])} is below {GOOD_ENOUGH}")
+    if search["miou_up_to_symmetry"] < GOOD_ENOUGH:
+        reasons.append(f"mIoU {format_score(search['miou_up_to_symmetry'])} is below {GOOD_ENOUGH}")
     if search["lowest_miou"] < LOWEST:
         reasons.append(f"mIoU of the worst view, {format_score(search['lowest_miou'])}, is below {LOWEST}")
     return reasons
@@ -260,9 +241,11 @@ def best_method(table: Mapping[str, Mapping[str, Any]]) -> tuple[Method, str]:
     more views, else the faster one; the network alone, which registers nothing, only where it is clearly better still.
 
     Args:
-        table: IoU, mIoU, explained share and seconds of "search", "network" and "both", on the same views.
+        table: IoU, mIoU up to symmetry, explained share and seconds of "search", "network" and "both", on the same
+            views.
     """
-    scores = {name: float(row["miou"] if row["miou"] is not None else row["iou"]) for name, row in table.items()}
+    miou = {name: row["miou_up_to_symmetry"] for name, row in table.items()}
+    scores = {name: float(row["iou"] if miou[name] is None else miou[name]) for name, row in table.items()}
     search, both = table["search"], table["both"]
     if scores["network"] > max(scores["search"], scores["both"]) + CLEARLY:
         return "network", f"use the network alone: mIoU {_than(scores, 'network', 'both')}"

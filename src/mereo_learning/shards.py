@@ -41,7 +41,7 @@ from pydantic import BaseModel, Field, ValidationError
 from mereo.io.atomic_files import check_place
 from mereo.io.checked_tensors import check_tensors, pack_tensors, read_content, unpack_tensors
 from mereo.io.errors import first_problem, reason
-from mereo.io.object_storage import ObjectPath, Place, claim, names_in, write_whole
+from mereo.io.object_storage import Place, claim, names_in, write_whole
 from mereo.io.progress import progress
 from mereo.scenes.random_states import scene_model, states_for
 from mereo.scenes.registry import is_yaml, load_scene
@@ -50,7 +50,7 @@ from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.scenes.statistical_model import read_statistical_model, statistical_model_bytes
 from mereo.synthesis.config import STATISTICAL_MODEL, TEMPLATE, GenerateConfig
-from mereo.synthesis.examples import Clouds, Example, synthesize
+from mereo.synthesis.examples import Example, synthesize
 from mereo.workers.spread import Cluster, spread
 
 SHARD_SIZE = 64
@@ -244,30 +244,6 @@ def read_template(path: Place, manifest: Mapping[str, Any]) -> Float16[np.ndarra
     return tensors["distance"]
 
 
-def check_space(output: Place, examples: int, each: int, machines: int) -> None:
-    """Raise ``ValueError`` where examples of ``each`` bytes do not fit on the disk, beside those that are there.
-
-    An object storage tells no free space.
-
-    Args:
-        output: the dataset's folder, which may not exist yet.
-        examples: of the whole dataset.
-        each: bytes of one.
-        machines: that share the work; this one makes its part.
-    """
-    if isinstance(output, ObjectPath):
-        return
-    stored = sum(file.stat().st_size for file in output.glob("shard-*.safetensors")) if output.is_dir() else 0
-    disk = next(folder for folder in (output.absolute(), *output.absolute().parents) if folder.is_dir())
-    free = shutil.disk_usage(disk).free
-    needed = max(0, min(examples * each - stored, -(-examples // machines) * each))
-    if needed > free:
-        raise ValueError(
-            f"--examples {examples} needs {needed / 1e9:,.1f} GB at {each / 1e3:,.1f} kB each and {output} has "
-            f"{free / 1e9:,.1f} GB free; {machines * (free // each)} would fit: ask for fewer, or change --output"
-        )
-
-
 # --- generation -------------------------------------------------------------------------------------------------------
 
 
@@ -337,11 +313,22 @@ def generate(
     if isinstance(output, Path):
         check_place(output, may_be_link=True)
     config.check()
-    _check_sharing(workers, shard)
+    if isinstance(workers, int) and workers < 1:
+        raise ValueError(f"the number of workers is {workers}; it must be at least 1: pass 1, or one per core")
+    if not 0 <= shard[0] < shard[1]:
+        raise ValueError(f"the shard is {shard[0]}/{shard[1]}; i/n needs i from 0 to n - 1: pass for example 0/4")
     settings, examples, seed = config.settings, config.examples, config.seed
     loaded = load_scene(scene) if isinstance(scene, str) else scene
     manifest = make_manifest(loaded, settings, examples, seed)
-    check_space(output, examples, manifest["bytes"] // examples, shard[1])
+    if isinstance(output, Path):  # an object storage tells no free space
+        stored = sum(file.stat().st_size for file in output.glob("shard-*.safetensors"))
+        disk = next(folder for folder in output.absolute().parents if folder.is_dir())
+        needed, free = manifest["bytes"] // shard[1] - stored, shutil.disk_usage(disk).free
+        if needed > free:
+            raise ValueError(
+                f"--examples {examples} needs {needed / 1e9:,.1f} GB and {output} has {free / 1e9:,.1f} GB free: ask "
+                "for fewer, or change --output"
+            )
     numbers = range(shard[0], -(-examples // SHARD_SIZE), shard[1])
     before = claim(output, MANIFEST, manifest, "a dataset")
     if before is not None:
@@ -372,13 +359,6 @@ def generate(
         for rows, data in made:
             write_whole(output / shard_name(rows.start // SHARD_SIZE), data)
             shown.advance(len(rows))
-
-
-def _check_sharing(workers: int | Cluster, shard: tuple[int, int]) -> None:
-    if isinstance(workers, int) and workers < 1:
-        raise ValueError(f"the number of workers is {workers}; it must be at least 1: pass 1, or one per core")
-    if not 0 <= shard[0] < shard[1]:
-        raise ValueError(f"the shard is {shard[0]}/{shard[1]}; i/n needs i from 0 to n - 1: pass for example 0/4")
 
 
 # --- the manifest -----------------------------------------------------------------------------------------------------
@@ -449,7 +429,11 @@ def _make_shard(scene: str | Scene, settings: GenerateConfig, seed: int, dataset
 
 def pack(example: Example, points: int) -> dict[str, np.ndarray]:
     """Row of each tensor of a shard for one example; clouds with fewer points repeat theirs from the front."""
-    count, queries = len(example.cloud), example.queries
+    count, queries, seen = len(example.cloud), example.queries, dict[str, np.ndarray]()
+    if example.observations:  # half precision is off by 0.0003 where a pixel is 0.03 wide
+        clouds = np.stack([_filled(cloud, points) for cloud in example.observations]).astype(np.float16)
+        counts = np.array([len(cloud) for cloud in example.observations], dtype=np.int32)
+        seen = {"seen": clouds, "seen_count": counts}
     return {
         "cloud": _filled(example.cloud, points).astype(np.float32),
         "cloud_count": np.array(count, dtype=np.int32),
@@ -460,19 +444,9 @@ def pack(example: Example, points: int) -> dict[str, np.ndarray]:
         "distances": queries.distances.astype(np.float32),
         "directions": queries.directions.astype(np.float16),
         "rest": queries.rest.astype(np.float16),
-        **_pack_observations(example.observations, points),
+        **seen,
     }
 
 
 def _filled(cloud: Float[np.ndarray, "n 3"], points: int) -> Float[np.ndarray, "p 3"]:
-    """Cloud of so many points, which repeats its own from the front."""
     return cloud[np.arange(points) % len(cloud)]
-
-
-def _pack_observations(clouds: Clouds, points: int) -> dict[str, np.ndarray]:
-    """Rows for further observations, none without any; half precision is off by 0.0003 where a pixel is 0.03 wide."""
-    if not clouds:
-        return {}
-    seen = np.stack([_filled(cloud, points) for cloud in clouds])
-    counts = np.array([len(cloud) for cloud in clouds], dtype=np.int32)
-    return {"seen": seen.astype(np.float16), "seen_count": counts}

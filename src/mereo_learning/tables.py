@@ -32,14 +32,17 @@ def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
     scores, (iou, miou), errors = evaluation.scores, evaluation.example_mean, evaluation.errors
     count = len(evaluation.examples)
     sources = evaluation.sources if len(evaluation.sources) == count else (None,) * count
+    words = [str(known).lower() for known in evaluation.known]
     known = evaluation.known if len(evaluation.known) == count else (None,) * count
     return {
         **facts,
         "examples": count,
         "definition": f"{CELLS}^3 cell centres of the joint box, kept inside any segment's box enlarged by 50 %; one "
-        "confusion matrix over the set; miou is the mean over the segments without empty space",
+        "confusion matrix over the set; miou is the mean over the segments without empty space; up to symmetry, segments "
+        "that no frame tells apart are exchanged in an example where that suits the answer",
         "iou": scores.iou,
         "miou": scores.miou,
+        "miou_up_to_symmetry": evaluation.miou_up_to_symmetry,
         "seconds": float(np.median(evaluation.seconds)) if evaluation.seconds else None,
         "per_segment": dict(zip(evaluation.names, scores.per_segment.tolist(), strict=True)),
         "example_mean": {"iou": iou, "miou": miou},
@@ -59,7 +62,7 @@ def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
         "better": {name: _share_better(answer, evaluation) for name, answer in evaluation.answers.items()},
         "registration_error": None if errors is None else errors.summary(evaluation.unit_mm),
         "coverage95": None if errors is None else errors.coverage(evaluation.unit_mm),
-        "known": _recognition(evaluation),
+        "known": {word: words.count(word) / len(words) for word in ("true", "unsure", "false")} if words else None,
     }
 
 
@@ -76,15 +79,13 @@ def _value(scores: Scores) -> float:
 def _answer(answer: AnswerScores, segmented: bool) -> dict[str, float]:
     scores = intersection_over_union(answer.confusion, segmented)
     tenth = float(np.quantile([example.miou for example in answer.examples], 0.1))
-    return {"iou": scores.iou, "miou": scores.miou, "seconds": float(np.median(answer.seconds)), "miou_tenth": tenth}
-
-
-def _recognition(evaluation: Evaluation) -> dict[str, float] | None:
-    """Share of the examples that are said to show the object, not to, and unsure; None where nothing was said."""
-    if not evaluation.known:
-        return None
-    words = [str(known).lower() for known in evaluation.known]
-    return {word: words.count(word) / len(words) for word in ("true", "unsure", "false")}
+    return {
+        "iou": scores.iou,
+        "miou": scores.miou,
+        "miou_up_to_symmetry": answer.miou_up_to_symmetry,
+        "seconds": float(np.median(answer.seconds)),
+        "miou_tenth": tenth,
+    }
 
 
 def certainty_lines(metrics: Mapping[str, Any]) -> list[str]:

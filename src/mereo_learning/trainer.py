@@ -14,7 +14,7 @@ from pathlib import Path
 
 import torch
 import torch.distributed as dist
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from mereo.io.atomic_files import check_place
@@ -27,7 +27,7 @@ from mereo.models.network import Network
 from mereo.models.weights import save_model, trained_steps
 from mereo.models.weights_place import WEIGHTS
 from mereo_learning.config import TrainConfig
-from mereo_learning.dataset import Batch, Dataset, Draws, ShuffledOrder, seed_of
+from mereo_learning.dataset import Batch, Dataset, Draws, seed_of, shuffled_index
 from mereo_learning.losses import supervised_loss, with_known
 from mereo_learning.metrics_log import MetricsLog
 from mereo_learning.processes import (
@@ -102,9 +102,6 @@ def _train(
 VALIDATIONS = 20
 """Held-out scores of a run, evenly over its steps: by the clock, a resumed run would have others."""
 
-READ_EVERY = 20
-"""Steps after which losses are read on a device where reading waits."""
-
 
 def steps_between(total: int) -> int:
     """Steps from one held-out score to the next, in a run of ``total``."""
@@ -129,20 +126,18 @@ class Trainer:
         self.optimizer = torch.optim.AdamW(parameter_groups(self.network, config), lr=config.learning_rate, fused=True)
         self.examples = len(data) - config.holdout
         self.before = seen_by(config.init)  # now: the file may be gone when the weights are saved
-        self.order = ShuffledOrder(self.examples, config.batch, config.seed)
         share = config.batch // process.world
         self.rows = slice(process.rank * share, (process.rank + 1) * share)
         self.total = max(1, math.ceil(config.epochs * self.examples / config.batch))
         self.step = self.saved_step = 0
         self.log = MetricsLog(run_dir, bool(data.further)) if process.is_main else None
-        self.unread: list[tuple[int, float, dict[str, Tensor]]] = []
         self.autocast = pick_precision(config.precision, device)
         self.module: nn.Module = share_statistics(self.network, process, device)
         if process.world > 1:
             self.module = nn.parallel.DistributedDataParallel(self.network)
         if config.compile == "on" or (config.compile == "auto" and compiling_pays(device, self.total)):
             self.module = torch.compile(self.module)  # type: ignore[assignment]
-        self.first_step = self.shown_step = 0
+        self.first_step = 0
         self.shown: Progress | None = None
 
     def say(self, text: str) -> None:
@@ -153,7 +148,6 @@ class Trainer:
     @contextmanager
     def showing(self) -> Iterator[None]:
         """Block in which the steps from here are shown."""
-        self.shown_step = self.step
         with progress("train", self.total - self.step, "steps", each=self.config.batch) as self.shown:
             yield
         self.shown = None
@@ -162,21 +156,15 @@ class Trainer:
         """Block whose time is no step's."""
         return nullcontext() if self.shown is None else self.shown.paused()
 
-    def _scoring_s(self, shown: Progress) -> float:
-        """Seconds of the scores to come, of held-out examples and for the class offsets.
-
-        To answer an example is taken to cost half of what learning from it does.
-        """
-        between = steps_between(self.total)
-        validations = -(-self.total // between) - self.step // between
-        scored = validations * len(held_out(self.data, self.config)) * (2 if self.data.further else 1)
-        return shown.unit_s / self.config.batch / 2 * (scored + self.config.offset_examples)
+    def index(self, step: int) -> Int[Tensor, " b"]:
+        """Numbers of the examples in the whole batch of a step."""
+        return shuffled_index(step, self.examples, self.config.batch, self.config.seed)
 
     def batches(self) -> Iterator[Batch]:
         """Share of this process in every remaining batch."""
         config = self.config
         for step in range(self.step, self.total):
-            index = self.order.index(step)[self.rows]
+            index = self.index(step)[self.rows]
             draws = Draws.of(seed_of(config.seed, step, 0), config.batch, self.rows)
             batch = self.data.batch(index, config.network.points, config.queries, config.augment, draws)
             yield with_known(batch, self.process)
@@ -195,10 +183,7 @@ class Trainer:
         self.optimizer.step()
         self.step += 1
         update_average(self.average, self.network, self.step, self.config.ema_decay)
-        values = {"norm": norm, **self._of_all({"loss": loss.detach(), **terms})}
-        self.unread.append((self.step, self.config.learning_rate * part, values))
-        if self.device.type == "cpu" or self.step % READ_EVERY == 0 or self.step == self.total:
-            self._read_losses()  # on a CPU that waits for nothing
+        self._record(self.config.learning_rate * part, {"norm": norm, **self._of_all({"loss": loss.detach(), **terms})})
 
     def _of_all(self, terms: dict[str, Tensor]) -> dict[str, Tensor]:
         """Means over all processes, which so stop at the same step, as DDP has made them of the gradients."""
@@ -218,31 +203,21 @@ class Trainer:
             loss = loss + self.config.l1_weight * terms["code"]
         return loss, {name: value.detach() for name, value in terms.items()}
 
-    def _read_losses(self) -> None:
-        """Log the steps since the last call, all with one copy from the device, which would wait at every step.
-
-        Whoever saves calls it first, so nothing is saved of a step whose loss or gradient is not finite, or after it.
-        All processes call it at the same steps, and raise the same.
-        """
-        if not self.unread:
-            return
-        values = torch.stack([torch.stack(list(terms.values())) for _, _, terms in self.unread]).tolist()
-        for (step, rate, terms), row in zip(self.unread, values, strict=True):
-            losses = dict(zip(terms, row, strict=True))
-            norm = losses.pop("norm")
-            if not (math.isfinite(norm) and math.isfinite(losses["loss"])):
-                raise ValueError(self._divergence(step, losses["loss"], norm))
-            if self.log is not None:
-                self.log.add_step(step, rate, losses)
-        self.unread.clear()
+    def _record(self, rate: float, terms: dict[str, Tensor]) -> None:
+        """Log a step; raises ``ValueError`` where it is not finite, in all processes, so nothing is saved of it."""
+        losses = dict(zip(terms, torch.stack(list(terms.values())).tolist(), strict=True))
+        norm = losses.pop("norm")
+        if not (math.isfinite(norm) and math.isfinite(losses["loss"])):
+            raise ValueError(self._divergence(self.step, losses["loss"], norm))
+        if self.log is not None:
+            self.log.add_step(self.step, rate, losses)
         if self.shown is not None:
-            self.shown.advance(self.step - self.shown_step, f"loss {losses['loss']:.4f}", self._scoring_s(self.shown))
-            self.shown_step = self.step
+            self.shown.advance(1, f"loss {losses['loss']:.4f}")
 
     def _divergence(self, step: int, loss: float, norm: float) -> str:
         """Sentence about a step that is not finite: where it is, what is left, and what may help."""
         what = f"the gradient's norm is {norm}" if math.isfinite(loss) else f"the loss is {loss}"
-        batch = self.order.index(step - 1).tolist()
+        batch = self.index(step - 1).tolist()
         examples = ", ".join(map(str, batch[:8])) + (", ..." if len(batch) > 8 else "")
         kept = (
             f"the checkpoint and weights of step {self.saved_step} are kept" if self.saved_step else "nothing is saved"
@@ -259,26 +234,22 @@ class Trainer:
         due = self.step % steps_between(self.total) == 0 or self.step == self.total
         if not (due and self.config.holdout):
             return
-        self._read_losses()
         with self._no_step(), meeting(self.process):
-            if self.log is not None:
-                self._validate(self.log)
-
-    def _validate(self, log: MetricsLog) -> None:
-        self._update_codes()
-        scores = validate(self.average, self.data, self.config)
-        log.add_validation(self.step, scores.iou, scores.miou)
-        if self.data.further:
-            scores = validate(self.average, self.data, self.config, further=True)
-            log.add_validation(self.step, scores.iou, scores.miou, "sensor")
-        self.say(f"held-out examples at step {self.step}: {log.summary()}")
+            if self.log is None:
+                return
+            self._update_codes()
+            scores = validate(self.average, self.data, self.config)
+            self.log.add_validation(self.step, scores.iou, scores.miou)
+            if self.data.further:
+                scores = validate(self.average, self.data, self.config, further=True)
+                self.log.add_validation(self.step, scores.iou, scores.miou, "sensor")
+            self.say(f"held-out examples at step {self.step}: {self.log.summary()}")
 
     def save(self, finished: bool = False) -> None:
         """Write metrics, curves, the weights and the checkpoint; every file atomically.
 
         The checkpoint is the last, so whatever stops this leaves one from which the others are written again.
         """
-        self._read_losses()
         with self._no_step(), meeting(self.process):
             if self.log is not None:
                 self._save(self.log, finished)

@@ -9,7 +9,7 @@ import pytest
 
 from mereo.fitting.registration.register import CloudToFit, Registrar
 from mereo.geometry.camera import PointCloud
-from mereo.geometry.metrics import Scores, truth_grid
+from mereo.geometry.metrics import Scores
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.atomic_files import write_json
 from mereo.models.model import Model
@@ -20,7 +20,7 @@ from mereo.scenes.scene import State
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import View, sample_view
-from mereo_learning.cases import Evaluation, RegistrationErrors, find_candidates, seen_points
+from mereo_learning.cases import Evaluation, RegistrationErrors, seen_points
 from mereo_learning.scoring import EvaluationConfig, evaluate
 from mereo_learning.tables import markdown_table, metrics
 
@@ -35,25 +35,6 @@ def model() -> Model:
 @pytest.fixture(scope="module")
 def view() -> View:
     return sample_view(load_scene("engine").for_seed(SEED), GenerateConfig(), example_rng(SEED, 0))
-
-
-@pytest.mark.slow
-def test_a_user_gets_what_is_scored(model: Model, view: View) -> None:
-    cloud, grid = view.depth.to_points(), truth_grid(view.mesh, 24).grid
-    alone = find_candidates(model, cloud, grid, None, 1.0)
-    assert list(alone.each) == ["network"] and alone.source == "network"
-    modes = find_candidates(model, cloud, grid, Registrar.of(model, "modes"), 1.0)
-    assert list(modes.each) == ["network", "modes"] and modes.default == "modes"
-    every = find_candidates(model, cloud, grid, Registrar.of(model, "auto"), 1.0)
-    assert list(every.each) == ["network", "modes", "full"]
-    for name in ("network", "modes"):
-        np.testing.assert_array_equal(every.each[name].labels, modes.each[name].labels)
-    assert every.each["full"].seconds > every.each["modes"].seconds
-    stretched = PointCloud(cloud.points * np.array([1.0, 1.8, 1.0]))
-    assert find_candidates(model, stretched, grid, Registrar.of(model, "auto"), 1.0).source == "network"
-    forced = find_candidates(model, stretched, grid, Registrar.of(model, "modes"), 1.0)
-    assert forced.source == "modes" and forced.answer.registration is not None
-    assert not forced.answer.registration.accepted
 
 
 def test_a_registration_is_as_far_off_as_its_points_are(model: Model, view: View) -> None:

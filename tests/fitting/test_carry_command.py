@@ -10,7 +10,7 @@ import trimesh
 
 from mereo import __main__ as command_line
 from mereo.fitting.registration.register import CloudToFit, Registrar, fit_frame
-from mereo.io.attachments import PoseTable, Surfaces, read_attachments, read_pose_table
+from mereo.io.attachments import read_pose_table
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.volume_files import Volume, read_volume
 from mereo.io.writers.volumes import write_volume
@@ -110,7 +110,7 @@ def test_a_wrong_unit_is_not_believed(weights: Model, view: SampleView) -> None:
     [
         (["--method", "network"], "--method is network, but --carry needs a registration"),
         (["--carry", "nowhere.stl"], "nowhere.stl does not exist"),
-        (["--carry", "."], "has the suffix ''; what is carried is one of .stl"),
+        (["--carry", "."], "has the suffix ''; a file to carry is one of .stl"),
     ],
 )
 def test_the_command_refuses_before_any_work(
@@ -129,26 +129,7 @@ def test_a_frame_of_nothing_is_refused(folder: Path, capsys: pytest.CaptureFixtu
 def test_without_a_registration_nothing_is_written(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with monkeypatch.context() as patched:
-        patched.setattr(Registrar, "takes", lambda *_: False)  # as of a frame that no state explains
-        assert run(folder, *carrying(folder, "grasp.csv"), output="none") != 0
+    monkeypatch.setattr(Registrar, "takes", lambda *_: False)  # as of a frame that no state explains
+    assert run(folder, *carrying(folder, "grasp.csv"), output="none") != 0
     assert "the network's answer is kept, but --carry needs a registration" in capsys.readouterr().err
     assert not (folder / "none").exists()
-    (folder / "far.csv").write_text("x,y,z\n9000,0,0\n", encoding="utf-8")
-    assert run(folder, *carrying(folder, "far.csv"), output="none") != 0
-    assert "1 of 1 points of far.csv are farther from the object" in capsys.readouterr().err
-
-
-def test_weights_without_a_model_say_so(
-    folder: Path, weights: Model, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    bare = replace(weights, statistical_model=None, provenance={**weights.provenance, "scene": "mine"})
-    save_model(bare, tmp_path / "rope.safetensors")
-    np.save(tmp_path / "cloud.npy", np.load(folder / "cloud.npy"))
-    assert run(tmp_path, *carrying(folder, "grasp.csv")) != 0
-    assert "carry no statistical model of their object's states" in capsys.readouterr().err
-
-
-def test_everything_that_can_be_carried_is_read_by_its_name(folder: Path) -> None:
-    kinds = [type(one.content) for one in read_attachments([folder / "own.ply", folder / "grasp.csv"])]
-    assert kinds == [Surfaces, PoseTable]

@@ -5,14 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from answers import fit_correspondences
+from fit_cases import IN_FRONT, SCENE, said, seen, shown
 from scipy.spatial.transform import Rotation
-from toy_scene import toy_scene
 
+from mereo.fitting.config import FitConfig
+from mereo.fitting.draws.fit import DrawsProblem, Shape, approach, derivatives, fit_draws, lay_on_shape, secant
+from mereo.fitting.draws.fit import narrowing as narrowing_of_draws
 from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
-from mereo.fitting.problem.correspondences import Correspondences, estimate_unit
+from mereo.fitting.modes import narrowing, turns
+from mereo.fitting.problem.correspondences import Correspondences, nothing
 from mereo.fitting.problem.evidence import Evidence
-from mereo.fitting.problem.gauss_newton import POSE, Posed, along
+from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, along
+from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
+from mereo.fitting.problem.residuals import NetworkTerm
 from mereo.fitting.registration.recognition import recognize
+from mereo.fitting.registration.register import CloudToFit, ModesFit, is_drawn
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
 from mereo.scenes.random_states import state_points
@@ -22,13 +29,7 @@ from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import View, sample_view
 
-SCENE = toy_scene()
 CLEAN = replace(GenerateConfig(), noise_std=0.0)
-
-
-@pytest.fixture(scope="module")
-def model(toy_model: StatisticalModel) -> StatisticalModel:
-    return toy_model
 
 
 def true_material(model: StatisticalModel, view: View) -> np.ndarray:
@@ -40,11 +41,7 @@ def true_material(model: StatisticalModel, view: View) -> np.ndarray:
 
 def told(model: StatisticalModel, view: View, error: float = 0.0) -> Correspondences:
     """What a network might say: 200 material points, wrong by ``error`` units."""
-    rng = np.random.default_rng(0)
-    chosen = rng.choice(len(model.labels), 200, replace=False)
-    rest = model.rest_points[chosen] + rng.normal(scale=max(error, 1e-12), size=(200, 3))
-    observed = np.arange(200) < 100
-    return Correspondences(true_material(model, view)[chosen], rest, model.labels[chosen], np.ones(200), observed)
+    return said(model, true_material(model, view), max(error, 1e-12))
 
 
 @pytest.fixture(scope="module")
@@ -66,14 +63,6 @@ def test_a_known_state_is_found(model: StatisticalModel, index: int) -> None:
     assert found.accepted and found.explained > 0.99 and found.beyond_states < 0.05
 
 
-def test_the_cloud_mends_a_network_that_is_unsure(
-    model: StatisticalModel, view: View, registration: Registration
-) -> None:
-    """Correspondences that are 1 unit off lead to a state 10 times better than themselves."""
-    error = np.linalg.norm(registration.material - true_material(model, view), axis=1)
-    assert np.median(error) < 0.1
-
-
 def test_the_fit_turns_with_the_frame(model: StatisticalModel, view: View, registration: Registration) -> None:
     """Everything is turned about the camera: so is the answer."""
     T = rigid(Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix(), np.zeros(3))
@@ -93,15 +82,6 @@ def test_the_unit_changes_nothing(model: StatisticalModel, view: View, registrat
     np.testing.assert_allclose(scaled.material / unit, free.material, atol=0.05)
 
 
-def test_another_object_is_not_believed(model: StatisticalModel, view: View) -> None:
-    """A cloud of twice the height is said to be unexplained."""
-    points = view.depth.to_points().points
-    middle = points.mean(axis=0)
-    found = told(model, view)
-    stretched = fit_correspondences(middle + (points - middle) * [1.0, 2.0, 1.0], found, model, 1.0)
-    assert not stretched.accepted
-
-
 def test_what_the_frame_rules_out_is_told(model: StatisticalModel, view: View, registration: Registration) -> None:
     """Nothing of a right fit; half of a cloud leaves the model's other half where nothing of it was seen."""
     assert registration.ruled_out == 0.0 and recognize(registration).known is True
@@ -119,12 +99,6 @@ def test_to_rest_undoes_to_camera(registration: Registration) -> None:
     points, labels = points[labels > 0], labels[labels > 0]
     moved = registration.to_camera(points)
     np.testing.assert_allclose(registration.to_rest(moved, labels), points, atol=1e-3)
-
-
-def test_material_points_go_where_the_mesh_is(registration: Registration) -> None:
-    corners = registration.model.rest.segments[3].vertices[:20]
-    moved = registration.to_camera(corners, np.full(20, 4, dtype=np.uint8))
-    np.testing.assert_allclose(moved, registration.mesh.segments[3].vertices[:20], atol=0.2)
 
 
 def test_queries_agree_with_the_mesh(registration: Registration) -> None:
@@ -151,13 +125,6 @@ def test_derivatives_are_those_of_differences(model: StatisticalModel) -> None:
         np.testing.assert_allclose(found[:, number], (moved * direction).sum(axis=1) / 2e-2, rtol=2e-3, atol=2e-2)
 
 
-def test_true_surfaces_violate_nothing(view: View) -> None:
-    """The vertices that are seen, and those hidden behind them, are within what the frame allows."""
-    evidence = Evidence.of(view.depth.to_points().points)
-    _, amount = evidence.violations(np.concatenate([s.vertices for s in view.mesh.segments]), 0.5)
-    assert (amount > 0.5).mean() < 0.01
-
-
 def test_vertices_in_front_or_beside_are_pushed_back(view: View) -> None:
     points = view.depth.to_points().points
     evidence = Evidence.of(points)
@@ -167,19 +134,7 @@ def test_vertices_in_front_or_beside_are_pushed_back(view: View) -> None:
     assert direction[0] @ middle > 0 and direction[1, 0] < 0
 
 
-def test_the_unit_is_told_by_distances(model: StatisticalModel, view: View) -> None:
-    assert estimate_unit(told(model, view).scaled(0.001)) == pytest.approx(0.001, rel=0.1)
-
-
 # --- draws ------------------------------------------------------------------------------------------------------------
-
-
-def test_draws_played_back_give_the_same_state(model: StatisticalModel) -> None:
-    drawn = Drawn.of(SCENE, 3)
-    states = DrawnStates.of(SCENE, model, 1, 3)
-    deformations = drawn.deformations(SCENE, drawn.z)
-    assert deformations is not None
-    np.testing.assert_allclose(material_moved(SCENE, model, deformations), states.material[0], atol=1e-4)
 
 
 def test_draws_find_a_state_of_the_scene(model: StatisticalModel) -> None:
@@ -189,3 +144,230 @@ def test_draws_find_a_state_of_the_scene(model: StatisticalModel) -> None:
     assert found.method == "draws"
     error = np.linalg.norm(found.material - true_material(model, view), axis=1)
     assert np.median(error) < 0.05
+
+
+# --- the object at rest -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("noise", "unit"), [(0.0, 1.0), (0.1, 1.0), (0.1, 0.004)])
+def test_an_object_at_rest_is_found_to_be_at_rest(model: StatisticalModel, noise: float, unit: float) -> None:
+    material = transform_points(IN_FRONT, model.rest_points)
+    points = seen(model.rest.transformed(IN_FRONT))
+    points = points + np.random.default_rng(0).normal(scale=noise, size=points.shape)
+    found = fit_correspondences(unit * points, said(model, material).scaled(unit), model, unit)
+    assert found.method == "rest" and found.accepted
+    # a rigid motion of the rest model, and the right one
+    apart = [np.linalg.norm(np.diff(places[::50], axis=0), axis=1) for places in (found.material / unit, material)]
+    np.testing.assert_allclose(*apart, atol=1e-6)
+    assert np.linalg.norm(found.material / unit - material, axis=1).max() < 0.05 + noise / 2
+    np.testing.assert_allclose(found.z, model.rest_z)
+
+
+@pytest.mark.parametrize("excess", [0.1, 0.3, 1.0])
+def test_a_bent_object_is_not(model: StatisticalModel, excess: float) -> None:
+    points, material = shown(model, excess)
+    assert fit_correspondences(points, said(model, material), model, 1.0).method == "modes"
+
+
+def test_under_noise_draws_are_asked_too_and_an_object_at_rest_stays_at_rest(model: StatisticalModel) -> None:
+    points, material = seen(model.rest.transformed(IN_FRONT)), transform_points(IN_FRONT, model.rest_points)
+    clean = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
+    noisy = replace(clean, problem=replace(clean.problem, noisy=True))
+    assert noisy.may_take_draws and not clean.may_take_draws
+    found = noisy.with_draws(DrawnStates.of(SCENE, model, 30))
+    assert found.method == "rest" and found.seconds > clean.seconds
+
+
+def test_what_the_frame_does_not_show_narrows_nothing(model: StatisticalModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without evidence the coefficients' posterior is their prior; with more evidence it only narrows."""
+    points, material = shown(model, 0.5)
+    problem = Problem.of(model, said(model, material), Evidence.of(points), KNOWN_SCALE_STD, FitConfig())
+    posed = Posed(IN_FRONT[:3, :3], IN_FRONT[:3, 3], np.zeros(model.count))
+    assert narrowing(problem, posed) > 1.0
+
+    def nothing(self: Problem, normal: NormalEquations, *rest: object) -> NormalEquations:
+        return NormalEquations(normal.matrix + 1e-9 * np.eye(len(normal.matrix)), normal.gradient)
+
+    monkeypatch.setattr(Problem, "seen", nothing)
+    monkeypatch.setattr(
+        Problem, "known", lambda self, p, prior, slack: NormalEquations.prior(p.z, *vars(prior).values(), 0.0, 1.0)
+    )
+    assert narrowing(problem, posed) == pytest.approx(0.0, abs=1e-6)
+
+
+# --- the camera turned in place ---------------------------------------------------------------------------------------
+
+
+AXIS = np.array([0.3, -0.2, 2.0])
+
+
+def confused(found: Correspondences) -> Correspondences:
+    """Correspondences as of an object turned by a third of a turn in itself, about an axis that is none of symmetry."""
+    center = found.rest.mean(axis=0)
+    cyclic = (found.rest - center)[:, [1, 2, 0]] + center
+    return Correspondences(found.points, cyclic, found.labels, found.confidence, found.observed)
+
+
+class Network:
+    """A network that understands a frame only when its camera is turned in one way."""
+
+    def __init__(self, points: np.ndarray, right: Correspondences, turn: np.ndarray | None) -> None:
+        self.points, self.right, self.turn, self.asked = points, right, turn, 0
+
+    def __call__(self, seen: np.ndarray) -> Correspondences:
+        self.asked += 1
+        rotation = np.linalg.lstsq(self.points, seen, rcond=None)[0].T  # from its frame to the one that is asked about
+        understood = self.turn is not None and np.allclose(rotation, self.turn, atol=1e-6)
+        return (self.right if understood else confused(self.right)).turned(rotation)
+
+
+def test_turns_are_different_rotations_that_keep_the_object_in_front_of_the_camera() -> None:
+    found = np.stack(list(turns(AXIS)))
+    np.testing.assert_allclose(found @ found.transpose(0, 2, 1), np.broadcast_to(np.eye(3), found.shape), atol=1e-12)
+    assert np.linalg.det(found) == pytest.approx(np.ones(len(found)))
+    away = found @ (AXIS / np.linalg.norm(AXIS)) @ (AXIS / np.linalg.norm(AXIS))
+    assert (away > np.cos(np.deg2rad(26.0))).all()
+    all_of_them = np.concatenate([np.eye(3)[None], found])
+    apart = np.abs(all_of_them[:, None] - all_of_them[None]).max(axis=(2, 3)) + np.eye(len(all_of_them))
+    assert apart.min() > 0.15
+
+
+@pytest.mark.parametrize("number", [2, 12])
+def test_a_frame_that_the_network_understands_only_when_it_is_turned_is_found(
+    model: StatisticalModel, number: int
+) -> None:
+    points, material = shown(model, 0.8)
+    right = said(model, material)
+    turn = list(turns(points.mean(axis=0)))[number]
+    network = Network(points, right, turn)
+    alone = ModesFit.of(CloudToFit(points, 1.0), confused(right), model)
+    turned = ModesFit.of(CloudToFit(points, 1.0), confused(right), model, predict=network)
+    off, mended = (np.linalg.norm(one.registration().material - material, axis=1) for one in (alone, turned))
+    assert np.median(off) > 3.0 and np.median(mended) < 0.3
+    assert number < network.asked <= 8 * (number // 8 + 1)  # no more than its round
+
+
+def test_a_frame_that_is_explained_is_asked_about_once(model: StatisticalModel) -> None:
+    points, material = shown(model, 0.5)
+    network = Network(points, said(model, material), None)
+    ModesFit.of(CloudToFit(points, 1.0), said(model, material), model, predict=network)
+    assert network.asked == 0
+
+
+def test_noise_that_hides_how_wrong_a_fit_is_hides_it_from_a_last_try_no_more(model: StatisticalModel) -> None:
+    points, material = shown(model, 0.8)
+    points = points * (1 + np.random.default_rng(0).normal(scale=0.4, size=(len(points), 1)) / IN_FRONT[2, 3])
+    right = said(model, material)
+    network = Network(points, right, list(turns(points.mean(axis=0)))[2])
+    first = ModesFit.of(CloudToFit(points, 1.0), confused(right), model, FitConfig(turned=False), predict=network)
+    last = ModesFit.of(CloudToFit(points, 1.0), confused(right), model, FitConfig(turned_anyway=True), predict=network)
+    off, mended = (np.linalg.norm(one.registration().material - material, axis=1) for one in (first, last))
+    assert not first.registration().accepted and np.median(off) > 3.0
+    assert last.registration().accepted and np.median(mended) < 0.5
+
+
+# --- draws: what is played, and the approach to a shape ---------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def states(model: StatisticalModel) -> DrawnStates:
+    return DrawnStates.of(SCENE, model, 30, 1000)
+
+
+def test_all_points_follow_the_played_ones(model: StatisticalModel, states: DrawnStates) -> None:
+    drawn = Drawn.of(SCENE, 1004)
+    deformations = drawn.deformations(SCENE, drawn.z)
+    assert deformations is not None
+    followed = states.played.spread @ states.played.moved(deformations).astype(np.float32)
+    error = np.linalg.norm(followed - material_moved(SCENE, model, deformations), axis=1)
+    assert np.quantile(error, 0.95) < 0.02 * model.half
+
+
+def test_derivatives_predict_a_small_step(states: DrawnStates) -> None:
+    drawn = Drawn.of(SCENE, 1005)
+    here = drawn.deformations(SCENE, drawn.z)
+    step = np.where(drawn.smooth, 0.02 * np.cos(np.arange(len(drawn.z))), 0.0)
+    there = drawn.deformations(SCENE, drawn.z + step)
+    assert here is not None and there is not None
+    points = states.played.moved(here)
+    moved = states.played.moved(there) - points
+    predicted = derivatives(states, drawn, drawn.z, points) @ step
+    assert np.abs(predicted - moved).max() < 0.1 * np.abs(moved).max()
+
+
+def test_a_secant_agrees_with_the_step_and_only_there() -> None:
+    rng = np.random.default_rng(0)
+    motion, step = rng.normal(size=(5, 3, 4)).astype(np.float32), rng.normal(size=4)
+    moved, across = rng.normal(size=(5, 3)), np.array([step[1], -step[0], 0.0, 0.0])
+    found = secant(motion, step, moved)
+    np.testing.assert_allclose(found @ step, moved, atol=1e-5)
+    np.testing.assert_allclose(found @ across, motion @ across, atol=1e-5)
+
+
+def test_the_approach_reaches_a_state_of_the_scene(model: StatisticalModel, states: DrawnStates) -> None:
+    """From another state, to the shape of one whose draws are known, in any pose."""
+    points = states.material[7][states.played.index].astype(np.float64) @ np.diag([-1.0, -1.0, 1.0]) + 5.0
+    shape = Shape.of(points, 0.04 * model.half, np.ones(len(points)))
+    drawn = Drawn.of(SCENE, states.seeds[3])
+    start = lay_on_shape(states, shape, drawn, drawn.z)
+    assert start is not None
+    found = approach(states, shape, start, 3)
+    apart = [np.linalg.norm(n.points @ n.rotation.T + n.translation - points, axis=1) for n in (start, found)]
+    assert found.misfit < start.misfit
+    assert np.median(apart[1]) < 0.3 * np.median(apart[0])
+
+
+def test_the_simpler_description_is_preferred_by_its_evidence(model: StatisticalModel, states: DrawnStates) -> None:
+    """Draws are taken where their misfit is lower, or higher by less than what the modes' more free numbers buy."""
+    points, material = shown(model, 0.5)
+    fitted = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
+    problem = DrawsProblem.of(fitted.problem, states, fitted.correspondences)
+    drawn = fit_draws(problem, fitted.posed)
+    assert drawn is not None
+    modes = problem.last.misfit(fitted.posed).total
+    bought = narrowing(problem.base, fitted.posed) - narrowing_of_draws(problem, drawn)
+    assert bought > 1.0
+    for gain, taken in ((-5.0, True), (0.9 * bought, True), (1.1 * bought, False)):
+        assert is_drawn(problem, replace(drawn, misfit=modes + gain), fitted.posed) == taken
+
+
+def test_draws_that_move_nothing_narrow_nothing(model: StatisticalModel, states: DrawnStates) -> None:
+    points, material = shown(model, 0.5)
+    fitted = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
+    problem = DrawsProblem.of(fitted.problem, states, fitted.correspondences)
+    drawn = fit_draws(problem, fitted.posed)
+    assert drawn is not None and drawn.motion is not None
+    one_moves, none_moves = drawn.motion.copy(), np.zeros_like(drawn.motion)
+    one_moves[:, :, 1:] = 0.0
+    narrowed = [narrowing_of_draws(problem, replace(drawn, motion=motion)) for motion in (one_moves, none_moves)]
+    assert narrowed[0] > 1.0
+    assert narrowed[1] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_second_pass_follows_where_the_first_has_failed(
+    model: StatisticalModel, states: DrawnStates, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Modes that are wrong and a single step leave the cloud unexplained; a pass from there comes nearer."""
+    points, material = shown(model, 0.5)
+    fitted = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
+    problem = DrawsProblem.of(fitted.problem, states, fitted.correspondences)
+    wrong = replace(fitted.posed, z=np.full(model.count, 2.0))
+    poor = replace(problem.config, starts=1, sieve=((1, 1),), kept=1, last_rounds=0, steps=1, hopeless=0.0)
+    poor = replace(poor, jumps=0, network_start=False)
+    once, twice = (fit_draws(replace(problem, config=replace(poor, passes=n)), wrong) for n in (0, 1))
+    assert once is not None and twice is not None and twice.misfit < 0.9 * once.misfit
+    monkeypatch.setattr("mereo.fitting.draws.fit.refine", None)  # not called where the first explains the cloud
+    assert fit_draws(replace(problem, config=replace(problem.config, passes=1, hopeless=9.0)), fitted.posed) is not None
+
+
+def test_after_a_search_nobody_is_asked_about_a_frame_that_is_not_explained(
+    model: StatisticalModel, states: DrawnStates
+) -> None:
+    """A search has no correspondences, and draws are fitted all the same."""
+    points, material = shown(model, 0.5)
+    fitted = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
+    base = replace(fitted.problem, network=NetworkTerm.none(model))
+    problem = DrawsProblem.of(base, states, nothing())
+    strict = replace(problem, config=replace(problem.config, explained=0.0, jumps=0))
+    assert strict.config.network_start
+    assert fit_draws(strict, fitted.posed) is not None

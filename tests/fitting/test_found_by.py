@@ -17,7 +17,7 @@ from mereo.fitting.registration.answer_frame import (
     more_evident,
     search_modes,
 )
-from mereo.fitting.registration.register import CloudToFit, Registrar
+from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import PointCloud, SightLines
 from mereo.models.model import Model
 from mereo.models.weights import load_model
@@ -67,16 +67,6 @@ def test_a_search_is_asked_too_where_the_network_is_lost(liver: Model, cloud: Po
     assert found.located_by == "search" and found.taken and found.registration is not None
     assert found.registration.accepted and found.recognition.known is True
     assert all(0 < segment.confidence <= 1 for segment in found.reconstruction.segments)  # the network's, all the same
-
-
-@pytest.mark.usefixtures("confused", "without_turns")
-@pytest.mark.parametrize("method", ["modes", "network"])
-def test_other_methods_ask_nobody_else(
-    liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch, method: Any
-) -> None:
-    monkeypatch.setattr(f"{HYPOTHESES}.search_modes", None)
-    registrar = None if method == "network" else Registrar.of(liver, method)
-    assert answer_to(cloud, liver, registrar, 24).located_by == "network"
 
 
 def test_the_network_is_left_out_on_request(liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,7 +142,7 @@ def test_a_fit_that_alone_explains_the_frame_is_taken(liver: Model, cloud: Point
     assert more_evident(refused, searched) is searched
 
 
-def test_a_search_finds_an_unknown_unit(liver: Model, cloud: PointCloud) -> None:
-    assert liver.statistical_model is not None
-    found = search_modes(CloudToFit(0.001 * cloud.points), liver.statistical_model).registration()
-    assert found.accepted and found.scene_unit == pytest.approx(0.001, rel=0.05)
+@pytest.mark.usefixtures("confused", "without_turns")
+def test_other_methods_ask_nobody_else(liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(f"{HYPOTHESES}.search_modes", None)
+    assert answer(liver, cloud, "modes").located_by == "network"

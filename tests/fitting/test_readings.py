@@ -16,7 +16,6 @@ from mereo.fitting.problem.problem import (
     SHARED,
     constants_for,
     is_noise,
-    looks_normal,
     noise_of,
     shared,
 )
@@ -27,18 +26,10 @@ from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import PointCloud
 from mereo.models.model import Model
 from mereo.models.weights import load_model
-from mereo.reconstruction.isolation import Reading, readings
+from mereo.reconstruction.isolation import Reading
 from mereo.reconstruction.observation import observe
 from mereo.reconstruction.pipeline import EncodedFrame
-from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import AssetUnavailable
-from mereo.scenes.seeds import example_rng
-from mereo.synthesis.config import GenerateConfig
-from mereo.synthesis.examples import sample_view
 from mereo.synthesis.sample_views import load_view
-from mereo_learning.scans import SCANS, scan_in_camera
-
-CLEAN_SEED = 720_000
 
 
 @pytest.fixture(scope="module")
@@ -122,13 +113,6 @@ def test_points_that_a_fit_explains_are_given_back_beside_strays(
     assert keep[lost].all() and not keep[len(points) :].any()
 
 
-def test_without_a_fit_the_likely_reading_is_taken(model: Model, points: np.ndarray) -> None:
-    contaminated = with_rim(points)
-    found, likelier = candidates(model, None, contaminated)
-    assert found.modes is None and found.encoded is likelier
-    assert found.hypothesis.dropped == readings(PointCloud(contaminated))[0].dropped
-
-
 def test_an_answer_says_which_points_it_is_of(model: Model, registrar: Registrar, points: np.ndarray) -> None:
     found = answer_to(with_rim(points), model, registrar, 24, label_points=True, scene_unit=1.0)
     assert found.taken and found.reconstruction.observed is not None
@@ -161,19 +145,12 @@ def test_what_neighbours_share_is_no_noise(points: np.ndarray) -> None:
     around, rng = Evidence.of(points).around, np.random.default_rng(0)
     own = rng.normal(scale=0.3, size=len(points))
     half = np.where(points[:, 0] > np.median(points[:, 0]), 2.0, 0.0)
-    assert noise_of(own, around) == pytest.approx(0.3, rel=0.1) and is_noise(own, noise_of(own, around))
+    assert noise_of(own, around) == pytest.approx(0.3, rel=0.1) and is_noise(own, around)
     assert noise_of(own + 1.0, around) == pytest.approx(0.3, rel=0.1)
-    assert not is_noise(own + 1.0, noise_of(own + 1.0, around))
+    assert not is_noise(own + 1.0, around)
     assert noise_of(half, around) == 0.0
     assert 0.97 < shared(own, around, 0.45) < SHARED
     assert shared(own + 0.5, around, 0.45) > 1.3 and shared(own + half, around, 0.45) > 1.3
-
-
-def test_noise_that_neighbours_share_is_spread_evenly_and_a_wrong_state_is_not() -> None:
-    rng = np.random.default_rng(0)
-    windows = np.repeat(rng.normal(size=300), 9)
-    assert looks_normal(windows)
-    assert not looks_normal(np.where(rng.random(len(windows)) < 0.1, 6.0, windows))
 
 
 def test_a_noisy_cloud_is_explained_where_only_noise_is_left(
@@ -206,37 +183,3 @@ def test_doubtful_points_rule_nothing_out(points: np.ndarray) -> None:
     vertices = np.array([corner * 50.0, corner * 150.0])
     assert (Evidence.of(points).violations(vertices, 0.5)[1] > 0).all()
     assert (Evidence.of(points, corner[None] * 300.0).violations(vertices, 0.5)[1] == 0).all()
-
-
-CLEAN_VIEWS = {"shapes": 20, "lizard": 20, "robot": 20, "rope": 20, "engine": 20, "sheet": 20}
-CLEAN_VIEWS |= {"bunny": 20, "human": 20, "skull": 20, "liver": 20}  # of real meshes
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CLEAN_VIEWS)
-def test_clean_views_lose_nothing(name: str) -> None:
-    """Whether there is one reading or a fit has chosen of two, each point is kept, and so the answer is the same."""
-    try:
-        scene = load_scene(name).for_seed(CLEAN_SEED)
-    except AssetUnavailable as error:
-        pytest.skip(str(error))
-    network = load_model(name)
-    modes = Registrar.of(network, "modes")
-    for index in range(CLEAN_VIEWS[name]):
-        seen = sample_view(scene, GenerateConfig(), example_rng(CLEAN_SEED, index)).depth.to_points()
-        found = readings(seen)
-        if len(found) > 1:
-            assert fitted(network, modes, seen.points).hypothesis.dropped == 0, index
-        else:
-            assert found[0].cloud is seen, index
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SCANS)
-def test_real_scans_lose_nothing(name: str) -> None:
-    try:
-        seen = scan_in_camera(name)[0]
-    except AssetUnavailable as error:
-        pytest.skip(str(error))
-    network = load_model("bunny")
-    assert fitted(network, Registrar.of(network, "modes"), seen.points, unit=None).hypothesis.dropped == 0

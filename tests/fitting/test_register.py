@@ -1,10 +1,7 @@
 """The registered model as a reconstruction: the rest mesh's own segments, in the input's frame."""
 
-import json
-import pickle
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import jaxtyping
 import numpy as np
@@ -14,7 +11,6 @@ from answers import answer_to, reconstruct
 from trimesh.remesh import subdivide
 
 import mereo
-from mereo import __main__ as command_line
 from mereo.api.objects import Object
 from mereo.fitting.draws.playback import DrawnStates
 from mereo.fitting.registration import register
@@ -35,7 +31,6 @@ from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.metrics import confusion_matrix, intersection_over_union
 from mereo.geometry.solids import Solids
 from mereo.models.model import Model
-from mereo.models.weights import save_model
 from mereo.reconstruction.observation import observe
 from mereo.reconstruction.pipeline import Reconstruction
 from mereo.scenes.registry import load_scene
@@ -98,23 +93,6 @@ def test_a_scanners_frame_gets_its_answer_in_that_frame(model: Model, view: Samp
     for one in result.segments:
         inside = result.labels.positions(np.argwhere(result.labels.labels == one.label)).mean(axis=0)
         np.testing.assert_allclose(one.centroid, inside, atol=1e-9)
-
-
-def test_weights_without_states_say_what_to_do() -> None:
-    other = replace(untrained(("a", "b")), provenance={"scene": "mine"})
-    with pytest.raises(ValueError, match="the weights of a, b carry no statistical model .* or use --method network"):
-        statistical_model_of(other)
-
-
-@pytest.mark.slow
-def test_the_command_says_which_answer_it_is(model: Model, view: SampleView, few_states: None, tmp_path: Path) -> None:
-    save_model(model, tmp_path / "rope.safetensors")
-    np.save(tmp_path / "cloud.npy", view.depth.to_points().points)
-    arguments = ["reconstruct", str(tmp_path / "cloud.npy"), "--weights", str(tmp_path / "rope.safetensors")]
-    arguments += ["--output", str(tmp_path / "out"), "--resolution", "32", "--method", "auto"]
-    assert command_line.main(arguments) == 0
-    facts = json.loads((tmp_path / "out/summary.json").read_text())["registration"]
-    assert facts["answer"] == "registration" and facts["method"] in ("modes", "draws") and facts["explained"] > 0.95
 
 
 def test_full_needs_a_scene(model: Model) -> None:
@@ -187,11 +165,6 @@ def test_without_its_mesh_auto_fits_the_modes_and_full_says_what_is_missing(
         Registrar.of(model, "full")
 
 
-def test_without_a_model_in_the_weights_auto_asks_the_network(model: Model) -> None:
-    assert registrar_for(replace(model, statistical_model=None), "auto") is None
-    assert registrar_for(model, "network") is None and registrar_for(model, "auto") is not None
-
-
 @pytest.mark.usefixtures("without_turns")
 def test_a_refused_registration_leaves_the_answer_to_the_network(model: Model, view: SampleView) -> None:
     stretched = view.depth.to_points().points * np.array([1.0, 2.5, 1.0])
@@ -223,7 +196,7 @@ def test_points_may_be_plain_lists(found: Answer) -> None:
     np.testing.assert_array_equal(registration.to_camera(rest[0]), registration.to_camera(rest[:1]))
 
 
-MOTION = "the transform is .*; it must be rigid, a rotation and a translation"
+MOTION = "the pose is .* must be 4 x 4 finite numbers: a rotation and a translation"
 REFUSED: dict[str, tuple[Callable[[Registration], object], str]] = {
     "pairs": (lambda r: r.to_camera([[0.0, 1.0]]), r"have the shape \(1, 2\); they must be rows of x, y, z"),
     "NaN": (lambda r: r.to_camera([[np.nan, 0, 0], [0, 0, 0]]), "1 of 2 points are NaN, infinite or beyond 1e"),
@@ -247,11 +220,6 @@ def test_what_is_no_place_or_motion_is_refused(case: str, found: Answer, monkeyp
         call(found.registration)
 
 
-def test_a_registration_says_that_it_cannot_be_sent(found: Answer) -> None:
-    with pytest.raises(TypeError, match="a registration cannot be pickled or copied.*save_state"):
-        pickle.dumps(found.registration)
-
-
 @pytest.mark.parametrize("scene_unit", [-1.0, 0.0, np.nan, np.inf])
 def test_a_scene_unit_is_a_length(scene_unit: float, view: SampleView, model: Model) -> None:
     seen, registrar = observe(view.depth.to_points()), Registrar.of(model, "modes")
@@ -263,3 +231,14 @@ def test_a_scene_unit_is_a_length(scene_unit: float, view: SampleView, model: Mo
             tracker.follow(seen, 0.0, scene_unit=scene_unit)
         with pytest.raises(ValueError, match="time_s is nan; it must be a finite number"):
             tracker.follow(seen, np.nan)
+
+
+def test_weights_without_states_say_what_to_do() -> None:
+    other = replace(untrained(("a", "b")), provenance={"scene": "mine"})
+    with pytest.raises(ValueError, match="the weights of a, b carry no statistical model .* or use --method network"):
+        statistical_model_of(other)
+
+
+def test_without_a_model_in_the_weights_auto_asks_the_network(model: Model) -> None:
+    assert registrar_for(replace(model, statistical_model=None), "auto") is None
+    assert registrar_for(model, "network") is None and registrar_for(model, "auto") is not None

@@ -17,7 +17,6 @@ from mereo.fitting.registration.state import (
     RegistrationState,
     load_state,
     model_digest,
-    played_state,
     read_state,
     restored,
     save_state,
@@ -25,16 +24,10 @@ from mereo.fitting.registration.state import (
 )
 from mereo.models.model import Model
 from mereo.models.weights import load_model, save_model
-from mereo.scenes.parameters import random_state
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel
-
-
-@pytest.fixture(scope="module")
-def model() -> StatisticalModel:
-    return scene_model(SCENE, count=60)
 
 
 def by_draws(model: StatisticalModel, scene: Scene = SCENE, seed: int = 5) -> Registration:
@@ -82,44 +75,11 @@ def test_draws_come_back_with_their_seed_sizes_and_names(model: StatisticalModel
     np.testing.assert_array_equal(drawn.smooth, before.drawn.smooth)
 
 
-def test_the_sliders_of_a_state_stand_where_its_draws_are(model: StatisticalModel) -> None:
-    drawn = Drawn.of(SCENE, 5)
-    state = state_of(placed(model, _moved(model, drawn), method="draws", z=drawn.z, drawn=drawn), SCENE)
-    played, wanted = played_state(state, SCENE), random_state(SCENE, 5)
-    for one, other in zip(played.calls, wanted.calls, strict=True):
-        np.testing.assert_allclose(one.shares, other.shares, atol=1e-12)
-
-
-def _moved(model: StatisticalModel, drawn: Drawn) -> np.ndarray:
-    deformations = drawn.deformations(SCENE, drawn.z)
-    assert deformations is not None
-    return material_moved(SCENE, model, deformations)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["rope", "robot", "engine"])
-def test_a_built_in_scene_is_found_by_its_name(name: str, tmp_path: Path) -> None:
-    scene = load_scene(name)
-    model = scene_model(scene, count=20)
-    before = by_draws(model, scene)
-    save_state(tmp_path / STATE, state_of(before, scene))
-    assert_same(load_state(tmp_path, model), before)
-
-
-def test_weights_keep_the_digest_of_their_model(rope: Model, tmp_path: Path) -> None:
-    save_model(rope, tmp_path / "r.safetensors")
-    one, other = (load_model(tmp_path / "r.safetensors").statistical_model for _ in range(2))
-    assert one is not None and other is not None
-    assert model_digest(one) == model_digest(other)
-    state = state_of(by_modes(one), "rope")
-    assert_same(restored(state, other), by_modes(one))
-
-
 def test_a_state_of_other_weights_is_refused(model: StatisticalModel) -> None:
     state = state_of(by_modes(model), "toy", weights="mine.safetensors")
     modes = model.modes.copy()
     modes[0, 0, 0] += 1e-3
-    with pytest.raises(ValueError, match="model of other weights .*'mine.safetensors'.* name those weights with"):
+    with pytest.raises(ValueError, match="model of other weights .*'mine.safetensors'.* the model of those weights"):
         restored(state, replace(model, modes=modes))
 
 
@@ -142,7 +102,7 @@ def test_a_name_in_a_file_runs_no_code(model: StatisticalModel, tmp_path: Path) 
     ran = tmp_path / "ran"
     (tmp_path / "evil.py").write_text(f"open({str(ran)!r}, 'w')\n")
     state = state_of(by_draws(model), SCENE).model_copy(update={"scene": str(tmp_path / "evil.py")})
-    with pytest.raises(ValueError, match="which is not built in: name its file with --scene"):
+    with pytest.raises(ValueError, match="which is not built in: give the scene"):
         restored(state, model)
     assert not ran.exists()
 
@@ -150,63 +110,45 @@ def test_a_name_in_a_file_runs_no_code(model: StatisticalModel, tmp_path: Path) 
 def test_draws_need_their_scene_to_be_written(model: StatisticalModel) -> None:
     with pytest.raises(ValueError, match="one of draws; the scene that is played is needed, not its name 'toy'"):
         state_of(by_draws(model), "toy")
-    with pytest.raises(ValueError, match="the state of 'toy' is one of modes; it has no draws"):
-        played_state(state_of(by_modes(model), "toy"), SCENE)
 
 
-SENTENCES: list[tuple[str, Callable[[dict[str, Any]], Any], str]] = [
-    ("key", lambda facts: {**facts, "extra": 1}, "'extra' means nothing here"),
-    ("missing", lambda facts: {k: v for k, v in facts.items() if k != "z"}, "`z` is missing"),
-    ("text", lambda facts: {**facts, "z": ["1.0"]}, "`z.0` is '1.0'; it must be a valid number"),
-    ("long", lambda facts: {**facts, "z": [1e9]}, "`z.0` is 1000000000.0; it must be less than or equal to 1000"),
-    ("format", lambda facts: {**facts, "format": 2}, "its format is 2; this mereo reads format 1"),
-    ("method", lambda facts: {**facts, "method": "draws"}, "the block `draws` belongs to the method 'draws' alone"),
-    ("unit", lambda facts: {**facts, "scene_unit": 0.0}, "`scene_unit` is 0.0; it must be greater than or equal to"),
-    ("pose", lambda facts: {**facts, "T_camera_model": [[1, 0, 0, 0]] * 4}, "it must be a rigid transform"),
-    ("mirror", lambda facts: {**facts, "T_camera_input": np.diag([1, 1, -1, 1]).tolist()}, "a rigid transform"),
-    ("ragged", lambda facts: {**facts, "T_camera_model": [[1, 0], [0, 1]]}, "`T_camera_model.0` is"),
-    ("list", lambda facts: [facts], "it must be an object"),
-    ("yes", lambda facts: {**facts, "accepted": "yes"}, "`accepted` is 'yes'; it must be a valid boolean"),
-    (
-        "sizes",
-        lambda facts: {**facts, "method": "draws", "draws": {"seed": 1, "sizes": [2, -2], "names": []}},
-        "`draws.sizes.1` is -2; it must be greater than or equal to 0",
-    ),
-    (
-        "lengths",
+# what is wrong in a file, and where
+WRONG: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
+    "key": (lambda facts: {**facts, "extra": 1}, "'extra'"),
+    "missing": (lambda facts: {k: v for k, v in facts.items() if k != "z"}, "'z'"),
+    "text": (lambda facts: {**facts, "z": ["1.0"]}, "'z.0'"),
+    "large": (lambda facts: {**facts, "z": [1e9]}, "'z.0'"),
+    "format": (lambda facts: {**facts, "format": 2}, "its format is 2; this mereo reads format 1"),
+    "method": (lambda facts: {**facts, "method": "draws"}, "the block `draws` belongs to the method 'draws' alone"),
+    "unit": (lambda facts: {**facts, "scene_unit": 0.0}, "'scene_unit'"),
+    "mirror": (lambda facts: {**facts, "T_camera_input": np.diag([1, 1, -1, 1]).tolist()}, "must be a rigid transform"),
+    "list": (lambda facts: [facts], "an object"),
+    "lengths": (
         lambda facts: {**facts, "method": "draws", "draws": {"seed": 1, "sizes": [1], "names": ["a"]}},
         "must be of one length",
     ),
-]
+}
 
 
-@pytest.mark.parametrize("change, sentence", [case[1:] for case in SENTENCES], ids=[case[0] for case in SENTENCES])
-def test_a_wrong_value_is_said_in_one_sentence(
-    change: Callable[[dict[str, Any]], Any], sentence: str, model: StatisticalModel, tmp_path: Path
-) -> None:
-    path = tmp_path / STATE
+@pytest.mark.parametrize("kind", WRONG)
+def test_a_wrong_value_is_refused_in_one_sentence(kind: str, model: StatisticalModel, tmp_path: Path) -> None:
+    path, (change, where) = tmp_path / STATE, WRONG[kind]
     save_state(path, state_of(by_modes(model), "toy"))
     path.write_text(json.dumps(change(json.loads(path.read_text()))))
-    with pytest.raises(ValueError, match="is no state of a registration") as error:
+    with pytest.raises(ValueError, match="is no state of a registration.*: give the state.json of") as error:
         read_state(path)
-    assert sentence in str(error.value) and "\n" not in str(error.value) and len(str(error.value)) < 400
-    assert str(error.value).endswith("give the state.json of a `mereo reconstruct`")
+    assert where in str(error.value) and "\n" not in str(error.value) and len(str(error.value)) < 400
 
 
-@pytest.mark.parametrize(
-    "content",
-    [b"", b"\xff\xfe{}", b"{", b"[" * 200_000, b'{"z": NaN}', b'{"z": 1e999}', b"null", b"{}" + b" " * 2**20],
-    ids=["empty", "bytes", "half", "deep", "nan", "infinite", "null", "large"],
-)
+@pytest.mark.parametrize("content", [b"", b"[" * 200_000, b'{"z": NaN}', b"{}" + b" " * 2**20])
 def test_hostile_files_are_refused(content: bytes, tmp_path: Path) -> None:
-    path = tmp_path / STATE
-    path.write_bytes(content)
-    with pytest.raises(ValueError, match="state") as error:
-        read_state(path)
+    (tmp_path / STATE).write_bytes(content)
+    with pytest.raises(ValueError, match="is no state of a registration") as error:
+        read_state(tmp_path)
     assert "\n" not in str(error.value) and len(str(error.value)) < 400
 
 
-def test_what_names_a_state(tmp_path: Path) -> None:
+def test_a_folder_without_a_state_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="`mereo reconstruct` writes it where the answer is a registered model"):
         read_state(tmp_path)
 
@@ -219,3 +161,21 @@ def test_a_damaged_number_of_coefficients_is_said(model: StatisticalModel) -> No
     moved = state.model_copy(update={"z": (state.z[0] + 1, *state.z[1:])})
     with pytest.raises(ValueError, match="has changed since, or the file: register the frame again"):
         restored(moved, model)
+
+
+@pytest.mark.slow
+def test_a_built_in_scene_is_found_by_its_name(tmp_path: Path) -> None:
+    scene = load_scene("rope")
+    model = scene_model(scene, count=20)
+    before = by_draws(model, scene)
+    save_state(tmp_path / STATE, state_of(before, scene))
+    assert_same(load_state(tmp_path, model), before)
+
+
+def test_weights_keep_the_digest_of_their_model(rope: Model, tmp_path: Path) -> None:
+    save_model(rope, tmp_path / "r.safetensors")
+    one, other = (load_model(tmp_path / "r.safetensors").statistical_model for _ in range(2))
+    assert one is not None and other is not None
+    assert model_digest(one) == model_digest(other)
+    state = state_of(by_modes(one), "rope")
+    assert_same(restored(state, other), by_modes(one))

@@ -5,14 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fit_cases import seen
-from scipy.spatial import cKDTree
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import Posed
-from mereo.fitting.registration.answer_frame import search_modes, size_of
+from mereo.fitting.registration.answer_frame import search_modes
 from mereo.fitting.registration.register import CloudToFit
-from mereo.fitting.search import CELLS, Poses, Screen, SightTable, medoids, rotations, tables_of
+from mereo.fitting.search import Poses, Screen, SightTable, medoids, rotations, tables_of
 from mereo.geometry.camera import SightLines
 from mereo.models.weights import load_model
 from mereo.scenes.statistical_model import StatisticalModel
@@ -62,15 +61,6 @@ def test_rotations_are_even() -> None:
     assert nearest.min() > 15 and nearest.max() < 32  # as far apart as 600 can be, about 25 degrees
 
 
-def test_a_table_names_the_sample_nearest_to_each_cell(model: StatisticalModel) -> None:
-    tables = tables_of(model, 3)
-    steps = np.indices((CELLS,) * 3).reshape(3, -1).T + 0.5
-    for row in range(len(tables.z)):
-        centers = tables.low[row] + tables.cell[row] * steps
-        distance = np.linalg.norm(tables.position[row, tables.nearest[row]] - centers, axis=1)
-        np.testing.assert_allclose(distance, cKDTree(tables.position[row]).query(centers)[0], rtol=1e-5)
-
-
 def test_medoids_are_states_that_stand_for_all(model: StatisticalModel) -> None:
     rows = medoids(model, 8)
     assert len(set(rows)) == len(rows) <= 8
@@ -109,7 +99,7 @@ def test_a_rigid_step_draws_a_pose_to_the_frame(model: StatisticalModel) -> None
     )
     before = screen.scored(poses, 0.05).cost
     for sigma in (0.15, 0.1, 0.1, 0.05, 0.05, 0.05):
-        poses = screen.aligned(poses, sigma)
+        poses = screen.scored(poses, sigma, moves=True)
     assert (screen.scored(poses, 0.05).cost < before).all()
     assert np.linalg.norm(poses.translation - FAR, axis=1).max() < 0.1 * model.half  # from 0.16
 
@@ -135,12 +125,6 @@ def test_a_view_of_which_a_half_is_hidden_is_found_as_one(model: StatisticalMode
     apart = [off(model, fitted.registration().material, posed) for fitted in (told, open_, wrong)]
     assert max(apart[:2]) < 0.1 < apart[2]
     assert open_.problem.evidence.other_lines == "unknown"
-
-
-def test_the_size_of_a_cloud_is_guessed(model: StatisticalModel) -> None:
-    points = view(model, state(model, 2))
-    assert 0.6 < size_of(points, model) < 1.6
-    assert size_of(7.0 * points, model) == pytest.approx(7.0 * size_of(points, model), rel=1e-3)
 
 
 def test_noise_is_told_from_a_wrong_state(model: StatisticalModel) -> None:

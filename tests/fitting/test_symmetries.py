@@ -1,9 +1,10 @@
-"""Turns of a segment that its shape does not show: found where states make them, and ruled out by what is seen."""
+"""Segments that look alike turned: found where states make turns, ruled out by what is seen, and turned together."""
 
 from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
+import pytest
 import trimesh
 from fit_cases import IN_FRONT, said, seen
 from scipy.spatial.transform import Rotation
@@ -11,11 +12,23 @@ from scipy.special import ndtr, ndtri
 from shapes import box
 
 from mereo.deformation.draw_names import named
-from mereo.deformation.maps import Deformation
+from mereo.deformation.maps import Compose, Deformation, Identity, Rigid
 from mereo.fitting.config import MANY_DRAWS
-from mereo.fitting.draws.fit import descend, draws_that_may_jump, try_jumps
+from mereo.fitting.draws.fit import (
+    DrawsFit,
+    DrawsProblem,
+    descend,
+    draws_that_may_jump,
+    lower,
+    refine_by_sight,
+    simulate,
+    symmetric_groups,
+    try_jumps,
+    try_symmetric_states,
+    turn_segments,
+)
 from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
-from mereo.fitting.draws.problem import DrawsProblem, simulate
+from mereo.fitting.problem.evidence import OBSERVED_SAMPLES
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.segments import ANGLES, find_symmetries, left_open
 from mereo.fitting.registration.register import CloudToFit, ModesFit
@@ -96,19 +109,10 @@ def test_of_a_wheel_of_six_sides_only_sixths_look_alike() -> None:
     assert np.isin([60, 120, 180, 240, 300], degrees).all() and not np.isin([30, 90, 150, 210, 270, 330], degrees).any()
 
 
-def test_an_object_without_states_is_at_rest() -> None:
-    model = model_of(free)
-    assert find_symmetries(model.around(model.mean, np.zeros((len(model.mean), 3, 0), dtype=np.float32))) == ()
-
-
 def test_turns_that_no_state_makes_by_themselves_do_not_count() -> None:
     assert find_symmetries(model_of(held)) == ()
     for turn in find_symmetries(model_of(coupled)):  # it may stand on its head
         assert abs(turn.axis[2]) < 0.01
-
-
-def test_a_wheel_with_a_long_peg_is_not_like_itself() -> None:
-    assert find_symmetries(model_of(free, peg=6.0)) == ()
 
 
 def test_what_is_left_open_has_the_second_moments_of_the_turns() -> None:
@@ -194,3 +198,130 @@ def test_of_many_draws_those_jump_that_slide_along_the_surface() -> None:
     assert abs(ndtr(start.z[0]) - ndtr(truth[0])) > 0.1 and abs(ndtr(found.z[0]) - ndtr(truth[0])) < 0.01
     assert found.misfit < start.misfit
     assert try_jumps(replace(problem, config=replace(config, jumps=0)), start) is start
+
+
+def test_an_object_without_states_is_at_rest() -> None:
+    model = model_of(free)
+    assert find_symmetries(model.around(model.mean, np.zeros((len(model.mean), 3, 0), dtype=np.float32))) == ()
+
+
+def test_a_wheel_with_a_long_peg_is_not_like_itself() -> None:
+    assert find_symmetries(model_of(free, peg=6.0)) == ()
+
+
+# --- segments turned together -----------------------------------------------------------------------------------------
+
+
+X, Y, WRIST = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), np.array([6.0, 0.0, 0.0])
+POSE = Posed(IN_FRONT[:3, :3], IN_FRONT[:3, 3], np.empty(0))
+
+
+def arm(rng: np.random.Generator) -> tuple[Deformation, ...]:
+    """A forearm that rolls, a wrist that bends, a hand that spins: half a roll, bent back, half a spin is the same."""
+    roll, pitch, spin = (named(rng, name).uniform(-1, 1) for name in ("roll", "pitch", "spin"))
+    rolled = Rigid(np.pi * roll * X, np.zeros(3), WRIST)
+    bent, spun = Rigid(1.2 * pitch * Y, np.zeros(3), WRIST), Rigid(np.pi * spin * X, np.zeros(3), WRIST)
+    return Identity(), rolled, Compose((bent, rolled)), Compose((spun, bent, rolled))
+
+
+@cache
+def scene() -> Scene:
+    """Base and hand are lopsided, forearm and wrist look alike turned by half about x."""
+    base, hand = box((-16, -6, -5), (-8, 5, 7), "base", 0), box((10, -4, -2), (17, 4, 3), "hand", 3)
+    lopsided = [
+        replace(part, vertices=part.vertices * np.where((part.vertices[:, 1:] > 0).all(axis=1), 1.4, 1.0)[:, None])
+        for part in (base, hand)
+    ]
+    forearm, wrist = box((-7, -3, -1.5), (4, 3, 1.5), "forearm", 1), box((5, -2.5, -1), (9, 2.5, 1), "wrist", 2)
+    return Scene("arm", SegmentedMesh((lopsided[0], forearm, wrist, lopsided[1])), arm, Workspace())
+
+
+@cache
+def model() -> StatisticalModel:
+    return scene_model(scene(), count=200)
+
+
+@cache
+def states() -> DrawnStates:
+    return DrawnStates.of(scene(), model(), 80, 1000)
+
+
+def flipped(z: np.ndarray) -> np.ndarray:
+    """Draws of the state that looks alike: roll and spin half a turn on, the pitch reversed."""
+    roll, pitch, spin = ndtr(z)
+    return ndtri(np.array([(roll + 0.5) % 1.0, 1.0 - pitch, (spin + 0.5) % 1.0]))
+
+
+def moved(z: np.ndarray) -> np.ndarray:
+    drawn = Drawn.of(scene(), 1000)
+    deformations = drawn.deformations(scene(), z)
+    assert deformations is not None
+    return material_moved(scene(), model(), deformations)
+
+
+def problem_of(z: np.ndarray, points: int = 4000) -> DrawsProblem:
+    material = transform_points(IN_FRONT, moved(z))
+    cloud = seen(model().mesh(material))
+    fitted = ModesFit.of(CloudToFit(cloud[:: max(1, len(cloud) // points)], 1.0), said(model(), material), model())
+    return DrawsProblem.of(fitted.problem, states(), fitted.correspondences)
+
+
+def state(problem: DrawsProblem, z: np.ndarray) -> DrawsFit:
+    fit = simulate(problem, Drawn.of(scene(), 1000), z, POSE)
+    assert fit is not None
+    return fit
+
+
+TRUTH = np.array([0.3, 0.9, -0.5])
+
+
+def test_an_arm_has_one_group_of_forearm_and_wrist() -> None:
+    (together,) = symmetric_groups(model())
+    assert [turn.label for turn, _ in together] == [2, 3]
+    assert all(angle == pytest.approx(np.pi) and abs(turn.axis[0]) > 0.999 for turn, angle in together)
+
+
+def test_the_turned_shape_is_that_of_other_draws() -> None:
+    """Exactly, as the segments lie on the axis of the roll; and twice turned is the same."""
+    (together,) = symmetric_groups(model())
+    there = turn_segments(model(), moved(TRUTH), together)
+    assert np.abs(there - moved(TRUTH)).max() > 4.0
+    np.testing.assert_allclose(there, moved(flipped(TRUTH)), atol=0.02)
+    np.testing.assert_allclose(turn_segments(model(), there, together), moved(TRUTH), atol=1e-6)
+
+
+def test_a_state_that_is_turned_so_is_found() -> None:
+    """What it is told from is the correspondences alone; a right state stays what it is."""
+    problem = problem_of(TRUTH)
+    right, wrong = state(problem, TRUTH), descend(problem, state(problem, flipped(TRUTH)), 1)
+    assert np.abs(wrong.surface.material - right.surface.material).max() > 4.0
+    many = replace(problem, config=replace(problem.config, turned_worse=np.inf))
+    found = try_symmetric_states(many, wrong)
+    assert found.misfit < wrong.misfit
+    assert np.abs(found.surface.material - right.surface.material).max() < 0.2
+    assert try_symmetric_states(many, found).misfit <= found.misfit
+    assert try_symmetric_states(replace(many, config=replace(many.config, turned_worse=-np.inf)), wrong) is wrong
+
+
+def test_a_step_never_leads_up() -> None:
+    problem = problem_of(TRUTH)
+    start = state(problem, TRUTH + np.array([0.15, -0.2, 0.2]))
+    motion = descend(problem, start, 1).motion
+    assert motion is not None
+    for damping in (1e-3, 0.1, 10.0):
+        assert lower(problem, start, motion, 0.2, damping)[0].misfit <= start.misfit
+
+
+def test_the_answer_is_fitted_to_every_point_and_judged_by_them() -> None:
+    problem = problem_of(TRUTH)
+    assert len(problem.base.evidence.points) > OBSERVED_SAMPLES
+    dense = problem.base.by_every_point
+    assert len(dense.evidence.observed_samples) == len(problem.base.evidence.points) and dense.by_every_point is dense
+    found = refine_by_sight(problem, state(problem, TRUTH + 0.02))
+    again = simulate(replace(problem, by_sight=True, base=dense), found.drawn, found.z, found.posed)
+    assert again is not None and found.misfit == again.misfit and len(found.distance) == OBSERVED_SAMPLES
+    assert found.motion is not None
+    few = problem_of(TRUTH, points=300)
+    assert few.base.by_every_point is few.base
+    sparing = replace(problem, config=replace(problem.config, every_point=False))
+    assert sparing.last is problem.base and problem.last is not problem.base

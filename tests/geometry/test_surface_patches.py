@@ -1,13 +1,14 @@
-"""What is a patch of surface is kept, a rim of another one is not, whatever the unit, the turn and the density."""
+"""What is a patch of surface is kept, a rim of another one is not; and smoothing along lines of sight."""
 
 import numpy as np
 import pytest
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from mereo.geometry import surface_patches as module
 from mereo.geometry.camera import Camera
 from mereo.geometry.downsampling import MAX_POINTS
-from mereo.geometry.surface_patches import longest_side, surface_patches, surface_points
+from mereo.geometry.surface_patches import longest_side, smoothed, surface_patches, surface_points
 
 
 def rays(size: int = 96) -> np.ndarray:
@@ -52,13 +53,6 @@ def test_what_is_wide_is_a_surface_wherever_it_lies() -> None:
     assert patch[genuine][0] != patch[~genuine][0]
 
 
-def test_a_ball_loses_slivers_of_its_outline_at_most() -> None:
-    """Its outermost rows of pixels are four of their widths behind the next ones."""
-    points = ball()
-    keep = surface_points(points)
-    assert keep.mean() > 0.985 and longest_side(points) < 1.04 * longest_side(points[keep])
-
-
 def test_parts_of_different_density_lose_nothing() -> None:
     """A ball of 1,800 random points beside a plate of 600, which are farther apart."""
     rng = np.random.default_rng(4)
@@ -73,22 +67,12 @@ def test_neither_unit_nor_turn_nor_order_matters(factor: float) -> None:
     np.testing.assert_array_equal(surface_points(turned), PLATE[order])
 
 
-@pytest.mark.parametrize("times", [2, 5, 30])
-def test_points_given_more_than_once_change_nothing(times: int) -> None:
-    np.testing.assert_array_equal(surface_points(np.repeat(POINTS, times, axis=0)), np.repeat(PLATE, times))
-
-
 def test_too_few_points_to_tell_are_all_kept() -> None:
     rng = np.random.default_rng(2)
     for count in (0, 1, 2, 25):
         assert surface_points(rng.normal((0, 0, 9), 1, (count, 3))).all()
     for place in ([0.0, 0, 0], [0, 0, 3.0]):
         assert surface_points(np.tile(place, (100, 1))).all()
-
-
-def test_a_thin_line_alone_is_kept() -> None:
-    """Nothing is a surface: then nothing is a stray."""
-    assert surface_points(np.column_stack([np.linspace(-1, 1, 200), np.zeros(200), np.full(200, 4.0)])).all()
 
 
 def test_points_closer_than_their_noise_are_a_surface() -> None:
@@ -106,3 +90,55 @@ def test_many_points_are_decided_by_some_of_them(monkeypatch: pytest.MonkeyPatch
     keep = surface_points(points)
     assert looked_at[0] <= MAX_POINTS
     assert (keep == genuine).mean() > 0.999
+
+
+# --- smoothing --------------------------------------------------------------------------------------------------------
+
+
+SIGHT = Camera.from_fov(48, 48, 0.5).directions().reshape(-1, 3)
+
+
+def plane(tilt: float) -> Float[np.ndarray, "n 3"]:
+    """A plane through (0, 0, 50), tilted about x."""
+    normal = np.array([0.0, np.sin(tilt), -np.cos(tilt)])
+    return SIGHT * (normal[2] * 50.0 / (SIGHT @ normal))[:, None]
+
+
+def noisy(points: Float[np.ndarray, "n 3"], std: float) -> Float[np.ndarray, "n 3"]:
+    return points * (1.0 + np.random.default_rng(2).normal(scale=std / 50.0, size=(len(points), 1)))
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.6, 1.1])
+def test_planes_stay_and_their_noise_falls(tilt: float) -> None:
+    flat = plane(tilt)
+    np.testing.assert_allclose(smoothed(flat), flat, rtol=2e-3)
+    before, after = noisy(flat, 0.3) - flat, smoothed(noisy(flat, 0.3)) - flat
+    assert np.linalg.norm(after, axis=1).std() < 0.5 * np.linalg.norm(before, axis=1).std()
+
+
+def test_points_stay_on_their_lines_of_sight_in_any_frame_and_unit() -> None:
+    """Turned about the camera and in other units, all is the same."""
+    points = noisy(plane(0.4), 0.3)
+    moved = smoothed(points)
+    along = np.einsum("ij,ij->i", moved, points) / (np.linalg.norm(moved, axis=1) * np.linalg.norm(points, axis=1))
+    np.testing.assert_allclose(along, 1.0)
+    np.testing.assert_allclose(smoothed(points * 1024.0), moved * 1024.0)
+    turn = Rotation.from_rotvec([0.2, -0.4, 1.0]).as_matrix()
+    turned = smoothed(points @ turn.T) @ turn
+    assert np.median(np.linalg.norm(turned - moved, axis=1)) < 0.02
+
+
+def test_an_edge_stays_sharp() -> None:
+    """Nothing lies between a near wall and a far one."""
+    points = plane(0.0)
+    points[SIGHT[:, 0] > 0.02] *= 0.8
+    depth = smoothed(points)[:, 2]
+    assert np.minimum(np.abs(depth - 50.0), np.abs(depth - 40.0)).max() < 0.1
+
+
+@pytest.mark.parametrize("count", [1, 3, 5])
+def test_a_handful_of_points_is_as_good_as_it_is(count: int) -> None:
+    points = SIGHT[:count] * 50.0
+    np.testing.assert_allclose(smoothed(points), points, rtol=2e-2)
+    same = np.repeat(points[:1], 8, axis=0)
+    np.testing.assert_allclose(smoothed(same), same)

@@ -6,6 +6,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.metrics import with_segments_exchanged
 from mereo.geometry.symmetry import describe_symmetries, find_symmetries
 from mereo.geometry.transforms import rigid, transform_points
 
@@ -82,3 +83,11 @@ def test_a_small_part_on_the_surface_breaks_the_symmetry() -> None:
 def test_a_tolerance_must_be_above_zero() -> None:
     with pytest.raises(ValueError, match="the tolerance is 0; it must be above 0"):
         find_symmetries(posed(CUBOID), 0.0)
+
+
+def test_scores_up_to_symmetry_take_the_exchange_that_fits_best() -> None:
+    right = np.array([[90, 1, 0, 0], [2, 30, 0, 0], [0, 0, 40, 1], [0, 0, 0, 9]])
+    exchanged = right[[0, 2, 1, 3]]  # the answer has taken one part for the other
+    for confusion in (right, exchanged):
+        np.testing.assert_array_equal(with_segments_exchanged(confusion, [(1, 0, 2)]), right)
+    np.testing.assert_array_equal(with_segments_exchanged(exchanged, []), exchanged)

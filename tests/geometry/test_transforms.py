@@ -41,13 +41,6 @@ def test_a_fit_of_points_whose_products_are_infinite_ends() -> None:
         fit_rigid(points, points)
 
 
-def test_a_weight_is_a_number_of_repetitions(rng: np.random.Generator) -> None:
-    source, target, times = rng.normal(size=(6, 3)), rng.normal(size=(6, 3)), np.array([1, 0, 3, 2, 1, 5])
-    weighted = fit_rigid(source, target, times.astype(float))
-    np.testing.assert_allclose(weighted, fit_rigid(source.repeat(times, axis=0), target.repeat(times, axis=0)))
-    assert np.abs(weighted - fit_rigid(source, target)).max() > 0.1
-
-
 def test_mirrored_points_are_turned_not_mirrored(rng: np.random.Generator) -> None:
     source = rng.normal(size=(30, 3))
     rotation = fit_rigid(source, source * [-1, 1, 1])[:3, :3]

@@ -62,54 +62,28 @@ def outside(bounds: Bounds, kind: Any) -> list[Any]:
 def test_every_number_has_bounds_that_it_cannot_leave(settings: type, name: str, kind: Any) -> None:
     bounds = bounds_of(kind)
     assert bounds is not None, "annotate it with a kind of mereo.io.bounds"
+    sentence = rf"{name.replace('_', '[_-]')} is .*; it must be .*{re.escape(bounds.rule)}: "
     for value in outside(bounds, kind):
-        with pytest.raises(
-            ValueError, match=rf"{name.replace('_', '[_-]')} is .*; it must be .*{re.escape(bounds.rule)}: "
-        ):
+        with pytest.raises(ValueError, match=sentence):
             check_values(settings, {name: value})
     if settings in SETTINGS:
-        with pytest.raises(
-            ValueError, match=rf"{name.replace('_', '[_-]')} is .*; it must be .*{re.escape(bounds.rule)}: "
-        ):
+        with pytest.raises(ValueError, match=sentence):
             settings(**{name: outside(bounds, kind)[-1]})
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (
-            "train data --output run --batch 0",
-            "batch is 0; it must be a whole number, from 1 to 65536: give for",
-        ),
-        (
-            "train data --output run --network.width 51200",
-            "network.width is 51200; it must be a whole number, from 1",
-        ),
-        (
-            "train data --output run --network.skip-after 99",
-            "network.skip_after is 99, of 7 layers; the query and the latent vector can return after one of them",
-        ),
-        (
-            "generate rope --examples 1 --output run --workers 9999",
-            "--workers is 9999; it must be a whole number",
-        ),
-        (
-            "scene modes rope --states 150000",
-            "--states is 150000; it must be a whole number, from 1 to 20000",
-        ),
-        ("reconstruct a.npy --weights rope --output run --resolution 100000", "--resolution is 100000; it must be a"),
+        ("train data --output run --batch 0", "batch is 0; it must be a whole number, from 1 to 65536: give for"),
+        ("generate rope --examples 1 --output run --workers 9999", "--workers is 9999; it must be a whole number"),
         ("train data --output run --learning-rate nan", "learning_rate is nan; it must be greater than 0: give for"),
         ("train data --output run --network.mlp1 8 0", "network.mlp1 is 8 0; it must be whole numbers, each from"),
+        ("train data --output run --network.skip-after 99", "network.skip_after is 99, of 7 layers; the query and"),
         ("train data --output run --augment.keep-points 1 0.5", "augment.keep_points is 1 0.5; the smaller prob"),
-        (
-            "train data --output run --network.local-width 6",
-            "network.local_width is 6; it must be a multiple of its 4 heads",
-        ),
+        ("train data --output run --network.local-width 6", "network.local_width is 6; it must be a multiple of its 4"),
         ("train data --output run --batch 1 --queries 1", "batch and queries are both 1; batch normalization"),
-        ("generate rope --examples 1 --output run --image-size 0", "image_size is 0; it must be"),
         ("generate rope --examples 0 --output run", "--examples is 0; it must be a whole number, at least 1: correct"),
         ("reconstruct a.npy --weights bunny --output run --depth-scale 0", "--depth-scale is 0.0; it must be greater"),
-        ("scene preview rope --output a.png --seed -1", "--seed is -1; it must be a whole number, at least 0"),
     ],
 )
 def test_an_option_out_of_its_bounds_is_refused_before_anything_is_read_or_written(
@@ -120,10 +94,6 @@ def test_an_option_out_of_its_bounds_is_refused_before_anything_is_read_or_writt
     printed = capsys.readouterr().err
     assert printed.startswith(f"mereo: error: {message}") and printed.count("\n") == 1
     assert not list(tmp_path.iterdir())
-
-
-def test_a_whole_number_may_be_larger_than_any_float() -> None:
-    check_values(TrainConfig, {"holdout": 10**400})
 
 
 def test_the_help_shows_bounds(capsys: pytest.CaptureFixture[str]) -> None:

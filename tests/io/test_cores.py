@@ -9,7 +9,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from mereo.io import cores
-from mereo.io.cores import THREAD_VARIABLES, limit_blas_threads, use_threads, workers_for
+from mereo.io.cores import THREAD_VARIABLES, limit_blas_threads, use_threads
 
 
 @pytest.mark.parametrize(
@@ -63,10 +63,6 @@ def test_threads_hold_for_torch_blas_and_what_is_started(monkeypatch: pytest.Mon
     command = [sys.executable, "-c", THREADS, *THREAD_VARIABLES]
     told = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout.split("\n")
     assert told[:4] == ["1 1", "1 1 1 1", "2 2", "2 2 2 2"]
-
-
-def test_workers_are_as_many_as_threads_unless_said() -> None:
-    assert (workers_for(3, 2), workers_for(0, 2)) == (3, 2) and workers_for(0, 0) >= 1
 
 
 def test_one_blas_thread_lasts_until_the_last_thread_lets_go() -> None:

@@ -1,6 +1,5 @@
 """Places by URL: which texts are local paths, storages, or refused; and what a storage's folder does."""
 
-import random
 import subprocess
 import sys
 from pathlib import Path
@@ -8,7 +7,6 @@ from pathlib import Path
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
-from mereo.io import object_storage
 from mereo.io.atomic_files import check_place
 from mereo.io.object_storage import ObjectPath, StorageError, claim, names_in, place_of, write_whole
 
@@ -21,18 +19,9 @@ def folder(request: pytest.FixtureRequest) -> ObjectPath:
 # --- texts ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "text, path",
-    [
-        ("data/bunny", "data/bunny"),
-        ("a:b", "a:b"),
-        ("file:///tmp/a%20b", "/tmp/a b"),
-        ("file://localhost/tmp/x/", "/tmp/x"),
-        ("./s3:/b/x", "s3:/b/x"),
-    ],
-)
-def test_texts_without_a_storage_are_local_paths(text: str, path: str) -> None:
-    assert place_of(text) == Path(path)
+@pytest.mark.parametrize("text", ["data/bunny", "a:b", "./s3:/b/x"])
+def test_texts_without_a_storage_are_local_paths(text: str) -> None:
+    assert place_of(text) == Path(text)
 
 
 @pytest.mark.parametrize(
@@ -40,38 +29,24 @@ def test_texts_without_a_storage_are_local_paths(text: str, path: str) -> None:
     [
         ("s3://bucket/data/", "s3://bucket/data"),
         ("S3://bucket/a b/ü", "s3://bucket/a b/ü"),
-        ("gs://b/x.y", "gs://b/x.y"),
         ("memory://x", "memory://x"),
     ],
 )
 def test_urls_keep_what_a_path_would_lose(text: str, url: str) -> None:
     place = place_of(text)
     assert isinstance(place, ObjectPath) and str(place) == url and place_of(place) is place
-    assert str(place / "a.safetensors") == f"{url}/a.safetensors"
-    assert ((place / "shard-1.safetensors").name, (place / "shard-1.safetensors").stem) == (
-        "shard-1.safetensors",
-        "shard-1",
-    )
+    assert str(place / "a.safetensors") == f"{url}/a.safetensors" and (place / "b" / "a.npy").name == "a.npy"
 
 
 @pytest.mark.parametrize(
-    "text, sentence",
-    [
-        ("ftp://host/x", "ftp://host/x has none of the protocols s3, gs and file: correct it, or name a local"),
-        ("s3://bucket", "names no folder in a bucket, which is needed: write for example s3://bucket/data"),
-        ("s3://", "names no folder"),
-        ("memory://", "names no folder"),
-        ("s3:///x", "names no folder"),
-        ("s3://b/../x", "names no folder"),
-        ("s3://b/x?versionId=1", "names no folder"),
-        ("s3://b/x\ny", r"s3://b/x\\ny is no name that a storage takes"),
-        ("s3://b/" + "x" * 901, "is no name that a storage takes: choose a shorter one"),
-        ("file://host/x", "names another machine; a file URL has three slashes"),
-    ],
+    "text",
+    ["ftp://host/x", "s3://bucket", "memory://", "s3:///x", "s3://b/../x", "s3://b/x?versionId=1", "s3://b/x\ny"],
 )
-def test_other_urls_are_one_sentence(text: str, sentence: str) -> None:
-    with pytest.raises(ValueError, match=sentence):
+def test_other_urls_are_one_sentence(text: str) -> None:
+    sentence = "names no folder of a storage, s3 or gs, which is needed: write for example s3://bucket/data"
+    with pytest.raises(ValueError, match=sentence) as caught:
         place_of(text)
+    assert "\n" not in str(caught.value)
 
 
 def test_credentials_in_a_url_are_refused_and_not_repeated() -> None:
@@ -79,40 +54,6 @@ def test_credentials_in_a_url_are_refused_and_not_repeated() -> None:
     with pytest.raises(ValueError, match=refused_with) as refused:
         place_of("s3://AKIA123:geheim/x@bucket/data".replace("/x@", "x@"))
     assert "geheim" not in str(refused.value) and "AKIA" not in str(refused.value)
-
-
-def test_any_text_is_a_place_or_one_sentence() -> None:
-    rng = random.Random(7)
-    pieces = [
-        "s3",
-        "gs",
-        "file",
-        "memory",
-        "x",
-        ":",
-        "//",
-        "/",
-        "..",
-        ".",
-        "@",
-        "?",
-        "#",
-        "%2F",
-        "ä",
-        "\0",
-        "\n",
-        " ",
-        "\udc80",
-    ]
-    for _ in range(3000):
-        text = "".join(rng.choices(pieces, k=rng.randrange(1, 9)))
-        try:
-            place = place_of(text)
-        except ValueError as error:
-            said = str(error)
-            assert said.isprintable() and len(said) < 400 and ": " in said, repr(text)
-        else:
-            assert isinstance(place, Path) or place_of(str(place)) == place, repr(text)
 
 
 def test_outputs_that_cannot_be_objects_refuse_a_url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,13 +68,13 @@ def test_outputs_that_cannot_be_objects_refuse_a_url(tmp_path: Path, monkeypatch
 
 
 def test_a_folder_of_objects_is_as_one_of_files(folder: ObjectPath) -> None:
-    assert names_in(folder) == [] and not (folder / "a").exists()
+    assert names_in(folder) == [] and not (folder / "a").is_file()
     with pytest.raises(FileNotFoundError, match="a does not exist: check the URL"):
         (folder / "a").read_bytes()
     write_whole(folder / "a", b"1")
     write_whole(folder / "b/c", b"2")
     assert names_in(folder) == ["a", "b"]
-    assert (folder / "a").exists() and not (folder / "b").exists()
+    assert (folder / "a").is_file() and not (folder / "b").is_file()
     write_whole(folder / "a", b"3")
     assert (folder / "a").read_bytes() == b"3" and (folder / "a").read_text("utf-8") == "3"
     with pytest.raises(FileExistsError, match="a exists; it is not overwritten"):
@@ -144,8 +85,6 @@ def test_a_folder_of_objects_is_as_one_of_files(folder: ObjectPath) -> None:
 def test_one_of_several_claims_a_folder(folder: ObjectPath, monkeypatch: pytest.MonkeyPatch) -> None:
     assert claim(folder, "m.json", {"a": [1, 2.5]}, "a dataset") is None
     assert claim(folder, "m.json", {"a": 3}, "a dataset") == {"a": [1, 2.5]}
-    with pytest.raises(FileExistsError, match="is not empty and holds no other.json; choose another --output"):
-        claim(folder, "other.json", {}, "a dataset")
     # another machine, whose manifest came between our look and our put
     monkeypatch.setattr(ObjectPath, "names", lambda _: [])
     assert claim(folder, "m.json", {"a": 3}, "a dataset") == {"a": [1, 2.5]}
@@ -155,25 +94,27 @@ def test_without_a_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setitem(sys.modules, "s3fs", None)
     monkeypatch.setitem(sys.modules, "gcsfs", None)
     for url, extra in (("s3://b/x", "storage"), ("gs://b/x", "gcs")):
-        with pytest.raises(ImportError, match=rf"is needed for {url[:2]}:// places: pip install 'mereo\[{extra}\]'"):
-            place_of(url).exists()
+        with pytest.raises(ImportError, match=rf"{url} needs .*: pip install 'mereo\[{extra}\]'"):
+            place_of(url).is_file()
 
 
-@pytest.mark.parametrize("said", ["AccessDenied", "timed out", "no route to http://me:secret@host/x"])
-def test_what_a_storage_says_is_one_sentence_without_credentials(said: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*_: object) -> bytes:
-        raise OSError(said)
+@pytest.mark.parametrize("answer", ["AccessDenied", "timed out", "no route to http://me:secret@host/x"])
+def test_what_a_storage_refuses_is_no_missing_file_and_one_sentence(
+    answer: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor do credentials show."""
 
-    monkeypatch.setattr(MemoryFileSystem, "cat_file", fails)
-    with pytest.raises(StorageError, match=r"memory://b/x cannot be used \(.*\): check the bucket 'b', your") as caught:
-        ObjectPath("memory://b/x").read_bytes()
-    assert "secret" not in str(caught.value)
+    def fails(*_: object, **__: object) -> bytes:
+        raise OSError(answer)
+
+    place = ObjectPath("memory://b/x")
+    for name, look in (("cat_file", place.read_bytes), ("info", place.is_file), ("ls", place.names)):
+        monkeypatch.setattr(MemoryFileSystem, name, fails)
+        with pytest.raises(StorageError, match=r"b/x cannot be used \(.*\): check the bucket 'b', your") as caught:
+            look()
+        assert "secret" not in str(caught.value)
 
 
 def test_the_libraries_are_loaded_where_they_are_needed_alone() -> None:
     code = "import mereo.__main__, sys; print([name for name in ('fsspec', 's3fs', 'pydantic') if name in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
-
-
-def test_every_protocol_names_its_library() -> None:
-    assert set(object_storage.LIBRARIES) == {"s3", "gs", "memory"}

@@ -3,7 +3,12 @@
 import errno
 import json
 import os
+import shutil
+import signal
 import stat
+import subprocess
+import sys
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -11,8 +16,10 @@ import numpy as np
 import pytest
 from folder_contents import contents
 
-from mereo.io.atomic_files import atomic_file, claim_directory, new_directory, write_json
+from mereo import __main__ as command_line
+from mereo.io.atomic_files import MARKER, OLD, atomic_file, new_directory, write_json
 from mereo.io.errors import words_of
+from mereo.io.object_storage import claim
 
 INTERRUPTIONS = [ValueError("no"), KeyboardInterrupt(), SystemExit(1)]
 
@@ -60,34 +67,19 @@ def test_a_full_disk_is_one_sentence_and_leaves_nothing(tmp_path: Path) -> None:
     assert contents(tmp_path) == {}
 
 
-def test_a_really_full_disk(tmp_path: Path) -> None:
-    if not Path("/dev/full").exists():
-        pytest.skip("there is no /dev/full here")
-    with pytest.raises(OSError, match="disk is full"), atomic_file(tmp_path / "a") as partial:
-        partial.symlink_to("/dev/full")
-        partial.write_bytes(b"x" * 100_000)
-    assert contents(tmp_path) == {}
-
-
 def test_existing_outputs_are_kept_unless_forced(tmp_path: Path) -> None:
     (tmp_path / "a").write_text("old")
     (tmp_path / "d").mkdir()
     (tmp_path / "empty").mkdir()
     (tmp_path / "d" / "x").write_text("old")
-    with (
-        pytest.raises(FileExistsError, match=r"exists; it is not overwritten: .*--force"),
-        atomic_file(tmp_path / "a", force=False),
+    for place, sentence in (
+        (atomic_file(tmp_path / "a", force=False), r"exists; it is not overwritten: .*--force"),
+        (new_directory(tmp_path / "d"), r"not empty; it is not overwritten: .*--force"),
+        (new_directory(tmp_path / "a", force=True), "is a file; a directory"),
+        (atomic_file(tmp_path / "d"), "is a directory; a file"),
     ):
-        pass
-    with (
-        pytest.raises(FileExistsError, match=r"not empty; it is not overwritten: .*--force"),
-        new_directory(tmp_path / "d"),
-    ):
-        pass
-    with pytest.raises(FileExistsError, match="is a file; a directory"), new_directory(tmp_path / "a", force=True):
-        pass
-    with pytest.raises(FileExistsError, match="is a directory; a file"), atomic_file(tmp_path / "d"):
-        pass
+        with pytest.raises(FileExistsError, match=sentence), place:
+            pass
     with new_directory(tmp_path / "empty") as partial:
         (partial / "y").write_text("new")
     after = contents(tmp_path)
@@ -101,8 +93,7 @@ def test_a_file_that_came_meanwhile_is_kept_unless_forced(tmp_path: Path) -> Non
         with suppress(FileExistsError), atomic_file(path, force=force) as partial:
             partial.write_text("ours")
             path.write_text("theirs")
-        assert path.read_text() == kept
-    assert len(contents(tmp_path)) == 2
+        assert path.read_text() == kept and len(contents(tmp_path)) == 1 + force
 
 
 def test_json_knows_arrays_and_has_no_nan(tmp_path: Path) -> None:
@@ -116,26 +107,209 @@ def test_json_knows_arrays_and_has_no_nan(tmp_path: Path) -> None:
 def test_a_directory_is_claimed_once(tmp_path: Path) -> None:
     """Whoever comes later, with whatever settings, is told those of the first."""
     place = tmp_path / "deep" / "new"
-    assert claim_directory(place, "settings.json", {"a": [1, 2.5]}, "a run") is None
+    (place / ".settings.json.1a2b3c4d.mereo").mkdir(parents=True)  # what a killed process left
+    assert claim(place, "settings.json", {"a": [1, 2.5]}, "a run") is None
     (place / "result.txt").write_text("much work")
-    assert claim_directory(place, "settings.json", {"a": 3}, "a run") == {"a": [1, 2.5]}
-
-
-def test_what_a_killed_process_left_is_in_nobodys_way(tmp_path: Path) -> None:
-    (tmp_path / ".settings.json.1a2b3c4d.mereo").mkdir()
-    assert claim_directory(tmp_path, "settings.json", {"a": 1}, "a run") is None
-    assert json.loads((tmp_path / "settings.json").read_text()) == {"a": 1}
+    assert claim(place, "settings.json", {"a": 3}, "a run") == {"a": [1, 2.5]}
 
 
 def test_a_directory_of_something_else_is_not_claimed(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("precious")
     before = contents(tmp_path)
     with pytest.raises(FileExistsError, match=r"is not empty and holds no settings\.json; choose another --output"):
-        claim_directory(tmp_path, "settings.json", {}, "a run")
+        claim(tmp_path, "settings.json", {}, "a run")
     with pytest.raises(FileExistsError, match="thesis.tex is a file; a run is a directory: choose another --output"):
-        claim_directory(tmp_path / "thesis.tex", "settings.json", {}, "a run")
+        claim(tmp_path / "thesis.tex", "settings.json", {}, "a run")
     assert contents(tmp_path) == before
     for text in ("{", "[1]"):
         (tmp_path / "settings.json").write_text(text)
         with pytest.raises(ValueError, match="holds no settings; .* cannot be continued: choose another --output"):
-            claim_directory(tmp_path, "settings.json", {}, "a run")
+            claim(tmp_path, "settings.json", {}, "a run")
+
+
+# --- folders of results replace what mereo wrote and nothing else, whoever comes between or dies half-way -------------
+
+
+def write(path: Path, text: str, force: bool = False) -> None:
+    with new_directory(path, force) as folder:
+        (folder / "deep").mkdir()
+        (folder / "deep" / "a.txt").write_text(text)
+
+
+def read(path: Path) -> str:
+    return (path / "deep" / "a.txt").read_text()
+
+
+def test_what_mereo_wrote_is_replaced_when_forced(tmp_path: Path) -> None:
+    write(tmp_path / "out", "first")
+    write(tmp_path / "out", "second", force=True)
+    assert read(tmp_path / "out") == "second" and os.listdir(tmp_path) == ["out"]
+    shutil.move(tmp_path / "out", tmp_path / "elsewhere")
+    (tmp_path / "elsewhere/deep/a.txt").unlink()
+    write(tmp_path / "elsewhere", "third", force=True)
+    assert read(tmp_path / "elsewhere") == "third"
+
+
+CHANGES: dict[str, tuple[Callable[[Path], object], str]] = {
+    "another file": (
+        lambda folder: (folder / "deep/mine.txt").write_text("precious"),
+        r"holds deep/mine\.txt, not written by this version of mereo or .*: move that away, or choose another",
+    ),
+    "an edit": (lambda folder: (folder / "deep/a.txt").write_text("corrected"), r"holds deep/a\.txt, not written by"),
+    "a link": (lambda folder: (folder / "deep/link").symlink_to(folder), r"holds deep/link, not written"),
+    "a folder": (lambda folder: (folder / "mine").mkdir(), r"holds mine, not written"),
+    "no list": (lambda folder: (folder / MARKER).unlink(), r"holds deep and 1 more, not written"),
+    "a bad list": (lambda folder: (folder / MARKER).write_text('{"files": 3}'), r"holds deep and 1 more, not written"),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_folder_with_anything_else_in_it_is_refused_before_the_work(change: str, tmp_path: Path) -> None:
+    make, sentence = CHANGES[change]
+    write(tmp_path / "out", "first")
+    make(tmp_path / "out")
+    before = contents(tmp_path)
+    with pytest.raises(FileExistsError, match=sentence), new_directory(tmp_path / "out", force=True):
+        pytest.fail("the work was begun")
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_what_comes_into_a_folder_during_the_work_is_kept(change: str, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    write(out, "first")
+    before: dict[str, bytes] = {}
+    with pytest.raises(FileExistsError, match="out (holds|was written)"), new_directory(out, force=True) as folder:
+        (folder / "b.txt").write_text("second")
+        CHANGES[change][0](out)
+        before = contents(out)
+    assert contents(out) == before and os.listdir(tmp_path) == ["out"]
+
+
+@pytest.mark.parametrize("existing", ["absent", "empty"])
+def test_an_output_that_is_filled_during_the_work_is_kept(existing: str, tmp_path: Path) -> None:
+    """By a person, and by another run: the first one to end has its result there, the second one says so."""
+    if existing == "empty":
+        (tmp_path / "out").mkdir()
+    message = "was written by another while this ran; it is kept and this result is dropped: run again with another"
+    with pytest.raises(FileExistsError, match=message), new_directory(tmp_path / "out") as folder:
+        (folder / "b.txt").write_text("ours")
+        (tmp_path / "out").mkdir(exist_ok=True)
+        (tmp_path / "out/a.txt").write_text("theirs")
+    assert contents(tmp_path) == {"out": b"", "out/a.txt": b"theirs"}
+
+
+def test_two_runs_at_once_into_one_folder_are_refused_at_once(tmp_path: Path) -> None:
+    with (
+        new_directory(tmp_path / "out"),
+        pytest.raises(FileExistsError, match="is being written by another process: wait for it, or choose another"),
+        new_directory(tmp_path / "out"),
+    ):
+        pass
+
+
+def test_the_input_is_never_replaced(tmp_path: Path) -> None:
+    """Not even where mereo wrote it."""
+    write(tmp_path / "out", "first")
+    inputs = [tmp_path / "missing", tmp_path / "out/deep/a.txt"]
+    with (
+        pytest.raises(FileExistsError, match=r"out holds .*a\.txt, which is read; it is not replaced: choose another"),
+        new_directory(tmp_path / "out", True, inputs),
+    ):
+        pytest.fail("the work was begun")
+
+
+def test_reconstruct_does_not_delete_the_folder_of_its_input(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.save(tmp_path / "cloud.npy", np.ones((100, 3)))
+    (tmp_path / "thesis.tex").write_text("precious")
+    before = contents(tmp_path)
+    command = ["reconstruct", tmp_path / "cloud.npy", "--weights", "rope", "--output", tmp_path, "--force"]
+    assert command_line.main([str(part) for part in command]) == 2
+    assert "which is read; it is not replaced" in capsys.readouterr().err
+    assert contents(tmp_path) == before
+
+
+DIES = """
+import os, signal, sys
+from pathlib import Path
+from mereo.io import atomic_files
+def die(*_): os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def killed(code: str) -> None:
+    """Run Python that must end by a SIGKILL."""
+    done = subprocess.run([sys.executable, "-c", DIES + code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+
+
+def test_what_a_killed_process_left_is_removed_by_the_next_one(tmp_path: Path) -> None:
+    killed(
+        f"with atomic_files.new_directory({str(tmp_path / 'out')!r}) as folder:\n"
+        f" with atomic_files.atomic_file({str(tmp_path / 'a.txt')!r}) as file:\n"
+        "  (folder / 'half').touch(); file.touch(); die()"
+    )
+    assert len(os.listdir(tmp_path)) == 2
+    lookalikes = (".out.mine.mereo", ".out.00000000.partial", ".other.00000000.mereo")
+    for name in lookalikes:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "mine.txt").write_text("precious")
+    write(tmp_path / "out", "whole")
+    with atomic_file(tmp_path / "a.txt") as file:
+        file.write_text("whole")
+    assert set(os.listdir(tmp_path)) == {"out", "a.txt", *lookalikes}
+    assert all((tmp_path / name / "mine.txt").exists() for name in lookalikes)
+
+
+@pytest.mark.parametrize("renames", [1, 2])
+def test_a_process_killed_while_it_replaces_loses_neither_result(renames: int, tmp_path: Path) -> None:
+    """Between the two renames the old one is put back; after them the new one is there, and is whole."""
+    out = tmp_path / "out"
+    write(out, "first")
+    killed(
+        f"plain, left = os.rename, iter(range({renames - 1}))\n"
+        "def rename(*places):\n"
+        " plain(*places)\n"
+        " next(left, None) is not None or die()\n"
+        "os.rename = rename\n"
+        f"with atomic_files.new_directory({str(out)!r}, force=True) as folder:\n (folder / 'b.txt').touch()"
+    )
+    assert any((tmp_path / name / OLD).is_dir() for name in os.listdir(tmp_path))
+    with pytest.raises(FileExistsError, match="not overwritten"):  # after it was put back
+        write(out, "second")
+    assert (out / "deep/a.txt").exists() == (renames == 1) and (out / MARKER).exists()
+    assert os.listdir(tmp_path) == ["out"]
+
+
+@pytest.mark.parametrize("unlinked", [0, 2])
+def test_a_result_that_was_being_removed_is_not_put_back(unlinked: int, tmp_path: Path) -> None:
+    """Not even where the user has deleted the new one meanwhile: it lacks files. The next run removes what is left."""
+    out = tmp_path / "out"
+    with new_directory(out) as folder:
+        for name in "abc":
+            (folder / name).write_text("first")
+    killed(
+        f"plain, left = os.unlink, iter(range({unlinked}))\n"
+        "def unlink(*place, **options):\n"
+        " next(left, None) is not None or die()\n"
+        " plain(*place, **options)\n"
+        "os.unlink = unlink\n"
+        f"with atomic_files.new_directory({str(out)!r}, force=True) as folder:\n (folder / 'n').touch()"
+    )
+    assert {path.name for path in out.iterdir()} == {"n", MARKER}
+    shutil.rmtree(out)
+    write(out, "second")
+    assert read(out) == "second" and {path.name for path in out.iterdir()} == {"deep", MARKER}
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def test_a_living_process_keeps_what_it_is_writing(tmp_path: Path) -> None:
+    """Another one that writes the same file at the same time removes none of it."""
+    with atomic_file(tmp_path / "a.txt") as first:
+        first.write_text("first")
+        with atomic_file(tmp_path / "a.txt") as second:
+            second.write_text("second")
+        assert (tmp_path / "a.txt").read_text() == "second"
+    assert contents(tmp_path) == {"a.txt": b"first"}

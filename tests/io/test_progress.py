@@ -40,32 +40,6 @@ def test_lines_say_stage_rate_and_time_left(wait: Callable[[float], None], capsy
     ]
 
 
-def test_lines_come_now_and_then(
-    wait: Callable[[float], None], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(module, "LINE_EVERY_S", 10.0)
-    for _ in tracked("evaluate", 24, "views"):
-        wait(1.0)
-    lines = capsys.readouterr().err.splitlines()
-    assert [line.partition(" of")[0] for line in lines] == [
-        "evaluate: 10",
-        "evaluate: 20",
-        "evaluate: 24 views in 24 s",
-    ]
-
-
-def test_a_machine_that_becomes_slow_shows_in_the_rate(
-    wait: Callable[[float], None], capsys: pytest.CaptureFixture[str]
-) -> None:
-    with progress("train", 10_000, "steps", each=6) as shown:
-        for seconds in [1.0] * 200 + [10.0] * 10:
-            wait(seconds)
-            shown.advance()
-    lines = capsys.readouterr().err.splitlines()
-    fast, slow = lines[150], lines[-2]
-    assert ", 6.0 examples/s, " in fast and ", 0.6 examples/s, 27 h 12 min left" in slow
-
-
 def test_pauses_count_for_the_end_and_not_for_the_rate(
     wait: Callable[[float], None], capsys: pytest.CaptureFixture[str]
 ) -> None:

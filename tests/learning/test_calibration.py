@@ -12,7 +12,6 @@ from safetensors import safe_open
 
 from mereo import __main__ as command_line
 from mereo.geometry.labels import LabelGrid
-from mereo.geometry.metrics import truth_grid
 from mereo.geometry.radii import Radii, rounded_to
 from mereo.models.calibration import Calibration, RadiusFactors
 from mereo.models.model import scaled_logits
@@ -30,7 +29,7 @@ from mereo_learning.calibrate import (
     factors_of,
     fit_scaling,
 )
-from mereo_learning.cases import BINS, RegistrationErrors, Reliability, sample_cells
+from mereo_learning.cases import BINS, RegistrationErrors, Reliability
 
 NAMES = ("one", "two")
 FAVOUR = np.array([0.0, 2.0, -1.0])
@@ -55,7 +54,7 @@ def test_the_error_is_the_distance_of_confidence_from_right_answers() -> None:
     assert counted.ece == pytest.approx(0.3)
     counted.add(np.full(10, 1.0), np.ones(10, dtype=bool))
     assert counted.ece == pytest.approx(0.15)
-    assert [bin["share"] for bin in counted.facts()] == [0.5, 0.5] and len(counted.count) == BINS
+    assert [bin["share"] for bin in counted.facts()] == [0.5, 0.5] and counted.bins.shape == (3, BINS)
     assert np.isnan(Reliability().ece)
 
 
@@ -70,15 +69,6 @@ def test_scaling_finds_what_made_the_probabilities_wrong(logits: np.ndarray) -> 
     np.testing.assert_allclose(favoured.biases, [0.0, -2.0, 1.0], atol=0.08)
     before = ece_of(2.5 * (logits + FAVOUR), truth)
     assert ece_of(2.5 * (logits + FAVOUR), truth, favoured) < GOOD_ENOUGH / 2 < before / 5
-
-
-def test_cells_are_drawn_among_those_that_count_and_are_the_same_every_time() -> None:
-    truth = truth_grid(load_scene("rope").rest, 24)
-    points, labels = sample_cells(truth, 500)
-    index = np.rint((points - truth.grid.origin) / truth.grid.spacing).astype(int)
-    assert len(points) == 500 and truth.kept[tuple(index.T)].all()
-    np.testing.assert_array_equal(truth.grid.labels[tuple(index.T)], labels)
-    np.testing.assert_array_equal(sample_cells(truth, 500)[0], points)
 
 
 def test_labels_stay_and_probabilities_are_scaled() -> None:

@@ -13,7 +13,7 @@ from mereo.api.reconstruct import load_frame
 from mereo.cli import demo
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
-from mereo.geometry.metrics import confusion_matrix, format_score, grid_confusion, intersection_over_union, truth_grid
+from mereo.geometry.metrics import format_score, grid_confusion, intersection_over_union, truth_grid
 from mereo.geometry.solids import Solids
 from mereo.models.weights import save_model
 from mereo.scenes.registry import load_scene
@@ -70,16 +70,6 @@ def test_scores_have_three_decimals_and_the_table_agrees_with_the_matrix(missing
     assert {len(row) for row in rows} == {5}
 
 
-def test_false_positives_in_free_space_count() -> None:
-    """Everything is called left: the joint box is 2 x 1 x 1, of which left fills a third once right is short."""
-    mesh = SegmentedMesh((box((0, 0, 5), (1, 1, 6), "left"), box((1, 0, 5), (2, 1, 5.5), "right", 1)))
-    everywhere = AnalyticModel.of(lambda points: np.tile([0.0, 1.0, 0.0], (len(points), 1)), NAMES)
-    truth = truth_grid(mesh, 40)
-    scores = grid_scores(everywhere, cloud(), mesh, cells=40)
-    assert scores.per_segment[0] == pytest.approx((truth.grid.labels == 1).sum() / truth.kept.sum())
-    assert scores.per_segment[1] == 0.0
-
-
 def test_truth_grid_against_point_by_point() -> None:
     mesh = sample_view(load_scene("rope"), GenerateConfig(), example_rng(1_000_000, 3)).mesh
     truth = truth_grid(mesh, 16)
@@ -94,21 +84,6 @@ def test_truth_grid_against_point_by_point() -> None:
     np.testing.assert_array_equal(truth.kept.ravel(), kept)
     assert (truth.grid.labels.ravel() == Solids(mesh).label(points)).mean() > 0.999
     assert 0.02 < kept.mean() < 1.0 and not truth.grid.labels[~truth.kept].any()
-
-
-def test_grid_prediction_is_that_of_asking_every_point() -> None:
-    """Labels of two soft walls, on a grid of cells that are not cubes."""
-    model = AnalyticModel.of(lambda p: np.stack([0 * p[:, 0], 1.1 - p[:, 0], p[:, 0] - p[:, 1] - 0.7], axis=1), NAMES)
-    truth = truth_grid(two_cuboids(), 30)
-    index = np.indices((30, 30, 30)).reshape(3, -1).T
-    code = model.encode(cloud())
-    expected = model.query(code, truth.grid.positions(index)).label.reshape(30, 30, 30)
-    predicted = predict_grid(model, cloud(), truth)
-    np.testing.assert_array_equal(predicted, expected)
-    np.testing.assert_array_equal(
-        grid_confusion(truth, predicted, 2),
-        confusion_matrix(truth.grid.labels[truth.kept], expected[truth.kept], 3),
-    )
 
 
 def test_one_confusion_matrix_over_the_whole_set() -> None:

@@ -7,7 +7,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
@@ -24,7 +23,7 @@ from mereo.scenes.random_states import CACHE_VARIABLE
 from mereo.scenes.registry import load_scene
 from mereo_learning import calibrate as calibration
 from mereo_learning import learn as learning
-from mereo_learning import search_stage, shards, trial
+from mereo_learning import search_stage, shards
 from mereo_learning.config import PRESETS
 from mereo_learning.learn import (
     LearnConfig,
@@ -67,12 +66,6 @@ def test_stages_fill_the_time_that_is_left(left_s: float, generate_s: float) -> 
     # the tail is in it: what is expected of training is its steps and its scores, and some more
     scores_s = (20 * holdout(plan.examples) + min(learning.OFFSET_EXAMPLES, plan.examples)) * rates.score_s
     assert learning.MARGIN * plan.training_s == pytest.approx(6 * steps * rates.train_s + scores_s)
-
-
-def test_faster_machines_make_more_of_the_same_time() -> None:
-    slow, fast = (plan_for(600, Rates(0.05 / f, 0.04 / f, 0.02 / f), "rope", 6) for f in (1, 2))
-    assert fast.examples > 1.9 * slow.examples
-    assert fast.epochs == pytest.approx(slow.epochs, rel=0.1) == pytest.approx(learning.PASSES, rel=0.1)
 
 
 def test_no_time_gives_the_least_and_late_examples_leave_less_training() -> None:
@@ -138,14 +131,11 @@ def test_arguments_bind_once_something_is_made_of_them(tmp_path: Path) -> None:
     assert not out.exists()
     learning._claim(out, {"object": "a", "minutes": 1.0})
     learning._claim(out, {"object": "b", "minutes": 2.0})
-    assert json.loads((out / "config.json").read_text()) == {"object": "b", "minutes": 2.0}
     (out / "scene.yaml").write_text("of b")
     learning._claim(out, {"object": "b", "minutes": 3.0})
     with pytest.raises(ValueError, match="was begun with object = 'b', not 'a'"):
         learning._claim(out, {"object": "a", "minutes": 3.0})
     (out / "plan.json").write_text("of 3 minutes")
-    with pytest.raises(ValueError, match=r"was begun with minutes = 3.0, not 1.0; .*choose another --output"):
-        learning._claim(out, {"object": "b", "minutes": 1.0})
     with pytest.raises(ValueError, match=r"plan.json holds no plan; remove it"):
         learning._decided(out)
 
@@ -160,12 +150,6 @@ def test_the_example_frame_is_as_long_as_the_object(tmp_path: Path) -> None:
     seen = find_object(read_frame(tmp_path / "frame.ply", InputConfig(unit_m=1.0)), IsolationConfig())
     assert 0.01 < max(seen.size_m) < 0.06  # 40 mm at rest
     assert size_warning(seen, {"visible_m": [0.02, 0.05]}) is None
-    # in scene units that are called metres, as the documented first try once had it, the same frame is too long
-    cloud = seen.cloud.points / scene.unit_m
-    np.save(tmp_path / "frame.npy", cloud)
-    far = find_object(read_frame(tmp_path / "frame.npy", InputConfig(unit_m=1.0)), IsolationConfig())
-    warning = size_warning(far, {"visible_m": [0.02, 0.05]})
-    assert warning is not None and "its unit is wrong" in warning
 
 
 # --- what is said -----------------------------------------------------------------------------------------------------
@@ -202,9 +186,9 @@ def small(monkeypatch: pytest.MonkeyPatch, without_turns: None, cache: Path) -> 
         (learning, "EXAMPLES", 12),
         (shards, "states_for", lambda _: 12),
         (DrawnStates, "of", partial(DrawnStates.of, count=30)),
-        (trial, "STEPS", 2),
-        (trial, "SCORED", 4),
-        (trial, "shipped_names", lambda: ("rope",)),
+        (learning, "STEPS", 2),
+        (learning, "SCORED", 4),
+        (learning, "shipped_names", lambda: ("rope",)),
         (learning, "LEAST_EXAMPLES", 30),
         (learning, "MOST_EXAMPLES", 30),
         (learning, "LEAST_TESTS", 1),
@@ -235,7 +219,7 @@ def test_one_command_and_the_same_again(
     printed = capsys.readouterr()
     said = printed.out
     assert re.findall(r"\[(\d)/6\]", said) == list("123456")
-    assert f"measure: {trial.trial_steps(compared=False)} steps in" in printed.err
+    assert f"measure: {learning.trial_steps(compared=False)} steps in" in printed.err
     assert "the least that can be learnt from takes" in said
     assert f"mereo reconstruct {out}/frame.ply --weights {out}/weights.safetensors --scene {scene}" in said
     assert {place.name for place in out.iterdir()} == {
@@ -275,10 +259,10 @@ def _stop(*_: object, **__: object) -> None:
 def test_the_nearest_weights_are_those_that_adapt_fastest(
     small: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(trial, "shipped_names", lambda: ("rope", "skull"))
+    monkeypatch.setattr(learning, "shipped_names", lambda: ("rope", "skull"))
     _, name = learning.measure(str(write_bar(tmp_path)), tmp_path, LIGHT, init="", workers=1)
     printed = capsys.readouterr()
-    assert f"measure: {trial.trial_steps(compared=True)} steps in" in printed.err
+    assert f"measure: {learning.trial_steps(compared=True)} steps in" in printed.err
     losses = re.findall(r"(rope|skull) (\d+\.\d+)", printed.out)
     assert len(losses) == 2 and float(losses[0][1]) <= float(losses[1][1]) and name == losses[0][0]
 

@@ -9,7 +9,7 @@ from align_cases import object_at_rest
 from scipy.spatial.transform import Rotation
 
 from mereo.geometry.transforms import rigid, transform_points
-from mereo_learning.placement import pose_of_pairs, read_start
+from mereo_learning.placement import read_start
 
 SCALE = 2.5
 TURN = Rotation.from_euler("xyz", [20, -30, 50], degrees=True).as_matrix()
@@ -54,20 +54,6 @@ def test_the_known_scale_is_kept_and_the_middle_stays_and_a_missing_file_is_name
         read_start(tmp_path / "gone.json", object_at_rest())
 
 
-def test_noisy_pairs_give_the_best_rotation() -> None:
-    """No other pose of that scale near it has a smaller sum of squares."""
-    rng = np.random.default_rng(0)
-    seen = transform_points(POSE, MODEL) + rng.normal(scale=0.5, size=MODEL.shape)
-    pose = pose_of_pairs(MODEL, seen, "the object", SCALE, 10.0)
-
-    def cost(candidate: np.ndarray) -> float:
-        return float(np.sum((transform_points(candidate, MODEL) - seen) ** 2))
-
-    for _ in range(50):
-        turn = Rotation.from_rotvec(rng.normal(scale=0.02, size=3)).as_matrix()
-        assert cost(pose) < cost(rigid(turn, rng.normal(scale=0.1, size=3)) @ pose)
-
-
 SPREAD = np.array([[0.0, 0, 0], [20, 0, 0], [20, 20, 0], [0, 20, 0], [0, 0, 9]])
 SADDLE = SCALE * SPREAD + np.outer([-15, 15, -15, 15, 0], [0, 0, 1])
 TWISTED = {"model": SPREAD.tolist(), "scan": SADDLE.tolist()}
@@ -81,27 +67,21 @@ MIRROR = POSE @ np.diag([-1.0, 1, 1, 1])
         ({"object": pairs(), "scale": 3}, SCALE, "has the key 'scale'; it may have"),
         ({"segments": {"leg": pairs()}}, SCALE, "start of the segment 'leg'; the segments are base, arm, peg"),
         ({"segments": {"arm": pairs()}}, SCALE, "no start for the segment 'base' and none of the object"),
-        ({"segments": [1]}, SCALE, '"segments" of .* is not an object'),
         ({"object": pairs(MODEL[:2])}, SCALE, "2 points of the model and 2 of the scan; at least 3 pairs"),
-        ({"object": {**pairs(), "scan": [[0, 0, 0]] * 3}}, SCALE, "4 points of the model and 3 of the scan"),
-        ({"object": {"model": []}}, SCALE, 'has the keys \'model\'; pairs are "model" and "scan"'),
         ({"object": {**pairs(), "scan": "here"}}, SCALE, "scan of the start of the object must be rows of 3 finite"),
         ({"object": pairs(np.outer([0, 1, 2, 3], [1.0, 2, 3]))}, SCALE, "lie on a line; they must span a triangle"),
         ({"object": pairs(pose=MIRROR)}, SCALE, "the pairs of the object fit a mirror image better"),
         ({"object": pairs(SPREAD), "segments": {"arm": TWISTED}}, SCALE, "pairs of segment 'arm' are 13.4 apart"),
         ({"object": pairs()}, None, "about 2.5 scan units per scene unit.: give the scene's unit with --scene-unit-mm"),
         ({"object": pairs()}, 2500.0, "has 2.5 scan units per scene unit, but the units of scene and scan give 2500"),
-        ({"object": POSE.tolist()}, 0.0025, "has 2.5 scan units per scene unit, but .* give 0.0025"),
         ({"object": MIRROR.tolist()}, SCALE, "is a reflection"),
         ({"object": np.diag([1.0, 2, 1, 1]).tolist()}, None, "shears or stretches"),
         ({"object": POSE.T.tolist()}, SCALE, "has the last row .*; it must be 0 0 0 1: is it transposed?"),
-        ({"object": POSE[:3].tolist()}, SCALE, "the start of the object must be 4 rows of 4 finite numbers"),
         (
             {"object": {"model": SPREAD.tolist(), "scan": (1e300 * SPREAD).tolist()}},
             SCALE,
             "finite numbers up to 1e.12",
         ),
-        ({"object": [[float("nan")] * 4] * 4}, SCALE, "the start of the object must be 4 rows of 4 finite numbers"),
     ],
 )
 def test_bad_starts(tmp_path: Path, stated: object, scale: float | None, sentence: str) -> None:

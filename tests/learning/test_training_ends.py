@@ -4,15 +4,11 @@ import errno
 import math
 import os
 import shutil
-import socket
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import training_runs
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from small_training import SMALL
@@ -106,8 +102,6 @@ def test_a_resumed_run_leaves_the_same_files(often: float, dataset: Path, finish
     ("loss", "gradient", "clip", "says"),
     [
         (math.nan, math.nan, 1.0, "the loss is nan in step 4 of 5"),
-        (math.inf, math.nan, 0.0, "the loss is inf in step 4 of 5"),
-        (0.0, math.inf, 1.0, "the gradient's norm is (inf|nan) in step 4 of 5"),
         (0.0, math.inf, 0.0, "the gradient's norm is (inf|nan) in step 4 of 5"),
     ],
 )
@@ -135,42 +129,6 @@ def test_a_divergence_before_anything_is_saved_is_an_error_of_the_command(
     message = capsys.readouterr().err
     assert message.startswith("mereo: error: the loss is nan in step 1 of ") and message.count("\n") == 1
     assert "nothing is saved" in message and "--precision" not in message
-    assert os.listdir(tmp_path / "run") == ["config.json"]
-
-
-SECOND_DIVERGES = """
-import math, os, sys
-import pytest
-from mereo import __main__ as command_line
-from training_runs import diverge_at
-if os.environ["RANK"] == "1":
-    diverge_at(pytest.MonkeyPatch(), 2, math.inf, math.nan)  # with a finite gradient, so only its own loss says so
-sys.exit(command_line.main(sys.argv[1:]))
-"""
-
-
-@pytest.mark.slow
-def test_where_one_process_diverges_all_stop_with_the_same_sentence(dataset: Path, tmp_path: Path) -> None:
-    command = f"train {dataset} --output {tmp_path / 'run'} --preset tiny --batch 8 --precision float32"
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
-    place = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "OMP_NUM_THREADS": "1"}
-    path = os.pathsep.join([str(Path(training_runs.__file__).parent), os.environ.get("PYTHONPATH", "")])
-    processes = [
-        subprocess.Popen(
-            [sys.executable, "-c", SECOND_DIVERGES, *command.split()],
-            env={**os.environ, **place, "RANK": rank, "LOCAL_RANK": rank, "PYTHONPATH": path, "JAXTYPING_DISABLE": "1"},
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for rank in "01"
-    ]
-    said = [process.communicate(timeout=240)[1] for process in processes]
-    assert [process.returncode for process in processes] == [2, 2], said
-    sentences = {line for text in said for line in text.splitlines() if line.startswith("mereo: error: ")}
-    assert len(sentences) == 1 and "the loss is inf in step 2 of " in sentences.pop()
-    assert all("mereo: error: " in text and "Traceback" not in text for text in said)
     assert os.listdir(tmp_path / "run") == ["config.json"]
 
 

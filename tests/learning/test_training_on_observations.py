@@ -8,10 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 from observed_views import observed, rng
-from safetensors.numpy import load_file, save_file
 from small_training import SMALL
 from toy_data import read_all, write_toy_dataset
-from training_runs import assert_resumes_exactly
 
 from mereo.models.weights import load_model
 from mereo_learning import trainer
@@ -88,10 +86,6 @@ def test_queries_and_cloud_stay_in_one_frame(data: tuple[Dataset, Dataset], numb
         assert torch.allclose(now, then * scale.view(-1, *[1] * (then.dim() - 1)), rtol=1e-4, atol=1e-3)
 
 
-def test_killed_and_resumed_equals_uninterrupted(folders: tuple[Path, Path], tmp_path: Path) -> None:
-    assert_resumes_exactly(folders[1], tmp_path, replace(SMALL, epochs=0.4), steps=2)
-
-
 def test_a_run_scores_sensors_apart_and_says_what_it_saw(folders: tuple[Path, Path], tmp_path: Path) -> None:
     headers, models = [], []
     for folder in folders:
@@ -126,14 +120,3 @@ def test_an_autodecoder_sees_every_example_as_it_is(data: tuple[Dataset, Dataset
     assert fit_config(PRESETS["paper-autodecoder"], data[1]).augment.observations == 0.0
     assert fit_config(PRESETS["paper"], data[1]).augment.observations == 0.5
     assert fit_config(PRESETS["paper"], data[0]).augment.observations == 0.0
-
-
-def test_a_shard_whose_observations_are_cut_is_refused(folders: tuple[Path, Path], tmp_path: Path) -> None:
-    directory = write_toy_dataset(tmp_path / "data", examples=4, example=observed)
-    path = directory / "shard-00000.safetensors"
-    for name, change in (("seen", slice(3)), ("seen_count", slice(2))):
-        tensors = load_file(path)
-        save_file(tensors | {name: tensors[name][change]}, path)
-        with pytest.raises(ValueError, match=f"its tensor '{name}' has the shape"):
-            Dataset.load(directory)
-        save_file(tensors, path)

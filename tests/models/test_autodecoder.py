@@ -10,19 +10,17 @@ from answers import reconstruct
 from safetensors.torch import load_file
 from shapes import ball
 from toy_data import read_all, write_toy_dataset
-from training_runs import assert_resumes_exactly, train_in_two_processes
+from training_runs import assert_resumes_exactly
 
-from mereo.api.generate import generate
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.metrics import confusion_matrix, intersection_over_union, truth_grid
+from mereo.geometry.metrics import truth_grid
 from mereo.models.config import AutodecoderConfig, NetworkConfig
 from mereo.models.decoder import Code
 from mereo.models.encoders import Autodecoder, Encoding
 from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.models.weights import load_model
-from mereo.synthesis.config import GenerateConfig
 from mereo_learning import trainer, validation
 from mereo_learning.cases import TestCase
 from mereo_learning.config import PRESETS, AugmentConfig, TrainConfig
@@ -157,24 +155,6 @@ def test_the_search_is_deterministic_and_by_cloud(model: Model, data: Dataset) -
     assert (together[3] - together[4]).abs().max() > 0.1
 
 
-def test_the_search_works_beside_alignment_sight_and_template() -> None:
-    config = PRESETS["tiny"].network.changed(encoder="autodecoder", local_neighbors=0, search_steps=2)
-    torch.manual_seed(0)
-    network = Network(config, 2).eval().requires_grad_(False)
-    unmoved = network.encoder.mean.clone()
-    cloud = np.random.default_rng(0).normal(loc=(0.0, 0.0, 9.0), size=(300, 3))
-    answer = Model(network, ("a", "b"), ((1, 2, 3), (4, 5, 6)), loss="ce+l1+cd")
-    assert np.isfinite(answer.query(answer.encode(cloud), cloud[:5]).direction).all()
-    assert torch.equal(network.encoder.mean, unmoved)
-
-
-def test_weights_hold_the_mean_code_only(run: Path) -> None:
-    weights, state = load_file(run / "weights.safetensors"), load_file(run / "checkpoint.safetensors")
-    assert state["average/encoder.codes"].shape == (12, 32)
-    assert "encoder.codes" not in weights
-    assert torch.equal(weights["encoder.mean"], state["average/encoder.codes"].mean(dim=0))
-
-
 def test_only_the_codes_of_a_batch_move_and_at_their_own_rate(dataset: Path, data: Dataset, tmp_path: Path) -> None:
     """Adam's first step moves every coordinate by the rate."""
     config = replace(SMALL, batch=5, code_rate=0.01, learning_rate=1e-5)
@@ -187,27 +167,6 @@ def test_only_the_codes_of_a_batch_move_and_at_their_own_rate(dataset: Path, dat
     assert torch.allclose(moved[batch.index], torch.tensor(0.01), rtol=1e-2)
     others = [i for i in range(12) if i not in batch.index.tolist()]
     assert len(others) == 7 and not moved[others].any()
-
-
-def test_gradient_reaches_every_parameter(data: Dataset) -> None:
-    network = start_network(SMALL, data).train()
-    index = torch.arange(12)
-    stored = read_all(data)
-    prediction, coarse = network(stored.cloud, stored.viewpoint, stored.positions, index)
-    sum(output.square().sum() for output in (*prediction, coarse) if output is not None).backward()
-    for name, parameter in network.named_parameters():
-        assert parameter.grad is not None, name
-        assert parameter.grad.abs().max() > 1e-7 or name.endswith("score.bias"), name  # a softmax takes nothing of it
-    assert (network.encoder.codes.grad.abs().amax(dim=1) > 1e-7).all()
-
-
-def test_codes_begin_as_long_as_the_recipe_says(data: Dataset) -> None:
-    for length in (1.0, 0.1):
-        network = start_network(replace(SMALL, code_length=length, holdout=2), data)
-        codes = network.encoder.codes.detach()
-        assert codes.shape == (10, 32)
-        assert codes.square().sum(dim=1).mean().sqrt().item() == pytest.approx(length, rel=0.15)
-    assert torch.allclose(codes * 10, start_network(replace(SMALL, holdout=2), data).encoder.codes, atol=1e-6)
 
 
 def test_a_search_in_the_codes_spread_stays_among_codes_like_them() -> None:
@@ -225,13 +184,6 @@ def test_a_search_in_the_codes_spread_stays_among_codes_like_them() -> None:
     assert torch.allclose(found[:, 1], torch.tensor(1.0)) and torch.allclose(found[:, 3], torch.tensor(-1.0))
 
 
-def test_the_prior_is_the_codes_squared_length() -> None:
-    encoder = Autodecoder(AutodecoderConfig(code_penalty=0.5), latent=4)
-    assert torch.equal(
-        encoder.length_penalty(torch.tensor([[1.0, 2.0, 0.0, 2.0], [0.0, 0, 0, 0]])), torch.tensor([4.5, 0])
-    )
-
-
 # --- training ---------------------------------------------------------------------------------------------------------
 
 
@@ -240,15 +192,6 @@ def test_killed_and_resumed_equals_uninterrupted(dataset: Path, tmp_path: Path) 
     config = replace(SMALL, batch=5, epochs=1.2, ema_decay=0.9, holdout=1)
     config = replace(config, network=config.network.changed(dropout=0.2, search_steps=3))
     assert_resumes_exactly(dataset, tmp_path, config, steps=2)
-
-
-@pytest.mark.slow
-def test_two_processes_train_each_others_codes(dataset: Path, data: Dataset, tmp_path: Path) -> None:
-    """After one pass every code has moved, in the one copy that is saved."""
-    run = train_in_two_processes(dataset, tmp_path, replace(SMALL, batch=6, epochs=1))
-    codes = load_file(run / "checkpoint.safetensors")["network/encoder.codes"]
-    moved = (codes - start_network(SMALL, data).encoder.codes).abs()
-    assert torch.isfinite(codes).all() and (moved.amin(dim=1) > 1e-4).all()
 
 
 def test_the_curve_shows_a_few_held_out_examples(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -299,34 +242,3 @@ def test_the_papers_recipe_and_the_small_one_which_adds_nothing_to_its_network()
     assert not (added.local_neighbors or added.sight_neighbors or added.align_points or added.rest_template)
     assert small.augment == AugmentConfig() and small.loss == "ce+l1" and small.network.autodecoder.search_steps == 75
     assert small.network.decoder == replace(PRESETS["tiny"].network.decoder, highest_exponent=1)
-
-
-@pytest.mark.slow
-def test_the_small_recipe_learns_what_the_published_one_has_not_begun_with(tmp_path: Path) -> None:
-    """Sixteen ropes, each met 200 times: are they in their codes?"""
-    folder = tmp_path / "data"
-    generate("rope", folder, GenerateConfig(), examples=16, seed=710_000, workers=1)
-    data = Dataset.load(folder)
-    stored = read_all(data)
-    paper = PRESETS["paper-autodecoder"]
-    published = replace(paper, network=paper.network.changed(width=128, mlp_global=(128, 256), points=256), queries=64)
-    found = []
-    for name, recipe in (("small", PRESETS["tiny-autodecoder"]), ("published", published)):
-        config = replace(recipe, epochs=200, batch=16, holdout=0, precision="float32", compile="off")
-        trainer.train(folder, tmp_path / name, config)
-        network = trained_with_codes(tmp_path / name, data, config)
-        code = network.decoder.prepare(Encoding(network.encoder.codes.detach(), ()), stored.cloud, stored.viewpoint)
-        with torch.inference_mode():
-            guess = network.query(code, stored.positions).logits.argmax(dim=-1)
-        matrix = confusion_matrix(stored.labels.numpy(), guess.numpy(), network.segments + 1)
-        found.append(intersection_over_union(matrix, True).iou)
-    assert found[0] > 0.5 > 0.1 > found[1]
-
-
-def trained_with_codes(run: Path, data: Dataset, config: TrainConfig) -> Network:
-    """The averaged network of a run, codes of its examples included, which weights do not hold."""
-    state = load_file(run / "checkpoint.safetensors")
-    network = start_network(config, data).eval().requires_grad_(False)
-    average = {name.removeprefix("average/"): value for name, value in state.items() if name.startswith("average/")}
-    network.load_state_dict(average)
-    return network

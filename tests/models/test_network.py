@@ -7,7 +7,6 @@ from torch import nn
 
 from mereo.models.config import Loss, NetworkConfig, Supervision
 from mereo.models.decoder import FrequencyEncoding, Prediction
-from mereo.models.encoders import PointNet2
 from mereo.models.model import fold_batch_norm
 from mereo.models.network import Network
 from mereo_learning.config import PRESETS
@@ -54,6 +53,7 @@ def test_paper_preset_has_the_papers_sizes() -> None:
     assert [layer.in_features for layer in network.decoder.hidden] == [512] * 6
     assert len(network.decoder.norms) == 7
     assert network.decoder.latent2.in_features == 1024 and network.decoder.query2.in_features == 60
+    assert Network(TINY.changed(encode_positions=False), 5).decoder.query1.in_features == 3  # the paper's ablation
     assert not network.decoder.local and config.additions.sight_neighbors == 0 and network.aligner is None
 
 
@@ -74,30 +74,6 @@ def test_what_all_clouds_have_in_common_is_not_rounded_to_bfloat16() -> None:
     with torch.autocast("cpu", torch.bfloat16):
         rounded = network(*inputs).prediction.logits
     assert (rounded - exact).std() < 0.1 * exact.std()
-
-
-def test_encoder_ignores_the_order_within_its_last_half() -> None:
-    """Centres are the first half (a farthest-point sample); the rest is a set, whatever its order."""
-    config = TINY.changed(neighbors=TINY.points)
-    encoder = settled(config).encoder
-    cloud = cloud_of(config)
-    half = config.points // 2
-    shuffled = torch.cat([cloud[:, :half], cloud[:, half:][:, torch.randperm(half)]], dim=1)
-    with torch.inference_mode():
-        assert torch.allclose(encoder(cloud).latent, encoder(shuffled).latent, atol=1e-5)
-
-
-def test_encoder_ignores_repeated_points() -> None:
-    config = TINY.changed(neighbors=TINY.points)
-    encoder = PointNet2(config.pointnet2).eval()
-    cloud = cloud_of(config)
-    doubled = torch.cat([cloud, cloud[:, : config.points // 4]], dim=1)
-    doubled = torch.cat([doubled[:, : config.points // 2], doubled[:, config.points // 2 :]], dim=1)
-    encoder.ratio1 = 0.5
-    with torch.inference_mode():
-        plain = encoder(cloud).latent
-        encoder.ratio1 = (config.points // 2) / doubled.shape[1]
-        assert torch.allclose(plain, encoder(doubled).latent, atol=1e-5)
 
 
 def test_split_latent_layer_equals_concatenation() -> None:
@@ -122,16 +98,6 @@ def test_split_latent_layer_equals_concatenation() -> None:
     assert torch.allclose(logits, expected, atol=1e-4)
 
 
-def test_queries_do_not_influence_each_other() -> None:
-    network = settled(TINY)
-    points = torch.randn(2, 12, 3)
-    with torch.inference_mode():
-        code = network.encode(cloud_of(TINY), viewpoint_of())
-        together = network.query(code, points).logits
-        alone = torch.cat([network.query(code, points[:, i : i + 1]).logits for i in range(12)], dim=1)
-    assert torch.allclose(together, alone, atol=1e-5)
-
-
 def test_frequency_encoding_is_the_papers() -> None:
     encode = FrequencyEncoding(-4, 5)
     x = torch.tensor([[[0.07, -0.4, 1.3]]])
@@ -139,20 +105,6 @@ def test_frequency_encoding_is_the_papers() -> None:
         [torch.stack([f(2.0**e * torch.pi * c) for c in x[0, 0] for e in range(-4, 6)]) for f in (torch.sin, torch.cos)]
     )
     assert torch.allclose(encode(x)[0, 0], expected, atol=1e-5)
-
-
-def test_without_encoding_the_query_is_its_three_coordinates() -> None:
-    """The paper's ablation: a network of one layer is then piecewise linear in the position."""
-    plain = NetworkConfig().changed(points=64, width=16, depth=1, skip_after=1, mlp_global=(8,), encode_positions=False)
-    network = settled(plain)
-    assert network.decoder.query1.in_features == 3
-    step = torch.tensor([1e-3, 2e-3, -1e-3])
-    line = torch.stack([0.3 + i * step for i in range(3)])[None].repeat(2, 1, 1)
-    with torch.inference_mode():
-        code = network.encode(cloud_of(plain), viewpoint_of())
-        a, b, c = network.query(code, line).logits.unbind(dim=1)
-        far = network.query(code, line + 2.0).logits[:, 0]
-    assert torch.allclose(c - b, b - a, atol=1e-6) and not torch.allclose(a, far, atol=1e-2)
 
 
 def test_dropout_clears_its_share_and_only_in_training() -> None:

@@ -6,8 +6,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mereo.models.config import NetworkConfig
-from mereo.models.encoders import PointTransformer, TransitionDown, VectorAttention
-from mereo.models.neighbors import distinct_distances, nearest
+from mereo.models.encoders import PointTransformer, VectorAttention
+from mereo.models.neighbors import nearest
 from mereo.models.network import Network
 from mereo_learning.config import PRESETS
 
@@ -62,39 +62,6 @@ def test_vector_attention_is_equation_3() -> None:
             assert torch.allclose(fast[b], torch.stack(slow), atol=1e-5)
 
 
-def test_attention_sees_relative_places_only() -> None:
-    layer = VectorAttention(6)
-    points, features = torch.randn(2, 10, 3), torch.randn(2, 10, 6)
-    index = nearest(points, points, 4)
-    with torch.no_grad():
-        here, there = layer(points, features, index), layer(points + 3.0, features, index)
-        assert torch.allclose(here, there, atol=1e-4)
-        assert not torch.allclose(here, layer(2 * points, features, index), atol=1e-2)
-
-
-def test_transition_down_takes_the_largest_of_each_neighbourhood() -> None:
-    torch.manual_seed(0)
-    down = TransitionDown(5, 7).eval()
-    features, points = torch.randn(2, 20, 5), torch.randn(2, 20, 3)
-    index = nearest(points[:, :5], points, 4)
-    with torch.no_grad():
-        found = down(features, index)
-        for b, m in ((0, 0), (1, 4)):
-            each = torch.stack([down.mlp(features[b, j]) for j in index[b, m].tolist()])
-            assert torch.allclose(found[b, m], each.amax(dim=0), atol=1e-6)
-
-
-def test_repeated_points_are_nobodys_neighbours() -> None:
-    """Against a slow reference: the nearest of the points that do not repeat an earlier one."""
-    cloud = cloud_of(12)
-    cloud = torch.cat([cloud, cloud[:, [3, 0, 7, 3]]], dim=1)
-    index = distinct_distances(cloud).topk(5, dim=2, largest=False).indices
-    for b in range(2):
-        for i in range(16):
-            reach = (cloud[b, :12] - cloud[b, i]).square().sum(dim=1)
-            assert index[b, i].tolist() == reach.argsort()[:5].tolist()
-
-
 def test_encoder_ignores_which_points_fill_up_a_cloud_and_the_order_of_what_is_not_kept() -> None:
     """The first quarter are the points of the second level; the rest is a set."""
     encoder, cloud = settled(), cloud_of()
@@ -109,27 +76,6 @@ def test_encoder_ignores_which_points_fill_up_a_cloud_and_the_order_of_what_is_n
     with torch.inference_mode():
         assert torch.allclose(encoder(cloud).latent, encoder(shuffled).latent, atol=1e-5)
         assert not torch.allclose(encoder(cloud).latent, encoder(cloud.flip(2)).latent, atol=1e-3)
-
-
-def test_its_levels_are_prefixes_of_the_cloud() -> None:
-    encoding, cloud = settled()(cloud_of()), cloud_of()
-    assert [level.features.shape for level in encoding.levels] == [(2, 32, 12), (2, 8, 16)]
-    for level in encoding.levels:
-        assert torch.equal(level.centers, cloud[:, : level.centers.shape[1]])
-
-
-def test_gradient_reaches_every_parameter() -> None:
-    """With two points or more in the last block: one alone has nothing to weigh.
-
-    But for the bias of scores, of which a softmax takes nothing: its gradient is rounding, of any size.
-    """
-    torch.manual_seed(0)
-    network = Network(TINY.changed(points=512, width=24, local_neighbors=3, local_width=8), segments=3).train()
-    prediction, coarse = network(cloud_of(512, batch=4), torch.tensor([[0.0, 0.0, -8.0]] * 4), torch.randn(4, 30, 3))
-    sum(output.square().sum() for output in (*prediction, coarse) if output is not None).backward()
-    for name, parameter in network.named_parameters():
-        assert parameter.grad is not None, name
-        assert parameter.grad.abs().max() > 1e-7 or name.endswith("score.bias"), name
 
 
 def test_paper_sizes() -> None:

@@ -40,22 +40,15 @@ def changed(folder: Path, change: Callable[[Any, dict[str, torch.Tensor]], Any],
 
 WRONG: dict[str, Callable[[Any, dict[str, torch.Tensor]], Any]] = {
     "has weights format None": lambda h, t: [],
-    "a header with a wrong 'names' (Field required)": lambda h, t: h.pop("names") and None,
     "a header with a wrong 'network'": lambda h, t: h.update(network=[1]),
     "a header with a wrong 'names'": lambda h, t: h.update(names="ab"),
-    "a header with a wrong 'colors.0.1'": lambda h, t: h.update(colors=[[1, 300, 3], [4, 5, 6]]),
     "and nested segments disagree": lambda h, t: h.update(nested=[["a", "c"]]),
     "1 colours": lambda h, t: h.update(colors=[[1, 2, 3]]),
     "a header with a wrong 'loss'": lambda h, t: h.update(loss="mse"),
-    "a header with a wrong 'domain.0.0'": lambda h, t: h.update(domain=[["x", 0, 0], [1, 1, 1]]),
-    "a header with a wrong 'provenance'": lambda h, t: h.update(provenance=3),
     "a header with a wrong 'provenance.visible_m": lambda h, t: h.update(provenance={"visible_m": [1]}),
     "network.width is '64'; it must be a whole number": lambda h, t: h["network"].update(width="64"),
-    "network.depth is 1000000000; it must be": lambda h, t: h["network"].update(depth=10**9),
     "network.skip_after is 4000, of": lambda h, t: h["network"].update(skip_after=4000),
-    "network.radius1 is 1e+308; it must be above 0 to 1000": lambda h, t: h["network"].update(radius1=1e308),
     "the network settings differ in 'heads'": lambda h, t: h["network"].update(heads=3),
-    "header says [3, 8192]": lambda h, t: h["network"].update(width=8192),
     "a header of no possible network": lambda h, t: h["network"].update(width=10**15),
     "lacks the tensor decoder.head.bias": lambda h, t: t.pop("decoder.head.bias") is None or None,
     "has a tensor decoder.tail, which": lambda h, t: t.update({"decoder.tail": torch.zeros(1)}),
@@ -67,7 +60,6 @@ WRONG: dict[str, Callable[[Any, dict[str, torch.Tensor]], Any]] = {
 
 WRONG_STATES: dict[str, Callable[[Any, dict[str, torch.Tensor]], Any]] = {
     "nothing is called 'pair_index'": lambda h, t: t.pop("states.pair_index") is None or None,
-    "nothing is called 'residue'": lambda h, t: h["states"].pop("residue") and None,
     "nothing is called": lambda h, t: h.pop("states") and None,
     "there is NaN or infinity in states.mean": lambda h, t: t["states.mean"].fill_(float("nan")) is None or None,
     "a statistical model that cannot be read": lambda h, t: h["states"].update(vertices=5),
@@ -82,16 +74,6 @@ def test_what_is_wrong_with_weights_is_one_sentence(text: str, tmp_path: Path) -
     assert str(caught.value).startswith(str(path)) and text in str(caught.value)
     assert "\n" not in str(caught.value) and "again" in str(caught.value)
     assert trained_steps(path) is None or text in WRONG_STATES
-
-
-def test_the_command_line_says_so_and_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    bad = changed(tmp_path, WRONG["lacks the tensor decoder.head.bias"])
-    np.save(tmp_path / "cloud.npy", np.random.default_rng(0).normal((0, 0, 20), 1, (200, 3)))
-    before = sorted(tmp_path.iterdir())
-    out = ["--output", str(tmp_path / "out")]
-    assert command_line.main(["reconstruct", str(tmp_path / "cloud.npy"), "--weights", str(bad), *out]) == 2
-    assert capsys.readouterr().err.startswith(f"mereo: error: {bad} lacks the tensor")
-    assert sorted(tmp_path.iterdir()) == before
 
 
 @pytest.mark.slow

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from solid_pairs import gap, overlapping_pairs
+from solid_pairs import overlapping_pairs
 
 from mereo.deformation.maps import Deformation, jacobian_determinant
-from mereo.scenes.registry import load_scene
 from mereo_objects import _engine_parts as parts
 from mereo_objects import engine
 
@@ -19,21 +18,6 @@ def motions(crank_rad: float) -> dict[str, Deformation]:
 
 def moved(deformation: Deformation, *point: float) -> np.ndarray:
     return deformation(np.array([point]))[0]
-
-
-def test_rest_pose_has_the_parts_of_a_four_cylinder_engine() -> None:
-    assert NAMES[:4] == ("block", "crankshaft", "camshaft", "valves")
-    assert NAMES[4:] == tuple(f"{part}_{number}" for part in ("rod", "piston") for number in (1, 2, 3, 4))
-    mesh = engine.rest_mesh()
-    assert len(set(mesh.colors)) == 12
-    volumes = [segment.volume for segment in mesh.segments]
-    assert np.allclose(volumes[4:8], volumes[4]) and np.allclose(volumes[8:], volumes[8])
-
-
-def test_rest_pose_is_crank_angle_0() -> None:
-    state = engine.scene().deform(engine.deformations_at(0.0)).mesh
-    for segment, rest in zip(state.segments, engine.rest_mesh().segments, strict=True):
-        assert np.allclose(segment.vertices, rest.vertices)
 
 
 @pytest.mark.parametrize("crank_rad", ANGLES_RAD)
@@ -78,12 +62,6 @@ def test_exhaust_opens_before_intake_and_each_once_a_cycle() -> None:
         assert np.isclose((lift > 0).mean(), 300 / 720, atol=0.01)
 
 
-def test_tappets_follow_the_lobes_at_one_distance() -> None:
-    for crank_rad in ANGLES_RAD[::3]:
-        state = engine.scene().deform(engine.deformations_at(crank_rad)).mesh
-        assert np.isclose(gap(state, "camshaft", "valves"), 0.12, atol=0.02)
-
-
 def test_valves_move_only_along_their_stems_and_each_by_its_own_lift() -> None:
     x, radius, _ = engine.valve_places()
     widest = np.maximum(radius, parts.TAPPET_RADIUS)
@@ -95,26 +73,3 @@ def test_valves_move_only_along_their_stems_and_each_by_its_own_lift() -> None:
             assert np.allclose(motion(points) - points, [0.0, 0.0, expected])
         anywhere = np.random.default_rng(1).uniform([-25, -5, 15], [25, 5, 35], size=(500, 3))
         assert np.allclose(jacobian_determinant(motion, anywhere), 1.0, atol=1e-4)
-
-
-def test_motion_repeats_after_two_turns_but_not_after_one() -> None:
-    scene = engine.scene()
-    first, half, full = (
-        scene.deform(engine.deformations_at(1.0 + turns * 2 * np.pi)).mesh.segments for turns in (0, 1, 2)
-    )
-    for index, name in enumerate(NAMES):
-        assert np.allclose(first[index].vertices, full[index].vertices)
-        differs = name in ("camshaft", "valves")
-        assert np.allclose(first[index].vertices, half[index].vertices) is not differs
-
-
-def test_parts_that_move_alike_share_their_motion() -> None:
-    motion = motions(1.0)
-    assert motion["rod_1"] is motion["rod_4"] and motion["piston_2"] is motion["piston_3"]
-    assert motion["rod_1"] is not motion["rod_2"]
-
-
-def test_states_spread_over_the_whole_cycle() -> None:
-    scene, rng = load_scene("engine"), np.random.default_rng(1)
-    heights = [scene.sample_state(rng).mesh.segments[NAMES.index("piston_1")].bounds[1, 2] for _ in range(40)]
-    assert np.isclose(np.ptp(heights), 2 * parts.CRANK_RADIUS, atol=0.3)

@@ -6,7 +6,7 @@ import numpy as np
 from manifold3d import Manifold
 
 from mereo_objects import lizard
-from mereo_objects._hinges import Hinged, Knuckle, follow
+from mereo_objects._hinges import Hinged, follow
 from mereo_objects._lizard_parts import SPINE, leg, spine_links
 
 
@@ -51,15 +51,6 @@ def test_a_chain_of_knuckles_moves_every_link_rigidly() -> None:
             motion = follow(motion, SPINE[number - 1], vectors[number - 1])
         points = vertices(link)
         assert np.allclose(chain(points), points @ motion[:3, :3].T + motion[:3, 3], atol=1e-9)
-
-
-def test_the_air_in_a_knuckle_shears_but_does_not_fold() -> None:
-    knuckle = Knuckle((0.0, 0.0, 0.0), heading_rad=0.4, radius=1.0, sector_rad=1.0, opening_rad=0.3)
-    turned = Hinged((knuckle,), np.array([[0.0, 0.0, 0.85 * 0.9 * 0.3]]))
-    points = np.random.default_rng(3).uniform(-4.0, 4.0, size=(20000, 3))
-    step = 1e-6
-    columns = [turned(points + step * e) - turned(points - step * e) for e in np.eye(3)]
-    assert np.linalg.det(np.stack(columns, axis=-1) / (2 * step)).min() > 0.05
 
 
 def test_a_tail_curled_into_a_leg_is_refused() -> None:

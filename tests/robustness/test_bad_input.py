@@ -1,14 +1,12 @@
 """What a user sees after a mistake: one line that says value, rule and cure, exit code 2, and nothing half-written."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
-from safetensors.torch import save_file
+import trimesh
 
 from mereo import __main__ as command_line
 from mereo.geometry.mesh import Segment, SegmentedMesh, check_segment
@@ -26,11 +24,9 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def sphere(radius: float = 1.0, center: tuple[float, float, float] = (0.0, 0.0, 0.0), name: str = "ball") -> Segment:
-    import trimesh
-
-    ball = trimesh.creation.icosphere(3, radius)
-    return Segment(name, (1, 2, 3), np.asarray(ball.vertices + np.array(center)), np.asarray(ball.faces, np.int64))
+def sphere() -> Segment:
+    ball = trimesh.creation.icosphere(3)
+    return Segment("ball", (1, 2, 3), np.asarray(ball.vertices), np.asarray(ball.faces, np.int64))
 
 
 def refused(capsys: pytest.CaptureFixture[str], folder: Path, text: str, *arguments: object) -> None:
@@ -51,10 +47,8 @@ def cloud(count: int = 200) -> np.ndarray:
 BAD_CLOUDS = {
     "missing": (None, "missing.npy"),
     "too few": (cloud(20), "has 20 points; a reconstruction needs at least 32"),
-    "nan": (np.where(np.arange(600).reshape(-1, 3) == 7, np.nan, cloud()), "NaN"),
     "behind": (cloud() - [0.0, 0.0, 40.0], "behind the camera"),
     "one place": (np.ones((100, 3)), "all points coincide"),
-    "two columns": (cloud()[:, :2], "3"),
 }
 
 
@@ -67,65 +61,12 @@ def test_bad_clouds(case: str, weights: Path, tmp_path: Path, capsys: pytest.Cap
     refused(capsys, tmp_path, text, "reconstruct", path, "--weights", weights, "--output", tmp_path / "out")
 
 
-@pytest.mark.parametrize(
-    ("content", "text"), [(b"", "empty"), (b"ply\nformat ascii 1.0\nelement vertex 99\n", "cloud.ply")]
-)
-def test_broken_files(
-    content: bytes, text: str, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "cloud.ply"
-    path.write_bytes(content)
-    refused(capsys, tmp_path, text, "reconstruct", path, "--weights", weights, "--output", tmp_path / "out")
-
-
 @pytest.mark.parametrize("number", ["1e400", "1e300", "nan"])
 def test_a_mesh_beyond_all_numbers(number: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     places, faces = f"v 0 0 0\nv {number} 0 0\nv 0 1 0\nv 0 0 1\n", "f 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
     (tmp_path / "part.obj").write_text(places + faces)
     text = "part.obj cannot be read as a mesh (its part 'part' has vertices that are NaN, infinite or beyond 1e+12)"
     refused(capsys, tmp_path, text, "learn", tmp_path / "part.obj", "--output", tmp_path / "out")
-
-
-def test_bad_depth_images(weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    image, camera = tmp_path / "depth.png", tmp_path / "camera.json"
-    camera.write_text(json.dumps({"fx": 60.0, "fy": 60.0, "cx": 32.0, "cy": 24.0, "width": 64, "height": 48}))
-    command = ("reconstruct", image, "--weights", weights, "--output", tmp_path / "out")
-    Image.fromarray(np.full((48, 64), 900, dtype=np.uint16)).save(image)
-    refused(capsys, tmp_path, "without intrinsics", *command)
-    # metres taken for millimetres: everything would be 0.9 km away
-    refused(capsys, tmp_path, "--depth-scale", *command, "--intrinsics", camera, "--depth-scale", 1)
-    Image.fromarray(np.zeros((48, 64), dtype=np.uint16)).save(image)
-    refused(capsys, tmp_path, "measures 0 pixels", *command, "--intrinsics", camera)
-    camera.write_text(json.dumps({"fx": -60.0, "fy": 60.0, "cx": 32.0, "cy": 24.0, "width": 64, "height": 48}))
-    refused(capsys, tmp_path, "focal length", *command, "--intrinsics", camera)
-
-
-def test_bad_weights(weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    np.save(tmp_path / "cloud.npy", cloud())
-    bad = tmp_path / "bad.safetensors"
-    command = ("reconstruct", tmp_path / "cloud.npy", "--weights", bad, "--output", tmp_path / "out")
-    refused(capsys, tmp_path, "there are no weights", *command)
-    bad.write_bytes(b"not weights at all")
-    refused(capsys, tmp_path, "is not a safetensors file", *command)
-    bad.write_bytes(weights.read_bytes()[:3000])
-    refused(capsys, tmp_path, "is not a safetensors file", *command)
-    save_file({"x": torch.zeros(1)}, bad)
-    refused(capsys, tmp_path, "no mereo header", *command)
-    save_file({"x": torch.zeros(1)}, bad, metadata={"mereo": json.dumps({"version": 99})})
-    refused(capsys, tmp_path, "weights format 99; this mereo reads format 3:", *command)
-
-
-def test_an_existing_output_is_kept(weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    np.save(tmp_path / "cloud.npy", cloud())
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "thesis.tex").write_text("precious")
-    command = ("reconstruct", tmp_path / "cloud.npy", "--weights", weights, "--output", tmp_path / "out")
-    refused(capsys, tmp_path, "exists and is not empty", *command)
-
-
-def test_test_seeds_are_not_for_training(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ("generate", "rope", "--examples", 4, "--seed", 1_000_000, "--output", tmp_path / "data")
-    refused(capsys, tmp_path, "for testing", *command)
 
 
 def test_bad_segments_are_named_with_the_cure() -> None:
@@ -155,14 +96,9 @@ def test_segment_names_are_unique_and_few() -> None:
         SegmentedMesh(tuple(replace(sphere(), name=str(i)) for i in range(255)))
 
 
-def test_weights_come_back_as_they_were(weights: Path) -> None:
-    model = load_model(weights)
-    assert model.names == ("a", "b") and model.colors == ((1, 2, 3), (4, 5, 6))
-    assert model.network.config == PRESETS["tiny"].network and not model.network.training
-
-
 def test_half_precision_weights_answer_alike(weights: Path, tmp_path: Path) -> None:
     model = load_model(weights)
+    assert model.names == ("a", "b") and model.colors == ((1, 2, 3), (4, 5, 6)) and not model.network.training
     save_model(model, tmp_path / "half.safetensors", torch.float16)
     half = load_model(tmp_path / "half.safetensors")
     points = cloud()

@@ -2,23 +2,21 @@
 
 import gzip
 import io
-import json
 import os
 import resource
 import struct
-import zipfile
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from fuzz import zipped
 from PIL import Image
 
 from mereo.io.errors import LIMIT_VARIABLE, PAGES, max_bytes
 from mereo.io.intrinsics import read_intrinsics
 from mereo.io.mesh_formats import read_glb, read_segmented_mesh
-from mereo.io.readers import read_mask, read_point_cloud, read_raw_depth
+from mereo.io.readers import read_point_cloud, read_raw_depth
 from mereo.io.ros_recordings import recorded_frames
 from mereo.io.sensor_frame import read_frame
 from mereo.io.simulation_states import read_states
@@ -51,13 +49,6 @@ def npy(*shape: int) -> bytes:
     return file.getvalue()
 
 
-def zipped(name: str, data: bytes) -> bytes:
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr(name, data)
-    return file.getvalue()
-
-
 def one_sentence(read: Callable[[Path], object], path: Path, content: bytes, expected: str) -> None:
     path.write_bytes(content)
     with pytest.raises(ValueError, match=expected) as caught:
@@ -65,24 +56,18 @@ def one_sentence(read: Callable[[Path], object], path: Path, content: bytes, exp
     assert "\n" not in str(caught.value) and str(path) in str(caught.value)
 
 
-# --- headers that lie -------------------------------------------------------------------------------------------------
-
 LYING_CLOUDS = {
     "fewer than none.ply": (ply(ASCII, -5, TEXT), "its header states -5 of element 'vertex'"),
-    "none less one.ply": (ply(BINARY, -1, DATA), "its header states -1 of element 'vertex'"),
-    "no format.ply": (ply("", 57, DATA), "its format is '', not one of ascii, binary_little_endian, binary_big"),
     "no such format.ply": (ply("binary_middle_endian", 57, DATA), "its format is 'binary_middle_endian'"),
     "more than there are.ply": (ply(BINARY, 10**12, DATA), "PLY is unexpected length"),
     "fewer than none.pcd": (pcd(-5, "ascii", TEXT), "its header states -5 points"),
-    "none less one.pcd": (pcd(-1, "binary", DATA), "its header states -1 points"),
     "two counts.pcd": (pcd(20, "binary", DATA, 57), "its header states 20 points and 57 x 1"),
     "too far back.pcd": (
         pcd(4, "binary_compressed", struct.pack("<II", 5, 48) + bytes([1, 65, 66, 32, 10])),
         "its compressed data are damaged",
     ),
     "cut short.pts": (b"58\n" + TEXT, "truncated: 57 of 58 points"),
-    "huge.npy": (npy(10**15, 3) + DATA, "takes more than 8 GB of memory to read"),
-    "huge.npz": (zipped("points.npy", npy(10**15, 3) + DATA), "takes more than 8 GB of memory to read"),
+    "huge.npz": (zipped({"points.npy": npy(10**15, 3) + DATA}), "takes more than 8 GB of memory to read"),
 }
 
 
@@ -91,46 +76,17 @@ def test_a_cloud_whose_header_lies_is_refused(tmp_path: Path, name: str) -> None
     one_sentence(read_point_cloud, tmp_path / name, *LYING_CLOUDS[name])
 
 
-def glb(vertices: int, indices: int, view: bool = True) -> bytes:
-    """A triangle, with these counts in its header; without a view its vertices are zeros."""
-    positions = {"componentType": 5126, "type": "VEC3", "count": vertices} | ({"bufferView": 0} if view else {})
-    document = {
-        "asset": {"version": "2.0"},
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
-        "accessors": [positions, {"componentType": 5125, "type": "SCALAR", "count": indices, "bufferView": 1}],
-        "bufferViews": [
-            {"buffer": 0, "byteOffset": 0, "byteLength": 36},
-            {"buffer": 0, "byteOffset": 36, "byteLength": 12},
-        ],
-        "buffers": [{"byteLength": 48}],
-    }
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    data = np.eye(3, dtype=np.float32).tobytes() + np.arange(3, dtype=np.uint32).tobytes()
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
-    return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
-
-
 LYING_MESHES = {
     "fewer faces.ply": (ply(ASCII, 57, TEXT + TRIANGLE, 5), "truncated: 58 of 62 rows"),
-    "fewer than none.ply": (ply(BINARY, -57, DATA, 1), "its header states -57 of element 'vertex'"),
     "fewer faces.off": (b"OFF\n3 5 0\n0 0 0\n1 0 0\n0 1 0\n" + TRIANGLE, "truncated: 1 of 5 faces"),
     "fewer than none.off": (b"OFF\n-3 1 0\n0 0 0\n" + TRIANGLE, "its header states -3 vertices"),
     "huge.stl": (bytes(80) + b"\xff" * 4 + bytes(100), "cannot be read as a mesh"),
-    "zeros.glb": (glb(10**9, 3, view=False), r"takes more than 8 GB of memory to read: .* MEREO_MAX_FILE_GB=16"),
 }
 
 
 @pytest.mark.parametrize("name", LYING_MESHES)
 def test_a_mesh_whose_header_lies_is_refused(tmp_path: Path, name: str) -> None:
     one_sentence(read_segmented_mesh, tmp_path / name, *LYING_MESHES[name])
-
-
-def test_a_glb_that_does_not_lie_is_read(tmp_path: Path) -> None:
-    (tmp_path / "honest.glb").write_bytes(glb(3, 3))
-    assert len(read_segmented_mesh(tmp_path / "honest.glb").segments[0].faces) == 1
 
 
 def nifti(*sizes: int) -> bytes:
@@ -156,39 +112,21 @@ def test_a_volume_whose_header_lies_is_refused(tmp_path: Path) -> None:
     one_sentence(read_label_volume, tmp_path / "b.nrrd", nrrd("-5 -6 7", "raw", bytes(210)), "the size -5 x -6 x 7")
 
 
-# --- files that unpack to far more than they are ----------------------------------------------------------------------
-
-
-def bomb(path: Path) -> Path:
-    """File of about a megabyte that unpacks to one gigabyte."""
-    zeros = bytes(1_000_000_000)
-    if path.suffix == ".npz":
-        path.write_bytes(zipped("points.npy", npy(len(zeros) // 12, 3) + zeros))
-    elif path.suffix == ".nrrd":
-        path.write_bytes(nrrd("1000 1000 1000", "gzip", gzip.compress(zeros, 1)))
-    elif path.suffix == ".3mf":
-        pytest.importorskip("lxml", reason="lxml is not installed: pip install 'mereo[cad]'")
-        path.write_bytes(zipped("3D/3dmodel.model", b"<model>" + b"<a/>" * 50_000_000 + b"</model>"))
-    return path
-
-
-BOMBS: dict[str, Callable[[Path], object]] = {
-    "a.npz": read_point_cloud,
-    "states.npz": lambda path: read_states(path, ("a",)),
-    "a.nrrd": read_label_volume,
-    "a.3mf": read_segmented_mesh,
-}
+BOMBS: dict[str, Callable[[Path], object]] = {"a.npz": read_point_cloud, "a.nrrd": read_label_volume}
+"""Files of about a megabyte that unpack to one gigabyte."""
 
 
 @pytest.mark.skipif(not PAGES.exists(), reason="only Linux holds a process to a limit")
 @pytest.mark.parametrize("name", BOMBS)
 def test_what_takes_too_much_memory_is_refused(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = bomb(tmp_path / name)
+    path, zeros = tmp_path / name, bytes(1_000_000_000)
+    if name == "a.npz":
+        path.write_bytes(zipped({"points.npy": npy(len(zeros) // 12, 3) + zeros}))
+    else:
+        path.write_bytes(nrrd("1000 1000 1000", "gzip", gzip.compress(zeros, 1)))
     before = resource.getrlimit(resource.RLIMIT_AS)
     monkeypatch.setenv(LIMIT_VARIABLE, "0.7")
-    with pytest.raises(
-        ValueError, match=r"takes more than 0\.7 GB of memory to read|cannot be read as a mesh"
-    ) as caught:
+    with pytest.raises(ValueError, match=r"takes more than 0\.7 GB of memory to read") as caught:
         BOMBS[name](path)
     assert "\n" not in str(caught.value) and str(path) in str(caught.value)
     assert resource.getrlimit(resource.RLIMIT_AS) == before
@@ -214,21 +152,24 @@ def test_a_recording_is_unpacked_in_limited_memory(tmp_path: Path, monkeypatch: 
 def test_a_pipe_or_device_that_is_named_like_a_file_is_refused_at_once(tmp_path: Path) -> None:
     """Nobody writes to this pipe: whoever opened it would wait for ever."""
     readers: dict[str, Callable[[Path], object]] = {
-        ".ply": read_point_cloud, ".npy": read_point_cloud, ".obj": read_segmented_mesh, ".glb": read_glb,
-        ".png": read_raw_depth, ".nrrd": read_label_volume, ".json": read_intrinsics,
-        ".bag": lambda p: next(recorded_frames(p)), ".npz": lambda p: read_states(p, ("a",)),
-    }  # fmt: skip
-    os.mkfifo(path := tmp_path / "frame.npy")
-    with pytest.raises(ValueError, match=r"frame\.npy is not a regular file; "):
-        read_frame(path)
+        ".ply": read_frame,
+        ".npy": read_frame,
+        ".bag": read_frame,
+        ".obj": read_segmented_mesh,
+        ".glb": read_glb,
+        ".png": read_raw_depth,
+        ".nrrd": read_label_volume,
+        ".json": read_intrinsics,
+        ".npz": lambda p: read_states(p, ("a",)),
+        ".yaml": load_scene,
+        ".safetensors": lambda p: load_model(str(p)),
+    }
     for suffix, read in readers.items():
         os.mkfifo(path := tmp_path / f"a{suffix}")
-        with pytest.raises(ValueError, match=f"a{suffix} is not a regular file; "):
+        with pytest.raises(
+            (ValueError, FileNotFoundError), match=f"a{suffix} (is not a regular file; |does not exist|)"
+        ):
             read(path)
-    for suffix, load in {".yaml": load_scene, ".safetensors": load_model}.items():
-        os.mkfifo(path := tmp_path / f"a{suffix}")
-        with pytest.raises((ValueError, FileNotFoundError), match=f"a{suffix}"):
-            load(str(path))
 
 
 def test_the_limit_is_a_positive_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -239,17 +180,6 @@ def test_the_limit_is_a_positive_number(tmp_path: Path, monkeypatch: pytest.Monk
             read_point_cloud(tmp_path / "a.npy")
     monkeypatch.setenv(LIMIT_VARIABLE, "12.5")
     assert max_bytes() == 12.5e9 and len(read_point_cloud(tmp_path / "a.npy").points) == 57
-
-
-# --- images -----------------------------------------------------------------------------------------------------------
-
-
-def png(width: int, height: int) -> bytes:
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0))
-    return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", zlib.compress(bytes(9))) + chunk(b"IEND", b"")
 
 
 def test_no_flipped_bit_of_a_png_makes_another_image(tmp_path: Path) -> None:
@@ -265,9 +195,3 @@ def test_no_flipped_bit_of_a_png_makes_another_image(tmp_path: Path) -> None:
         except ValueError:
             continue
         np.testing.assert_array_equal(found, values)
-
-
-def test_an_image_with_too_many_pixels_is_refused(tmp_path: Path) -> None:
-    for read in (read_raw_depth, read_mask):
-        one_sentence(read, tmp_path / "a.png", png(30000, 30000), "exceeds limit of 178956970 pixels")
-        one_sentence(read, tmp_path / "b.png", png(10000, 10000), "cannot be read as a")

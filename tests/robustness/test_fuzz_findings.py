@@ -1,18 +1,15 @@
 """What the damage of ``test_fuzz`` once got through: each input as small as it can be, and what is said of it now."""
 
-import io
 import json
 import os
 import struct
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from fuzz_rule import fault_of
-from fuzz_targets import TARGETS
+from fuzz import TARGETS, fault_of, zipped
 from PIL import Image
 from safetensors import numpy as arrays
 from safetensors.torch import load_file, save_file
@@ -20,53 +17,18 @@ from safetensors.torch import load_file, save_file
 from mereo.io.errors import quiet, reason, without_output, words_of
 
 
-def npz(**members: bytes) -> bytes:
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w") as archive:
-        for name, data in members.items():
-            archive.writestr(name, data)
-    return file.getvalue()
-
-
-def npy(text: str) -> bytes:
-    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode()
-
-
-def replaced(old: bytes, new: bytes) -> Callable[[bytes], bytes]:
-    def change(content: bytes) -> bytes:
-        assert old in content
-        return content.replace(old, new, 1)
-
-    return change
-
-
 def at(place: int, piece: bytes) -> Callable[[bytes], bytes]:
     return lambda content: content[:place] + piece + content[place + len(piece) :]
-
-
-def without_focal_length(content: bytes) -> bytes:
-    return content.replace(struct.pack("<d", 10.0), struct.pack("<d", np.nan))
 
 
 def json_with(**values: object) -> Callable[[bytes], bytes]:
     return lambda content: json.dumps(json.loads(content) | values).encode()
 
 
-def second_chunk(content: bytes) -> bytes:
-    start = 20 + int.from_bytes(content[12:16], "little")
-    return at(start, struct.pack("<I", 2**32 - 1))(content)
-
-
 def chunk_size(content: bytes) -> bytes:
     """The first chunk begins where the table of offsets says, and with its line and its size."""
     starts = (place for place in range(len(content) - 8) if struct.unpack_from("<Q", content, place)[0] == place + 8)
     return at(next(starts) + 12, struct.pack("<i", -1))(content)
-
-
-def changed_box(content: bytes) -> bytes:
-    facts = json.loads(content)
-    facts["segments"]["left"]["rest_box"] = [[0, 0, 0], [1e308, 1, 1]]
-    return json.dumps(facts).encode()
 
 
 def pair_at_infinity(content: bytes) -> bytes:
@@ -87,50 +49,24 @@ def labels_of_infinity(content: bytes) -> bytes:
     return bytes(nibabel.Nifti1Image(np.full((4, 4, 4), np.inf, "f4"), np.eye(4)).to_bytes())
 
 
-def of_python_2(content: bytes) -> bytes:
-    """An array whose header has a long integer of Python 2, of which numpy warns; the others are missing."""
-    header = "{'descr': '<f8', 'fortran_order': False, 'shape': (1L,), }\n"
-    return npz(**{"depth.npy": npy(header) + bytes(8)})
-
-
-EMPTY = npy("{'descr': '<f8', 'fortran_order': False, 'shape': (2147483647, 0, 3), }\n")
 CASES: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
     "pixels that OpenEXR prints about": ("depth.exr", chunk_size, "cannot be read as a depth image"),
-    "a chunk of 4 GB": ("mesh.glb", second_chunk, "chunk was not expected length"),
     "a header of 4 GB": ("cloud.npy", at(6, b"\2\0" + b"\xff" * 4), "expected 4294967295 bytes"),
-    "no array": ("surfaces.npz", lambda c: npz(a=b"text"), "its entry 'a' is no array"),
-    "no array in a view": ("view.npz", lambda c: npz(depth=b"text"), "its entry 'depth' is no array"),
-    "no values, and two billion rows": ("tetrahedra.npz", lambda c: npz(**{"nodes.npy": EMPTY}), "states of 'nodes'"),
-    "a name of two lines": ("surfaces.npz", lambda c: npz(**{"b\n.npy": npy_of(1.0)}), r"states of 'b\\n' but not of"),
-    "an image of another size": ("depth.npy", lambda c: npy_of(np.ones((12, 17), "u2")), "depth.npy cannot be used: "),
-    "negative depth": ("depth.npy", lambda c: npy_of(-np.ones((12, 16))), "depth.npy cannot be used: "),
-    "a zero in YAML": ("bar.yaml", lambda c: c + b"\0", "this is not YAML .unacceptable character"),
-    "a number beyond all": ("bar.yaml", replaced(b"[120, 5, 5]", b"[1e308, 5, 5]"), "`pivot` is .* less than"),
-    "segments that are none": ("manifest.json", json_with(segments=None), "its 'segments': Input should be"),
-    "a unit below zero": ("manifest.json", json_with(unit_m=-1), "its 'unit_m': Input should be"),
-    "another model": ("state.json", json_with(model="0" * 64), "state.json does not lead to a registration: "),
+    "no array": ("surfaces.npz", lambda c: zipped({"a": b"text"}), "its entry 'a' is no array"),
+    "a zero in YAML": ("bar.yaml", lambda c: c + b"\0", "this is not YAML in UTF-8 .unacceptable character"),
+    "a number beyond all": ("bar.yaml", lambda c: c.replace(b"[120, 5", b"[1e308, 5", 1), "`pivot` is .* less than"),
     "a pose that no rotation fits": ("start.json", json_with(object=np.ones((4, 4)).tolist()), "start.json cannot"),
     "a point at infinity": ("start.json", pair_at_infinity, "scan of the start of the object must be rows of 3 finite"),
-    "a cloud as wide as numbers": ("cloud.npy", lambda c: npy_of(np.full((40, 3), 1e300)), "or beyond 1e.12"),
-    "a camera of no size": ("frames.mcap", without_focal_length, "is no camera .focal"),
+    "a camera of no size": (
+        "frames.mcap",
+        lambda c: c.replace(struct.pack("<d", 10.0), struct.pack("<d", np.nan)),
+        "is no camera .focal",
+    ),
     "complex places": ("shard-00000.safetensors", complex_centres, "its tensor 'center' has complex numbers"),
     "labels beyond all numbers": ("labels.nii", labels_of_infinity, "holds values that are no labels"),
-    "arrays as of Python 2": ("view.npz", of_python_2, "view.npz is not a sample view of mereo"),
-    "a run whose recipe is a number": ("config.json", json_with(train=3), "holds a run with another train setting"),
-    "a score that is a word": ("metrics.json", json_with(iou="high"), "metrics.json is not what .*'iou': Input should"),
-    "scores of nothing": ("metrics.json", lambda c: c.replace(b"examples", b"e"), "says neither its scans nor its"),
-    "a unit that is none": ("truth.json", json_with(unit="ell"), "its unit is 'ell'"),
     "a scan of two lines": ("truth.json", json_with(scan="\u2028"), r"the name of its scan is '.u2028'"),
-    "a scan of a long name": ("truth.json", json_with(scan="a" * 5000), "the name of its scan is 'aaa"),
-    "a box that has no size": ("truth.json", changed_box, "is not 2 x 3 numbers up to 1e.12"),
     "an extension of 2 GB": ("labels.nii", at(352, struct.pack("<i", 2**31 - 16)), "labels.nii cannot be read"),
-}  # fmt: skip
-
-
-def npy_of(values: object) -> bytes:
-    file = io.BytesIO()
-    np.save(file, np.asarray(values))
-    return file.getvalue()
+}
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -143,38 +79,37 @@ def test_it_is_one_sentence_now(case: str, tmp_path: Path, capfd: pytest.Capture
     path.write_bytes(change(path.read_bytes()))
     with pytest.raises(ValueError, match=expected):
         target.read(path)
-    assert fault_of(target.read, path, (tmp_path.name,)) == (False, None)
+    assert fault_of(target.read, path) == (False, "")
     assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("name", ["depth.tif", "text.stl", "labels.nii"])
 def test_libraries_say_nothing_of_their_own(name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """Pillow warned, trimesh logged a traceback and nibabel what it had changed in the header."""
-    changes = {"depth.tif": lambda c: c[:-7], "text.stl": replaced(b"normal ", b"normal x"), "labels.nii": at(0, b"\0")}
+    changes: dict[str, Callable[[bytes], bytes]] = {
+        "depth.tif": lambda c: c[:-7],
+        "text.stl": lambda c: c.replace(b"normal ", b"normal x", 1),
+        "labels.nii": at(0, b"\0"),
+    }
     target, path = TARGETS[name], tmp_path / name
     target.write(path)
     path.write_bytes(changes[name](path.read_bytes()))
-    _, fault = fault_of(target.read, path)
-    assert fault is None and capfd.readouterr() == ("", "")
+    assert fault_of(target.read, path)[1] == "" and capfd.readouterr() == ("", "")
 
 
 def test_a_checkpoint_of_another_run_is_refused_before_training_begins(tmp_path: Path) -> None:
     target, path = TARGETS["checkpoint.safetensors"], tmp_path / "checkpoint.safetensors"
     target.write(path)
     whole = load_file(path)
-    for name, value in (("optimizer/0/exp_avg", torch.ones(7)), ("optimizer/0", torch.ones(1)), ("network/x", None)):
-        tensors = {**whole, name: torch.ones(2) if value is None else value}
-        save_file(tensors, path, metadata={"step": "3"})
+    for name, size in (("optimizer/0/exp_avg", 7), ("optimizer/0", 1), ("network/x", 2)):
+        save_file({**whole, name: torch.ones(size)}, path, metadata={"step": "3"})
         with pytest.raises(ValueError, match=r"checkpoint.safetensors cannot be read \(.*\); delete it to train"):
             target.read(path)
 
 
-def test_a_terminal_obeys_no_file(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_librarys_text_is_short_and_its_output_is_dropped(capfd: pytest.CaptureFixture[str]) -> None:
     error = ValueError("the segment \x1b[31mred\x07 is unknown;\n\u2028correct it")
     assert words_of(error) == r"the segment \x1b[31mred\x07 is unknown; correct it"
-
-
-def test_a_librarys_text_is_short_and_its_output_is_dropped(capfd: pytest.CaptureFixture[str]) -> None:
     assert len(reason(ValueError("a" * 5000))) == 303
     with without_output():
         print("text")
@@ -190,4 +125,4 @@ def test_a_depth_that_signals_is_no_measurement(tmp_path: Path) -> None:
     values = np.full((12, 16), 0.7, "<f4")
     values.view("<u4")[0, 0] = 0x7F800001
     Image.fromarray(values).save(path)
-    assert fault_of(TARGETS["depth.tif"].read, path) == (True, None)
+    assert fault_of(TARGETS["depth.tif"].read, path) == (True, "")

@@ -10,20 +10,15 @@ from scene_files import HEAD, write_bar, write_mesh
 from shapes import box
 
 from mereo import __main__ as command_line
-from mereo.io.atomic_files import atomic_file, check_new_directory, claim_directory, new_directory
+from mereo.io.atomic_files import atomic_file, check_new_directory, new_directory
+from mereo.io.object_storage import claim
 
 NO_PLACES = {
     "": "the output '.' has no name of its own",
-    ".": "has no name of its own, which it needs: name it, as in out",
     "..": "the output '..' has no name of its own",
-    "deep/..": "has no name of its own",
-    "/": "the output '/' has no name of its own",
-    "x" * 250: r"the output 'x+\.\.\. has a name of over 239 bytes: choose a shorter one",
-    f"{'ü' * 130}/out": "has a name of over 239 bytes",
     "a\udcff": r"the output 'a\\udcff' has .* no UTF-8 text: choose another name",
     "a\0b": r"the output 'a\\x00b' has a zero byte",
     "link": "link is a link, which would be lost; an output is written in its own place: name that",
-    "dangling": "is a link",
     "pipe/deep/out": "pipe is no folder, so out cannot be made in it: choose another --output",
     "pipe": "is a device or pipe; an output is a file or folder: choose another --output",
 }
@@ -37,7 +32,6 @@ def test_what_is_no_place_for_an_output_is_refused_before_the_work(
     monkeypatch.chdir(tmp_path)
     Path("target").mkdir()
     Path("link").symlink_to("target")
-    Path("dangling").symlink_to("nowhere")
     os.mkfifo("pipe")
     before = sorted(tmp_path.rglob("*"))
     for force in (True, False):
@@ -50,12 +44,12 @@ def test_a_run_may_lie_behind_a_link(tmp_path: Path) -> None:
     """Nothing is put in the place of a folder in which work is continued."""
     (tmp_path / "disk").mkdir()
     (tmp_path / "run").symlink_to("disk")
-    assert claim_directory(tmp_path / "run", "config.json", {"a": 1}, "a run") is None
+    assert claim(tmp_path / "run", "config.json", {"a": 1}, "a run") is None
     assert os.listdir(tmp_path / "disk") == ["config.json"] and (tmp_path / "run").is_symlink()
     os.mkfifo(tmp_path / "pipe")
     for path in (Path(""), Path(".."), tmp_path / "pipe"):
         with pytest.raises(ValueError, match="has no name|is a device"):
-            claim_directory(path, "config.json", {}, "a run")
+            claim(path, "config.json", {}, "a run")
 
 
 def test_a_mount_point_is_no_place_for_a_new_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -69,14 +63,12 @@ def test_a_mount_point_is_no_place_for_a_new_folder(tmp_path: Path, monkeypatch:
     [
         "reconstruct cloud.npy --weights rope --output {}",
         "export rope --output {}",
-        "release rope --name rope --output {}",
         "evaluate rope --output {}",
         "generate rope --examples 2 --output {}",
         "train data --output {}",
         "align cloud.npy --scene rope --weights rope --output {}",
         "stream . --weights rope --surfaces {}",
         "scene preview rope --output {}",
-        "scene export rope --output {}",
         "bench --weights rope --output {}",
         "demo --output {}",
     ],
@@ -89,17 +81,6 @@ def test_every_command_refuses_a_pipe_first(
     assert command_line.main(command.format("pipe").split()) == 2
     assert "mereo: error: pipe is a device or pipe" in capsys.readouterr().err
     assert Path("pipe").is_fifo() and os.listdir() == ["pipe"]
-
-
-@pytest.mark.parametrize("command", ["scene preview rope", "scene export rope", "bench"])
-def test_an_existing_file_is_refused_before_the_work(
-    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("notes.txt").write_text("precious")
-    assert command_line.main([*command.split(), "--output", "notes.txt"]) == 2
-    assert "notes.txt exists; it is not overwritten: choose another name or pass --force" in capsys.readouterr().err
-    assert os.listdir() == ["notes.txt"] and Path("notes.txt").read_text() == "precious"
 
 
 @pytest.mark.parametrize(
@@ -115,6 +96,7 @@ def test_force_replaces_a_file(command: str, tmp_path: Path, monkeypatch: pytest
     output = Path(command.split()[-1])
     output.write_text("old")
     before = sorted(os.listdir())
+    assert command_line.main(command.split()) == 2 and output.read_text() == "old"
     for _ in range(2):
         assert command_line.main([*command.split(), "--force"]) == 0
         assert output.stat().st_size > 1000 and sorted(os.listdir()) == before
@@ -124,9 +106,7 @@ def test_force_replaces_a_file(command: str, tmp_path: Path, monkeypatch: pytest
     "command",
     [
         "scene export bar.yaml --output right.ply",
-        "scene export bar.yaml --output deep/../right.ply",
         "scene export bar.yaml --output linked.ply",
-        "scene preview scene.py --output scene.py",
         "scene preview bar.yaml --output bar.yaml",
         "scene preview bar.yaml --output left.ply",
         "bench --weights weights.safetensors --output weights.safetensors",
@@ -142,9 +122,8 @@ def test_not_even_force_replaces_an_input(
         write_mesh(box((low, 0, 0), (low + 20, 10, 10), name), Path(f"{name}.ply"))
     Path("bar.yaml").write_text(HEAD.replace(".stl", ".ply"))
     os.link("right.ply", "linked.ply")
-    for name in ("deep", "assets/bunny"):
-        Path(name).mkdir(parents=True)
-    for name in ("scene.py", "weights.safetensors", "assets/bunny/bunny.off"):
+    Path("assets/bunny").mkdir(parents=True)
+    for name in ("weights.safetensors", "assets/bunny/bunny.off"):
         Path(name).write_text("precious")
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     assert command_line.main([*command.split(), "--force"]) == 2

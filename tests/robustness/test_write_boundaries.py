@@ -1,52 +1,55 @@
-"""A command that is killed anywhere between two changes of a folder is finished by the same command again."""
+"""A command that is killed between two changes of a folder is finished by the same command again; so on a full disk."""
 
 import os
+import re
 import shutil
 import subprocess
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 import trimesh
-from analytic import untrained
-from failpoints import Commands, command_server
-from fuzz_files import weights as tiny_weights
+from failpoints import MOVES, Commands, command_server
+from fuzz import weights as tiny_weights
 from scene_files import write_bar
 from toy_data import write_toy_dataset
-from write_boundaries import Case, check_boundaries
 
-from mereo.models.weights import save_model
 from mereo.models.weights_place import find_weights
-from mereo.scenes.registry import load_scene
 from mereo.synthesis.sample_views import load_view
+
+
+class Case(NamedTuple):
+    """Command that writes ``out`` (or ``out.SUFFIX``), with INPUTS for the folder of its inputs.
+
+    Attributes:
+        arguments: the command line.
+        again: what is added where the same command refuses because its result, or a part of it, is there; where
+            nothing can be added, what it says of a whole result.
+        first: a command that writes the result which this one replaces.
+        dear: it takes seconds, so it is killed only where it gives a file its name.
+    """
+
+    arguments: str
+    again: str = ""
+    first: str = ""
+    dear: bool = False
+
 
 TRAIN = (
     "train INPUTS/data --output out --preset tiny --precision float32 --compile off --batch 8 --queries 48 --epochs 1 "
     "--network.points 64 --network.width 48 --network.neighbors 8 --holdout 0"
 )
 GENERATE = "generate INPUTS/bar.yaml --examples 4 --workers 1 --output out --image-size 32 --points 32 --per-segment 4"
+RECONSTRUCT = (
+    "reconstruct INPUTS/cloud.npy --weights INPUTS/w.safetensors --output out --resolution 24 --method network"
+)
 RELEASE = "release INPUTS/tiny.safetensors --output out --name"
-
 CASES = {
     "generate": Case(GENERATE, again="--resume"),
     "train": Case(TRAIN),
-    "reconstruct": Case(
-        "reconstruct INPUTS/cloud.npy --weights INPUTS/w.safetensors --output out --resolution 24 --method network",
-        again="--force",
-        timed=("summary.json", "report.html"),
-        dear=True,
-    ),
-    "evaluate": Case(
-        "evaluate INPUTS/w.safetensors --output out --examples 1 --method network",
-        again="choose another --output",
-        timed=("metrics.json",),
-        dear=True,
-    ),
-    "calibrate": Case(
-        "calibrate INPUTS/rope.safetensors --output out.safetensors --views 8", again="--force", dear=True
-    ),
+    "reconstruct": Case(RECONSTRUCT, again="--force", dear=True),
     "release": Case(f"{RELEASE} new", again="--force"),
     "release over another": Case(f"{RELEASE} new --force", first=f"{RELEASE} old"),
     "scene new": Case("scene new INPUTS/ball.ply --output out.yaml", again="choose another --output"),
@@ -54,14 +57,18 @@ CASES = {
     "scene export over another": Case(
         "scene export rope --output out.ply --force", first="scene export shapes --output out.ply"
     ),
-    "scene preview": Case("scene preview rope --output out.png", again="--force"),
     "scene check": Case(
-        "scene check out.yaml --repair",
-        again="move or remove it",
-        first="scene new INPUTS/open.ply --output out.yaml",
+        "scene check out.yaml --repair", again="move or remove it", first="scene new INPUTS/open.ply --output out.yaml"
     ),
     "export": Case("export INPUTS/tiny.safetensors --output out --format torch", again="--force", dear=True),
 }
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in CASES if name != "scene export"]
+
+FOREIGN = ("thesis.tex", ".out.mine.mereo/mine.txt", ".out.00000000.partial/mine.txt")
+"""Files of somebody else beside an output, two in folders that look like mereo's own."""
+
+TIMES = re.compile(rb'"timings_s": {[^}]*}|"seconds": [0-9.e+-]+')
+"""Durations in JSON, and in pages that hold it: all that differs between two runs of a command."""
 
 
 @pytest.fixture(scope="module")
@@ -76,11 +83,9 @@ def commands() -> Iterator[Commands]:
 def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("inputs")
     write_toy_dataset(folder / "data", examples=16)
-    points = load_view("rope").depth.to_points().points
-    np.save(folder / "cloud.npy", points)
+    np.save(folder / "cloud.npy", load_view("rope").depth.to_points().points)
     shutil.copy(find_weights("rope"), folder / "w.safetensors")
     tiny_weights(folder / "tiny.safetensors")
-    save_model(untrained(load_scene("rope").rest.names), folder / "rope.safetensors")
     write_bar(folder)
     ball = trimesh.creation.icosphere(2)
     ball.export(folder / "ball.ply")
@@ -88,87 +93,107 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("name", [pytest.param("release over another", marks=pytest.mark.slow), "scene export"])
+def content(folder: Path) -> dict[str, bytes]:
+    """All files without durations; the list of times and sizes says no more."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != ".mereo.json")
+    return {path.relative_to(folder).as_posix(): TIMES.sub(b"", path.read_bytes()) for path in files}
+
+
+def names(folder: Path) -> set[str]:
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
+
+
+def go_on(commands: Commands, case: Case, arguments: str, place: Path, where: str) -> None:
+    """The same command again, as a person would give it: it succeeds, or refuses and succeeds with ``case.again``."""
+    done = commands.run(place, arguments)
+    if done.code:
+        assert (done.code, done.said.count("mereo: error: ")) == (2, 1), f"{where}\n{done.said}"
+        assert case.again and case.again in done.said, f"{where}\n{done.said}"
+        if not case.again.startswith("--"):
+            return
+        done = commands.run(place, f"{arguments} {case.again}")
+    assert done.code == 0, f"{where}\n{done.said}"
+
+
+def prepare(commands: Commands, case: Case, inputs: Path, place: Path) -> str:
+    """Arguments of the command; the result that it replaces, and files of somebody else, are there."""
+    for name in FOREIGN:
+        (place / name).parent.mkdir(parents=True, exist_ok=True)
+        (place / name).write_text("precious")
+    if case.first:
+        assert commands.run(place, case.first.replace("INPUTS", str(inputs))).code == 0
+    return case.arguments.replace("INPUTS", str(inputs))
+
+
+def boundaries(calls: list[str]) -> Iterator[tuple[int, bool]]:
+    """Moments at which to kill: the number of a call, and whether just after it; of each kind of call the first."""
+    kinds, functions = set[str](), set[str]()
+    for number, (function, place) in enumerate(call.split(" ", 1) for call in calls):
+        name = re.sub("[0-9a-f]{8}|[0-9]+", "0", Path(place).name) if function in MOVES else Path(place).suffix
+        if f"{function} {name}" not in kinds:
+            yield number, True
+        if function in MOVES and function not in functions:
+            yield number, False
+        kinds.add(f"{function} {name}")
+        functions.add(function)
+
+
+@pytest.mark.parametrize("name", ["scene export", *SLOW])
 def test_a_killed_command_is_finished_by_the_next(name: str, commands: Commands, inputs: Path, tmp_path: Path) -> None:
-    check_boundaries(commands, CASES[name], inputs, tmp_path, every_call=False)
-
-
-# --- a full disk ------------------------------------------------------------------------------------------------------
+    """With the bytes of one that was never disturbed; nothing is left over, and no file of somebody else changes."""
+    case, before = CASES[name], content(inputs)
+    fresh, whole, place = (tmp_path / folder for folder in ("fresh", "whole", "place"))
+    arguments = prepare(commands, case, inputs, fresh)
+    shutil.copytree(fresh, whole)
+    undisturbed = commands.run(whole, arguments, every_call=not case.dear)
+    assert undisturbed.code == 0 and undisturbed.calls, undisturbed.said
+    for number, after in boundaries(undisturbed.calls):
+        shutil.copytree(fresh, place)
+        killed = commands.run(place, arguments, at=number, after=after, every_call=not case.dear)
+        where = f"killed {'after' if after else 'before'} call {number}: {killed.calls[-1]}"
+        assert killed.code == -9, f"{where}\n{killed.said}"
+        go_on(commands, case, arguments, place, where)
+        assert names(place) == names(whole) and content(place) == content(whole), where
+        shutil.rmtree(place)
+    assert content(inputs) == before
 
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A disk of 24 MB that is in memory."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    mounted = shutil.which("mount") and subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=24m", "tmpfs", str(place)], capture_output=True, text=True, check=False
-    )
-    if not mounted or mounted.returncode:
-        pytest.skip(f"no disk can be mounted here: {mounted.stderr.strip() if mounted else 'there is no mount'}")
+    (place := tmp_path / "disk").mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=24m", "tmpfs", str(place)]
+    if not shutil.which("mount") or subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("no disk can be mounted here")
     yield place
     subprocess.run(["umount", str(place)], check=True)
 
 
-def check_full_disk(commands: Commands, case: Case, inputs: Path, place: Path, room: int) -> None:
-    """With ``room`` bytes the command says that the disk is full and leaves nothing; with more it does its work."""
-    arguments = case.arguments.replace("INPUTS", str(inputs))
-    if case.first:
-        assert commands.run(place, case.first.replace("INPUTS", str(inputs))).code == 0
-    before = {path.name: path.read_bytes() for path in place.rglob("*") if path.is_file()}
+@pytest.mark.parametrize(
+    ("name", "room"),
+    [
+        ("scene export", 40_000),
+        *(pytest.param(name, room, marks=pytest.mark.slow) for name in CASES for room in (0, 8_192)),
+    ],
+)
+def test_a_full_disk_is_said_and_leaves_nothing(
+    name: str, room: int, commands: Commands, inputs: Path, small_disk: Path
+) -> None:
+    """No room at all, and some for folders, locks and the smallest files; with more the command does its work."""
+    case, place = CASES[name], small_disk
+    arguments = prepare(commands, case, inputs, place)
+    before = content(place)
     with (place / "ballast").open("wb") as file:
         file.write(bytes(os.statvfs(place).f_bavail * os.statvfs(place).f_frsize - room))
     full = commands.run(place, arguments)
     if room and full.code == 0:  # a small file had room
         return
-    assert (full.code, full.said.count("mereo: error: ")) == (2, 1), full.said
+    assert (full.code, full.said.count("mereo: error: ")) == (2, 1) and "Traceback" not in full.said, full.said
     assert "the disk is full while writing" in full.said or "GB free" in full.said, full.said
-    assert "Traceback" not in full.said
     (place / "ballast").unlink()
-    after = {path.name: path.read_bytes() for path in place.rglob("*") if path.is_file()}
+    after = content(place)
     if arguments.startswith(("train", "generate", "scene check")):  # whole files stay, and the work is continued
-        after = {name: after[name] for name in before}
+        after = {file: after[file] for file in before}
     assert after == before
-    assert not list(place.rglob("*.mereo"))
-    if case.only_once:
-        return
-    done = commands.run(place, arguments)
-    if done.code:
-        assert case.again and case.again in done.said, done.said
-        done = commands.run(place, f"{arguments} {case.again}")
-    assert done.code == 0, done.said
-    assert not list(place.rglob("*.mereo"))
-
-
-@pytest.mark.parametrize("name", [pytest.param("release over another", marks=pytest.mark.slow), "scene export"])
-def test_a_full_disk_is_said_and_leaves_nothing(name: str, commands: Commands, inputs: Path, small_disk: Path) -> None:
-    check_full_disk(commands, CASES[name], inputs, small_disk, room=40_000)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("room", [0, 8_192])
-def test_whatever_room_a_disk_has(name: str, room: int, commands: Commands, inputs: Path, small_disk: Path) -> None:
-    """No room at all, and some for folders, locks and the smallest files."""
-    check_full_disk(commands, CASES[name], inputs, small_disk, room)
-
-
-@pytest.mark.slow
-def test_a_disk_that_has_no_room_for_an_onnx_graph(commands: Commands, inputs: Path, small_disk: Path) -> None:
-    pytest.importorskip("onnxscript", reason="the extra onnx is not installed")
-    arguments = CASES["export"].arguments.replace("torch", "onnx")
-    check_full_disk(commands, replace(CASES["export"], arguments=arguments, only_once=True), inputs, small_disk, 8_192)
-
-
-# --- every call -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
-def test_whatever_call_a_command_is_killed_at(name: str, commands: Commands, inputs: Path, tmp_path: Path) -> None:
-    """At a sample of the changes of folders: each kind of change, and one in three of the further renames.
-
-    Commands that take seconds are killed only where they give a file its name. ``write_boundaries.boundaries`` says it
-    exactly.
-    """
-    check_boundaries(commands, CASES[name], inputs, tmp_path, every_call=not CASES[name].dear)
+    go_on(commands, case, arguments, place, "after a full disk")
+    assert {str(path) for path in place.rglob(".*.mereo")} == {str(place / ".out.mine.mereo")}

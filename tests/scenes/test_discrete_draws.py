@@ -1,4 +1,4 @@
-"""States that differ in a discrete draw: all that was drawn is kept, and what the choice asks for is drawn anew."""
+"""States beside one: all that was drawn is kept but a choice, and neighbours are played without the scene's test."""
 
 from dataclasses import dataclass, replace
 
@@ -16,6 +16,7 @@ from mereo.fitting.registration.register import CloudToFit, ModesFit
 from mereo.geometry.transforms import transform_points
 from mereo.scenes.parameters import random_state
 from mereo.scenes.random_states import scene_model, state_points
+from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene, Workspace
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -63,12 +64,6 @@ def test_all_but_the_choice_and_what_it_asks_for_is_kept(seed: int) -> None:
             np.testing.assert_allclose(other.z[4:], drawn.z[4:])
 
 
-def test_the_same_state_gives_the_same_others() -> None:
-    drawn = Drawn.of(SCENE, 1001)
-    first, second = (np.concatenate([other.z for other in redraw_choices(SCENE, drawn, 10)]) for _ in range(2))
-    np.testing.assert_array_equal(first, second)
-
-
 def test_a_scene_without_discrete_draws_has_no_others() -> None:
     assert redraw_choices(toy_scene(), Drawn.of(toy_scene(), 1001), 10) == []
 
@@ -109,10 +104,31 @@ def test_a_choice_that_no_start_has_made_is_found() -> None:
     assert np.median(np.linalg.norm(found.material - material, axis=1)) < 0.05
 
 
-def test_draws_far_beyond_the_bounds_are_kept_as_they_are_played() -> None:
-    """A fit may push a draw farther than its share can say; then the state is played at the bound."""
-    drawn = Drawn.of(SCENE, 1001)
-    far = replace(drawn, z=np.where(np.arange(len(drawn.z)) == 0, 9.0, drawn.z))
-    others = redraw_choices(SCENE, far, 10)
-    assert others
-    np.testing.assert_allclose([other.z[0] for other in others], 4.0)
+# --- without the test of a state --------------------------------------------------------------------------------------
+
+
+REFUSES = {"human": 7, "robot": 3, "rope": 1, "sheet": 5}
+"""A seed of each scene beside whose state are some that it refuses."""
+
+
+@pytest.mark.parametrize("name", [*REFUSES, "lizard"])
+def test_a_scene_that_tests_its_states_plays_their_neighbours_without(name: str) -> None:
+    scene = load_scene(name)
+    drawn, rng, refused = Drawn.of(scene, REFUSES.get(name, 7)), np.random.default_rng(0), 0
+    points = [segment.vertices[::50] for segment in scene.rest.segments]
+    for _ in range(15):
+        z = np.where(drawn.smooth, drawn.z + 3.0 * rng.normal(size=len(drawn.z)), drawn.z)
+        tested, untested = drawn.deformations(scene, z), drawn.deformations(scene, z, checked=False)
+        if tested is None:
+            refused += untested is not None
+            continue
+        assert untested is not None
+        for one, other, places in zip(tested, untested, points, strict=True):
+            assert np.array_equal(one(places), other(places))
+    assert (refused > 0) == (name in REFUSES)
+
+
+@pytest.mark.parametrize(("name", "calls"), [("robot", {(6, 1)}), ("rope", {(1, 8, 8, 1), (1,) * 6})])
+def test_draws_of_refused_attempts_are_not_part_of_a_state(name: str, calls: set[tuple[int, ...]]) -> None:
+    scene = load_scene(name)
+    assert {Drawn.of(scene, seed).sizes for seed in range(10)} <= calls

@@ -1,7 +1,6 @@
 """Elastic solids in scene files: what the block says, the object's model made of it, and fits of that to frames."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +12,13 @@ from shapes import box
 
 from mereo.deformation.elastic import build_lattice
 from mereo.deformation.tetrahedral import Tetrahedra
-from mereo.fitting.config import ELASTIC, FitConfig
+from mereo.fitting.config import ELASTIC
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.problem import GivenPose, Problem
 from mereo.fitting.problem.residuals import NetworkTerm, Prior, SampledSurface
 from mereo.fitting.registration.answer_frame import initial_state, search_modes
-from mereo.fitting.registration.register import CloudToFit, Registrar
+from mereo.fitting.registration.register import CloudToFit
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import rigid, transform_points
 from mereo.scenes.files.build import files_of
@@ -105,7 +104,7 @@ def test_one_word_says_the_deformations(tmp_path: Path) -> None:
         (ELASTIC_BAR.replace("0.1", "0.9"), "motion"),
         (ELASTIC_BAR + "    tetrahedra: bar.vtu\n", "both cells and tetrahedra; .*: drop one"),
         (ELASTIC_BAR.replace("cells: 10", "tetrahedra: bar.vtu"), "bar.vtu does not exist"),
-        (ELASTIC_BAR.replace("cells: 10", "tetrahedra: bar.msh"), "suffix '.msh'; a volume mesh is one of"),
+        (ELASTIC_BAR.replace("cells: 10", "tetrahedra: bar.stl"), "suffix '.stl'; a volume mesh is one of"),
     ],
 )
 def test_blocks_that_do_not_fit_are_refused_with_their_line(tmp_path: Path, tail: str, message: str) -> None:
@@ -210,11 +209,6 @@ def test_the_kept_model_is_another_for_another_solid(tmp_path: Path, scene: Scen
 
 
 # --- fits -------------------------------------------------------------------------------------------------------------
-
-
-def test_constants_suit_the_kind_of_model(model: StatisticalModel) -> None:
-    assert Registrar(None, model).config == ELASTIC
-    assert Registrar(None, replace(model, is_normal=False)).config == FitConfig()
 
 
 def test_a_search_finds_a_state_of_the_solid(scene: Scene, model: StatisticalModel) -> None:

@@ -10,15 +10,13 @@ from safetensors.numpy import load_file
 from toy_data import SMALL, make_small_datasets, small_shards
 from toy_scene import toy_scene
 
-import mereo.__main__ as command_line
 from mereo.api.generate import generate
-from mereo.cli import training
 from mereo.geometry.surface_patches import without_strays
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis import examples
 from mereo.synthesis.config import OBSERVATIONS, SENSORS, GenerateConfig
 from mereo.synthesis.depth_sensor import SimulatedView, observe
-from mereo.synthesis.examples import Example, _sample_view, synthesize
+from mereo.synthesis.examples import Example, synthesize
 from mereo_learning.shards import example_bytes, pack
 
 __all__ = ["small_shards"]  # a fixture
@@ -58,11 +56,6 @@ def test_all_are_those_that_differ_from_the_examples_own_sensor() -> None:
     assert list(replace(SMALL, observations=("tool", "paper", "tool")).further) == ["tool", "paper"]
 
 
-def test_one_option_adds_them() -> None:
-    command = command_line.parse(["generate", "rope", "--examples", "2", "--output", "out", "--observations", "all"])
-    assert isinstance(command, training.Generate) and command.settings == GenerateConfig(observations=("all",))
-
-
 def test_an_unknown_one_is_answered_with_the_known_ones() -> None:
     settings = GenerateConfig()
     object.__setattr__(settings, "observations", ("tool", "lidar"))  # which the type checker of the tests would refuse
@@ -78,13 +71,6 @@ def test_state_first_cloud_and_queries_are_those_without(data: tuple[Path, Path]
         plain, seen = (load_file(directory / name) for directory in data)
         assert seen.keys() - plain.keys() == {"seen", "seen_count"}
         assert all(seen[key].tobytes() == value.tobytes() for key, value in plain.items())
-
-
-def test_a_shard_is_remade_alone(data: tuple[Path, Path], tmp_path: Path) -> None:
-    generate(TOY, tmp_path / "data", SEEN, examples=EXAMPLES, seed=SEED, shard=(1, 3))
-    assert (tmp_path / "data" / "shard-00001.safetensors").read_bytes() == shards_of(data[1])["shard-00001.safetensors"]
-    row, stored = pack(example(SEEN, 3), 128), load_file(data[1] / "shard-00001.safetensors")
-    assert all(np.array_equal(row[name], stored[name][1], equal_nan=True) for name in row)
 
 
 def test_an_observation_is_the_same_whichever_others_there_are() -> None:
@@ -117,26 +103,7 @@ def test_resuming_needs_the_same_observations(data: tuple[Path, Path]) -> None:
     assert [shards_of(directory) for directory in data] == before
 
 
-def test_resuming_needs_the_same_sensors_of_these_names(
-    data: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(OBSERVATIONS, "tool", replace(OBSERVATIONS["tool"], axial=2.0))
-    with pytest.raises(ValueError, match=r"settings\.sensors\.tool\.axial = 1\.0, not 2\.0"):
-        generate(TOY, data[1], SEEN, examples=EXAMPLES, seed=SEED, resume=True)
-
-
 # --- what they show ---------------------------------------------------------------------------------------------------
-
-
-def test_all_clouds_lie_on_the_object_in_one_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In scene units: sensors err by 0.2 to 0.5."""
-    for way in ("UNCLEANED", "BY_RULE"):  # a hand is a surface, and may show more points than the object behind it
-        monkeypatch.setattr(examples, way, 0.0)
-    for index in range(3):
-        found, (_, solids) = example(SEEN, index), _sample_view(TOY, SEEN, example_rng(SEED, index))
-        for name, cloud in zip(SEEN.further, found.observations, strict=True):
-            off = solids.nearest(found.normalizer.invert(cloud)).distance
-            assert np.median(off) < 1.0, (index, name)
 
 
 def test_half_precision_moves_no_point_by_more_than_its_noise(data: tuple[Path, Path]) -> None:
@@ -180,18 +147,3 @@ def test_an_observation_keeps_its_strays_or_loses_those_found_or_all_of_them(mon
         assert (np.abs(seen[:, None] - cloud).max(axis=2).min(axis=0) < 1e-9).all(), "points of the same cloud"
     sides = [max(np.ptp(cloud, axis=0).max() for cloud in clouds) for clouds in (right, whole)]
     assert sides[0] < sides[1], "the background is far behind"
-
-
-def flat(rows: int, columns: int, depth: float, left: int = 0) -> np.ndarray:
-    """Points of a plane facing the camera, a pixel apart."""
-    v, u = np.mgrid[:rows, left : left + columns]
-    return np.stack([u.ravel() * 0.01, v.ravel() * 0.01, np.ones(u.size)], axis=1) * depth
-
-
-def test_strays_are_left_where_the_box_is_hardly_longer_for_them() -> None:
-    surface, rim = flat(20, 20, 1.0), flat(20, 1, 1.5, left=20)
-    inside = flat(20, 1, 1.02, left=7) / 1.02 * 1.002
-    assert without_strays(surface).all()
-    keep = without_strays(np.concatenate([surface, rim]))
-    assert keep[:400].all() and not keep[400:].any()
-    assert without_strays(np.concatenate([surface, inside])).all()

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from shapes import box
 
 from mereo.fitting.problem.gauss_newton import Posed
-from mereo.fitting.problem.segments import Joints, different
+from mereo.fitting.problem.segments import Joints
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.scenes.random_states import build_model
 from mereo.scenes.statistical_model import StatisticalModel
@@ -53,8 +53,3 @@ def test_an_object_of_one_segment_has_no_joints() -> None:
     states = rest.segments[0].vertices * np.random.default_rng(0).uniform(0.8, 1.2, size=(50, 1, 3))
     model = build_model(rest, *NONE, states.astype(np.float32))
     assert Joints.of(model).others(Posed(np.eye(3), np.zeros(3), np.zeros(model.count)), 4) == []
-
-
-def test_different_rows_are_taken_in_order() -> None:
-    shapes = np.array([[0.0], [1.0], [10.0], [-4.0], [9.5]])
-    np.testing.assert_array_equal(different(shapes, np.array([0.0]), 3), [2, 3, 1])

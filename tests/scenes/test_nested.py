@@ -1,7 +1,5 @@
 """A segment inside a segment: every rule of docs/method.md, on balls whose answers are in closed form."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from analytic import ball as distance_to_ball
@@ -14,8 +12,8 @@ from toy_scene import Shear
 from mereo.deformation.maps import Deformation
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.mesh_check import overlaps
-from mereo.geometry.solids import Solids, label_grid, signed_distance_and_direction
-from mereo.geometry.transforms import rigid, transform_points
+from mereo.geometry.solids import Solids, signed_distance_and_direction
+from mereo.geometry.transforms import transform_points
 from mereo.reconstruction.isosurfaces import extract
 from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH, rest_distances, rest_frame
 from mereo.scenes.scene import Scene
@@ -23,15 +21,9 @@ from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo.synthesis.examples import sample_view, synthesize
 from mereo.synthesis.query_sampling import (
-    label_uniform,
-    nested_sort_sample,
-    owner_labels,
     sample_queries,
     sort_sample,
-    volume_uniform,
 )
-from mereo.visualization.renderer import Viewpoint, shade
-from mereo_learning.shards import make_manifest
 
 CORE, ORGAN = ((2.0, 0.0, 0.0), 2.6), ((0.0, 0.0, 0.0), 5.0)
 """Centre and radius; the core comes as near as 0.4 to the organ's surface."""
@@ -69,13 +61,6 @@ def test_what_is_nested_in_a_nested_segment_is_nested_too() -> None:
     assert organ(()).nesting == ()
 
 
-def test_a_moved_mesh_keeps_its_declaration() -> None:
-    mesh = organ()
-    assert mesh.with_vertices([s.vertices + 1 for s in mesh.segments]).nested == mesh.nested
-    assert mesh.transformed(rigid(np.eye(3), np.ones(3))).nested == mesh.nested
-    assert nested_scene().sample_state(np.random.default_rng(0)).mesh.nested == mesh.nested
-
-
 def test_the_inner_segment_comes_first() -> None:
     with pytest.raises(ValueError, match=r"'organ' is declared nested in 'core' but does not come before it;.*first"):
         organ((("organ", "core"),))
@@ -86,10 +71,6 @@ def test_the_inner_segment_comes_first() -> None:
 def test_a_declaration_of_unknown_segments_names_them() -> None:
     with pytest.raises(ValueError, match=r"'core' is declared nested in 'liver', but no segment is called 'liver'"):
         organ((("core", "liver"),))
-
-
-def test_the_manifest_of_a_dataset_states_it() -> None:
-    assert make_manifest(nested_scene(), GenerateConfig(), 1, 0)["nested"] == [["core", "organ"]]
 
 
 # --- overlap ----------------------------------------------------------------------------------------------------------
@@ -116,29 +97,6 @@ def test_the_inner_segment_must_be_inside() -> None:
 
 
 # --- who owns a point -------------------------------------------------------------------------------------------------
-
-
-def test_the_inner_segment_owns_its_points() -> None:
-    points, solids = draws(20_000), Solids(organ())
-    assert np.array_equal(solids.label(points), true_labels(points))
-
-
-def test_the_nearest_surface_is_the_inner_ones_too() -> None:
-    """The authors' rule needs no declaration: the way to the outer surface meets the inner one first."""
-    points = draws(20_000)
-    assert np.array_equal(owner_labels(Solids(organ(())), points), true_labels(points))
-    onions = np.random.default_rng(0).uniform(-3, 3, size=(5000, 3))
-    clear = np.abs(np.linalg.norm(onions, axis=1)[:, None] - [1, 2, 3]).min(axis=1) > 0.02
-    assert np.array_equal(owner_labels(Solids(onion()), onions[clear]), Solids(onion()).label(onions[clear]))
-
-
-def test_label_grids_agree_and_add_up_to_the_owned_volumes() -> None:
-    mesh, axis = organ(), np.linspace(-5.2, 5.2, 105)
-    grid = label_grid(mesh, axis, axis, axis)
-    nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)[::7]
-    assert np.array_equal(grid.ravel()[::7], Solids(mesh).label(nodes))
-    volumes = np.bincount(grid.ravel())[1:] * (axis[1] - axis[0]) ** 3
-    np.testing.assert_allclose(volumes, mesh.owned_volumes, rtol=0.01)
 
 
 def test_owned_volumes_are_those_of_shells() -> None:
@@ -192,12 +150,6 @@ def test_the_outside_of_a_nested_segment_is_the_segment_around_it() -> None:
         assert np.median(np.abs(radius(points[side], part) - part[1])) < 0.2 * part[1]
 
 
-def test_a_segment_in_the_middle_borders_on_the_ones_around_it_only() -> None:
-    samples = sort_sample(Solids(onion()), 100, 100, np.random.default_rng(1))
-    sides = [set(part.tolist()) for part in np.split(samples.labels, 6)]
-    assert sides == [{1}, {2}, {2}, {3}, {3}, {0}]
-
-
 @pytest.mark.parametrize("sampler", ["volume-uniform", "label-uniform", "sort-sample", "nested-sort-sample"])
 def test_every_sampler_gives_points_to_their_owner(sampler: str) -> None:
     settings = SamplingConfig(sampler=sampler, per_segment=128, uniform_fraction=1.0)  # type: ignore[arg-type]
@@ -206,13 +158,6 @@ def test_every_sampler_gives_points_to_their_owner(sampler: str) -> None:
     clear = np.all([np.abs(radius(samples.points, part) - part[1]) > 0.02 for part in (CORE, ORGAN)], axis=0)
     assert np.array_equal(samples.labels[clear], true_labels(samples.points[clear]))
     assert set(samples.labels.tolist()) == {0, 1, 2}
-
-
-@pytest.mark.parametrize("sampler", [label_uniform, nested_sort_sample, volume_uniform])
-def test_the_other_samplers_keep_all_labels_around_a_nested_segment(sampler: Callable[..., object]) -> None:
-    arguments = (64, 64) if sampler is nested_sort_sample else (64,)
-    samples = sampler(Solids(onion()), *arguments, np.random.default_rng(3))
-    assert set(samples.labels.tolist()) == {0, 1, 2, 3}  # type: ignore[attr-defined]
 
 
 # --- surfaces ---------------------------------------------------------------------------------------------------------
@@ -240,14 +185,6 @@ def test_a_declared_outer_surface_leaves_out_the_wall_of_the_cavity(nested: tupl
     assert volumes.sum() == pytest.approx(4 / 3 * np.pi, rel=0.01)
     apart = cKDTree(outer.vertices).query(inner.vertices)[0].max()  # marching cubes is in single precision
     assert apart > 0.1 if nested else apart < 1e-5
-
-
-def test_a_picture_shows_what_is_nested_through_what_is_around_it() -> None:
-    def middle(mesh: SegmentedMesh) -> np.ndarray:
-        return shade(mesh, Viewpoint.along(mesh.bounds, (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)), (40, 40))[20, 14].astype(int)
-
-    alone, within = middle(organ(())), middle(organ())
-    assert np.abs(alone - within).max() > 40
 
 
 # --- a scene ----------------------------------------------------------------------------------------------------------

@@ -10,7 +10,18 @@ from toy_scene import rest_mesh, toy_scene
 from mereo.deformation.draw_names import DrawName, named, part
 from mereo.deformation.maps import Deformation, Rigid
 from mereo.scenes.draw_recorder import Recorder
-from mereo.scenes.parameters import Parameter, Played, Refused, parameters, play, random_state, set_value, turned
+from mereo.scenes.parameters import (
+    Parameter,
+    Played,
+    Refused,
+    draw_names,
+    parameters,
+    play,
+    played_back,
+    random_state,
+    set_value,
+    turned,
+)
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 
@@ -164,21 +175,6 @@ def test_an_array_of_many_numbers_has_one_slider() -> None:
     np.testing.assert_allclose(shift_of(home), shift_of(played), atol=1e-6)
 
 
-def test_the_toy_scene_has_a_slider_for_every_number_it_draws() -> None:
-    scene = toy_scene()
-    played = random_state(scene, 0)
-    found = parameters(played)
-    assert [(f.low, f.high) for f in found] == [(-1.0, 1.0)] * 3 + [(0.5, 3.0)]
-    assert [(f.group, f.name) for f in found] == [
-        *(("whole", f"shear {axis}") for axis in "xyz"),
-        ("ball", "lift"),
-    ]
-    for parameter in found:
-        moved = set_value(scene, played, parameter, parameter.high)
-        points = scene.rest.segments[3].vertices
-        assert np.abs(moved.deformations[3](points) - played.deformations[3](points)).max() > 0.01
-
-
 def test_bounds_in_either_order_are_one_slider() -> None:
     def sample(rng: np.random.Generator) -> tuple[Deformation, ...]:
         return shifted(named(rng, "down").uniform(5.0, -1.0), *named(rng, "mixed").uniform([0.0, 4.0], [2.0, 3.0]))
@@ -267,14 +263,35 @@ def test_draws_keep_their_values_with_their_names() -> None:
         np.testing.assert_array_equal(shift_of(played), before)
 
 
-def test_built_in_scenes_name_their_sliders() -> None:
-    robot = [(f.name, f.unit, f.low, f.high) for f in parameters(random_state(load_scene("robot"), 0))]
-    moved = [name.rsplit(" ", 1)[0].replace(" ", "_") for name, *_ in robot]
-    assert (*moved[:6], "finger_left") == load_scene("robot").rest.names[1:8] and robot[6][0] == "fingers apart"
-    assert {f.group for f in parameters(random_state(load_scene("skull"), 3))} == {"mandible"}
-    assert robot[0][1:] == ("°", -170.0, 170.0)
-    (cycle,) = parameters(random_state(load_scene("engine"), 0))
-    assert (cycle.name, cycle.unit) == ("crank angle", "°")
-    assert (cycle.low, cycle.high) == pytest.approx((0.0, 720.0))
-    rope = parameters(random_state(load_scene("rope"), 3))
-    assert {"start", "turn per unit", "pitch"} <= {f.name for f in rope if f.group == "coil"}
+# --- draws in the order of the calls ----------------------------------------------------------------------------------
+
+
+def places(scene: Scene, played: Played) -> np.ndarray:
+    return scene.deform(played.deformations).mesh.merged()[0]
+
+
+@pytest.mark.parametrize("name", ["toy", "rope", "robot"])
+def test_the_same_draws_give_the_same_state_and_sliders_that_move_it(name: str) -> None:
+    scene = toy_scene() if name == "toy" else load_scene(name)
+    before = random_state(scene, 7)
+    again = played_back(scene, 7, [call.shares for call in before.calls])
+    np.testing.assert_array_equal(places(scene, again), places(scene, before))
+    assert again.keys == before.keys and parameters(again) == parameters(before)
+    slider = parameters(again)[0]
+    middle = (slider.low + slider.high) / 2
+    np.testing.assert_array_equal(
+        places(scene, set_value(scene, again, slider, middle)), places(scene, set_value(scene, before, slider, middle))
+    )
+
+
+def test_every_number_has_the_name_of_its_slider() -> None:
+    assert draw_names(random_state(toy_scene(), 0)) == (
+        *("whole: shear x", "whole: shear y", "whole: shear z"),
+        "ball: lift",
+    )
+
+
+@pytest.mark.parametrize("sizes", [(3,), (3, 2), (4, 1), ()])
+def test_other_draws_than_the_scene_makes_are_refused(sizes: tuple[int, ...]) -> None:
+    with pytest.raises(Refused, match=f"the scene 'toy' does not take these {len(sizes)} draws; .* register the frame"):
+        played_back(toy_scene(), 0, [np.full(size, 0.5) for size in sizes])

@@ -1,9 +1,7 @@
 """Every built-in scene in many random states: closed, positive, apart, in view, and invertible."""
 
 import re
-from collections.abc import Callable
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,11 +13,11 @@ from mereo.deformation.maps import invert, jacobian_determinant
 from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.solids import Solids, label_grid
-from mereo.geometry.transforms import inverse_rigid, look_at, transform_points
+from mereo.geometry.solids import Solids
+from mereo.geometry.transforms import inverse_rigid, is_rigid, look_at, transform_points
 from mereo.scenes.parameters import parameters, random_state, set_value
 from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import SCENES, Scene, State, Workspace
+from mereo.scenes.scene import SCENES, AssetUnavailable, Scene, State, Workspace
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.depth_sensor import render_depth
 
@@ -41,26 +39,13 @@ flat triangles cut across the crease between neighbours."""
 LENGTHS_M = {"bunny": 0.156, "liver": 0.202, "tumor": 0.202, "liver-simulated": 0.202, "skull": 0.236, "human": 1.68}
 """Longest side of the rest pose's box, of objects that have a true size."""
 
-_LIVER = ("liver/lapgym_liver_visual.stl", "liver/lapgym_gallbladder_visual.stl")
-NEEDED_ASSETS = {
-    "bunny": ("bunny/bunny.off",),
-    "skull": ("skull/sofa_skull_and_teeth_coarse.obj",),
-    "liver": _LIVER,
-    "tumor": _LIVER,
-    "liver-simulated": _LIVER,
-    "human": (
-        "human/makehuman_base.obj",
-        "human/makehuman_default.mhskel",
-        "human/makehuman_default_weights.mhw",
-    ),
-}
-
 
 @pytest.fixture(scope="module", params=SCENES)
-def scene(request: pytest.FixtureRequest, require_asset: Callable[[str], Path]) -> Scene:
-    for name in NEEDED_ASSETS.get(request.param, ()):
-        require_asset(name)
-    return load_scene(request.param)
+def scene(request: pytest.FixtureRequest) -> Scene:
+    try:
+        return load_scene(request.param)
+    except AssetUnavailable as error:
+        pytest.skip(str(error))
 
 
 @pytest.fixture(scope="module")
@@ -197,15 +182,6 @@ def test_two_hundred_states_are_sound_invertible_and_in_view(scene: Scene) -> No
             assert_seen(scene, state.mesh, rng)
 
 
-def test_label_grid_adds_up_to_the_volumes(scene: Scene) -> None:
-    low, high = scene.rest.bounds
-    axes = [np.linspace(low[k] - 1, high[k] + 1, 120) for k in range(3)]
-    grid = label_grid(scene.rest, *axes)
-    cell = np.prod([axis[1] - axis[0] for axis in axes])
-    for index, volume in enumerate(scene.rest.owned_volumes):
-        assert abs((grid == index + 1).sum() * cell / volume - 1) < 0.06
-
-
 def test_true_size_where_it_is_known(scene: Scene) -> None:
     if scene.name not in LENGTHS_M:
         assert scene.unit_m is None
@@ -243,13 +219,7 @@ def test_whole_sphere_with_any_roll_prefers_no_direction() -> None:
 
 def test_look_at_straight_along_up_is_still_a_rotation() -> None:
     pose = look_at(np.array([0.0, 0.0, 10.0]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
-    assert np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3)) and np.isclose(np.linalg.det(pose[:3, :3]), 1.0)
-    assert np.allclose(pose[:3, 2], [0, 0, -1])
-
-
-def test_unknown_scene_is_named() -> None:
-    with pytest.raises(ValueError, match=f"scene 'hare' is unknown; it must be one of {', '.join(SCENES)}"):
-        load_scene("hare")
+    assert is_rigid(pose) and np.allclose(pose[:3, 2], [0, 0, -1])
 
 
 # --- sliders ----------------------------------------------------------------------------------------------------------

@@ -5,12 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from analytic import untrained
+from PIL import Image
 
+from mereo import __main__ as command_line
+from mereo.cli.scenes import SceneModes
 from mereo.deformation.maps import Identity
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.models.weights import load_model, save_model, weights_bytes
+from mereo.models.weights import save_model
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.statistical_model import (
@@ -26,7 +28,7 @@ from mereo.scenes.statistical_model import (
 
 @pytest.fixture(scope="module")
 def rope() -> StatisticalModel:
-    return scene_model(load_scene("rope"), 60)
+    return scene_model(load_scene("rope"), 100)
 
 
 def test_a_model_survives_its_file_up_to_rounding(rope: StatisticalModel, tmp_path: Path) -> None:
@@ -66,22 +68,6 @@ def test_as_many_modes_as_fit(rope: StatisticalModel, spare: int) -> None:
     assert most == rope.count or size(with_fewer_modes(rope, most + 1)) > limit
 
 
-def test_weights_carry_the_model(rope: StatisticalModel, tmp_path: Path) -> None:
-    model = replace(untrained(rope.rest.names), statistical_model=rope)
-    save_model(model, tmp_path / "w.safetensors", torch.float16)
-    read = load_model(tmp_path / "w.safetensors")
-    assert read.statistical_model is not None
-    same_rest(read.statistical_model.rest, rope.rest)
-    without = replace(model, statistical_model=None)
-    assert load_model(save(without, tmp_path / "v.safetensors")).statistical_model is None
-    assert len(weights_bytes(model)) > len(weights_bytes(without))
-
-
-def save(model: object, path: Path) -> Path:
-    save_model(model, path)  # type: ignore[arg-type]
-    return path
-
-
 def test_another_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "m.safetensors").write_bytes(b"nothing")
     with pytest.raises(ValueError, match=r"m.safetensors is no statistical model of mereo \(.*\); delete it and run"):
@@ -94,3 +80,45 @@ def test_an_object_that_does_not_deform_has_no_modes(tmp_path: Path) -> None:
     read = load_statistical_model(tmp_path / "m.safetensors")
     assert read.count == 0 and read.residue < 1e-5
     np.testing.assert_allclose(read.material(np.zeros(0)), read.rest_points, atol=1e-4)
+
+
+# --- how many modes are needed ----------------------------------------------------------------------------------------
+
+
+def test_the_residue_of_fewer_modes_is_that_of_the_model_without_the_others(rope: StatisticalModel) -> None:
+    for count in (0, 1, rope.count // 2, rope.count):
+        assert rope.residues[count] == pytest.approx(with_fewer_modes(rope, count).residue, rel=1e-6)
+    assert (np.diff(rope.residues) < 0).all() and (np.diff(rope.explained) > 0).all()
+
+
+def test_the_number_of_modes_needed_is_the_smallest_that_is_enough(rope: StatisticalModel) -> None:
+    count = rope.modes_for(1.0)
+    assert count is not None and rope.residues[count] <= 1.0 < rope.residues[count - 1]
+    assert rope.modes_for(np.inf) == 0 and rope.modes_for(rope.residue / 2) is None
+
+
+def test_the_command_says_how_many_and_draws_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = tmp_path / "modes.png"
+    assert command_line.main(["scene", "modes", "rope", "--states", "100", "--output", str(picture)]) == 0
+    assert "modes leave" in capsys.readouterr().out
+    drawn = np.asarray(Image.open(picture).convert("RGB"))
+    assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 100
+
+
+def test_weights_show_the_model_that_they_carry(
+    rope: StatisticalModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    network = replace(untrained(rope.rest.names), provenance={"scene": "rope"})
+    save_model(replace(network, statistical_model=rope), tmp_path / "with.safetensors")
+    SceneModes(str(tmp_path / "with.safetensors"), states=100).run()
+    assert f"{rope.count} modes" in capsys.readouterr().out
+    save_model(network, tmp_path / "without.safetensors")
+    with pytest.raises(ValueError, match="carries no statistical model: name the scene"):
+        SceneModes(str(tmp_path / "without.safetensors"), states=100).run()
+
+
+def test_bad_wishes_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="fewer than 100 say little"):
+        SceneModes("rope", states=5).run()
+    with pytest.raises(ValueError, match="the picture is a PNG file"):
+        SceneModes("rope", tmp_path / "modes.jpg", 100).run()

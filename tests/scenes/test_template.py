@@ -9,10 +9,9 @@ from shapes import one
 from toy_scene import toy_scene
 
 from mereo.api.generate import generate
-from mereo.geometry.mesh import SegmentedMesh
 from mereo.models.decoder import RestLookup
 from mereo.models.network import Network
-from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH, rest_distances, rest_frame
+from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH, rest_distances
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo.synthesis.examples import synthesize
@@ -42,12 +41,6 @@ def test_linear_fields_are_read_exactly_and_along_the_right_axes() -> None:
     assert torch.allclose(mixed[..., 0], rest @ torch.tensor([0.3, -0.5, 0.1]), atol=1e-5)
 
 
-def test_beyond_the_grid_its_border_is_read() -> None:
-    x, _, _ = torch.meshgrid(AXIS, AXIS, AXIS, indexing="ij")
-    far = torch.tensor([[[9.0, 0.0, 0.0], [-9.0, 0.3, 0.0]]])
-    assert torch.allclose(lookup_of(x).distances(far)[0, :, 0], torch.tensor([TEMPLATE_REACH, -TEMPLATE_REACH]))
-
-
 def test_grid_of_a_ball_is_its_signed_distance() -> None:
     """A ball fills the rest box: its radius is the unit of length."""
     ball = toy_scene().rest.segments[3]
@@ -68,13 +61,6 @@ def test_true_rest_coordinates_find_the_right_segment() -> None:
     assert (own < SPACING / 2).all()  # trilinear reading rounds edges off by less than this
     clear = -own > SPACING / 2
     assert clear.float().mean() > 0.6 and torch.equal(found.argmin(dim=1)[clear], labels[clear])
-
-
-def test_rest_frame_is_that_of_the_longest_side() -> None:
-    rest: SegmentedMesh = toy_scene().rest
-    center, half = rest_frame(rest)
-    low, high = (rest.bounds - center) / half
-    assert np.isclose(np.abs([low, high]).max(), 1.0) and np.allclose(low, -high)
 
 
 def test_a_new_lookup_changes_no_answer() -> None:
@@ -98,14 +84,6 @@ def test_what_is_read_corrects_the_coordinates() -> None:
     rest, seen = lookup(torch.zeros(1, 20, 8), random_rest(1, 20, reach=0.5))
     (slope,) = torch.autograd.grad(seen.sum(), rest)
     assert (torch.nn.functional.cosine_similarity(slope, rest, dim=-1) > 0.9).all()
-
-
-def test_autocast_does_not_touch_rest_coordinates() -> None:
-    x, y, z = torch.meshgrid(AXIS, AXIS, AXIS, indexing="ij")
-    lookup, placed = lookup_of(x, y, z), random_rest(1, 30)
-    with torch.autocast("cpu", torch.bfloat16):
-        rest, _ = lookup(torch.zeros(1, 30, 8, dtype=torch.bfloat16), placed)
-    assert torch.equal(rest, placed)
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ import pytest
 pytest.importorskip("fastapi", reason="fastapi (extra `serve`) is not installed")
 pytest.importorskip("python_multipart", reason="python-multipart (extra `serve`) is not installed")
 
-from fuzz_mutations import damaged
+from fuzz import damaged
 from serving_parts import ADDRESS, CLOUD, NPY, balls, figures, npy, run, running, setup, until
 
 from mereo.io.errors import LIMIT_VARIABLE

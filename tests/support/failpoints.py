@@ -26,7 +26,7 @@ CALLS = {**MOVES, "mkdir": "os.mkdir", "unlink": "os.remove", "remove": "os.remo
 """All functions that change what is in a folder, but for opening a new file."""
 
 
-NETWORKS = ("train", "reconstruct", "evaluate", "export")
+NETWORKS = ("train", "reconstruct", "export")
 """Commands that load torch's compiler, whether they compile or not."""
 
 
@@ -73,6 +73,7 @@ class Failpoints:
 
 def _serve() -> None:
     import matplotlib.pyplot  # noqa: F401 (loaded before the forks, as all that takes long)
+    import pytest
     import scipy.interpolate  # noqa: F401
     import torch
     from toy_data import make_small_datasets
@@ -81,15 +82,12 @@ def _serve() -> None:
     from mereo.io import atomic_files  # noqa: F401
     from mereo.models.export import onnx_export
     from mereo.models.weights import load_model
-    from mereo_learning import evaluation_report, model_card, trainer
+    from mereo_learning import trainer
 
-    del model_card
     torch.set_num_threads(1)
-    make_small_datasets(_Patch())  # type: ignore[arg-type]
+    make_small_datasets(pytest.MonkeyPatch())  # which nothing undoes
     assert trainer.train.__kwdefaults__ is not None
     trainer.train.__kwdefaults__["checkpoint_every_s"] = 0.0
-    assert evaluation_report.evaluate_weights.__kwdefaults__ is not None
-    evaluation_report.evaluate_weights.__kwdefaults__["cells"] = 16
     traced = list[onnx_export.Graphs]()
     for line in sys.stdin:
         asked = json.loads(line)
@@ -99,13 +97,6 @@ def _serve() -> None:
             traced.append(onnx_export.export_graphs(load_model(asked["arguments"][1])))
             onnx_export.export_graphs = lambda _: traced[0]
         print(json.dumps(_forked(asked, command_line.main)), flush=True)
-
-
-class _Patch:
-    """As much of pytest's as is needed; nothing is put back."""
-
-    def setattr(self, place: Any, name: str, value: Any) -> None:
-        setattr(place, name, value)
 
 
 def _forked(asked: dict[str, Any], main: Callable[[list[str]], int]) -> dict[str, Any]:
@@ -149,22 +140,10 @@ class Commands:
         self.process = process
 
     def run(
-        self,
-        folder: Path,
-        arguments: str,
-        *,
-        at: int = -1,
-        after: bool = False,
-        every_call: bool = False,
+        self, folder: Path, arguments: str, *, at: int = -1, after: bool = False, every_call: bool = False
     ) -> Ended:
         """Run a command in ``folder``, killed before (or after) call ``at`` of the moves, or of all calls."""
-        asked = {
-            "folder": str(folder),
-            "arguments": arguments.split(),
-            "at": at,
-            "after": after,
-            "all": every_call,
-        }
+        asked = {"folder": str(folder), "arguments": arguments.split(), "at": at, "after": after, "all": every_call}
         assert self.process.stdin is not None and self.process.stdout is not None
         self.process.stdin.write(json.dumps(asked) + "\n")
         self.process.stdin.flush()

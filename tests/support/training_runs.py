@@ -1,10 +1,6 @@
 """Training runs that are stopped, diverge or are shared."""
 
 import math
-import os
-import pickle
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -54,23 +50,3 @@ def assert_resumes_exactly(dataset: Path, folder: Path, config: TrainConfig, ste
     assert whole.keys() == parts.keys()
     assert all(torch.equal(whole[name], parts[name]) for name in whole)
     assert (folder / "whole" / "metrics.csv").read_text() == (folder / "parts" / "metrics.csv").read_text()
-
-
-def train_in_two_processes(dataset: Path, folder: Path, config: TrainConfig) -> Path:
-    """Train under torchrun, and return the run."""
-    (folder / "config.pickle").write_bytes(pickle.dumps(config))
-    script = folder / "run.py"
-    script.write_text(
-        "import pickle\nimport sys\nfrom pathlib import Path\nfrom mereo_learning.trainer import train\n"
-        "dataset, run, config = map(Path, sys.argv[1:])\n"
-        "train(dataset, run, pickle.loads(config.read_bytes()))\n"
-        # threads of the group would outlive the interpreter, and may then wait forever
-        "threads = [name.read_text() for name in Path('/proc/self/task').glob('*/comm')]\n"
-        "assert not any('gloo' in name for name in threads), threads\n"
-    )
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "JAXTYPING_DISABLE": "1"}
-    arguments = [str(dataset), str(folder / "run"), str(folder / "config.pickle")]
-    done = subprocess.run([*command, *arguments], env=environment, capture_output=True, text=True, timeout=240)
-    assert done.returncode == 0, done.stderr[-2000:]
-    return folder / "run"

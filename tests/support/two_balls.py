@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from analytic import AnalyticModel, ball, logits_of
 
-from mereo.geometry.camera import scanner_to_camera
+from mereo.geometry.camera import into_camera
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.transforms import inverse_rigid, transform_points
 
@@ -33,5 +33,5 @@ def scene(frame: CloudAxes) -> tuple[np.ndarray, AnalyticModel]:
     if frame == "camera":
         return np.concatenate([front(*BIG, -1.0), front(*SMALL, -1.0)]), AnalyticModel.of(two_balls, NAMES)
     cloud = np.concatenate([front(*BIG, 1.0), front(*SMALL, 1.0)])
-    back = inverse_rigid(scanner_to_camera(cloud))
+    back = inverse_rigid(into_camera(cloud, "scanner"))
     return cloud, AnalyticModel.of(lambda points: two_balls(transform_points(back, points)), NAMES)

@@ -1,6 +1,5 @@
 """Generation: the same bits however the work is shared or interrupted, and never a test seed by accident."""
 
-import errno
 import json
 import os
 import re
@@ -9,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from analytic import AnalyticModel
 from folder_contents import contents
 from safetensors.numpy import load_file
 from scene_code import CODE
@@ -19,13 +17,11 @@ from toy_data import SMALL
 from toy_scene import toy_scene
 
 from mereo.api.generate import generate
-from mereo.io import progress
 from mereo.scenes.scene import Scene
-from mereo.scenes.seeds import TEST_SEED_START, example_rng
+from mereo.scenes.seeds import TEST_SEED_START
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import Example, synthesize
 from mereo_learning import shards
-from mereo_learning.scoring import trained_scene
 from mereo_learning.shards import example_bytes
 
 TOY = toy_scene()
@@ -67,23 +63,6 @@ def test_killed_and_resumed_equals_uninterrupted(
     assert complete.items() <= contents(whole).items()
     generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3, resume=True)
     assert contents(tmp_path / "data") == contents(whole)
-
-
-def test_any_example_can_be_remade_alone(whole: Path) -> None:
-    example = synthesize(TOY, SMALL, example_rng(3, 5))
-    shard = load_file(whole / "shard-00001.safetensors")
-    assert np.array_equal(shard["positions"][1], example.queries.positions.astype(np.float32))
-    assert np.array_equal(shard["labels"][1], example.queries.labels)
-    count = int(shard["cloud_count"][1])
-    assert count == len(example.cloud) < SMALL.points or count == SMALL.points
-    repeated = example.cloud[np.arange(SMALL.points) % count].astype(np.float32)
-    assert np.array_equal(shard["cloud"][1], repeated)
-
-
-@pytest.mark.slow
-def test_two_workers_equal_one(whole: Path, tmp_path: Path) -> None:
-    generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3, workers=2)
-    assert contents(whole) == contents(tmp_path / "data")
 
 
 def test_tensors_are_as_documented_and_a_paper_size_dataset_fits_in_2_5_gigabytes(whole: Path) -> None:
@@ -167,34 +146,6 @@ def test_an_existing_directory_is_left_alone(tmp_path: Path, resume: bool) -> No
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
-@pytest.mark.parametrize("victim", ["template", "statistical_model", "shard-00000"])
-def test_a_full_disk_is_one_sentence_and_leaves_no_half_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, victim: str
-) -> None:
-    written = Path.write_bytes
-
-    def full(path: Path, data: bytes) -> int:
-        if victim not in path.name:
-            return written(path, data)
-        written(path, data[: len(data) // 2])
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
-
-    monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(OSError, match=rf"the disk is full while writing .*{victim}\.safetensors: free space or"):
-        generate(TOY, tmp_path / "data", SMALL, examples=4, seed=1)
-    order = ["manifest.json", "template.safetensors", "statistical_model.safetensors", "shard-00000.safetensors"]
-    assert set(contents(tmp_path / "data")) == set(order[: order.index(f"{victim}.safetensors")])
-
-
-def test_what_a_killed_run_was_writing_is_removed_on_resume(whole: Path, tmp_path: Path) -> None:
-    generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3, shard=(0, 2))
-    leftover = tmp_path / "data" / ".shard-00001.safetensors.1a2b3c4d.mereo"
-    leftover.mkdir()
-    (leftover / "shard-00001.safetensors").write_bytes(b"half")
-    generate(TOY, tmp_path / "data", SMALL, examples=10, seed=3, shard=(1, 2))
-    assert contents(tmp_path / "data") == contents(whole)
-
-
 @pytest.mark.parametrize(
     "examples, seed, workers, shard, message",
     [
@@ -210,21 +161,6 @@ def test_wrong_numbers_are_named(
     with pytest.raises(ValueError, match=message):
         generate(TOY, tmp_path / "data", SMALL, examples=examples, seed=seed, workers=workers, shard=shard)
     assert not (tmp_path / "data").exists()
-
-
-def test_progress_tells_rate_and_time_left(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(progress, "LINE_EVERY_S", 0.0)
-    generate(TOY, tmp_path / "data", SMALL, examples=6, seed=3)
-    printed = capsys.readouterr()
-    assert printed.out == "modes of 100 random states, for registration\n"
-    lines = printed.err.splitlines()
-    assert re.fullmatch(r"model: 1 of 100 states, \d+\.\d states/s, \d+ s left", lines[0])
-    assert re.fullmatch(r"model: 100 states in \d+ s", lines[100])
-    lines = lines[101:]
-    assert re.fullmatch(r"generate: 4 of 6 examples, \d+\.\d examples/s, \d+ s left", lines[0])
-    assert lines[1].startswith("generate: 6 of 6 ") and re.fullmatch(r"generate: 6 examples in \d+ (s|min)", lines[2])
 
 
 def made(scene: Path, output: Path, workers: int = 1, examples: int = 2, resume: bool = False) -> dict[str, bytes]:
@@ -256,10 +192,3 @@ def test_two_workers_make_the_same_files_as_one(kind: str, tmp_path: Path) -> No
         scene.write_text(CODE.format(name="mine", file=str(file)))
     one = made(scene, tmp_path / "one", 1, examples=70)
     assert made(scene, tmp_path / "two", 2, examples=70) == one
-
-
-def test_weights_of_a_scene_that_is_not_built_in_ask_for_its_file() -> None:
-    model = AnalyticModel.of(lambda points: points, ("a", "b", "c"))
-    object.__setattr__(model, "provenance", {"scene": "bar"})
-    with pytest.raises(ValueError, match=r"trained on the scene 'bar', which is not built in; .*--scene FILE.yaml"):
-        trained_scene(model)

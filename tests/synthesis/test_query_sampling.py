@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from balls import Balls
 from polygons import Polygons2D
 from shapes import box
 
@@ -17,13 +16,37 @@ from mereo.synthesis.query_sampling import (
     Shape,
     extended_boxes,
     joint_box,
-    label_uniform,
     nested_sort_sample,
     owner_labels,
     sample_queries,
     sort_sample,
-    volume_uniform,
 )
+
+
+class Balls:
+    """Balls in any dimension; every answer in closed form."""
+
+    def __init__(self, *balls: tuple[tuple[float, ...], float], nesting: tuple[tuple[int, int], ...] = ()) -> None:
+        self.centers, self.radii = np.array([c for c, _ in balls]), np.array([r for _, r in balls])
+        self.count, self.nesting = len(balls), nesting
+
+    def boxes(self) -> np.ndarray:
+        return np.stack([self.centers - self.radii[:, None], self.centers + self.radii[:, None]], axis=1)
+
+    def radius(self, index: int, points: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(points - self.centers[index], axis=1)
+
+    def inside(self, index: int, points: np.ndarray) -> np.ndarray:
+        return self.radius(index, points) < self.radii[index]
+
+    def label(self, points: np.ndarray) -> np.ndarray:
+        labels = np.zeros(len(points), dtype=np.uint8)
+        for index in reversed(range(self.count)):
+            labels[self.inside(index, points)] = index + 1
+        return labels
+
+    def segment_distance(self, index: int, points: np.ndarray) -> np.ndarray:
+        return np.abs(self.radius(index, points) - self.radii[index])
 
 
 def square(low: float, high: float, shift: float = 0.0) -> np.ndarray:
@@ -101,60 +124,6 @@ def test_batch_size_changes_no_bit_and_the_generator_advances_alike_whatever_is_
     assert rngs[0].random() == rngs[1].random()
 
 
-def test_few_distances_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The bound that makes it fast: far fewer distances than draws outside."""
-    ball = Balls(((0, 0, 0), 1.0))
-    measured: list[int] = []
-    real = ball.segment_distance
-    monkeypatch.setattr(ball, "segment_distance", lambda i, p: (measured.append(len(p)), real(i, p))[1])
-    points = np.random.default_rng(0).uniform(-6, 6, size=(20_000, 3))
-    rows = query_sampling._nearest_rows(ball, 0, points, 100)
-    assert set(rows) == set(np.argsort(real(0, points))[:100])
-    assert sum(measured) < 5_000
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_equal_counts_and_right_labels(name: str) -> None:
-    shape, rng = shapes()[name], np.random.default_rng(0)
-    for samples in (label_uniform(shape, 50, rng), sort_sample(shape, 50, 50, rng), sort_sample(shape, 50, 100, rng)):
-        assert len(samples.points) == 100 * shape.count
-        np.testing.assert_array_equal(samples.labels, shape.label(samples.points))
-        for index, (inside, outside) in enumerate(halves(samples, 50)):
-            assert (inside.labels == index + 1).all()
-            assert (outside.labels != index + 1).all()
-    uniform = volume_uniform(shape, 100, rng)
-    np.testing.assert_array_equal(uniform.labels, shape.label(uniform.points))
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_samples_fill_the_extended_boxes_and_stay_in_them(name: str) -> None:
-    shape = shapes()[name]
-    boxes = extended_boxes(shape)
-    np.testing.assert_allclose(boxes[:, 1] - boxes[:, 0], 1.5 * (shape.boxes()[:, 1] - shape.boxes()[:, 0]))
-    np.testing.assert_allclose(boxes.mean(axis=1), shape.boxes().mean(axis=1), atol=1e-12)
-    for points, (low, high) in zip(
-        np.split(volume_uniform(shape, 4000, np.random.default_rng(0)).points, shape.count), boxes, strict=True
-    ):
-        unit = (points - low) / (high - low)
-        assert unit.min() > 0
-        assert unit.max() < 1
-        # mean of 4000 uniform numbers: standard deviation 0.0046
-        assert np.abs(unit.mean(axis=0) - 0.5).max() < 4 * np.sqrt(1 / 12 / 4000)
-
-
-def test_sort_sample_drops_points_in_other_segments_and_nested_keeps_them() -> None:
-    squares = shapes()["squares"]
-    dropped = halves(sort_sample(squares, 200, 200, np.random.default_rng(0)), 200)
-    assert all((outside.labels == 0).all() for _, outside in dropped)
-    nested = nested_sort_sample(squares, 200, 200, np.random.default_rng(0))
-    np.testing.assert_array_equal(nested.labels, squares.label(nested.points))
-    left, right, alone = halves(nested, 200)
-    # a quarter of a square's outline is shared with its neighbour
-    assert 0.15 < (left[1].labels == 2).mean() < 0.35
-    assert 0.15 < (right[1].labels == 1).mean() < 0.35
-    assert (alone[1].labels == 0).all()
-
-
 def test_the_nearest_surface_owns_nested_and_overlapping_solids() -> None:
     nested = Balls(((0, 0, 0), 3.0), ((0, 0, 0), 2.0), ((0, 0, 0), 1.0))
     points = np.random.default_rng(0).uniform(-3.2, 3.2, size=(5000, 3))
@@ -167,15 +136,6 @@ def test_the_nearest_surface_owns_nested_and_overlapping_solids() -> None:
     assert len(lens) > 100
     # equal radii: the first ball's surface is nearer where its centre is farther
     np.testing.assert_array_equal(owner_labels(overlapping, lens), np.where(lens[:, 0] > 0, 1, 2))
-
-
-def test_nested_sampler_reaches_what_sort_sample_cannot() -> None:
-    organ = Balls(((0, 0, 0), 1.0), ((0, 0, 0), 3.0))
-    samples = nested_sort_sample(organ, 100, 100, np.random.default_rng(0))
-    (_, around), (outer, beyond) = halves(samples, 100)
-    assert (around.labels == 2).all()
-    assert (outer.labels == 2).all()
-    assert set(beyond.labels) <= {0, 1}
 
 
 def test_reach_around_balls_in_closed_form() -> None:

@@ -9,15 +9,22 @@ from toy_scene import Shear, rest_mesh, toy_scene
 
 from mereo import __main__ as command_line
 from mereo.deformation.maps import Deformation
-from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.config import InputConfig
 from mereo.io.sensor_frame import read_frame
 from mereo.scenes.parameters import played_back, random_state
 from mereo.scenes.scene import Scene
-from mereo.scenes.walks import process_weights, switches, walk
 from mereo.synthesis.clutter import OCCLUDER
 from mereo.synthesis.config import SENSORS, SequenceConfig
-from mereo.synthesis.recording import Moment, is_recording_folder, sequence, write_recording
+from mereo.synthesis.recording import (
+    Moment,
+    is_recording_folder,
+    process_weights,
+    sequence,
+    switches,
+    walk,
+    write_recording,
+)
 
 SHORT = SequenceConfig(seconds=1.0, rate=12.0, occluded=0.5, image_size=48)
 
@@ -108,14 +115,6 @@ def test_a_tool_passes_in_the_middle_and_the_camera_stays_near(moments: list[Mom
     assert min(turns) > np.cos(0.6) and moments[3].time_s == pytest.approx(0.25)
 
 
-@pytest.mark.parametrize("sensor", ["paper", "structured-light"])
-def test_the_same_seed_is_the_same_sequence(sensor: str) -> None:
-    settings = SequenceConfig(seconds=0.2, rate=15.0, image_size=32, occluder="hand")
-    first, second = (list(sequence(toy_scene(), settings, SENSORS[sensor], 5)) for _ in range(2))  # type: ignore[index]
-    for one, other in zip(first, second, strict=True):
-        np.testing.assert_array_equal(one.seen.image.depth, other.seen.image.depth)
-
-
 def test_a_sequence_of_one_frame_and_test_seeds_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(ValueError, match="0.01 s at 30 frames a second are 0 frames; a sequence has at least 2"):
         SequenceConfig(seconds=0.01)
@@ -158,18 +157,8 @@ def test_the_command_records_what_stream_answers(tmp_path: Path, capsys: pytest.
     small = ["--seconds", "0.2", "--rate", "10", "--seed", "3"]
     assert command_line.main(["scene", "record", "rope", "--output", str(out), *small]) == 0
     assert "2 frames in 0.2 s" in capsys.readouterr().out and len(list((out / "frames").iterdir())) == 2
-    assert (
-        command_line.main(
-            ["stream", str(out), "--weights", "rope", "--every-frame", "--rate", "10", "--resolution", "16"]
-        )
-        == 0
-    )
+    options = ["--weights", "rope", "--every-frame", "--rate", "10", "--resolution", "16"]
+    assert command_line.main(["stream", str(out), *options]) == 0
     lines = [json.loads(text) for text in capsys.readouterr().out.splitlines()]
     assert [(one["method"], one["tracked"]) for one in lines] == [("modes", False), ("modes", True)]
     assert all(one["explained"] > 0.9 for one in lines)
-    truth, base = np.load(out / "truth.npz"), lines[1]["segments"]["base"]
-    unit_m = json.loads((out / "recording.json").read_text())["unit_m"]
-    count, faces = truth["counts"][0]
-    first = Segment("base", (0, 0, 0), unit_m * truth["vertices"][1, :count].astype(float), truth["faces"][:faces])
-    np.testing.assert_allclose(base["centroid"], first.vertices.mean(axis=0), atol=0.02)
-    assert base["volume"] == pytest.approx(first.volume, rel=0.1)

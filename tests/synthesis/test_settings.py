@@ -1,7 +1,6 @@
 """Sensors and workspaces from the options to the files: presets, datasets that state them, evaluation with them."""
 
 import json
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import get_args
@@ -17,11 +16,8 @@ from mereo.geometry.camera import PointCloud
 from mereo.models.model import Model
 from mereo.models.trained import EncodedCloud
 from mereo.models.weights import load_model
-from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import PAPER_APERTURE_RAD, WHOLE_SPHERE_RAD, Scene, Workspace
-from mereo.scenes.seeds import example_rng
+from mereo.scenes.scene import PAPER_APERTURE_RAD, WHOLE_SPHERE_RAD, Workspace
 from mereo.synthesis.config import SENSOR_TERMS, SENSORS, GenerateConfig, SamplingConfig, Sensor, SensorConfig
-from mereo.synthesis.examples import sample_view
 from mereo_learning.evaluation_report import evaluate_weights
 from mereo_learning.model_card import card
 from mereo_learning.scoring import EvaluationConfig
@@ -64,16 +60,6 @@ def test_terms_are_added_to_a_sensor_and_all_are_off_by_default() -> None:
     assert all(replace(SensorConfig(), **{name: 0.1}).on for name in SENSOR_TERMS)
 
 
-def test_an_option_chooses_a_workspace() -> None:
-    assert generate_options("--workspace sphere").workspace == "sphere"
-    scored = parsed("evaluate rope --output out --workspace cone")
-    assert isinstance(scored, training.Evaluate) and scored.workspace == "cone"
-    settings = GenerateConfig()
-    object.__setattr__(settings, "workspace", "dome")  # as where types are not checked
-    with pytest.raises(ValueError, match="workspace is 'dome'; it must be one of own, cone, sphere: give"):
-        settings.__post_init__()
-
-
 @pytest.mark.parametrize(
     "options, sentences",
     [
@@ -99,12 +85,6 @@ def test_unknown_and_contradictory_options_are_refused_before_anything_is_writte
     assert not list(tmp_path.iterdir())
 
 
-def looks(scene: Scene, settings: GenerateConfig, count: int) -> np.ndarray:
-    """Unit vectors from the object to random cameras."""
-    poses = [sample_view(scene, settings, example_rng(1, index)).T_world_camera for index in range(count)]
-    return np.stack([-pose[:3, 2] for pose in poses])
-
-
 def test_a_scene_has_its_own_workspace_a_cone_and_the_sphere() -> None:
     """Where it has no cone of its own, the paper's."""
     scene = replace(toy_scene(), workspace=NARROW)
@@ -116,23 +96,6 @@ def test_a_scene_has_its_own_workspace_a_cone_and_the_sphere() -> None:
     expected = asdict(ALL_AROUND) | {"aperture_rad": PAPER_APERTURE_RAD, "any_roll": False}
     assert asdict(scene.workspace_named("cone")) == expected
     assert replace(scene, cone=NARROW).workspace_named("cone") is NARROW
-
-
-def test_cameras_are_where_the_settings_say() -> None:
-    scene = replace(toy_scene(), workspace=NARROW)
-    assert looks(scene, SMALL, 20)[:, 1].min() > np.cos(0.25) - 1e-9
-    around = looks(scene, replace(SMALL, workspace="sphere"), 20)
-    assert np.abs(around).max() > 0.8 and (around < -0.3).any(axis=0).all() and (around > 0.3).any(axis=0).all()
-
-
-def test_the_bunny_is_seen_from_all_around_or_from_above(require_asset: Callable[[str], Path]) -> None:
-    require_asset("bunny/bunny.off")
-    bunny = load_scene("bunny")
-    own, sphere = looks(bunny, SMALL, 10), looks(bunny, replace(SMALL, workspace="sphere"), 10)
-    assert np.array_equal(own, sphere) and own[:, 1].min() < -0.3
-    above = looks(bunny, replace(SMALL, workspace="cone"), 10)
-    up = np.mean([bunny.rest.segments[k].vertices.mean(axis=0) for k in (2, 3)], axis=0)[1]  # the ears are on top
-    assert up > bunny.rest.segments[0].vertices.mean(axis=0)[1] and above[:, 1].min() > np.cos(np.deg2rad(70)) - 1e-9
 
 
 @pytest.mark.parametrize(
@@ -156,12 +119,6 @@ def test_the_manifest_states_the_settings_and_resuming_needs_the_same(
     generate(scene, tmp_path / "data", settings, examples=2, seed=3, resume=True)
     with pytest.raises(ValueError, match=f"was made with {other}"):
         generate(scene, tmp_path / "data", SMALL, examples=2, seed=3, resume=True)
-
-
-def test_settings_say_nothing_of_the_scenes_own_workspace() -> None:
-    """So manifests, and the keys of datasets made of them, are as they were before there was a choice."""
-    assert "workspace" not in SMALL.stated() and "observations" not in SMALL.stated()
-    assert replace(SMALL, workspace="sphere").stated() == SMALL.stated() | {"workspace": "sphere"}
 
 
 def test_evaluation_looks_through_the_sensor_from_the_workspace_and_says_so(

@@ -9,12 +9,11 @@ from shapes import ball, box, one, segment
 from toy_scene import toy_scene
 
 from mereo.geometry.camera import Camera
-from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.solids import Hits, Solids, first_hits
+from mereo.geometry.solids import Solids
 from mereo.scenes.seeds import example_rng
-from mereo.synthesis.clutter import BACKGROUND, NOTHING, OBJECT, OCCLUDER, Backdrop, Capsule, Surroundings
-from mereo.synthesis.config import SENSORS, GenerateConfig, SamplingConfig, SensorConfig
+from mereo.synthesis.clutter import BACKGROUND, NOTHING, OBJECT, OCCLUDER, Capsule
+from mereo.synthesis.config import GenerateConfig, SamplingConfig, SensorConfig
 from mereo.synthesis.depth_sensor import SimulatedView, observe
 from mereo.synthesis.examples import sample_view, synthesize
 
@@ -27,10 +26,6 @@ PAIR = Solids(SegmentedMesh((ball((-5, 0, 150), 15.0), box((12, -15, 140), (30, 
 
 def look(seed: int, solids: Solids = PAIR, **terms: float) -> SimulatedView:
     return observe(solids, CAMERA, 0.0, replace(OFF, **terms), np.random.default_rng(seed))
-
-
-def settings(**terms: float) -> GenerateConfig:
-    return GenerateConfig(sampling=SamplingConfig(per_segment=16), sensor=replace(OFF, **terms))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -70,24 +65,12 @@ BOXES = [
 
 
 @pytest.mark.parametrize("part", [ball((-38, 30, 130), 14.0), ball((0, 0, 10), 14.0), *BOXES])
-def test_rays_that_are_left_out_would_have_missed(part: Segment) -> None:
+def test_rays_that_are_left_out_would_have_missed(part: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same bits as with all rays, for segments in any part of the image, at its border and around the camera."""
-    solid = Solids(one(part))._solids[0]
-    rows, found = first_hits(solid.rays, solid.center, RAYS)
-    culled_rows, culled = solid.first_hit(RAYS)
-    assert len(rows) > 50
-    assert np.array_equal(rows, culled_rows) and np.array_equal(found.distance, culled.distance)
-
-
-def test_what_the_object_hit_stays_what_it_was() -> None:
-    """Joining makes new hits, so that those of the object alone can still be asked for."""
-    alone = PAIR.first_hit(RAYS)
-    kept = Hits(*(part.copy() for part in alone))
-    around = Surroundings((Capsule(np.array([0.0, 0, 60]), np.array([30.0, 0, 60]), 5.0),), Backdrop(RAYS[0], 200.0))
-    first, source = around.join(alone, RAYS)
-    assert {OBJECT, OCCLUDER, BACKGROUND} == set(source)
-    assert all(np.array_equal(now, then) for now, then in zip(alone, kept, strict=True))
-    assert np.array_equal(first.distance == alone.distance, source == OBJECT)
+    culled = Solids(one(part)).first_hit(RAYS).distance
+    monkeypatch.setattr("mereo.geometry.solids.toward", lambda directions, low, high: np.arange(len(directions)))
+    found = Solids(one(part)).first_hit(RAYS).distance
+    assert np.isfinite(found).sum() > 50 and np.array_equal(found, culled)
 
 
 @pytest.mark.parametrize("term", ["tool", "hand"])
@@ -104,18 +87,6 @@ def test_occluders_are_in_front_hide_the_object_and_come_from_outside(term: str)
         edge = np.concatenate([occluder[0], occluder[-1], occluder[:, 0], occluder[:, -1]])
         borders += bool(edge.any())
     assert np.mean(np.array(hidden) > 0) > 0.9 and np.mean(hidden) > 10 and borders >= 38
-
-
-def test_occluders_appear_as_often_as_asked_and_a_hand_has_the_size_of_a_hand() -> None:
-    """Seen side on it is 7 to 12 cm wide, forearm included never wider than 25."""
-    appeared = [(look(seed, tool=0.3).source == OCCLUDER).any() for seed in range(120)]
-    assert abs(np.mean(appeared) - 0.3) < 5 * np.sqrt(0.21 / 120)
-    for seed in range(20):
-        seen = look(seed, hand=1.0)
-        points = seen.whole.depth[..., None] * CAMERA.directions()
-        hand = points[seen.source == OCCLUDER] * OFF.metres_per_unit
-        widths = np.sort(np.sqrt(np.linalg.eigvalsh(np.cov(hand.T))))
-        assert 0.012 < widths[1] < 0.06
 
 
 def test_a_background_is_behind_everything_and_outside_a_true_mask() -> None:
@@ -151,21 +122,6 @@ def test_a_wrong_mask_lets_background_and_tools_in_and_loses_the_object() -> Non
     assert sum(bool((seen.image.valid & (seen.source == OCCLUDER)).any()) for seen in stray) > 10
 
 
-@pytest.mark.parametrize("name", SENSORS)
-def test_examples_can_be_made_again_and_their_queries_are_exact(name: str) -> None:
-    """The cloud is what the sensor spoils: state, camera and labelled queries are those of the paper's sensor."""
-    config = replace(settings(), sensor=SENSORS[name])  # type: ignore[index]
-    first, again = (synthesize(SCENE, config, example_rng(5, 7)) for _ in range(2))
-    assert np.array_equal(first.cloud, again.cloud)
-    assert np.array_equal(first.queries.positions, again.queries.positions)
-    clean = synthesize(SCENE, settings(), example_rng(5, 7))
-    assert np.array_equal(first.queries.labels, clean.queries.labels)
-    assert np.allclose(
-        first.normalizer.invert(first.queries.positions), clean.normalizer.invert(clean.queries.positions), atol=1e-9
-    )
-    assert name == "paper" or not np.array_equal(first.cloud[:50], clean.cloud[:50])
-
-
 def test_the_paper_makes_the_examples_it_always_made() -> None:
     """Values from before there were other sensors, within the single precision of rays: 4e-7 of an image's sum."""
     config = GenerateConfig(image_size=48, points=128, sampling=SamplingConfig(per_segment=16))
@@ -174,14 +130,3 @@ def test_the_paper_makes_the_examples_it_always_made() -> None:
     assert example.normalizer.scale == pytest.approx(0.0489688726, rel=1e-6)
     assert np.allclose(example.cloud[1], [-0.9883676, -0.23809237, 0.19280505], atol=1e-5)
     assert np.allclose(example.queries.positions[0], [-0.70238803, 0.09261255, 0.62152631], atol=1e-5)
-
-
-def test_every_view_shows_enough_of_the_object_or_the_sensor_is_named() -> None:
-    """With most of it hidden in most views, strays do not count."""
-    config = settings(holes=3.0, hole_radius_m=0.06, hand=1.0, background=1.0, mask_offset_px=1.5)
-    for index in range(8):
-        view = sample_view(SCENE, config, example_rng(6, index))
-        near = Solids(view.mesh).nearest(view.depth.to_points().points).distance < 1.0
-        assert near.sum() >= MIN_POINTS
-    with pytest.raises(ValueError, match="'toy' showed fewer than 32 .*, or weaken the sensor's errors"):
-        sample_view(SCENE, settings(holes=50.0, hole_radius_m=1.0), example_rng(0, 0))

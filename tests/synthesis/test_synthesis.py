@@ -7,7 +7,7 @@ from toy_scene import rest_mesh, sample_deformations, toy_scene
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.geometry.transforms import transform_points
 from mereo.scenes.scene import Scene, Workspace
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig, SamplingConfig
@@ -90,24 +90,6 @@ def test_rest_coordinates_lead_back_to_the_query_and_lie_in_the_same_segment_at_
     # faces are flat before and after, the map between them is not: only points beside a face may change sides
     clear = solids.nearest(rest).distance > 0.1
     assert np.array_equal(solids.label(rest[clear]), queries.labels[inside][clear])
-
-
-def test_the_mesh_of_a_view_is_the_state_seen_from_the_camera() -> None:
-    view = sample_view(SCENE, SETTINGS, example_rng(2, 0))
-    back = view.mesh.transformed(view.T_world_camera)
-    for part, rest, deformation in zip(back.segments, SCENE.rest.segments, view.deformations, strict=True):
-        assert np.allclose(part.vertices, deformation(rest.vertices))
-    camera_in_camera = transform_points(inverse_rigid(view.T_world_camera), view.T_world_camera[None, :3, 3])
-    assert np.allclose(camera_in_camera, 0, atol=1e-9)
-
-
-def test_noise_moves_points_along_their_rays_only_and_large_clouds_are_thinned() -> None:
-    clean = sample_view(SCENE, GenerateConfig(noise_std=0.0), example_rng(3, 1)).depth
-    noisy = sample_view(SCENE, GenerateConfig(noise_std=0.1), example_rng(3, 1)).depth
-    assert np.array_equal(clean.valid, noisy.valid)
-    assert 0.09 < (noisy.depth - clean.depth)[clean.valid].std() < 0.11
-    example, _ = example_and_view(0, GenerateConfig(points=100, sampling=SETTINGS.sampling))
-    assert len(example.cloud) == 100
 
 
 def test_views_that_see_too_little_are_drawn_again_and_a_scene_out_of_sight_is_named() -> None:

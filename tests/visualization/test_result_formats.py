@@ -123,7 +123,7 @@ def test_a_missing_extra_is_said_before_the_work(
     monkeypatch.setitem(sys.modules, "nibabel", None)
     arguments = ["reconstruct", "absent.ply", "--weights", "rope", "--output", str(tmp_path / "o"), "--formats", "all"]
     assert main(arguments) == 2
-    assert "nibabel is needed to write NIfTI files: pip install 'mereo[medical]'" in capsys.readouterr().err
+    assert "NIfTI needs nibabel, which is not installed: pip install 'mereo[medical]'" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 

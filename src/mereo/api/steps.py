@@ -20,8 +20,7 @@ from mereo.io.object_storage import ObjectPath, place_of
 from mereo.models.config import EXACT, Device, InferenceConfig
 from mereo.models.export.onnx_export import export_weights
 from mereo.models.model import Model
-from mereo.models.remote import settings_for
-from mereo.models.weights import load_for
+from mereo.models.weights import load_for, settings_for
 from mereo.models.weights_place import WEIGHTS
 from mereo.workers.spread import choose_cluster
 from mereo_learning import learn as learning

@@ -96,7 +96,7 @@ class ReconstructCommand:
 
         cluster, inference = choose_cluster(self.ray, self.threads, self.task), self.inference
         if cluster is not None and self.weights is not None:
-            from mereo.models.remote import settings_for
+            from mereo.models.weights import settings_for
 
             inference = settings_for(inference, cluster)
         job = FrameJob(self, inference)

@@ -331,7 +331,7 @@ class _Answering:
         """The job with its weights on the task's device, moved there once."""
         if self.job.object.network is None or not self.gpu:
             return self.job
-        from mereo.models.remote import to_gpu
+        from mereo.models.weights import to_gpu
 
         return self.job.asking(to_gpu(self.job.object.network))
 
@@ -361,7 +361,7 @@ def _answer_in_tasks(
 ) -> Iterator[tuple[Path, Callable[[], Summary]]]:
     """Answer frames in tasks of a cluster; yields each as it is there, in any order."""
     if job.object.network is not None:
-        from mereo.models.remote import to_cpu
+        from mereo.models.weights import to_cpu
 
         job = job.asking(to_cpu(job.object.network, cluster))
     if job.registrar is not None:

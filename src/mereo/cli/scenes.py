@@ -3,11 +3,12 @@
 import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
 from mereo.cli.options import AssetNames, MeshUnits, ObjectFiles, SceneName
+from mereo.geometry.conventions import Way
 from mereo.io.bounds import Aperture, CountOrNone, States
 from mereo.synthesis.config import SENSORS, Sensor, SequenceConfig
 
@@ -52,7 +53,7 @@ class SceneNew:
     output: Path | None = None
     units: MeshUnits = None
     aperture: Aperture = 360.0
-    deformations: Literal["auto", "rigid", "soft", "stiff", "articulated"] = "auto"
+    deformations: Way = "auto"
 
     def run(self) -> None:
         """Write the scene file, and print what was found and what to do next."""

@@ -35,7 +35,7 @@ from mereo.fitting.tracking import SynchronousExecutor, Tracker
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import owned_centroids
-from mereo.io.atomic_files import atomic_file, check_place, remove_all_abandoned, to_json
+from mereo.io.atomic_files import atomic_file, check_place, remove_abandoned, to_json
 from mereo.io.config import InputConfig
 from mereo.io.errors import is_foreseen, words_of
 from mereo.io.readers import CLOUD_READERS, DEPTH_READERS
@@ -520,7 +520,7 @@ class SurfaceFolder:
         check_place(path, may_be_link=True)
         if path.exists() and not path.is_dir():
             raise FileExistsError(f"{path} is a file; surfaces are written into a folder: choose another --surfaces")
-        remove_all_abandoned(path)
+        remove_abandoned(path)
         if path.is_dir() and any(path.iterdir()) and not force:
             raise FileExistsError(
                 f"{path} exists and is not empty; nothing in it is overwritten: choose another --surfaces or pass "

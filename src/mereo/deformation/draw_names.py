@@ -30,12 +30,9 @@ class DrawName:
 
 
 class NamedGenerator(np.random.Generator):
-    """Generator that is told what its next draw is called.
+    """Generator that is told what its next draw is called, and of which parts, the outermost first.
 
-    Attributes:
-        parts: those whose numbers are being drawn, the outermost first.
-        next_name: name and unit of the next draw.
-        checked: whether states that the scene would refuse are to be refused, see ``unchecked``.
+    ``checked`` is whether states that the scene would refuse are to be refused, see ``unchecked``.
     """
 
     parts: tuple[str, ...] = ()
@@ -51,10 +48,8 @@ class NamedGenerator(np.random.Generator):
 def named(rng: np.random.Generator, name: str | tuple[str, ...], unit: str = "") -> np.random.Generator:
     """Generator ``rng`` itself, told what the numbers of its next draw are called.
 
-    Args:
-        rng: any generator.
-        name: of all numbers of the draw, or of each of them in C order.
-        unit: of the numbers as they are drawn: "rad", "°", "mm", "log" for a factor's logarithm, "" for shares.
+    ``name`` is that of all numbers, or of each of them in C order; ``unit`` as they are drawn is "rad", "°", "mm",
+    "log" for a factor's logarithm, "" for shares.
     """
     if isinstance(rng, NamedGenerator):
         rng.next_name = (name, unit)

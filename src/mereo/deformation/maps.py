@@ -16,14 +16,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-STEP = 1e-6
-"""Step of finite differences, of the coordinates' magnitude: they err by 1e-6 in truncation, 1e-10 in rounding."""
+STEP, TOLERANCE = 1e-6, 1e-7
+"""Step of finite differences, which err by 1e-6 in truncation, 1e-10 in rounding, and tolerance at which Newton's
+iteration is done, both of the coordinates' magnitude."""
 
-TOLERANCE = 1e-7
-"""Tolerance, of the coordinates' magnitude: where Newton's iteration is done."""
-
-ITERATIONS = 30
-LEAST_DETERMINANT = 0.02
+ITERATIONS, LEAST_DETERMINANT = 30, 0.02
 
 
 @runtime_checkable
@@ -68,8 +65,7 @@ class Rigid:
     @cached_property
     def _matrix(self) -> Float[np.ndarray, "3 3"]:
         """Turn as a matrix, made once: a chain of joints asks each for all links behind it."""
-        matrix: np.ndarray = Rotation.from_rotvec(self.rotation_vector).as_matrix()
-        return matrix
+        return np.asarray(Rotation.from_rotvec(self.rotation_vector).as_matrix())
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,8 +105,15 @@ class Localized:
                 "grow outwards: enlarge outer_radius"
             )
         ticks = np.linspace(-self.outer_radius, self.outer_radius, self.samples)
-        grid = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3)
-        check_positive(self, self.center + grid)
+        points = self.center + np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+        determinant = jacobian_determinant(self, points)
+        worst = int(np.argmin(determinant))
+        if not determinant[worst] >= LEAST_DETERMINANT:
+            raise ValueError(
+                f"the deformation Localized scales volume by {determinant[worst]:.3g} at "
+                f"{np.round(points[worst], 3).tolist()}; it must be at least {LEAST_DETERMINANT:g} or space folds "
+                "over: make its displacement smaller or its transition wider"
+            )
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Points after the part of ``inner`` that reaches them."""
@@ -177,33 +180,13 @@ def jacobian_determinant(deformation: Deformation, points: Float[np.ndarray, "n 
     return np.linalg.det(jacobian(deformation, points)[1])
 
 
-def check_positive(
-    deformation: Deformation, points: Float[np.ndarray, "n 3"], least: float = LEAST_DETERMINANT
-) -> None:
-    """Raise ``ValueError`` naming the worst point unless the Jacobian's determinant is at least ``least`` at all."""
-    determinant = jacobian_determinant(deformation, points)
-    worst = int(np.argmin(determinant))
-    if not determinant[worst] >= least:
-        raise ValueError(
-            f"the deformation {type(deformation).__name__} scales volume by {determinant[worst]:.3g} at "
-            f"{np.round(points[worst], 3).tolist()}; it must be at least {least:g} or space folds over: "
-            "make its displacement smaller or its transition wider"
-        )
-
-
 def invert(
     deformation: Deformation, points: Float[np.ndarray, "n 3"], guess: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
     """Rest points whose image is ``points``: by the deformation itself where it is ``Invertible``, else by ``newton``.
 
-    Args:
-        deformation: the map to be undone.
-        points: deformed positions.
-        guess: starting rest positions, for example the rest position of the nearest deformed vertex.
-
-    Returns:
-        Rest points, and for each whether its image lies within ``TOLERANCE`` of the coordinates' magnitude.
-        Where it does not, the best position found.
+    It starts at ``guess``, for example the rest positions of the nearest deformed vertices. Returns also for each
+    whether its image lies within ``TOLERANCE`` of the coordinates' magnitude; elsewhere it is the best position found.
     """
     if isinstance(deformation, Invertible):
         return deformation.rest_points(points, guess)

@@ -22,11 +22,8 @@ ANCHORS = 200
 """Surface vertices of each segment that points may follow, spread evenly: the nearest of all lie on one small patch,
 from which the other side is extrapolated (errors up to 6 units in the bunny, 0.8 with these)."""
 
-FOLLOWED = 32
-"""Material points that one point follows."""
-
-SOFTENING = 0.05
-"""Softening length, of the segment's size: material points nearer than this count alike."""
+FOLLOWED, SOFTENING = 32, 0.05
+"""Material points that one point follows; nearer than the softening length, of the segment's size, they count alike."""
 
 RIDGE = 1e-6
 """Keeps the normal equations regular where all material points lie in a plane."""
@@ -54,12 +51,7 @@ class PointWeights:
 
 @dataclass(frozen=True, eq=False)
 class Anchors:
-    """Material points of one segment that others follow.
-
-    Attributes:
-        index: which of the object's material points they are.
-        position: their positions, in any state.
-    """
+    """Material points of one segment that others follow, by their index among the object's, and where they are."""
 
     index: Int[np.ndarray, " a"]
     position: Float[np.ndarray, "a 3"]

@@ -5,8 +5,7 @@ therefore comes before the one that carries it. A map that depends on where the 
 thickness, a push on its surface) is drawn for the points as the maps before it have left them.
 
 Every map that can be drawn has a positive Jacobian throughout the object: each is bounded by its own rule, and maps one
-after the other multiply. Only a bend's bound depends on the maps before it, which may have moved the object away from
-its axis: the angle is drawn from what that leaves of its range. Lengths are in scene units, angles in radians.
+after the other multiply. Lengths are in scene units, angles in radians.
 """
 
 from collections.abc import Callable, Sequence
@@ -168,11 +167,7 @@ class PushSampler:
 
 @dataclass(frozen=True, eq=False)
 class RandomMotion:
-    """Random deformations of a scene file: steps one after the other, each for some segments.
-
-    Attributes:
-        rest: the segments at rest.
-        steps: samplers, and the indices of the segments that it moves.
+    """Random deformations of a scene file: samplers one after the other, each for the segments of some indices.
 
     Segments with the same steps share one map and so stay in contact.
     """
@@ -211,10 +206,8 @@ def _surface(
     rest: SegmentedMesh, chains: Sequence[tuple[Deformation, ...]], members: Sequence[int]
 ) -> tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 3"]]:
     """Vertices of segments after their maps so far, and their normals."""
-    moved = []
-    for index in members:
-        segment = rest.segments[index]
-        moved.append(replace(segment, vertices=Compose(chains[index])(segment.vertices)))
+    parts = [(rest.segments[index], Compose(chains[index])) for index in members]
+    moved = [replace(segment, vertices=chain(segment.vertices)) for segment, chain in parts]
     return np.concatenate([s.vertices for s in moved]), np.concatenate([vertex_normals(s) for s in moved])
 
 

@@ -25,11 +25,7 @@ from mereo.geometry.read_only import read_only, read_only_view
 
 
 class Tetrahedra:
-    """Tetrahedral mesh at rest with its search trees, which all of its states share.
-
-    Args:
-        nodes: positions, any unit.
-        elements: four node indices each, in either orientation.
+    """Tetrahedral mesh at rest, in either orientation, with its search trees, which all of its states share.
 
     Raises ``ValueError`` for NaN, indices that do not exist, and tetrahedra without volume.
     """
@@ -38,7 +34,8 @@ class Tetrahedra:
         if len(elements) == 0:
             raise ValueError("there are no tetrahedra; at least one is needed: export the volume mesh")
         if not np.isfinite(nodes).all():
-            raise ValueError(f"rest node {_first(~np.isfinite(nodes).all(axis=1))} is not finite: export it again")
+            bad = np.argmin(np.isfinite(nodes).all(axis=1))
+            raise ValueError(f"rest node {bad} is not finite: export it again")
         if elements.min() < 0 or elements.max() >= len(nodes):
             raise ValueError(
                 f"a tetrahedron refers to node {int(elements.max() if elements.min() >= 0 else elements.min())}, but "
@@ -51,7 +48,7 @@ class Tetrahedra:
         size = float(np.ptp(self.nodes, axis=0).max())
         if (flat := np.abs(self.volumes) <= 1e-12 * size**3).any():
             raise ValueError(
-                f"tetrahedron {_first(flat)} has no volume at rest; it must have some: remove it from the mesh"
+                f"tetrahedron {np.argmax(flat)} has no volume at rest; it must have some: remove it from the mesh"
             )
         self._rest_inverse = np.linalg.inv(edges)
 
@@ -96,8 +93,7 @@ class Tetrahedra:
 
     def node_gradients(self, gradients: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "n 3 3"]:
         """Gradients averaged at nodes, which makes them continuous over the surface."""
-        mean: np.ndarray = self._node_mean @ gradients.reshape(-1, 9)
-        return mean.reshape(-1, 3, 3)
+        return np.reshape(self._node_mean @ gradients.reshape(-1, 9), (-1, 3, 3))
 
     def locate(self, points: Float[np.ndarray, "p 3"]) -> Int[np.ndarray, " p"]:
         """Tetrahedron around each point at rest, -1 outside."""
@@ -114,9 +110,8 @@ class Tetrahedra:
         corners, outer, _ = self.closest(points[beyond])
         place = np.concatenate([np.repeat(rows, 4), np.repeat(beyond, 3)])
         nodes = np.concatenate([self.elements[tetrahedra].ravel(), corners.ravel()])
-        return coo_array(
-            (np.concatenate([weights.ravel(), outer.ravel()]), (place, nodes)), (len(points), len(self.nodes))
-        ).tocsr()
+        entries = np.concatenate([weights.ravel(), outer.ravel()])
+        return coo_array((entries, (place, nodes)), (len(points), len(self.nodes))).tocsr()
 
     def closest(
         self, points: Float[np.ndarray, "p 3"]
@@ -129,15 +124,11 @@ class Tetrahedra:
 
 @dataclass(frozen=True, eq=False)
 class TetrahedralMap:
-    """Map of space that one state of a tetrahedral mesh gives; satisfies ``Deformation`` and ``Invertible``.
+    """Map of space that one state of a tetrahedral mesh gives, its deformed ``nodes``; it is ``Invertible``.
 
     Inside the mesh it is piecewise affine, so the Jacobian's determinant is a tetrahedron's ratio of volumes. Outside
     it goes on from the closest surface point c along the gradient averaged there, ``f(p) = f(c) + A(c) (p - c)``: a
     continuous map as far as c is continuous, that is nearer to the mesh than the mesh is to itself.
-
-    Attributes:
-        rest: the mesh at rest.
-        nodes: its deformed node positions.
     """
 
     rest: Tetrahedra
@@ -216,19 +207,12 @@ def _apply(matrix: Float[np.ndarray, "p 3 3"], vector: Float[np.ndarray, "p 3"])
     return np.einsum("pij,pj->pi", matrix, vector)
 
 
-def _first(mask: Bool[np.ndarray, " n"]) -> int:
-    return int(np.argmax(mask))
-
-
 # --- driven by a surface ----------------------------------------------------------------------------------------------
 
-# Maps of space given by a moving surface alone: exact on it, estimated inside.
-#
 # A surface says nothing about its interior; many motions of the inside agree with it. This one is the biharmonic spline
 # (the radial function ``r`` in three dimensions, Duchon 1977; as in Carr et al., SIGGRAPH 2001) through a spread of the
 # surface's vertices, which bends as little as it can and is exact for affine motions. What it misses at the other
-# vertices is carried inwards from the closest surface point and fades out. How far that is from an elastic solid is
-# measured in docs/design/0008-simulated-states.md.
+# vertices is carried inwards from the closest surface point and fades out (docs/design/0008-simulated-states.md).
 #
 # Notation: f(p) = s(p) + w(|p - c|) e(c), with the spline s, the closest surface point c, the spline's error e there
 # (interpolated over the triangle), and a weight w from 1 at the surface to 0 at ``reach``.
@@ -260,10 +244,10 @@ class Surface:
         return _tree(self.vertices, self.faces)
 
     @cached_property
-    def _solver(self) -> Float[np.ndarray, "k c"]:
-        """From values at the controls to the spline's coefficients: of r at each control, and of 1, x, y, z."""
+    def solver(self) -> Float[np.ndarray, "k c"]:
+        """Matrix from values at the controls to the spline's coefficients: of r at each control, and of 1, x, y, z."""
         count = len(self.controls)
-        basis = self._basis(self.vertices[self.controls])
+        basis = self.basis(self.vertices[self.controls])
         system = np.zeros((count + 4, count + 4))
         system[:count] = basis
         system[count:, :count] = basis[:, count:].T
@@ -272,20 +256,13 @@ class Surface:
     @cached_property
     def vertex_basis(self) -> Float[np.ndarray, "v k"]:
         """Basis of the spline at all vertices at rest."""
-        return read_only(self._basis(self.vertices))
+        return read_only(self.basis(self.vertices))
 
-    def _basis(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p k"]:
+    def basis(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p k"]:
+        """Values of the spline's functions at points at rest."""
         local = points - self.center
         radial = cdist(points, self.vertices[self.controls])
         return np.concatenate([radial, np.ones((len(points), 1)), local], axis=1)
-
-    def coefficients(self, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "k 3"]:
-        """Coefficients of the spline that takes the controls to where they are in ``vertices``."""
-        return self._solver @ vertices[self.controls]
-
-    def spline(self, coefficients: Float[np.ndarray, "k 3"], points: Float[np.ndarray, "p 3"]) -> np.ndarray:
-        """Values [p, 3] of a spline at points."""
-        return self._basis(points) @ coefficients
 
     def carry(self, values: Float[np.ndarray, "v 3"], points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
         """Values at vertices taken from the closest surface point, fading with its distance."""
@@ -300,19 +277,14 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceMap:
-    """Map of space that one state of a surface gives; satisfies ``Deformation``.
-
-    Attributes:
-        rest: the surface at rest.
-        vertices: its deformed vertices, which the map meets exactly.
-    """
+    """Map of space that one state of a surface gives, whose deformed ``vertices`` it meets exactly."""
 
     rest: Surface
     vertices: Float[np.ndarray, "v 3"]
 
     @cached_property
     def _coefficients(self) -> Float[np.ndarray, "k 3"]:
-        return self.rest.coefficients(self.vertices)
+        return self.rest.solver @ self.vertices[self.rest.controls]
 
     @cached_property
     def _error(self) -> Float[np.ndarray, "v 3"]:
@@ -320,4 +292,4 @@ class SurfaceMap:
 
     def __call__(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
         """Images of points: exact on the surface, estimated inside."""
-        return self.rest.spline(self._coefficients, points) + self.rest.carry(self._error, points)
+        return self.rest.basis(points) @ self._coefficients + self.rest.carry(self._error, points)

@@ -127,10 +127,7 @@ class SmoothField:
     The displacement's gradient has norm at most ``g = sum_k |a_k| |b_k|``. For g < 1, which is required, the map is a
     diffeomorphism of all space: distances change by a factor in [1 - g, 1 + g].
 
-    Attributes:
-        amplitudes: a, in length.
-        frequencies: b, in radians per length.
-        phases: c.
+    Amplitudes a are lengths, frequencies b radians per length, phases c radians.
     """
 
     amplitudes: Float[np.ndarray, "k 3"]
@@ -174,10 +171,7 @@ class FreeFormLattice:
     Each component of a control point's displacement must stay below ``spacing / 2.48``, under which the map is
     injective with a positive Jacobian (Choi & Lee 2000).
 
-    Attributes:
-        origin: position of control point (0, 0, 0).
-        spacing: distance between control points along x, y, z.
-        displacements: of the control points, in length.
+    ``origin`` is the position of control point (0, 0, 0), ``spacing`` that between them along x, y, z.
     """
 
     origin: Float[np.ndarray, "3"]
@@ -219,11 +213,8 @@ class CurveSweep:
     """Sweep of the x axis onto a curve: ``(x, y, z) -> c(x) + y n(x) + z b(x)``; straight beyond its ends.
 
     The Jacobian is the curve's speed times one minus curvature times the offset towards the centre of curvature:
-    positive within ``radius`` of the axis while curvature times radius is below one. Make it with ``through``.
-
-    Attributes:
-        curve: arc length -> centre c, normal n, binormal b as nine numbers.
-        ends: arc length of both ends.
+    positive within ``radius`` of the axis while curvature times radius is below one. Make it with ``through``; its
+    curve goes from arc length, between that of both ends, to c, n and b as nine numbers.
     """
 
     curve: CubicSpline
@@ -237,15 +228,10 @@ class CurveSweep:
         normal: Float[np.ndarray, "3"],
         radius: float,
     ) -> "CurveSweep":
-        """Sweep onto a smooth curve, its frame free of twist.
+        """Sweep onto the cubic spline through ``centers`` at ascending arc lengths, its frame free of twist.
 
-        Args:
-            nodes: ascending arc lengths at which the curve is given.
-            centers: the curve's points there; between them it is a cubic spline.
-            normal: direction of the y axis at the start; its part along the curve is dropped.
-            radius: largest distance from the axis of anything to be moved.
-
-        Raises ``ValueError`` where the curvature times ``radius`` reaches one.
+        The y axis starts along ``normal``, whose part along the curve is dropped. Raises ``ValueError`` where the
+        curvature times ``radius``, the largest distance from the axis of anything to be moved, reaches one.
         """
         spline = CubicSpline(nodes, centers)
         velocity, acceleration = spline(nodes, 1), spline(nodes, 2)

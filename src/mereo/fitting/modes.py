@@ -86,23 +86,20 @@ def find_candidates(problem: Problem, best: Posed, number: int) -> list[Posed]:
     """Find two other states that may explain the frame: screen by few points, refine a little, screen again."""
     coarse, sigma = problem.coarse, REFINE_SIGMA * problem.model.half
     library = similar_states(problem, best, 12) + (states_like_network(problem, 2) if number == 0 else [])
-    screened = [
-        group[index]
-        for group in (library, problem.joints.others(best, 4))
-        for index in np.argsort([coarse.screen(other, sigma).total for other in group])[:8]
-    ]
+    screened = list[Posed]()
+    for group in (library, problem.joints.others(best, 4)):
+        screened += sorted(group, key=lambda other: coarse.screen(other, sigma).total)[:8]
     # those that differ from ``best`` and from all before them: from alike starts a fit ends alike
     drawn = [best, *(refine(coarse, other, 2.0, 4) for other in screened)]
     rows = diverse_rows(corner_positions(problem.model, drawn), ALIKE * problem.model.half, largest_distance)[1:]
-    order = np.argsort([problem.screen(drawn[row], sigma).total for row in rows])
-    return [drawn[rows[index]] for index in order[:2]]
+    return sorted((drawn[row] for row in rows), key=lambda other: problem.screen(other, sigma).total)[:2]
 
 
 def fit_whole(problem: Problem) -> Posed:
     """Fit stages 1 and 2 from the mean state, under the prior of all states."""
     prior = Prior.whole(problem.model)
     z = np.zeros(problem.model.count)
-    T = robust_rigid(problem.unposed(z), problem.network.target, problem.network.confidence, problem.network_sigma)
+    T = robust_rigid(problem.network.mean, problem.network.target, problem.network.confidence, problem.network_sigma)
     return fit_wide(problem, fit_network(problem, Posed(T[:3, :3], T[:3, 3], z), prior))
 
 
@@ -143,11 +140,8 @@ def fit_cloud(problem: Problem, posed: Posed, prior: Prior, start: float, steps:
 
 # --- states of the library from which a fit may start -----------------------------------------------------------------
 
-SEARCHED = 700
-"""States of the library that are compared with a fit or the network's correspondences."""
-
-FEWER = 64
-"""Correspondences, and material points, that rank them."""
+SEARCHED, FEWER = 700, 64
+"""States of the library that are compared, and correspondences or material points that rank them."""
 
 ALIKE = 0.03
 """Tolerance, of half the rest box's longest side: points nearer than this agree."""
@@ -192,8 +186,7 @@ def states_like_network(problem: Problem, count: int) -> list[Posed]:
 def similar_states(problem: Problem, posed: Posed, count: int) -> list[Posed]:
     """Return states of the library that agree with a fit in most points and differ from each other in the rest.
 
-    A wheel that is seen on one side only may be half a turn off, or a finger taken for the other: everything else is
-    right already.
+    A wheel that is seen on one side only may be half a turn off, or a finger taken for the other.
     """
     model = problem.model
     goal = model.material(posed.z)[model.sparse].astype(np.float32)
@@ -211,10 +204,8 @@ def similar_states(problem: Problem, posed: Posed, count: int) -> list[Posed]:
 
 # --- the object at rest -----------------------------------------------------------------------------------------------
 
-# The object at rest: the hypothesis that nothing is bent, compared with the modes by its evidence.
-#
-# Modes can imitate noise, so their misfit is always lower; a hypothesis with fewer free numbers is right when the
-# difference is smaller than what that freedom buys. By Laplace's approximation (MacKay, Neural Computation 1992) that
+# Modes can imitate noise, so their misfit is always lower; the hypothesis that nothing is bent is right when the
+# difference is smaller than what their freedom buys. By Laplace's approximation (MacKay, Neural Computation 1992) that
 # is the logarithm of how much the frame narrows the coefficients, ``log det`` of their posterior precision, as the
 # prior is N(0, 1) each.
 
@@ -225,8 +216,7 @@ def fit_rest(problem: Problem, correspondences: Correspondences, modes: Posed) -
     T = fit_rigid(model.rest_points, modes.place(model.material(modes.z)))
     start = Posed(T[:3, :3], T[:3, 3], np.empty(0), modes.log_scale)
     prior = Prior(np.empty(0), np.empty((0, 0)))
-    posed = fit_cloud(rest, start, prior, REFINE_SIGMA, 10, 0.0)
-    return ScoredFit.of(rest, posed)
+    return ScoredFit.of(rest, fit_cloud(rest, start, prior, REFINE_SIGMA, 10, 0.0))
 
 
 def of_rest(problem: Problem, correspondences: Correspondences) -> Problem:
@@ -243,8 +233,7 @@ def is_at_rest(problem: Problem, modes: ScoredFit, rest: ScoredFit) -> bool:
 
 def narrowing(problem: Problem, modes: Posed) -> float:
     """``NormalEquations.narrowing`` of the modes at a state."""
-    config = problem.config
-    known = problem.known(modes, Prior.whole(problem.model), 0.0)
+    known, config = problem.known(modes, Prior.whole(problem.model), 0.0), problem.config
     return problem.seen(known, modes, config.cloud_sigma, config.network_weight[1], True).narrowing()
 
 
@@ -260,12 +249,8 @@ NetworkFit = tuple[Problem, Correspondences, ScoredFit]
 def as_noisy(start: NetworkFit, points: Float[np.ndarray, "n 3"], predict: PredictCorrespondences | None) -> NetworkFit:
     """Fit a noisy frame once more where what the second fit leaves over is noise; else return the first fit.
 
-    The second fit decides, since noise throws the first off by more than it is itself.
-
-    Args:
-        start: the frame, taken for a clean one.
-        points: its cloud, scene units.
-        predict: the network, which also sees the smoothed cloud.
+    The second fit decides, since noise throws the first off by more than it is itself. The network also sees the
+    smoothed cloud. ``points`` are in scene units.
     """
     problem, correspondences, modes = start
     noisy = problem.as_noisy_as(modes.surface)
@@ -280,9 +265,8 @@ def as_noisy(start: NetworkFit, points: Float[np.ndarray, "n 3"], predict: Predi
 
 # --- the camera turned ------------------------------------------------------------------------------------------------
 
-# A camera that turns about its own centre sees the same points along the same lines of sight, so the correspondences
-# may only turn along with it. A network's do so where it recognizes what it sees; where it does not, each turn gives
-# another guess, and the fit decides which is right.
+# Correspondences should turn along with a camera that turns about its centre. A network's do so where it recognizes
+# what it sees; where it does not, each turn gives another guess, and the fit decides which is right.
 
 ROLL = np.pi / 4
 """Angle between two turns about the line of sight to the object, rad."""
@@ -303,12 +287,7 @@ def turns(axis: Float[np.ndarray, "3"]) -> Iterator[Float[np.ndarray, "3 3"]]:
 
 
 def with_turned_camera(start: NetworkFit, predict: PredictCorrespondences | None) -> NetworkFit:
-    """Return a fit, or where it leaves much unexplained the best of it and of fits with the camera turned.
-
-    Args:
-        start: the fit to the frame as it is.
-        predict: the network, in scene units.
-    """
+    """Return a fit, or where it leaves much unexplained the best of it and of fits with the camera turned."""
     problem, _, modes = start
     if predict is None or not problem.config.turned or not problem.wants_turns(modes.misfit.cloud, modes.surface):
         return start
@@ -317,7 +296,10 @@ def with_turned_camera(start: NetworkFit, predict: PredictCorrespondences | None
     while rotations := list(islice(waiting, 8)):
         predicted = [predict(points @ turn.T).turned(turn.T) for turn in rotations]
         frames = [(problem.with_network(correspondences), correspondences) for correspondences in predicted]
-        costs = [_coarse_misfit(frame) for frame, _ in frames]
+        costs = list[float]()
+        for frame, _ in frames:
+            posed = refine(frame.coarse, fit_whole(frame.coarse), 2.0, 4)
+            costs.append(frame.screen(posed, frame.config.cloud_sigma).without_network)
         for index in np.argsort(costs)[:2]:
             frame, correspondences = frames[index]
             modes = ScoredFit.of(frame, refine(frame, fit_whole(frame)))
@@ -326,9 +308,3 @@ def with_turned_camera(start: NetworkFit, predict: PredictCorrespondences | None
         if best[2].misfit.cloud < best[0].config.unexplained or (anyway and best[0].leaves_noise(best[2].surface)):
             break
     return best if best is start else (best[0], best[1], explored(best[0], best[2]))
-
-
-def _coarse_misfit(problem: Problem) -> float:
-    """Misfit, without the network's term, of a fit by few points."""
-    posed = refine(problem.coarse, fit_whole(problem.coarse), 2.0, 4)
-    return problem.screen(posed, problem.config.cloud_sigma).without_network

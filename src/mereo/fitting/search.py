@@ -37,10 +37,8 @@ from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
 
 def clipped(position: Float32[np.ndarray, "n w d"], count: int) -> Int32[np.ndarray, "n w d"]:
     """Index of a cell along each axis, of ``count``: that at the border for what lies beyond, or nowhere."""
-    index: Int32[np.ndarray, "n w d"] = np.fmax(np.fmin(position, np.float32(count - 1)), np.float32(0)).astype(
-        np.int32
-    )
-    return index
+    index: np.ndarray = np.fmax(np.fmin(position, np.float32(count - 1)), np.float32(0))
+    return index.astype(np.int32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +48,7 @@ class SightTable:
     Attributes:
         T: rotation into the axes of the table, whose third is the direction of the cloud.
         low, cell: corner of the table and length of a cell, as slopes across the direction.
-        toward: unit vector of the nearest line of sight to each cell that met the object, or of which nothing is known.
-        front: distance before which it is free.
-        free: distance up to which a cell beside these is free; negative where it is not beside.
+        toward, front, free: ``Evidence.along`` the cells.
         pitch: angle between neighbouring lines of sight.
     """
 
@@ -78,16 +74,8 @@ class SightTable:
         across = corner + (np.stack(np.meshgrid(*(np.arange(cells) + 0.5,) * 2, indexing="ij"), -1)) * side / cells
         sight = np.concatenate([across.reshape(-1, 2), np.ones((cells * cells, 1))], axis=1) @ T
         sight /= np.linalg.norm(sight, axis=1, keepdims=True)
-        toward, front, free = evidence.along(sight)
-        return cls(
-            T.astype(np.float32),
-            corner.astype(np.float32),
-            side / cells,
-            toward.astype(np.float32),
-            front.astype(np.float32),
-            free.astype(np.float32),
-            evidence.pitch,
-        )
+        T, corner, *along = (part.astype(np.float32) for part in (T, corner, *evidence.along(sight)))
+        return cls(T, corner, side / cells, *along, evidence.pitch)
 
     def violations(
         self, position: Float32[np.ndarray, "n w 3"], slack: float
@@ -121,11 +109,9 @@ CELLS = 32
 
 @dataclass(frozen=True, eq=False)
 class ShapeTables:
-    """Tables of some states, model frame.
+    """Tables of some states, with their coefficients and samples, model frame.
 
     Attributes:
-        z: coefficients of each state.
-        position, normal: of its samples.
         low, cell: corner of each table's box, and the length of a cell.
         nearest: index of the sample nearest to the centre of each cell.
     """
@@ -150,12 +136,8 @@ class ShapeTables:
         cell = (high - low).max(axis=1) / CELLS
         low = (low + high - CELLS * cell[:, None]) / 2
         steps = np.stack(np.meshgrid(*(np.arange(CELLS, dtype=np.float32) + 0.5,) * 3, indexing="ij"), axis=-1)
-        nearest = [
-            cKDTree(position[i], balanced_tree=False, compact_nodes=False).query(
-                low[i] + cell[i] * steps.reshape(-1, 3)
-            )[1]
-            for i in range(len(z))
-        ]
+        trees = (cKDTree(samples, balanced_tree=False, compact_nodes=False) for samples in position)
+        nearest = [tree.query(low[i] + cell[i] * steps.reshape(-1, 3))[1] for i, tree in enumerate(trees)]
         return cls(z, position, normal.reshape(position.shape), low, cell, np.stack(nearest).astype(np.int32))
 
 
@@ -168,8 +150,7 @@ def medoids(model: StatisticalModel, count: int) -> Int[np.ndarray, " q"]:
     sizes = np.bincount(owner, minlength=count)
     order = np.argsort(-sizes, kind="stable")[: np.count_nonzero(sizes)]
     distance = ((shape[None] - center[order, None]) ** 2).sum(axis=2)
-    rows: Int[np.ndarray, " q"] = np.unique(distance.argmin(axis=1))
-    return rows
+    return np.unique(distance.argmin(axis=1))
 
 
 @lru_cache(maxsize=4)
@@ -197,13 +178,7 @@ FARTHEST = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Many poses of states, with their costs.
-
-    Attributes:
-        state: row of each one's state in the tables.
-        rotation, translation, log_scale: of the similarity into the camera frame.
-        cost: of each, as last computed.
-    """
+    """Many poses of states, given by rows of the tables, with their costs as last computed."""
 
     state: Int[np.ndarray, " n"]
     rotation: Float32[np.ndarray, "n 3 3"]
@@ -231,15 +206,12 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class Screen:
-    """What poses are compared with.
+    """What poses are compared with: some observed points, evenly spread, and what the frame rules out.
 
     Attributes:
-        tables: of the states.
-        points: some of the observed ones, evenly spread.
-        sight: what the frame rules out.
         half: half the object's length.
         scaled: whether the scale is unknown.
-        in_part: whether something may hide a part of the object.
+        in_part: whether something may hide a part of the object, or nothing is known beside it.
     """
 
     tables: ShapeTables
@@ -253,7 +225,8 @@ class Screen:
     def of(cls, tables: ShapeTables, evidence: Evidence, half: float, scaled: bool = False) -> "Screen":
         """Screen of a frame."""
         points, sight = evidence.observed_samples[:POINTS].astype(np.float32), SightTable.of(evidence)
-        return cls(tables, points, sight, half, scaled, evidence.may_be_cut)
+        in_part = evidence.other_lines == "unknown" or len(evidence.sight.data) > len(evidence.points)
+        return cls(tables, points, sight, half, scaled, in_part)
 
     def starts(self, rotations: Float[np.ndarray, "r 3 3"]) -> Poses:
         """Every state at every rotation, its visible side on the cloud; where ``scaled``, as large as the cloud.
@@ -267,11 +240,10 @@ class Screen:
         visible = np.maximum(-(self.tables.normal @ toward), 0.0)  # q s r
         parts = [visible]
         if self.in_part:
+            total = np.maximum(visible.sum(axis=1, keepdims=True), 1e-9)
             for axis in rotation_along(ahead)[:, :2].T.astype(np.float32):
                 across = self.tables.position @ (rotations.transpose(0, 2, 1) @ axis).T
-                middle = (across * visible).sum(axis=1, keepdims=True) / np.maximum(
-                    visible.sum(axis=1, keepdims=True), 1e-9
-                )
+                middle = (across * visible).sum(axis=1, keepdims=True) / total
                 parts += [np.where(across > middle, visible, 0.0), np.where(across <= middle, visible, 0.0)]
         return Poses.of_all([self._on_cloud(part, rotations, ahead) for part in parts])
 
@@ -298,16 +270,11 @@ class Screen:
         none = np.full(len(state), np.inf, dtype=np.float32)
         return Poses(state, rotation, (center - shift).astype(np.float32), log_scale, none)
 
-    def aligned(self, poses: Poses, sigma: float) -> Poses:
-        """Poses after a rigid step, with the costs that they had before; ``sigma`` is a share of ``half``."""
-        return self._in_blocks(poses, sigma, True)
+    def scored(self, poses: Poses, sigma: float, moves: bool = False) -> Poses:
+        """Poses with their costs for a sigma in shares of ``half``, after a rigid step from there if it ``moves`` them.
 
-    def scored(self, poses: Poses, sigma: float) -> Poses:
-        """Poses with their costs for a sigma in shares of ``half``."""
-        return self._in_blocks(poses, sigma, False)
-
-    def _in_blocks(self, poses: Poses, sigma: float, moves: bool) -> Poses:
-        """``_step`` of blocks that fit a core's cache, on all cores."""
+        In blocks that fit a core's cache, on all cores.
+        """
         blocks = [poses.rows(np.arange(first, min(first + BLOCK, len(poses)))) for first in range(0, len(poses), BLOCK)]
         with ThreadPoolExecutor(cores()) as pool:
             return Poses.of_all(list(pool.map(lambda block: self._step(block, sigma * self.half, moves), blocks)))
@@ -337,14 +304,9 @@ class Screen:
         rows = np.concatenate([np.cross(seen, normal), normal, -np.einsum("npi,npi->np", seen, normal)[..., None]], 2)
         toward = np.matmul(direction, poses.rotation)  # in the model's frame, where a sample moves the other way
         pull = -np.concatenate([np.cross(few, toward), toward, -np.einsum("nwi,nwi->nw", few, toward)[..., None]], 2)
-        rows, residual, weight = (
-            np.concatenate(parts, axis=1)
-            for parts in (
-                (rows, pull),
-                (np.einsum("npi,npi->np", offset, normal), -amount / size[..., 0]),
-                (weight, np.where(amount > 0, weight_outside, 0.0)),
-            )
-        )
+        residual = np.einsum("npi,npi->np", offset, normal), -amount / size[..., 0]
+        parts = (rows, pull), residual, (weight, np.where(amount > 0, weight_outside, 0.0))
+        rows, residual, weight = (np.concatenate(part, axis=1) for part in parts)
         matrix, gradient = _normal_equations(rows, residual, weight)
         # with planes alone, poses far away would slide past each other
         near, pulled = _along(seen, offset, 0.2 * weight[:, : len(self.points)])
@@ -402,8 +364,7 @@ class SearchRound:
     Attributes:
         states: medoids of the library that are tried; 0 tries the mean state.
         rotations: tried with each of them.
-        bent: candidates that are bent towards the frame by few points.
-        fitted: how many of these are fitted at most.
+        bent, fitted: candidates that are bent towards the frame by few points, and of these fitted at most.
     """
 
     states: int
@@ -431,41 +392,30 @@ BENDING = ((0.12, 5, 0.05), (0.05, 8, 0.02))
 """First sigma, steps, and the sigma of the choice, of the two stages in which few points bend a candidate."""
 
 RIVAL = 1.5
-"""Misfit by few points, in misfits of the best, up to which a candidate may still be as good.
-
-Of 65 candidates with more, of 25 training views that others explain, none ended lower by a cloud's misfit of .01."""
+"""Misfit by few points, in misfits of the best, up to which a candidate may still be as good."""
 
 ALIKE = 0.05
 """Difference of the cloud's misfit up to which two states explain a frame alike."""
 
 HEAVY, HEAVIER_STEPS, HELPS = 3000.0, (0.04, 12), 0.65
 """Weight of a cloud that an elastic solid explains only under it, the first sigma and the steps of the fit with it, and
-the share of the misfit which must be left.
-
-Bends of a bunny's ears leave .45 to .54; states of livers and tumours .77 to .9, a real deformed liver .93."""
+the share of the misfit that may be left: bends of a bunny's ears leave .45 to .54, states of livers .77 up."""
 
 WHOLE = 150.0
-"""Misfit by which an object that is seen whole may be explained worse than one that something hides in part.
-
-The silhouette only adds to the misfit, so the hypothesis without it has a lower one: by more than this on 4 of 40 whole
-training views, and on all of 40 of which 30 % are hidden."""
+"""Misfit by which an object that is seen whole may be explained worse than one that something hides in part: it is on
+36 of 40 whole training views, and on none of 40 of which 30 % are hidden."""
 
 
 @dataclass(frozen=True, eq=False)
 class SearchOutcome:
-    """Outcome of a search.
+    """Outcome of a search: the frame with the constants of its noise, and the candidate that explains it best.
 
-    Attributes:
-        problem: the frame, with the constants of its noise.
-        best: the candidate that explains the frame best.
-        alike: number of candidates that explain it alike and differ from each other, the best included.
-        tried: number of candidates that were fitted.
+    ``alike`` candidates explain it alike and differ from each other, the best included.
     """
 
     problem: Problem
     best: ScoredFit
     alike: int
-    tried: int
 
 
 def rotations(count: int) -> Float[np.ndarray, "n 3 3"]:
@@ -474,13 +424,12 @@ def rotations(count: int) -> Float[np.ndarray, "n 3 3"]:
     inner, outer = np.sqrt(step / count), np.sqrt(1 - step / count)
     first, second = 2 * np.pi * step / np.sqrt(2), 2 * np.pi * step / 1.533751168755204288118041
     spiral = (inner * np.sin(first), inner * np.cos(first), outer * np.sin(second), outer * np.cos(second))
-    matrices: Float[np.ndarray, "n 3 3"] = Rotation.from_quat(np.stack(spiral, axis=1)).as_matrix()
-    return matrices
+    return Rotation.from_quat(np.stack(spiral, axis=1)).as_matrix()
 
 
 @dataclass(eq=False)
 class _Trail:
-    """Search under one hypothesis on the lines of sight beside the cloud, as far as it has come."""
+    """Search under one hypothesis on the lines of sight beside the cloud."""
 
     problem: Problem
     handicap: float = 0.0
@@ -494,19 +443,21 @@ class _Trail:
     def is_explained(self) -> bool:
         return self.best.explains(self.problem)
 
-    def begin(self, start: Posed) -> None:
-        """Fit from a pose that is known roughly, and not by a search."""
-        self.fitted.append(refined(self.problem, fit_wide(self.problem, start)))
-
     def go_on(self, stage: SearchRound) -> None:
-        self.fitted += fit_candidates(self.problem, candidates(self.problem, stage), stage.fitted)
+        """Fit the candidates of a round that may be the best, and explore from there."""
+        found, fitted = candidates(self.problem, stage), list[ScoredFit]()
+        for cost, posed in found[: stage.fitted]:
+            if fitted and cost > RIVAL * found[0][0] and min(fitted, key=_total).explains(self.problem):
+                break
+            fitted.append(refined(self.problem, fit_wide(self.problem, posed)))
+        self.fitted += fitted
         if not self.is_explained:
             self.fitted.append(explored(self.problem, self.best))
 
     def with_heavier_cloud(self) -> "_Trail | None":
         """The same with a cloud that is worth more, where the prior of an elastic solid keeps it from being explained.
 
-        Where more weight hardly helps, the object moves in ways that the modes do not have, and the prior is right.
+        Where that hardly helps, the object moves in ways that the modes do not have, and the prior is right.
         """
         problem, best = self.problem, self.best
         if not problem.model.is_normal or self.is_explained:
@@ -539,22 +490,19 @@ class _Trail:
         best = self.best
         rivals = [scored for scored in self.fitted if scored.misfit.cloud < best.misfit.cloud + ALIKE]
         alike = differing(self.problem, [scored.posed for scored in sorted(rivals, key=_total)], APART)
-        return SearchOutcome(self.problem, best, len(alike), len(self.fitted))
+        return SearchOutcome(self.problem, best, len(alike))
 
 
 def search(whole: Problem, partial: Problem | None = None, start: Posed | None = None) -> SearchOutcome:
-    """Search for the state that explains a frame, or fit it from a state that is known.
+    """Search for the state that explains a frame without correspondences, or fit it from ``start``.
 
-    Args:
-        whole: the frame, without correspondences.
-        partial: the same where it is open whether the object is seen whole: with nothing known beside the cloud. It is
-            taken where it explains the frame better by more than ``WHOLE``.
-        start: from which both are fitted instead of a search.
+    ``partial`` is the same where it is open whether the object is seen whole: with nothing known beside the cloud. It
+    is taken where it explains the frame better by more than ``WHOLE``.
     """
     trails = [_Trail(whole)] if partial is None else [_Trail(whole), _Trail(partial, WHOLE)]
     if start is not None:
         for trail in trails:
-            trail.begin(start)
+            trail.fitted.append(refined(trail.problem, fit_wide(trail.problem, start)))
         chosen = min(trails, key=lambda trail: trail.best.misfit.total + trail.handicap)
         return (chosen.with_heavier_cloud() or chosen.as_noisy() or chosen).outcome()
     for number, stage in enumerate(ROUNDS[: whole.config.search_rounds]):
@@ -578,16 +526,6 @@ def search(whole: Problem, partial: Problem | None = None, start: Posed | None =
 
 def _total(scored: ScoredFit) -> float:
     return scored.misfit.total
-
-
-def fit_candidates(problem: Problem, candidates: list[tuple[float, Posed]], most: int) -> list[ScoredFit]:
-    """Fit the candidates that may be the best, given with their misfits by few points, the lowest first."""
-    fitted: list[ScoredFit] = []
-    for cost, posed in candidates[:most]:
-        if fitted and cost > RIVAL * candidates[0][0] and min(fitted, key=_total).explains(problem):
-            break
-        fitted.append(refined(problem, fit_wide(problem, posed)))
-    return fitted
 
 
 def candidates(problem: Problem, stage: SearchRound) -> list[tuple[float, Posed]]:
@@ -615,19 +553,15 @@ def screen_poses(problem: Problem, stage: SearchRound) -> list[Posed]:
     screen = Screen.of(tables, problem.evidence, problem.model.half, problem.is_scale_open)
     poses = screen.starts(rotations(stage.rotations))
     for sigma, share in SIGMAS:
-        poses = screen.aligned(poses, sigma)
+        poses = screen.scored(poses, sigma, moves=True)
         count = max(round(share * len(poses)), 2 * stage.bent)
         poses = poses if count >= len(poses) else poses.rows(np.argpartition(poses.cost, count)[:count])
     poses = screen.scored(poses, SIGMAS[-1][0])
     poses = poses.rows(np.argsort(poses.cost))
     positions = poses.place(tables.position[poses.state, ::16])
-    return [
-        _posed(screen, poses, row)
-        for row in diverse_rows(positions, APART * problem.model.half, rms_distance)[: stage.bent]
-    ]
-
-
-def _posed(screen: Screen, poses: Poses, row: int) -> Posed:
-    z = screen.tables.z[poses.state[row]].astype(np.float64)
-    rotation = Rotation.from_matrix(poses.rotation[row]).as_matrix()
-    return Posed(rotation, poses.translation[row].astype(np.float64), z, float(poses.log_scale[row]))
+    states = list[Posed]()
+    for row in diverse_rows(positions, APART * problem.model.half, rms_distance)[: stage.bent]:
+        rotation, z = Rotation.from_matrix(poses.rotation[row]).as_matrix(), tables.z[poses.state[row]]
+        translation, log_scale = poses.translation[row].astype(np.float64), float(poses.log_scale[row])
+        states.append(Posed(rotation, translation, z.astype(np.float64), log_scale))
+    return states

@@ -2,17 +2,18 @@
 
     Observation, time -Tracker.follow-> Answer (found, followed or lost)
 
-What can be seen of a lost object: few points lie near where it was expected, the model explains fewer of them than it
-must, or the frame rules out much of it. Then, and at first, a network fits the frame by itself, as `mereo reconstruct`
-does, and the better of both is continued. Where that explains nothing, or there is no network, the answer says that
-the object is lost, and a search goes on in the background; its state, fitted to the newest frame, begins a new track.
+An object is lost where few points lie near where it was expected, the model explains fewer of them than it must, or the
+frame rules out much of it. Then, and at first, a network fits the frame by itself, and the better of both is continued.
+Where that explains nothing, or there is no network, the answer says so, and a search goes on in the background; its
+state, fitted to the newest frame, begins a new track.
 """
 
 import time
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -53,14 +54,12 @@ class Track:
         problem: of that frame, without correspondences: the model, and constants by the frame's noise.
         unit: length of a scene unit in the clouds' unit.
         posed: the state, scene units, without a scale.
-        time_s: of the frame.
         velocity: of the parameters, in the order of ``gauss_newton``, a second.
         unsure: how far the velocity may be off because little is known yet, scene units per second.
         noise: of the frames, smoothed, scene units.
         clean: constants of frames without noise; ``problem`` has those for ``noise``.
         other_lines: kind of the lines of sight of which a frame says nothing, as it was when the track began.
         area: greatest area of the object that was seen (``seen_area``).
-        calibration: as ``ModesFit`` has it.
     """
 
     problem: Problem
@@ -76,23 +75,24 @@ class Track:
     calibration: Calibration | None = None
 
     @classmethod
-    def of(
-        cls,
-        fitted: ModesFit,
-        time_s: float,
-        config: TrackConfig,
-        clean: FitConfig = FitConfig(),  # noqa: B008 (frozen)
-    ) -> "Track":
+    def of(cls, fitted: ModesFit, time_s: float, config: TrackConfig, clean: FitConfig) -> "Track":
         """Track that begins with a frame's own fit."""
         posed, scale = without_scale(fitted.posed)
         base, model = fitted.problem, fitted.problem.model
         scale_std = config.scale_std if base.is_scale_open else KNOWN_SCALE_STD
-        problem = replace(base, network=NetworkTerm.none(model), scale_std=scale_std)
-        share_surfaces(base, problem)
-        still, noise = np.zeros(POSE + model.count), fitted.problem.residual_noise(fitted.surface)
-        unit, unsure, seen = fitted.unit * scale, config.first_speed, base.evidence
-        area, kind = seen_area(seen), seen.other_lines
-        return cls(problem, unit, posed, time_s, still, unsure, noise, clean, kind, area, fitted.calibration)
+        return cls(
+            problem=changed(base, network=NetworkTerm.none(model), scale_std=scale_std),
+            unit=fitted.unit * scale,
+            posed=posed,
+            time_s=time_s,
+            velocity=np.zeros(POSE + model.count),
+            unsure=config.first_speed,
+            noise=base.residual_noise(fitted.surface),
+            clean=clean,
+            other_lines=base.evidence.other_lines,
+            area=seen_area(base.evidence),
+            calibration=fitted.calibration,
+        )
 
     def expected(self, time_s: float, config: TrackConfig) -> Posed:
         """State that is expected at a time."""
@@ -106,11 +106,10 @@ class Track:
     def squared(self) -> Float[np.ndarray, "p p"]:
         """Mean square of a material point's way, as a form of the parameters' step."""
         model = self.problem.model
-        rows = model.sparse
-        modes = model.modes[rows]
-        position = self.posed.place(model.mean[rows] + modes @ self.posed.z.astype(np.float32))
+        modes = model.modes[model.sparse]
+        position = self.posed.place(model.mean[model.sparse] + modes @ self.posed.z.astype(np.float32))
         jacobian = in_space(self.posed, position, modes).astype(np.float64)
-        form: Float[np.ndarray, "p p"] = jacobian.T @ jacobian / len(rows)
+        form: Float[np.ndarray, "p p"] = jacobian.T @ jacobian / len(modes)
         return form
 
     @property
@@ -125,9 +124,11 @@ def without_scale(posed: Posed) -> tuple[Posed, float]:
     return replace(posed, translation=posed.translation / scale, log_scale=0.0), scale
 
 
-def share_surfaces(base: Problem, other: Problem) -> None:
-    """Give a problem of the same model what another has prepared of the model's surface."""
-    vars(other).update({"pairs": base.pairs, "samples": base.samples})
+def changed(problem: Problem, **changes: Any) -> Problem:
+    """A problem of the same model, with what this one has prepared of the model's surface."""
+    other = replace(problem, **changes)
+    vars(other).update({"pairs": problem.pairs, "samples": problem.samples})
+    return other
 
 
 def gated(track: Track, points: Float[np.ndarray, "n 3"], time_s: float, config: TrackConfig) -> Bool[np.ndarray, " n"]:
@@ -135,8 +136,7 @@ def gated(track: Track, points: Float[np.ndarray, "n 3"], time_s: float, config:
     samples = track.problem.samples.every(2)
     position = samples.posed(track.expected(time_s, config)).position
     most = config.gate * track.problem.model.half + samples.spacing
-    distance = cKDTree(position).query(points / track.unit, distance_upper_bound=most)[0]
-    return np.isfinite(distance)
+    return np.isfinite(cKDTree(position).query(points / track.unit, distance_upper_bound=most)[0])
 
 
 def next_fit(
@@ -149,28 +149,21 @@ def next_fit(
 ) -> tuple[ModesFit, Track]:
     """Fit the modes to a frame, and return the fit with the track that ends with it.
 
-    Args:
-        track: up to the frame before.
-        points: of the object, camera frame, the clouds' unit.
-        outliers: points that are none of it (``Evidence.of``).
-        time_s: of the frame.
-        config: constants.
-        lines: what is known of the lines of sight beside the points, in the same frame and unit. Where they leave it
-            open, the object is seen whole or in part as it was when the track began; where it was seen whole and the
-            frame rules that out by more than ``WHOLE``, it is fitted as seen in part too, and the better fit is taken.
+    Points, outliers and lines of sight are in the camera frame and the clouds' unit. Where ``lines`` leave it open, the
+    object is seen whole or in part as it was when the track began; where it was seen whole and the frame rules that out
+    by more than ``WHOLE``, it is fitted as seen in part too, and the better fit is taken.
     """
     started = time.perf_counter()
     with limit_blas_threads():
         few = means_along_sight(points / track.unit, config.points)
         start = track.expected(time_s, config)
-        expectation = Expectation.of(track, start, max(time_s - track.time_s, 0.0), config)
+        precision = motion_precision(track, max(time_s - track.time_s, 0.0), config)
 
         def fit(other_lines: SightKind) -> ModesFit:
             sight_lines = replace(lines.scaled(1 / track.unit), other_lines=other_lines)
             evidence = Evidence.of(few, outliers / track.unit, config.observed_samples, sight_lines)
-            problem = replace(track.problem, evidence=evidence)
-            share_surfaces(track.problem, problem)
-            posed = descend(problem, start, expectation, config)
+            problem = changed(track.problem, evidence=evidence)
+            posed = descend(problem, start, precision, config)
             return ModesFit(problem, nothing(), track.unit, posed, 0.0, calibration=track.calibration)
 
         fitted = fit(lines.other_lines or track.other_lines)
@@ -186,21 +179,17 @@ def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig)
     """Track with a further frame."""
     posed, scale = without_scale(fitted.posed)
     passed = max(time_s - track.time_s, 1e-3)
-    velocity = track.velocity + config.smoothing * (between(track.posed, posed) / passed - track.velocity)
-    unsure = track.unsure * (1 - config.smoothing)
     noise = track.noise + config.smoothing * (fitted.problem.residual_noise(fitted.surface) - track.noise)
-    problem = replace(fitted.problem, config=constants_for(noise, track.clean))
-    share_surfaces(fitted.problem, problem)
     return replace(
         track,
-        problem=problem,
+        problem=changed(fitted.problem, config=constants_for(noise, track.clean)),
         unit=track.unit * scale,
         posed=posed,
         time_s=time_s,
-        velocity=velocity,
-        unsure=unsure,
+        velocity=track.velocity + config.smoothing * (between(track.posed, posed) / passed - track.velocity),
+        unsure=track.unsure * (1 - config.smoothing),
         noise=noise,
-        area=max(track.area, seen_area(problem.evidence)),
+        area=max(track.area, seen_area(fitted.problem.evidence)),
     )
 
 
@@ -216,41 +205,25 @@ def between(first: Posed, second: Posed) -> Float[np.ndarray, " p"]:
     return np.concatenate([turn, second.translation - first.translation, scale, second.z - first.z])
 
 
-@dataclass(frozen=True, eq=False)
-class Expectation:
-    """Expectation of where material points are: a Gaussian of the parameters around a state.
-
-    Attributes:
-        state: the expected one.
-        precision: of the step from it.
-    """
-
-    state: Posed
-    precision: Float[np.ndarray, "p p"]
-
-    @classmethod
-    def of(cls, track: Track, state: Posed, passed_s: float, config: TrackConfig) -> "Expectation":
-        """Expectation after a time: each point is where ``state`` has it, up to its speeds times that."""
-        speed = config.speed + max(config.gain * max(track.speed - config.dead, 0.0), track.unsure)
-        # noisy frames weigh less, and a moving object must not lag behind for that
-        coarser = track.problem.config.cloud_sigma / track.clean.cloud_sigma
-        sigma = coarser * (speed * passed_s + config.least)
-        return cls(state, track.squared * (config.motion_weight / sigma**2))
-
-    def add_to(self, normal: NormalEquations, posed: Posed) -> NormalEquations:
-        """Sum with the squared distance from the expectation."""
-        gradient = self.precision @ between(self.state, posed)
-        return NormalEquations(normal.matrix + self.precision, normal.gradient + gradient)
+def motion_precision(track: Track, passed_s: float, config: TrackConfig) -> Float[np.ndarray, "p p"]:
+    """Precision of the parameters' step from the expected state: a point is there up to its speeds times the time."""
+    speed = config.speed + max(config.gain * max(track.speed - config.dead, 0.0), track.unsure)
+    # noisy frames weigh less, and a moving object must not lag behind for that
+    coarser = track.problem.config.cloud_sigma / track.clean.cloud_sigma
+    sigma = coarser * (speed * passed_s + config.least)
+    precision: Float[np.ndarray, "p p"] = track.squared * (config.motion_weight / sigma**2)
+    return precision
 
 
-def descend(problem: Problem, start: Posed, expectation: Expectation, config: TrackConfig) -> Posed:
-    """State that explains cloud, silhouette, prior and expectation, from nearby."""
+def descend(problem: Problem, start: Posed, precision: Float[np.ndarray, "p p"], config: TrackConfig) -> Posed:
+    """State that explains cloud, silhouette and prior from nearby, and lies near ``start``, which is expected."""
     constants, half = problem.config, problem.model.half
     prior = Prior.whole(problem.model)
     posed, steps = start, config.steps + config.exact_steps
     for step in range(steps):
         sigma = max(config.first_sigma * half * config.cooling**step, constants.cloud_sigma)
-        normal = expectation.add_to(problem.known(posed, prior, 0.0), posed)
+        expected = NormalEquations(precision, precision @ between(start, posed))
+        normal = problem.known(posed, prior, 0.0).plus(expected)
         normal = problem.seen(normal, posed, sigma, 0.0, exact=step >= config.steps)
         posed = posed.moved(normal.step(DAMPING))
     return posed
@@ -258,22 +231,14 @@ def descend(problem: Problem, start: Posed, expectation: Expectation, config: Tr
 
 # --- search in the background -----------------------------------------------------------------------------------------
 
-# TrackedFrame -BackgroundSearch.start-> (seconds later) -BackgroundSearch.take-> Searched
+# TrackedFrame -BackgroundSearch.start-> (seconds later) -BackgroundSearch.take-> Candidate
 #
-# A search takes a second to several, and frames come 30 times a second. NumPy lets go of the interpreter in most of a
-# search, so a thread is enough.
+# NumPy lets go of the interpreter in most of a search, so a thread is enough.
 
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
-    """Frame of a sequence, with what is known of it.
-
-    Attributes:
-        seen: the object in the frame.
-        time_s: of the frame.
-        scene_unit: length of a scene unit in the frame's unit, where it is known for certain.
-        keep_all: take every point for the object's.
-    """
+    """Frame of a sequence, with what is known of it: the arguments of ``Tracker.follow``."""
 
     seen: Observation
     time_s: Number
@@ -282,13 +247,6 @@ class TrackedFrame:
 
     def __post_init__(self) -> None:
         check_bounds(self)
-
-
-class Searched(NamedTuple):
-    """Frame in which a lost object was searched for, and its best candidate, which may not explain it."""
-
-    frame: TrackedFrame
-    candidate: Candidate
 
 
 class SynchronousExecutor(Executor):
@@ -317,47 +275,39 @@ class BackgroundSearch:
         # a newer frame is worth more than the last round, which takes as long as the two before and longer
         self.registrar = replace(registrar, constants=replace(registrar.config, search_rounds=2))
         self.executor = executor
-        self._thread: ThreadPoolExecutor | None = None
-        self._running: Future[Searched] | None = None
+        self._thread = ThreadPoolExecutor(1, "mereo-search")
+        self._running: tuple[TrackedFrame, Future[Candidate]] | None = None
 
     def start(self, frame: TrackedFrame) -> None:
         """Search a frame, unless one is being searched, or was and has not been taken."""
         if self._running is None:
-            if self.executor is None and self._thread is None:
-                self._thread = ThreadPoolExecutor(1, "mereo-search")
-            executor = self.executor or self._thread
-            assert executor is not None
-            self._running = executor.submit(_search, self.registrar, frame)
+            executor = self._thread if self.executor is None else self.executor
+            arguments = frame.seen, self.registrar, frame.keep_all, frame.scene_unit
+            self._running = frame, executor.submit(lambda: search_hypotheses(*arguments)[0])
 
-    def take(self) -> Searched | None:
-        """What the last search has found; None while it goes on, and where nothing was searched or could be.
+    def take(self) -> tuple[TrackedFrame, Candidate] | None:
+        """The searched frame and its best candidate, which may not explain it; None where there is none, or not yet.
 
         Raises what a search does, but for the ``ValueError`` of an unusable frame.
         """
-        if self._running is None or not self._running.done():
+        if self._running is None or not self._running[1].done():
             return None
-        ended, self._running = self._running, None
-        try:
-            return ended.result()
-        except ValueError:
-            return None
+        (frame, ended), self._running = self._running, None
+        with suppress(ValueError):
+            return frame, ended.result()
+        return None
 
     def drop(self) -> None:
         """Forget the frame that is being searched."""
         if self._running is not None:
-            self._running.cancel()
+            self._running[1].cancel()
             self._running = None
 
     def close(self, wait: bool) -> None:
-        """Forget it, and let its thread end with the search, which ``wait`` waits for."""
+        """Forget it, and let its thread end with the search, which ``wait`` waits for; the next has another thread."""
         self.drop()
-        if self._thread is not None:
-            self._thread.shutdown(wait, cancel_futures=True)
-            self._thread = None
-
-
-def _search(registrar: Registrar, frame: TrackedFrame) -> Searched:
-    return Searched(frame, search_hypotheses(frame.seen, registrar, frame.keep_all, frame.scene_unit)[0])
+        self._thread.shutdown(wait, cancel_futures=True)
+        self._thread = ThreadPoolExecutor(1, "mereo-search")
 
 
 # --- the tracker ------------------------------------------------------------------------------------------------------
@@ -465,12 +415,12 @@ class Tracker:
 
     def _searched(self, frame: TrackedFrame) -> "_Tracked | None":
         """Fit the frame from the state that a search has found in an earlier one; None where that explains none."""
-        searched = self._search.take()
-        if searched is None or searched.candidate.modes is None:
+        earlier, candidate = self._search.take() or (frame, None)
+        if candidate is None or candidate.modes is None:
             return None
         before = self._T_camera_input, self._axes
-        self._T_camera_input, self._axes = searched.candidate.encoded.T_camera_input, searched.frame.seen.frame.axes
-        begun = _Tracked.of_frame(searched.candidate, searched.frame.time_s, self.config, self.registrar.config)
+        self._T_camera_input, self._axes = candidate.encoded.T_camera_input, earlier.seen.frame.axes
+        begun = _Tracked.of_frame(candidate, earlier.time_s, self.config, self.registrar.config)
         area = 0.0 if self._track is None else self._track.area
         tracked, _ = self._tracked(replace(begun.track, area=max(area, begun.track.area)), frame, np.inf)
         if tracked is not None and self._takes(tracked):
@@ -487,18 +437,13 @@ class Tracker:
         seen, registrar, config = frame.seen, self.registrar, self.config
         candidate, likelier = find(seen, registrar.network, registrar, frame.keep_all, frame.scene_unit)
         must_register = registrar.method != "auto" or registrar.network is None
-        if candidate.modes is None and tracked is None and must_register:
-            assert candidate.error is not None
+        if candidate.error is not None and tracked is None and must_register:
             raise candidate.error
-        self._has_begun = True
-        alone = (
-            None if candidate.modes is None else _Tracked.of_frame(candidate, frame.time_s, config, registrar.config)
-        )
-        if (
-            tracked is not None
-            and self._takes(tracked)
-            and (alone is None or alone.score <= tracked.score + config.margin)
-        ):
+        self._has_begun, alone = True, None
+        if candidate.modes is not None:
+            alone = _Tracked.of_frame(candidate, frame.time_s, config, registrar.config)
+        is_better = tracked is not None and (alone is None or alone.score <= tracked.score + config.margin)
+        if tracked is not None and is_better and self._takes(tracked):
             return self._gone_on(frame, tracked, started, restart=True)
         if alone is None or not self._takes(alone):
             registration = None if alone is None else alone.registration

@@ -20,8 +20,8 @@ from scipy.special import chdtri
 from scipy.stats import norm
 
 from mereo.deformation.moving_least_squares import PointWeights
-from mereo.fitting.draws.problem import DrawsFit, DrawsProblem
-from mereo.fitting.draws.problem import terms as terms_of_draws
+from mereo.fitting.draws.fit import DrawsFit, DrawsProblem
+from mereo.fitting.draws.fit import terms as terms_of_draws
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, rigid_motion
 from mereo.fitting.problem.problem import Problem
 from mereo.fitting.problem.residuals import Prior, Surface, Terms
@@ -296,7 +296,7 @@ class DrawsOptimum:
         modes: Float32[np.ndarray, "m 3 d"] = (spread @ motion.reshape(len(motion), -1)).reshape(
             spread.shape[0], *motion.shape[1:]
         )
-        material: Float[np.ndarray, "m 3"] = self.fit.placed()
+        material: Float[np.ndarray, "m 3"] = self.fit.surface.material
         with limit_blas_threads():
             turns = turns_left_open(self.problem.base, material)
             return Posterior.of(self.terms.total, self.fit.posed, material, modes, open=turns)

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from mereo.geometry.brief import counted, sides
 from mereo.geometry.conventions import CloudAxes, check_real
 from mereo.geometry.read_only import read_only
-from mereo.geometry.transforms import Normalizer, rigid
+from mereo.geometry.transforms import Normalizer, rigid, transform_points
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ class SightLines:
 
     def transformed(self, T_new_old: Float[np.ndarray, "4 4"]) -> "SightLines":
         """Lines of sight in another frame, whose origin is the camera as well."""
-        past, unknown = (points @ T_new_old[:3, :3].T + T_new_old[:3, 3] for points in (self.past, self.unknown))
+        past, unknown = (transform_points(T_new_old, points) for points in (self.past, self.unknown))
         return SightLines(past, unknown, self.other_lines)
 
     def scaled(self, factor: float) -> "SightLines":
@@ -177,26 +177,20 @@ SCANNER_TO_CAMERA = read_only(np.diag([1.0, -1.0, -1.0]))
 """Half a turn about x: from a scanner's axes to a camera's, and back."""
 
 VIEW_DISTANCE = 8.5
-"""Assumed distance of a scanner, in half longest sides of the visible part: within the range of the training views.
-
-Anything from 7 to 16 gives the bunny's scans the same IoU to 0.002."""
-
-
-def scanner_to_camera(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4 4"]:
-    """Transform ``T_camera_scanner`` that turns a scan into a camera frame and puts it on the optical axis.
-
-    The network looks along lines of sight from the camera, but a scan does not say where the scanner stood; it is
-    assumed ``VIEW_DISTANCE`` away, in front of the middle of the cloud. Raises ``ValueError`` for a cloud without
-    extent.
-    """
-    normalizer = Normalizer.fit(points)
-    target = np.array([0.0, 0.0, VIEW_DISTANCE / normalizer.scale])
-    return rigid(SCANNER_TO_CAMERA, target - SCANNER_TO_CAMERA @ normalizer.center)
+"""Assumed distance of a scanner, in half longest sides of the visible part; 7 to 16 give the same IoU to 0.002."""
 
 
 def into_camera(points: Float[np.ndarray, "n 3"], frame: CloudAxes) -> Float[np.ndarray, "4 4"]:
-    """Transform ``T_camera_input`` of a cloud in either frame; see ``scanner_to_camera``."""
-    return scanner_to_camera(points) if frame == "scanner" else np.eye(4)
+    """Transform ``T_camera_input`` of a cloud in either frame: a scan is turned, and put on the optical axis.
+
+    The network looks along lines of sight from the camera, but a scan does not say where the scanner stood; it is
+    assumed ``VIEW_DISTANCE`` away, in front of the middle of the cloud. Raises ``ValueError`` for one without extent.
+    """
+    if frame == "camera":
+        return np.eye(4)
+    normalizer = Normalizer.fit(points)
+    target = np.array([0.0, 0.0, VIEW_DISTANCE / normalizer.scale])
+    return rigid(SCANNER_TO_CAMERA, target - SCANNER_TO_CAMERA @ normalizer.center)
 
 
 def camera_axes(frame: CloudAxes) -> Float[np.ndarray, "4 4"]:

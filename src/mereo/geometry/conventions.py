@@ -20,6 +20,10 @@ WorkspaceName = Literal["own", "cone", "sphere"]
 """Places where a virtual camera may be: as the scene states them, on one side of the object, or all around it."""
 
 
+Way = Literal["auto", "rigid", "soft", "stiff", "articulated"]
+"""How an object deforms: not at all, as a soft or a stiff elastic solid, by its joints, or as its meshes suggest."""
+
+
 UNITS_M: Mapping[str, float] = MappingProxyType({"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254})
 """Metres in each unit of length that files and options may name."""
 

@@ -49,10 +49,7 @@ def means_along_sight(points: Float[np.ndarray, "n 3"], limit: int) -> Float[np.
 
     Neighbours are seen from the origin within one cell of a grid of lines of sight, the smallest cells that suffice; a
     gap in range parts surfaces. So the noise of a dense cloud averages out, and no mean lies between two surfaces.
-
-    Args:
-        points: seen from the origin (camera frame), any unit, within 90 degrees of their middle.
-        limit: number of points, and about that of the cells.
+    ``points`` are seen from the origin (camera frame), in any unit, within 90 degrees of their middle.
     """
     if len(points) <= limit:
         return points
@@ -118,13 +115,7 @@ def farthest_point_order(
     with the smaller x, then y, then z, so the sequence of points does not depend on the order in which they came.
     Points that coincide with an earlier one come last.
 
-    Args:
-        points: finite, any unit.
-        count: how many rows are wanted.
-        start: the first row; by default the point farthest from the middle of the bounding box.
-
-    Returns:
-        Distinct rows of ``points``.
+    The rows are distinct; ``start`` is the first, by default the point farthest from the middle of the bounding box.
     """
     m = min(count, len(points))
     if m <= 0:
@@ -133,16 +124,11 @@ def farthest_point_order(
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     # about the middle, so that single precision is spent on the shape and not on where it is
     xyz = np.ascontiguousarray((points[rank] - middle).T, dtype=np.float32)
-    first = int((np.add.reduce(xyz * xyz, axis=0)).argmax() if start is None else np.flatnonzero(rank == start)[0])
-    return rank[_greedy(xyz, first, m)]
-
-
-def _greedy(xyz: Float[np.ndarray, "3 n"], first: int, m: int) -> Int[np.ndarray, " m"]:
-    """The loop; buffers are reused and every operation is one pass, because m passes over n points dominate."""
+    current = int(np.add.reduce(xyz * xyz, axis=0).argmax() if start is None else np.flatnonzero(rank == start)[0])
+    # buffers are reused and every operation is one pass, because m passes over n points dominate
     order = np.empty(m, dtype=np.int64)
     difference, square = np.empty_like(xyz), np.empty_like(xyz[0])
     distance = np.full(xyz.shape[1], np.inf, dtype=np.float32)
-    current = first
     for i in range(m):
         order[i] = current
         np.subtract(xyz, xyz[:, current : current + 1], out=difference)
@@ -151,4 +137,4 @@ def _greedy(xyz: Float[np.ndarray, "3 n"], first: int, m: int) -> Int[np.ndarray
         np.minimum(distance, square, out=distance)
         distance[current] = -1.0  # below any distance: a point is taken once, after its distinct rivals
         current = int(distance.argmax())
-    return order
+    return rank[order]

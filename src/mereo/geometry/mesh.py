@@ -8,10 +8,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from mereo.geometry.brief import counted, listed, sides
 from mereo.geometry.read_only import read_only_view
+from mereo.geometry.transforms import transform_points
 
 Color = tuple[int, int, int]
 """Red, green, blue in 0..255."""
@@ -74,13 +77,8 @@ class Segment:
 
     def edge_imbalance(self) -> tuple[int, int]:
         """Numbers of open and of misoriented edges: both zero exactly when the mesh is closed and oriented alike."""
-        directed = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
-        low, high = directed.min(axis=1), directed.max(axis=1)
-        key = low * (len(self.vertices) + 1) + high
-        _, inverse, uses = np.unique(key, return_inverse=True, return_counts=True)
-        winding = np.bincount(inverse, weights=np.where(directed[:, 0] == low, 1, -1), minlength=len(uses))
-        open_edges = uses % 2 == 1
-        return int(open_edges.sum()), int(((winding != 0) & ~open_edges).sum())
+        _, uses, unbalanced = edge_uses(self.faces)
+        return int((uses % 2 == 1).sum()), int((unbalanced & (uses % 2 == 0)).sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,8 +167,7 @@ class SegmentedMesh:
 
     def transformed(self, transform: Float[np.ndarray, "4 4"]) -> "SegmentedMesh":
         """Mesh with all vertices mapped by a homogeneous transform."""
-        rotation, translation = transform[:3, :3], transform[:3, 3]
-        return self.with_vertices([s.vertices @ rotation.T + translation for s in self.segments])
+        return self.with_vertices([transform_points(transform, segment.vertices) for segment in self.segments])
 
     def merged(self) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Int[np.ndarray, " f"]]:
         """All segments in one array: vertices, faces, and for each face the index of its segment."""
@@ -184,7 +181,6 @@ class SegmentedMesh:
         """Raise ``ValueError`` unless every segment is finite, closed, outward oriented and of positive volume.
 
         Of a segment that is marked as no solid, only finite vertices and existing indices are asked.
-        Overlap between segments needs inside tests, see ``mereo.geometry.mesh_check.overlaps``.
         """
         for segment in self.segments:
             check_segment(segment)
@@ -192,34 +188,50 @@ class SegmentedMesh:
 
 def check_segment(segment: Segment) -> None:
     """Raise ``ValueError`` naming the segment, the rule it breaks and the cure."""
-    name, faces, vertices = segment.name, segment.faces, segment.vertices
+    faces, count, fault = segment.faces, len(segment.vertices), ""
     if len(faces) == 0:
-        raise ValueError(f"segment {name!r} has no faces; it must be a closed mesh: check the exported part")
-    if not np.isfinite(vertices).all():
-        raise ValueError(f"segment {name!r} has NaN or infinite vertices; all must be finite: export the part again")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise ValueError(
-            f"segment {name!r} has a face that refers to vertex {int(faces.max())} of {len(vertices)}; "
-            "indices must exist: export the part again"
-        )
-    if not segment.solid:
-        return
-    open_edges, misoriented = segment.edge_imbalance()
-    if open_edges:
-        raise ValueError(
-            f"segment {name!r} has {open_edges} open edges; it must be closed: fill its holes "
-            "(for example trimesh.repair.fill_holes or MeshLab's 'Close Holes')"
-        )
-    if misoriented:
-        raise ValueError(
-            f"segment {name!r} has {misoriented} edges whose faces disagree in orientation; all faces must be "
-            "counter-clockwise from outside: fix the winding (for example trimesh.repair.fix_winding)"
-        )
-    if segment.volume <= 0:
-        raise ValueError(
-            f"segment {name!r} has volume {segment.volume:.4g}; it must be positive: its faces point inwards, "
-            "so reverse them (for example trimesh.repair.fix_inversion)"
-        )
+        fault = "no faces; it must be a closed mesh: check the exported part"
+    elif not np.isfinite(segment.vertices).all():
+        fault = "NaN or infinite vertices; all must be finite: export the part again"
+    elif faces.min() < 0 or faces.max() >= count:
+        fault = f"a face that refers to vertex {int(faces.max())} of {count}; indices must exist: export the part again"
+    elif segment.solid:
+        open_edges, misoriented = segment.edge_imbalance()
+        if open_edges:
+            fault = f"{open_edges} open edges; it must be closed: fill its holes (for example "
+            fault += "trimesh.repair.fill_holes or MeshLab's 'Close Holes')"
+        elif misoriented:
+            fault = f"{misoriented} edges whose faces disagree in orientation; all faces must be counter-clockwise "
+            fault += "from outside: fix the winding (for example trimesh.repair.fix_winding)"
+        elif segment.volume <= 0:
+            fault = f"volume {segment.volume:.4g}; it must be positive: its faces point inwards, so reverse them "
+            fault += "(for example trimesh.repair.fix_inversion)"
+    if fault:
+        raise ValueError(f"segment {segment.name!r} has {fault}")
+
+
+def edge_uses(
+    faces: Int[np.ndarray, "f 3"],
+) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, " e"], Bool[np.ndarray, " e"]]:
+    """Edges with their lower end first, how many faces each has, and whether these do not go there and back alike."""
+    directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+    size = int(directed.max(initial=0)) + 1
+    keys, edge, uses = np.unique(np.sort(directed, axis=1) @ [size, 1], return_inverse=True, return_counts=True)
+    forth = np.where(directed[:, 0] < directed[:, 1], 1, -1)
+    unbalanced = np.bincount(edge.ravel(), weights=forth, minlength=len(keys)) != 0
+    return np.stack(np.divmod(keys, size), axis=1), uses, unbalanced
+
+
+def area_vectors(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
+    """Normals of faces, each as long as twice the face's area."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return np.cross(b - a, c - a)
+
+
+def connected(pairs: Int[np.ndarray, "p 2"], count: int) -> Int[np.ndarray, " n"]:
+    """Number of the group of each of ``count`` things, of which pairs hang together."""
+    graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count))
+    return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
 def surface_points(
@@ -230,7 +242,7 @@ def surface_points(
     Vertices are not: a CAD program's are where a surface is round, none where it is flat.
     """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
-    area = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    area = np.cumsum(np.linalg.norm(area_vectors(vertices, faces), axis=1))
     face = np.searchsorted(area, (np.arange(count) + 0.5) / count * area[-1])
     u, v = np.random.default_rng(0).random((2, count, 1))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
@@ -249,8 +261,7 @@ def barycentric(triangles: Float[np.ndarray, "n 3 3"], points: Float[np.ndarray,
 
 def vertex_normals(segment: Segment) -> Float[np.ndarray, "v 3"]:
     """Unit normals of a segment's vertices, outward, weighted by the area of the faces around."""
-    a, b, c = (segment.vertices[segment.faces[:, k]] for k in range(3))
     normals = np.zeros_like(segment.vertices)
     for k in range(3):
-        np.add.at(normals, segment.faces[:, k], np.cross(b - a, c - a))
+        np.add.at(normals, segment.faces[:, k], area_vectors(segment.vertices, segment.faces))
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)

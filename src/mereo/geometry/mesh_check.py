@@ -1,43 +1,32 @@
 """What is wrong with a user's meshes: each segment by itself, and the volume that segments share."""
 
 from collections.abc import Collection
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
+from typing import NamedTuple
 
 import igl
 import manifold3d
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from mereo.geometry.brief import counted
-from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.mesh import Segment, SegmentedMesh, area_vectors, connected, edge_uses
 from mereo.geometry.solids import label_grid
 
 Vertices = Float[np.ndarray, "_ 3"]
 Faces = Int[np.ndarray, "_ 3"]
 
-MOST_BURIED = 5e-3
-"""Share of a segment's surface that may lie within itself, as lips and eyelids do: two rays are compared anyway."""
-
-MOST_BACKWARDS = 0.05
-"""Share of the surface that may face inwards before the winding number has no meaning."""
-
-MOST_UNDECIDED = 0.5
-"""Share of the surface that may have as much of an inside before it as behind it: of open surfaces it is all."""
+MOST_BURIED, MOST_BACKWARDS, MOST_UNDECIDED = 5e-3, 0.05, 0.5
+"""Shares of a surface that may lie within the segment, as lips and eyelids do (two rays are compared anyway), face
+inwards before the winding number has no meaning, and have as much inside before as behind: of open ones it is all."""
 
 
-@dataclass(frozen=True)
-class Health:
+class Health(NamedTuple):
     """Faults of one segment, as parts of a sentence that starts with its name.
 
-    Attributes:
-        dirty: faults that the winding number copes with.
-        hopeless: faults that leave no inside.
-        mendable: whether a repair may help.
-        notes: what does no harm by itself, but changes in a repair: fragments, faces without area.
+    The winding number copes with ``dirty`` ones; ``hopeless`` ones leave no inside, and a repair may help where they
+    are ``mendable``. ``notes`` do no harm, but change in a repair: fragments, faces without area.
     """
 
     dirty: tuple[str, ...] = ()
@@ -58,11 +47,7 @@ def examine(segment: Segment, unit: str = "") -> Health:
 
     Across a face the winding number rises by one from its front to its back. In front of it, it is 0 on a solid's
     surface, 1 where the face lies within the mesh itself (a self-intersection), and -1 where it faces inwards. On both
-    sides of an open surface that encloses nothing it is about a half.
-
-    Args:
-        segment: any mesh.
-        unit: of the vertices, such as "mm"; it stands behind each place.
+    sides of an open surface that encloses nothing it is about a half. ``unit``, such as "mm", stands behind each place.
     """
     vertices, faces = segment.vertices, segment.faces
     if len(faces) == 0:
@@ -84,7 +69,8 @@ def examine(segment: Segment, unit: str = "") -> Health:
         return Health(tuple(dirty), (*hopeless, "has no faces with three vertices"), mendable=False)
     surface = _front_winding(vertices, faces)
     opened, edges = _wrong_edges(vertices, faces, unit)
-    if opened and surface.share_where(surface.undecided) > MOST_UNDECIDED:
+    undecided = (surface.winding > -0.75) & (surface.winding < -0.25)
+    if opened and surface.share_where(undecided) > MOST_UNDECIDED:
         hopeless.append(f"is an open surface ({opened} open edges) that encloses no volume")
         return Health((*dirty, *edges[1:]), tuple(hopeless), notes=_notes(vertices, faces, surface, unit))
     dirty += edges
@@ -118,18 +104,10 @@ def _broken_data(vertices: Vertices, faces: Faces) -> tuple[list[str], Bool[np.n
 
 def _wrong_edges(vertices: Vertices, faces: Faces, unit: str) -> tuple[int, list[str]]:
     """Number of open edges, and phrases on them and on edges of too many faces or of faces that disagree."""
-    directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
-    keys, inverse, uses = np.unique(
-        np.sort(directed, axis=1) @ [len(vertices), 1], return_inverse=True, return_counts=True
-    )
-    ends = np.stack(np.divmod(keys, len(vertices)), axis=1)
-    forth = np.where(directed[:, 0] < directed[:, 1], 1, -1)
-    unbalanced = np.bincount(inverse.ravel(), weights=forth) != 0
-    faults = []
-    rim = ends[uses == 1]
+    ends, uses, unbalanced = edge_uses(faces)
+    faults, rim = [], ends[uses == 1]
     if len(rim):
-        graph = coo_array((np.ones(len(rim)), rim.T), shape=(len(vertices),) * 2)
-        _, loop = np.unique(connected_components(graph, directed=False)[1][rim[:, 0]], return_inverse=True)
+        _, loop = np.unique(connected(rim, len(vertices))[rim[:, 0]], return_inverse=True)
         longest = rim[loop == np.bincount(loop).argmax()]
         holes = f"{counted(int(loop.max()) + 1, 'hole')}, the largest" if loop.max() else "1 hole,"
         where = near(vertices[longest].mean(axis=(0, 1)), unit)
@@ -169,30 +147,19 @@ def faces_astray(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3
     return disagree or surface.share_where(surface.winding < -0.5) > 1e-3
 
 
-@dataclass(frozen=True, eq=False)
-class _FrontWinding:
-    """Winding number before each face that has an area, the share of the surface that each is, and its middle.
-
-    Attributes:
-        proper: which faces have an area; the other arrays are of these.
-    """
+class _FrontWinding(NamedTuple):
+    """Winding number before each face that has an area (``proper``), its share of the surface, and its middle."""
 
     winding: Float[np.ndarray, " p"]
     share: Float[np.ndarray, " p"]
     middle: Float[np.ndarray, "p 3"]
     proper: Bool[np.ndarray, " f"]
 
-    @property
-    def undecided(self) -> Bool[np.ndarray, " p"]:
-        """Whether a face has as much of an inside before it as behind it."""
-        return (self.winding > -0.75) & (self.winding < -0.25)
-
     def share_where(self, chosen: Bool[np.ndarray, " p"]) -> float:
-        """Share of the surface that some faces are."""
         return float(self.share[chosen].sum())
 
     def place(self, chosen: Bool[np.ndarray, " p"], unit: str) -> str:
-        """Where the largest of some faces is."""
+        """Place of the largest of some faces."""
         return near(self.middle[np.where(chosen, self.share, -1.0).argmax()], unit)
 
 
@@ -200,11 +167,11 @@ def _front_winding(vertices: Vertices, faces: Faces) -> _FrontWinding:
     corners = vertices[np.unique(faces)]
     low, high = corners.min(axis=0), corners.max(axis=0)
     vertices = (np.where(np.isfinite(vertices), vertices, low) - (low + high) / 2) / float(np.linalg.norm(high - low))
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
+    normal = area_vectors(vertices, faces)
     area = np.linalg.norm(normal, axis=1)
     proper = area > 1e-12
-    middle = ((a + b + c) / 3)[proper]
+    a, b, c = (vertices[faces[proper, k]] for k in range(3))
+    middle = (a + b + c) / 3
     # a ten-thousandth of the box's diagonal before each face; libigl's winding number is in single precision
     front = middle + 1e-4 * normal[proper] / area[proper, None]
     winding = igl.fast_winding_number(vertices, faces.astype(np.int64), front)
@@ -212,17 +179,12 @@ def _front_winding(vertices: Vertices, faces: Faces) -> _FrontWinding:
     return _FrontWinding(winding, area[proper] / max(area.sum(), 1e-300), middle, proper)
 
 
-# --- pieces -----------------------------------------------------------------------------------------------------------
-
-
 def pieces(faces: Faces, vertices: int) -> Int[np.ndarray, " f"]:
     """Number of the piece of each face; a piece is connected over edges which exactly two of its faces share."""
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1) @ [vertices, 1]
     order = np.argsort(edges, kind="stable")
     _, first, uses = np.unique(edges[order], return_index=True, return_counts=True)
-    pair = np.stack([order[first[uses == 2]], order[first[uses == 2] + 1]]) // 3
-    graph = coo_array((np.ones(pair.shape[1]), pair), shape=(len(faces), len(faces)))
-    return connected_components(graph, directed=False)[1].astype(np.int64)
+    return connected(np.stack([order[first[uses == 2]], order[first[uses == 2] + 1]], axis=1) // 3, len(faces))
 
 
 FRAGMENT = 0.02
@@ -233,7 +195,7 @@ def fragments(vertices: Vertices, faces: Faces, unit: str = "") -> tuple[Bool[np
     """Faces of pieces that are tiny beside the whole, and a phrase with their number, size and place."""
     piece = pieces(faces, len(vertices))
     corners = vertices[faces]
-    low, high = np.full((piece.max() + 1, 3), np.inf), np.full((piece.max() + 1, 3), -np.inf)
+    low, high = (np.full((piece.max() + 1, 3), end) for end in (np.inf, -np.inf))
     np.minimum.at(low, piece, corners.min(axis=1))
     np.maximum.at(high, piece, corners.max(axis=1))
     size = np.linalg.norm(high - low, axis=1)
@@ -248,9 +210,6 @@ def fragments(vertices: Vertices, faces: Faces, unit: str = "") -> tuple[Bool[np
     return stray, f"{counted(int(tiny.sum()), 'fragment')} ({counted(int(stray.sum()), 'face')}), {which}, {where}"
 
 
-# --- units ------------------------------------------------------------------------------------------------------------
-
-
 def likely_unit(bounds: Float[np.ndarray, "2 3"]) -> str:
     """Guess of a mesh's unit from its longest side: CAD and scanners write millimetres, robots and glTF metres."""
     longest = float((bounds[1] - bounds[0]).max())
@@ -259,9 +218,6 @@ def likely_unit(bounds: Float[np.ndarray, "2 3"]) -> str:
 
 PLAUSIBLE_M = (0.005, 5.0)
 """Longest side of what a depth camera looks at: from 5 mm to 5 m."""
-
-
-# --- solids of manifold3d ---------------------------------------------------------------------------------------------
 
 
 def solid_of(vertices: Vertices, faces: Faces) -> manifold3d.Manifold:
@@ -289,15 +245,8 @@ CELLS = 40
 """Along each side of a segment's box, for meshes that are no solids: fast also where they have holes."""
 
 
-@dataclass(frozen=True)
-class Overlap:
-    """Volume that two segments share without being declared nested, or that a nested one has outside.
-
-    Attributes:
-        small, large: names; the smaller one, or the inner one, first.
-        share: of the smaller segment's volume.
-        nested: whether the pair is declared nested; then ``share`` lies outside of the outer one.
-    """
+class Overlap(NamedTuple):
+    """Share of the volume of the ``small`` segment, or the inner one, in the ``large`` one, or outside if nested."""
 
     small: str
     large: str
@@ -316,12 +265,8 @@ def overlaps(
     """Pairs of segments that share more than ``tolerance`` of the smaller one, or nest with as much outside.
 
     Exact for solids, however thin what they share; within a percent or so where one of two is no solid. Segments that
-    touch share no volume. Segments may be no solids, so their boxes say which of two is smaller.
-
-    Args:
-        mesh: any unit.
-        tolerance: share of a segment's volume, from 0 to 1.
-        among: pairs of indices, the lower one first, to which the test is limited.
+    touch share no volume. Segments may be no solids, so their boxes say which of two is smaller. The test is limited to
+    the pairs of indices ``among``, the lower one first.
     """
     bodies, nesting, names = [_Body(segment) for segment in mesh.segments], set(mesh.nesting), mesh.names
     order = sorted(range(len(bodies)), key=lambda index: bodies[index].box_volume)
@@ -360,10 +305,13 @@ class _Body:
         except ValueError:
             return None
 
+    def held_by(self, segment: Segment) -> Bool[np.ndarray, "x y z"]:
+        """Whether the centre of each cell lies in a segment."""
+        return label_grid(SegmentedMesh((segment,)), *self.axes) > 0
+
     @cached_property
     def filled(self) -> Bool[np.ndarray, "x y z"]:
-        """Whether the centre of each cell lies in the segment."""
-        return label_grid(SegmentedMesh((self.segment,)), *self.axes) > 0
+        return self.held_by(self.segment)
 
     def share_in(self, other: "_Body") -> float:
         """How much of the volume lies in another segment, from 0 to 1."""
@@ -371,6 +319,6 @@ class _Body:
         if (around[1] <= box[0]).any() or (around[0] >= box[1]).any():
             return 0.0
         if self.solid is None or other.solid is None:
-            both = self.filled & (label_grid(SegmentedMesh((other.segment,)), *self.axes) > 0)
+            both = self.filled & self.held_by(other.segment)
             return float(both.sum() / max(int(self.filled.sum()), 1))
         return float(np.clip((self.solid ^ other.solid).volume() / self.solid.volume(), 0.0, 1.0))

@@ -5,19 +5,18 @@ moved by the last resort alone, a new surface from the winding number, with fine
 is deterministic.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import igl
 import manifold3d
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
 from mereo.geometry.brief import counted
-from mereo.geometry.mesh import Segment, SegmentedMesh, surface_points
+from mereo.geometry.mesh import Segment, SegmentedMesh, area_vectors, connected, surface_points
 from mereo.geometry.mesh_check import (
     Faces,
     Vertices,
@@ -35,14 +34,10 @@ MERGED_WITHIN = (1e-6, 1e-4)
 """Vertices of open edges this near to each other, in diagonals of the box, count as one; the less, where it helps."""
 
 
-@dataclass(frozen=True, eq=False)
-class Repair:
+class Repair(NamedTuple):
     """Mended mesh and what was done to it, each as a phrase; none where it was sound.
 
-    Attributes:
-        segment: the mended mesh.
-        changes: phrases.
-        kept: the mesh before, without the faces and fragments that were dropped.
+    ``kept`` is the mesh before, without the faces and fragments that were dropped.
     """
 
     segment: Segment
@@ -51,11 +46,7 @@ class Repair:
 
 
 def repaired(segment: Segment, unit: str = "") -> Repair:
-    """Segment mended to a closed solid that faces outwards and does not intersect itself.
-
-    Args:
-        segment: any mesh.
-        unit: of the vertices, such as "mm", for the phrases.
+    """Segment mended to a closed solid that faces outwards and does not intersect itself; ``unit`` is for the phrases.
 
     Raises ``ValueError`` where nothing is left to work with.
     """
@@ -110,10 +101,9 @@ def _merge_near(vertices: Vertices, faces: Faces, unit: str) -> Step:
 def _merged(vertices: Vertices, faces: Faces, distance: float) -> tuple[Vertices, Faces]:
     rim = np.unique(open_edges(vertices, faces))
     pairs = rim[cKDTree(vertices[rim]).query_pairs(distance, output_type="ndarray")].reshape(-1, 2)
-    graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(vertices),) * 2)
-    _, group = connected_components(graph, directed=False)
+    group = connected(pairs, len(vertices))
     _, first = np.unique(group, return_index=True)
-    merged = group.astype(np.int64)[faces]
+    merged = group[faces]
     return vertices[first], merged[(merged != np.roll(merged, 1, axis=1)).all(axis=1)]
 
 
@@ -133,17 +123,15 @@ def _orient(vertices: Vertices, faces: Faces, unit: str) -> Step:
     turned = turned.astype(np.int64)  # C's long long, which numpy tells apart
     for index in range(int(patch.max()) + 1):
         members = patch == index
-        if _signed_volume(vertices, turned[members]) < 0:
+        corners = vertices[turned[members]]
+        a, b, c = np.moveaxis(
+            corners - corners.mean(axis=(0, 1)), 1, 0
+        )  # about its middle, so that holes matter little
+        if np.einsum("ij,ij->", a, np.cross(b, c)) < 0:
             turned[members] = turned[members][:, ::-1]
     same = np.any([(np.roll(turned, k, axis=1) == faces).all(axis=1) for k in range(3)], axis=0)
     changed = int((~same).sum())
     return vertices, turned, f"turned {changed} faces around" if changed else ""
-
-
-def _signed_volume(vertices: Vertices, faces: Faces) -> float:
-    """Volume about the middle of the patch, so that holes matter little."""
-    a, b, c = (vertices[faces[:, k]] - vertices[faces].mean(axis=(0, 1)) for k in range(3))
-    return float(np.einsum("ij,ij->", a, np.cross(b, c)))
 
 
 def _fill_holes(vertices: Vertices, faces: Faces, unit: str) -> Step:
@@ -174,13 +162,8 @@ def _unite(vertices: Vertices, faces: Faces, unit: str) -> Step:
 # In cells: one is 1 / CELLS of the longest side. Places of finer cells are multiples of powers of two, so that Booleans
 # along them are exact.
 
-CELLS = 128
-"""Cells along the longest side."""
-
-FINER = 4
-"""Cells of each level along one of the level before."""
-
-LEVELS = 3
+CELLS, FINER, LEVELS = 128, 4, 3
+"""Cells along the longest side, those of each level along one of the level before, and levels of finer ones."""
 
 MOST_BLOCKS = 300
 """Blocks of 16 x 16 x 16 finer cells in a level, for time and memory."""
@@ -245,8 +228,7 @@ class _Body:
         distance = self.distance(nodes)
         pairs = (64 * np.arange(len(nodes) // 64)[:, None, None] + NEIGHBOURS).reshape(-1, 2)
         pairs = pairs[distance[pairs].sum(axis=1) > 1.001 * cell]
-        graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(nodes),) * 2)
-        _, part = connected_components(graph, directed=False)
+        part = connected(pairs, len(nodes))
         order = np.argsort(-distance, kind="stable")
         _, first = np.unique(part[order], return_index=True)
         return self.inside(nodes[order[first]])[part]
@@ -260,12 +242,11 @@ class _Body:
         """
         chosen = self.faces[faces]
         corners = self.vertices[chosen]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normal = area_vectors(self.vertices, chosen)
         area = np.linalg.norm(normal, axis=1)
         normal /= np.maximum(area, 1e-300)[:, None]
-        spread, face = surface_points(
-            self.vertices, chosen, int(np.clip(area.sum() / 2 / spacing**2, 1000, MOST_SAMPLES))
-        )
+        most = int(np.clip(area.sum() / 2 / spacing**2, 1000, MOST_SAMPLES))
+        spread, face = surface_points(self.vertices, chosen, most)
         _, first = np.unique(chosen, return_index=True)
         edges = np.roll(corners, -1, axis=1) - corners  # along which a thin part has places, however small its area is
         count = np.ceil(np.linalg.norm(edges, axis=2) / spacing).astype(int).ravel()
@@ -279,7 +260,7 @@ class _Body:
         return places[kept], normal[face[kept]], faces[face[kept]]
 
 
-NODES = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+NODES = np.indices((4, 4, 4)).reshape(3, -1).T
 
 NEIGHBOURS = np.argwhere(np.triu(np.abs(NODES[:, None] - NODES).sum(axis=2) == 1))
 """Pairs of nodes of a block."""
@@ -292,7 +273,7 @@ def _even_surface(body: _Body) -> manifold3d.Manifold:
     """Surface from cells of one size."""
     shape = np.ceil(body.vertices.max(axis=0) + 2.5 - 1e-9).astype(int)
     blocks = -(-shape // 4)
-    first = 4 * np.stack(np.meshgrid(*map(np.arange, blocks), indexing="ij"), axis=-1).reshape(-1, 3)
+    first = 4 * np.indices(blocks).reshape(3, -1).T
     inside = body.inside_blocks(first, 1.0).reshape(*blocks, 4, 4, 4).transpose(0, 3, 1, 4, 2, 5)
     inside = inside.reshape(4 * blocks)[: shape[0], : shape[1], : shape[2]]
     near_change = np.zeros_like(inside)
@@ -331,14 +312,12 @@ def _with_thin_parts(
             blocks = _blocks(places[chosen], way[chosen], 16 * finer, FINER * finer)
             if len(blocks) > MOST_BLOCKS:  # of finer cells there would be even more
                 blocks, last = blocks[:MOST_BLOCKS], level + 1
-            region = _boxes(blocks, 16 * finer)
+            cube, corners = manifold3d.Manifold.cube((16 * finer,) * 3), (blocks * 16 * finer).tolist()
+            region = manifold3d.Manifold.batch_boolean([cube.translate(c) for c in corners], manifold3d.OpType.Add)
             solid, cell = (whole - region) + (_fine_surface(body, blocks, finer) ^ region), finer
     worst = int(np.where(seeds, way, -1.0).argmax())
-    return (
-        whole.simplify(0.01 * cell) if cell < 1 else solid,
-        cell,
-        (float(way[worst]), places[worst]) if seeds.any() else None,
-    )
+    lost = (float(way[worst]), places[worst]) if seeds.any() else None
+    return whole.simplify(0.01 * cell) if cell < 1 else solid, cell, lost
 
 
 def _within(places: Vertices, of: Vertices, distance: float) -> Bool[np.ndarray, " n"]:
@@ -355,25 +334,16 @@ def _without_specks(solid: manifold3d.Manifold, side: float) -> manifold3d.Manif
 
 def _blocks(places: Vertices, way: Float[np.ndarray, " n"], side: float, margin: float) -> Int[np.ndarray, "b 3"]:
     """Blocks of a lattice with a margin around places, those around the largest ``way`` first."""
-    shifts = margin * (np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) - 1)
+    shifts = margin * (np.indices((3, 3, 3)).reshape(3, -1).T - 1)
     order = np.argsort(-way, kind="stable")
     touched = np.floor((places[order, None] + shifts) / side).astype(np.int64).reshape(-1, 3)
     blocks, first = np.unique(touched, axis=0, return_index=True)
     return blocks[np.argsort(first)]
 
 
-def _boxes(blocks: Int[np.ndarray, "b 3"], side: float) -> manifold3d.Manifold:
-    cube = manifold3d.Manifold.cube((side, side, side))
-    return manifold3d.Manifold.batch_boolean(
-        [cube.translate(place) for place in (blocks * side).tolist()], manifold3d.OpType.Add
-    )
-
-
 def _fine_surface(body: _Body, blocks: Int[np.ndarray, "b 3"], cell: float) -> manifold3d.Manifold:
     """Surface within blocks of 16 x 16 x 16 cells and one cell around; it is closed along their outside."""
-    parts = (
-        4 * blocks[:, None] + np.stack(np.meshgrid(*[np.arange(5)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    ).reshape(-1, 3)
+    parts = (4 * blocks[:, None] + np.indices((5, 5, 5)).reshape(3, -1).T).reshape(-1, 3)
     first = 4 * np.unique(parts, axis=0) - 1
     nodes = (first[:, None] + NODES).reshape(-1, 3)
     inside = body.inside_blocks(first, cell).reshape(-1)
@@ -412,7 +382,6 @@ def _cut_off(
 
 # --- what a repair moved ----------------------------------------------------------------------------------------------
 
-
 Reach = tuple[float, Float[np.ndarray, "3"]]
 """A distance, and the place where it is."""
 
@@ -435,8 +404,7 @@ def farthest(before: Segment, after: Segment) -> tuple[Reach, Reach]:
             reach.setdefault(within, (float(way[row]), places[row]))
         if len(reach) == 2 or (len(rows) and way[rows[-1]] < 1e-4 * length):
             break
-    none = (0.0, places[0])
-    return reach.get(False, none), reach.get(True, none)
+    return reach.get(False, (0.0, places[0])), reach.get(True, (0.0, places[0]))
 
 
 # --- segments together ------------------------------------------------------------------------------------------------
@@ -450,9 +418,8 @@ def without_overlaps(mesh: SegmentedMesh) -> tuple[SegmentedMesh, dict[str, list
     segments = {segment.name: segment for segment in mesh.segments}
     changes: dict[str, list[str]] = {}
     for overlap in overlaps(mesh):
-        small, large = (
-            solid_of(segments[name].vertices, segments[name].faces) for name in (overlap.small, overlap.large)
-        )
+        pair = segments[overlap.small], segments[overlap.large]
+        small, large = (solid_of(segment.vertices, segment.faces) for segment in pair)
         changed = overlap.small if overlap.nested else overlap.large
         cut = small ^ large if overlap.nested else large - small
         if cut.is_empty():
@@ -495,8 +462,7 @@ def open_edges(vertices: Vertices, faces: Faces) -> Int[np.ndarray, "_ 2"]:
 def close_holes(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
     """Mesh whose open loops are closed by fans around the mean of their vertices; a closed mesh stays as it is."""
     rim = open_edges(vertices, faces)
-    graph = coo_array((np.ones(len(rim)), rim.reshape(-1, 2).T), shape=(len(vertices),) * 2)
-    _, group = connected_components(graph, directed=False)
+    group = connected(rim.reshape(-1, 2), len(vertices))
     for index in np.unique(group[rim[:, 0]]):
         loop = rim[group[rim[:, 0]] == index]
         fan = np.stack([loop[:, 1], loop[:, 0], np.full(len(loop), len(vertices))], axis=1)

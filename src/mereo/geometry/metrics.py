@@ -1,5 +1,6 @@
 """Metrics of the paper (appendix B): truth on a grid, and IoU and mIoU from one confusion matrix over a test set."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import isnan
 
@@ -51,6 +52,20 @@ def intersection_over_union(confusion: Int[np.ndarray, "c c"], segmented: bool =
     present = per_segment[~np.isnan(per_segment)]
     miou = float(present.mean()) if segmented and len(present) else float("nan")
     return Scores(float(iou), miou, per_segment)
+
+
+def with_segments_exchanged(
+    confusion: Int[np.ndarray, "c c"], swaps: Sequence[Sequence[int]]
+) -> Int[np.ndarray, "c c"]:
+    """Confusion matrix up to symmetry: of the true segments as they are, or exchanged, what gives the greatest mIoU.
+
+    Args:
+        confusion: counts of points of one view, by true (row) and predicted (column) class; 0 is empty space.
+        swaps: for each symmetry of the object and each segment, the index of the one whose place it takes
+            (``Symmetry.lands_on``).
+    """
+    exchanged = [confusion[[0, *(index + 1 for index in swap)]] for swap in swaps]
+    return max([confusion, *exchanged], key=lambda each: intersection_over_union(each).miou)
 
 
 def format_score(score: float | None, missing: str = "-") -> str:

@@ -88,9 +88,6 @@ def rounded_to(values: Float[np.ndarray, " n"], digits: int) -> Float[np.ndarray
     return result
 
 
-# --- color stops ------------------------------------------------------------------------------------------------------
-
-
 def between_stops(shares: Float[np.ndarray, " n"], stops: Sequence[Color]) -> Float[np.ndarray, "n 3"]:
     """Colours (red, green, blue, 0 to 255) of shares, linear between stops at equal distances.
 

@@ -1,10 +1,9 @@
 """Solid queries on closed meshes: which segment holds a point, how far is its surface, which way, what a ray hits.
 
-Inside tests cast one ray and ask whether the first face hit is seen from behind. Two rays in unrelated directions are
-compared; where they disagree (a ray through an edge, an imperfect mesh) the generalized winding number decides
+Inside tests ask of two rays in unrelated directions whether the first face hit is seen from behind; where they disagree
+(a ray through an edge, an imperfect mesh), and of what is marked as no solid, the generalized winding number decides
 (Jacobson et al., SIGGRAPH 2013; Barill et al., SIGGRAPH 2018). Each segment has a ray scene of its own: in a joint one
-the coincident faces of two neighbours would make the first face hit ambiguous. A segment that is marked as no solid
-(holes, self-intersections) is left to the winding number altogether.
+the coincident faces of two neighbours would make the first face hit ambiguous.
 
 Rays from the camera are ``t * direction``, t > 0, from the origin of the camera frame; Embree finds where they first
 meet a surface. Directions have z = 1, so that t is the depth and a direction's x and y are its slopes.
@@ -21,7 +20,7 @@ from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 from scipy.sparse import csr_array
 
-from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.mesh import Segment, SegmentedMesh, area_vectors
 from mereo.geometry.read_only import read_only
 
 _DIRECTIONS = read_only(np.array([[0.4637, 0.5718, 0.6767], [-0.7301, 0.3469, -0.5887]], dtype=np.float32))
@@ -44,11 +43,6 @@ class Hits(NamedTuple):
     distance: Float[np.ndarray, " n"]
     normal: Float[np.ndarray, "n 3"]
 
-    @classmethod
-    def none(cls, count: int) -> "Hits":
-        """Hits of rays that meet nothing (yet)."""
-        return cls(np.full(count, np.inf), np.zeros((count, 3)))
-
     def nearer(self, rows: Int[np.ndarray, " m"], others: "Hits") -> Int[np.ndarray, " k"]:
         """Rows of ``rows`` on which the ``others`` meet something nearer, which these hits take over, in place."""
         better = others.distance < self.distance[rows]
@@ -62,15 +56,6 @@ def ray_scene(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"])
     scene = EmbreeScene(_DEVICE)
     TriangleMesh(scene, vertices.astype(np.float32), faces.astype(np.int32))
     return scene
-
-
-def first_hits(
-    scene: EmbreeScene, center: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]
-) -> tuple[Int[np.ndarray, " m"], Hits]:
-    """Rays that hit a scene whose coordinates are relative to ``center``, and their hits."""
-    hits = scene.run(*_rays(center, directions), output=True)
-    rows = np.flatnonzero(hits["primID"] >= 0)
-    return rows, Hits(hits["tfar"][rows].astype(np.float64), hits["Ng"][rows].astype(np.float64))
 
 
 def first_faces(
@@ -134,7 +119,7 @@ class _Solid:
     def in_box(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Whether points lie strictly in the segment's box, outside of which nothing is inside."""
         result = np.ones(len(points), dtype=bool)
-        for axis in range(3):
+        for axis in range(3):  # several times faster than all three at once
             result &= (points[:, axis] > self.low[axis]) & (points[:, axis] < self.high[axis])
         return result
 
@@ -162,8 +147,9 @@ class _Solid:
     def first_hit(self, directions: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Hits]:
         """Which rays from the origin hit the segment, and where each of them does first."""
         rows = toward(directions, self.low, self.high)
-        hit, hits = first_hits(self.rays, self.center, directions[rows])
-        return rows[hit], hits
+        hits = self.rays.run(*_rays(self.center, directions[rows]), output=True)
+        hit = np.flatnonzero(hits["primID"] >= 0)
+        return rows[hit], Hits(hits["tfar"][hit].astype(np.float64), hits["Ng"][hit].astype(np.float64))
 
     def closest(
         self, points: Float[np.ndarray, "n 3"]
@@ -171,11 +157,6 @@ class _Solid:
         """Squared distance to the surface, face and place of the closest surface point."""
         squared, face, place = self.tree.squared_distance(self.vertices, self.faces, np.ascontiguousarray(points))
         return squared, face.astype(np.int64), place  # libigl's faces are C's long long, which numpy tells apart
-
-    def squared_distance_to_box(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """At most the squared distance to the surface, for points outside the box; 0 inside it."""
-        outside = np.maximum(np.maximum(self.low - points, points - self.high), 0.0)
-        return np.einsum("ij,ij->i", outside, outside)
 
 
 class Nearest(NamedTuple):
@@ -229,11 +210,9 @@ class Solids:
 
         Rays are cast in single precision, so nearer to a surface than two millionths of its segment's longest side the
         label may be that of the other side, on some processors and not on others (0.4 millionths were the most with
-        AVX-512 and AVX2, 1.6 with SSE; most wrong labels lie within 0.1). Beyond that it is right where no surface
-        folds over itself. Beside such a fold, a pocket of winding number -1, both rays may meet the
-        pocket's wall from behind, and a point outside then counts as inside. Of the built-in scenes the cranium of the
-        skull has folds: they mislead six in 10,000 of the outside points drawn within 0.1 units of its surface, none of
-        them further from it than 0.05.
+        AVX-512 and AVX2, 1.6 with SSE). Beyond that it is right where no surface folds over itself. Beside such a fold
+        both rays may meet the wall of a pocket of winding number -1 from behind, and a point outside then counts as
+        inside: of the built-in scenes six in 10,000 within 0.1 units of the skull's cranium.
         """
         labels = np.zeros(len(points), dtype=np.uint8)
         for index, solid in enumerate(self._solids):
@@ -247,7 +226,9 @@ class Solids:
 
     def nearest(self, points: Float[np.ndarray, "n 3"]) -> Nearest:
         """Closest points over the surfaces of all segments."""
-        bounds = np.stack([solid.squared_distance_to_box(points) for solid in self._solids])
+        # of the squared distances: that from the box, 0 inside of it
+        outside = (np.maximum(np.maximum(each.low - points, points - each.high), 0.0) for each in self._solids)
+        bounds = np.stack([np.einsum("ij,ij->i", offset, offset) for offset in outside])
         likely = bounds.argmin(axis=0)
         squared, place = np.full(len(points), np.inf), np.empty_like(points)
         face, owner = np.empty(len(points), dtype=np.int64), np.empty(len(points), dtype=np.int64)
@@ -265,7 +246,7 @@ class Solids:
 
     def first_hit(self, directions: Float[np.ndarray, "n 3"]) -> Hits:
         """First meetings of rays ``t * direction`` from the origin with any surface, t > 0; directions have z = 1."""
-        hits = Hits.none(len(directions))
+        hits = Hits(np.full(len(directions), np.inf), np.zeros((len(directions), 3)))
         for solid in self._solids:
             hits.nearer(*solid.first_hit(directions))
         return hits
@@ -273,8 +254,7 @@ class Solids:
     def face_normals(self, face: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
         """Unit normals of faces of ``mesh.merged()``."""
         vertices, faces, _ = self._merged
-        a, b, c = (vertices[faces[face, i]] for i in range(3))
-        normal = np.cross(b - a, c - a)
+        normal = area_vectors(vertices, faces[face])
         return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
 
 
@@ -307,26 +287,21 @@ def label_grid(
     """
     labels = np.zeros((len(x), len(y), len(z)), dtype=np.uint8)
     for index, segment in enumerate(mesh.segments):
-        lows = [int(np.searchsorted(axis, low)) for axis, low in zip((x, y, z), segment.bounds[0], strict=True)]
-        highs = [
-            int(np.searchsorted(axis, high, "right")) for axis, high in zip((x, y, z), segment.bounds[1], strict=True)
-        ]
-        if any(low >= high for low, high in zip(lows, highs, strict=True)):
-            continue
-        box = tuple(slice(low, high) for low, high in zip(lows, highs, strict=True))
+        box = tuple(
+            slice(int(np.searchsorted(axis, low)), int(np.searchsorted(axis, high, "right")))
+            for axis, low, high in zip((x, y, z), *segment.bounds, strict=True)
+        )
         block = labels[box]
-        has_holes = not segment.solid and segment.edge_imbalance() != (0, 0)
-        inside = (_winding_nodes if has_holes else winding_grid)(segment, x[box[0]], y[box[1]], z[box[2]])
+        if block.size == 0:
+            continue
+        axes = x[box[0]], y[box[1]], z[box[2]]
+        if segment.solid or segment.edge_imbalance() == (0, 0):
+            inside = winding_grid(segment, *axes)
+        else:  # node by node, for a column may enter a mesh with holes and never leave
+            nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+            inside = _Solid(segment).holds(nodes).reshape(block.shape)
         block[(block == 0) & inside] = index + 1
     return labels
-
-
-def _winding_nodes(
-    segment: Segment, x: Float[np.ndarray, " nx"], y: Float[np.ndarray, " ny"], z: Float[np.ndarray, " nz"]
-) -> Bool[np.ndarray, "nx ny nz"]:
-    """``winding_grid`` for a mesh with holes, node by node: a column may enter it and never leave."""
-    nodes = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
-    return _Solid(segment).holds(nodes).reshape(len(x), len(y), len(z))
 
 
 # --- winding numbers --------------------------------------------------------------------------------------------------
@@ -398,20 +373,18 @@ def _covered_columns(
 
 def owned_centroids(mesh: SegmentedMesh) -> Float[np.ndarray, "s 3"]:
     """Centre of the volume that belongs to each segment: its mesh's without that of the segments nested in it."""
-    volumes, moments = mesh.owned_volumes, np.stack([first_moment(segment) for segment in mesh.segments])
+    volumes, moments = mesh.owned_volumes, np.stack([_first_moment(segment) for segment in mesh.segments])
     for outer in range(len(moments)):  # the inner ones come first and are done
         moments[outer] -= sum((moments[inner] for inner, other in mesh.nesting if other == outer), np.zeros(3))
-    centroids: Float[np.ndarray, "s 3"] = moments / volumes[:, None]
-    return centroids
+    return np.asarray(moments / volumes[:, None])
 
 
-def first_moment(segment: Segment) -> Float[np.ndarray, "3"]:
+def _first_moment(segment: Segment) -> Float[np.ndarray, "3"]:
     """Volume times centroid of a closed mesh (divergence theorem), by tetrahedra with one corner at its middle."""
     middle = segment.vertices.mean(axis=0)
     a, b, c = (segment.vertices[segment.faces[:, i]] - middle for i in range(3))
     volume = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
-    moment: Float[np.ndarray, "3"] = (volume[:, None] * (a + b + c)).sum(axis=0) / 4.0 + volume.sum() * middle
-    return moment
+    return np.asarray((volume[:, None] * (a + b + c)).sum(axis=0) / 4.0 + volume.sum() * middle)
 
 
 def owned_gradients(mesh: SegmentedMesh) -> Float[np.ndarray, "s 4 v 3"]:
@@ -423,18 +396,15 @@ def owned_gradients(mesh: SegmentedMesh) -> Float[np.ndarray, "s 4 v 3"]:
     centers, volumes = owned_centroids(mesh), mesh.owned_volumes
     result = np.zeros((len(mesh.segments), 4, ends[-1], 3))
     for owner, center in enumerate(centers):
-        for index, sign in ((owner, 1.0), *((inner, -1.0) for inner in _directly_inside(mesh, owner))):
+        within = [inner for inner, outer in mesh.nesting if outer == owner]
+        # only the meshes directly inside bound the volume that belongs to it
+        inner = [each for each in within if not any((each, other) in mesh.nesting for other in within)]
+        for index, sign in ((owner, 1.0), *((each, -1.0) for each in inner)):
             rows = slice(ends[index], ends[index + 1])
             result[owner, :, rows] = sign * _gradients(mesh.segments[index], center)
         # about the centroid the first moment is zero, so that the volume's change does not move it
         result[owner, 1:] /= volumes[owner]
     return result
-
-
-def _directly_inside(mesh: SegmentedMesh, outer: int) -> list[int]:
-    """Segments whose meshes bound the volume that belongs to a segment from within."""
-    within = [inner for inner, other in mesh.nesting if other == outer]
-    return [inner for inner in within if not any((inner, other) in mesh.nesting for other in within)]
 
 
 def _gradients(segment: Segment, origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 v 3"]:

@@ -5,10 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
-from mereo.geometry.mesh import Segment
+from mereo.geometry.mesh import Segment, connected
 
 Faces = Int[np.ndarray, "_ 3"]
 
@@ -100,15 +98,11 @@ CREASE_DEG = 30.0
 
 
 def split_at_creases(segment: Segment, angle_deg: float = CREASE_DEG) -> tuple[Segment, Int[np.ndarray, " n"]]:
-    """The same surface, its vertices split where faces meet at a crease.
+    """The same surface, its vertices split where faces meet at a crease: normals are farther apart than ``angle_deg``.
 
     A vertex is split into as many as there are groups of faces around it between which only creases lie; where a crease
     ends within a smooth surface there is one such group, and it stays one vertex. Faces without area have no normal and
     are not seen: they split nothing.
-
-    Args:
-        segment: any triangle mesh, any unit; open or closed.
-        angle_deg: angle between normals above which an edge is a crease.
 
     Returns the segment (itself where nothing is split), and for each of its vertices the index of the one that it was:
     first all old ones in their order, then the added ones. Faces keep their order and orientation.
@@ -147,8 +141,7 @@ def _face_normals(segment: Segment) -> Float[np.ndarray, "f 3"]:
     normals = np.cross(b - a, c - a)
     area = np.linalg.norm(normals, axis=1, keepdims=True)
     longest = np.max([((q - p) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)[:, None]
-    result: Float[np.ndarray, "f 3"] = np.where(area > 1e-12 * longest, normals / np.maximum(area, 1e-300), 0.0)
-    return result
+    return np.where(area > 1e-12 * longest, normals / np.maximum(area, 1e-300), 0.0)
 
 
 def _neighbours(
@@ -172,17 +165,9 @@ def _groups(
 
     ``smooth`` are neighbours without a crease between them, as ``_neighbours`` has them.
     """
-    first, second, edge = smooth
-    pairs = [np.stack([_corner(faces, face, edge[:, end]) for face in (first, second)]) for end in (0, 1)]
-    links = np.concatenate(pairs, axis=1)
+    *sides, edge = smooth
+    # which of all corners, three for each face in their order, an edge's ends are of the faces on both of its sides
+    corners = [[3 * face + (faces[face] == end[:, None]).argmax(axis=1) for face in sides] for end in edge.T]
+    links = np.concatenate(corners, axis=1)
     links = links[:, on_crease[faces.reshape(-1)[links[0]]]]
-    graph = coo_array((np.ones(links.shape[1], dtype=np.int8), links), shape=(faces.size, faces.size))
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
-
-
-def _corner(
-    faces: Int[np.ndarray, "f 3"], face: Int[np.ndarray, " n"], vertex: Int[np.ndarray, " n"]
-) -> Int[np.ndarray, " n"]:
-    """Which of all corners (three for each face, in their order) each vertex is of its face."""
-    result: Int[np.ndarray, " n"] = 3 * face + (faces[face] == vertex[:, None]).argmax(axis=1)
-    return result
+    return connected(links.T, faces.size)

@@ -9,11 +9,10 @@ Notation: n points, k neighbours.
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mereo.geometry.downsampling import MAX_POINTS, thin_to_grid
+from mereo.geometry.mesh import connected
 
 NEIGHBORS = 24
 """Neighbours that are looked at: in an image, the 5 x 5 pixels around one."""
@@ -30,31 +29,25 @@ NOISE = 2.5
 GRID = 0.8
 """Nearest neighbour's angle over the fourth's from which on lines of sight are a grid of pixels; random ones have 0.5.
 
-On a grid the pitch is the same everywhere, and where neighbours are farther there are none: the few points that cameras
-add before edges would otherwise join to patches. Other clouds may be sparser in one part than in another."""
+On a grid the pitch is the same everywhere: points that cameras add before edges would otherwise join to patches."""
 
 INNER = 20
 """Neighbours of the same patch, of the 24, that make a point an inner one; a strip of three pixels has 14."""
 
 STRETCH = 1.03
-"""Times by which points off all surfaces must lengthen the cloud's box to matter: a network is normalized by that box.
-
-They do on 0.77 of views of simulated sensors and on 0.04 of clean ones; on none of four real scans (1.02 at most)."""
+"""Times by which points off all surfaces must lengthen the cloud's box, by which a network is normalized, to matter."""
 
 
 def surface_points(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Whether each point belongs to a patch of surface; all do where the cloud is too sparse to tell.
-
-    Args:
-        points: seen from the origin (camera frame), any unit and density.
-    """
+    """Whether each point belongs to a patch of surface, as in ``surface_patches``."""
     return surface_patches(points)[1]
 
 
 def surface_patches(points: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Number of each point's patch, and whether it belongs to one that is a surface, as in ``surface_points``.
+    """Number of each point's patch, and whether it belongs to one that is a surface; all do where too few can tell.
 
-    Of more than ``MAX_POINTS``, points evenly in space are looked at, and the others go with the nearest of these.
+    Points are seen from the origin (camera frame), in any unit and density. Of more than ``MAX_POINTS``, points evenly
+    in space are looked at, and the others go with the nearest of these.
     """
     rows = thin_to_grid(points, MAX_POINTS)
     places, place = np.unique(points[rows], axis=0, return_inverse=True)
@@ -86,10 +79,9 @@ def _patches(
     step = np.abs(distance[neighbor] - distance[:, None])
     tall = np.maximum(JUMP * pitch * distance, NOISE * float(np.median(step[:, :4])))
     row, column = np.nonzero((angle <= ADJACENT * pitch[:, None]) & (step <= tall[:, None]))
-    edges = (np.ones(len(row), dtype=np.int8), (row, neighbor[row, column]))
-    patch = connected_components(coo_matrix(edges, shape=(len(points),) * 2), directed=False)[1]
+    patch = connected(np.stack([row, neighbor[row, column]], axis=1), len(points))
     same = (angle <= AROUND * around[:, None]) & (patch[neighbor] == patch[:, None])
-    return patch.astype(np.int64), same.sum(axis=1) >= INNER, tall
+    return patch, same.sum(axis=1) >= INNER, tall
 
 
 def longest_side(points: Float[np.ndarray, "n 3"]) -> float:
@@ -103,11 +95,7 @@ def stretch(points: Float[np.ndarray, "n 3"], keep: Bool[np.ndarray, " n"]) -> f
 
 
 def without_strays(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Whether each point is left where strays are removed: all are, unless strays make the box ``STRETCH`` longer.
-
-    Args:
-        points: seen from the origin (camera frame), any unit and density.
-    """
+    """Whether each point is left where strays are removed: all are, unless strays make the box ``STRETCH`` longer."""
     keep = surface_points(points)
     if keep.all() or stretch(points, keep) <= STRETCH:
         return np.ones(len(points), dtype=bool)
@@ -116,20 +104,13 @@ def without_strays(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
 
 # --- smoothing --------------------------------------------------------------------------------------------------------
 
-# Smoothing of a point cloud along its lines of sight, for noisy depth cameras.
-#
 # Local polynomial regression: what neighbours on the same surface have in common, evaluated at each point's own line of
 # sight. The inverse of the range is fitted, which for a plane is linear in the direction, so that slanted planes stay
 # as they are; squares follow the curvature. Notation: n points, k neighbours.
 
-SIGHT_NEIGHBORS = 36
-"""Neighbours that are looked at: in an image nearly the 7 x 7 pixels around one, without its corners."""
-
-RADIUS = 3.2
-"""How far neighbours may be, in pitches of the lines of sight."""
-
-WIDTH = 0.6
-"""Standard deviation of their weights, in radii."""
+SIGHT_NEIGHBORS, RADIUS, WIDTH = 36, 3.2, 0.6
+"""Neighbours that are looked at, in an image nearly the 7 x 7 pixels around one; how far they may be, in pitches of the
+lines of sight; and the standard deviation of their weights, in radii."""
 
 RIDGE = (0.0, 0.02, 0.02, 0.1, 0.1, 0.1)
 """Pull of the coefficients of (1, u, v, u^2, uv, v^2) towards 0, in neighbours: few of them carry no curvature."""
@@ -139,11 +120,7 @@ FEWEST = 4
 
 
 def smoothed(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Points moved along their lines of sight to where their neighbours on the same surface say that it is.
-
-    Args:
-        points: seen from the origin (camera frame), any unit, all different from it.
-    """
+    """Points moved along their lines of sight, from the origin, to where their neighbours on the surface say it is."""
     if len(points) < FEWEST:
         return points
     distance = np.linalg.norm(points, axis=1)

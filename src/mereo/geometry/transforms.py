@@ -89,10 +89,8 @@ def fit_rigid(
 ) -> Float[np.ndarray, "4 4"]:
     """``T_target_source`` that brings ``source`` nearest to ``target`` in least squares (Kabsch, 1976), never mirrored.
 
-    Args:
-        source: points, any unit; where they lie on a line, any turn about it is as good, and one is taken.
-        target: where each of them should go.
-        weights: of the squared distances, not negative and not all 0; by default all count alike.
+    Of points on a line any turn about it is as good, and one is taken. ``weights`` are of the squared distances, not
+    negative and not all 0; by default all count alike.
     """
     middle, aim = (np.average(points, axis=0, weights=weights) for points in (source, target))
     offsets = target - aim if weights is None else weights[:, None] * (target - aim)
@@ -153,14 +151,11 @@ class Normalizer:
 
 # --- best rotations ---------------------------------------------------------------------------------------------------
 
-# Rigid motions ``y = R x + t`` that bring points onto others. Notation: n points, s sets of points.
-
 
 def best_rotations(covariance: Float[np.ndarray, "*s 3 3"]) -> Float[np.ndarray, "*s 3 3"]:
     """Rotations R that maximize ``trace(R H)`` for ``H = sum_i x_i y_i^T``, centred: they bring x onto y (Kabsch)."""
     left, _, right = finite_svd(covariance)
     proper = np.sign(np.linalg.det(left) * np.linalg.det(right))
-    left = left.copy()
     left[..., 2] *= np.where(proper == 0, 1.0, proper)[..., None]
     return np.swapaxes(left @ right, -1, -2)
 
@@ -174,7 +169,7 @@ def robust_rigid(
     """``fit_rigid`` under a Cauchy loss whose scale falls from the residuals' own median to ``sigma``."""
     T = fit_rigid(source, target, weight)
     for _ in range(20):  # it has converged by then
-        distance = np.linalg.norm(source @ T[:3, :3].T + T[:3, 3] - target, axis=1)
+        distance = np.linalg.norm(transform_points(T, source) - target, axis=1)
         scale = max(float(np.median(distance)), sigma)
         T = fit_rigid(source, target, weight / (1.0 + (distance / scale) ** 2))
     return T

@@ -1,8 +1,7 @@
 """Files and folders of results: they appear whole or not at all, and replace only what mereo itself wrote.
 
-An output is first made in a scratch folder beside its destination and renamed at the end, so that a reader never sees
-half of it and an error, Ctrl-C or a full disk leaves nothing behind. A scratch folder (``.NAME.1a2b3c4d.mereo``) is
-locked by its process; the system frees locks when a process dies, however it does, so the next one that writes there
+An output is made in a scratch folder beside its destination (``.NAME.1a2b3c4d.mereo``) and renamed at the end. The
+scratch folder is locked by its process; the system frees locks when a process dies, so the next one that writes there
 can tell what a killed one left from work in progress.
 
 Each folder of results holds ``.mereo.json``, a list of all that is in it with the size and time of each file. A folder
@@ -37,9 +36,6 @@ MARKER = ".mereo.json"
 
 EXISTS = "exists; it is not overwritten: choose another name or pass --force"
 
-SUFFIX_BYTES = len(".1a2b3c4d.mereo")
-"""Length of what a scratch folder's name has behind that of its output."""
-
 
 # --- scratch folders --------------------------------------------------------------------------------------------------
 
@@ -53,17 +49,13 @@ def check_place(path: Path, may_be_link: bool = False) -> None:
     if re.search("[\0\ud800-\udfff]", str(path)):
         raise ValueError(f"the output {name} has a zero byte, or bytes that are no UTF-8 text: choose another name")
     # a path makes "s3:/bucket" of "s3://bucket"
-    is_url = len(path.parts) > 1 and re.fullmatch(r"[A-Za-z][A-Za-z0-9+.-]+:", path.parts[0])
-    if is_url and not Path(path.parts[0]).exists():
+    if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", path.as_posix()) and not Path(path.parts[0]).exists():
         raise ValueError(
-            f"the output {path.parts[0]}//{'/'.join(path.parts[1:])} is a URL, and a local path is needed here; only "
+            f"the output {path.as_posix().replace(':/', '://', 1)} is a URL, and a local path is needed here; only "
             "datasets go to an object storage: name a folder or file of this machine"
         )
     if path.name in ("", ".."):
         raise ValueError(f"the output {name} has no name of its own, which it needs: name it, as in {path / 'out'}")
-    most = 255 - len(".") - SUFFIX_BYTES  # of usual file systems, which hold the scratch folder too
-    if max(len(part.encode()) for part in path.parts) > most:
-        raise ValueError(f"the output {name[:40]}... has a name of over {most} bytes: choose a shorter one")
     if path.is_symlink() and not (may_be_link and path.is_dir()):
         raise ValueError(f"{path} is a link, which would be lost; an output is written in its own place: name that")
     if path.exists() and not (path.is_file() or path.is_dir()):
@@ -78,12 +70,9 @@ def scratch_folder(path: Path) -> Iterator[Path]:
     """Yield a fresh folder beside ``path``, and remove it at the end, whatever happens; missing parents are made.
 
     Where the block fails (Ctrl-C too) the parents are removed again. What killed processes left here for ``path`` goes.
-
-    Raises:
-        OSError: the disk is full.
-        PermissionError: the place cannot be written to.
+    Raises ``OSError`` where the disk is full, and ``PermissionError``.
     """
-    remove_abandoned(path)
+    remove_abandoned(path.parent, path.name)
     missing = [folder for folder in path.parents if not folder.exists()]
     try:
         scratch, lock = _new_scratch(path)
@@ -105,7 +94,6 @@ def scratch_folder(path: Path) -> Iterator[Path]:
 
 
 def _new_scratch(path: Path) -> tuple[Path, int | None]:
-    """A new scratch folder and the descriptor of its lock, if there are locks."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         while True:
@@ -122,43 +110,30 @@ def _new_scratch(path: Path) -> tuple[Path, int | None]:
         raise PermissionError(f"{path} cannot be written; its directory is read-only: choose another place") from error
 
 
-def remove_abandoned(path: Path) -> None:
-    """Remove what killed processes left for ``path``; an output that one of them had taken away is put back."""
-    _clear_dead(path.parent, re.escape(path.name))
+def remove_abandoned(directory: Path, name: str | None = None) -> bool:
+    """Remove what killed processes left for a name in a directory, or for any; whether a live one is writing that.
 
-
-def remove_all_abandoned(directory: Path) -> None:
-    """Remove what killed processes left for any file of a directory in which work is continued."""
-    _clear_dead(directory, ".+")
-
-
-def is_being_written(path: Path) -> bool:
-    """Whether a process that lives, this one too, has a scratch folder for ``path``."""
-    return any(not is_dead for _, is_dead in _scratches(path.parent, re.escape(path.name)))
-
-
-def _clear_dead(directory: Path, names: str) -> None:
-    for scratch, is_dead in _scratches(directory, names):
-        if is_dead:
-            _clear(scratch, directory / scratch.name[1:-SUFFIX_BYTES])
-
-
-def _scratches(directory: Path, names: str) -> Iterator[tuple[Path, bool]]:
-    """Scratch folders for a pattern of names, each with whether its process is dead; none where there are no locks."""
-    pattern, scratches = re.compile(rf"\.(?:{names})\.[0-9a-z_]{{8}}\.mereo"), list[Path]()
+    An output that a killed one had taken away is put back. Without locks nothing is known, and nothing removed.
+    """
+    is_written, names = False, ".+" if name is None else re.escape(name)
+    items = list[Path]()
     with suppress(OSError):  # it may be missing, or be no one's to list
-        scratches = [item for item in directory.iterdir() if pattern.fullmatch(item.name) and not item.is_symlink()]
-    for scratch in scratches:
+        items = list(directory.iterdir())
+    for scratch in items:
+        match = re.fullmatch(rf"\.({names})\.[0-9a-z_]{{8}}\.mereo", scratch.name)
+        if match is None or scratch.is_symlink():
+            continue
         try:
             lock = _lock(scratch)
         except BlockingIOError:
-            yield scratch, False
-            continue
+            is_written = True
         except OSError:  # another user's, or gone by now
-            continue
-        if lock is not None:
-            yield scratch, True
-            os.close(lock)
+            pass
+        else:
+            if lock is not None:
+                _clear(scratch, directory / match[1])
+                os.close(lock)
+    return is_written
 
 
 def _lock(scratch: Path, *, wait: bool = False) -> int | None:
@@ -177,10 +152,7 @@ def _lock(scratch: Path, *, wait: bool = False) -> int | None:
 
 
 def _clear(scratch: Path, path: Path) -> None:
-    """Remove a scratch folder; an output that was to be replaced and was not goes back to its place.
-
-    While that place is taken, the output waits.
-    """
+    """Remove a scratch folder; an output that was to be replaced and was not goes back to its place when free."""
     old = scratch / OLD
     if old.exists() and (scratch / path.name).exists():  # its successor was not put in its place
         try:
@@ -202,11 +174,8 @@ def atomic_file(path: str | Path, *, force: bool = True, inputs: Iterable[str | 
         force: replace an existing file.
         inputs: files and folders that are read, which are never replaced.
 
-    Raises:
-        ValueError: ``path`` is a link, a device or no usable name.
-        FileExistsError: ``path`` exists and ``force`` is false, also where it came while the block ran; or it is a
-            directory, or one of the inputs.
-        OSError: the disk is full, or the place cannot be written to.
+    Raises ``ValueError`` for a link, a device or no usable name, ``FileExistsError`` for a directory, an input, or
+    without ``force`` for what exists or came while the block ran, and ``OSError`` where it cannot be written.
     """
     path = Path(path)
     check_file_place(path, force=force, inputs=inputs)
@@ -215,8 +184,13 @@ def atomic_file(path: str | Path, *, force: bool = True, inputs: Iterable[str | 
         yield partial
         if force:
             os.replace(partial, path)
-        else:
-            _place_new(partial, path)
+            return
+        try:
+            os.link(partial, path)  # in one step if nothing has the name by now, which a rename on POSIX is not
+        except OSError:  # also of a file system without hard links
+            if path.exists():
+                raise FileExistsError(f"{path} {EXISTS}") from None
+            os.rename(partial, path)
 
 
 def check_file_place(path: str | Path | None, *, force: bool = True, inputs: Iterable[str | Path] = ()) -> None:
@@ -228,34 +202,17 @@ def check_file_place(path: str | Path | None, *, force: bool = True, inputs: Ite
         return
     path = Path(path)
     check_place(path)
-    remove_abandoned(path)
+    remove_abandoned(path.parent, path.name)
     if path.is_dir():
         raise FileExistsError(f"{path} is a directory; a file is written there: choose another name")
     if path.exists() and not force:
         raise FileExistsError(f"{path} {EXISTS}")
-    if path.exists() and any(_holds(Path(place), path) for place in inputs):
-        raise FileExistsError(
-            f"{path} is read by this command; it is not replaced, not even by --force: choose another name"
-        )
-
-
-def _holds(place: Path, path: Path) -> bool:
-    """Whether ``path``, which exists, is the file ``place`` by whatever name, or lies in the folder ``place``."""
-    if place.is_dir():
-        return path.resolve().is_relative_to(place.resolve())
-    return place.exists() and path.samefile(place)
-
-
-def _place_new(partial: Path, path: Path) -> None:
-    """Give a file its name if nothing has that by now, which a link does in one step and a rename on POSIX does not."""
-    try:
-        os.link(partial, path)
-    except FileExistsError:
-        raise FileExistsError(f"{path} {EXISTS}") from None
-    except OSError:  # a file system without hard links
-        if path.exists():
-            raise FileExistsError(f"{path} {EXISTS}") from None
-        os.rename(partial, path)
+    for place in map(Path, inputs) if path.exists() else ():
+        # a file may have several names
+        if path.resolve().is_relative_to(place.resolve()) or (place.exists() and path.samefile(place)):
+            raise FileExistsError(
+                f"{path} is read by this command; it is not replaced, not even by --force: choose another name"
+            )
 
 
 # --- folders of results ---------------------------------------------------------------------------------------------
@@ -270,11 +227,9 @@ def new_directory(path: str | Path, force: bool = False, inputs: Sequence[str | 
         force: replace an existing directory, once the new one is complete, if mereo wrote all that it holds.
         inputs: files that are read, which are never replaced.
 
-    Raises:
-        ValueError: ``path`` is a link, a device, a mount point or no usable name.
-        FileExistsError: ``path`` is a file, or a directory with content and ``force`` is false, or it holds what mereo
-            did not write; or one of these came to be while the block ran.
-        OSError: the disk is full, or the place cannot be written to.
+    Raises ``ValueError`` for a link, a device, a mount point or no usable name, ``FileExistsError`` for a file, for a
+    directory with content that mereo did not write, or without ``force`` with any, and ``OSError`` where it cannot be
+    written.
     """
     path = Path(path)
     check_new_directory(path, force, inputs)
@@ -309,9 +264,8 @@ def check_new_directory(path: Path, force: bool, inputs: Sequence[str | Path] = 
         raise FileExistsError(f"{path} is a file; a directory is written there: choose another --output")
     if os.path.ismount(path):
         raise ValueError(f"{path} is a mount point, which cannot be renamed: name a folder in it")
-    if is_being_written(path):
+    if remove_abandoned(path.parent, path.name):
         raise FileExistsError(f"{path} is being written by another process: wait for it, or choose another --output")
-    remove_abandoned(path)
     if not _has_content(path):
         return
     if not force:
@@ -329,15 +283,11 @@ def _has_content(path: Path) -> bool:
 
 
 def _check_ours(folder: Path, path: Path) -> None:
-    """Raise ``FileExistsError`` where ``folder``, which is or was ``path``, holds what its list does not have as it is.
-
-    Links are never in that list.
-    """
+    """Raise ``FileExistsError`` where ``folder``, which is or was ``path``, holds what its list does not have so."""
     try:
-        listed = json.loads((folder / MARKER).read_text("utf-8"))["files"]
+        known = dict(json.loads((folder / MARKER).read_text("utf-8"))["files"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        listed = {}
-    known = listed if isinstance(listed, dict) else {}
+        known = {}
     stamps = {name: stamp for name, stamp in _stamps(folder).items() if name != MARKER}
     others = [name for name, stamp in stamps.items() if stamp is None or known.get(name) != stamp]
     if others:
@@ -356,52 +306,6 @@ def _stamps(folder: Path) -> dict[str, list[int] | None]:
         stamp = [facts.st_size, facts.st_mtime_ns] if stat.S_ISREG(facts.st_mode) else None
         stamps[item.relative_to(folder).as_posix()] = [] if stat.S_ISDIR(facts.st_mode) else stamp
     return stamps
-
-
-# --- folders in which work is continued -------------------------------------------------------------------------------
-
-
-def claim_directory(directory: Path, name: str, settings: dict[str, Any], kind: str) -> dict[str, Any] | None:
-    """Settings that a directory of earlier work holds, or None where it was made with ``settings`` just now.
-
-    Hidden files do not count: a process that was killed while writing leaves them, and they are removed here. It may
-    be a link to a directory, because nothing is put in its place.
-
-    Args:
-        directory: where work is done that may be stopped and continued; made when it is missing.
-        name: of the JSON file in it that says what the work is.
-        settings: what that file says of a new directory.
-        kind: of the directory, for messages: "a dataset".
-
-    Raises:
-        FileExistsError: it is a file, or holds something but no such file.
-        ValueError: its file holds no settings, or it is no place for a directory.
-    """
-    check_place(directory, may_be_link=True)
-    path = directory / name
-    if directory.exists() and not directory.is_dir():
-        raise FileExistsError(f"{directory} is a file; {kind} is a directory: choose another --output")
-    remove_all_abandoned(directory)
-    if path.is_file():
-        return read_settings(path)
-    if directory.is_dir() and any(not file.name.startswith(".") for file in directory.iterdir()):
-        raise FileExistsError(f"{directory} is not empty and holds no {name}; choose another --output")
-    try:
-        write_json(path, settings, force=False)
-    except FileExistsError:  # another process came first
-        return read_settings(path)
-    return None
-
-
-def read_settings(path: Any) -> dict[str, Any]:
-    """Settings in the file of earlier work, a local one or an ``ObjectPath``; ``ValueError`` where it holds none."""
-    try:
-        settings = json.loads(path.read_text("utf-8"))
-    except ValueError:
-        settings = None
-    if not isinstance(settings, dict):
-        raise ValueError(f"{path} holds no settings; what it belongs to cannot be continued: choose another --output")
-    return settings
 
 
 # --- JSON -------------------------------------------------------------------------------------------------------------

@@ -7,7 +7,6 @@ are read whole, moved with the object, and written in their own format again.
 import csv
 import io
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,9 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.atomic_files import atomic_file
-from mereo.io.errors import readable
+from mereo.io.errors import check_suffix, readable
 from mereo.io.mesh_formats import read_segmented_mesh
-from mereo.io.readers import CLOUD_READERS, ply_counts
+from mereo.io.readers import check_ply, read_points
 from mereo.io.volume_files import VOLUME_SUFFIXES, Volume, is_volume, read_scalar_volume
 from mereo.io.writers.glb import write_segments_glb
 from mereo.io.writers.meshes import write_positions_ply, write_segments_obj, write_segments_ply, write_surface_stl
@@ -34,7 +33,7 @@ POSITION, QUATERNION = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """Surfaces of one or more named parts, closed or not; they have no orientations."""
+    """Surfaces of one or more named parts, closed or not."""
 
     mesh: SegmentedMesh
     rotations = None
@@ -52,7 +51,7 @@ class Surfaces:
 
 @dataclass(frozen=True, eq=False)
 class Positions:
-    """Points of a cloud, without anything else that its file may say about them; they have no orientations."""
+    """Points of a cloud, without anything else that its file may say about them."""
 
     points: Float[np.ndarray, "n 3"]
     rotations = None
@@ -109,28 +108,19 @@ Content = Placeable | Volume
 
 @dataclass(frozen=True, eq=False)
 class Attachment:
-    """File that belongs to an object's rest model.
-
-    Attributes:
-        name: of the file, without its folder.
-        content: what it holds, in any frame and unit.
-    """
+    """File that belongs to an object's rest model: its name without the folder, and what it holds, in any frame."""
 
     name: str
     content: Content
 
 
 def read_attachments(paths: Sequence[str | Path]) -> tuple[Attachment, ...]:
-    """Attachments of files, whose names must differ.
-
-    Raises ``FileNotFoundError``, ``ValueError`` for files that are empty, damaged, without points or of another format,
-    and ``ImportError`` for volumes without the extra `medical`.
-    """
+    """Attachments of files, whose names must differ; raises as their readers."""
     files = [Path(path) for path in paths]
     names = [file.name.lower() for file in files]
-    if repeated := [file for file, name in zip(files, names, strict=True) if names.count(name) > 1]:
+    if repeated := [name for name in names if names.count(name) > 1]:
         raise ValueError(
-            f"two files to carry are called {repeated[0].name!r}; results have the names of their files: rename one"
+            f"two files to carry are called {repeated[0]!r}; results have the names of their files: rename one"
         )
     return tuple(Attachment(file.name, _read(file)) for file in files)
 
@@ -139,39 +129,27 @@ def _read(path: Path) -> Content:
     if is_volume(path):
         return read_scalar_volume(path)
     suffix = path.suffix.lower()
-    known = dict.fromkeys((*MESHES, *CLOUDS, ".csv", *VOLUME_SUFFIXES))
-    if path.exists() and suffix not in known:
-        raise ValueError(
-            f"{path} has the suffix {path.suffix!r}; what is carried is one of {', '.join(known)}: convert it"
-        )
+    check_suffix(path, dict.fromkeys((*MESHES, *CLOUDS, ".csv", *VOLUME_SUFFIXES)), "file to carry")
     if suffix == ".csv":
         return read_pose_table(path)
     is_mesh = suffix in MESHES
     if suffix == ".ply":
         with readable(path, "mesh or point cloud"):
-            is_mesh = ply_counts(path).get("face", 0) > 0
-    content = Surfaces(read_segmented_mesh(path)) if is_mesh else _cloud(path)
-    if not np.isfinite(content.points).all():
-        raise ValueError(f"{path} has NaN or infinite positions; all must be finite: export it again")
+            is_mesh = check_ply(path).get("face", 0) > 0
+    content = Surfaces(read_segmented_mesh(path)) if is_mesh else Positions(read_points(path))
+    if not len(content.points) or not np.isfinite(content.points).all():
+        raise ValueError(f"{path} has no positions, or NaN or infinite ones; all must be finite: export it again")
     return content
-
-
-def _cloud(path: Path) -> Positions:
-    with readable(path, "point cloud"):
-        points = np.asarray(CLOUD_READERS[path.suffix.lower()](path), dtype=np.float64).reshape(-1, 3)
-        if not len(points):
-            raise ValueError("it holds 0 points")
-    return Positions(points)
 
 
 def write_attachment(
     path: Path, content: Content, factor: float, frame_rotation: Float[np.ndarray, "3 3"], unit_m: float
 ) -> None:
-    """Write an attachment in the format of its name.
+    """Write an attachment, which is in the input's frame and unit, in the format of its name.
 
     Args:
         path: the file.
-        content: in the input's frame and unit.
+        content: of it.
         factor: of positions in files that have no unit of their own.
         frame_rotation: from the input's frame to glTF's (y up), for the root node of glTF.
         unit_m: metres per unit of the input, for the same and for volumes, which are in millimetres.
@@ -197,9 +175,6 @@ def write_attachment(
         plain(path, content.mesh.transformed(np.diag([factor] * 3 + [1.0])))
 
 
-# --- tables of positions and poses ------------------------------------------------------------------------------------
-
-
 def read_pose_table(path: Path) -> PoseTable:
     """Table of a CSV file, separated by commas, semicolons or tabs: ``POSITION``, with ``QUATERNION`` where it has any.
 
@@ -214,23 +189,21 @@ def read_pose_table(path: Path) -> PoseTable:
         lines = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
         (_, header), *body = lines
         columns = _columns(header)
-        if not set(POSITION) <= columns.keys():
-            raise ValueError(f"its columns are {', '.join(columns)}; it needs x, y, z")
-        stated, lacking = ([name for name in QUATERNION if (name in columns) == has] for has in (True, False))
-        if stated and lacking:
-            raise ValueError(f"it has a column {stated[0]!r} but no {lacking[0]!r}")
+        names = POSITION + QUATERNION if columns.keys() & set(QUATERNION) else POSITION
+        if not set(names) <= columns.keys():
+            raise ValueError(f"its columns are {', '.join(columns)}; it needs {', '.join(names)}")
         if not body:
             raise ValueError("it has a header and no row")
         for line, row in body:
             if len(row) != len(header):
                 raise ValueError(f"line {line} has {len(row)} cells and the header {len(header)}")
-        points = _numbers(body, columns, POSITION)
-        rotations = _rotations(body, _numbers(body, columns, QUATERNION)) if stated else None
+        values = np.array([[_number(line, row[columns[name]], name) for name in names] for line, row in body])
+        points, quaternions = values[:, :3], values[:, 3:]
+        off = np.abs(np.linalg.norm(quaternions, axis=1) - 1) >= 1e-3
+        if len(names) > 3 and off.any():
+            raise ValueError(f"line {body[int(np.argmax(off))][0]} has an orientation that is no rotation")
+        rotations = Rotation.from_quat(quaternions).as_matrix() if len(names) > 3 else None
     return PoseTable(tuple(header), tuple(tuple(row) for _, row in body), delimiter, points, rotations)
-
-
-Lines = list[tuple[int, list[str]]]
-"""Number and cells of each line."""
 
 
 def _columns(header: Sequence[str]) -> dict[str, int]:
@@ -240,21 +213,11 @@ def _columns(header: Sequence[str]) -> dict[str, int]:
     return {name: index for index, name in enumerate(names)}
 
 
-def _numbers(lines: Lines, columns: dict[str, int], names: tuple[str, ...]) -> Float[np.ndarray, "n k"]:
-    """Values of some columns."""
-    return np.array([[_number(line, row[columns[name]], name) for name in names] for line, row in lines])
-
-
 def _number(line: int, cell: str, name: str) -> float:
-    with suppress(ValueError):
-        if np.isfinite(value := float(cell)):
-            return value
-    raise ValueError(f"line {line} has {cell!r} in the column {name}, which is no finite number")
-
-
-def _rotations(lines: Lines, quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
-    """Orientations of quaternions, whose lengths are 1."""
-    off = np.abs(np.linalg.norm(quaternions, axis=1) - 1) >= 1e-3
-    if off.any():
-        raise ValueError(f"line {lines[int(np.argmax(off))][0]} has an orientation that is no rotation")
-    return Rotation.from_quat(quaternions).as_matrix()
+    try:
+        value = float(cell)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise ValueError(f"line {line} has {cell!r} in the column {name}, which is no finite number")
+    return value

@@ -6,8 +6,8 @@ Light, so that the command line may import it.
 
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, Field, dataclass, fields
-from functools import lru_cache
+from dataclasses import MISSING, dataclass, fields
+from functools import lru_cache, partial
 from numbers import Integral, Real
 from types import NoneType
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
@@ -19,13 +19,9 @@ from mereo.geometry.conventions import MIN_POINTS
 
 @dataclass(frozen=True)
 class Bounds:
-    """Interval of finite numbers; of a tuple, which may not be empty, all must lie in it.
+    """Interval of finite numbers, without ``least`` where ``above`` and without ``most`` where ``below``.
 
-    Attributes:
-        least: smallest number that is allowed, or with ``above`` the largest that is not.
-        most: largest number that is allowed, or with ``below`` the smallest that is not.
-        above: leave out ``least`` itself.
-        below: leave out ``most`` itself.
+    Of a tuple, which may not be empty, all numbers must lie in it.
     """
 
     least: float = -math.inf
@@ -50,7 +46,6 @@ class Bounds:
 
 
 def _within(least: float, most: float = math.inf, *, above: bool = False, below: bool = False) -> tuple[Bounds, Any]:
-    """Bounds, and the help of options with their rule behind the default."""
     bounds = Bounds(least, most, above, below)
     return bounds, arg(help_behavior_hint=lambda default: f"(default: {default}; {bounds.rule})")
 
@@ -90,12 +85,13 @@ Share = Annotated[float, *_within(0, 1, above=True)]
 ShareRange = Annotated[tuple[float, float], *_within(0, 1, above=True)]
 
 
-def check_bounds(settings: Any, prefix: str = "") -> None:
-    """Raise ``ValueError`` for the first field of a dataclass whose value its annotation does not allow.
+_kinds = lru_cache(maxsize=64)(partial(get_type_hints, include_extras=True))
 
-    Args:
-        settings: the dataclass; fields with ``Bounds``, literals and truth values are checked.
-        prefix: what the options of these fields begin with, for the sentence; ``--`` turns names into options.
+
+def check_bounds(settings: Any, prefix: str = "") -> None:
+    """Raise ``ValueError`` for the first field of a dataclass whose ``Bounds``, literals or truth value do not hold.
+
+    ``prefix`` is what the options of these fields begin with, for the sentence; ``--`` turns names into options.
     """
     check_values(type(settings), {item.name: getattr(settings, item.name) for item in fields(settings)}, prefix)
 
@@ -107,18 +103,15 @@ def check_values(settings: type, values: Mapping[str, Any], prefix: str = "") ->
         rule = _broken_rule(kinds[item.name], values[item.name]) if item.name in values else None
         if rule is not None:
             name = prefix + (item.name.replace("_", "-") if prefix == "--" else item.name)
-            raise ValueError(f"{name} is {_text(values[item.name])}; it must be {rule}: {_cure(item)}")
+            known = item.default not in (MISSING, None)
+            cure = f"give for example {_text(item.default)}" if known else "correct it"
+            raise ValueError(f"{name} is {_text(values[item.name])}; it must be {rule}: {cure}")
 
 
 def check_value(name: str, value: object, kind: Any, example: object) -> None:
     """Raise ``ValueError`` for an argument that its kind, of this module or a ``Literal``, does not allow."""
     if (rule := _broken_rule(kind, value)) is not None:
         raise ValueError(f"{name} is {_text(value)}; it must be {rule}: give for example {_text(example)}")
-
-
-@lru_cache(maxsize=64)
-def _kinds(settings: type) -> dict[str, Any]:
-    return get_type_hints(settings, include_extras=True)
 
 
 def _broken_rule(kind: Any, value: Any) -> str | None:
@@ -128,27 +121,18 @@ def _broken_rule(kind: Any, value: Any) -> str | None:
     if kind is bool:
         return None if isinstance(value, bool) else "true or false"
     bounds = next((extra for extra in getattr(kind, "__metadata__", ()) if isinstance(extra, Bounds)), None)
-    if bounds is None:
-        return None
-    plain = get_args(kind)[0]
-    if value is None and NoneType in get_args(plain):
+    plain = get_args(kind)[0] if bounds else None
+    if bounds is None or (value is None and NoneType in get_args(plain)):
         return None
     many = get_origin(plain) is tuple
     whole = plain is int or int in get_args(plain)
     values = value if many and isinstance(value, tuple) else (value,) if not many else ()
-    if values and all(_is_number(v, Integral if whole else Real) and bounds.holds(v) for v in values):
+    number: Any = Integral if whole else Real
+    if values and all(isinstance(v, number) and not isinstance(v, bool) and bounds.holds(v) for v in values):
         return None
     return f"{'whole numbers, each ' if many and whole else 'a whole number, ' if whole else ''}{bounds.rule}"
-
-
-def _is_number(value: object, kind: type) -> bool:
-    return isinstance(value, kind) and not isinstance(value, bool)
 
 
 def _text(value: object) -> str:
     text = " ".join(map(repr, value)) if isinstance(value, tuple) else repr(value)
     return text if len(text) <= 60 else f"{text[:60]}..."
-
-
-def _cure(item: "Field[Any]") -> str:
-    return "correct it" if item.default in (MISSING, None) else f"give for example {_text(item.default)}"

@@ -14,7 +14,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from mereo.io.errors import reason
-from mereo.io.object_storage import ObjectPath, Place
+from mereo.io.object_storage import Place, StorageError
 
 HEADER, CHECKSUM = "mereo", "sha256"
 
@@ -28,31 +28,28 @@ def pack_tensors(tensors: Tensors, facts: Mapping[str, Any]) -> bytes:
 
 
 def read_content(path: Place) -> bytes:
-    """Bytes of a file of a dataset.
-
-    Raises ``FileNotFoundError``, ``ValueError`` (its reason only) where a disk cannot read it, and ``StorageError``.
-    """
+    """Bytes of a file of a dataset; ``ValueError`` (its reason only) where a disk cannot read it."""
     try:
         return path.read_bytes()
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
         raise FileNotFoundError(f"{path} does not exist; it is part of a dataset: check the path") from None
+    except StorageError:  # a storage's silence says nothing about the file
+        raise
     except OSError as error:
-        if isinstance(path, ObjectPath):  # a storage's silence says nothing about the file
-            raise
         raise ValueError(reason(error)) from None
 
 
 def unpack_tensors(content: bytes, dataset: str | None = None) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Tensors that ``pack_tensors`` has packed, and their facts, none where there is no header entry.
 
-    Args:
-        content: of the file.
-        dataset: key of the dataset that it should be of; None takes any.
-
-    Raises ``ValueError`` (its reason only) where the file is damaged, or states another dataset.
+    Raises ``ValueError`` (its reason only) where the content is damaged, or of another dataset than the one of this
+    key.
     """
     try:
-        tensors, facts = load(content), _facts(content)
+        tensors = load(content)
+        # 8 bytes with the length of a JSON object, which follows
+        header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
+        facts: dict[str, Any] = json.loads(header.get("__metadata__", {}).get(HEADER, "{}"))
         expected = facts.pop(CHECKSUM, None)
     except (SafetensorError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(reason(error)) from None
@@ -61,13 +58,6 @@ def unpack_tensors(content: bytes, dataset: str | None = None) -> tuple[dict[str
     if dataset is not None and facts.get("dataset") not in (None, dataset):
         raise ValueError("it is of another dataset")
     return tensors, facts
-
-
-def _facts(content: bytes) -> dict[str, Any]:
-    """Header's entry of a file that safetensors has read: 8 bytes with the length of a JSON object, which follows."""
-    header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
-    facts: dict[str, Any] = json.loads(header.get("__metadata__", {}).get(HEADER, "{}"))
-    return facts
 
 
 def check_tensors(tensors: Tensors, shapes: Mapping[str, str], sizes: Mapping[str, int]) -> None:

@@ -5,7 +5,7 @@ import os
 import sys
 import threading
 from collections.abc import Callable
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager, ExitStack, suppress
 from pathlib import Path
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "IGL_NUM_THREADS")
@@ -21,19 +21,12 @@ QUOTAS = (
 def cores() -> int:
     """Number of cores that this process may use, a container's quota included."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, math.ceil(min(count, _quota())))
-
-
-def _quota() -> float:
-    """Cores' worth of time that this process's container may have; infinite where nothing limits it."""
     for files in QUOTAS:
-        try:
+        with suppress(OSError, ValueError):  # no such file, or "max"
             quota, period = (float(word) for file in files for word in Path(file).read_text().split())
-        except (OSError, ValueError):  # no such file, or "max"
-            continue
-        if quota > 0 and period > 0:  # -1 is no limit
-            return quota / period
-    return math.inf
+            if quota > 0 and period > 0:  # -1 is no limit
+                return max(1, math.ceil(min(count, quota / period)))
+    return count
 
 
 def use_threads(count: int) -> None:
@@ -84,10 +77,9 @@ _BLAS_LIMIT = SharedLimit(_blas_limit)
 
 
 def limit_blas_threads() -> AbstractContextManager[object]:
-    """Hold BLAS to one thread: its sums come out the same on any number of cores.
+    """Hold BLAS to one thread, until the last holder lets go: its sums come out the same on any number of cores.
 
-    And where products are small it is faster than two, on busy cores 20 times. The limit is the whole process's, and
-    lasts until the last thread that holds it lets go.
+    And where products are small it is faster than two, on busy cores 20 times.
     """
     return _BLAS_LIMIT
 

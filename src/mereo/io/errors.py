@@ -1,8 +1,7 @@
 """Errors: whatever a library raises becomes one sentence for users, and what else it says is not shown.
 
-A header of a few bytes can promise terabytes, and a megabyte of zip can hold a gigabyte. So while a file is read, the
-process may take only so much more memory: ``DEFAULT_GB``, or what the environment variable ``MEREO_MAX_FILE_GB`` says.
-Light, so that the command line may import it.
+A header of a few bytes can promise terabytes. So while a file is read, the process may take only so much more memory:
+``DEFAULT_GB``, or what the environment variable ``MEREO_MAX_FILE_GB`` says. Light, for the command line.
 """
 
 import ctypes
@@ -13,7 +12,7 @@ import os
 import sys
 import sysconfig
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout
 from pathlib import Path
 from traceback import walk_tb
@@ -122,12 +121,6 @@ def max_bytes() -> int:
     return int(limit * 1e9)
 
 
-def check_bytes(path: str | Path, size: int) -> None:
-    """Raise ``SizeError`` where ``size``, the bytes of ``path``, is over the limit."""
-    if size > max_bytes():
-        raise _too_large(path)
-
-
 def _too_large(path: str | Path) -> SizeError:
     limit = max_bytes() / 1e9
     return SizeError(
@@ -164,6 +157,13 @@ def limited_memory(path: str | Path) -> Iterator[None]:
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
+def check_suffix(path: Path, known: Iterable[str], kind: str) -> None:
+    """Raise ``ValueError`` for a file whose suffix is none of those that a kind of files has."""
+    if path.exists() and path.suffix.lower() not in known:
+        suffixes = ", ".join(known)
+        raise ValueError(f"{path} has the suffix {path.suffix!r}; a {kind} is one of {suffixes}: convert or rename it")
+
+
 def check_count(count: int, available: int, what: str) -> None:
     """Raise ``ValueError`` (its reason only) for a negative count, or one of more than is ``available``."""
     if count < 0:
@@ -176,21 +176,18 @@ def check_count(count: int, available: int, what: str) -> None:
 def readable(path: Path, kind: str) -> Iterator[None]:
     """Refuse missing, empty and too large files; turn what a library raises in the block into one sentence.
 
-    Args:
-        path: the file that is read.
-        kind: what it should be, for the sentence: "point cloud".
-
-    Raises ``FileNotFoundError`` or ``ValueError``; ``ImportError`` and ``SizeError`` pass as they are.
+    ``kind`` is what it should be: "point cloud". Raises ``FileNotFoundError`` or ``ValueError``; ``ImportError`` and
+    ``SizeError`` pass as they are.
     """
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; a {kind} is needed: check the path")
-    if path.is_dir():
-        raise ValueError(f"{path} is a directory; a {kind} is needed: name a file in it")
     if not path.is_file():
-        raise ValueError(f"{path} is not a regular file; a {kind} is needed: save it to a file and name that")
-    if path.stat().st_size == 0:
+        what = "a directory" if path.is_dir() else "not a regular file"
+        raise ValueError(f"{path} is {what}; a {kind} is needed: name a file")
+    if (size := path.stat().st_size) == 0:
         raise ValueError(f"{path} is empty (0 bytes); a {kind} is needed: export or download it again")
-    check_bytes(path, path.stat().st_size)
+    if size > max_bytes():
+        raise _too_large(path)
     try:
         with quiet(), limited_memory(path):
             yield
@@ -223,7 +220,6 @@ def without_output() -> Iterator[None]:
     """
 
     def flush() -> None:
-        """Write out what Python and C still hold of the process's streams."""
         sys.stdout.flush()
         sys.stderr.flush()
         ctypes.CDLL(None).fflush(None)

@@ -1,7 +1,8 @@
-"""The extra `network`: what torch is needed for, said in one sentence where it is not installed."""
+"""Extras: what libraries are needed for, said in one sentence where they are not installed."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
@@ -17,17 +18,12 @@ def network_needed() -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        if not is_torch(error):
-            raise
-        raise ImportError(NEEDED) from None
+        raise (ImportError(NEEDED) if is_torch(error) else error) from None
 
 
 def has_network() -> bool:
     """Whether torch is installed."""
-    try:
-        return find_spec("torch") is not None
-    except ModuleNotFoundError:
-        return False
+    return find_spec("torch") is not None
 
 
 def is_torch(error: BaseException) -> bool:
@@ -35,9 +31,13 @@ def is_torch(error: BaseException) -> bool:
     return isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] == "torch"
 
 
-# --- matplotlib -------------------------------------------------------------------------------------------------------
+def library(name: str, extra: str, user: object) -> Any:
+    """Library that an extra brings; ``ImportError`` says that ``user``, a file or a purpose, needs it."""
+    try:
+        return import_module(name)
+    except ImportError:
+        raise ImportError(f"{user} needs {name}, which is not installed: pip install 'mereo[{extra}]'") from None
 
-# matplotlib, which the extra `plots` brings: training curves and charts need it, and no answer does.
 
 CURE = "is not installed: pip install 'mereo[plots]'"
 

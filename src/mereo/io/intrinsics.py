@@ -31,12 +31,13 @@ NAMED = (
     ("fl_x", "fl_y", "cx", "cy"),
     ("f_u", "f_v", "pp_x", "pp_y"),
 )
-"""Names of focal lengths and principal point: plain, RealSense, nerfstudio, 3DObjectTracking (DLR's M3T)."""
+"""Names of focal lengths and principal point: plain, RealSense, nerfstudio, 3DObjectTracking."""
 
 MATRICES = ("intrinsic_matrix", "K", "k", "cam_K", "camera_matrix")
-"""Names of camera matrices, 3 x 3 or 9 numbers row by row; the first is Open3D's, column by column.
+"""Names of camera matrices, 3 x 3 or 9 numbers row by row; the first is Open3D's, column by column."""
 
-The others are of ROS 1, ROS 2, BOP and ROS's calibrator."""
+SIDES = (("width", "height"), ("image_width", "image_height"), ("w", "h"))
+"""Names of the size in pixels."""
 
 NESTED = ("intrinsic", "intrinsics", "depth_intrinsics")
 """Names of the blocks in which files that hold more keep intrinsics."""
@@ -51,12 +52,7 @@ class CameraWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Statements of a file about a depth camera.
-
-    Attributes:
-        camera: the pinhole.
-        depth_scale: pixel value of one metre, or None where the file does not say.
-    """
+    """Statements of a file about a depth camera: the pinhole, and the pixel value of one metre where it is stated."""
 
     camera: Camera
     depth_scale: float | None = None
@@ -85,10 +81,8 @@ def read_intrinsics(
 ) -> Intrinsics:
     """Pinhole intrinsics, and the depth scale where it is stated, from JSON or ROS YAML.
 
-    Understood: ``fx fy cx cy``, RealSense's ``fx fy ppx ppy``, nerfstudio's ``fl_x fl_y cx cy w h``, 3DObjectTracking's
-    ``f_u f_v pp_x pp_y``, a matrix (``MATRICES``), ROS CameraInfo as YAML or JSON, and files of many frames: BOP's
-    scene_camera.json, and transforms.json with intrinsics for each frame. ``width`` and ``height`` may be called
-    ``image_width`` and ``image_height``.
+    Understood: the names in ``NAMED`` and ``MATRICES``, ROS CameraInfo as YAML or JSON, and files of many frames: BOP's
+    scene_camera.json, and transforms.json with intrinsics for each frame.
 
     Args:
         path: the file.
@@ -108,7 +102,7 @@ def read_intrinsics(
             fields = next(iter(yaml.safe_load_all(plain.removeprefix("\n---"))), None)
         if not isinstance(fields, dict):
             raise ValueError("it is not an object with named fields")
-        fields = _frame(fields, None if image is None else Path(image).stem, index)
+        fields = _frame(fields, Path(image or "").stem, index)
         for key in NESTED:
             fields = {**fields, **fields[key]} if isinstance(fields.get(key), dict) else fields
         intrinsics = Intrinsics(camera_from_fields(fields, size), _depth_scale(fields))
@@ -117,49 +111,44 @@ def read_intrinsics(
 
 
 def camera_from_fields(fields: Fields, size: tuple[int, int] | None = None) -> Camera:
-    """Pinhole camera that these fields of a file state.
-
-    Args:
-        fields: names and values, see ``read_intrinsics``.
-        size: (width, height) in pixels where the fields do not say.
+    """Pinhole camera that these fields of a file state; ``size`` is (width, height) in pixels where they do not say.
 
     Raises ``ValueError`` that says which fields are missing.
     """
     focal_x, focal_y, center_x, center_y = _pinhole(fields)
-    width, height = _image_size(fields, size)
+    sides = next((names for names in SIDES if all(fields.get(name) is not None for name in names)), None)
+    if sides is None and size is None:
+        raise ValueError("it has no width and height")
+    width, height = size if sides is None else [int(fields[name]) for name in sides]  # type: ignore[misc]
     shift = 0.5 - float(fields.get("pixel_center", 0.5 if "fl_x" in fields else 0.0))
     return Camera(width, height, focal_x, focal_y, center_x + shift, center_y + shift)
 
 
-# --- files of many frames --------------------------------------------------------------------------------------------
-
-
-def _frame(fields: Fields, stem: str | None, index: int | None) -> Fields:
+def _frame(fields: Fields, stem: str, index: int | None) -> Fields:
     """Fields of one frame; ``fields`` itself where it describes one camera."""
+    frames, chosen = fields.get("frames"), index
     if _states_a_camera(fields):
         return fields
-    frames = fields.get("frames")
     if isinstance(frames, list) and any(map(_states_a_camera, frames)):
+        numbered = {number: {**fields, **frame} for number, frame in enumerate(frames)}
         names = [Path(str(f.get("depth_file_path", f.get("file_path", "")))).stem for f in frames]
-        chosen = index if index is not None else names.index(stem) if stem in names else None
-        return {**fields, **frames[_chosen(chosen, len(frames), list(range(len(frames))))]}
-    if fields and all(key.isdecimal() for key in fields) and all(map(_states_a_camera, fields.values())):
-        numbers = {int(key): value for key, value in fields.items()}
-        number = re.search(r"\d+$", stem or "")
-        chosen = index if index is not None else int(number.group()) if number else None
-        return dict(numbers[_chosen(chosen, len(numbers), list(numbers))])
-    return fields
-
-
-def _chosen(chosen: int | None, count: int, known: list[int]) -> int:
-    if chosen is None and count == 1:
-        return known[0]
-    if chosen not in known:
+        if index is None and stem in names:
+            chosen = names.index(stem)
+    elif fields and all(key.isdecimal() for key in fields) and all(map(_states_a_camera, fields.values())):
+        numbered = {int(key): value for key, value in fields.items()}
+        if index is None and (digits := re.search(r"\d+$", stem)):
+            chosen = int(digits.group())
+    else:
+        return fields
+    if chosen is None and len(numbered) == 1:
+        chosen = min(numbered)
+    if chosen not in numbered:
         wanted = "no frame is named" if chosen is None else f"frame {chosen} is not there"
         raise ValueError(
-            f"it has {count} frames from {min(known)} to {max(known)} and {wanted}; give one with --frame-index"
+            f"it has {len(numbered)} frames from {min(numbered)} to {max(numbered)} and {wanted}; give one with "
+            "--frame-index"
         )
-    return chosen
+    return numbered[chosen]
 
 
 def _states_a_camera(fields: object) -> bool:
@@ -168,9 +157,6 @@ def _states_a_camera(fields: object) -> bool:
         or any(key in fields for key in MATRICES)
         or any(isinstance(fields.get(key), dict) for key in NESTED)
     )
-
-
-# --- fields ----------------------------------------------------------------------------------------------------------
 
 
 def _pinhole(fields: Fields) -> tuple[float, float, float, float]:
@@ -192,16 +178,6 @@ def _pinhole(fields: Fields) -> tuple[float, float, float, float]:
     return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])
 
 
-def _image_size(fields: Fields, size: tuple[int, int] | None) -> tuple[int, int]:
-    for names in (("width", "height"), ("image_width", "image_height"), ("w", "h")):
-        if all(fields.get(name) is not None for name in names):
-            width, height = (int(fields[name]) for name in names)
-            return width, height
-    if size is None:
-        raise ValueError("it has no width and height")
-    return size
-
-
 def _depth_scale(fields: Fields) -> float | None:
     """Pixel value of one metre, whatever the file means by its number (the module's note)."""
     if "depth_units" in fields:  # RealSense's option: metres of one unit
@@ -219,9 +195,6 @@ def _depth_scale(fields: Fields) -> float | None:
             "unit (0.1) are known; correct it there"
         )
     return per_metre / value
-
-
-# --- lens distortion -------------------------------------------------------------------------------------------------
 
 
 def warn_of_distortion(camera: Camera, fields: Fields, source: str) -> None:

@@ -4,8 +4,9 @@
 """
 
 import re
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,8 @@ from jaxtyping import Float, Int, UInt8
 from mereo.geometry.conventions import LARGEST
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
 from mereo.geometry.radii import Radii
-from mereo.io.errors import check_count, readable
+from mereo.io.errors import check_count, check_suffix, readable
+from mereo.io.extras import library
 from mereo.io.readers import check_ply
 
 VIEWER_ROOT = "camera_frame"
@@ -30,36 +32,28 @@ MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", ".3mf")
 
 
 def read_segmented_mesh(*paths: str | Path) -> SegmentedMesh:
-    """Segments of one or more GLB, OBJ, 3MF, PLY, STL or OFF files, in label order.
+    """Segments of one or more GLB, OBJ, 3MF, PLY, STL or OFF files, in label order; they are not checked.
 
     A file with several named parts (GLB nodes, OBJ objects or groups, 3MF objects) gives one segment each; a file with
     one part gives one segment called after its GLB node, or as our own STL files say, or else after the file. A
-    directory stands for the mesh files in it, by name.
-    Node transforms are applied, except the root of GLB files written by mereo: those come back in the camera frame.
-    Vertices at the same position are merged, because exporters split them at normals and texture seams, which would
-    open a closed mesh. ``SegmentedMesh.check`` is left to the caller.
+    directory stands for the mesh files in it, by name. Node transforms are applied, except the root of GLB files
+    written by mereo: those come back in the camera frame. Vertices at the same position are merged, because exporters
+    split them at normals and texture seams, which would open a closed mesh.
 
-    Raises:
-        FileNotFoundError, ValueError: a file is missing, of another format, damaged or without faces, or two segments
-            have the same name.
-        ImportError: a 3MF file, without the extra `cad`.
+    Raises ``FileNotFoundError``, ``ValueError`` where a file is of another format, damaged or without faces, or two
+    segments have the same name, and ``ImportError`` for a 3MF file without the extra `cad`.
     """
-    files = [file for path in paths for file in _mesh_files(Path(path))]
-    parts = [part for file in files for part in _parts(file)]
+    parts = list[Part]()
+    for path in map(Path, paths):
+        files = [path]
+        if path.is_dir() and not (files := sorted(f for f in path.iterdir() if f.suffix.lower() in MESH_SUFFIXES)):
+            raise ValueError(f"{path} has no mesh files; a {', '.join(MESH_SUFFIXES)} per segment is needed: add them")
+        parts += [part for file in files for part in _parts(file)]
     segments = (
         Segment(name, color or PALETTE[index % len(PALETTE)], vertices, faces)
         for index, (name, color, vertices, faces) in enumerate(parts)
     )
     return SegmentedMesh(tuple(segments))
-
-
-def _mesh_files(path: Path) -> list[Path]:
-    if not path.is_dir():
-        return [path]
-    files = sorted(file for file in path.iterdir() if file.suffix.lower() in MESH_SUFFIXES)
-    if not files:
-        raise ValueError(f"{path} has no mesh files; one of {', '.join(MESH_SUFFIXES)} per segment is needed: add them")
-    return files
 
 
 Part = tuple[str, Color | None, Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
@@ -68,11 +62,9 @@ Part = tuple[str, Color | None, Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]
 
 def _parts(path: Path) -> list[Part]:
     suffix = path.suffix.lower()
-    if path.exists() and suffix not in MESH_SUFFIXES:
-        known = ", ".join(MESH_SUFFIXES)
-        raise ValueError(f"{path} has the suffix {path.suffix!r}; a mesh is one of {known}: convert or rename it")
-    if suffix == ".3mf" and find_spec("lxml") is None:
-        raise ImportError(f"{path} needs lxml, which reads 3MF files and is not installed: pip install 'mereo[cad]'")
+    check_suffix(path, MESH_SUFFIXES, "mesh")
+    if suffix == ".3mf":
+        library("lxml", "cad", path)
     with readable(path, "mesh"):
         if suffix == ".ply":
             check_ply(path)
@@ -87,23 +79,20 @@ def _parts(path: Path) -> list[Part]:
 
 
 def _check_places(name: str, vertices: Float[np.ndarray, "v 3"]) -> None:
-    """Raise ``ValueError`` (its reason only) for places that are not finite, or beyond ``LARGEST``."""
     if not (np.abs(vertices) <= LARGEST).all():
         raise ValueError(f"its part {name!r} has vertices that are NaN, infinite or beyond {LARGEST:g}")
 
 
 def _check_off(path: Path) -> None:
     """Raise ``ValueError`` for an OFF file that was cut short, of which trimesh would return a part."""
-    lines = (line.partition("#")[0].strip() for line in path.read_text("utf-8", errors="replace").splitlines())
-    rows = [line for line in lines if line]
-    keyword = re.match(r"[A-Za-z0-9]*OFF\b", rows[0]) if rows else None
-    if keyword is None:
+    text = re.sub(r"#.*", "", path.read_text("utf-8", errors="replace"))
+    head = re.match(r"\s*[A-Za-z0-9]*OFF\s+(-?\d+)\s+(-?\d+).*", text)
+    if head is None:
         raise ValueError("it has no OFF header")
-    rest = rows[0][keyword.end() :].split()
-    counts, body = (rest, rows[1:]) if rest else (rows[1].split(), rows[2:])
-    vertices, faces = int(counts[0]), int(counts[1])
-    check_count(vertices, len(body), "vertices")
-    check_count(faces, len(body) - vertices, "faces")
+    vertices, faces = int(head[1]), int(head[2])
+    rows = len([line for line in text[head.end() :].splitlines() if line.strip()])
+    check_count(vertices, rows, "vertices")
+    check_count(faces, rows - vertices, "faces")
 
 
 def _obj_parts(path: Path) -> list[Part]:
@@ -111,27 +100,25 @@ def _obj_parts(path: Path) -> list[Part]:
     positions: list[list[float]] = []
     faces: list[list[int]] = []
     owners: list[tuple[str, str, str]] = []
-    name, library = {"o": "", "g": "", "usemtl": ""}, ""
+    name = {"o": "", "g": "", "usemtl": "", "mtllib": ""}
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         kind, *cells = line.split() or [""]
         if kind == "v":
             positions.append([float(cell) for cell in cells[:3]])
         elif kind in name:
             name[kind] = " ".join(cells)
-        elif kind == "mtllib":
-            library = " ".join(cells)
         elif kind == "f":
             corners = [_obj_index(cell, len(positions)) for cell in cells]
             faces += [[corners[0], corners[i], corners[i + 1]] for i in range(1, len(corners) - 1)]
             owners += [(name["o"], name["g"], name["usemtl"])] * (len(corners) - 2)
-    colors = _material_colors(path, library)
+    colors = _material_colors(path, name["mtllib"])
     return _split_parts(np.asarray(positions), np.asarray(faces, dtype=np.int64), owners, colors, path.stem)
 
 
 def _obj_index(cell: str, count: int) -> int:
     """Index of a vertex from ``vertex/texture/normal``, counted from 1, or from the end when negative."""
     index = int(cell.split("/")[0])
-    index = index - 1 if index > 0 else count + index
+    index += -1 if index > 0 else count
     if not 0 <= index < count:
         raise ValueError(f"a face refers to vertex {cell} of {count}")
     return index
@@ -144,18 +131,14 @@ def _split_parts(
     colors: dict[str, Color],
     stem: str,
 ) -> list[Part]:
-    """Parts of a file: one per object, or per group where there is only one object, with the colour of all its faces.
-
-    ``owners`` are object, group and material of each face; unused vertices are left out.
-    """
+    """Parts of a file, with the colour of all faces: one per object, or per group where there is only one object."""
     level = 0 if len({key[0] for key in owners}) > 1 else 1
     labels = [key[level] or key[0] for key in owners]
-    names = list(dict.fromkeys(labels))
-    index = np.asarray([names.index(label) for label in labels], dtype=np.int64)
-    parts: list[Part] = []
-    for i, name in enumerate(names):
-        used, local = np.unique(faces[index == i], return_inverse=True)
-        worn = {colors.get(owner[2]) for owner, label in zip(owners, labels, strict=True) if label == name}
+    names, parts = list(dict.fromkeys(labels)), list[Part]()
+    for name in names:
+        rows = [row for row, label in enumerate(labels) if label == name]
+        used, local = np.unique(faces[rows], return_inverse=True)
+        worn = {colors.get(owners[row][2]) for row in rows}
         color = worn.pop() if len(worn) == 1 else None
         title = name if name and len(names) > 1 else stem
         parts.append((title, color, *merge_positions(vertices[used], local.reshape(-1, 3))))
@@ -165,41 +148,27 @@ def _split_parts(
 def _material_colors(mesh: Path, library: str) -> dict[str, Color]:
     """Diffuse colour (``Kd``, taken as that on the screen) of each material without a texture in an OBJ file's library.
 
-    A library is no part of the shape: where it is missing or damaged, there are no colours, and no error. Only a file
-    in the same folder is read, because a downloaded mesh should not choose which files are opened.
+    Only a file in the same folder is read, because a downloaded mesh should not choose which files are opened.
     """
     path = mesh.parent / library
     if not library or Path(library).name != library or not path.is_file():
         return {}
-    try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except (OSError, MemoryError):
-        return {}
-    colors: dict[str, Color] = {}
-    textured: set[str] = set()
-    name = ""
-    for line in lines:
+    colors, textured, name = dict[str, Color](), set[str](), ""
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         kind, *cells = line.split() or [""]
         if kind == "newmtl":
             name = " ".join(cells)
-        elif kind == "Kd" and (color := _color_of_shares(cells)) is not None:
-            colors[name] = color
         elif kind == "map_Kd":
             textured.add(name)
+        elif kind == "Kd":
+            with suppress(ValueError):  # of a spectral curve, CIE XYZ, damage
+                red, green, blue = map(float, cells)
+                if min(red, green, blue) >= 0 and max(red, green, blue) <= 1:
+                    colors[name] = round(255 * red), round(255 * green), round(255 * blue)
     return {name: color for name, color in colors.items() if name not in textured}
 
 
-def _color_of_shares(cells: list[str]) -> Color | None:
-    """Colour of three numbers from 0 to 1; None for anything else (a spectral curve, CIE XYZ, damage)."""
-    try:
-        red, green, blue = (round(255 * value) if 0 <= value <= 1 else -1 for value in map(float, cells))
-    except ValueError:
-        return None
-    return (red, green, blue) if min(red, green, blue) >= 0 else None
-
-
 def _scene_parts(path: Path) -> list[Part]:
-    """Parts of a file of any other format, by trimesh."""
     scene: Any = trimesh.load_scene(path, process=False)
     base = VIEWER_ROOT if VIEWER_ROOT in scene.graph.nodes else scene.graph.base_frame
     nodes, parts = _nodes_with_faces(scene), list[Part]()
@@ -275,8 +244,8 @@ class GlbScene:
     """Content of a GLB file.
 
     Attributes:
-        mesh: each node with faces as a segment, its vertices merged where they have the same place and colour. Those of
-            our own files are in the input's frame and unit, others in glTF's, metres and y up.
+        mesh: each node with faces as a segment, its vertices merged where they have the same place and colour; of our
+            own files in the input's frame and unit, of others in glTF's, metres and y up.
         colors: of the vertices of each, where it has several; None where it has one.
         radii: how sure the surfaces are, where our own file says it.
         rotation: from the vertices' frame to glTF's.
@@ -292,26 +261,13 @@ class GlbScene:
     is_ours: bool
 
 
-@dataclass(frozen=True, eq=False)
-class _GlbPart:
-    """Node with faces: its segment, colours of its vertices, their radii, and whether these are calibrated."""
-
-    segment: Segment
-    colors: UInt8[np.ndarray, "v 3"] | None
-    radii: Float[np.ndarray, " v"] | None
-    calibrated: bool
-
-
 def is_glb(path: Path) -> bool:
     """Whether a path names a GLB file."""
     return path.suffix.lower() == ".glb"
 
 
 def read_glb(path: str | Path) -> GlbScene:
-    """Meshes of any GLB file.
-
-    Raises ``FileNotFoundError`` where there is none, and ``ValueError`` for a damaged file or one without faces.
-    """
+    """Meshes of any GLB file; raises ``FileNotFoundError``, and ``ValueError`` where it is damaged or has no faces."""
     path = Path(path)
     with readable(path, "GLB file"):
         scene: Any = trimesh.load_scene(path, process=False)
@@ -321,22 +277,26 @@ def read_glb(path: str | Path) -> GlbScene:
         nodes = _nodes_with_faces(scene)
         if not nodes:
             raise ValueError("it has no faces")
-        parts = [_glb_part(scene, node, base, number, path.stem) for number, node in enumerate(nodes)]
+        parts = (_glb_part(scene, node, base, number, path.stem) for number, node in enumerate(nodes))
+        segments, colors, radii, calibrated = zip(*parts, strict=True)
         unit_m = float(abs(np.linalg.det(root)) ** (1 / 3))
         if not unit_m > 0:
             raise ValueError("its root node has a scale of 0")
-        mesh = SegmentedMesh(_renamed([part.segment for part in parts]))
-        return GlbScene(mesh, tuple(part.colors for part in parts), _radii(parts), root / unit_m, unit_m, is_ours)
+        mesh = SegmentedMesh(_renamed(segments))
+        return GlbScene(mesh, colors, _radii(segments, radii, all(calibrated)), root / unit_m, unit_m, is_ours)
 
 
-def _glb_part(scene: Any, node: str, base: str, number: int, stem: str) -> _GlbPart:
+def _glb_part(
+    scene: Any, node: str, base: str, number: int, stem: str
+) -> tuple[Segment, UInt8[np.ndarray, "v 3"] | None, Float[np.ndarray, " v"] | None, bool]:
+    """Segment of a node with faces, colours of its vertices, their radii, and whether these are calibrated."""
     vertices, faces, geometry = _in_frame(scene, node, base)
     _check_places(node, vertices)
     color, colors = _colors(geometry, PALETTE[number % len(PALETTE)])
     radii = geometry.vertex_attributes.get("_RADIUS95")
     facts = geometry.metadata.get("radius95")
     kept, index = _distinct(vertices if colors is None else np.column_stack([vertices, colors]))
-    return _GlbPart(
+    return (
         Segment(stem if node.startswith("geometry_") else node, color, vertices[kept], index[faces], solid=False),
         None if colors is None else colors[kept],
         None if radii is None else np.asarray(radii, dtype=np.float64).reshape(-1)[kept],
@@ -374,7 +334,7 @@ def _screen(linear: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
     return np.rint(255 * share).astype(np.uint8)
 
 
-def _renamed(segments: list[Segment]) -> tuple[Segment, ...]:
+def _renamed(segments: Sequence[Segment]) -> tuple[Segment, ...]:
     """Segments of which no two have the same name: repeated ones are numbered."""
     names: list[str] = []
     for segment in segments:
@@ -383,12 +343,13 @@ def _renamed(segments: list[Segment]) -> tuple[Segment, ...]:
     return tuple(replace(segment, name=name) for segment, name in zip(segments, names, strict=True))
 
 
-def _radii(parts: list[_GlbPart]) -> Radii | None:
-    """Radii of all parts; None where one of them has none."""
-    values = [part.radii for part in parts if part.radii is not None and np.isfinite(part.radii).all()]
-    if len(values) < len(parts):
+def _radii(
+    segments: Sequence[Segment], radii: Sequence[Float[np.ndarray, " _"] | None], calibrated: bool
+) -> Radii | None:
+    values = [each for each in radii if each is not None and np.isfinite(each).all()]
+    if len(values) < len(segments):
         return None
     counts = tuple(len(value) for value in values)
     labels = np.repeat(np.arange(1, len(counts) + 1), counts).astype(np.uint8)
-    points = np.concatenate([part.segment.vertices for part in parts])
-    return Radii(points, labels, np.concatenate(values), counts, all(part.calibrated for part in parts))
+    points = np.concatenate([segment.vertices for segment in segments])
+    return Radii(points, labels, np.concatenate(values), counts, calibrated)

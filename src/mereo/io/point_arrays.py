@@ -3,10 +3,10 @@
     anything -points_of-> PointCloud (or the DepthImage that it was), number of points left out
 
 Libraries are recognized by what their objects have, so that none of them is imported. What could be meant in two ways
-is refused: an image of depths has no positions without its camera, and the columns of a table name no axes. Which
-points are measurements is decided in ``mereo.io.readers.valid_points``, as for files.
+is refused: an image of depths has no positions without its camera, and the columns of a table name no axes.
 """
 
+from contextlib import suppress
 from os import PathLike
 from typing import Any
 
@@ -20,13 +20,6 @@ from mereo.io.errors import reason
 from mereo.io.readers import valid_points
 from mereo.io.ros_recordings import cloud_points
 
-ACCEPTED = (
-    "an array, tensor or nested list of n x 3 numbers, an organized array of h x w x 3, a structured array with fields "
-    "x, y and z, an object with points or vertices (Open3D, trimesh, PyVista), a PointCloud2 message, or a "
-    "mereo.PointCloud or mereo.DepthImage"
-)
-"""Forms that ``points_of`` takes, for sentences."""
-
 
 def points_of(source: object, drop_invalid: bool = False) -> tuple[PointCloud | DepthImage, int]:
     """Observed points of whatever holds a frame in memory, and how many points were left out.
@@ -38,18 +31,15 @@ def points_of(source: object, drop_invalid: bool = False) -> tuple[PointCloud | 
       itself into a numpy array; masked values are points without a measurement;
     - lists or tuples of rows of three numbers;
     - structured arrays with fields x, y and z in any order among others, in one or two dimensions;
-    - objects with ``points`` or ``vertices`` (Open3D, trimesh, PyVista), or with ``point["positions"]`` or
-      ``vertex["positions"]`` (Open3D's tensors);
+    - objects with ``points`` or ``vertices`` (Open3D and its tensors, trimesh, PyVista);
     - messages of the type sensor_msgs/PointCloud2, of ROS 1, ROS 2 or rosbags.
 
     Args:
         source: one frame; a list of frames is recognized by ``is_frame_list`` and refused here.
-        drop_invalid: leave out points that are NaN, infinite or beyond 1e12, and points at exactly (0, 0, 0): sensors
-            mark missing measurements so.
+        drop_invalid: leave out points that are NaN, infinite, beyond 1e12 or exactly (0, 0, 0), as sensors mark them.
 
-    Raises:
-        ValueError: the source is none of these, empty, of another shape or not of real numbers; or it has points
-            without a measurement and ``drop_invalid`` is false; or all of its points are such.
+    Raises ``ValueError`` where the source is none of these, empty, of another shape or not of real numbers, or has
+    points without a measurement that are not to be dropped, or no others.
     """
     if isinstance(source, PointCloud | DepthImage):
         return source, 0
@@ -65,18 +55,15 @@ def points_of(source: object, drop_invalid: bool = False) -> tuple[PointCloud | 
 def is_frame_list(source: object) -> bool:
     """Whether a list or tuple holds frames, and not the rows of one cloud.
 
-    It does where at least one element cannot be a row of numbers, but is a frame: a path or string, a ``PointCloud``
-    or ``DepthImage``, an array of two or more dimensions (of one, where it is structured), a list or tuple whose first
-    element is itself a list, tuple or array, an object with points or vertices, or a PointCloud2 message. So
-    ``[a, b]`` of two arrays n x 3 are two frames, even of equal length, ``[[x, y, z], [x, y, z]]`` is one cloud of two
-    points, and ``[[[x, y, z]]]`` is one frame of one point. What is no list or tuple, a generator or an array among
-    them, and what is empty is no list of frames.
+    It does where at least one element cannot be a row of numbers, but is a frame: a path, what ``points_of`` takes, an
+    array of two or more dimensions (of one, where it is structured), or a list or tuple of such rows. So ``[a, b]`` of
+    two arrays n x 3 are two frames, ``[[x, y, z], [x, y, z]]`` is one cloud of two points, and ``[[[x, y, z]]]`` is one
+    frame of one point. What is no list or tuple, an array among them, and what is empty is no list of frames.
     """
     return isinstance(source, list | tuple) and any(map(_is_frame, source))
 
 
 def _is_frame(item: object) -> bool:
-    """Whether an element of a list is a frame; else it is a row, or neither."""
     if isinstance(item, list | tuple):
         return bool(item) and (isinstance(item[0], list | tuple) or getattr(item[0], "ndim", 0) > 0)
     if isinstance(item, str | PathLike | PointCloud | DepthImage):
@@ -87,16 +74,9 @@ def _is_frame(item: object) -> bool:
     return _is_cloud_message(item) or _carried(item) is not None
 
 
-# --- kinds of sources ------------------------------------------------------------------------------------------------
-
-
 def _positions(source: Any) -> tuple[Float[np.ndarray, "n 3"], str, bool]:
     """All points of a source, what to call it in sentences, and whether it is a grid of pixels."""
     kind = f"the {type(source).__name__}"
-    if isinstance(source, str | PathLike):
-        raise ValueError(
-            f"{str(source)!r} is a path; a frame in memory is needed: read it first, with mereo.read_point_cloud"
-        )
     if is_frame_list(source):
         raise ValueError(f"{kind} holds {counted(len(source), 'frame')}; one is needed: give its elements one by one")
     if _is_cloud_message(source):
@@ -114,7 +94,12 @@ def _positions(source: Any) -> tuple[Float[np.ndarray, "n 3"], str, bool]:
             )
         carried = _carried(source)
         if carried is None and not any(hasattr(source, name) for name in ("__array__", "numpy")):
-            raise ValueError(f"{kind} cannot be read as a frame; one of these is needed: {ACCEPTED}")
+            raise ValueError(
+                f"{kind} cannot be read as a frame; one of these is needed: an array, tensor or nested list of n x 3 "
+                "numbers, an organized array of h x w x 3, a structured array with fields x, y and z, an object with "
+                "points or vertices (Open3D, trimesh, PyVista), a PointCloud2 message, or a mereo.PointCloud or "
+                "mereo.DepthImage"
+            )
         source = source if carried is None else carried
     values = _array(source, kind)
     name = f"{kind} of shape {values.shape}"
@@ -123,8 +108,8 @@ def _positions(source: Any) -> tuple[Float[np.ndarray, "n 3"], str, bool]:
     check_real(values, name)
     if values.size == 0:
         return np.empty((0, 3)), name, False
-    if values.ndim not in (2, 3) or values.shape[-1] != 3 or _is_color_image(values):
-        raise ValueError(f"{name} {_what_it_is(values)}")
+    if wrong := _what_else(values):
+        raise ValueError(f"{name} {wrong}")
     return _floats(values).reshape(-1, 3), name, values.ndim == 3
 
 
@@ -158,22 +143,15 @@ def _structured_points(records: np.ndarray, name: str) -> Float[np.ndarray, "n 3
     return np.stack([_floats(records[axis]).reshape(-1) for axis in "xyz"], axis=1)
 
 
-# --- arrays ----------------------------------------------------------------------------------------------------------
-
-
 def _array(source: Any, kind: str) -> np.ndarray:
-    """Values as numpy's, in the memory of the processor; ``kind`` is what to call them."""
     if isinstance(source, np.ma.MaskedArray):
         return source
     try:
         for step in ("detach", "cpu"):  # torch's tensors need both before numpy takes them, Open3D's the second
             source = getattr(source, step)() if hasattr(source, step) else source
-        if not hasattr(source, "numpy"):
-            return np.asarray(source)
-        try:
-            return np.asarray(source.numpy())
-        except TypeError:  # bfloat16 and 8-bit floats, which numpy does not have
-            return np.asarray(source.double().numpy())
+        with suppress(TypeError):  # of bfloat16 and 8-bit floats, which numpy does not have
+            return np.asarray(source.numpy() if hasattr(source, "numpy") else source)
+        return np.asarray(source.double().numpy())
     except Exception as error:  # whatever the library says of values that it does not hand over
         ragged = isinstance(source, list | tuple) and isinstance(error, ValueError)
         why = "its rows differ in length" if ragged else reason(error)
@@ -183,36 +161,27 @@ def _array(source: Any, kind: str) -> np.ndarray:
 
 
 def _floats(values: np.ndarray) -> Float[np.ndarray, "..."]:
-    """Values as 64-bit floats, NaN where they are masked."""
     return np.asarray(np.ma.filled(values.astype(np.float64), np.nan))
 
 
-def _is_color_image(values: np.ndarray) -> bool:
-    return values.ndim == 3 and values.shape[-1] in (3, 4) and values.dtype == np.uint8
-
-
-def _what_it_is(values: np.ndarray) -> str:
-    """What numbers of a wrong shape are instead, and what to do: the end of a sentence about them."""
-    if values.ndim not in (2, 3):
-        return "is not a point cloud; that is n x 3, or h x w x 3 where it is organized: reshape or select its values"
-    if _is_color_image(values):
-        return "is a color image, which shows no positions; a depth image or point cloud is needed: give one of these"
-    flat, rows, columns = values.ndim == 2, values.shape[0], values.shape[-1]
-    wide = columns > 16  # more than a point's position, normal, colour and labels: a row of pixels
-    if (wide and rows != 3) if flat else (columns == 1 or (wide and rows == 1)):
-        return (
-            "is an image of depths, which needs the camera's intrinsics: give intrinsics=, a mereo.Camera or a file of "
-            "one, or mereo.DepthImage(depth, camera)"
-        )
-    if columns < 3:
-        return f"has {counted(columns, 'column')}; points have three, x, y and z: give all three"
-    if rows == 3 and flat:
-        return "has points as columns; they must be rows: give points.T"
-    if rows == 3:
-        return "has x, y and z on its first axis; they must be on the last: give np.moveaxis(points, 0, -1)"
-    if flat:
-        return (
-            f"has {columns} columns; points have three, x, y and z: take them out, as points[:, :3] (if these are "
-            "depths of pixels, give mereo.DepthImage(depth, camera))"
-        )
-    return f"has {columns} values in each pixel; points have three, x, y and z: take them out, as points[..., :3]"
+def _what_else(values: np.ndarray) -> str:
+    """What numbers are instead of points, and what to do: the end of a sentence about them; empty for points."""
+    if values.ndim in (2, 3):
+        flat, rows, columns = values.ndim == 2, values.shape[0], values.shape[-1]
+        if not flat and columns in (3, 4) and values.dtype == np.uint8:
+            return "is a color image, which shows no positions; a depth image or cloud is needed: give one of these"
+        if columns == 3:
+            return ""
+        wide = columns > 16  # more than a point's position, normal, colour and labels: a row of pixels
+        if (wide and rows != 3) if flat else (columns == 1 or (wide and rows == 1)):
+            return (
+                "is an image of depths, which needs the camera's intrinsics: give intrinsics=, a mereo.Camera or a "
+                "file of one, or mereo.DepthImage(depth, camera)"
+            )
+        if rows == 3:
+            cure = "points.T" if flat else "np.moveaxis(points, 0, -1)"
+            return f"has x, y and z on its first axis; they must be on the last: give {cure}"
+    return (
+        "is not a point cloud; that is n x 3, or h x w x 3 where it is organized: reshape or select its values, as "
+        "points[..., :3]"
+    )

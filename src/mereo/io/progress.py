@@ -8,7 +8,6 @@ is a bar on a terminal, and elsewhere the same as a plain line now and then. Wha
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
@@ -21,22 +20,12 @@ from rich.progress import Progress as Bar
 LINE_EVERY_S = 10.0
 """Seconds between two plain lines."""
 
-WINDOW_S = 60.0
-"""Seconds, the latest, of which the rate is: a machine that becomes busy shows in it."""
-
 
 @dataclass
 class Progress:
-    """Progress of one stage, which ``progress`` makes.
+    """Progress of one stage of ``total`` units of work, which ``progress`` makes.
 
-    Attributes:
-        stage: its name.
-        total: units of work.
-        unit: what these are, in the plural.
-        each: examples in a unit, where the rate is not of units but of examples; else 0.
-        quiet: show nothing.
-        bar: of a terminal.
-        done: units so far.
+    ``unit`` is what these are, in the plural; with ``each`` examples in a unit the rate is of examples.
     """
 
     stage: str
@@ -51,24 +40,12 @@ class Progress:
         self._task = None if self.bar is None else self.bar.add_task("", total=self.total, stage=self.stage)
         self._started = self._shown = time.monotonic()
         self._paused_s = 0.0
-        self._past = deque([(0.0, 0)])
 
     def advance(self, count: int = 1, note: str = "", tail_s: float = 0.0) -> None:
-        """Count ``count`` units as done.
-
-        Args:
-            count: how many more.
-            note: to be shown behind the time left.
-            tail_s: seconds that are expected beside the units that are left, which the time left then includes.
-        """
+        """Count ``count`` more units as done; ``note`` is shown behind the time left, which includes ``tail_s``."""
         now = time.monotonic()
         self.done += count
-        worked_s = now - self._started - self._paused_s
-        while len(self._past) > 1 and worked_s - self._past[1][0] > WINDOW_S:
-            self._past.popleft()
-        then_s, then = self._past[0]
-        self._past.append((worked_s, self.done))
-        rate = (self.done - then) / max(worked_s - then_s, 1e-9)
+        rate = self.done / max(now - self._started - self._paused_s, 1e-9)
         left_s = (self.total - self.done) / max(rate, 1e-9) + tail_s
         speed = f"{rate:.{1 if rate >= 0.1 else 3}f} {self.unit}/s"
         if self.each:
@@ -95,20 +72,12 @@ class Progress:
         """Seconds that a unit took, in the mean; 0 before the first."""
         return (time.monotonic() - self._started - self._paused_s) / self.done if self.done else 0.0
 
-    def close(self) -> None:
-        """Print how long it took, where anything was done."""
-        if self.done and not self.quiet:
-            _print(f"{self.stage}: {self.done} {self.unit} in {duration(time.monotonic() - self._started)}")
-
 
 @contextmanager
 def progress(
     stage: str, total: int, unit: str = "examples", *, each: int = 0, quiet: bool = False
 ) -> Iterator[Progress]:
-    """Context of a stage, which shows its progress; at its end a line with the time it took, unless it failed.
-
-    The arguments are the attributes of ``Progress``.
-    """
+    """Context of a ``Progress``, which is shown; at its end a line with the time it took, unless it failed."""
     console = Console(stderr=True, highlight=False)
     bar = None
     if console.is_terminal and not quiet:
@@ -118,7 +87,8 @@ def progress(
     with bar or nullcontext():
         shown = Progress(stage, total, unit, each, quiet, bar)
         yield shown
-    shown.close()
+    if shown.done and not quiet:
+        _print(f"{stage}: {shown.done} {unit} in {duration(time.monotonic() - shown._started)}")
 
 
 def tracked(stage: str, count: int, unit: str, *, quiet: bool = False) -> Iterator[int]:
@@ -148,10 +118,7 @@ def shown_stages() -> Iterator[None]:
 
 @contextmanager
 def stage(text: str) -> Iterator[None]:
-    """Context of a stage without a count, which is shown on standard error once it takes ``STAGE_S``.
-
-    ``text`` says what is done: "register the model". A line now and then says for how long.
-    """
+    """Context of a stage without a count ("register the model"), shown on standard error once it takes ``STAGE_S``."""
     if not SHOWS_STAGES.get():
         yield
         return

@@ -1,16 +1,13 @@
 """Readers of point clouds, depth images and masks; ``mereo.io.sensor_frame`` reads whichever a file holds.
 
-Every reader raises ``FileNotFoundError`` or a ``ValueError`` of one sentence (value, rule, cure), whatever the parsing
-library raised: a parser of a format raises any exception whose text completes "cannot be read as a point cloud (...)".
-Nothing is repaired silently: missing points are refused unless the caller asks to drop them. Depth scales and pixel
-centres are explained in ``mereo.io.intrinsics``.
+Every reader raises ``FileNotFoundError`` or a ``ValueError`` of one sentence (value, rule, cure); a parser of a format
+raises any exception whose text completes "cannot be read as a point cloud (...)". Nothing is repaired silently.
 """
 
 import json
 import re
 from collections.abc import Callable
-from contextlib import suppress
-from importlib.util import find_spec
+from contextlib import nullcontext, suppress
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -23,13 +20,14 @@ from PIL import Image
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import LARGEST
 from mereo.geometry.transforms import checked_pose
-from mereo.io.errors import check_count, limited_memory, quiet, readable, without_output
+from mereo.io.errors import check_count, check_suffix, limited_memory, quiet, readable, without_output
+from mereo.io.extras import library
 
 PLAUSIBLE_DEPTH_M = (0.05, 20.0)
-"""Range of an image's median depth, unless the caller says otherwise; beyond it the unit is wrong."""
+"""Range of an image's median depth; beyond it the unit is wrong, which is otherwise invisible."""
 
-MILLIMETRES, METRES = 1000.0, 1.0
-"""Depth scales of integer and of floating images where nothing else is said, in units per metre."""
+MILLIMETRES = 1000.0
+"""Depth scale of images of integers where nothing else is said, in units per metre; that of floats is 1."""
 
 NOTHING_M = 1e9
 """Depth from which on nothing was measured: renderers store 1e10 where a ray met nothing."""
@@ -54,11 +52,8 @@ def read_point_cloud(path: str | Path, drop_invalid: bool = False) -> PointCloud
         drop_invalid: leave out points that are NaN, infinite or beyond 1e12, and points at exactly (0, 0, 0): sensors
             mark missing measurements so.
 
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is of another format, empty, truncated or not numeric, or has invalid points and
-            ``drop_invalid`` is false.
-        ImportError: a ZDF file, without the extra `sensors`.
+    Raises ``FileNotFoundError``, ``ValueError`` where it is of another format, empty, truncated or not numeric, or has
+    invalid points that are not to be dropped, and ``ImportError`` for a ZDF file without the extra `sensors`.
     """
     return PointCloud(valid_points(read_points(path), path, drop_invalid))
 
@@ -66,15 +61,9 @@ def read_point_cloud(path: str | Path, drop_invalid: bool = False) -> PointCloud
 def read_points(path: str | Path) -> Float[np.ndarray, "n 3"]:
     """Points of a file as ``read_point_cloud`` reads them, those without a measurement included."""
     path = Path(path)
-    reader = CLOUD_READERS.get(path.suffix.lower())
-    if reader is None and path.exists():
-        known = ", ".join(CLOUD_READERS)
-        raise ValueError(
-            f"{path} has the suffix {path.suffix!r}; a point cloud is one of {known}: convert or rename it"
-        )
+    check_suffix(path, CLOUD_READERS, "point cloud")
     with readable(path, "point cloud"):
-        assert reader is not None
-        return np.asarray(reader(path), dtype=np.float64).reshape(-1, 3)
+        return np.asarray(CLOUD_READERS[path.suffix.lower()](path), dtype=np.float64).reshape(-1, 3)
 
 
 def valid_points(
@@ -85,11 +74,7 @@ def valid_points(
 ) -> Float[np.ndarray, "m 3"]:
     """Points that are measurements, as a copy. Raises as ``read_point_cloud`` does.
 
-    Args:
-        points: any unit.
-        path: where they come from, for the sentences.
-        drop_invalid: leave the others out.
-        cure: what to do where they are not to be left out, for the end of that sentence.
+    ``path`` is where they come from, and ``cure`` what to do where others are not to be left out, for the sentences.
     """
     if len(points) == 0:
         raise ValueError(f"{path} holds 0 points; the object must be visible: check where they come from")
@@ -115,11 +100,7 @@ def valid_points(
 
 
 def read_depth_image(
-    path: str | Path,
-    camera: Camera,
-    depth_scale: float | None = None,
-    mask_path: str | Path | None = None,
-    plausible_m: tuple[float, float] = PLAUSIBLE_DEPTH_M,
+    path: str | Path, camera: Camera, depth_scale: float | None = None, mask_path: str | Path | None = None
 ) -> DepthImage:
     """Depth in metres of a PNG, TIFF, EXR or NPY image; 0 where nothing was measured or the mask is 0.
 
@@ -129,20 +110,13 @@ def read_depth_image(
         depth_scale: pixel value of one metre, so that metres = value / depth_scale; by default 1000 for integers and 1
             for floats (``mereo.io.intrinsics`` on BOP and RealSense).
         mask_path: image of the same size, not 0 on the object.
-        plausible_m: the median depth must lie in this range, because a wrong unit is otherwise invisible.
 
-    Raises:
-        FileNotFoundError, ValueError: the file is missing, damaged, of another kind or size, without any measured
-            pixel, or its median depth is not plausible.
-        ImportError: an EXR file, without the extra `sensors`.
+    Raises ``FileNotFoundError``, ``ValueError`` where it is damaged, of another kind or size, without any measured
+    pixel, or of an implausible median depth, and ``ImportError`` for an EXR file without the extra `sensors`.
     """
     path = Path(path)
-    if path.exists() and path.suffix.lower() not in DEPTH_READERS:
-        known = ", ".join(DEPTH_READERS)
-        raise ValueError(
-            f"{path} has the suffix {path.suffix!r}; a depth image is one of {known}: convert or rename it"
-        )
-    return usable_depth(depth_of(path, read_raw_depth(path), depth_scale, camera), path, mask_path, plausible_m)
+    check_suffix(path, DEPTH_READERS, "depth image")
+    return usable_depth(depth_of(path, read_raw_depth(path), depth_scale, camera), path, mask_path)
 
 
 def read_raw_depth(path: Path) -> Raw:
@@ -157,26 +131,21 @@ def is_depth_image(path: Path) -> bool:
         return path.suffix.lower() in DEPTH_READERS
     if not path.is_file():  # a pipe would be waited for
         return False
-    try:
-        with quiet():
-            array = np.lib.format.open_memmap(path, mode="r")
-    except Exception:  # a damaged header raises what Python's own parser does, too
-        return False  # the reader of clouds says what is wrong
-    return array.ndim == 2 and array.shape[1] >= NARROWEST
+    # a damaged header raises what Python's own parser does, too; the reader of clouds says what is wrong
+    with suppress(Exception), quiet():
+        array = np.lib.format.open_memmap(path, mode="r")
+        return array.ndim == 2 and array.shape[1] >= NARROWEST
+    return False
 
 
 def metres(raw: Raw, depth_scale: float | None) -> Float[np.ndarray, "h w"]:
     """Depth in metres from stored values, 0 where nothing was measured.
 
-    In floats NaN and infinity say so (ROS REP 118), and values from ``NOTHING_M`` up.
-
-    Args:
-        raw: 0 means no measurement.
-        depth_scale: pixel value of one metre; by default 1000 for integers and 1 for floats.
+    In floats NaN and infinity say so (ROS REP 118), and values from ``NOTHING_M`` up. ``depth_scale`` is the pixel
+    value of one metre, by default 1000 for integers and 1 for floats.
     """
-    floating = raw.dtype.kind == "f"
     if depth_scale is None:
-        depth_scale = METRES if floating else MILLIMETRES
+        depth_scale = 1.0 if raw.dtype.kind == "f" else MILLIMETRES
     if not (np.isfinite(depth_scale) and depth_scale > 0):
         raise ValueError(
             f"the depth scale is {depth_scale}; it must be positive, in units per metre: 1000 for millimetres"
@@ -194,12 +163,7 @@ def depth_of(path: Path, raw: Raw, depth_scale: float | None, camera: Camera) ->
         raise ValueError(f"{path} cannot be used: {error}") from None
 
 
-def usable_depth(
-    image: DepthImage,
-    path: str | Path,
-    mask_path: str | Path | None = None,
-    plausible_m: tuple[float, float] = PLAUSIBLE_DEPTH_M,
-) -> DepthImage:
+def usable_depth(image: DepthImage, path: str | Path, mask_path: str | Path | None = None) -> DepthImage:
     """Depth image in metres without what its mask leaves out; raises ``ValueError`` as ``read_depth_image`` does."""
     depth = image.depth
     if mask_path is not None:
@@ -208,10 +172,11 @@ def usable_depth(
         where = "inside the mask" if image.valid.any() else "in the image"
         raise ValueError(f"{path} measures 0 pixels {where}; the object must be visible: check the image and the mask")
     median_m = float(np.median(depth[depth > 0]))
-    if not plausible_m[0] <= median_m <= plausible_m[1]:
+    least_m, most_m = PLAUSIBLE_DEPTH_M
+    if not least_m <= median_m <= most_m:
         raise ValueError(
-            f"the median depth of {path} is {median_m:.4g} m; it must be between {plausible_m[0]:g} and "
-            f"{plausible_m[1]:g} m: give the pixel value of one metre with --depth-scale (1000 for millimetres)"
+            f"the median depth of {path} is {median_m:.4g} m; it must be between {least_m:g} and {most_m:g} m: give "
+            "the pixel value of one metre with --depth-scale (1000 for millimetres)"
         )
     return DepthImage(depth, image.camera)
 
@@ -235,12 +200,7 @@ def read_mask(path: str | Path, size: tuple[int, int] | None = None) -> Bool[np.
 
 
 def open_image(source: Path | BytesIO, formats: tuple[str, ...] | None = None) -> Image.Image:
-    """Open an image, which is to be closed by the caller; Pillow does not compare the checksums of a PNG by itself.
-
-    Args:
-        source: the file.
-        formats: those that Pillow may take it for.
-    """
+    """Open an image of one of some formats, to be closed by the caller, and compare the checksums of a PNG."""
     with Image.open(source, formats=formats) as image:
         if image.format == "PNG":
             image.verify()
@@ -249,38 +209,35 @@ def open_image(source: Path | BytesIO, formats: tuple[str, ...] | None = None) -
     return Image.open(source, formats=formats)
 
 
-def _png(path: Path) -> Raw:
-    with open_image(path) as image:
-        if image.format != "PNG" or image.mode not in ("I;16", "I;16B", "I"):
-            raise ValueError(f"it is {image.format} of mode {image.mode}, not a 16-bit grey PNG")
-        return np.asarray(image).astype(np.asarray(image).dtype.newbyteorder("="))
+def in_memory(values: np.ndarray) -> np.ndarray:
+    """Values that no longer lie in the file, with the machine's own order of bytes."""
+    return np.array(values, dtype=values.dtype.newbyteorder("="))
 
 
-def _tiff(path: Path) -> Raw:
+def _grey(path: Path) -> Raw:
+    kind = "PNG" if path.suffix.lower() == ".png" else "TIFF"
     with path.open("rb") as file:
         is_big_endian = file.read(2) == b"MM"
-    with without_output(), open_image(path) as image:  # libtiff prints what Pillow says again
-        if image.format != "TIFF" or image.mode not in ("I;16", "I;16B", "I", "F"):
-            raise ValueError(f"it is {image.format} of mode {image.mode}, not a grey TIFF of 16-bit or float values")
-        if getattr(image, "n_frames", 1) != 1:
-            raise ValueError(f"it has {image.n_frames} pages instead of one")  # type: ignore[attr-defined]
+    # libtiff prints what Pillow says again
+    with without_output() if kind == "TIFF" else nullcontext(), open_image(path) as image:
+        if image.format != kind or image.mode not in ("I;16", "I;16B", "I", "F"):
+            needed = "16-bit grey PNG" if kind == "PNG" else "grey TIFF of 16-bit or float values"
+            raise ValueError(f"it is {image.format} of mode {image.mode}, not a {needed}")
+        if (pages := getattr(image, "n_frames", 1)) != 1:
+            raise ValueError(f"it has {pages} pages instead of one")
         if image.mode == "F" and is_big_endian and image.info.get("compression") != "raw":
             # Pillow 13 swaps no bytes here and returns noise
             raise ValueError("it is compressed, floating and big-endian, which is not supported: save it uncompressed")
-        return np.asarray(image).astype(np.asarray(image).dtype.newbyteorder("="))
+        return in_memory(np.asarray(image))
 
 
 def _exr(path: Path) -> Raw:
-    if find_spec("OpenEXR") is None:
-        raise ImportError(f"{path} needs OpenEXR, which is not installed: pip install 'mereo[sensors]'")
-    import OpenEXR
-
+    OpenEXR: Any = library("OpenEXR", "sensors", path)
     with without_output(), OpenEXR.File(str(path), separate_channels=True) as file:
         channels = {str(name): np.array(channel.pixels) for name, channel in file.channels().items()}
     known = ("z", "v", "y", "r", "depth", "distance")  # v is Blender's, r that of an image saved as grey colour
     depths = [name for last in known for name in channels if name.lower().split(".")[-1] == last]
-    if not depths and len(channels) == 1:
-        depths = list(channels)
+    depths = depths or (list(channels) if len(channels) == 1 else [])
     if not depths:
         raise ValueError(f"its channels are {', '.join(channels)}, none of them a depth such as Z")
     return channels[depths[0]]
@@ -294,8 +251,7 @@ def _npy(path: Path) -> Raw:
 
 
 DEPTH_READERS: dict[str, Callable[[Path], Raw]] = {
-    ".png": _png,
-    **dict.fromkeys((".tif", ".tiff"), _tiff),
+    **dict.fromkeys((".png", ".tif", ".tiff"), _grey),
     ".exr": _exr,
     ".npy": _npy,
 }
@@ -307,8 +263,7 @@ DEPTH_READERS: dict[str, Callable[[Path], Raw]] = {
 
 def _ply_points(path: Path) -> Float[np.ndarray, "n 3"]:
     """Vertices of a PLY file; trimesh returns those it finds, so a file cut short is only noticed by counting them."""
-    check_ply(path)
-    count = ply_counts(path).get("vertex", 0)
+    count = check_ply(path).get("vertex", 0)
     if count == 0:
         raise ValueError("it has 0 vertices")
     loaded: Any = trimesh.load(path, file_type="ply", process=False)
@@ -316,41 +271,27 @@ def _ply_points(path: Path) -> Float[np.ndarray, "n 3"]:
     return np.asarray(loaded.vertices, dtype=np.float64)
 
 
-def ply_counts(path: Path) -> dict[str, int]:
-    """Number of each kind of element (vertex, face) that a PLY file's header states."""
+def check_ply(path: Path) -> dict[str, int]:
+    """Number of each kind of element (vertex, face) that a PLY file's header states.
+
+    Raises ``ValueError`` for a file that trimesh would read in part: with a wrong header, or text cut short.
+    """
     with path.open("rb") as file:
-        return {name: count for name, count, _ in _ply_header(file.read(65536))[1]}
-
-
-def check_ply(path: Path) -> None:
-    """Raise ``ValueError`` for a PLY file that trimesh would read in part: with a wrong header, or text cut short."""
-    with path.open("rb") as file:
-        order, elements, start = _ply_header(file.read(65536))
-        file.seek(start)
-        rows = sum(1 for row in file if row.strip()) if order == "ascii" else 0
-    if order == "ascii":
-        check_count(sum(count for _, count, _ in elements), rows, "rows")
-
-
-def _ply_header(content: bytes) -> tuple[str, list[tuple[str, int, list[list[str]]]], int]:
-    """Header of a PLY file: format, name, count and properties (type and name) of each element, start of the data."""
-    match = re.search(rb"^end_header[ \t]*\r?\n?", content[:65536], re.MULTILINE)
-    if not content.startswith(b"ply") or match is None:
-        raise ValueError("it has no PLY header")
-    order, elements = "", []
-    for key, *values in filter(None, map(str.split, content[: match.end()].decode("latin-1").splitlines())):
-        if key == "format":
-            order = values[0]
-        elif key == "element":
-            count = int(values[1])
-            check_count(count, max(count, 0), f"of element {values[0]!r}")
-            elements.append((values[0], count, list[list[str]]()))
-        elif key == "property":
-            elements[-1][2].append(values)
-    orders = ("ascii", "binary_little_endian", "binary_big_endian")
-    if order not in orders:
-        raise ValueError(f"its format is {order!r}, not one of {', '.join(orders)}")
-    return order, elements, match.end()
+        head = file.read(65536)
+        end = re.search(rb"^end_header[ \t]*\r?\n?", head, re.MULTILINE)
+        if not head.startswith(b"ply") or end is None:
+            raise ValueError("it has no PLY header")
+        lines = [line.split() for line in head[: end.end()].decode("latin-1").splitlines()]
+        order = next((line[1] for line in lines if line[:1] == ["format"]), "")
+        if order not in ("ascii", "binary_little_endian", "binary_big_endian"):
+            raise ValueError(f"its format is {order!r}, not ascii, binary_little_endian or binary_big_endian")
+        counts = {line[1]: int(line[2]) for line in lines if line[:1] == ["element"]}
+        for name, count in counts.items():
+            check_count(count, max(count, 0), f"of element {name!r}")
+        if order == "ascii":
+            file.seek(end.end())
+            check_count(sum(counts.values()), sum(1 for row in file if row.strip()), "rows")
+    return counts
 
 
 def _text_points(path: Path) -> Float[np.ndarray, "n 3"]:
@@ -372,14 +313,12 @@ def _text_points(path: Path) -> Float[np.ndarray, "n 3"]:
 
 def _is_row(line: str) -> bool:
     """Whether a line holds at least three numbers; other cells may be words, and comments are never rows."""
-    if line.lstrip().startswith(("#", "//")):
-        return False
     numbers = 0
     for cell in re.split(r"[,;\s]+", line.strip()):
         with suppress(ValueError):
             float(cell)
             numbers += 1
-    return numbers >= 3
+    return numbers >= 3 and not line.lstrip().startswith(("#", "//"))
 
 
 def _array_points(path: Path) -> Float[np.ndarray, "n 3"]:
@@ -387,10 +326,9 @@ def _array_points(path: Path) -> Float[np.ndarray, "n 3"]:
         loaded = np.load(file, allow_pickle=False)
         if isinstance(loaded, np.ndarray):
             return _check_array(loaded)
-        if "points" in loaded:
-            return _check_array(loaded["points"])
-        arrays = [loaded[key] for key in loaded.files]
-        fitting = [array for array in arrays if array.ndim in (2, 3) and array.shape[-1] == 3]
+        names = ["points"] if "points" in loaded else loaded.files
+        arrays = [loaded[name] for name in names]
+    fitting = [array for array in arrays if names == ["points"] or (array.ndim in (2, 3) and array.shape[-1] == 3)]
     if len(fitting) != 1:
         raise ValueError(f"it holds {len(fitting)} arrays of shape [n, 3] and none called 'points'")
     return _check_array(fitting[0])
@@ -409,7 +347,14 @@ def _check_array(array: np.ndarray) -> Float[np.ndarray, "n 3"]:
 
 def _pcd_points(path: Path) -> Float[np.ndarray, "n 3"]:
     """Points of a PCD file: ascii, binary, binary_compressed; organized clouds come row by row, with their NaN rows."""
-    header, body = _pcd_header(path.read_bytes())
+    content = path.read_bytes()
+    match = re.search(rb"^DATA[ \t]+\S+[ \t]*\r?\n?", content[:65536], re.MULTILINE)
+    if match is None:
+        raise ValueError("it has no PCD header")
+    lines = [line.split() for line in content[: match.end()].decode("ascii").splitlines() if not line.startswith("#")]
+    header, body = {line[0]: line[1:] for line in lines if len(line) > 1}, content[match.end() :]
+    if missing := [key for key in ("FIELDS", "SIZE", "TYPE", "POINTS") if key not in header]:
+        raise ValueError(f"its header has no {missing[0]}")
     count, row = int(header["POINTS"][0]), _pcd_row(header)
     width, height = (int(header.get(key, [str(count)])[0]) for key in ("WIDTH", "HEIGHT"))
     if count < 0 or ({"WIDTH", "HEIGHT"} <= header.keys() and width * height != count):
@@ -428,37 +373,25 @@ def _pcd_points(path: Path) -> Float[np.ndarray, "n 3"]:
     return np.stack([records[axis].astype(np.float64).reshape(count) for axis in "xyz"], axis=1)
 
 
-def _pcd_header(content: bytes) -> tuple[dict[str, list[str]], bytes]:
-    match = re.search(rb"^DATA[ \t]+\S+[ \t]*\r?\n?", content[:65536], re.MULTILINE)
-    if match is None:
-        raise ValueError("it has no PCD header")
-    lines = [line.split() for line in content[: match.end()].decode("ascii").splitlines() if not line.startswith("#")]
-    header = {line[0]: line[1:] for line in lines if len(line) > 1}
-    missing = [key for key in ("FIELDS", "SIZE", "TYPE", "POINTS") if key not in header]
-    if missing:
-        raise ValueError(f"its header has no {missing[0]}")
-    return header, content[match.end() :]
-
-
 def _pcd_row(header: dict[str, list[str]]) -> np.dtype:
     """One point as a packed record; padding fields are all called ``_`` and get distinct names."""
     kinds = {"F": "f", "I": "i", "U": "u"}
     counts = header.get("COUNT", ["1"] * len(header["FIELDS"]))
     columns = zip(header["FIELDS"], header["TYPE"], header["SIZE"], counts, strict=True)
-    fields: list[Any] = []
-    for index, (name, kind, size, count) in enumerate(columns):
-        fields.append((name if name in "xyz" else f"{name}{index}", f"<{kinds[kind]}{size}", (int(count),)))
+    fields: list[Any] = [
+        (name if name in "xyz" else f"{name}{index}", f"<{kinds[kind]}{size}", (int(count),))
+        for index, (name, kind, size, count) in enumerate(columns)
+    ]
     return np.dtype(fields)
 
 
 def _pcd_ascii(body: bytes, row: np.dtype, count: int) -> Float[np.ndarray, "n 3"]:
-    sizes = [int(np.prod(row[name].shape)) for name in row.names or ()]
-    starts = dict(zip(row.names or (), np.cumsum([0, *sizes[:-1]]).tolist(), strict=True))
+    names = [name for name in row.names or () for _ in range(int(np.prod(row[name].shape)))]  # of the columns
     lines = [line for line in body.decode("ascii").splitlines() if line.strip()]
     check_count(count, len(lines), "points")
     if count == 0:
         return np.empty((0, 3))
-    return np.loadtxt(lines[:count], usecols=[starts[axis] for axis in "xyz"], ndmin=2)
+    return np.loadtxt(lines[:count], usecols=[names.index(axis) for axis in "xyz"], ndmin=2)
 
 
 def _pcd_compressed(body: bytes, row: np.dtype, count: int) -> Float[np.ndarray, "n 3"]:
@@ -468,13 +401,9 @@ def _pcd_compressed(body: bytes, row: np.dtype, count: int) -> Float[np.ndarray,
     packed, unpacked = (int(size) for size in np.frombuffer(body, "<u4", 2))
     check_count(count, unpacked // row.itemsize, "points")
     data = _lzf_decompress(body[8 : 8 + packed], unpacked)
-    axes, start = {}, 0
-    for name in row.names or ():
-        length = row[name].itemsize * count
-        if name in "xyz":
-            axes[name] = np.frombuffer(data[start : start + length], row[name].base).astype(np.float64)
-        start += length
-    return np.stack([axes[axis] for axis in "xyz"], axis=1)
+    starts = {name: count * offset for name, (_, offset, *_) in (row.fields or {}).items()}
+    axes = [np.frombuffer(data, row[axis].base, count, starts[axis]) for axis in "xyz"]
+    return np.stack([values.astype(np.float64) for values in axes], axis=1)
 
 
 def _lzf_decompress(data: bytes, size: int) -> bytes:
@@ -501,16 +430,8 @@ def _lzf_decompress(data: bytes, size: int) -> bytes:
     return bytes(output)
 
 
-# --- ZDF (Zivid; NetCDF 4) -------------------------------------------------------------------------------------------
-
-
 def _zdf_points(path: Path) -> Float[np.ndarray, "n 3"]:
-    """Points of a ZDF file: organized, millimetres, NaN where nothing was measured."""
-    if find_spec("netCDF4") is None:
-        raise ImportError(f"{path} needs netCDF4, which is not installed: pip install 'mereo[sensors]'")
-    import netCDF4
-
-    with netCDF4.Dataset(path) as file:
+    with library("netCDF4", "sensors", path).Dataset(path) as file:
         cloud = file["data"]["pointcloud"][:]
     return _check_array(np.ma.filled(np.ma.asarray(cloud, dtype=np.float64), np.nan))
 
@@ -525,31 +446,19 @@ CLOUD_READERS: dict[str, Callable[[Path], Float[np.ndarray, "n 3"]]] = {
 """Parser of each suffix of point clouds."""
 
 
-# --- poses ------------------------------------------------------------------------------------------------------------
-
-
 def read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
-    """Rigid pose of a file: 4 x 4 numbers as text or NPY, or ``pose`` of a result's summary.json.
-
-    Raises ``ValueError`` and ``FileNotFoundError`` with the file's name.
-    """
+    """Rigid pose of a file: 4 x 4 numbers as text or NPY, or ``pose`` of a result's summary.json."""
     with readable(path, "pose"):
         if path.suffix.lower() == ".npy":
-            content = np.load(path, allow_pickle=False)
-        elif path.suffix.lower() == ".json":
-            content = json.loads(path.read_text("utf-8"))
-            content = content["pose"] if isinstance(content, dict) else content
-        else:
-            content = np.loadtxt(path, ndmin=2)
-        return checked_pose(content)
-
-
-# --- arrays -----------------------------------------------------------------------------------------------------------
+            return checked_pose(np.load(path, allow_pickle=False))
+        if path.suffix.lower() != ".json":
+            return checked_pose(np.loadtxt(path, ndmin=2))
+        content = json.loads(path.read_text("utf-8"))
+        return checked_pose(content["pose"] if isinstance(content, dict) else content)
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """All arrays of an NPZ file; raises ``SizeError``, and whatever damage makes of the parser."""
-    # by its name, numpy would leave a damaged file open
     with limited_memory(path), path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
         arrays = {key: file[key] for key in file.files}
     if strange := [key for key, value in arrays.items() if not isinstance(value, np.ndarray)]:

@@ -1,16 +1,16 @@
 """ROS recordings: depth images or point clouds, one message at a time, from ROS 1 bags, ROS 2 bags and MCAP files.
 
-A message is only decoded when it is asked for, so that a reader may skip what comes too fast, and a broken message
-stops nothing but itself. Depth follows ROS REP 118: 16UC1 in millimetres with 0, or 32FC1 in metres with NaN, where
-nothing was measured; compressed depth that of ROS's compressed_depth_image_transport.
+A message is only decoded when it is asked for, so that a broken one stops nothing but itself. Depth follows ROS REP
+118 (16UC1 in millimetres with 0, or 32FC1 in metres with NaN, where nothing was measured), and compressed depth
+compressed_depth_image_transport.
 """
 
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
-from importlib.util import find_spec
 from io import BytesIO
+from os.path import commonpath
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mereo.geometry.camera import Camera, DepthImage
-from mereo.io.errors import SizeError, check_count, limited_memory, reason
+from mereo.io.errors import check_count, is_foreseen, limited_memory, reason
+from mereo.io.extras import library
 from mereo.io.intrinsics import camera_from_fields, warn_of_distortion
 from mereo.io.readers import metres, open_image
 
@@ -27,7 +28,7 @@ COMPRESSED = "sensor_msgs/msg/CompressedImage"
 FRAMES = (IMAGE, COMPRESSED, CLOUD)
 """Types of messages that hold frames."""
 
-COMPRESSED_DEPTH, COMPRESSED_HEADER = "compressedDepth", 12
+COMPRESSED_DEPTH, HEADER = "compressedDepth", 12
 """Word in the format of a compressed depth image, and the bytes before its PNG: a number and two quantizations."""
 
 DEPTH_ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
@@ -46,18 +47,13 @@ class RecordedFrame:
 
     Attributes:
         topic: where it was published.
-        stamp_ns: when it was recorded, in nanoseconds.
+        time_s: when it was recorded, in seconds.
         read: decodes it; raises ``ValueError`` where its content is broken or not a depth.
     """
 
     topic: str
-    stamp_ns: int
+    time_s: float
     read: Callable[[], Content]
-
-    @property
-    def time_s(self) -> float:
-        """Time at which the message was recorded, in seconds."""
-        return self.stamp_ns / 1e9
 
     @property
     def name(self) -> str:
@@ -66,7 +62,7 @@ class RecordedFrame:
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a file is a bag: .bag, .mcap, .db3, or the directory of a ROS 2 bag."""
+    """Whether a path is a bag: .bag, .mcap, .db3, or the directory of a ROS 2 bag."""
     return path.suffix.lower() in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").is_file()
 
 
@@ -80,8 +76,7 @@ def recorded_frames(
 
     Args:
         path: the bag.
-        topic: a depth image or point cloud topic; by default the first depth image topic by name, else the first of
-            clouds.
+        topic: by default the first depth image topic by name, else the first of clouds.
         camera: by default the first CameraInfo of the topic nearest by name, for ``image_rect`` topics with its matrix
             P. It is taken to hold for the whole recording.
         depth_scale: value of one metre in integer images; by default 1000.
@@ -93,10 +88,9 @@ def recorded_frames(
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; a ROS bag is needed: check the path")
     if not (path.is_dir() or path.is_file()):
-        raise ValueError(f"{path} is not a regular file; a ROS bag is needed: save it to a file and name that")
-    if find_spec("rosbags") is None:
-        raise ImportError(f"{path} needs rosbags, which is not installed: pip install 'mereo[sensors]'")
-    with closing(_open(path)) as reader, _undamaged(path):
+        raise ValueError(f"{path} is not a regular file; a ROS bag is needed: name a file")
+    library("rosbags", "sensors", path)
+    with _opened(path) as reader:
         topic = topic or _depth_topic(reader, path)
         connections = [c for c in reader.connections if c.topic == topic and c.msgtype in FRAMES]
         if not connections:
@@ -106,10 +100,11 @@ def recorded_frames(
         if connections[0].msgtype != CLOUD:
             image = _depth_image if connections[0].msgtype == IMAGE else _compressed_depth
             decode = partial(image, camera=camera or _camera(reader, topic, path), depth_scale=depth_scale)
-        store, ros2 = reader.typestore, reader.is2
+        store, ros2 = reader.typestore, reader.is2  # a frame may be read when the bag is closed
         for connection, stamp_ns, data in _messages(reader, connections, path):
             message = partial(store.deserialize_cdr if ros2 else store.deserialize_ros1, data, connection.msgtype)
-            yield RecordedFrame(topic, stamp_ns, partial(_read, decode, message, f"{path}, {topic} at {stamp_ns} ns"))
+            source = f"{path}, {topic} at {stamp_ns} ns"
+            yield RecordedFrame(topic, stamp_ns / 1e9, partial(_read, decode, message, source))
 
 
 def recorded_frame(
@@ -120,8 +115,6 @@ def recorded_frame(
     depth_scale: float | None = None,
 ) -> RecordedFrame:
     """Frame ``index`` (from 0) of ``recorded_frames``; ``ValueError`` where the recording is shorter."""
-    if index < 0:
-        raise ValueError(f"the frame index is {index}; frames count from 0: give 0 or more with --frame-index")
     with closing(recorded_frames(path, topic, camera, depth_scale)) as frames:  # type: ignore[type-var]
         count = 0
         for count, frame in enumerate(frames, start=1):
@@ -130,7 +123,9 @@ def recorded_frame(
     raise ValueError(f"{path} has {count} frames; frame {index} is asked for: give a lower --frame-index")
 
 
-def _open(path: Path) -> Any:
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Reader of a bag; whatever a damaged one raises, now or while it is read, becomes one sentence."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
@@ -139,26 +134,15 @@ def _open(path: Path) -> Any:
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         with limited_memory(path):
             reader.open()
-    except SizeError:
-        raise
+        with closing(reader):
+            yield reader
     except Exception as error:  # a damaged bag raises whatever its storage format does
+        if is_foreseen(error) and not isinstance(error, OSError):
+            raise
         raise ValueError(f"{path} cannot be read as a ROS bag ({reason(error)}): record or copy it again") from error
-    return reader
-
-
-@contextmanager
-def _undamaged(path: Path) -> Iterator[None]:
-    """One sentence of whatever a bag raises that could be opened but is damaged farther in."""
-    try:
-        yield
-    except (ValueError, ImportError):
-        raise
-    except Exception as error:
-        raise ValueError(f"{path} cannot be read any farther ({reason(error)}): record or copy it again") from error
 
 
 def _messages(reader: Any, connections: list[Any], source: str | Path) -> Iterator[Any]:
-    """Messages one after the other, each unpacked in limited memory; nothing is held between them."""
     messages = reader.messages(connections)
     while True:
         with limited_memory(source):
@@ -173,19 +157,15 @@ def _depth_topic(reader: Any, path: Path) -> str:
     images, compressed, clouds = (
         sorted({c.topic for c in reader.connections if c.msgtype == kind and c.msgcount}) for kind in FRAMES
     )
-    for topic in images:
-        if _first(reader, topic).encoding in DEPTH_ENCODINGS:
-            return topic
-    for topic in compressed:
-        if COMPRESSED_DEPTH in _first(reader, topic).format:
-            return topic
-    if not clouds:
+    depths = [topic for topic in images if _first(reader, topic).encoding in DEPTH_ENCODINGS]
+    depths = depths or [topic for topic in compressed if COMPRESSED_DEPTH in _first(reader, topic).format] or clouds
+    if not depths:
         have = ", ".join(sorted({f"{c.topic} ({c.msgtype})" for c in reader.connections})) or "nothing"
         raise ValueError(
             f"{path} has neither depth images ({', '.join(DEPTH_ENCODINGS)}) nor point clouds, only {have}: record the "
             "depth topic and its camera_info"
         )
-    return clouds[0]
+    return depths[0]
 
 
 def _first(reader: Any, topic: str) -> Any:
@@ -199,33 +179,22 @@ def _camera(reader: Any, topic: str, path: Path) -> Camera:
     infos = sorted({c.topic for c in reader.connections if c.msgtype == INFO and c.msgcount})
     if not infos:
         raise ValueError(f"{path} has no CameraInfo; the intrinsics of {topic} are needed: give --intrinsics FILE")
-    names = topic.split("/")
-
-    def shared(info: str) -> int:
-        return next((i for i, (a, b) in enumerate(zip(info.split("/"), names, strict=False)) if a != b), len(names))
-
-    nearest = max(infos, key=shared)
+    nearest = max(infos, key=lambda info: len(commonpath([f"/{info}", f"/{topic}"])))
     try:
-        return _camera_of(_first(reader, nearest), topic, path)
+        info = _first(reader, nearest)
+        # ROS 1 has capital letters
+        stated = {name.lower(): np.asarray(getattr(info, name)) for name in "KkPpDd" if hasattr(info, name)}
+        rectified = "image_rect" in topic
+        matrix = stated["p"].reshape(3, 4)[:, :3] if rectified else stated["k"]
+        camera = camera_from_fields({"width": info.width, "height": info.height, "K": matrix})
+        if not rectified:
+            lens = {"d": stated["d"], "distortion_model": info.distortion_model}
+            warn_of_distortion(camera, lens, f"{path}, {topic}")
+        return camera
     except Exception as error:  # whatever a broken message makes of the parser
         raise ValueError(
             f"{path}, {nearest} is no camera ({reason(error)}): give --intrinsics FILE, or record it again"
         ) from error
-
-
-def _camera_of(info: Any, topic: str, path: Path) -> Camera:
-    matrix = getattr(info, "k", None) if hasattr(info, "k") else info.K
-    fields: dict[str, Any] = {"width": info.width, "height": info.height, "K": np.asarray(matrix)}
-    if "image_rect" in topic:
-        projection = np.asarray(info.p if hasattr(info, "p") else info.P).reshape(3, 4)
-        return camera_from_fields({**fields, "K": projection[:, :3]})
-    camera = camera_from_fields(fields)
-    coefficients = np.asarray(info.d if hasattr(info, "d") else info.D)
-    warn_of_distortion(camera, {"d": coefficients, "distortion_model": info.distortion_model}, f"{path}, {topic}")
-    return camera
-
-
-# --- messages --------------------------------------------------------------------------------------------------------
 
 
 def _read(decode: Callable[[Any], Content], message: Callable[[], Any], source: str) -> Content:
@@ -253,11 +222,11 @@ def _compressed_depth(message: Any, camera: Camera, depth_scale: float | None) -
             f"its format is {message.format!r}, not PNG-compressed depth ('16UC1; compressedDepth png' or 32FC1)"
         )
     data = np.asarray(message.data, dtype=np.uint8).tobytes()
-    with open_image(BytesIO(data[COMPRESSED_HEADER:]), ("PNG",)) as image:
+    with open_image(BytesIO(data[HEADER:]), ("PNG",)) as image:
         raw = np.asarray(image).astype(np.uint16)
     if DEPTH_ENCODINGS[encoding] == "u2":
         return DepthImage(metres(raw, depth_scale), camera)
-    a, b = np.frombuffer(data[4:COMPRESSED_HEADER], "<f4").astype(np.float64)
+    a, b = np.frombuffer(data[4:HEADER], "<f4").astype(np.float64)
     with np.errstate(divide="ignore"):
         depth = np.where(raw > 0, a / (raw - b), 0.0)
     return DepthImage(depth, camera)
@@ -290,7 +259,6 @@ def cloud_points(message: Any) -> Float[np.ndarray, "n 3"]:
     formats = [f"{end}{FIELD_TYPES[field.datatype]}" for field in fields.values()]
     offsets = [field.offset for field in fields.values()]
     layout: Any = {"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": message.point_step}
-    point = np.dtype(layout)
-    rows = _rows(message, message.row_step, message.point_step)
-    points = np.ascontiguousarray(rows[:, : message.width * message.point_step]).view(point).reshape(-1)
+    rows = _rows(message, message.row_step, message.point_step)[:, : message.width * message.point_step]
+    points = np.ascontiguousarray(rows).view(np.dtype(layout)).reshape(-1)
     return np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=1)

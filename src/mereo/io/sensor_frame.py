@@ -1,16 +1,12 @@
 """One frame of a sensor from whatever file holds it: a depth image, a point cloud or a ROS recording.
 
-    path, InputConfig -read_frame-> SensorFrame (points, metres per unit, axes, source, depth image where there is one)
-
-Which kind a file is, its name says. Options that do not belong to its kind are refused, because ignored ones are wrong
-results that nobody notices.
+Options that do not belong to a file's kind are refused, because ignored ones are wrong results that nobody notices.
 """
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -23,9 +19,6 @@ from mereo.io.intrinsics import read_intrinsics
 from mereo.io.readers import depth_of, is_depth_image, read_points, read_raw_depth, usable_depth, valid_points
 from mereo.io.ros_recordings import RecordedFrame, is_recording, recorded_frame, recorded_frames
 
-Kind = Literal["recording", "depth image", "point cloud"]
-"""Kinds of files that hold frames."""
-
 
 @dataclass(frozen=True, eq=False)
 class SensorFrame:
@@ -36,8 +29,7 @@ class SensorFrame:
         cloud: the measured points, in the file's axes and unit.
         unit_m: metres per unit; None where neither the file nor an option says it.
         axes: the cloud's.
-        depth: the depth image that the points come from, in their unit (metres, of files), without what a mask leaves
-            out; None for clouds.
+        depth: the depth image that the points come from, in their unit, without what a mask leaves out.
         message: the recording's message, by topic and time; empty for other files.
         invalid: number of points without a measurement that were left out.
         whole: the whole depth image, without any mask; None for clouds.
@@ -79,17 +71,15 @@ class SensorFrame:
 def read_frame(path: str | Path, reading: InputConfig = InputConfig()) -> SensorFrame:  # noqa: B008 (frozen)
     """Frame that a depth image, point cloud or ROS recording holds, or that ``reading`` picks from it.
 
-    Depth images and recordings come in metres and camera axes; point clouds keep their file's unit and axes.
-
-    Raises ``FileNotFoundError``, ``ImportError`` for a missing extra, and ``ValueError`` for a damaged file and for
-    options that do not belong to this kind of file.
+    Depth images and recordings come in metres and camera axes; point clouds keep their file's unit and axes. Raises
+    ``FileNotFoundError``, ``ImportError`` for a missing extra, and ``ValueError`` for a damaged file and for options
+    that do not belong to this kind of file.
     """
     path = Path(path)
-    kind = _kind(path)
+    kind = "recording" if is_recording(path) else "depth image" if is_depth_image(path) else "point cloud"
     _check_options(path, kind, reading)
     if kind == "recording":
-        index = reading.frame_index or 0
-        return _recorded(recorded_frame(path, index, *_recording_options(reading)), path, reading)
+        return _recorded(recorded_frame(path, reading.frame_index or 0, *_recording_options(reading)), path, reading)
     if kind == "depth image":
         return _depth_image(path, reading)
     unit_m = reading.unit_m
@@ -106,16 +96,7 @@ def read_frames(path: Path, reading: InputConfig) -> Iterator[tuple[RecordedFram
         yield message, partial(_recorded, message, path, reading)
 
 
-# --- kinds of files --------------------------------------------------------------------------------------------------
-
-
-def _kind(path: Path) -> Kind:
-    if is_recording(path):
-        return "recording"
-    return "depth image" if is_depth_image(path) else "point cloud"
-
-
-def _check_options(path: Path, kind: Kind, reading: InputConfig) -> None:
+def _check_options(path: Path, kind: str, reading: InputConfig) -> None:
     if reading.topic is not None and kind != "recording":
         raise ValueError(f"{path} is no ROS recording and has no topics: leave out --topic")
     if kind == "point cloud":
@@ -143,12 +124,9 @@ def _depth_image(path: Path, reading: InputConfig) -> SensorFrame:
 
 
 def _recording_options(reading: InputConfig) -> tuple[str | None, Camera | None, float | None]:
-    """Topic, camera and depth scale, as ``recorded_frames`` takes them."""
-    if reading.intrinsics is None:
-        return reading.topic, None, reading.depth_scale
-    intrinsics = read_intrinsics(reading.intrinsics)
-    scale = intrinsics.depth_scale if reading.depth_scale is None else reading.depth_scale
-    return reading.topic, intrinsics.camera, scale
+    known = None if reading.intrinsics is None else read_intrinsics(reading.intrinsics)
+    scale = known.depth_scale if known and reading.depth_scale is None else reading.depth_scale
+    return reading.topic, known and known.camera, scale
 
 
 def _recorded(message: RecordedFrame, path: Path, reading: InputConfig) -> SensorFrame:

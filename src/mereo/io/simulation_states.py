@@ -15,9 +15,16 @@ from jaxtyping import Float, Int
 
 from mereo.io.errors import readable
 from mereo.io.readers import read_arrays
-from mereo.io.vtk_frames import COLLECTION_SUFFIXES, DISPLACEMENTS, VTK_SUFFIXES, MeshFrames, read_vtk_frames
+from mereo.io.vtk_frames import (
+    COLLECTION_SUFFIXES,
+    DISPLACEMENTS,
+    MESHIO_SUFFIXES,
+    VTK_SUFFIXES,
+    MeshFrames,
+    read_vtk_frames,
+)
 
-FRAME_SUFFIXES = (".ply", ".obj", ".stl", ".off", *VTK_SUFFIXES)
+FRAME_SUFFIXES = (".ply", ".obj", ".stl", ".off", *VTK_SUFFIXES, *MESHIO_SUFFIXES)
 """Suffixes of meshes that hold a state each."""
 
 TETRAHEDRAL = ("rest_nodes", "tetrahedra", "nodes", "displacements")
@@ -90,12 +97,14 @@ def read_states(path: Path, names: tuple[str, ...], mesh: Path | None = None) ->
 
 
 def read_tetrahedra(path: Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 4"]]:
-    """Nodes and tetrahedra, four node indices each, of a VTK or VTU file, or of `rest_nodes`, `tetrahedra` in an NPZ.
+    """Nodes and tetrahedra, four node indices each, of a VTK, VTU, MSH or INP file, or of an NPZ.
+
+    An NPZ has them as `rest_nodes` and `tetrahedra`.
 
     Nodes of no tetrahedron are left out; other solid cells are divided into tetrahedra.
 
     Raises ``FileNotFoundError`` and ``ValueError`` naming the file, ``ImportError`` without the extra `simulation`
-    where the format is one of VTK's.
+    where the format is another one.
     """
     suffix = path.suffix.lower()
     if suffix == ".npz":
@@ -107,11 +116,11 @@ def read_tetrahedra(path: Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarra
                 "is rest_nodes and tetrahedra: add it"
             )
         nodes, elements = _volume(path, arrays)
-    elif suffix in VTK_SUFFIXES:
+    elif suffix in (*VTK_SUFFIXES, *MESHIO_SUFFIXES):
         frames = _mesh_frames(path)
         nodes, elements = frames.points[0], frames.tetrahedra
     else:
-        known = ", ".join((".npz", *VTK_SUFFIXES[:2]))
+        known = ", ".join((".npz", *VTK_SUFFIXES[:2], *MESHIO_SUFFIXES))
         raise ValueError(f"{path} has the suffix {path.suffix!r}; a volume mesh is one of {known}: convert it")
     if not len(elements):
         raise ValueError(f"{path} has no tetrahedra, nor other solid cells: export the volume mesh, not its surface")
@@ -214,7 +223,7 @@ def _mesh_frames(path: Path) -> MeshFrames:
             f"{path} has files of the formats {', '.join(kinds)}; all frames must have one: name them by a pattern, as "
             f"{path / f'*{kinds[0]}'}"
         )
-    if kinds[0] in (*VTK_SUFFIXES, *COLLECTION_SUFFIXES):
+    if kinds[0] in (*VTK_SUFFIXES, *MESHIO_SUFFIXES, *COLLECTION_SUFFIXES):
         frames = read_vtk_frames(files)
         for key in ("points", "displacements"):
             if (array := getattr(frames, key)) is not None:

@@ -8,7 +8,6 @@ space they stay as they are.
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +19,10 @@ from skimage.measure import marching_cubes
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.transforms import transform_points
 from mereo.io.errors import quiet, readable
+from mereo.io.extras import library
+from mereo.io.readers import in_memory
 
-VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr")
+VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd")
 
 FEW = 32
 """Distinct values of whole numbers up to which they are labels whatever they look like."""
@@ -38,9 +39,7 @@ class Volume:
         values: as they are stored; what they mean is ``slope * values + intercept``.
         T_world_index: from voxel indices (whole numbers at voxel centres) to positions. Of a file that was read these
             are RAS in the file's unit; what is made of it says its own frame.
-        slope, intercept: scaling of the values that the file states.
-        header: of the file, for what else it says: that of NIfTI as nibabel has it, the fields of NRRD as pynrrd has
-            them; None for a volume without a file.
+        header: of the file, nibabel's or pynrrd's, for what else it says; None for a volume without a file.
     """
 
     values: Shaped[np.ndarray, "..."]
@@ -76,23 +75,15 @@ def is_volume(path: Path) -> bool:
 
 
 def read_volume(path: Path, kind: str = "volume") -> Volume:
-    """Volume of a NIfTI or NRRD file, with as many dimensions as it has.
-
-    Args:
-        path: the file, whose name ``is_volume``.
-        kind: what it should be, for messages: "label volume".
+    """Volume of a NIfTI or NRRD file, with as many dimensions as it has; ``kind`` is what messages call it.
 
     Raises ``FileNotFoundError``, ``ValueError`` for a file that is damaged or holds other than real numbers, and
     ``ImportError`` without the extra `medical`.
     """
     nifti = ".nii" in path.name.lower()
-    name = "nibabel" if nifti else "nrrd"
-    try:
-        library: Any = import_module(name)
-    except ImportError:
-        raise ImportError(f"{name} is needed to read {kind}s: pip install 'mereo[medical]'") from None
+    module = library("nibabel" if nifti else "nrrd", "medical", path)
     with readable(path, kind):
-        volume = _nifti(library, path) if nifti else _nrrd(library, path)
+        volume = _nifti(module, path) if nifti else _nrrd(module, path)
     if volume.values.dtype.kind not in "iuf":
         raise ValueError(
             f"{path} has voxels of the type {volume.values.dtype}; each must be one real number: export one channel"
@@ -103,10 +94,10 @@ def read_volume(path: Path, kind: str = "volume") -> Volume:
 def _nifti(nibabel: Any, path: Path) -> Volume:
     image = nibabel.load(path)
     _check_sides(image.shape)
-    values = _in_memory(image.dataobj.get_unscaled())
+    values = image.dataobj.get_unscaled()
     values = values[..., 0] if values.ndim == 4 and values.shape[3] == 1 else values
     slope, intercept = float(image.dataobj.slope), float(image.dataobj.inter)
-    return Volume(values, np.asarray(image.affine, float), slope, intercept, image.header.copy())
+    return Volume(in_memory(values), np.asarray(image.affine, float), slope, intercept, image.header.copy())
 
 
 def _nrrd(nrrd: Any, path: Path) -> Volume:
@@ -120,16 +111,10 @@ def _nrrd(nrrd: Any, path: Path) -> Volume:
     elif "spacings" in header:
         transform[:3, :3] = np.diag(header["spacings"][-3:])
     transform[:3, 3] = header.get("space origin", np.zeros(3))
-    return Volume(_in_memory(values), _to_ras(str(header.get("space", ""))) @ transform, header=header)
-
-
-def _in_memory(values: np.ndarray) -> np.ndarray:
-    """Values that no longer lie in the file, with the machine's own order of bytes."""
-    return np.array(values, dtype=values.dtype.newbyteorder("="))
+    return Volume(in_memory(values), _to_ras(str(header.get("space", ""))) @ transform, header=header)
 
 
 def _check_sides(sizes: Iterable[Any]) -> None:
-    """Raise ``ValueError`` (its reason only) for sizes in a header that are none."""
     sides = [int(side) for side in sizes]
     if min(sides, default=0) < 1:
         raise ValueError(f"its header states the size {' x '.join(map(str, sides))}")
@@ -138,17 +123,13 @@ def _check_sides(sizes: Iterable[Any]) -> None:
 def _to_ras(space: str) -> Float[np.ndarray, "4 4"]:
     """Transform to RAS from an anatomical frame, such as left-posterior-superior or LPS; others stay as they are."""
     words = space.lower().split("-") if "-" in space else list(space.lower())
-    words = [{"l": "left", "r": "right", "p": "posterior", "a": "anterior", "i": "inferior"}.get(w, w) for w in words]
-    negative = [word in ("left", "posterior", "inferior") for word in words[:3]]
-    return np.diag([*(-1.0 if flip else 1.0 for flip in negative), *[1.0] * (4 - len(negative))])
+    negative = ("left", "posterior", "inferior", "l", "p", "i")
+    signs = [-1.0 if word in negative else 1.0 for word in words[:3]]
+    return np.diag([*signs, *[1.0] * (4 - len(signs))])
 
 
 def read_scalar_volume(path: Path) -> Volume:
-    """Volume of one finite number for each voxel.
-
-    Raises as ``read_volume``, and ``ValueError`` for more than three dimensions, for values that are not finite and for
-    voxels without a place.
-    """
+    """Volume of three dimensions, of one finite number for each voxel, which has a place; raises as ``read_volume``."""
     volume = read_volume(path)
     if volume.values.ndim != 3:
         raise ValueError(
@@ -174,7 +155,7 @@ def segment_fields(header: Any) -> dict[str, str]:
 def is_labels(volume: Volume) -> bool:
     """Whether the values are labels: whole numbers, few different ones or mostly equal to their neighbours.
 
-    Judged by evenly spread slices. Neighbours that both have the least value are left out, as air is even everywhere.
+    Neighbours that both have the least value are left out, as air is even everywhere.
     """
     if volume.values.dtype.kind not in "iu":
         return False
@@ -190,18 +171,9 @@ def is_labels(volume: Volume) -> bool:
     return 2 * equal > counted
 
 
-# --- labels -----------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class LabelVolume:
-    """Voxel labels with their place in space.
-
-    Attributes:
-        labels: 0 is empty space.
-        T_world_index: from voxel indices (whole numbers at voxel centres) to RAS coordinates in the file's unit.
-        names: of the values, where the file has them (``.seg.nrrd`` of 3D Slicer).
-    """
+    """Voxel labels, 0 in empty space, with their place (see ``Volume``), and the names of values that the file has."""
 
     labels: Int[np.ndarray, "x y z"]
     T_world_index: Float[np.ndarray, "4 4"]
@@ -209,11 +181,7 @@ class LabelVolume:
 
 
 def read_label_volume(path: Path) -> LabelVolume:
-    """Label volume from a NIfTI or NRRD file of whole numbers.
-
-    Raises ``FileNotFoundError``, ``ValueError`` for anything but three dimensions of whole numbers from 0 up, and
-    ``ImportError`` without the extra `medical`.
-    """
+    """Label volume of three dimensions of whole numbers from 0 up; raises as ``read_volume``."""
     if path.exists() and not is_volume(path):
         raise ValueError(f"{path} is no label volume; its name must end in {', '.join(VOLUME_SUFFIXES)}: convert it")
     volume = read_volume(path, "label volume")
@@ -252,15 +220,11 @@ def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) 
     """Closed surface of each named label, smoothed, in the volume's world coordinates.
 
     Labels become shares of the cells of a coarser grid, each smoothed by a Gaussian. The object is where they add up to
-    more than a half, and in it a segment is where its share is the largest: marching cubes gives neighbours the same
-    interface, so that they touch without overlap, and no groove runs along it.
+    more than a half, and in it a segment is where its share is the largest: so neighbours share one interface.
 
-    Args:
-        volume: the labels; those without a name count as empty space.
-        names: of the values; several may share one.
-        cells: of the grid along the longest side, roughly: a cell is a whole number of voxels.
-
-    Raises ``ValueError`` for a value that does not occur, and for a segment too thin for the grid.
+    Labels without a name count as empty space, and several may share one. ``cells`` are those of the grid along the
+    longest side, roughly: a cell is a whole number of voxels. Raises ``ValueError`` for a value that does not occur,
+    and for a segment too thin for the grid.
     """
     present = np.unique(volume.labels)
     if missing := [value for value in names if value not in present]:
@@ -292,14 +256,7 @@ def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) 
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """A coarser grid over part of a volume; a cell is a block of voxels.
-
-    Attributes:
-        first: voxel index of its lowest corner, before the margin.
-        counts: cells along each axis, without the margin.
-        block: voxels of a cell along each axis.
-        T_world_index: of the volume.
-    """
+    """A coarser grid over part of a volume, from the voxel ``first`` on: ``counts`` cells of ``block`` voxels each."""
 
     first: Int[np.ndarray, "3"]
     counts: Int[np.ndarray, "3"]

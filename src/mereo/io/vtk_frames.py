@@ -1,4 +1,4 @@
-"""Frames of a simulation in VTK's formats, read by pyvista in a process of its own.
+"""Frames of a simulation in VTK's formats, and meshes of Gmsh and Abaqus, read by pyvista in a process of its own.
 
 VTK takes seconds to load, and a damaged file can end the process that reads it. So a child process runs ``main``
 and hands arrays over in a folder.
@@ -23,6 +23,9 @@ from mereo.io.errors import limited_memory, printable_line, readable, reason
 
 VTK_SUFFIXES = (".vtk", ".vtu", ".vtp")
 """Suffixes of files with one frame each."""
+
+MESHIO_SUFFIXES = (".msh", ".inp")
+"""Suffixes of one frame's meshes that pyvista reads by meshio: of Gmsh and of Abaqus."""
 
 COLLECTION_SUFFIXES = (".pvd", ".xdmf", ".pvtu")
 """Suffixes of files that name others: in PVD and XDMF files each time step is a frame."""
@@ -54,13 +57,14 @@ class MeshFrames:
 
 
 def read_vtk_frames(files: Sequence[Path]) -> MeshFrames:
-    """Frames of VTK, VTU and VTP files, one each, or the time steps of a PVD or XDMF file.
+    """Frames of VTK, VTU, VTP, MSH and INP files, one each, or the time steps of a PVD or XDMF file.
 
     Raises ``FileNotFoundError`` and ``ValueError`` naming the file, ``ImportError`` without the extra `simulation`.
     """
     place = files[0] if len(files) == 1 else files[0].parent
-    if find_spec("pyvista") is None:
-        raise ImportError(f"{place} needs pyvista, which is not installed: pip install 'mereo[simulation]'")
+    readers = ("pyvista", "meshio") if files[0].suffix.lower() in MESHIO_SUFFIXES else ("pyvista",)
+    if missing := [name for name in readers if find_spec(name) is None]:
+        raise ImportError(f"{place} needs {missing[0]}, which is not installed: pip install 'mereo[simulation]'")
     for file in files:
         with readable(file, "mesh"):
             pass
@@ -154,6 +158,9 @@ def _steps(file: str) -> Iterator[Any]:
 
     if file.lower().endswith(".xdmf"):
         yield from _xdmf_steps(file)
+        return
+    if file.lower().endswith(MESHIO_SUFFIXES):
+        yield pyvista.read_meshio(file)
         return
     reader = pyvista.get_reader(file)
     times = reader.time_values if file.lower().endswith(".pvd") else [None]

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
+from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,18 +22,8 @@ MOST_VALUES = 100_000
 """Values of a document, those of aliases counted where they stand: a few lines of nested aliases are billions."""
 
 
-class _TooMuch(ValueError):
-    """Refusal of a document that is small as a text and endless as values."""
-
-
 class Document:
-    """YAML mapping with the lines that its values stand on.
-
-    Attributes:
-        path: the file.
-        text: its content.
-        data: the mapping, as Python values.
-    """
+    """YAML mapping with the lines of its values: the file's ``path`` and ``text``, and ``data``, Python's values."""
 
     def __init__(self, path: Path) -> None:
         """Read a file. Raises ``FileNotFoundError``, or ``ValueError`` where it is no YAML mapping."""
@@ -43,46 +34,20 @@ class Document:
             self.text = path.read_text(encoding="utf-8")
             # two passes, because only nodes know their lines and only values their types
             root = yaml.compose(self.text, Loader=yaml.SafeLoader)
-            self._measure(root, {})
-            self.data: Any = yaml.safe_load(self.text)
-        except UnicodeDecodeError:
-            raise ValueError(f"{path} is not text in UTF-8; a YAML file is needed: save it as UTF-8") from None
-        except yaml.MarkedYAMLError as error:
-            mark = error.problem_mark or error.context_mark
-            place = f"{path}:{mark.line + 1}" if mark else str(path)
-            raise ValueError(f"{place}: this is not YAML ({error.problem}): correct the line, or its indent") from None
-        except yaml.YAMLError as error:
-            raise ValueError(f"{path}: this is not YAML ({reason(error)}): save it as plain text") from None
-        except RecursionError:
+            count = _count(root, {})
+            self.data: Any = yaml.safe_load(self.text) if count <= MOST_VALUES else None
+        except RecursionError:  # also of what contains itself by an alias
             raise ValueError(f"{path} is nested too deeply; a scene file has lists in blocks: write it anew") from None
-        except _TooMuch:
-            raise
-        except (ValueError, KeyError) as error:  # of dates, numbers and truth values
-            raise ValueError(f"{path} has a value that YAML cannot read ({_short(error)}): put it in quotes") from None
+        except (yaml.YAMLError, ValueError, KeyError) as error:  # the last two of dates, numbers and truth values
+            mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
+            place, why = f"{path}:{mark.line + 1}" if mark else path, getattr(error, "problem", None) or reason(error)
+            raise ValueError(f"{place}: this is not YAML in UTF-8 ({why}): correct it, or put it in quotes") from None
+        if count > MOST_VALUES:
+            raise ValueError(f"{path} holds {count} values; at most {MOST_VALUES} can be read: use fewer aliases")
         if not isinstance(root, yaml.MappingNode):
             raise ValueError(f"{path} holds no `key: value` lines; a scene file starts with `name:`: write one anew")
         self._root: yaml.Node = root
         self._refuse_repeated(root)
-
-    def _measure(self, node: yaml.Node | None, known: dict[int, int]) -> int:
-        """Number of values in a node with all its aliases spelt out; refuses what contains itself or has too many.
-
-        ``known`` has the numbers of nodes that were met before, by their ``id``; 0 of those that are not yet counted.
-        """
-        if not isinstance(node, yaml.CollectionNode):
-            return 1
-        if id(node) not in known:
-            known[id(node)] = 0
-            inner = (
-                node.value if isinstance(node, yaml.SequenceNode) else [part for pair in node.value for part in pair]
-            )
-            known[id(node)] = 1 + sum(self._measure(part, known) for part in inner)
-        count, place = known[id(node)], f"{self.path}:{node.start_mark.line + 1}"
-        if count == 0:
-            raise _TooMuch(f"{place}: this value contains itself by an alias; it must end: spell it out")
-        if count > MOST_VALUES:
-            raise _TooMuch(f"{place}: this holds {count} values; at most {MOST_VALUES} can be read: use fewer aliases")
-        return count
 
     def _refuse_repeated(self, node: yaml.Node) -> None:
         """Refuse keys that stand twice: YAML takes the last of two in silence."""
@@ -101,8 +66,7 @@ class Document:
     def pair(self, place: Place) -> tuple[yaml.Node, yaml.Node]:
         """Node of the key and of the value at a place, or of the innermost block around it that is there.
 
-        For the items of a list both are the item. A name in ``place`` that no key has, such as the tag that pydantic
-        puts between an item and its keys, is passed over.
+        For the items of a list both are the item. A name that no key has, such as a tag of pydantic, is passed over.
         """
         key = value = self._root
         for step in place:
@@ -142,10 +106,8 @@ class Document:
         raise self.error(problems[0]["loc"], self._sentence(problems[0], model) + more)
 
     def _sentence(self, problem: ErrorDetails, model: type[BaseModel]) -> str:
-        """Sentence of value, rule and cure."""
-        place, kind = problem["loc"], problem["type"]
-        key, value = str(place[-1]) if place else "the file", problem["input"]
-        context = problem.get("ctx", {})
+        place, kind, value, context = problem["loc"], problem["type"], problem["input"], problem.get("ctx", {})
+        key = str(place[-1]) if place else "the file"
         rule = problem["msg"].removeprefix("Value error, ").replace("Input should", "it must").replace("should", "must")
         if kind == "missing" and isinstance(place[-1], int):
             return f"`{_key_of(place)}` has too few entries; it must have more than {place[-1]}: add the others"
@@ -167,11 +129,20 @@ class Document:
         return f"`{_key_of(place)}` is {_short(repr(value))}; {rule}: correct it"
 
     def _known_keys(self, place: Place, model: type[BaseModel]) -> list[str]:
-        """Keys that are allowed where an unknown one is, found by asking the models for a block like that."""
-        fields = _fields_at(place[:-1], model)
-        used = self.pair(place[:-1])[1]
+        """Keys that are allowed where an unknown one is, and not yet there."""
+        fields, used = _fields_at(place[:-1], model), self.pair(place[:-1])[1]
         have = {k.value for k, _ in used.value} if isinstance(used, yaml.MappingNode) else set()
-        return [name for name in fields if name not in have] or list(fields)
+        return [name for name in fields if name not in have] or fields
+
+
+def _count(node: yaml.Node | None, known: dict[int, int]) -> int:
+    """Number of values in a node with all its aliases spelt out; ``known`` has those of nodes by their ``id``."""
+    if not isinstance(node, yaml.CollectionNode):
+        return 1
+    if id(node) not in known:
+        parts = node.value if isinstance(node, yaml.SequenceNode) else chain.from_iterable(node.value)
+        known[id(node)] = 1 + sum(_count(part, known) for part in parts)
+    return known[id(node)]
 
 
 def _short(value: object) -> str:
@@ -186,15 +157,13 @@ def _key_of(place: Place) -> str:
 
 
 def _types(model: type[BaseModel]) -> list[str]:
-    """Types of deformation, from the schema."""
     schema = model.model_json_schema()
     return list(schema["properties"]["deformations"]["anyOf"][0]["items"]["discriminator"]["mapping"])
 
 
 def _fields_at(place: Place, model: type[BaseModel]) -> list[str]:
     """Names of the fields of the block at ``place``, from the model's JSON schema."""
-    schema = model.model_json_schema()
-    block: dict[str, Any] = schema
+    schema = block = model.model_json_schema()
     for step in place:  # a key, a list's item, or the item of a named type
         if "discriminator" in block and isinstance(step, str):
             block = {"$ref": block["discriminator"]["mapping"][step]}

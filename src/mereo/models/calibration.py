@@ -152,11 +152,8 @@ def calibration_rows(calibration: Calibration | None) -> list[tuple[str, str]]:
     rows = [("calibration", f"{calibration.views} views of the training seed {calibration.seed}")]
     if calibration.temperature is not None:
         kind = "a temperature" if calibration.biases is None else "a temperature and a bias for each class"
-        error = (
-            ""
-            if calibration.ece is None
-            else f"; calibration error {calibration.ece[0]:.3f}, with it {calibration.ece[1]:.3f}"
-        )
+        ece = calibration.ece
+        error = "" if ece is None else f"; calibration error {ece[0]:.3f}, with it {ece[1]:.3f}"
         rows.append(("probabilities", f"{kind} ({calibration.temperature:.2f}){error}"))
     for what, noisy in (("radii", False), ("radii of noisy frames", True)):
         modes, draws = (calibration.radii(draws=each, noisy=noisy).scale for each in (False, True))

@@ -84,8 +84,15 @@ class Supervision:
         return cls("ce" in terms, "l1" in terms, "cd" in terms)
 
 
+class _Part:
+    """Settings whose bounds are checked."""
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "network.")
+
+
 @dataclass(frozen=True)
-class PointNet2Config:
+class PointNet2Config(_Part):
     """Settings of PointNet++; sizes are those of its reference implementation.
 
     Attributes:
@@ -108,12 +115,9 @@ class PointNet2Config:
     mlp2: Widths = (128, 128, 256)
     mlp_global: Widths = (256, 512, 1024)
 
-    def __post_init__(self) -> None:
-        check_bounds(self, "network.")
-
 
 @dataclass(frozen=True)
-class PointTransformerConfig:
+class PointTransformerConfig(_Part):
     """Settings of the Point Transformer; sizes are those of its authors' code, the paper says five blocks.
 
     Attributes:
@@ -124,12 +128,9 @@ class PointTransformerConfig:
     transformer_widths: Widths = (32, 64, 128, 256, 512)
     transformer_neighbors: Neighbors = 16
 
-    def __post_init__(self) -> None:
-        check_bounds(self, "network.")
-
 
 @dataclass(frozen=True)
-class AutodecoderConfig:
+class AutodecoderConfig(_Part):
     """Settings of the autodecoder.
 
     Attributes:
@@ -144,9 +145,6 @@ class AutodecoderConfig:
     search_rate: Positive = 1e-3
     code_penalty: NotNegative = 1e-4
     spread_penalty: NotNegative = 0.0
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "network.")
 
 
 @dataclass(frozen=True)

@@ -24,15 +24,10 @@ from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH
 
 # --- template ---------------------------------------------------------------------------------------------------------
 
-# Lookup of queries in the rest pose: what an object looks like is known, only its deformation is not.
+# What an object looks like is known, only its deformation is not: halfway through its layers the decoder predicts where
+# in the rest pose a query is, and reads there the signed distance to every segment (docs/learning.md).
 #
-# Halfway through its layers the decoder predicts where in the rest pose a query is, and reads there, from a grid, the
-# signed distance to every segment of the model it was trained for. Deformations are smooth, so the position is easy to
-# learn; thin parts and the borders between segments come from the model, not from weights. Compare canonical templates
-# (Deformed Implicit Field, Deng et al., CVPR 2021; D-NeRF, Pumarola et al., CVPR 2021), which learn the template too:
-# docs/learning.md.
-#
-# Notation: b clouds, q queries, h hidden channels, s segments, n grid nodes.
+# Notation: s segments, n grid nodes.
 
 SCALES = (1.0, 8.0, 32.0)
 """Magnifications at which distances are seen, clipped to [-1, 1], so that what is near is resolved finely."""

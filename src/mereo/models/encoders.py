@@ -1,6 +1,6 @@
 """Encodings, what every encoder gives, and the layer that all of them are made of.
 
-Notation: b clouds, m points of a level, c channels, z latent channels.
+Notation: b clouds, n points, m of them at a coarser level, k neighbours, e training examples, c and z channels.
 """
 
 import math
@@ -63,8 +63,6 @@ class SharedMLP(nn.Module):
 # --- PointNet++ -------------------------------------------------------------------------------------------------------
 
 # PointNet++ (Qi et al., NeurIPS 2017) as the paper uses it: two set abstractions and a global max pool.
-#
-# Notation: b clouds, n points, m centres, k neighbours, c channels.
 
 
 class SetAbstraction(nn.Module):
@@ -111,8 +109,6 @@ class PointNet2(nn.Module):
 #
 # "The PointTransformer contains 5 transformer blocks" is all that the paper says of it (Henrich et al., appendix B);
 # what it leaves open is taken from Zhao et al. and listed in docs/design/0009-encoders.md.
-#
-# Notation: b clouds, n points, m of them kept at a coarser level, k neighbours, c channels.
 
 STRIDE = 4
 """From one block to the next a quarter of the points stay."""
@@ -220,8 +216,6 @@ def _smallest(distances: Float[Tensor, "b m n"], count: int) -> Int[Tensor, "b m
 # There is no encoder network. Each training example has a code of its own, trained like the weights. The code of a new
 # cloud is searched for: "the input point cloud is reinterpreted as the locus of points where the signed distance should
 # be zero" (Henrich et al., appendix B). Segments follow from a code that explains the distances.
-#
-# Notation: b clouds, n observed points, e training examples, z latent channels.
 
 CODES = "encoder.codes"
 """Name of the training examples' codes among a network's parameters."""
@@ -281,25 +275,17 @@ class Autodecoder(nn.Module):
         ``distance`` answers with the signed distance at each cloud's observed points. Deterministic, and the clouds of
         a batch do not influence each other. Gradients are taken for the codes only, whatever the caller's mode.
         """
-        place = self._start(clouds).requires_grad_()
+        start = self.mean if self.axes is None else torch.zeros_like(self.mean)
+        place = start.repeat(clouds, 1).requires_grad_()  # codes, or standard deviations from the mean along each axis
         optimizer = torch.optim.Adam([place], lr=self.rate)
         for _ in range(self.steps):
             with torch.enable_grad():
-                error = distance(self._code_at(place)).abs().mean(dim=1) + self._prior(place)
+                spread = self.spread_penalty * place.square().sum(dim=1)
+                prior = self.length_penalty(place) if self.axes is None else spread
+                error = distance(self._code_at(place)).abs().mean(dim=1) + prior
                 (place.grad,) = torch.autograd.grad(error.sum(), place)
             optimizer.step()
         return self._code_at(place).detach()
 
-    def _start(self, clouds: int) -> Float[Tensor, "b z"]:
-        """Place of the mean code, in the coordinates of the search."""
-        start = self.mean if self.axes is None else torch.zeros_like(self.mean)
-        return start.repeat(clouds, 1)
-
     def _code_at(self, place: Float[Tensor, "b z"]) -> Float[Tensor, "b z"]:
-        """Codes at these places: themselves, or so many standard deviations from the mean along each axis."""
         return place if self.axes is None else self.mean + place @ self.axes
-
-    def _prior(self, place: Float[Tensor, "b z"]) -> Float[Tensor, " b"]:
-        if self.axes is None:
-            return self.length_penalty(place)
-        return self.spread_penalty * place.square().sum(dim=1)

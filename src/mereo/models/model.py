@@ -165,11 +165,6 @@ class Model:
         """Whether probabilities are calibrated: by the temperature, and biases, of the weights' calibration."""
         return self.calibration is not None and self.calibration.temperature is not None
 
-    def rest(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"] | None:
-        """Rest coordinates of each point (``scenes.rest_pose``); None from a model without template."""
-        correspondences = self.correspond(code, points)
-        return None if correspondences is None else correspondences[1]
-
     def correspond(
         self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, "n c"], Float[np.ndarray, "n 3"]] | None:
@@ -268,8 +263,6 @@ def _on_device(biases: tuple[float, ...], device: torch.device) -> Float[Tensor,
 
 # --- batch normalization, fused ---------------------------------------------------------------------------------------
 
-# Batch normalization folded into the layers before it: the same function in fewer passes, for inference.
-#
 # In evaluation mode normalization is a scale and a shift per channel, ``norm(W x) = (s W) x + t``. Every linear layer
 # whose output is normalized therefore takes the scale into its weights and the shift into its bias. Rounding apart,
 # nothing changes.

@@ -5,10 +5,7 @@ points exactly the farthest-point sample of size m, so the centres of every set-
 nothing, and "the first K neighbours in order" are a well-spread subset of a crowded ball.
 """
 
-from functools import cache, lru_cache
-from importlib import import_module
-from importlib.util import find_spec
-from types import ModuleType
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -87,23 +84,12 @@ def nearest(queries: Float[Tensor, "b q d"], points: Float[Tensor, "b n d"], cou
     """Indices of the ``count`` nearest points to each query, nearest first; ties in any order.
 
     On a CPU by a k-d tree per cloud, which is exact and six times faster than all distances and a selection; on a
-    GPU by a kernel that never writes the distances (``triton_kernels``); in exported graphs, by those.
+    GPU and in exported graphs, by those.
     """
     count = min(count, points.shape[1])
-    if queries.is_cuda and not torch.compiler.is_compiling():
-        kernels = gpu_kernels()
-        if kernels is not None and points.shape[1] <= kernels.MOST_COMPARED:
-            rows: Tensor = kernels.nearest(queries, points, count)
-            return rows
     if queries.device.type == "cpu" and not is_exporting():
         return _by_trees(queries.detach(), points.detach(), count)
     return squared_distances(queries, points).topk(count, dim=-1, largest=False).indices
-
-
-@cache
-def gpu_kernels() -> ModuleType | None:
-    """Module ``mereo.models.triton_kernels``; None without Triton, which PyTorch's CUDA builds for Linux bring."""
-    return import_module("mereo.models.triton_kernels") if find_spec("triton") is not None else None
 
 
 @torch.library.custom_op("mereo::nearest", mutates_args=())

@@ -96,12 +96,20 @@ class Network(nn.Module):
 
 # --- encoders ---------------------------------------------------------------------------------------------------------
 
-# The encoder that a network's settings ask for.
-
 
 def make_encoder(config: NetworkConfig) -> PointNet2 | PointTransformer | Autodecoder:
     """Encoder that the settings name; ``ValueError`` where they do not go together."""
-    _check(config)
+    neighbors, widths = config.additions.local_neighbors, config.transformer.transformer_widths
+    if config.encoder == "autodecoder" and neighbors:
+        raise ValueError(
+            f"local_neighbors is {neighbors}, but an autodecoder has no features at points to attend to; train with "
+            "--network.local-neighbors 0, or with the preset paper-autodecoder"
+        )
+    if config.encoder == "point-transformer" and len(widths) < 3:
+        raise ValueError(
+            f"transformer_widths are {widths}; a Point Transformer needs at least three: give for "
+            "example 32 64 128 256 512"
+        )
     if config.encoder == "autodecoder":
         return Autodecoder(config.autodecoder, config.latent)
     if config.encoder == "point-transformer":
@@ -109,33 +117,10 @@ def make_encoder(config: NetworkConfig) -> PointNet2 | PointTransformer | Autode
     return PointNet2(config.pointnet2)
 
 
-def _check(config: NetworkConfig) -> None:
-    """Raise ``ValueError`` naming the setting, its rule and the cure."""
-    neighbors = config.additions.local_neighbors
-    if config.encoder == "autodecoder" and neighbors:
-        raise ValueError(
-            f"local_neighbors is {neighbors}, but an autodecoder has no features at points to attend to; train with "
-            "--network.local-neighbors 0, or with the preset paper-autodecoder"
-        )
-    widths = config.transformer.transformer_widths
-    if config.encoder == "point-transformer" and len(widths) < 3:
-        raise ValueError(
-            f"transformer_widths are {widths}; a Point Transformer needs at least three: give for "
-            "example 32 64 128 256 512"
-        )
-
-
 # --- alignment --------------------------------------------------------------------------------------------------------
 
-# Alignment of an observed cloud with the object's rest pose, before anything else looks at it.
-#
-# A free camera shows an object in any orientation, and a network that must recognize each of them separately learns
-# slowly. Here a small network first predicts rest-pose coordinates (normalized object coordinates; Wang et al., CVPR
-# 2019) at the observed points; the rigid motion that fits them best takes cloud and queries into the rest pose's frame.
-# What deformation and the estimate's error leave over is for the network behind it. Regressing the rotation directly,
-# as T-Net does (PointNet; Qi et al., CVPR 2017), learned far more slowly: docs/learning.md.
-#
-# Notation: b clouds, n points, q queries.
+# A small network predicts rest-pose coordinates (normalized object coordinates; Wang et al., CVPR 2019) at the observed
+# points; the rigid motion that fits them best takes cloud and queries into the rest pose's frame (docs/learning.md).
 
 
 class Aligned(NamedTuple):

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -18,16 +19,16 @@ from mereo.io.atomic_files import atomic_file
 from mereo.io.errors import reason
 from mereo.models.calibration import Calibration
 from mereo.models.config import InferenceConfig, Loss, NetworkConfig, Supervision
-from mereo.models.device import find_device
+from mereo.models.device import find_device, pick_precision
 from mereo.models.encoders import CODES
 from mereo.models.model import Model
 from mereo.models.network import Network
+from mereo.models.trained import Trained
 from mereo.models.weights_place import STATES, find_weights
 from mereo.scenes.statistical_model import StatisticalModel, pack_model, unpack_model
+from mereo.workers.spread import Cluster
 
 # --- the header -------------------------------------------------------------------------------------------------------
-
-# Header of a file of weights, checked: what is missing, of another type or in disagreement is said in one sentence.
 
 FORMAT_VERSION = 3
 """Version of the files."""
@@ -94,12 +95,6 @@ def read_header(path: Path, metadata: Mapping[str, str]) -> Header:
             f"{path} has a header whose names ({', '.join(header.names)}), {len(header.colors)} colours and nested "
             f"segments disagree; {CURE}"
         )
-    _check_biases(path, header)
-    return header
-
-
-def _check_biases(path: Path, header: Header) -> None:
-    """Raise ``ValueError`` for a calibration of other classes than the network tells apart."""
     biases = None if header.calibration is None else header.calibration.biases
     classes = 1 + (len(header.names) if Supervision.of(header.loss).labels else 1)
     if biases is not None and len(biases) != classes:
@@ -107,6 +102,7 @@ def _check_biases(path: Path, header: Header) -> None:
             f"{path} has a calibration with {len(biases)} biases, and {classes} classes; calibrate it again with "
             "`mereo calibrate`"
         )
+    return header
 
 
 def _checked(path: Path, model: type[Checked], content: Any, *within: str) -> Checked:
@@ -117,14 +113,6 @@ def _checked(path: Path, model: type[Checked], content: Any, *within: str) -> Ch
         first = error.errors()[0]
         place = ".".join(map(str, (*within, *first["loc"])))
         raise ValueError(f"{path} has a header with a wrong {place!r} ({first['msg']}); {CURE}") from None
-
-
-def read_config(path: Path, header: Header) -> NetworkConfig:
-    """Settings of the network; ``ValueError`` names the file and the setting that is unknown or out of its bounds."""
-    try:
-        return NetworkConfig.from_dict(header.network)
-    except ValueError as error:
-        raise ValueError(f"{path} has a header of no possible network ({error}); {CURE}") from None
 
 
 def check_tensors(path: Path, config: NetworkConfig, segments: int, tensors: Mapping[str, Tensor]) -> None:
@@ -268,7 +256,10 @@ def load_model(name: str | Path, device: torch.device | str = "cpu") -> Model:
     tensors, metadata = _read(path)
     header = read_header(path, metadata)
     states = {key.removeprefix(STATES): tensors.pop(key).numpy() for key in list(tensors) if key.startswith(STATES)}
-    config = read_config(path, header)
+    try:
+        config = NetworkConfig.from_dict(header.network)
+    except ValueError as error:
+        raise ValueError(f"{path} has a header of no possible network ({error}); {CURE}") from None
     restored = {name: _restored(name, value) for name, value in tensors.items()}
     check_tensors(path, config, len(header.names), restored)
     network = Network(config, len(header.names))
@@ -298,3 +289,37 @@ def _unpacked(path: Path, states: dict[str, np.ndarray], header: Header) -> Stat
         raise ValueError(
             f"{path} has a statistical model that cannot be read ({kind}{reason(error)}); {CURE}"
         ) from None
+
+
+# --- in tasks of a cluster --------------------------------------------------------------------------------------------
+
+# A model is loaded on the CPU, sent, and moved to the device that a task has.
+
+
+def settings_for(inference: InferenceConfig, workers: int | Cluster | None) -> InferenceConfig:
+    """Settings to load weights with: on the CPU where tasks of a cluster compute.
+
+    Raises ``ValueError`` where another device is asked for than tasks have.
+    """
+    if not isinstance(workers, Cluster):
+        return inference
+    if inference.device not in ("auto", workers.device):
+        raise ValueError(
+            f"--device is {inference.device}, but tasks of the cluster compute on {workers.device}: leave it out, or "
+            "change --gpus-per-task"
+        )
+    return replace(inference, device="cpu")
+
+
+def to_cpu(model: Trained, cluster: Cluster) -> Model:
+    """The same model on the CPU, its precision chosen here once for the device of the cluster's tasks."""
+    assert isinstance(model, Model)
+    half = pick_precision(model.precision, torch.device(cluster.device)) is not None
+    network = model.network if model.device.type == "cpu" else deepcopy(model.network).to("cpu")
+    return replace(model, network=network, precision="bfloat16" if half else "float32")
+
+
+def to_gpu(model: Trained) -> Model:
+    """The model on this machine's GPU; raises ``ValueError`` where torch sees none."""
+    assert isinstance(model, Model)
+    return replace(model, network=model.network.to(find_device("cuda")))

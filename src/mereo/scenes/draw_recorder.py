@@ -2,15 +2,14 @@
 
 A scene says how it deforms by drawing from a generator. ``Recorder`` is a generator that writes down every draw as
 *shares*: where each number lies in its distribution, uniform in 0..1. Played back with other shares, the same scene
-gives the state that lies there. So every scene has sliders, a user's own YAML or Python file as well, and each stays
-within the scene's own bounds. docs/design/0013-viewer.md tells how draws are told apart and what happens in loops that
-draw again.
+gives the state that lies there, within its own bounds. docs/design/0013-viewer.md tells how draws are told apart and
+what happens in loops that draw again.
 """
 
 import sys
 from collections import Counter
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from types import CodeType, FrameType
 from typing import Any
 
@@ -19,8 +18,6 @@ from jaxtyping import Float
 from scipy.special import ndtri
 
 from mereo.deformation.draw_names import DrawName, NamedGenerator
-from mereo.deformation.maps import Deformation
-from mereo.scenes.scene import Scene
 
 Trail = tuple[tuple[CodeType, int], ...]
 """The calls that led to a draw, outermost first: code, and the instruction within it."""
@@ -166,8 +163,7 @@ class Recorder(NamedGenerator):
         self._ends = ends = np.cumsum(np.full(count, 1 / count) if p is None else p)
         shares = self._take("choice", shape, 0, count).reshape(shape)
         index = np.minimum(np.searchsorted(ends, shares, side="right"), count - 1)
-        chosen = np.take(options, index, axis=axis)
-        return _plain(chosen)
+        return _plain(np.take(options, index, axis=axis))
 
     def permutation(self, x: Any, axis: int = 0) -> Any:
         """The elements of ``x`` in random order; recorded as sort keys."""
@@ -188,100 +184,15 @@ def _plain(values: Any) -> Any:
 
 
 def _trail() -> Trail:
-    """The calls from ``parameters.play`` down to the recorder, which are what a draw is known by."""
+    """The calls from ``parameters.play`` down to the recorder, which are what a draw is known by.
+
+    Without the recorder's own steps, and those of the tests' shape checks around every function.
+    """
     frame: FrameType | None = sys._getframe(1)
     trail: list[tuple[CodeType, int]] = []
     while frame is not None and frame.f_code.co_name != "play":
-        if not _is_ours(frame.f_code):
-            trail.append((frame.f_code, frame.f_lasti))
+        code, file = frame.f_code, frame.f_code.co_filename
+        if file != __file__ and not file.startswith("<@") and "jaxtyping" not in file:
+            trail.append((code, frame.f_lasti))
         frame = frame.f_back
     return tuple(trail[::-1])
-
-
-def _is_ours(code: CodeType) -> bool:
-    """Whether these are the recorder's own steps, or those of the tests' shape checks around every function."""
-    return code.co_filename == __file__ or code.co_filename.startswith("<@") or "jaxtyping" in code.co_filename
-
-
-# --- states beyond the scene's ----------------------------------------------------------------------------------------
-
-# States beyond those of a scene: its own draws, each farther from its middle than its bound is.
-#
-# For trials of what is said of states that a network has not learned. Draws are known by their methods, so a scene
-# needs no change; what is a choice, a count or an order stays within what there is.
-
-ATTEMPTS = 50
-"""States that are drawn before giving up on a scene that refuses what is beyond its bounds."""
-
-MOST_CALLS = 20_000
-"""Calls of the generator after which a scene that draws again and again has refused."""
-
-
-FULL_TURN = 2 * np.pi
-"""Width of an interval of angles that has no end."""
-
-
-class FartherDraws(Recorder):
-    """Generator whose numbers lie beyond what they are drawn from.
-
-    A uniform or triangular number lies farther from the middle (the mode) than its bound does, by a factor: on the side
-    on which it was drawn, or, of an interval on one side of zero, on that which is away from zero. A normal one is the
-    factor times as far from the mean. Directions of a full turn stay.
-    """
-
-    def __init__(self, seed: int, factor: float) -> None:
-        super().__init__(seed, {}, MOST_CALLS)
-        self.factor = factor
-
-    def _beyond(self, values: Any, low: Any, middle: Any, high: Any) -> Any:
-        drawn, low, middle, high = (np.asarray(value, dtype=float) for value in (values, low, middle, high))
-        upwards = np.where(low >= 0, True, np.where(high <= 0, False, drawn >= middle))
-        return middle + self.factor * (np.where(upwards, high, low) - middle)
-
-    def uniform(self, low: Any = 0.0, high: Any = 1.0, size: Any = None) -> Any:
-        """Numbers beyond an interval."""
-        drawn = super().uniform(low, high, size)
-        low, high = np.minimum(low, high), np.maximum(low, high)
-        beyond = self._beyond(drawn, low, (low + high) / 2, high)
-        return _plain_value(np.where(np.isclose(high - low, FULL_TURN), drawn, beyond))
-
-    def normal(self, loc: Any = 0.0, scale: Any = 1.0, size: Any = None) -> Any:
-        """Normal numbers of a greater standard deviation."""
-        middle = np.asarray(loc, dtype=float)
-        return _plain_value(middle + self.factor * (np.asarray(super().normal(loc, scale, size)) - middle))
-
-    def standard_normal(self, size: Any = None, dtype: Any = np.float64, out: Any = None) -> Any:
-        """Normal numbers of mean 0 and the factor as their standard deviation."""
-        return _plain_value(self.factor * np.asarray(super().standard_normal(size, dtype, out)))
-
-    def triangular(self, left: Any, mode: Any, right: Any, size: Any = None) -> Any:
-        """Numbers beyond the bounds of a triangular distribution."""
-        return _plain_value(self._beyond(super().triangular(left, mode, right, size), left, mode, right))
-
-
-def _plain_value(values: Any) -> Any:
-    """A single number as numpy's generators return it."""
-    return values if np.ndim(values) else float(values)
-
-
-def with_farther_states(scene: Scene, factor: float) -> Scene:
-    """The scene with all its draws ``factor`` times as far from their middle as their bounds.
-
-    Its ``sample_deformations`` raises ``ValueError`` where the scene refuses ``ATTEMPTS`` such states.
-    """
-    return replace(scene, sample_deformations=_farther_sampler(scene, factor))
-
-
-def _farther_sampler(scene: Scene, factor: float) -> Callable[[np.random.Generator], tuple[Deformation, ...]]:
-    def sample(rng: np.random.Generator) -> tuple[Deformation, ...]:
-        for _ in range(ATTEMPTS):
-            try:
-                return scene.sample_deformations(FartherDraws(int(rng.integers(2**31)), factor))
-            except (OutOfDraws, ValueError):
-                continue
-        raise ValueError(
-            f"the scene {scene.name!r} allows no state with its draws {factor:g} times as far from their middle as "
-            "their bounds: take a smaller factor"
-        )
-
-    return sample

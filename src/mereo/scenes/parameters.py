@@ -9,6 +9,7 @@ import linecache
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from zlib import crc32
 
@@ -20,10 +21,9 @@ from mereo.deformation.maps import Deformation
 from mereo.scenes.draw_recorder import Call, Key, OutOfDraws, Place, Recorder, Shares, Trail
 from mereo.scenes.scene import Scene
 
-MANY = 48
-"""An array of more numbers than this, or of more than ``MANY_NORMAL`` normal ones, gets one slider."""
+MANY, MANY_NORMAL = 48, 3
+"""An array of more numbers than the first, or of more normal ones than the second, gets one slider."""
 
-MANY_NORMAL = 3
 NORMAL_REACH = 3.0
 """Sliders of normal draws go this many standard deviations to either side."""
 
@@ -64,14 +64,10 @@ class Played:
 
 @dataclass(frozen=True)
 class Parameter:
-    """Degree of freedom of a scene, as a slider shows it.
+    """Degree of freedom of a scene, as a slider shows it: one number of a draw, or all of them together (index None).
 
-    Attributes:
-        key, index: which draw, and which of its numbers; None for all of them together.
-        group, name, unit: for people.
-        low, high, value: as the scene draws them, radians in degrees; a normal draw in standard deviations, many
-            numbers together in turns.
-        whole: whether only whole numbers mean something.
+    Values are as the scene draws them, radians in degrees; a normal draw in standard deviations, many numbers together
+    in turns. ``whole`` is whether only whole numbers mean something.
     """
 
     key: Key
@@ -98,17 +94,20 @@ def play(scene: Scene, recorder: Recorder) -> tuple[Deformation, ...]:
     return scene.sample_deformations(recorder)
 
 
-def replayed(scene: Scene, seed: int, given: Mapping[Key, Shares]) -> Played | None:
-    """State by the shares of its draws, in their order; None where the scene refuses them, or draws others."""
-    recorder = Recorder(seed, given, len(given))
+def _played_by(scene: Scene, seed: int, recorder: Recorder) -> Played | None:
+    """State of the draws that a recorder has; None where the scene refuses them."""
     try:
         deformations = play(scene, recorder)
     except (OutOfDraws, ValueError):  # a scene that gives up raises ValueError
         return None
     calls = tuple(recorder.calls)
-    if [call.key for call in calls] != list(given):
-        return None
     return Played(seed, calls, deformations, {call.key: call.shares for call in calls}, {})
+
+
+def replayed(scene: Scene, seed: int, given: Mapping[Key, Shares]) -> Played | None:
+    """State by the shares of its draws, in their order; None where the scene refuses them, or draws others."""
+    played = _played_by(scene, seed, Recorder(seed, given, len(given)))
+    return played if played is not None and list(played.keys) == list(given) else None
 
 
 def _played(
@@ -124,9 +123,8 @@ def _played(
     calls = tuple(recorder.calls)
     if before is None or tuple(call.key for call in calls) != before.keys:
         calls = _without_refused(scene, seed, calls, deformations)
-    renumbered = _renumbered(calls)
-    remembered = {**given, **{call.key: call.shares for call in renumbered}}
-    return Played(seed, renumbered, deformations, remembered, turns)
+    calls = _renumbered(calls)
+    return Played(seed, calls, deformations, {**given, **{call.key: call.shares for call in calls}}, turns)
 
 
 def _renumbered(calls: Sequence[Call]) -> tuple[Call, ...]:
@@ -154,16 +152,12 @@ def _without_refused(
         again = [k for k in range(len(calls) - 1, first, -1) if calls[k].key[0] == calls[first].key[0]]
         for later in again:
             kept = calls[:first] + calls[later:]
-            if _plays_alike(scene, seed, kept, wanted):
+            played = replayed(scene, seed, {call.key: call.shares for call in _renumbered(kept)})
+            if played is not None and np.array_equal(_witness(scene, played.deformations), wanted):
                 calls = kept
                 break
         first += 1
     return calls
-
-
-def _plays_alike(scene: Scene, seed: int, calls: tuple[Call, ...], wanted: Float[np.ndarray, "w 3"]) -> bool:
-    played = replayed(scene, seed, {call.key: call.shares for call in _renumbered(calls)})
-    return played is not None and np.array_equal(_witness(scene, played.deformations), wanted)
 
 
 def _witness(scene: Scene, deformations: tuple[Deformation, ...]) -> Float[np.ndarray, "w 3"]:
@@ -183,14 +177,16 @@ def parameters(played: Played) -> tuple[Parameter, ...]:
     """Degrees of freedom of this state, in the order in which they are drawn, with names that differ in a group."""
     sliders: list[Parameter] = []
     titles = [_title(call) for call in played.calls]
-    repeated = Counter(titles)
     seen: Counter[tuple[str, tuple[str, ...]]] = Counter()
-    for call, title in zip(played.calls, titles, strict=True):
-        seen[title] += 1
-        group, names = title
-        if repeated[title] > 1:
-            names = tuple(f"{name} {seen[title]}" for name in names)
-        sliders += _parameters_of(call, group, names, played.turns.get(call.key, (0.0, call.shares))[0])
+    for call, (group, names) in zip(played.calls, titles, strict=True):
+        seen[group, names] += 1
+        if titles.count((group, names)) > 1:
+            names = tuple(f"{name} {seen[group, names]}" for name in names)
+        if len(call.shares) > (MANY_NORMAL if call.kind == "normal" else MANY):
+            turn = played.turns.get(call.key, (0.0, call.shares))[0]
+            sliders.append(Parameter(call.key, None, group, names[0], "turns", 0.0, 1.0, turn))
+        else:
+            sliders += [_parameter(call, index, group, name) for index, name in enumerate(_numbered(call, names))]
     return tuple(parameter for parameter in sliders if parameter.high > parameter.low)
 
 
@@ -199,13 +195,6 @@ def _title(call: Call) -> tuple[str, tuple[str, ...]]:
     group, *inner = call.name.parts or ("whole",)
     names = (call.name.name,) if isinstance(call.name.name, str) else call.name.name
     return group, tuple(" ".join([*inner, name or _source_name(call.trail)]) for name in names)
-
-
-def _parameters_of(call: Call, group: str, names: tuple[str, ...], turn: float) -> list[Parameter]:
-    """The sliders of one draw: one for each number, or one for many together."""
-    if len(call.shares) > (MANY_NORMAL if call.kind == "normal" else MANY):
-        return [Parameter(call.key, None, group, names[0], "turns", 0.0, 1.0, turn)]
-    return [_parameter(call, index, group, name) for index, name in enumerate(_numbered(call, names))]
 
 
 def _source_name(trail: Trail) -> str:
@@ -257,14 +246,15 @@ def set_value(scene: Scene, played: Played, parameter: Parameter, value: float) 
         shares = call.shares.copy()
         shares[parameter.index] = _share(call, parameter, value)
     given = {**played.remembered, call.key: shares}
-    try:
+    with suppress(OutOfDraws, ValueError):  # a scene that gives up raises ValueError
         result = _played(scene, played.seed, given, turns, played)
-    except (OutOfDraws, ValueError):  # a scene that gives up raises ValueError
-        raise Refused(_refusal(parameter)) from None
-    taken = next((c for c in result.calls if c.key == call.key), None)
-    if taken is None or not np.allclose(taken.shares, shares, atol=1e-6):
-        raise Refused(_refusal(parameter))
-    return result
+        taken = next((c for c in result.calls if c.key == call.key), None)
+        if taken is not None and np.allclose(taken.shares, shares, atol=1e-6):
+            return result
+    raise Refused(
+        f"the scene refuses this value of {parameter.name!r} ({parameter.group}): with the other values as they are, "
+        "its parts would touch, or fold over; the last state that it allows is shown: move another slider first"
+    )
 
 
 def turned(shares: Shares, turn: float, seed: int | tuple[int, int]) -> Shares:
@@ -290,24 +280,13 @@ def _share(call: Call, parameter: Parameter, value: float) -> float:
     return float((value - parameter.low) / (parameter.high - parameter.low))
 
 
-def _refusal(parameter: Parameter) -> str:
-    return (
-        f"the scene refuses this value of {parameter.name!r} ({parameter.group}): with the other values as they are, "
-        "its parts would touch, or fold over; the last state that it allows is shown: move another slider first"
-    )
-
-
 # --- draws played back ------------------------------------------------------------------------------------------------
 
-# States of a scene from draws that are given in the order of its calls, and what each of the numbers is called.
-#
-#     seed, shares -played_back-> Played -draw_names-> names
-#
 # A key says where in the scene's code a draw comes from, and so belongs to one version of it; an order may be written
 # to a file.
 
 
-class InOrder(Recorder):
+class _InOrder(Recorder):
     """Recorder that is given its draws in the order of the calls; more or other ones raise ``OutOfDraws``."""
 
     def __init__(self, seed: int, shares: Sequence[np.ndarray]) -> None:
@@ -325,25 +304,20 @@ def played_back(
     scene: Scene, seed: int, shares: Sequence[np.ndarray], cure: str = "register the frame again"
 ) -> Played:
     """State of a scene by the shares of each call; raises ``Refused``, with a ``cure``, where it does not take them."""
-    recorder = InOrder(seed, shares)
-    try:
-        deformations = play(scene, recorder)
-    except (OutOfDraws, ValueError):
+    played = _played_by(scene, seed, _InOrder(seed, shares))
+    if played is None:
         raise Refused(
             f"the scene {scene.name!r} does not take these {len(shares)} draws; they are of another scene, or of "
             f"another version of it: {cure}"
-        ) from None
-    calls = tuple(recorder.calls)
-    return Played(seed, calls, deformations, {call.key: call.shares for call in calls}, {})
+        )
+    return played
 
 
 def draw_names(played: Played) -> tuple[str, ...]:
     """Name of each number in the order of the draws, as its slider is called; "" for one that cannot vary."""
     sliders = {(slider.key, slider.index): f"{slider.group}: {slider.name}" for slider in parameters(played)}
-
-    def name(key: Key, index: int) -> str:
-        if (key, None) in sliders:
-            return f"{sliders[key, None]} {index + 1}"
-        return sliders.get((key, index), "")
-
-    return tuple(name(call.key, index) for call in played.calls for index in range(len(call.shares)))
+    numbers = [(call.key, index) for call in played.calls for index in range(len(call.shares))]
+    return tuple(
+        f"{sliders[key, None]} {index + 1}" if (key, None) in sliders else sliders.get((key, index), "")
+        for key, index in numbers
+    )

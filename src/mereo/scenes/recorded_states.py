@@ -6,7 +6,6 @@ and test seeds never share one. See docs/own-object.md for formats.
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -23,28 +22,11 @@ HELD_OUT = 0.1
 """The share of frames, the last ones, that is kept for testing."""
 
 
-@runtime_checkable
-class Frames(Protocol):
-    """Recorded states as deformations of an object at rest."""
-
-    @property
-    def count(self) -> int:
-        """Number of recorded states."""
-
-    def deformations(self, frame: int) -> tuple[Deformation, ...]:
-        """Deformations of the segments in one recorded state."""
-
-
 @dataclass(frozen=True, eq=False)
 class States:
-    """Some of the recorded frames, to draw from.
+    """Recorded frames from ``first`` to before ``end``, to draw from."""
 
-    Attributes:
-        frames: all of them.
-        first, end: those drawn from, without the end.
-    """
-
-    frames: Frames
+    frames: "TetrahedralFrames | SurfaceFrames"
     first: int
     end: int
 
@@ -55,19 +37,10 @@ class States:
 
 @dataclass(frozen=True, eq=False)
 class SplitStates:
-    """Recorded states in two parts that share no frame.
-
-    Attributes:
-        training: all but the last frames.
-        testing: the last ones; None where none are held out.
-    """
+    """Recorded states in two parts that share no frame; the last ones are for testing, None where none are held out."""
 
     training: States
     testing: States | None
-
-    def sample(self, rng: np.random.Generator) -> tuple[Deformation, ...]:
-        """Deformations of one random frame for training."""
-        return self.training.sample(rng)
 
     def scene(self, name: str, rest: SegmentedMesh, workspace: Workspace, source: str) -> Scene:
         """Scene in these states; its ``held_out`` draws from ``testing``."""
@@ -84,35 +57,28 @@ def load_states(
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
     held_out: float = HELD_OUT,
 ) -> SplitStates:
-    """Recorded states of an object.
+    """Recorded states of an object; ``scene = file * scale + shift`` takes the file's coordinates to those of ``rest``.
 
     Args:
         path: a file, a directory or a pattern of files, see docs/own-object.md.
         rest: the object at rest, in scene units.
         mesh: file of the states' own nodes at rest, and of their tetrahedra, where the frames do not have them.
-        scale: ``scene = file * scale + shift`` takes the file's coordinates to those of ``rest``.
-        shift: see ``scale``.
+        scale: above 0.
+        shift: in scene units.
         held_out: the share of frames, the last ones, kept for testing: from 0 to less than 1.
 
-    Raises:
-        FileNotFoundError: nothing at ``path``.
-        ValueError: damaged files, frames that do not fit ``rest``, or frames that turn something inside out, which are
-            named.
-        ImportError: a format of VTK, without the extra `simulation`.
+    Raises ``FileNotFoundError`` for nothing at ``path``, ``ImportError`` for a format of VTK without the extra
+    `simulation`, ``ValueError`` for damaged files, frames that do not fit ``rest``, or turn something inside out.
     """
     offset = np.asarray(shift, dtype=np.float64)
     if not (np.isfinite(scale) and scale > 0 and offset.shape == (3,) and np.isfinite(offset).all()):
         raise ValueError(f"scale is {scale} and shift {shift}; they must be finite, scale above 0, shift of 3 numbers")
     record = read_states(Path(path), rest.names, mesh)
-    frames: Frames
-    if isinstance(record, TetrahedralRecord):
-        frames = tetrahedral_frames(path, record, rest, scale, offset)
-    else:
-        frames = surface_frames(path, record, rest, scale, offset)
-    return _split(path, frames, held_out)
-
-
-def _split(path: Path, frames: Frames, held_out: float) -> SplitStates:
+    frames = (
+        _tetrahedral_frames(path, record, rest, scale, offset)
+        if isinstance(record, TetrahedralRecord)
+        else _surface_frames(path, record, rest, scale, offset)
+    )
     if not 0 <= held_out < 1:
         raise ValueError(f"held_out is {held_out}; the share of frames for testing is from 0 to less than 1: take 0.1")
     count = frames.count
@@ -126,9 +92,7 @@ def _split(path: Path, frames: Frames, held_out: float) -> SplitStates:
     return SplitStates(States(frames, 0, count - kept), testing)
 
 
-# --- recorded frames --------------------------------------------------------------------------------------------------
-
-# Recorded frames fitted to an object at rest: each one is a map of space, by tetrahedra or by surfaces.
+# --- recorded frames: each is a map of space, by tetrahedra or by surfaces --------------------------------------------
 
 MATCHED = 1e-4
 """How near a vertex of the states must be to the mesh's, of the segment's longest side: what single precision and a
@@ -137,19 +101,15 @@ few printed digits leave."""
 DOUBTFUL_STRETCH = 2.0
 """Edges that the first frame makes longer or shorter by this factor, in the median, are hardly those of one mesh."""
 
-
-# --- tetrahedra -------------------------------------------------------------------------------------------------------
+FAR = 0.1
+"""A surface that lies mostly farther from the tetrahedra than this, of their longest side, is not theirs."""
 
 
 @dataclass(frozen=True, eq=False)
 class TetrahedralFrames:
-    """States of one tetrahedral mesh that moves all segments.
+    """States of one tetrahedral mesh, at rest in scene units, that moves all segments.
 
-    Attributes:
-        mesh: at rest, in scene units.
-        displacements: of its nodes, in the file's unit and precision.
-        scale: scene units per unit of the file.
-        segments: how many there are.
+    ``displacements`` of its nodes are in the file's unit and precision, ``scale`` is scene units per unit of the file.
     """
 
     mesh: Tetrahedra
@@ -198,13 +158,10 @@ def tetrahedra_around(
     return mesh
 
 
-def tetrahedral_frames(
+def _tetrahedral_frames(
     path: Path, record: TetrahedralRecord, rest: SegmentedMesh, scale: float, shift: Float[np.ndarray, "3"]
 ) -> TetrahedralFrames:
-    """Frames of a record of tetrahedra, in scene units.
-
-    Raises ``ValueError`` for a mesh elsewhere than ``rest`` and for the first frame that inverts a tetrahedron.
-    """
+    """Frames; ``ValueError`` for a mesh elsewhere than ``rest`` and for the first frame that inverts a tetrahedron."""
     mesh = tetrahedra_around(path, record.rest_nodes * scale + shift, record.tetrahedra, rest)
     frames = TetrahedralFrames(mesh, record.displacements, scale, len(rest.segments))
     for frame in range(frames.count):
@@ -218,17 +175,11 @@ def tetrahedral_frames(
     return frames
 
 
-# --- surfaces ---------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class SurfaceFrames:
     """States of surfaces, each segment moved by a map of its own.
 
-    Attributes:
-        surfaces: the segments at rest, in scene units.
-        vertices: for each of them its positions in all frames, in the file's unit and the mesh's order.
-        scale, shift: from the file's coordinates to the scene's.
+    ``surfaces`` are at rest, in scene units; ``vertices`` of each in all frames, in the file's unit.
     """
 
     surfaces: tuple[Surface, ...]
@@ -250,27 +201,27 @@ class SurfaceFrames:
         return tuple(SurfaceMap(s, self.positions(index, frame)) for index, s in enumerate(self.surfaces))
 
 
-def surface_frames(
+def _surface_frames(
     path: Path, record: SurfaceRecord, rest: SegmentedMesh, scale: float, shift: Float[np.ndarray, "3"]
 ) -> SurfaceFrames:
-    """Frames of a record of surfaces, their vertices in the order of the meshes.
-
-    Raises ``ValueError`` for vertices that do not match ``rest`` and for the first frame that is inside out.
-    """
+    """Frames; ``ValueError`` for vertices that do not match ``rest`` and for the first frame that is inside out."""
     ordered = []
     for segment in rest.segments:
-        states = record.vertices[segment.name]
-        known = record.rest.get(segment.name)
-        ordered.append(
-            states[:, _order(path, segment, states.shape[1], None if known is None else known * scale + shift)]
-        )
+        states, known = record.vertices[segment.name], record.rest.get(segment.name)
+        known = None if known is None else known * scale + shift
+        ordered.append(states[:, _order(path, segment, states.shape[1], known)])
     surfaces = tuple(Surface(segment.vertices, segment.faces) for segment in rest.segments)
     frames = SurfaceFrames(surfaces, tuple(ordered), scale, shift)
     for index, segment in enumerate(rest.segments):
         if segment.name not in record.rest:
             _check_order(path, segment, frames.positions(index, 0))
         for frame, name in enumerate(record.frames):
-            _check_volume(path, name, segment, frames.positions(index, frame))
+            volume = replace(segment, vertices=frames.positions(index, frame)).volume / segment.volume
+            if not volume > 0:
+                raise ValueError(
+                    f"{path}: {name} turns {segment.name!r} inside out (its volume is {volume:.3g} times that at "
+                    "rest); it must stay above 0: leave the frame out"
+                )
     return frames
 
 
@@ -312,13 +263,4 @@ def _check_order(path: Path, segment: Segment, vertices: Float[np.ndarray, "v 3"
             f"{path} makes the edges of {segment.name!r} longer or shorter by a factor of {stretch:.3g}; its vertices "
             f"seem to be in another order or unit than the mesh's: check scale, or name their own mesh by the key "
             f"mesh (in an NPZ file '{segment.name}.rest')"
-        )
-
-
-def _check_volume(path: Path, frame: str, segment: Segment, vertices: Float[np.ndarray, "v 3"]) -> None:
-    volume = replace(segment, vertices=vertices).volume / segment.volume
-    if not volume > 0:
-        raise ValueError(
-            f"{path}: {frame} turns {segment.name!r} inside out (its volume is {volume:.3g} times that at rest); it "
-            "must stay above 0: leave the frame out"
         )

@@ -34,8 +34,7 @@ def files_of(name: str | Path) -> list[Path]:
     Raises as ``load_scene`` does for a faulty YAML file.
     """
     if is_yaml(name):
-        listed: list[Path] = import_module("mereo.scenes.files.build").files_of(Path(name))
-        return listed
+        return list(import_module("mereo.scenes.files.build").files_of(Path(name)))
     if name not in SCENES:
         return [Path(name)]
     from mereo_objects.assets import ASSETS, location
@@ -70,7 +69,21 @@ def _load_python(path: Path) -> Scene:
         raise FileNotFoundError(
             f"{path} does not exist; a Python file with a function scene() is needed: check the path"
         )
-    scene = _run(path)
+    name = f"mereo_scene_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None and spec.loader is not None, "a .py file always has a loader"
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look their module up
+    try:
+        spec.loader.exec_module(module)
+        scene = module.scene()
+    except Exception as error:
+        raise ValueError(
+            f"{path} fails with {type(error).__name__}: {error}; it must run and define a function scene(): correct it "
+            "(MEREO_TRACEBACK=1 shows where)"
+        ) from error
+    finally:
+        del sys.modules[name]  # nobody else finds it by its name, and Ray sends the code of what it does not find
     if not isinstance(scene, Scene):
         raise ValueError(
             f"scene() in {path} returns a {type(scene).__name__}; it must return a Scene of mereo.scenes.scene"
@@ -79,21 +92,3 @@ def _load_python(path: Path) -> Scene:
         raise ValueError(f"{path} names its scene {scene.name!r}, which is a built-in scene: choose another name")
     scene.rest.check()
     return replace(scene, definition=scene.definition + path.read_text("utf-8"))
-
-
-def _run(path: Path) -> object:
-    name = f"mereo_scene_{path.stem}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None and spec.loader is not None, "a .py file always has a loader"
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses look their module up
-    try:
-        spec.loader.exec_module(module)
-        return module.scene()
-    except Exception as error:
-        raise ValueError(
-            f"{path} fails with {type(error).__name__}: {error}; it must run and define a function scene(): correct it "
-            "(MEREO_TRACEBACK=1 shows where)"
-        ) from error
-    finally:
-        del sys.modules[name]  # nobody else finds it by its name, and Ray sends the code of what it does not find

@@ -12,11 +12,8 @@ from jaxtyping import Float, Float16
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 
-TEMPLATE_NODES = 64
-"""Nodes of the grid along each axis: 0.04 apart, a fiftieth of the object's longest side."""
-
-TEMPLATE_REACH = 1.25
-"""The grid covers rest coordinates from -1.25 to 1.25: whatever is farther out is far outside."""
+TEMPLATE_NODES, TEMPLATE_REACH = 64, 1.25
+"""Nodes of the grid along each axis, 0.04 apart, and the largest rest coordinate: what is farther is far outside."""
 
 ROUNDED_TO = 7.3e-7
 """Vertices are rounded to this share of the longest side before they are hashed. It is no simple fraction, or the round

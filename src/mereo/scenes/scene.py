@@ -15,19 +15,10 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import look_at, rotation_along
 from mereo.scenes.seeds import TEST_SEED_START
 
-# --- the source's frame -----------------------------------------------------------------------------------------------
-
-# Frame and unit of the files that an object was read from: how what is defined beside them gets to scene units.
-
 
 @dataclass(frozen=True, eq=False)
 class SourceFrame:
-    """Frame of an object's own files, and the true size of a scene unit.
-
-    Attributes:
-        T_scene_source: similarity from the files' coordinates to the scene's.
-        unit_m: metres per scene unit; None where the object's true size is not known.
-    """
+    """Similarity from the frame of an object's own files, and metres per scene unit, None where they are not known."""
 
     T_scene_source: Float[np.ndarray, "4 4"]
     unit_m: float | None
@@ -47,16 +38,13 @@ class SourceFrame:
         return None if facts is None else cls(np.asarray(facts["T_scene_source"], dtype=np.float64), facts["unit_m"])
 
 
-# --- scenes -----------------------------------------------------------------------------------------------------------
-
 SCENES = (
     *("human", "robot", "bunny", "lizard", "rope", "skull", "engine", "liver", "shapes", "sheet"),
     *("tumor", "liver-simulated"),
 )
 """Built-in scenes, one module each in ``mereo_objects``: the paper's ten, then ours."""
 
-PAPER_APERTURE_RAD = float(np.deg2rad(140.0))
-WHOLE_SPHERE_RAD = float(np.deg2rad(360.0))
+PAPER_APERTURE_RAD, WHOLE_SPHERE_RAD = float(np.deg2rad(140.0)), float(np.deg2rad(360.0))
 
 
 class AssetUnavailable(OSError):
@@ -107,12 +95,7 @@ class Workspace:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Random state of a scene, in the scene's own (world) frame.
-
-    Attributes:
-        mesh: the deformed segments.
-        deformations: for each segment the map of space from its rest pose to ``mesh``.
-    """
+    """Random state of a scene in its own (world) frame, and for each segment the map of space from its rest pose."""
 
     mesh: SegmentedMesh
     deformations: tuple[Deformation, ...]
@@ -191,14 +174,11 @@ class Scene:
 
     def deform(self, deformations: tuple[Deformation, ...]) -> State:
         """State made by one deformation per segment; vertices shared by a common map are moved in one call."""
-        groups: dict[int, list[int]] = {}
-        for index, deformation in enumerate(deformations):
-            groups.setdefault(id(deformation), []).append(index)
         moved: list[Float[np.ndarray, "_ 3"]] = [np.empty((0, 3))] * len(deformations)
-        for members in groups.values():
-            parts = [self.rest.segments[i].vertices for i in members]
-            joint = deformations[members[0]](np.concatenate(parts))
-            pieces = np.split(joint, np.cumsum([len(part) for part in parts])[:-1])
+        for shared in {id(each): each for each in deformations}.values():
+            members = [index for index, each in enumerate(deformations) if each is shared]
+            parts = [self.rest.segments[index].vertices for index in members]
+            pieces = np.split(shared(np.concatenate(parts)), np.cumsum([len(part) for part in parts])[:-1])
             for index, piece in zip(members, pieces, strict=True):
                 moved[index] = piece
         return State(self.rest.with_vertices(moved), deformations)

@@ -29,13 +29,9 @@ from mereo.scenes.scene import SourceFrame
 
 # --- distances that all states keep -----------------------------------------------------------------------------------
 
-# Distances between material points that an object's states keep, though its linear model does not.
-#
 # A linear model of states is too wide where states are not linear: it stretches a rope that only bends, and shears a
 # robot's links. Each pair here has a distance that varies far less among the states than under the model's own
 # Gaussian. Together they say, without any code of the scene, what bends, what is rigid and what turns about what.
-#
-# Notation: q pairs, v points that are tried, k modes.
 
 TRIED_STATES, TRIED_GAUSSIAN = 600, 300
 """States, and draws of the Gaussian, whose distances are compared."""
@@ -75,12 +71,7 @@ def kept_distances(
 ) -> PairDistances:
     """Distances among the ``tried`` material points that the states keep; see ``LEAST_RATIO``.
 
-    Args:
-        tried: material points.
-        mean: of the linear model.
-        modes: of the linear model.
-        library: coefficients of the states.
-        half: half of the rest box's longest side.
+    ``mean``, ``modes`` and ``library`` are the linear model's, ``half`` is half of the rest box's longest side.
     """
     rng = np.random.default_rng(0)
     first, second = np.triu_indices(len(tried), 1)
@@ -106,17 +97,13 @@ def _distances(
     points = mean + (z @ modes.reshape(3 * len(mean), z.shape[1]).T).reshape(len(z), -1, 3)
     squared = (points**2).sum(axis=2)
     product = np.matmul(points, points.transpose(0, 2, 1))
-    result: np.ndarray = np.sqrt(np.maximum(squared[:, :, None] + squared[:, None] - 2 * product, 0.0))
-    return result
+    return np.asarray(np.sqrt(np.maximum(squared[:, :, None] + squared[:, None] - 2 * product, 0.0)))
 
 
 # --- statistical model ------------------------------------------------------------------------------------------------
 
-SPARSE = 200
-"""Material points by which states of the library are compared."""
-
-SILHOUETTE_VERTICES = 1500
-"""Vertices that are compared with what a frame rules out."""
+SPARSE, SILHOUETTE_VERTICES = 200, 1500
+"""Material points by which states of the library are compared, and vertices compared with what a frame rules out."""
 
 OF_REST: tuple[str, ...] = (
     *("faces", "vertex_counts", "labels", "rest_points", "half", "rest_center"),
@@ -173,6 +160,11 @@ class StatisticalModel:
         return find_symmetries(self.rest, TOLERANCE)
 
     @property
+    def swaps(self) -> tuple[tuple[int, ...], ...]:
+        """Exchanges of segments that no frame tells from the rest pose: for each segment the one in its place."""
+        return tuple(tuple(i for i in each.lands_on if i is not None) for each in self.symmetries if each.swaps)
+
+    @property
     def count(self) -> int:
         """Number of modes."""
         return self.modes.shape[2]
@@ -184,7 +176,7 @@ class StatisticalModel:
 
     @cached_property
     def vertex_counts(self) -> tuple[int, ...]:
-        """Vertices of each segment."""
+        """Number of vertices of each segment."""
         return tuple(len(segment.vertices) for segment in self.rest.segments)
 
     @cached_property
@@ -218,12 +210,11 @@ class StatisticalModel:
     @cached_property
     def anchors(self) -> tuple[Int[np.ndarray, " a"], ...]:
         """Anchors of each segment: the material points that others of it follow."""
-        result = []
-        for index, first in enumerate(np.cumsum([0, *self.vertex_counts[:-1]])):
-            vertices = first + spread(self.rest.segments[index].vertices, ANCHORS)
-            nodes = sum(self.vertex_counts) + np.flatnonzero(self.node_labels == index + 1)
-            result.append(np.concatenate([vertices, nodes]))
-        return tuple(result)
+        *firsts, count = np.cumsum([0, *self.vertex_counts])
+        return tuple(
+            np.concatenate([first + spread(part.vertices, ANCHORS), count + np.flatnonzero(self.node_labels == label)])
+            for label, (first, part) in enumerate(zip(firsts, self.rest.segments, strict=True), start=1)
+        )
 
     @cached_property
     def rest_anchors(self) -> tuple[Anchors, ...]:
@@ -277,8 +268,7 @@ class StatisticalModel:
 
     def modes_for(self, residue: float) -> int | None:
         """Fewest modes that leave no more than this root mean square distance; None where all leave more."""
-        enough = np.flatnonzero(self.residues <= residue)
-        return int(enough[0]) if len(enough) else None
+        return next(iter(np.flatnonzero(self.residues <= residue).tolist()), None)
 
     def beyond(self, z: Float[np.ndarray, " k"]) -> float:
         """How far a state lies outside the range of the library's states: root mean square of the material points.
@@ -332,8 +322,6 @@ def following(
 
 # --- files ------------------------------------------------------------------------------------------------------------
 
-# Statistical models as tensors, small enough to travel with datasets and weights.
-#
 # Modes and the library of states are bytes: each mode in 254 steps of its largest motion, the first few, which move
 # most, in 65,534, and each coefficient in steps of a 32nd of a standard deviation. A hundred modes of 6,000 material
 # points are 2 MB, and rounding moves points by about a hundredth of a scene unit, a tenth of the paper's noise. Rest
@@ -341,11 +329,8 @@ def following(
 #
 # Notation: v vertices, m material points, k modes, n states, q pairs.
 
-LIBRARY_STEP = 1 / 32
-"""Step of a coefficient; bytes reach to 4 standard deviations, which one normal number in 16,000 exceeds."""
-
-WIDE_MODES = 12
-"""The first ones, in two bytes: they move most, and so would be rounded most."""
+LIBRARY_STEP, WIDE_MODES = 1 / 32, 12
+"""Step of a coefficient, whose bytes reach to 4 standard deviations, and how many first modes have two bytes."""
 
 
 def pack_model(model: StatisticalModel) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -460,8 +445,7 @@ def _integers(
     modes: Float32[np.ndarray, "m 3 k"], dtype: type[np.signedinteger]
 ) -> tuple[Int[np.ndarray, "m 3 k"], Float32[np.ndarray, " k"]]:
     """Modes in steps of their largest motion, and the motion that one step of each stands for."""
-    largest = np.abs(modes).max(axis=(0, 1), initial=1e-12)
-    scale = (largest / np.iinfo(dtype).max).astype(np.float32)
+    scale = (np.abs(modes).max(axis=(0, 1), initial=1e-12) / np.iinfo(dtype).max).astype(np.float32)
     return np.rint(modes / scale).astype(dtype), scale
 
 

@@ -1,8 +1,7 @@
 """Tools and hands in front of an object, and a plane behind it: what else a camera sees.
 
 Everything is in the camera frame, in scene units; lengths in metres are multiplied by ``unit``, scene units per metre.
-Occluders made in front of a rendered object are a common way to train for occlusion (Sárándi et al., "How robust is 3D
-human pose estimation to occlusion?", IROS workshops 2018). Here they are solid bodies with a depth of their own.
+Occluders are solid bodies with a depth of their own (sources in docs/design/0006-sensors.md).
 """
 
 from dataclasses import dataclass
@@ -32,11 +31,12 @@ class Capsule:
         low, high = np.minimum(self.start, self.end) - self.radius, np.maximum(self.start, self.end) + self.radius
         rows = toward(directions, low, high)
         rays = directions[rows]
-        distance = np.minimum(self._end_hit(self.start, rays), self._end_hit(self.end, rays))
-        distance = np.minimum(distance, self._side_hit(rays))
+        ends = np.minimum(self._end_hit(self.start, rays), self._end_hit(self.end, rays))
+        distance = np.minimum(ends, self._side_hit(rays))
         hit = np.isfinite(distance)
-        place = rays[hit] * distance[hit, None]
-        return rows[hit], Hits(distance[hit], place - self._axis_point(place))
+        place, axis = rays[hit] * distance[hit, None], self.end - self.start
+        share = np.clip((place - self.start) @ axis / max(float(axis @ axis), 1e-300), 0.0, 1.0)
+        return rows[hit], Hits(distance[hit], place - (self.start + share[:, None] * axis))  # from the axis outwards
 
     def _end_hit(self, center: Vector, rays: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Entry into the ball around one end: the smaller root of |t ray - center| = radius."""
@@ -57,12 +57,6 @@ class Capsule:
         )
         place = np.where(np.isfinite(distance), distance, 0.0) * along - offset
         return np.where((place >= 0) & (place <= length), distance, np.inf)
-
-    def _axis_point(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """The nearest point of the axis."""
-        axis = self.end - self.start
-        share = np.clip((points - self.start) @ axis / max(float(axis @ axis), 1e-300), 0.0, 1.0)
-        return self.start + share[:, None] * axis
 
 
 def _entry(
@@ -89,31 +83,10 @@ class Backdrop:
 
 
 @dataclass(frozen=True, eq=False)
-class Screen:
-    """Flat occluder with one straight edge: all points of a depth whose slope (x/z, y/z) along an axis is small enough.
-
-    Attributes:
-        depth: z of its points.
-        axis: unit vector in the image plane, across the edge.
-        limit: largest slope along the axis.
-    """
-
-    depth: float
-    axis: Float[np.ndarray, "2"]
-    limit: float
-
-    def first_hit(self, directions: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Hits]:
-        """Rows of the rays from the origin that hit the screen, and where."""
-        slope = directions[:, :2] / directions[:, 2:]
-        rows = np.flatnonzero(slope @ self.axis <= self.limit)
-        return rows, Hits(self.depth / directions[rows, 2], np.tile([0.0, 0.0, 1.0], (len(rows), 1)))
-
-
-@dataclass(frozen=True, eq=False)
 class Surroundings:
-    """Everything in a view that is not the object: tools, hands, screens, a plane behind."""
+    """Everything in a view that is not the object: tools, hands, a plane behind."""
 
-    occluders: tuple[Capsule | Screen, ...] = ()
+    occluders: tuple[Capsule, ...] = ()
     background: Backdrop | None = None
 
     def join(self, hits: Hits, directions: Float[np.ndarray, "n 3"]) -> tuple[Hits, UInt8[np.ndarray, " n"]]:
@@ -134,14 +107,9 @@ def sample_surroundings(
     reach: float,
     streams: dict[str, np.random.Generator],
 ) -> Surroundings:
-    """Random tool, hand and plane around an object of which the points ``seen`` are visible.
+    """Random tool, hand and plane around an object, as probable as ``sensor`` says, each of a stream of its name.
 
-    Args:
-        sensor: how probable each is.
-        solids: the object.
-        seen: at least one point; tools and hands point at one of them.
-        reach: slope x/z from the image's centre to its corners, so that shafts and forearms begin outside the image.
-        streams: a random generator for each of ``tool``, ``hand``, ``background``.
+    ``seen`` and ``reach`` are as for ``sample_occluder``.
     """
     unit = 1 / sensor.metres_per_unit
     probable: tuple[tuple[Occluder, float], ...] = (("tool", sensor.tool), ("hand", sensor.hand))
@@ -156,18 +124,14 @@ def sample_surroundings(
 def sample_occluder(
     kind: Occluder, seen: Float[np.ndarray, "m 3"], reach: float, unit: float, rng: np.random.Generator
 ) -> tuple[Capsule, ...]:
-    """Random occluder of a kind in front of an object.
+    """Random occluder of a kind in front of an object; "none" is nothing.
 
-    Args:
-        kind: what it is; "none" is nothing.
-        seen: visible points of the object, camera frame; it points at one of them.
-        reach: slope x/z from the image's centre to its corners, beyond which it begins.
-        unit: scene units in a metre.
-        rng: decides on its place and shape.
+    It points at one of the visible points ``seen``, in the camera frame, and begins outside the image: ``reach`` is the
+    slope x/z from the image's centre to its corners. ``unit`` is scene units in a metre.
     """
     if kind == "none":
         return ()
-    return tuple(sample_tool(seen, reach, unit, rng) if kind == "tool" else sample_hand(seen, reach, unit, rng))
+    return tuple((_sample_tool if kind == "tool" else _sample_hand)(seen, reach, unit, rng))
 
 
 def sample_plane(solids: Solids, unit: float, rng: np.random.Generator) -> Backdrop:
@@ -197,7 +161,7 @@ def _approach(
     return tip, out
 
 
-def sample_tool(seen: Float[np.ndarray, "m 3"], reach: float, unit: float, rng: np.random.Generator) -> list[Capsule]:
+def _sample_tool(seen: Float[np.ndarray, "m 3"], reach: float, unit: float, rng: np.random.Generator) -> list[Capsule]:
     """Random straight shaft that ends in two jaws, as laparoscopic instruments have: 5 to 12 mm thick."""
     tip, out = _approach(seen, reach, unit, rng)
     radius, jaw, opening = rng.uniform(0.0025, 0.006) * unit, 0.018 * unit, rng.uniform(0.05, 0.4)
@@ -213,12 +177,10 @@ _FINGERS = ((-0.030, 0.90), (-0.010, 1.0), (0.010, 0.93), (0.030, 0.75))
 """Index to little finger: place of the knuckle across the palm in metres, length relative to the middle finger."""
 
 
-def sample_hand(seen: Float[np.ndarray, "m 3"], reach: float, unit: float, rng: np.random.Generator) -> list[Capsule]:
+def _sample_hand(seen: Float[np.ndarray, "m 3"], reach: float, unit: float, rng: np.random.Generator) -> list[Capsule]:
     """Random left or right hand with forearm, as capsules, that reaches up to 7 cm past the point it is sent to.
 
-    Hands of simple solids are known from tracking (Oikonomidis et al., "Efficient model-based 3D tracking of hand
-    articulations using Kinect", BMVC 2011). An adult's: about 18 cm long, 8 cm wide, with 10 % of variation. Fingers
-    bend away from the camera by random angles.
+    An adult's: about 18 cm long, 8 cm wide, with 10 % of variation. Fingers bend away from the camera by random angles.
     """
     tip, out = _approach(seen, reach, unit, rng)
     size, mirror = unit * rng.uniform(0.9, 1.1), rng.choice([-1.0, 1.0])

@@ -81,32 +81,16 @@ SENSOR_TERMS = (
 
 Sensor = Literal["paper", "structured-light", "time-of-flight"]
 
+# noisy, with a segmentation that is about half a pixel off
+_REAL = SensorConfig(axial=1.0, lateral=1.0, background=1.0, mask_offset_px=0.5, mask_shift_px=0.3)
+
 SENSORS: dict[Sensor, SensorConfig] = {
     # Gaussian noise alone, GenerateConfig.noise_std
     "paper": SensorConfig(),
-    # the first Kinect and its kin, with a segmentation that is about half a pixel off
-    "structured-light": SensorConfig(
-        axial=1.0,
-        lateral=1.0,
-        quantization=1.0,
-        dropout=0.8,
-        holes=1.0,
-        background=1.0,
-        mask_offset_px=0.5,
-        mask_shift_px=0.3,
-    ),
+    # the first Kinect and its kin
+    "structured-light": replace(_REAL, quantization=1.0, dropout=0.8, holes=1.0),
     # the second Kinect and its kin: no depth steps, but flying pixels
-    "time-of-flight": SensorConfig(
-        model="time-of-flight",
-        axial=1.0,
-        lateral=1.0,
-        flying=0.5,
-        dropout=0.5,
-        holes=0.5,
-        background=1.0,
-        mask_offset_px=0.5,
-        mask_shift_px=0.3,
-    ),
+    "time-of-flight": replace(_REAL, model="time-of-flight", flying=0.5, dropout=0.5, holes=0.5),
 }
 
 Occluder = Literal["none", "tool", "hand"]
@@ -126,11 +110,8 @@ OBSERVATIONS: dict[ObservationName, SensorConfig] = {
 }
 """Sensors of further observations by name; each draws from the stream of its place, so new ones go to the end."""
 
-TEMPLATE = "template.safetensors"
-"""File of a dataset with the segments at rest (``scenes.rest_pose``)."""
-
-STATISTICAL_MODEL = "statistical_model.safetensors"
-"""A dataset's file with the object's statistical model (``statistical_model_file``)."""
+TEMPLATE, STATISTICAL_MODEL = "template.safetensors", "statistical_model.safetensors"
+"""Files of a dataset with the segments at rest (``scenes.rest_pose``), and with the object's statistical model."""
 
 
 Sampler = Literal["volume-uniform", "label-uniform", "sort-sample", "nested-sort-sample"]

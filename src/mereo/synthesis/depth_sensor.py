@@ -6,7 +6,7 @@ docs/design/0006-sensors.md has the sources and figures. Notation: h x w pixels,
 ray and surface normal.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -17,20 +17,17 @@ from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Hits, Solids
-from mereo.synthesis.clutter import NOTHING, OBJECT, Capsule, Surroundings, sample_surroundings
+from mereo.synthesis.clutter import NOTHING, OBJECT, Surroundings, sample_surroundings
 from mereo.synthesis.config import SENSOR_TERMS, SensorConfig, SensorModel
 
 STEEPEST_RAD = float(np.deg2rad(80.0))
 """Largest angle of the noise formulas, which have a pole at 90 degrees: steeper surfaces count as seen at this one."""
 
 GRAZING_RAD = float(np.deg2rad(60.0))
-"""Angle from which on axial noise rises steeply (Nguyen et al. 2012) and pixels go missing."""
+"""Angle from which on axial noise rises steeply and pixels go missing."""
 
-KINECT_FOCAL_PX = 585.0
-"""Focal length of the pixels in which Nguyen et al. state lateral noise."""
-
-KINECT_DISPARITY_M = 351.3
-"""Depth in metres times disparity in steps; 35130 in centimetres (Barron and Malik 2013)."""
+KINECT_FOCAL_PX, KINECT_DISPARITY_M = 585.0, 351.3
+"""Focal length of the pixels in which lateral noise is stated; depth in metres times disparity in steps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,21 +62,20 @@ def observe(
     sensor: SensorConfig,
     rng: np.random.Generator,
     *,
-    occluders: tuple[Capsule, ...] = (),
     around: Surroundings | None = None,
 ) -> SimulatedView:
-    """Measurement of an object in the camera frame by a simulated sensor; ``occluders`` stand in front of it.
+    """Measurement of an object in the camera frame by a simulated sensor.
 
     The Gaussian noise of ``noise_std`` is drawn from ``rng`` itself, every other term from a stream of its own that is
     spawned from it. So whatever is drawn from ``rng`` afterwards is the same with any sensor, and switching one term on
     or off leaves the others as they were. Where ``around`` is given, it is what stands around the object, and no
     surroundings are drawn.
     """
-    if not sensor.on and not occluders and around is None:
+    if not sensor.on and around is None:
         image = add_depth_noise(render_depth(solids, camera), noise_std, rng)
         return SimulatedView(image, image.valid, np.where(image.valid, OBJECT, NOTHING).astype(np.uint8))
     streams = dict(zip(SENSOR_TERMS, rng.spawn(len(SENSOR_TERMS)), strict=True))
-    hits, source = _look(solids, camera, sensor, streams, occluders, around)
+    hits, source = _look(solids, camera, sensor, streams, around)
     shape = (camera.height, camera.width)
     depth = np.where(np.isfinite(hits.distance), hits.distance, 0.0).reshape(shape)
     angle_rad = _incidence(hits, camera.directions().reshape(-1, 3)).reshape(shape)
@@ -103,7 +99,6 @@ def _look(
     camera: Camera,
     sensor: SensorConfig,
     streams: dict[str, np.random.Generator],
-    occluders: tuple[Capsule, ...],
     around: Surroundings | None,
 ) -> tuple[Hits, UInt8[np.ndarray, " n"]]:
     """What each pixel's ray meets, with the surroundings and lateral noise."""
@@ -115,7 +110,6 @@ def _look(
     seen = directions[visible] * hits.distance[visible, None]
     reach = float(np.linalg.norm(directions[:, :2], axis=1).max())
     around = sample_surroundings(sensor, solids, seen, reach, streams) if around is None else around
-    around = replace(around, occluders=(*around.occluders, *occluders))
     hits, source = around.join(hits, directions)
     if sensor.lateral == 0:
         return hits, source
@@ -139,9 +133,7 @@ def lateral_std(
 ) -> Float[np.ndarray, "*n"]:
     """Standard deviation of where a pixel looks, as a slope x/z.
 
-    Structured light: 0.8 + 0.035 a / (pi/2 - a) pixels of the Kinect (Nguyen, Izadi and Lovell, "Modeling Kinect sensor
-    noise for improved 3D reconstruction and tracking", 3DIMPVT 2012). Time of flight: 1.6 mm at any depth (Fankhauser
-    et al., "Kinect v2 for mobile robot navigation: evaluation and modeling", ICAR 2015).
+    Structured light: 0.8 + 0.035 a / (pi/2 - a) pixels of the Kinect. Time of flight: 1.6 mm at any depth.
     """
     if model == "time-of-flight":
         return 0.0016 / z_m
@@ -157,9 +149,9 @@ def axial_std_m(
 ) -> Float[np.ndarray, "*n"]:
     """Standard deviation of the depth in metres, at distance z and angle a.
 
-    Structured light: 0.0012 + 0.0019 (z - 0.4)^2 + 0.0001 z^-1/2 a^2 / (pi/2 - a)^2 (Nguyen et al. 2012, who add the
-    last term beyond 60 degrees only; it is small below, and here there is no jump). Time of flight: 1.5 - 0.5 z +
-    0.3 z^2 + 0.1 z^3/2 a^2 / (pi/2 - a)^2 millimetres (Fankhauser et al. 2015).
+    Structured light: 0.0012 + 0.0019 (z - 0.4)^2 + 0.0001 z^-1/2 a^2 / (pi/2 - a)^2; its source adds the last term
+    beyond 60 degrees only, and here there is no jump. Time of flight: 1.5 - 0.5 z + 0.3 z^2 +
+    0.1 z^3/2 a^2 / (pi/2 - a)^2 millimetres.
     """
     angle = np.minimum(angle_rad, STEEPEST_RAD)
     slant = (angle / (np.pi / 2 - angle)) ** 2
@@ -176,10 +168,8 @@ def add_axial_noise(
         return depth
     measured = depth > 0
     z_m = depth[measured] * sensor.metres_per_unit
-    noise_m = (
-        sensor.axial * axial_std_m(z_m, angle_rad[measured], sensor.model) * rng.normal(size=depth.shape)[measured]
-    )
-    noisy = depth.copy()
+    std_m = sensor.axial * axial_std_m(z_m, angle_rad[measured], sensor.model)
+    noisy, noise_m = depth.copy(), std_m * rng.normal(size=depth.shape)[measured]
     noisy[measured] = np.maximum(z_m + noise_m, np.finfo(np.float32).tiny) / sensor.metres_per_unit
     return noisy
 
@@ -188,10 +178,7 @@ def quantize(z_m: Float[np.ndarray, "*n"], strength: float) -> Float[np.ndarray,
     """Depth of the nearest whole disparity: z -> D / round(D / z), D = 351.3 m / ``strength``; 0 stays 0.
 
     A triangulating camera measures disparity in steps (an eighth of a pixel in the Kinect), so depth has steps of about
-    z^2 / D: 0.7 mm at 0.5 m, 2.8 mm at 1 m. D is from Barron and Malik ("Intrinsic scene properties from a single
-    RGB-D image", CVPR 2013), whom Handa et al. follow (ICL-NUIM, ICRA 2014); it agrees with the 2.85e-5 / cm measured
-    by Khoshelham and Elberink ("Accuracy and resolution of Kinect depth data", Sensors 2012). Their noise before
-    rounding is left to the axial noise.
+    z^2 / D: 0.7 mm at 0.5 m, 2.8 mm at 1 m. The noise before rounding is left to the axial noise.
     """
     disparity = KINECT_DISPARITY_M / strength
     steps = np.maximum(np.rint(disparity / np.where(z_m > 0, z_m, 1.0)), 1.0)
@@ -203,12 +190,9 @@ def mix_edges(
 ) -> Float[np.ndarray, "h w"]:
     """Depth with flying pixels: at edges, with this probability, a depth between the pixel's own and its neighbour's.
 
-    A pixel whose footprint covers both sides of an edge returns a mixture (Hebert and Krotkov, "3D measurements from
-    imaging laser radars: how good are they?", Image and Vision Computing 1992; for time-of-flight cameras Sabov and
-    Krüger, "Identification and correction of flying pixels in range camera data", SCCG 2008). How much of each depends
-    on both surfaces' brightness, which is unknown: the share is uniform. The neighbour is the one of four that differs
-    most; an edge is where it differs by more than one surface seen at 80 degrees would. An edge before nothing at all
-    stays sharp: no light comes back from there.
+    A pixel whose footprint covers both sides of an edge returns a mixture. How much of each depends on both surfaces'
+    brightness, which is unknown: the share is uniform. The neighbour is the one of four that differs most; an edge is
+    where it differs by more than one surface seen at 80 degrees would. An edge before nothing at all stays sharp.
     """
     if probability == 0:
         return depth
@@ -227,9 +211,8 @@ def mix_edges(
 def dropout_probability(angle_rad: Float[np.ndarray, "*n"], strength: float) -> Float[np.ndarray, "*n"]:
     """Probability that a pixel is missing: 0 up to 60 degrees of slant, then rising to ``strength`` at 90.
 
-    The light that comes back from a matt surface falls with the cosine of the angle (Lambert), and cameras give up on
-    weak or distorted returns (Mallick, Das and Majumdar, "Characterizations of noise in Kinect depth images: a review",
-    IEEE Sensors Journal 2014). The probability is what the cosine lacks of its value at 60 degrees.
+    Light from a matt surface falls with the cosine of the angle, and cameras give up on weak returns. The probability
+    is what the cosine lacks of its value at 60 degrees.
     """
     return strength * np.maximum(0.0, 1.0 - np.cos(angle_rad) / np.cos(GRAZING_RAD))
 
@@ -241,10 +224,9 @@ def sample_holes(
     sensor: SensorConfig,
     rng: np.random.Generator,
 ) -> Bool[np.ndarray, "h w"]:
-    """Pixels in missing blobs, as mirroring and absorbing spots leave them (Mallick et al. 2014).
+    """Pixels in missing blobs, as mirroring and absorbing spots leave them.
 
-    A Poisson number of ellipses at object pixels with gamma-distributed radii (shape 5), after the augmentation of Xie
-    et al. ("Unseen object instance segmentation for robotic environments", T-RO 2021), with radii in metres.
+    A Poisson number of ellipses at object pixels with gamma-distributed radii (shape 5).
     """
     holes = np.zeros(depth.shape, dtype=bool)
     rows, columns = np.nonzero(seen)
@@ -266,8 +248,8 @@ def sample_mask(
 ) -> Bool[np.ndarray, "h w"]:
     """Mask of the object as a segmentation gives it: shifted, its edge too far out here and too far in there.
 
-    Xie et al. (T-RO 2021) shift, erode and dilate masks to resemble those of a network. Here the signed distance to the
-    true edge is compared with a smooth random offset, so that neighbouring parts of the edge are wrong alike.
+    The signed distance to the true edge is compared with a smooth random offset, so that neighbouring parts of the edge
+    are wrong alike.
     """
     if (sensor.mask_offset_px == 0 and sensor.mask_shift_px == 0) or not seen.any() or seen.all():
         return seen
@@ -289,13 +271,10 @@ def _bumps(size: int, nodes: int) -> Float[np.ndarray, "s n"]:
     """Weights of the nodes at each pixel; their squares sum to 1."""
     pixels, centers = np.arange(size)[:, None] / max(size - 1, 1), np.linspace(0, 1, nodes)
     weights = np.exp(-0.5 * ((pixels - centers) * (nodes - 1) / 0.7) ** 2)
-    normalized: Float[np.ndarray, "s n"] = weights / np.linalg.norm(weights, axis=1, keepdims=True)
-    return normalized
+    return np.asarray(weights / np.linalg.norm(weights, axis=1, keepdims=True))
 
 
-# --- rendering --------------------------------------------------------------------------------------------------------
-
-# Virtual depth camera: ray casting and Gaussian noise (paper, appendix B).
+# --- rendering (paper, appendix B) ------------------------------------------------------------------------------------
 
 
 def render_depth(mesh: SegmentedMesh | Solids, camera: Camera) -> DepthImage:
@@ -312,8 +291,6 @@ def render_depth(mesh: SegmentedMesh | Solids, camera: Camera) -> DepthImage:
 
 def add_depth_noise(image: DepthImage, std: float, rng: np.random.Generator) -> DepthImage:
     """Depth image with Gaussian noise of standard deviation ``std`` (the depth's unit) on every measured pixel.
-
-    Misses stay misses.
 
     ``rng`` advances by one number per pixel, measured or not. Raises ``ValueError`` when ``std`` is not finite and at
     least 0.

@@ -99,8 +99,8 @@ def synthesize(scene: Scene, settings: GenerateConfig, rng: np.random.Generator)
     return Example(
         cloud=cloud[farthest_point_order(cloud, settings.points)],
         normalizer=normalizer,
-        queries=label_queries(scene, view, solids, samples, normalizer),
-        observations=further_observations(solids, view.depth, normalizer, settings, rng),
+        queries=_labelled(scene, view, solids, samples, normalizer),
+        observations=_further_observations(solids, view.depth, normalizer, settings, rng),
     )
 
 
@@ -133,7 +133,7 @@ def _sample_view(scene: Scene, settings: GenerateConfig, rng: np.random.Generato
     )
 
 
-def label_queries(scene: Scene, view: View, solids: Solids, samples: Samples, normalizer: Normalizer) -> LabelledPoints:
+def _labelled(scene: Scene, view: View, solids: Solids, samples: Samples, normalizer: Normalizer) -> LabelledPoints:
     """Labels, distances, directions and rest coordinates of sampled points, normalized."""
     nearest = solids.nearest(samples.points)
     distance, direction = signed_distance_and_direction(solids, samples.points, samples.labels, nearest)
@@ -176,8 +176,7 @@ def _rest_guess(
     does not matter whose face it is.
     """
     before, faces, _ = rest.merged()
-    after, _, _ = deformed.merged()
-    old, new = before[faces[face]], after[faces[face]]
+    old, new = before[faces[face]], deformed.merged()[0][faces[face]]
     weights = barycentric(new, closest)
     local = np.einsum("nji,nj->ni", _triangle_frames(new), points - closest)
     return np.einsum("nk,nkj->nj", weights, old) + np.einsum("nij,nj->ni", _triangle_frames(old), local)
@@ -193,8 +192,6 @@ def _triangle_frames(triangles: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray,
 
 # --- further observations ---------------------------------------------------------------------------------------------
 
-# Further observations of an example: the same state and camera, seen by other sensors.
-#
 # Training sees a random one of them, so a network learns what cameras, tools and masks do to a cloud. In use a network
 # sees a cloud in up to three ways: with its strays; without those that the rule of ``surface_patches`` finds, which on
 # thin objects takes more than strays; and, once a fit knows where the object is, with little but the object's points.
@@ -206,20 +203,13 @@ UNCLEANED, BY_RULE = 0.1, 0.4
 Clouds = tuple[Float[np.ndarray, "_ 3"], ...]
 
 
-def further_observations(
+def _further_observations(
     solids: Solids, first: DepthImage, normalizer: Normalizer, settings: GenerateConfig, rng: np.random.Generator
 ) -> Clouds:
     """Clouds of the sensors ``settings.further``, normalized as the first one, each in farthest-point order.
 
     Each is drawn from a stream of its own that is spawned from ``rng``, so what is drawn from ``rng`` stays the same
     with any of them. One that shows fewer than ``MIN_POINTS`` points of the object is the first cloud instead.
-
-    Args:
-        solids: the object in the camera frame.
-        first: the example's own depth image.
-        normalizer: of the first cloud.
-        settings: which sensors, and how many points are kept.
-        rng: of the example; nothing is drawn from it.
     """
     if not settings.further:
         return ()
@@ -238,11 +228,9 @@ def _observed_points(
     """Points that a sensor sees in place of ``first``, in the camera frame; None where too few show the object."""
     way = rng.random()
     seen = observe(solids, first.camera, noise_std, sensor, rng)
-    image = seen.image
-    points = image.to_points().points
     if seen.object_points < MIN_POINTS:
         return None
-    shows_object = (seen.source == OBJECT)[image.valid]
+    points, shows_object = seen.image.to_points().points, (seen.source == OBJECT)[seen.image.valid]
     if way < UNCLEANED:
         return points
     keep = without_strays(points) if way < UNCLEANED + BY_RULE else shows_object

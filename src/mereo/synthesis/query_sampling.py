@@ -9,7 +9,7 @@ result does not depend on the size of a batch: it is, bit for bit, that of drawi
 """
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, NoReturn, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -19,8 +19,6 @@ from mereo.synthesis.config import SamplingConfig
 
 # --- labels -----------------------------------------------------------------------------------------------------------
 
-# Rules of who owns a point that several segments hold, and what a sampler asks of an object.
-#
 # Where segments overlap, the first one owns the point (``Shape.label``): nested ones are declared, and the inner one
 # comes first. ``owner_labels`` is the rule of the authors' later work, which needs no declaration.
 
@@ -75,10 +73,8 @@ def owner_labels(shape: Shape, points: Float[np.ndarray, "n d"]) -> UInt8[np.nda
 MAX_DRAWS = 2_000_000
 """Number of draws for one segment after which sampling gives up: its share of its box is too small for it."""
 
-_FIRST_BATCH = 8
-"""The first batch draws this many times n; a segment usually fills a tenth to a quarter of its extended box."""
-
-_LARGEST_BATCH = 1 << 17
+_FIRST_BATCH, _LARGEST_BATCH = 8, 1 << 17
+"""The first batch draws so many times n: a segment usually fills a tenth to a quarter of its extended box."""
 
 
 class Samples(NamedTuple):
@@ -100,19 +96,13 @@ def extended_boxes(shape: Shape, margin: float = 0.5) -> Boxes:
 
 
 def joint_box(shape: Shape) -> Float[np.ndarray, "2 d"]:
-    """Box of all segments together, not extended.
-
-    The paper's "joint boundaries of all segments", read as its evaluation's "joint bounding box of all objects".
-    """
-    boxes = shape.boxes()
-    return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
+    """Box of all segments together, not extended: the paper's "joint boundaries of all segments"."""
+    low, high = shape.boxes().swapaxes(0, 1)
+    return np.stack([low.min(axis=0), high.max(axis=0)])
 
 
 def volume_uniform(shape: Shape, count: int, rng: np.random.Generator, boxes: Boxes | None = None) -> Samples:
-    """Volume Uniform samples: ``count`` points per segment, uniform in its draw box, whatever they hit.
-
-    ``boxes`` [s, 2, d] are the draw boxes; by default ``extended_boxes(shape)``.
-    """
+    """Volume Uniform samples: ``count`` points per segment, uniform in its draw box (extended), whatever they hit."""
     boxes = extended_boxes(shape) if boxes is None else boxes
     points = np.concatenate([_uniform(box, count, rng) for box in boxes])
     return Samples(points, shape.label(points))
@@ -124,8 +114,7 @@ def label_uniform(shape: Shape, keep: int, rng: np.random.Generator, boxes: Boxe
     Points outside may lie in other segments and carry their labels. Raises ``ValueError`` as ``sort_sample``.
     """
     draws = _draw_all(shape, boxes, keep, shape.label, others=True, rng=rng)
-    sides = [(d.points[rows[:keep]], d.labels[rows[:keep]]) for d in draws for rows in d.sides()]
-    return _join(sides)
+    return _join([(d, rows[:keep]) for d in draws for rows in d.sides()])
 
 
 def sort_sample(shape: Shape, keep: int, draw: int, rng: np.random.Generator, boxes: Boxes | None = None) -> Samples:
@@ -135,15 +124,9 @@ def sort_sample(shape: Shape, keep: int, draw: int, rng: np.random.Generator, bo
     empty space; those in other segments are dropped. Where segments overlap, the first one owns the point. A segment
     declared nested has no empty space around it: draws in those around it are its outside, with their labels.
 
-    Args:
-        shape: the object, with d-dimensional points.
-        keep: the paper's k, per side.
-        draw: the paper's n, per side, at least ``keep``; twice ``keep`` brings the points closer to the surface.
-        rng: advanced by the same amount whatever is drawn.
-        boxes: draw boxes [s, 2, d]; by default ``extended_boxes(shape)``.
-
-    Raises:
-        ValueError: a side of a segment stays short of ``draw`` points after ``MAX_DRAWS`` draws.
+    ``keep`` and ``draw`` are the paper's k and n; twice as many drawn as kept are closer to the surface. ``rng``
+    advances by the same amount whatever is drawn. Raises ``ValueError`` where a side of a segment stays short of
+    ``draw`` points after ``MAX_DRAWS`` draws.
     """
     return _sort(shape, keep, draw, shape.label, others=False, rng=rng, boxes=boxes)
 
@@ -161,11 +144,7 @@ def nested_sort_sample(
 def sample_queries(shape: Shape, settings: SamplingConfig, rng: np.random.Generator) -> Samples:
     """Queries of one example: ``settings.sampler``'s, then uniform points in ``joint_box`` (paper, section 3.2).
 
-    Returns:
-        ``settings.total(shape.count)`` points.
-
-    Raises:
-        ValueError: a segment cannot be sampled.
+    They are ``settings.total(shape.count)`` points. Raises ``ValueError`` where a segment cannot be sampled.
     """
     boxes = extended_boxes(shape, settings.box_margin)
     keep, draw = settings.per_segment // 2, settings.per_segment // 2 * settings.oversample
@@ -209,15 +188,14 @@ class _Draws:
         inside, outside = self.sides()
         self.fewest = min(len(inside), len(outside))
         if self.fewest < self.need:
-            self._check_limit(len(inside), len(outside))
+            if len(self.points) >= MAX_DRAWS:
+                self._give_up(len(inside), len(outside))
             return False
         stop = max(inside[self.need - 1], outside[self.need - 1]) + 1
         self.points, self.labels = self.points[:stop], self.labels[:stop]
         return True
 
-    def _check_limit(self, inside: int, outside: int) -> None:
-        if len(self.points) < MAX_DRAWS:
-            return
+    def _give_up(self, inside: int, outside: int) -> NoReturn:
         hits, where = inside, "inside it"
         cure = "check that it is closed and no earlier segment covers it, or split it into shorter parts"
         if inside >= self.need:
@@ -235,7 +213,12 @@ def _draw_all(
     boxes = extended_boxes(shape) if boxes is None else boxes
     # a stream per segment: how many draws one segment's batches hold changes no other segment's points
     seeds = rng.integers(0, 2**32, size=(shape.count, 4), dtype=np.uint32)
-    outside = _outside(shape, others)
+    # which labels count as outside of each: empty space, what it is nested in, and maybe all others
+    outside = np.full((shape.count, shape.count + 1), others)
+    outside[:, 0] = True
+    for inner, outer in shape.nesting:
+        outside[inner, outer + 1] = True
+    outside[np.arange(shape.count), np.arange(shape.count) + 1] = False
     draws = [_Draws(i, boxes[i], need, outside[i], seeds[i]) for i in range(shape.count)]
     pending = draws
     while pending:
@@ -246,28 +229,14 @@ def _draw_all(
     return draws
 
 
-def _outside(shape: Shape, others: bool) -> Bool[np.ndarray, "s c"]:
-    """For each segment which labels count as outside it: empty space, what it is nested in, and maybe all others."""
-    table = np.full((shape.count, shape.count + 1), others)
-    table[:, 0] = True
-    for inner, outer in shape.nesting:
-        table[inner, outer + 1] = True
-    table[np.arange(shape.count), np.arange(shape.count) + 1] = False
-    return table
-
-
 def _sort(
     shape: Shape, keep: int, draw: int, label: Label, others: bool, rng: np.random.Generator, boxes: Boxes | None
 ) -> Samples:
     """Samples with the ``keep`` points on each side of every segment that are nearest to its surface."""
     if not 1 <= keep <= draw:
         raise ValueError(f"keep is {keep} and draw is {draw}; at least as many are drawn as kept: pass keep <= draw")
-    sides = []
-    for d in _draw_all(shape, boxes, draw, label, others, rng):
-        for rows in d.sides():
-            near = rows[_nearest_rows(shape, d.index, d.points[rows], keep)]
-            sides.append((d.points[near], d.labels[near]))
-    return _join(sides)
+    draws = [(d, rows) for d in _draw_all(shape, boxes, draw, label, others, rng) for rows in d.sides()]
+    return _join([(d, rows[_nearest_rows(shape, d.index, d.points[rows], keep)]) for d, rows in draws])
 
 
 def _nearest_rows(shape: Shape, index: int, points: Float[np.ndarray, "n d"], keep: int) -> np.ndarray:
@@ -303,8 +272,9 @@ def _keep_th(distance: Float[np.ndarray, " n"], keep: int) -> float:
     return float(np.partition(distance, keep - 1)[keep - 1])
 
 
-def _join(sides: list[tuple[np.ndarray, np.ndarray]]) -> Samples:
-    return Samples(np.concatenate([points for points, _ in sides]), np.concatenate([labels for _, labels in sides]))
+def _join(sides: list[tuple[_Draws, np.ndarray]]) -> Samples:
+    points, labels = zip(*((draws.points[rows], draws.labels[rows]) for draws, rows in sides), strict=True)
+    return Samples(np.concatenate(points), np.concatenate(labels))
 
 
 def _uniform(box: Float[np.ndarray, "2 d"], count: int, rng: np.random.Generator) -> Float[np.ndarray, "n d"]:

@@ -14,14 +14,17 @@ and the number of its pixels that show the object. The truth has these arrays, f
                              play the state again (``scenes.parameters.played_back``)
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from PIL import Image
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import MIN_POINTS
@@ -30,21 +33,159 @@ from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid
 from mereo.io.atomic_files import write_json
 from mereo.io.intrinsics import written_intrinsics
-from mereo.scenes.parameters import Played
-from mereo.scenes.scene import Scene
+from mereo.scenes.draw_recorder import SMOOTH, Key, OutOfDraws, Recorder
+from mereo.scenes.parameters import Played, play, random_state, replayed
+from mereo.scenes.rest_pose import rest_frame
+from mereo.scenes.scene import Scene, Workspace
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
-from mereo.scenes.walks import process_weights, walk
 from mereo.synthesis.clutter import Backdrop, Capsule, Surroundings, farthest, sample_occluder, sample_plane
 from mereo.synthesis.config import Sensor, SensorConfig, SequenceConfig
 from mereo.synthesis.depth_sensor import SimulatedView, observe
 
+# --- walks ------------------------------------------------------------------------------------------------------------
+
+# Every number that a scene draws is a standard normal one as ``Phi^-1(share)`` (``scenes.draw_recorder``). A walk lets
+# each follow a smooth Gaussian process of mean 0 and variance 1, so that at any time the state is distributed as the
+# scene's own random states are, and never leaves their bounds. What has no way between two values stays as it is at the
+# start: whole numbers, choices, permutations, and draws on which it depends what else is drawn (``switches``).
+# Notation: n times, d numbers, k nodes of the process.
+
+FASTEST = 9.0
+"""Halves of the rest box's longest side a second: a vertex that is faster has jumped."""
+
+TRIES, SHRINK_EVERY, SHRINK = 160, 20, 0.75
+"""How often a part of a walk that the scene refuses is drawn again; after so many tries the whole walk shrinks towards
+its start, which the scene allows, by this factor."""
+
+EXTREMES = (0.02, 0.98)
+"""Shares at which a draw shows whether it is a switch."""
+
+
+def walk(scene: Scene, seed: int, times_s: Float[np.ndarray, " n"], change_s: float) -> list[Played]:
+    """States of a scene along the smooth walk of a seed, at times that rise from 0.
+
+    In ``change_s`` a state becomes about an independent one. ``scene`` is as ``Scene.for_seed`` gives it. Raises
+    ``ValueError`` for a scene that refuses nearly all states between its own.
+    """
+    start = random_state(scene, seed)
+    path = _Path.of(scene, start, seed, times_s / change_s)
+    states, places = list[Played](), list[np.ndarray]()
+    step = np.diff(times_s, prepend=0.0) * FASTEST * rest_frame(scene.rest)[1]
+    tries = 0
+    while len(states) < len(times_s):
+        i = len(states)
+        if (state := replayed(scene, seed, path.shares(i))) is not None:
+            place = scene.deform(state.deformations).mesh.merged()[0]
+            if i == 0 or np.linalg.norm(place - places[-1], axis=1).max() <= max(step[i], 1e-9):
+                states.append(state)
+                places.append(place)
+                continue
+        tries += 1
+        if tries > TRIES:
+            raise ValueError(
+                f"the scene {scene.name!r} refuses the states between its own random ones, {TRIES} times in a row of "
+                "other ways: try another --seed, or a slower walk with a larger --change"
+            )
+        kept = path.redraw(i, shrink=tries % SHRINK_EVERY == 0)
+        del states[kept:], places[kept:]
+    return states
+
+
+def process_weights(times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:
+    """Weights of independent normal nodes at times, in distances between nodes; their squares sum to 1.
+
+    Cubic B-splines: twice continuously differentiable, and a node is forgotten two distances away.
+    """
+    nodes = np.arange(int(np.ceil(times.max())) + 4) - 1  # up to two before and after
+    away = np.abs(times[:, None] - nodes)
+    near, far = 2 / 3 - away**2 + away**3 / 2, np.maximum(2 - away, 0.0) ** 3 / 6
+    weights = np.where(away < 1, near, far)
+    return np.asarray(weights / np.linalg.norm(weights, axis=1, keepdims=True))
+
+
+def switches(scene: Scene, start: Played) -> set[Key]:
+    """Draws on which it depends what else is drawn: a corner that is bent or not."""
+    keys = set()
+    for call in start.calls:
+        if call.kind not in SMOOTH or len(call.shares) > 1:
+            continue
+        for share in EXTREMES:
+            given = {**start.remembered, call.key: np.array([share])}
+            recorder, whole = Recorder(start.seed, given, 2 * len(start.calls) + 10), False
+            with suppress(OutOfDraws, ValueError):
+                play(scene, recorder)
+                whole = True
+            if _draws_others(start.keys, tuple(drawn.key for drawn in recorder.calls), whole):
+                keys.add(call.key)
+    return keys
+
+
+def _draws_others(before: tuple[Key, ...], after: tuple[Key, ...], whole: bool) -> bool:
+    """Whether other things are drawn than before; ``whole`` is whether a state came out.
+
+    A scene that refuses what it has drawn gives up, or draws once more from places where it has drawn already; neither
+    says that it wants anything else.
+    """
+    differs = (i for i, (a, b) in enumerate(zip(before, after, strict=False)) if a != b)
+    same = next(differs, min(len(before), len(after)))
+    if same == len(after):
+        return whole and len(after) < len(before)
+    return after[same][0] not in {place for place, _ in before[:same]}
+
+
+@dataclass(eq=False)
+class _Path:
+    """Values of all draws along a walk, parts of which can be drawn again."""
+
+    start: Played
+    moving: list[bool]
+    weights: Float[np.ndarray, "n k"]
+    first: Float[np.ndarray, " d"]
+    nodes: Float[np.ndarray, "k d"]
+    rng: np.random.Generator
+    reach: float = 1.0
+
+    @classmethod
+    def of(cls, scene: Scene, start: Played, seed: int, times: Float[np.ndarray, " n"]) -> "_Path":
+        fixed = switches(scene, start)
+        moving = [call.kind in SMOOTH and call.key not in fixed for call in start.calls]
+        parts = [call.shares for call, moves in zip(start.calls, moving, strict=True) if moves]
+        first = ndtri(np.concatenate([np.empty(0), *parts]))
+        rng, weights = example_rng(seed, 1), process_weights(times)
+        nodes = rng.normal(size=(weights.shape[1], len(first)))
+        # the walk begins at the start: the nodes that count at time 0 agree with it
+        nodes += np.outer(weights[0], first - weights[0] @ nodes)
+        return cls(start, moving, weights, first, nodes, rng)
+
+    def shares(self, i: int) -> dict[Key, Float[np.ndarray, " m"]]:
+        """Shares of all draws at time i."""
+        z = self.weights[i] @ self.nodes
+        z = np.sqrt(1 - self.reach**2) * self.first + self.reach * z if self.reach < 1 else z
+        result, at = {}, 0
+        for call, moves in zip(self.start.calls, self.moving, strict=True):
+            count = len(call.shares)
+            result[call.key] = ndtr(z[at : at + count]) if moves else call.shares
+            at += count if moves else 0
+        return result
+
+    def redraw(self, i: int, shrink: bool) -> int:
+        """Draw the nodes anew that count most at time i and after; returns how many first states stay as they were."""
+        if shrink:
+            self.reach *= SHRINK
+            return 0
+        first = int(self.weights[i].argmax())
+        before = self.nodes.copy()
+        self.nodes[first:] = self.rng.normal(size=self.nodes[first:].shape)
+        weights = self.weights[0, first:]
+        if weights.any():
+            self.nodes[first:] += np.outer(weights / (weights @ weights), self.first - self.weights[0] @ self.nodes)
+        changed = np.flatnonzero((self.nodes != before).any(axis=1))
+        return int(np.flatnonzero((self.weights[:, changed] > 0).any(axis=1))[0]) if len(changed) else 0
+
+
 # --- sequences --------------------------------------------------------------------------------------------------------
 
-# Sequences of frames: an object that changes smoothly, seen by a camera that moves smoothly, hidden for a while.
-#
-#     scene, SequenceConfig, seed -sequence-> Moment (state, camera, what the sensor saw), ...
-#
-# The object follows a walk through its scene's own states (``scenes.walks``), the camera one through its workspace. A
+# The object follows a walk through its scene's own states , the camera one through its workspace. A
 # tool or a hand comes into view from outside, stays, and leaves. Everything comes from the seed alone.
 
 ARRIVAL = 0.25
@@ -74,41 +215,23 @@ class Moment:
     seen: SimulatedView
 
 
-@dataclass(frozen=True, eq=False)
-class _Place:
-    """Place of the camera, in the terms of the scene's ``Workspace``."""
-
-    cosine: float
-    azimuth_rad: float
-    distance: float
-    roll_rad: float
-
-    def pose(self, scene: Scene, target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
-        return scene.workspace.pose(target, self.cosine, self.azimuth_rad, self.distance, self.roll_rad)
-
-
 def sequence(scene: Scene, settings: SequenceConfig, sensor: SensorConfig, seed: int) -> Iterator[Moment]:
-    """Frames of an object that follows a walk through its states.
+    """Frames of an object that follows a walk through its states, for training or for testing as ``seed`` says.
 
-    Args:
-        scene: the object; ``seed`` decides between its states for training and for testing.
-        settings: of the sequence.
-        sensor: simulated camera. Its own tools and hands are left out for those of ``settings``; its plane stays where
-            it is.
-        seed: of walk, camera, occluder and noise.
+    The sensor's own tools and hands are left out for those of ``settings``; its plane stays where it is.
 
     Raises ``ValueError`` as ``walk`` does, and where the camera sees too little of the object in the first frame.
     """
     scene = scene.for_seed(seed)
     times = np.arange(settings.frames) / settings.rate
     states = walk(scene, seed, times, settings.change)
-    places = _camera_places(scene, times / settings.camera_change, example_rng(seed, 2))
+    aims = _camera_aims(scene.workspace, times / settings.camera_change, example_rng(seed, 2))
     camera = Camera.from_fov(settings.image_size, settings.image_size, scene.workspace.fov_rad)
     rng, clear = example_rng(seed, 3), replace(sensor, tool=0.0, hand=0.0)
     meshes = (scene.deform(played.deformations).mesh for played in states)
     around: _Around | None = None
-    for time_s, played, place, mesh in zip(times, states, places, meshes, strict=True):
-        T_world_camera = place.pose(scene, mesh.bounds.mean(axis=0))
+    for time_s, played, aimed_at, mesh in zip(times, states, aims, meshes, strict=True):
+        T_world_camera = aimed_at(mesh.bounds.mean(axis=0))
         mesh = mesh.transformed(inverse_rigid(T_world_camera))
         solids = Solids(mesh)
         if around is None:
@@ -118,9 +241,10 @@ def sequence(scene: Scene, settings: SequenceConfig, sensor: SensorConfig, seed:
         yield Moment(float(time_s), played, mesh, T_world_camera, seen)
 
 
-def _camera_places(scene: Scene, times: Float[np.ndarray, " n"], rng: np.random.Generator) -> list[_Place]:
-    """Places on a smooth way near a random one; ``times`` are in units of the change."""
-    workspace = scene.workspace
+def _camera_aims(
+    workspace: Workspace, times: Float[np.ndarray, " n"], rng: np.random.Generator
+) -> list[Callable[[np.ndarray], np.ndarray]]:
+    """Poses by what they aim at, on a smooth way near a random one; ``times`` are in units of the change."""
     weights = process_weights(times)
     first = rng.normal(size=3)
     z = weights @ rng.normal(size=(weights.shape[1], 3))
@@ -129,21 +253,18 @@ def _camera_places(scene: Scene, times: Float[np.ndarray, " n"], rng: np.random.
     cosine, (near, far) = lowest + mixed[:, 0] * (1 - lowest), workspace.distance
     azimuth = 2 * np.pi * ndtr(first[2]) + CAMERA_TURN_RAD * z[:, 2]
     roll = rng.uniform(0.0, 2 * np.pi) if workspace.any_roll else 0.0
+    distance = near + mixed[:, 1] * (far - near)
     return [
-        _Place(float(c), float(a), float(near + d * (far - near)), roll)
-        for c, a, d in zip(cosine, azimuth, mixed[:, 1], strict=True)
+        partial(workspace.pose, cosine=float(c), azimuth_rad=float(a), distance=float(d), roll_rad=roll)
+        for c, a, d in zip(cosine, azimuth, distance, strict=True)
     ]
 
 
-@dataclass(frozen=True, eq=False)
-class _Around:
+class _Around(NamedTuple):
     """What stands around an object in a sequence: a plane that stays, and what passes in front of it.
 
-    Attributes:
-        occluder: at its place in the middle of its time, camera frame.
-        away: shift by which it is out of view.
-        span_s: first and last time at which it may be in view.
-        normal, gap: of the plane, in the scene's frame, and its distance behind the object; None without one.
+    The occluder is where it is in the middle of its ``span_s``, and out of view by the shift ``away``; the plane's
+    normal is in the scene's frame, and its gap the distance behind the object.
     """
 
     occluder: tuple[Capsule, ...]
@@ -231,15 +352,7 @@ def write_recording(
     *,
     named: str = "",
 ) -> None:
-    """Write a sequence of a scene into an empty folder.
-
-    Args:
-        folder: exists and is empty.
-        scene: the object.
-        settings: of the sequence.
-        sensor: simulated camera, and its name.
-        seed: of everything.
-        named: how the scene was named; by default by its own name.
+    """Write a sequence of a scene, ``named`` otherwise than by its name or not, into an empty folder.
 
     Raises ``ValueError`` as ``sequence`` does.
     """
@@ -257,7 +370,7 @@ def write_recording(
         file = f"{number:0{digits}}.png"
         Image.fromarray(steps).save(folder / FRAMES / file)
         frames.append({"file": file, "time_s": moment.time_s, "points": moment.seen.object_points})
-        vertices = np.concatenate([segment.vertices for segment in moment.mesh.segments]).astype(np.float32)
+        vertices = moment.mesh.merged()[0].astype(np.float32)
         shares = np.concatenate([np.empty(0), *(call.shares for call in moment.played.calls)])
         states.append((vertices, moment.T_world_camera, shares))  # the pictures would not fit into memory
         sizes = [len(call.shares) for call in moment.played.calls]

@@ -18,6 +18,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from ipaddress import ip_address
 from itertools import islice
@@ -31,6 +32,7 @@ from tyro.conf import arg
 
 from mereo.io.bounds import Count, NotNegative
 from mereo.io.cores import THREAD_VARIABLES, cores, use_threads
+from mereo.io.extras import library
 
 LOCAL = "local"
 """Address of a cluster of this machine alone, started for the run."""
@@ -40,6 +42,8 @@ RayAddress = Annotated[str | None, arg(metavar="local|auto|HOST:PORT")]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Function = Callable[[Any], Any]
+"""Work on an item."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +69,7 @@ class Cluster:
     Attributes:
         address: "local" for one of this machine that is started for the run, "auto" for the one that this machine is a
             node of, or HOST:PORT of that one; a cluster that was there before stays.
-        cpus: of a task, which computes in as many threads.
-        gpus: of a task.
+        cpus, gpus: of a task, which computes in as many threads.
         local_cpus: of a cluster that is started; 0 means one per core.
     """
 
@@ -101,21 +104,17 @@ def spread(
 
     Args:
         function: what to do; sent once to every worker.
-        items: also sent; ``AHEAD`` times as many as can be computed at a time are on their way, and for a cluster no
-            more are taken.
+        items: also sent; for a cluster only as many are taken as are computed or waited for.
         workers: number of processes, each with one thread; or a cluster.
         failed: result of an item for which ``function`` raises, or whose workers died; without it that ends all.
 
-    Raises:
-        ValueError: ``function`` cannot be pickled, or this machine has less than a task needs.
-        ConnectionError: there is no such cluster.
-        ChildProcessError: a worker was killed; in a cluster ``DEATHS`` workers or nodes, one after the other.
-        Exception: what ``function`` raises.
+    Raises what ``function`` raises, ``ValueError`` where it cannot be pickled, or this machine has less than a task
+    needs, ``ConnectionError`` where there is no such cluster, and ``ChildProcessError`` where workers were killed.
     """
 
-    def attempt(item: Item, call: Callable[[Any], Result], argument: Any) -> Result:
+    def attempt(item: Item, call: Callable[[], Result]) -> Result:
         try:
-            return call(argument)
+            return call()
         except Exception as error:
             if failed is None:
                 raise
@@ -124,7 +123,7 @@ def spread(
     if not isinstance(workers, Cluster):
         items = list(items)
         if min(workers, len(items)) <= 1:
-            yield from ((item, attempt(item, function, item)) for item in items)
+            yield from ((item, attempt(item, partial(function, item))) for item in items)
             return
     waiting, running = iter(items), dict[Future[Result], Item]()
     with _ray_pool(function, workers) if isinstance(workers, Cluster) else process_pool(function, workers) as submit:
@@ -136,11 +135,10 @@ def spread(
                 return
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 item = running.pop(future)
-                yield item, attempt(item, _result, future)
+                yield item, attempt(item, partial(_result, future))
 
 
 def _result(future: Future[Result]) -> Result:
-    """Result of work that is done; raises what the function raised, and ``ChildProcessError`` for killed workers."""
     try:
         return future.result()
     except BrokenProcessPool:
@@ -151,8 +149,7 @@ def _result(future: Future[Result]) -> Result:
     except Exception as error:
         if not type(error).__module__.startswith("ray."):
             raise
-        cause = getattr(error, "cause", None)
-        if isinstance(cause, Exception):
+        if isinstance(cause := getattr(error, "cause", None), Exception):
             raise cause from error
         raise ChildProcessError(
             f"{DEATHS + 1} workers or nodes died of one task ({type(error).__name__}), most often for memory; what is "
@@ -162,16 +159,12 @@ def _result(future: Future[Result]) -> Result:
 
 # --- processes of this machine ----------------------------------------------------------------------------------------
 
-Function = Callable[[Any], Any]
-"""Work on an item."""
-
 
 @contextmanager
 def process_pool(function: Function, workers: int) -> Iterator[Callable[[Any], Future[Any]]]:
     """Open a pool of processes, each with one thread; yields what submits an item to ``function`` there.
 
-    An exception in the block ends the processes at once. Raises ``ValueError`` where ``function``, which is sent once
-    to every process, cannot be pickled.
+    An exception in the block ends the processes at once.
     """
     pickled(function, pickle.dumps)
     # spawned, not forked: threads of libraries that this process has used do not survive a fork
@@ -188,10 +181,7 @@ def process_pool(function: Function, workers: int) -> Iterator[Callable[[Any], F
 
 
 def start_resource_tracker() -> None:
-    """Start Python's process that frees shared things, once; it ignores INT and TERM by itself, with HUP blocked too.
-
-    A closed terminal would end it before the others, which then complain that what they free is gone.
-    """
+    """Start Python's process that frees shared things, once, with HUP blocked: else a closed terminal ends it first."""
     if not hasattr(signal, "SIGHUP"):
         return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGHUP])  # what is blocked stays so in a new process
@@ -201,24 +191,20 @@ def start_resource_tracker() -> None:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-_in_worker: Function | None = None
-"""Set once when a worker starts: it need not be sent with every item."""
+_in_worker = list[Function]()
+"""The function, from when a worker starts: it need not be sent with every item."""
 
 
 def _start_worker(function: Function, end: Connection) -> None:
-    global _in_worker
     # Ctrl-C and a closed terminal are the parent's business, which ends its workers; TERM is how the pool ends them
     for number in (signal.SIGINT, *((signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ())):
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=exit_with_parent, args=(end,), daemon=True).start()
-    _in_worker = function
+    _in_worker.append(function)
 
 
 def exit_with_parent(*ends: Connection) -> None:
-    """End this process when its parent ends, as one that was killed cannot stop its workers, or closes a pipe.
-
-    Blocks, for a thread.
-    """
+    """End this process when its parent ends, also by a kill, or closes a pipe; blocks, for a thread."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         connection.wait([parent.sentinel, *ends])
@@ -226,12 +212,11 @@ def exit_with_parent(*ends: Connection) -> None:
 
 
 def _apply(item: Any) -> Any:
-    assert _in_worker is not None, "only called in a worker, which sets it first"
-    return _in_worker(item)
+    return _in_worker[0](item)
 
 
 def pickled(function: Function, dumps: Callable[[Function], bytes]) -> bytes:
-    """Pickle a function, by ``pickle.dumps`` or one like it; ``ValueError`` where it cannot be."""
+    """Pickle a function by ``dumps``; ``ValueError`` where it cannot be."""
     try:
         return dumps(function)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
@@ -245,16 +230,14 @@ def pickled(function: Function, dumps: Callable[[Function], bytes]) -> bytes:
 @contextmanager
 def limit_child_threads() -> Iterator[None]:
     """Let processes that are started in the block compute in one thread: libraries read this when they are loaded."""
-    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
+    before = {name: os.environ[name] for name in THREAD_VARIABLES if name in os.environ}
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+        for name in THREAD_VARIABLES:
+            os.environ.pop(name, None)
+        os.environ.update(before)
 
 
 # --- Ray --------------------------------------------------------------------------------------------------------------
@@ -263,10 +246,8 @@ def limit_child_threads() -> Iterator[None]:
 def choose_cluster(address: str | None, local_cpus: int = 0, task: TaskResources = DEFAULT_TASK) -> Cluster | None:
     """Cluster that options name, None where they name none; a wrong address is an error before any work.
 
-    Raises:
-        ImportError: Ray is not installed.
-        ValueError: resources of tasks without a cluster, or something that is no address.
-        ConnectionError: nothing answers at the address.
+    Raises ``ImportError`` without Ray, ``ValueError`` for resources of tasks without a cluster, and ``ConnectionError``
+    where nothing answers at the address.
     """
     if address is None and task != DEFAULT_TASK:
         raise ValueError("--cpus-per-task and --gpus-per-task are for tasks of a cluster: give --ray local")
@@ -274,32 +255,22 @@ def choose_cluster(address: str | None, local_cpus: int = 0, task: TaskResources
         return None
     import_ray()
     if address not in (LOCAL, "auto"):
-        _check_reachable(address)
+        host, _, port = address.rpartition(":")
+        try:
+            socket.create_connection((host.strip("[]"), int(port)), timeout=5.0).close()
+        except (OSError, OverflowError, ValueError) as error:
+            raise ConnectionError(
+                f"there is no Ray cluster at {address!r} ({getattr(error, 'strerror', None) or error}): give local, "
+                "auto, or the HOST:PORT that `ray start --head` prints"
+            ) from None
     return Cluster(address, task.cpus_per_task, task.gpus_per_task, local_cpus)
 
 
 def import_ray() -> ModuleType:
     """Import Ray, which then sends no statistics; ``ImportError`` where it is not installed."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    try:
-        return import_module("ray")
-    except ImportError:
-        raise ImportError("Ray, which --ray needs, is not installed: run pip install 'mereo[cluster]'") from None
-
-
-def _check_reachable(address: str) -> None:
-    host, _, port = address.rpartition(":")
-    if not host or not port.isdecimal() or "/" in host:
-        raise ValueError(
-            f"--ray is {address!r}; it must be local, auto, or the HOST:PORT that `ray start --head` prints: correct it"
-        )
-    try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=5.0).close()
-    except (OSError, OverflowError) as error:
-        raise ConnectionError(
-            f"there is no Ray cluster at {address} ({getattr(error, 'strerror', None) or error}): correct the address, "
-            "start one there with `ray start --head`, or use --ray local"
-        ) from None
+    ray: ModuleType = library("ray", "cluster", "--ray")
+    return ray
 
 
 def task_slots(cluster: Cluster) -> int:
@@ -311,16 +282,12 @@ def task_slots(cluster: Cluster) -> int:
 
 @contextmanager
 def connect(cluster: Cluster) -> Iterator[None]:
-    """Connect this process to a cluster while the block runs; where its caller has done so already, that stays.
-
-    Raises ``ConnectionError`` where there is no such cluster, ``ValueError`` where a local one has less than a task
-    needs.
-    """
+    """Connect this process to a cluster while the block runs; where its caller has done so already, that stays."""
     ray = import_ray()
     if ray.is_initialized():
         yield
         return
-    quiet = {"log_to_driver": False, "logging_level": logging.CRITICAL}
+    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
     handler = signal.getsignal(signal.SIGTERM)
     # in /tmp, as paths of sockets must be shorter than some systems' folders for temporary files allow
     with TemporaryDirectory(prefix=f"mereo-ray-{os.getpid()}-", dir="/tmp" if os.name == "posix" else None) as folder:
@@ -354,8 +321,7 @@ def connect(cluster: Cluster) -> Iterator[None]:
 def _loopback(ray: ModuleType) -> Iterator[None]:
     """Let a cluster that starts in the block listen on this machine's own address alone: who reaches it runs code.
 
-    Ray takes an address of the network on Linux, also where ``init`` names the loopback, but for this constant, by
-    which it spares users of macOS and Windows the firewall's question. Raises ``ConnectionError`` where that fails.
+    Ray takes an address of the network on Linux, also where ``init`` names the loopback, but for this constant.
     """
     constants: Any = import_module("ray._private.ray_constants")
     before, constants.ENABLE_RAY_CLUSTER = constants.ENABLE_RAY_CLUSTER, False
@@ -366,14 +332,13 @@ def _loopback(ray: ModuleType) -> Iterator[None]:
     address = ray.nodes()[0]["NodeManagerAddress"]
     if not ip_address(address).is_loopback:
         raise ConnectionError(
-            f"the servers of --ray local listen on {address}; they must listen on this machine's loopback alone: "
-            "install the Ray of constraints.txt, or start a cluster with `ray start --head` and give --ray auto"
+            f"the servers of --ray local listen on {address}; they must listen on the loopback alone: install the "
+            "Ray of constraints.txt, or start a cluster with `ray start --head` and give --ray auto"
         )
 
 
 @contextmanager
-def _ray_pool(function: Callable[[Any], Any], cluster: Cluster) -> Iterator[Callable[[Any], Future[Any]]]:
-    """Connect to a cluster; yields what submits an item to ``function`` there."""
+def _ray_pool(function: Function, cluster: Cluster) -> Iterator[Callable[[Any], Future[Any]]]:
     ray = import_ray()
     from ray import cloudpickle
 
@@ -398,15 +363,15 @@ def _ray_pool(function: Callable[[Any], Any], cluster: Cluster) -> Iterator[Call
                 ray.cancel(reference, force=True)
 
 
-_loaded: tuple[str, Callable[[Any], Any]] | None = None
+_loaded = dict[str, Function]()
 """The function of this worker process, unpickled once: a model takes longer for that than a view to be rendered."""
 
 
 def _apply_in_task(shared: list[Any], item: Any) -> Any:
     """Task: the result for an item. ``shared`` holds a reference, as Ray would unpickle a value for each task."""
-    global _loaded
     (reference,) = shared
-    if _loaded is None or _loaded[0] != reference.hex():
+    key: str = reference.hex()
+    if key not in _loaded:
         function, cluster, folder, path = import_ray().get(reference)
         use_threads(cluster.cpus)
         if not cluster.gpus:  # Ray shows all of a node's GPUs to a task without any
@@ -414,5 +379,6 @@ def _apply_in_task(shared: list[Any], item: Any) -> Any:
         with suppress(OSError):
             os.chdir(folder)
         sys.path.extend(item for item in path if item not in sys.path)
-        _loaded = reference.hex(), pickle.loads(function)
-    return _loaded[1](item)
+        _loaded.clear()
+        _loaded[key] = pickle.loads(function)
+    return _loaded[key](item)

@@ -1,44 +1,378 @@
 """Fit a scene's own draws to a frame: Gauss and Newton's method on states that the scene really has.
 
-Around a state the scene is linear in its draws (``draws.problem``); it is played with the draws that fit best there,
-and so on, from several starts.
+Around a state the material points are linear in the draws, so its neighbourhood is a linear model like that of the
+modes, with the same residuals. The scene is played with the draws that fit best there, and so on, from several starts.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import igl
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
+from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, ndtri
 
-from mereo.deformation.moving_least_squares import spread
-from mereo.fitting.draws.playback import Drawn, shares_of
-from mereo.fitting.draws.problem import (
-    DrawsFit,
-    DrawsProblem,
-    Shape,
-    StateOnShape,
-    approach,
-    derivatives,
-    lay_on_shape,
-    misfit,
-    normal_equations,
-    secant,
-    simulate,
-    try_material,
-)
+from mereo.deformation.moving_least_squares import PointWeights, spread
+from mereo.fitting.config import FEW_DRAWS, MANY_DRAWS, DrawsConfig
+from mereo.fitting.draws.playback import Drawn, DrawnStates, as_sparse, material_moved, shares_of
 from mereo.fitting.modes import refine, robust_poses
-from mereo.fitting.problem.gauss_newton import POSE, Posed
-from mereo.fitting.problem.residuals import robust_square
+from mereo.fitting.problem.correspondences import Correspondences
+from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, geman_mcclure, in_space
+from mereo.fitting.problem.problem import Problem
+from mereo.fitting.problem.residuals import (
+    SILHOUETTE_WEIGHT,
+    NetworkTerm,
+    Surface,
+    Terms,
+    add_silhouette,
+    cloud_rows,
+    robust_square,
+    silhouette_losses,
+)
 from mereo.fitting.problem.segments import Symmetry, branches, find_symmetries
-from mereo.scenes.draw_recorder import SMOOTH, Call, OutOfDraws, Recorder
+from mereo.geometry.mesh import barycentric
+from mereo.geometry.transforms import best_rotations
+from mereo.scenes.draw_recorder import SMOOTH, OutOfDraws, Recorder
 from mereo.scenes.parameters import play, played_back
 from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel
+
+# --- a frame, and states beside it ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class DrawsProblem:
+    """A frame to be explained by the states of a scene.
+
+    Attributes:
+        base: the same frame, explained by modes, with the weights that the draws are fitted by.
+        correspondences, weights: of the network, scene units, and how their rest positions follow the material points.
+        by_sight: whether observed points are compared with what their lines of sight meet, or with the nearest points.
+    """
+
+    base: Problem
+    states: DrawnStates
+    correspondences: Correspondences
+    weights: PointWeights
+    config: DrawsConfig
+    by_sight: bool = False
+
+    @property
+    def model(self) -> StatisticalModel:
+        """Statistical model of the object."""
+        return self.base.model
+
+    @property
+    def last(self) -> Problem:
+        """``base`` with the points of the last descent."""
+        return self.base.by_every_point if self.config.every_point else self.base
+
+    @classmethod
+    def of(
+        cls, base: Problem, states: DrawnStates, correspondences: Correspondences, config: DrawsConfig | None = None
+    ) -> "DrawsProblem":
+        """Problem with the constants for as many draws as the scene has, where none are given."""
+        if config is None:
+            config = DrawsConfig() if states.z.shape[1] <= FEW_DRAWS else MANY_DRAWS
+        network_weight = config.network_weight, config.network_weight
+        fit_config = replace(base.config, cloud_weight=config.cloud_weight, network_weight=network_weight)
+        weights = base.model.weights(correspondences.rest, correspondences.labels)
+        return cls(replace(base, config=fit_config), states, correspondences, weights, config)
+
+    def network(self, fit: "DrawsFit", modes: Float32[np.ndarray, "n 3 d"] | None = None) -> NetworkTerm:
+        """Correspondences in the neighbourhood of a state."""
+        matches = self.correspondences
+        modes = np.zeros((len(matches.labels), 3, 0), dtype=np.float32) if modes is None else modes
+        return NetworkTerm(matches.points, self.weights(fit.material), modes, matches.confidence)
+
+    @cached_property
+    def following_played(self) -> csr_array:
+        """How the rest positions of the correspondences follow the played points."""
+        return as_sparse(self.weights, len(self.model.rest_points)) @ self.states.played.spread
+
+
+@dataclass(frozen=True, eq=False)
+class DrawsFit:
+    """A played state, by its draws, beside the frame.
+
+    Attributes:
+        posed: rigid pose; its ``z`` is empty.
+        material: material points, unposed.
+        distance, face, position: of what each observed sample is compared with.
+        misfit: with the prior of the draws, the cloud by its last sigma.
+        motion: of the played points for a standard deviation of each draw, where it is known.
+    """
+
+    drawn: Drawn
+    z: Float[np.ndarray, " d"]
+    posed: Posed
+    material: Float[np.ndarray, "m 3"]
+    surface: Surface
+    distance: Float[np.ndarray, " p"]
+    face: Int[np.ndarray, " p"]
+    position: Float[np.ndarray, "p 3"]
+    misfit: float
+    motion: Float32[np.ndarray, "a 3 d"] | None = None
+
+
+def simulate(problem: DrawsProblem, drawn: Drawn, z: Float[np.ndarray, " d"], posed: Posed) -> DrawsFit | None:
+    """Simulate the state of these draws and score it; None where the scene refuses it."""
+    deformations = drawn.deformations(problem.states.scene, z)
+    if deformations is None:
+        return None
+    return score_material(problem, drawn, z, posed, material_moved(problem.states.scene, problem.model, deformations))
+
+
+def score_material(
+    problem: DrawsProblem, drawn: Drawn, z: Float[np.ndarray, " d"], posed: Posed, material: Float[np.ndarray, "m 3"]
+) -> DrawsFit | None:
+    """Score material points as those of a state; None where no face of them is seen."""
+    rigid = replace(posed, z=np.empty(0))
+    surface = Surface.through(problem.model, rigid.place(material))
+    if len(surface.facing) == 0:
+        return None
+    met = problem.base.met(surface) if problem.by_sight else surface.nearest(problem.base.evidence.observed_samples)
+    fit = DrawsFit(drawn, z, rigid, material, surface, *met, np.inf)
+    return replace(fit, misfit=misfit(problem, fit, problem.base.config.cloud_sigma))
+
+
+def misfit(problem: DrawsProblem, fit: DrawsFit, sigma: float) -> float:
+    """Misfit as ``Problem.misfit`` counts it, by any sigma of the cloud, without looking for observed samples again."""
+    base = problem.base
+    cloud = base.config.cloud_weight * float(robust_square(fit.distance, sigma).mean())
+    network = base.config.network_weight[1] * problem.network(fit).energy(fit.posed, base.network_sigma)
+    losses = silhouette_losses(fit.surface.material[base.model.silhouette_vertices], base.evidence, sigma)
+    return cloud + network + SILHOUETTE_WEIGHT * float(losses.sum()) + float(fit.z @ fit.z)
+
+
+def by_misfit(state: "DrawsFit | StateOnShape") -> float:
+    """Misfit, as a key to sort by."""
+    return state.misfit
+
+
+def narrowing(problem: DrawsProblem, fit: DrawsFit) -> float:
+    """``NormalEquations.narrowing`` of the draws that move something."""
+    assert fit.motion is not None
+    equations = terms(problem, fit, fit.motion, problem.base.config.cloud_sigma).total
+    return equations.narrowing() - int(unmoving(fit.motion).sum()) * float(np.log(HELD))
+
+
+def terms(problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3 d"], sigma: float) -> Terms:
+    """Terms of the fit of the modes, for changes of pose and draws: the played points' ``motion`` is that of modes."""
+    base, posed, config, surface = problem.base, fit.posed, problem.base.config, fit.surface
+    samples, spread, count = base.evidence.observed_samples, problem.states.played.spread, len(fit.z)
+    flat, vertices = motion.reshape(len(motion), -1), base.model.silhouette_vertices
+
+    def modes_of(follow: csr_array) -> Float32[np.ndarray, "n 3 d"]:
+        return (follow @ flat).reshape(-1, 3, count)
+
+    corners = surface.model.faces[surface.facing[fit.face]]
+    within = PointWeights(corners, barycentric(surface.material[corners], fit.position))
+    planes = fit.position, surface.normals[fit.face], modes_of(as_sparse(within, spread.shape[0]) @ spread)
+    nothing, state = NormalEquations.nothing(POSE + count), replace(posed, z=np.zeros(count))
+    network = problem.network(fit, modes_of(problem.following_played))
+    return Terms(
+        known=prior_of_draws(fit.z, motion, posed.log_scale, base.scale_std),
+        network=network.add_to(nothing, state, base.network_sigma, config.network_weight[1], robust=True),
+        cloud=cloud_rows(posed, samples, planes, sigma, config.cloud_weight),
+        observed_samples=samples,
+        ruled_out=add_silhouette(
+            nothing,
+            posed,
+            surface.material[vertices],
+            lambda rows: modes_of(spread[vertices[rows]]),
+            base.evidence,
+            sigma,
+        ),
+    )
+
+
+HELD = 1e6
+"""Precision of draws that move nothing at a state: they stay."""
+
+
+def unmoving(motion: Float32[np.ndarray, "a 3 d"]) -> Bool[np.ndarray, " d"]:
+    """Mark the draws that move nothing."""
+    return np.asarray(np.abs(motion).max(axis=(0, 1)) < 1e-9)  # scene units
+
+
+def prior_of_draws(
+    z: Float[np.ndarray, " d"], motion: Float32[np.ndarray, "a 3 d"], log_scale: float, scale_std: float
+) -> NormalEquations:
+    """Normal equations of draws that are N(0, 1) each; those that move nothing stay where they are."""
+    still = unmoving(motion)
+    precision = np.diag(np.where(still, HELD, 1.0))
+    return NormalEquations.prior(np.where(still, 0.0, z), np.zeros(len(z)), precision, log_scale, scale_std)
+
+
+def derivatives(
+    states: DrawnStates, drawn: Drawn, z: Float[np.ndarray, " d"], positions: Float[np.ndarray, "a 3"]
+) -> Float32[np.ndarray, "a 3 d"]:
+    """Motion of the played points, which are ``positions``, for a standard deviation of each draw.
+
+    Neighbours are played without the scene's own test where this state is the same without it: it is not where a scene
+    refuses and draws again in a way that ``Drawn`` does not see through.
+    """
+    change = np.zeros((*positions.shape, len(z)), dtype=np.float32)
+    untested = drawn.deformations(states.scene, z, checked=False)
+    checked = (
+        untested is None or float(np.abs(states.played.moved(untested) - positions).max()) > 1e-4
+    )  # rest points are in single precision
+    for number in np.flatnonzero(drawn.smooth):
+        step = 0.02 * (-1.0 if z[number] > 0 else 1.0)
+        other = z.copy()
+        other[number] += step
+        moved = drawn.deformations(states.scene, other, checked)
+        if moved is not None:
+            change[:, :, number] = (states.played.moved(moved) - positions) / step
+    return change
+
+
+def secant(
+    motion: Float32[np.ndarray, "a 3 d"], step: Float[np.ndarray, " d"], moved: Float[np.ndarray, "a 3"]
+) -> Float32[np.ndarray, "a 3 d"]:
+    """Derivatives that agree with what a step has really moved, otherwise changed least (Broyden's rule)."""
+    with np.errstate(invalid="ignore"):  # OpenBLAS raises the flag for lanes that it loads beyond a short row
+        missed = (moved - motion @ step.astype(np.float32)).astype(np.float32)
+    return motion + missed[..., None] * (step / max(float(step @ step), 1e-12)).astype(np.float32)
+
+
+# --- the state of a given shape ---------------------------------------------------------------------------------------
+
+# Levenberg and Marquardt's method on few points, without looking at the frame. A fit of the modes is dense and smooth,
+# so the draws of a state like it are found from far away; one set of differences serves for several steps.
+
+SHAPE_WEIGHT = 500.0
+"""How many independent points a shape is worth."""
+
+SHAPE_ROBUST = 2.5
+"""Points farther off than this many standard deviations count for little."""
+
+ENOUGH = 0.02
+"""Relative gain of a step below which nothing more is tried."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """Shape to be met: positions of some points, in any pose, with their standard deviation.
+
+    Attributes:
+        weight: inverse variances, together worth as many points as the shape is.
+        follow: how the points follow the played points of a state; they are these where None.
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    std: float
+    weight: Float[np.ndarray, " n"]
+    follow: csr_array | None = None
+
+    @classmethod
+    def of(
+        cls,
+        points: Float[np.ndarray, "n 3"],
+        std: float,
+        confidence: Float[np.ndarray, " n"],
+        follow: csr_array | None = None,
+    ) -> "Shape":
+        """Shape worth ``SHAPE_WEIGHT`` points."""
+        return cls(points, std, confidence / confidence.sum() * (SHAPE_WEIGHT / std**2), follow)
+
+    @classmethod
+    def of_material(cls, problem: DrawsProblem, material: Float[np.ndarray, "m 3"]) -> "Shape":
+        """Shape of material points, unposed: dense and smooth."""
+        few = problem.states.played.index
+        return cls.of(material[few], 0.04 * problem.model.half, np.ones(len(few)))
+
+    def at(self, values: Float[np.ndarray, "a *c"]) -> Float[np.ndarray, "n *c"]:
+        """Values at the points, from values at the played points."""
+        if self.follow is None:
+            return values
+        result: np.ndarray = self.follow @ values.reshape(len(values), -1)
+        return result.reshape(-1, *values.shape[1:])
+
+
+@dataclass(frozen=True, eq=False)
+class StateOnShape:
+    """A state of a scene, by its draws, beside a shape.
+
+    Attributes:
+        points: its played points.
+        rotation, translation: rigid motion onto the shape.
+        misfit: how badly it meets the shape, with the prior of the draws.
+        motion: as ``DrawsFit.motion``.
+    """
+
+    drawn: Drawn
+    z: Float[np.ndarray, " d"]
+    points: Float[np.ndarray, "a 3"]
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, "3"]
+    misfit: float
+    motion: Float32[np.ndarray, "a 3 d"] | None = None
+
+
+def lay_on_shape(states: DrawnStates, shape: Shape, drawn: Drawn, z: Float[np.ndarray, " d"]) -> StateOnShape | None:
+    """Lay the state of these draws robustly onto the shape; None where the scene refuses it."""
+    deformations = drawn.deformations(states.scene, z)
+    if deformations is None:
+        return None
+    positions = states.played.moved(deformations)
+    points, weight = shape.at(positions), shape.weight
+    for _ in range(3):
+        share = weight / weight.sum()
+        center, goal = share @ points, share @ shape.points
+        rotation = best_rotations(((points - center) * share[:, None]).T @ (shape.points - goal))
+        translation = goal - rotation @ center
+        distance = np.linalg.norm(points @ rotation.T + translation - shape.points, axis=1)
+        weight = shape.weight * geman_mcclure(distance, SHAPE_ROBUST * max(shape.std, float(np.median(distance))))
+    squared = distance**2
+    apart = float(shape.weight @ (squared / (1.0 + squared / (2 * SHAPE_ROBUST * shape.std) ** 2)))
+    return StateOnShape(drawn, z, positions, rotation, translation, apart + float(z @ z))
+
+
+def approach(states: DrawnStates, shape: Shape, state: StateOnShape, fresh: int) -> StateOnShape:
+    """Approach the shape from a state, by ``fresh`` sets of differences."""
+    damping = 0.1
+    for _ in range(fresh):
+        motion = derivatives(states, state.drawn, state.z, state.points)
+        before = state.misfit
+        for _ in range(6):
+            nearer, motion, damping = _step(states, shape, state, motion, damping)
+            gain, state = state.misfit - nearer.misfit, nearer
+            if gain < ENOUGH * state.misfit:
+                break
+        state = replace(state, motion=motion)
+        if before - state.misfit < 2 * ENOUGH * before:
+            break
+    return state
+
+
+def _step(
+    states: DrawnStates, shape: Shape, state: StateOnShape, motion: Float32[np.ndarray, "a 3 d"], damping: float
+) -> tuple[StateOnShape, Float32[np.ndarray, "a 3 d"], float]:
+    """Take Levenberg and Marquardt's step of the draws, the pose free; returns as ``lower`` does."""
+    posed = Posed(state.rotation, state.translation, np.zeros(len(state.z)))
+    points = posed.place(shape.at(state.points))
+    offset = points - shape.points
+    weight = shape.weight * geman_mcclure(np.linalg.norm(offset, axis=1), 2 * SHAPE_ROBUST * shape.std)
+    for _ in range(5):
+        normal = prior_of_draws(state.z, motion, 0.0, 1e-6)
+        jacobian = in_space(posed, points, shape.at(motion))
+        step = normal.add(jacobian, offset.ravel(), np.repeat(weight, 3)).step(damping)[POSE:]
+        tried = lay_on_shape(states, shape, state.drawn, state.z + step)
+        if tried is not None:
+            motion = secant(motion, step, tried.points - state.points)
+            if tried.misfit < state.misfit:
+                return tried, motion, max(damping / 4.0, 1e-3)
+        damping *= 5.0
+    return state, motion, damping
+
+
+# --- the fit ----------------------------------------------------------------------------------------------------------
 
 GAIN = 0.003
 """Relative gain of a step below which nothing more is tried."""
@@ -56,10 +390,9 @@ def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
 
 
 def refine_by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
-    """Refine a state by what the lines of sight meet, with every observed point.
+    """Refine a state by what the lines of sight meet, with every observed point, over which noise averages out.
 
-    Nearest points lead there from afar, and noise takes them a little beside it; over more points it averages out. The
-    fit has the observed samples of all other states, but its misfit by every point: those it was fitted to.
+    The fit has the observed samples of all other states, but its misfit by every point: those it was fitted to.
     """
     sighted = replace(problem, by_sight=True)
     dense = replace(sighted, base=problem.last)
@@ -79,7 +412,7 @@ def fit_near_modes(
 ) -> list[DrawsFit]:
     """Fit from states like a fit of the modes, and from ``others``."""
     guess = problem.states.guess(modes.z, problem.model.motion)
-    return fit_from_shape(problem, modes, shape_of(problem, problem.model.material(modes.z)), [guess, *others])
+    return fit_from_shape(problem, modes, Shape.of_material(problem, problem.model.material(modes.z)), [guess, *others])
 
 
 def fit_from_end(problem: DrawsProblem, modes: Posed, fits: list[DrawsFit]) -> list[DrawsFit]:
@@ -87,7 +420,7 @@ def fit_from_end(problem: DrawsProblem, modes: Posed, fits: list[DrawsFit]) -> l
     if not fits or explains_cloud(problem, fits, problem.config.hopeless):
         return []
     best = min(fits, key=by_misfit)
-    pose, z = problem.model.project(best.placed())
+    pose, z = problem.model.project(best.surface.material)
     scale = float(np.cbrt(np.linalg.det(pose[:3, :3])))
     modes = refine(problem.base, Posed(pose[:3, :3] / scale, pose[:3, 3], z, float(np.log(scale))))
     return fit_near_modes(problem, modes, fits, [replace(best.drawn, z=best.z)])
@@ -100,24 +433,14 @@ def fit_like_network(problem: DrawsProblem, modes: Posed, fits: list[DrawsFit]) 
         return []
     camera = Posed(np.eye(3), np.zeros(3), np.empty(0), modes.log_scale)
     points, sigma = matches.points * np.exp(-modes.log_scale), problem.base.network_sigma
-    shape = Shape.of(points, sigma, matches.confidence, problem.following_played)
-    return fit_from_shape(problem, camera, shape, [])
+    return fit_from_shape(problem, camera, Shape.of(points, sigma, matches.confidence, problem.following_played), [])
 
 
 def explains_cloud(problem: DrawsProblem, fits: list[DrawsFit], most: float) -> bool:
     """Whether one of the states explains the cloud: ``Problem.explained``."""
     sigma = problem.base.config.cloud_sigma
     misfits = [float(robust_square(fit.distance, sigma).mean()) for fit in fits]
-    if not misfits:
-        return False
-    best = fits[int(np.argmin(misfits))]
-    return problem.base.explained(min(misfits), best.surface, most)
-
-
-def shape_of(problem: DrawsProblem, material: Float[np.ndarray, "m 3"]) -> Shape:
-    """Shape of material points, unposed: dense and smooth."""
-    few = problem.states.played.index
-    return Shape.of(material[few], 0.04 * problem.model.half, np.ones(len(few)))
+    return bool(fits) and problem.base.explained(min(misfits), fits[int(np.argmin(misfits))].surface, most)
 
 
 def fit_from_shape(problem: DrawsProblem, frame: Posed, shape: Shape, guesses: list[Drawn]) -> list[DrawsFit]:
@@ -140,9 +463,15 @@ def descend_best(problem: DrawsProblem, frame: Posed, shape: Shape, starts: list
     for fresh, keep in config.sieve:
         starts = [approach(states, shape, start, fresh) for start in sorted(starts, key=by_misfit)[:keep]]
         starts += find_other_choices(problem, shape, min(starts, key=by_misfit, default=None))
-    fits = [(simulate(problem, start.drawn, start.z, pose_on_shape(frame, start)), start.motion) for start in starts]
-    best = sorted(((fit, motion) for fit, motion in fits if fit is not None), key=lambda pair: pair[0].misfit)
-    return [descend(problem, fit, config.last_rounds, motion) for fit, motion in best[: config.kept]]
+    fits = []
+    for start in starts:
+        translation = frame.place(start.translation[None])[0]
+        posed = Posed(frame.rotation @ start.rotation, translation, np.empty(0), frame.log_scale)
+        fit = simulate(problem, start.drawn, start.z, posed)
+        if fit is not None:
+            fits.append((fit, start.motion))
+    best = sorted(fits, key=lambda pair: pair[0].misfit)[: config.kept]
+    return [descend(problem, fit, config.last_rounds, motion) for fit, motion in best]
 
 
 def find_other_choices(problem: DrawsProblem, shape: Shape, best: StateOnShape | None) -> list[StateOnShape]:
@@ -155,11 +484,6 @@ def find_other_choices(problem: DrawsProblem, shape: Shape, best: StateOnShape |
     # a choice may come out the same again
     new = [near for near in states_near if near is not None and np.abs(near.points - best.points).max() > shape.std]
     return [approach(states, shape, state, 1) for state in sorted(new, key=by_misfit)[:4]]
-
-
-def by_misfit(state: StateOnShape | DrawsFit) -> float:
-    """Misfit, as a key to sort by."""
-    return state.misfit
 
 
 def similar_states(problem: DrawsProblem, shape: Shape) -> list[int]:
@@ -184,16 +508,11 @@ def try_symmetric_states(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     few = replace(problem, config=replace(config, sieve=((1, 4), (1, 1)), kept=1, batches=1))
     for together in symmetric_groups(problem.model):
         material = turn_segments(problem.model, fit.material, together)
-        stiff = try_material(problem, fit.drawn, fit.z, fit.posed, material)
+        stiff = score_material(problem, fit.drawn, fit.z, fit.posed, material)
         if stiff is not None and stiff.misfit < fit.misfit + config.turned_worse:
-            fit = min([fit, *fit_from_shape(few, fit.posed, shape_of(problem, material), [])], key=by_misfit)
+            fits = fit_from_shape(few, fit.posed, Shape.of_material(problem, material), [])
+            fit = min([fit, *fits], key=by_misfit)
     return fit
-
-
-def pose_on_shape(frame: Posed, state: StateOnShape) -> Posed:
-    """Pose in the camera frame of a state that lies on a shape whose own pose there is ``frame``."""
-    translation = frame.place(state.translation[None])[0]
-    return Posed(frame.rotation @ state.rotation, translation, np.empty(0), frame.log_scale)
 
 
 def try_jumps(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
@@ -226,10 +545,7 @@ def find_jumps(problem: DrawsProblem, fit: DrawsFit, number: int, sigma: float) 
 
 
 def draws_that_may_jump(problem: DrawsProblem, fit: DrawsFit) -> Int[np.ndarray, " n"]:
-    """Choose draws that may jump: of many, those that move a part along its own surface, as a ring on its post.
-
-    Only then a state far away may look nearly the same, so that no small step leads there.
-    """
+    """Choose draws that may jump: of many, those that move a part along its own surface, as a ring on its post."""
     smooth = np.flatnonzero(fit.drawn.smooth)
     if problem.config.sliding >= 1.0 or fit.motion is None:
         return smooth
@@ -240,11 +556,6 @@ def draws_that_may_jump(problem: DrawsProblem, fit: DrawsFit) -> Int[np.ndarray,
     moved, off = (motion**2).sum(axis=(0, 1)), (np.einsum("ac,acd->ad", normal, motion) ** 2).sum(axis=0)
     farthest = np.sqrt((motion**2).sum(axis=1).max(axis=0, initial=0.0))
     return smooth[(off < problem.config.sliding * moved) & (farthest > 0.03 * model.half)]
-
-
-# --- descent on simulated states --------------------------------------------------------------------------------------
-
-# DrawsFit -derivatives-> motion of the played points -normal_equations-> a step of pose and draws -played-> DrawsFit
 
 
 def first_sigma(problem: DrawsProblem) -> float:
@@ -278,10 +589,10 @@ def descend(
 def lower(
     problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3 d"], sigma: float, damping: float
 ) -> tuple[DrawsFit, Float32[np.ndarray, "a 3 d"], float]:
-    """A state of lower misfit, or the same; what was learnt of the motion; the next damping."""
+    """Return a state of lower misfit, or the same; what was learnt of the motion; the next damping."""
     index, least = problem.states.played.index, misfit(problem, fit, sigma)
     for _ in range(3):
-        step = normal_equations(problem, fit, motion, sigma).step(damping)
+        step = terms(problem, fit, motion, sigma).total.step(damping)
         tried = simulate(problem, fit.drawn, fit.z + step[POSE:], fit.posed.moved(step[:POSE]))
         if tried is not None:
             motion = secant(motion, step[POSE:], (tried.material - fit.material)[index])
@@ -293,51 +604,38 @@ def lower(
 
 # --- other discrete choices -------------------------------------------------------------------------------------------
 
-# Discrete draws are such as how many corners of a sheet are folded, and which.
-#
-# Derivatives do not reach across them, and random states hold one combination too seldom to be near everything else.
-# So a state that is right but for such a choice keeps all other draws; the choice, and what depends on it, is redrawn.
-
 
 def redraw_choices(scene: Scene, drawn: Drawn, count: int) -> list[Drawn]:
     """Redraw some of the discrete draws of a state, and what depends on them; fewer than ``count`` where refused.
 
-    Nothing where the scene has no discrete draws. The same state gives the same ones.
+    Discrete draws are such as how many corners of a sheet are folded: derivatives do not reach across them, and random
+    states hold one combination too seldom to be near everything else. All other draws are kept. Nothing where the scene
+    has no discrete draws. The same state gives the same ones.
     """
     calls = played_back(scene, drawn.seed, shares_of(drawn.z, drawn.sizes)).calls
-    discrete = [number for number, call in enumerate(calls) if call.kind not in SMOOTH]
-    if not discrete:
+    discrete = np.array([number for number, call in enumerate(calls) if call.kind not in SMOOTH], dtype=int)
+    if not len(discrete):
         return []
-    rng = np.random.default_rng(drawn.seed)
-    redrawn = [_redraw(scene, calls, _some(discrete, rng), int(rng.integers(2**31))) for _ in range(count)]
-    return [drawn for drawn in redrawn if drawn is not None]
-
-
-def _some(numbers: Sequence[int], rng: np.random.Generator) -> set[int]:
-    """At least one of them, each with probability one half or more."""
-    taken = rng.random(len(numbers)) < 0.5
-    taken[rng.integers(len(numbers))] = True
-    return {number for number, take in zip(numbers, taken, strict=True) if take}
-
-
-def _redraw(scene: Scene, calls: Sequence[Call], left_out: set[int], seed: int) -> Drawn | None:
-    given = {call.key: call.shares for number, call in enumerate(calls) if number not in left_out}
-    # a scene that asks for more calls than these has thrown its first attempt away
-    recorder = Recorder(seed, given, len(calls) + 12)
-    try:
-        play(scene, recorder)
-    except (OutOfDraws, ValueError):
-        return None
-    return Drawn.recorded(recorder.calls, seed)
+    rng, redrawn = np.random.default_rng(drawn.seed), list[Drawn]()
+    for _ in range(count):
+        taken = rng.random(len(discrete)) < 0.5
+        taken[rng.integers(len(discrete))] = True
+        seed = int(rng.integers(2**31))
+        given = {call.key: call.shares for number, call in enumerate(calls) if number not in discrete[taken]}
+        # a scene that asks for more calls than these has thrown its first attempt away
+        recorder = Recorder(seed, given, len(calls) + 12)
+        try:
+            play(scene, recorder)
+        except (OutOfDraws, ValueError):
+            continue
+        redrawn.append(Drawn.recorded(recorder.calls, seed))
+    return redrawn
 
 
 # --- segments turned by their symmetries ------------------------------------------------------------------------------
 
 # An arm looks the same with the forearm half a turn round, the wrist bent the other way and the hand turned back. No
-# small step leads there, and no jump of one draw: several change at once. But the shape is known, so that the draws can
-# be drawn towards it as towards that of the modes. Lengths are scene units.
-#
-# Notation: m material points.
+# jump of one draw leads there, but the shape is known, so that the draws can approach it as that of the modes.
 
 Twins = tuple[tuple[Symmetry, float], ...]
 """Segments that hang on each other, and the angle by which each is turned."""
@@ -347,11 +645,13 @@ Twins = tuple[tuple[Symmetry, float], ...]
 def symmetric_groups(model: StatisticalModel) -> tuple[Twins, ...]:
     """Groups of two segments or more that hang on each other and each look alike in exactly one other turn.
 
-    A segment that spins, or looks alike in many turns, is left to single draws, which slide along its surface.
+    Others are left to single draws, which slide along their surface.
     """
-    single = {
-        turn.label - 1: (turn, angle) for turn, angle in map(_only_angle, find_symmetries(model)) if angle is not None
-    }
+    single = dict[int, tuple[Symmetry, float]]()
+    for turn in find_symmetries(model):
+        middle = float(turn.angles.mean())
+        if np.abs(turn.angles - middle).max() <= np.deg2rad(15.0):  # one run of two or three, 10 degrees apart
+            single[turn.label - 1] = turn, middle
     if len(single) < 2:
         return ()
     touch = np.zeros((len(model.anchors),) * 2, dtype=bool)
@@ -359,16 +659,9 @@ def symmetric_groups(model: StatisticalModel) -> tuple[Twins, ...]:
         touch[a, b] = a in single and b in single
     count, group = connected_components(touch, directed=False)
     members = [
-        [single[label] for label in np.flatnonzero(group == number).tolist() if label in single]
-        for number in range(count)
+        tuple(single[label] for label in np.flatnonzero(group == i).tolist() if label in single) for i in range(count)
     ]
-    return tuple(tuple(some) for some in members if len(some) > 1)
-
-
-def _only_angle(turn: Symmetry) -> tuple[Symmetry, float | None]:
-    """The middle of a turn's angles, which are 10 degrees apart, where these are one run of two or three; else None."""
-    middle = float(turn.angles.mean())
-    return turn, middle if np.abs(turn.angles - middle).max() <= np.deg2rad(15.0) else None
+    return tuple(some for some in members if len(some) > 1)
 
 
 def turn_segments(

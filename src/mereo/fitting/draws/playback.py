@@ -52,9 +52,8 @@ class Drawn:
 
     Attributes:
         seed: of what is not recorded.
-        z: all draws in the order of the calls, standard normal.
+        z, smooth: all draws in the order of the calls, standard normal, and which of them move the state continuously.
         sizes: how many numbers each call drew.
-        smooth: which of them move the state continuously.
     """
 
     seed: int
@@ -98,14 +97,7 @@ def as_sparse(weights: PointWeights, count: int) -> csr_array:
 
 @dataclass(frozen=True, eq=False)
 class Played:
-    """Few material points of each segment, and how all others follow them.
-
-    Attributes:
-        points: their positions at rest, one segment after the other.
-        index: which material points they are.
-        counts: how many each segment has.
-        spread: weights by which all material points follow them.
-    """
+    """Few material points of each segment: where at rest, which, and how many; all others follow them by ``spread``."""
 
     points: Float[np.ndarray, "a 3"]
     index: Int[np.ndarray, " a"]
@@ -140,8 +132,6 @@ class DrawnStates:
     """Random states of a scene by seed: where a fit of draws may start.
 
     Attributes:
-        scene: what is played.
-        seeds: of the states.
         material: their material points, scene frame.
         z: their draws, standard normal; NaN of states with other calls than the first that was not drawn again.
         modes: their coefficients in the statistical model.

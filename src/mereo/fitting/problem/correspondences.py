@@ -58,11 +58,8 @@ class Correspondences:
     def displaced(self, model: StatisticalModel, material: Float[np.ndarray, "m 3"]) -> float | None:
         """How far the places of the object are from where a model's state has them, as a share of half its length.
 
-        Root mean square, each ``CLIPPED`` at most; None without correspondences, as where a frame is tracked.
-
-        Args:
-            model: statistical model of the object.
-            material: its posed material points, in the unit of ``points``, which is that of scenes.
+        Root mean square, each ``CLIPPED`` at most; None without correspondences, as where a frame is tracked. Points
+        and posed ``material`` are in scene units.
         """
         if len(self.points) == 0:
             return None
@@ -87,15 +84,10 @@ def nothing() -> Correspondences:
 def find_correspondences(
     model: Trained, code: EncodedCloud, center: Float[np.ndarray, "3"], half: float
 ) -> Correspondences | None:
-    """Predict correspondences at observed points and along the lines of sight behind them.
+    """Predict correspondences at observed points of an encoded cloud, and along the lines of sight behind them.
 
-    Args:
-        model: the trained network.
-        code: of the observed cloud.
-        center: of the rest frame (``scenes.rest_pose.rest_frame``), scene units.
-        half: of the rest frame's longest side, scene units.
-
-    Returns None from a network without rest coordinates.
+    Centre and half the longest side are those of the rest frame, scene units. Returns None from a network without rest
+    coordinates.
     """
     seen = code.cloud[:OBSERVED]
     lines = seen[:SIGHT_LINES]
@@ -117,8 +109,8 @@ def find_correspondences(
 # --- length of a scene unit -------------------------------------------------------------------------------------------
 
 UNIT_TOLERANCE = 0.15
-"""Difference of a stated unit from the correspondences' own up to which it is believed: they are off by less in 258 of
-264 training views, and no two units that are mistaken for each other are nearer than a factor of 2.5."""
+"""Difference of a stated unit from the correspondences' own up to which it is believed; no two units that are mistaken
+for each other are nearer than a factor of 2.5."""
 
 
 def agree(first: float, second: float) -> bool:

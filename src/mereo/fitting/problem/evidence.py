@@ -1,10 +1,9 @@
 """The evidence of a frame: observed points, and what silhouette and free space rule out. The camera is at the origin.
 
-A frame is a cloud seen from one position, and what is known of the lines of sight beside it (``geometry.sight_lines``).
 A vertex of a fitted model may lie neither on a line of sight that went past the object, before what that met (outside
 the silhouette), nor in front of the observed points around its line of sight (free space). Nothing is ruled out along
-lines of sight on which nothing is known. Lines of sight are compared by their angles, so a depth image and a cloud
-without one are the same, and so is any axis or unit.
+lines of sight on which nothing is known. Lines of sight are compared by their angles, so a depth image and a cloud are
+the same.
 """
 
 from dataclasses import dataclass, replace
@@ -53,8 +52,7 @@ class PastLines:
     Attributes:
         sight: search tree over their unit vectors.
         ranges: distance from the camera of what each met.
-        reach: angle from each up to which a line of sight without a measurement of its own is taken to be like it; they
-            are the farther apart the farther they are from the object.
+        reach: angle from each up to which a line of sight without a measurement of its own is taken to be like it.
     """
 
     sight: cKDTree
@@ -108,8 +106,7 @@ class Evidence:
     ) -> "Evidence":
         """Prepare a cloud, with so many ``observed_samples`` at most; its lines of sight start at the origin.
 
-        Along those of ``outliers`` points, which a front end has taken for outliers, anything may be: they are within
-        the silhouette, and rule nothing out. ``lines`` says what is known beside the cloud; without it, and where it
+        Those of ``outliers`` rule nothing out. ``lines`` says what is known beside the cloud; without it, and where it
         leaves that open, all lines of sight beside the cloud went past the object.
         """
         points = means_along_sight(points, MOST_POINTS)
@@ -144,11 +141,6 @@ class Evidence:
         normals = np.linalg.eigh(np.einsum("pki,pkj->pij", patches, patches))[1][:, :, 0]
         away = np.einsum("pi,pi->p", normals, self.observed_samples) > 0
         return np.where(away[:, None], -normals, normals)
-
-    @property
-    def may_be_cut(self) -> bool:
-        """Whether something may hide a part of the object, or lie beside it where nothing is known."""
-        return self.other_lines == "unknown" or len(self.sight.data) > len(self.points)
 
     @property
     def hidden_edge(self) -> float:

@@ -27,12 +27,7 @@ Rows = tuple[Float[np.ndarray, "p q"], Float[np.ndarray, " p"], Float[np.ndarray
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """Pose and coefficients: a state of the model in the camera frame.
-
-    Attributes:
-        rotation, translation, log_scale: of the similarity into the camera frame.
-        z: coefficients of the modes.
-    """
+    """Similarity into the camera frame, and coefficients of the modes: a state of the model."""
 
     rotation: Float[np.ndarray, "3 3"]
     translation: Float[np.ndarray, "3"]

@@ -43,24 +43,13 @@ class Misfit:
 
     Attributes:
         cloud: of one observed sample on average.
-        network: of all correspondences, as much as they are worth.
-        silhouette: of all vertices that the frame rules out.
-        prior: of the coefficients, under the Gaussian of all states.
-        pairs: of the kept distances, as much as they are worth.
-        total: all of it, the cloud as much as it is worth.
+        total: of cloud, correspondences, silhouette, prior and kept distances, as much as they are worth.
+        without_network: the total without the correspondences, for states that were found from different ones.
     """
 
     cloud: float
-    network: float
-    silhouette: float
-    prior: float
-    pairs: float
     total: float
-
-    @property
-    def without_network(self) -> float:
-        """The total without the correspondences, for states that were found from different ones."""
-        return self.total - self.network
+    without_network: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,10 +79,7 @@ class Problem:
     """Everything a fit of one frame works on; scene units, camera frame.
 
     Attributes:
-        model: the statistical model.
-        network: correspondences.
-        evidence: the frame.
-        scale_std: how far the scale is unsure.
+        scale_std: standard deviation of the scale's logarithm.
         config: constants.
         noisy: whether they are those of a noisy frame.
         given: pose that is known; None where the frame alone says it.
@@ -116,7 +102,7 @@ class Problem:
         scale_std: float,
         config: FitConfig,
     ) -> "Problem":
-        """Problem of one frame: what the network found, and what the frame shows."""
+        """Problem of a frame with correspondences of a network."""
         return cls(model, NetworkTerm.of(model, correspondences), evidence, scale_std, config)
 
     @property
@@ -148,11 +134,9 @@ class Problem:
     def as_noisy_as(self, surface: Surface, is_shared: bool = False) -> "Problem | None":
         """The problem of a frame as noisy as what a fit leaves over; None where the constants are for one like that.
 
-        Args:
-            surface: the fit's.
-            is_shared: take for noise what neighbours share too.
+        What neighbours share is taken for noise too where ``is_shared``.
         """
-        noise = noise_with_shared(surface.offsets(self.evidence.points)) if is_shared else self.residual_noise(surface)
+        noise = noise_of(surface.offsets(self.evidence.points)) if is_shared else self.residual_noise(surface)
         config = constants_for(noise, self.config)
         if config is self.config:
             return None
@@ -180,10 +164,7 @@ class Problem:
 
     def leaves_noise(self, surface: Surface, is_shared: bool = False) -> bool:
         """Whether what a fit leaves over is noise, and not its own error; ``is_shared`` as in ``as_noisy_as``."""
-        offset = surface.offsets(self.evidence.points)
-        if is_shared:
-            return is_shared_noise(offset)
-        return is_noise(offset, noise_of(offset, self.evidence.around))
+        return is_noise(surface.offsets(self.evidence.points), self.evidence.around, is_shared)
 
     def explained(self, cloud: float, surface: Surface, most: float) -> bool:
         """Whether a surface explains the cloud: by a misfit below ``most``, or of a noisy one all but the noise."""
@@ -218,17 +199,13 @@ class Problem:
     @cached_property
     def coarse(self) -> "Problem":
         """Problem with fewer points, for the choice among many states."""
-        config = replace(
-            self.config,
-            samples=1000,
-            silhouette_vertices=self.config.silhouette_vertices // COARSE,
-        )
-        if self.noisy:  # its sigma would use the faces in all steps
-            config = replace(config, exact_steps=0)
+        exact_steps = 0 if self.noisy else self.config.exact_steps  # its sigma would use the faces in all steps
+        few = self.config.silhouette_vertices // COARSE
+        config = replace(self.config, samples=1000, silhouette_vertices=few, exact_steps=exact_steps)
         some = slice(None, None, COARSE)
         network = NetworkTerm(*(part[some] for part in vars(self.network).values()))
         evidence = replace(self.evidence, observed_samples=self.evidence.observed_samples[: OBSERVED_SAMPLES // COARSE])
-        coarse = Problem(self.model, network, evidence, self.scale_std, config, self.noisy, self.given)
+        coarse = replace(self, network=network, evidence=evidence, config=config)
         vars(coarse)["pairs"] = PairTerm(*(part[some] for part in vars(self.pairs).values()))
         return coarse
 
@@ -268,14 +245,14 @@ class Problem:
     ) -> NormalEquations:
         """Sum with the samples of a state's surface that the frame rules out."""
         few = samples.few(self.config.silhouette_vertices)
-        return add_silhouette(normal, posed, few.points, few.modes_at, self.evidence, sigma)
+        points, modes = few.position.astype(np.float64), few.surface.modes[:, 0]
+        return add_silhouette(normal, posed, points, lambda rows: modes[rows], self.evidence, sigma)
 
     def cloud_rows(self, posed: Posed) -> Rows:
         """Residuals of the observed samples from the faces, as the last steps of a fit have them."""
-        observed_samples, config = self.evidence.observed_samples, self.config
-        planes = Surface.of(self.model, posed).planes(observed_samples, self.far)
-        weight, normals = config.cloud_weight, self.observed_normals
-        return cloud_rows(posed, observed_samples, planes, config.cloud_sigma, weight, normals)
+        observed, config = self.evidence.observed_samples, self.config
+        planes = Surface.of(self.model, posed).planes(observed, self.far)
+        return cloud_rows(posed, observed, planes, config.cloud_sigma, config.cloud_weight, self.observed_normals)
 
     @property
     def observed_normals(self) -> Float[np.ndarray, "p 3"] | None:
@@ -285,8 +262,8 @@ class Problem:
     def misfit(self, posed: Posed, surface: Surface | None = None) -> Misfit:
         """Misfit of a state, whose ``surface`` may be there already."""
         surface = surface or Surface.of(self.model, posed)
-        cloud, network = self.cloud_misfit(surface), self.network.energy(posed, self.network_sigma)
-        return self.total(cloud, network, self._silhouette_square(surface), posed.z)
+        network = self.network.energy(posed, self.network_sigma)
+        return self.total(self.cloud_misfit(surface), network, self._silhouette_square(surface), posed.z)
 
     def silhouette_misfit(self, surface: Surface) -> float:
         """Misfit of all vertices that the frame rules out."""
@@ -308,17 +285,12 @@ class Problem:
         silhouette = silhouette * SILHOUETTE_WEIGHT * SILHOUETTE_VERTICES
         prior, pairs = float(z @ z), PAIR_WEIGHT * self.pairs.energy(z)
         total = self.config.cloud_weight * cloud + network + silhouette + prior + pairs
-        return Misfit(cloud, network, silhouette, prior, pairs, total)
-
-    def unposed(self, z: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 3"]:
-        """The correspondences' positions in the model's frame."""
-        return self.network.mean + self.network.modes @ z.astype(np.float32)
+        return Misfit(cloud, total, total - network)
 
 
 # --- noise of a frame -------------------------------------------------------------------------------------------------
 
-# Depth cameras are off by a twentieth of a scene unit or by half of one, depending on their principle, the distance and
-# the slant. Differences between neighbouring pixels do not show that, as edges and curvature look like noise too; a
+# Differences between neighbouring pixels do not show a camera's noise, as edges and curvature look like noise too; a
 # fitted model takes these away. What it leaves over is noise where every pixel differs; where neighbours share it, the
 # model is wrong.
 
@@ -329,12 +301,10 @@ CLEAN = 0.1
 """Noise, in scene units, up to which the constants are as they are; clean frames have 0.05 to 0.07."""
 
 COHERENT = 1.3
-"""What a fit leaves over, in noises, from which on it is wrong; right ones have 0.8 to 1.1, whatever the camera."""
+"""What a fit leaves over, in noises, from which on it is wrong; right ones have 0.8 to 1.1."""
 
 NORMAL = 4.3
-"""The 95 % quantile of what a fit leaves over, in its median, up to which it looks like normal numbers, with 2.9.
-
-Right fits to simulated and real cameras have 2.7 to 4.2, of sheets in a wrong state 5.5 to 8.6."""
+"""The 95 % quantile of what a fit leaves over, in its median, up to which it looks like normal numbers, with 2.9."""
 
 SIGMAS = 1.5
 """Standard deviation that the cloud gets, in noises: mixed pixels are far beyond ``residuals.ROBUST`` of these."""
@@ -346,61 +316,44 @@ LARGEST = 1.0
 """Largest standard deviation of the cloud, in scene units."""
 
 SHARED = 1.05
-"""Misfit of a noisy cloud, in misfits of what neighbours do not share, up to which nothing more is to be explained.
-
-Fits to noisy training views that other states do not improve have 1.02 to 1.15, those that they do mostly more."""
+"""Misfit of a noisy cloud, in misfits of what neighbours do not share, up to which nothing more is to be explained."""
 
 ACCEPTED = 0.75
-"""Share of a noisy frame's points that a fit must explain to be believed: the rest are outliers that nothing reveals.
-
-Of 13 noisy training views that explain .76 to .95, the network was better in one, that with .76."""
+"""Share of a noisy frame's points that a fit must explain to be believed: nothing reveals the outliers among them."""
 
 
 def unshared(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
     """What each point's offset does not share with those around it, as large as its noise alone would be."""
-    unshared_offset = offset - np.median(offset[around], axis=1)
     # the median of k neighbours is itself off by pi / 2k of their variance
-    return unshared_offset / np.sqrt(1.0 + np.pi / (2 * around.shape[1]))
+    return (offset - np.median(offset[around], axis=1)) / np.sqrt(1.0 + np.pi / (2 * around.shape[1]))
 
 
-def noise_of(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"]) -> float:
-    """Standard deviation of what each point's offset does not share with those around it; robust.
+def noise_of(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"] | None = None) -> float:
+    """Standard deviation of offsets, robust: of all that a fit leaves over, or of what neighbours do not share.
 
     Args:
         offset: signed distance of each observed point from a fitted surface.
         around: indices of each point's neighbours.
     """
-    return TO_STD * float(np.median(np.abs(unshared(offset, around))))
+    return TO_STD * float(np.median(np.abs(offset if around is None else unshared(offset, around))))
 
 
-def noise_with_shared(offset: Float[np.ndarray, " n"]) -> float:
-    """Standard deviation of all that a fit leaves over, shared by neighbours or not; robust."""
-    return TO_STD * float(np.median(np.abs(offset)))
+def is_noise(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"], is_shared: bool = False) -> bool:
+    """Whether what a fit leaves over is noise, and not its own error.
 
-
-def looks_normal(offset: Float[np.ndarray, " n"]) -> bool:
-    """Whether what a fit leaves over is spread as normal numbers are, with no part of the frame far off.
-
-    Stereo cameras match windows of pixels, so neighbours share their errors, as they share a wrong fit's. That is
-    right in most of the frame and far off elsewhere.
+    Where ``is_shared``, noise that neighbours may share, as stereo cameras match windows of pixels: constants reach to
+    it, and it is spread as normal numbers are, while a wrong fit is right in most of the frame and far off elsewhere.
     """
-    return float(np.quantile(np.abs(offset), 0.95)) <= NORMAL * float(np.median(np.abs(offset)))
-
-
-def is_shared_noise(offset: Float[np.ndarray, " n"]) -> bool:
-    """Whether what a fit leaves over may be noise that neighbours share: it looks normal, and constants reach to it."""
-    return noise_with_shared(offset) * SIGMAS <= LARGEST and looks_normal(offset)
-
-
-def is_noise(offset: Float[np.ndarray, " n"], noise: float) -> bool:
-    """Whether what a fit leaves over is noise, and not the fit's own error."""
-    return noise_with_shared(offset) <= COHERENT * noise
+    if not is_shared:
+        return noise_of(offset) <= COHERENT * noise_of(offset, around)
+    far, middle = float(np.quantile(np.abs(offset), 0.95)), float(np.median(np.abs(offset)))
+    return noise_of(offset) * SIGMAS <= LARGEST and far <= NORMAL * middle
 
 
 def shared(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"], sigma: float) -> float:
     """Misfit of a cloud, in misfits of what its points' offsets do not share with those around them."""
-    unshared_offset = unshared(offset, around)
-    return float(robust_square(offset, sigma).mean() / max(robust_square(unshared_offset, sigma).mean(), 1e-12))
+    alone = robust_square(unshared(offset, around), sigma).mean()
+    return float(robust_square(offset, sigma).mean() / max(alone, 1e-12))
 
 
 def constants_for(noise: float, config: FitConfig) -> FitConfig:

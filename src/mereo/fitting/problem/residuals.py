@@ -24,8 +24,7 @@ from mereo.scenes.statistical_model import StatisticalModel
 
 # --- the surface as samples -------------------------------------------------------------------------------------------
 
-# A search among all faces is exact and slow. Samples are as good while the model is farther from the cloud than they
-# are from each other; the last steps of a fit use the faces themselves.
+# Samples are as good as faces, and faster, while the model is farther from the cloud than they are from each other.
 #
 # Notation: s samples, k modes. A frame is three vectors: the sample's position and two edges of its face.
 
@@ -35,12 +34,7 @@ Planes = tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"], Float32[np.nd
 
 @dataclass(frozen=True, eq=False)
 class SampledSurface:
-    """Samples of a model's surface, evenly spread; every second or fourth of them are as even.
-
-    Attributes:
-        mean, modes: of the frames.
-        spacing: distance between samples, about.
-    """
+    """Frames of samples of a model's surface, evenly ``spacing`` apart; every second or fourth of them are as even."""
 
     mean: Float32[np.ndarray, "s 3 3"]
     modes: Float32[np.ndarray, "s 3 3 k"]
@@ -82,28 +76,12 @@ class SampledSurface:
 
 @dataclass(frozen=True, eq=False)
 class PosedSamples:
-    """Samples in the camera frame.
-
-    Attributes:
-        surface: of which they are.
-        position: of each.
-        normal: outward.
-        facing: whether the camera sees their outside.
-    """
+    """Samples of a surface in the camera frame: positions, outward normals, whether the camera sees their outside."""
 
     surface: SampledSurface
     position: Float32[np.ndarray, "s 3"]
     normal: Float32[np.ndarray, "s 3"]
     facing: Bool[np.ndarray, " s"]
-
-    @property
-    def points(self) -> Float[np.ndarray, "s 3"]:
-        """Positions of the samples, in double precision."""
-        return self.position.astype(np.float64)
-
-    def modes_at(self, rows: Int[np.ndarray, " r"]) -> Float32[np.ndarray, "r 3 k"]:
-        """Modes of some of the samples."""
-        return self.surface.modes[rows, 0]
 
     def few(self, count: int) -> "PosedSamples":
         """About ``count`` samples, as evenly spread."""
@@ -113,10 +91,10 @@ class PosedSamples:
     def planes(
         self, points: Float[np.ndarray, "p 3"], normals: Float[np.ndarray, "p 3"] | None = None, length: float = 0.0
     ) -> Planes:
-        """Place, normal and modes of the facing sample nearest to each point.
+        """Planes of the facing samples nearest to points.
 
-        With the points' ``normals``, of the sample that is nearest in place and direction, whether it faces the camera
-        yet or not: a difference of 1 counts as ``length``.
+        With the points' ``normals``, of the samples that are nearest in place and direction, whether they face the
+        camera yet or not: a difference of 1 counts as ``length``.
         """
         rows = np.flatnonzero(self.facing)
         if len(rows) == 0 or normals is not None:
@@ -147,13 +125,7 @@ def robust_square(residual: Float[np.ndarray, " r"], sigma: float, robust: float
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A posed model, and its faces turned towards the camera.
-
-    Attributes:
-        material: posed positions of all material points.
-        facing: indices of the faces that are seen from their outside.
-        normals: unit normals of these.
-    """
+    """Posed material points of a model, and the faces that are seen from their outside, with their unit normals."""
 
     model: StatisticalModel
     material: Float[np.ndarray, "m 3"]
@@ -195,33 +167,28 @@ class Surface:
     ) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
         """Like ``nearest``, but of the point that each line of sight meets, and of the distance from its plane.
 
-        A depth camera is off along the line of sight. The nearest position is another one: of a surface that bulges, it
-        has a noisy cloud a little in front, and noise across an edge pulls that edge along. Where nothing is met, or
-        only a plane farther than ``far`` from the point, it is the nearest position all the same.
+        A depth camera is off along the line of sight; noise across an edge would pull the nearest position along. Where
+        nothing is met, or only a plane farther than ``far`` from the point, it is the nearest position all the same.
         """
-        rows, met = first_faces(self._rays, self._center, points)
+        rows, met = first_faces(*self._rays, points)
         toward, normal = points[rows], self.normals[met]
         corner = self.material[self.model.faces[self.facing[met], 0]]
         shares = np.einsum("pi,pi->p", normal, corner) / np.einsum("pi,pi->p", normal, toward)
         met_position = toward * shares[:, None]
         off = np.abs(np.einsum("pi,pi->p", normal, toward - met_position))
         near = off <= far
-        other = np.ones(len(points), dtype=bool)
-        other[rows[near]] = False
+        rows = rows[near]
+        other = np.setdiff1d(np.arange(len(points)), rows)
         distance, face, position = np.empty(len(points)), np.empty(len(points), dtype=np.int64), np.empty_like(points)
-        distance[~other], face[~other], position[~other] = off[near], met[near], met_position[near]  # rows are in order
-        if other.any():
+        distance[rows], face[rows], position[rows] = off[near], met[near], met_position[near]
+        if len(other):
             distance[other], face[other], position[other] = self.nearest(points[other])
         return distance, face, position
 
     @cached_property
-    def _center(self) -> Float[np.ndarray, "3"]:
+    def _rays(self) -> tuple[EmbreeScene, Float[np.ndarray, "3"]]:
         center: Float[np.ndarray, "3"] = self.material.mean(axis=0)
-        return center
-
-    @cached_property
-    def _rays(self) -> EmbreeScene:
-        return ray_scene(self.material - self._center, self.model.faces[self.facing])
+        return ray_scene(self.material - center, self.model.faces[self.facing]), center
 
     def offsets(self, points: Float[np.ndarray, "p 3"], far: float | None = None) -> Float[np.ndarray, " p"]:
         """Signed distance of each point from the facing surface, negative behind it; with ``far``, ``along_sight``."""
@@ -229,7 +196,7 @@ class Surface:
         return np.copysign(distance, np.einsum("pi,pi->p", points - position, self.normals[face]))
 
     def planes(self, points: Float[np.ndarray, "p 3"], far: float) -> Planes:
-        """Place of the facing surface along each point's line of sight, its normal and its modes."""
+        """Planes of the facing surface along each point's line of sight."""
         _, face, position = self.along_sight(points, far)
         corners = self.model.faces[self.facing[face]]
         weight = barycentric(self.material[corners], position).astype(np.float32)
@@ -239,13 +206,7 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class NetworkTerm:
-    """Correspondences, with the modes at their rest positions.
-
-    Attributes:
-        target: positions in the camera frame.
-        mean, modes: of the same points in the model.
-        confidence: weight of each.
-    """
+    """Correspondences: targets in the camera frame, mean and modes of the same points in the model, and weights."""
 
     target: Float[np.ndarray, "n 3"]
     mean: Float[np.ndarray, "n 3"]
@@ -372,12 +333,7 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class PairTerm:
-    """Distances that the states keep, with the modes' differences at their pairs.
-
-    Attributes:
-        mean, modes: of the vector from second to first point.
-        distance, std: of its length among the states.
-    """
+    """Distances that the states keep: mean and modes of vectors between points, mean and deviation of their lengths."""
 
     mean: Float[np.ndarray, "q 3"]
     modes: Float32[np.ndarray, "q 3 k"]
@@ -413,18 +369,13 @@ class PairTerm:
         return float((((self._vectors(z)[1] - self.distance) / self.std) ** 2).mean())
 
 
-# --- all of them ---
-
-
 @dataclass(frozen=True, eq=False)
 class Terms:
     """What a fit's normal equations at its optimum are made of.
 
     Attributes:
         known: without the frame: prior, scale, kept distances.
-        network: the correspondences.
-        cloud: distances of the observed samples from the surface, as rows.
-        observed_samples: the observed samples, camera frame, scene units.
+        cloud: distances of the observed samples (camera frame, scene units) from the surface, as rows.
         ruled_out: silhouette and free space.
     """
 

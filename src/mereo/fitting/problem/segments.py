@@ -1,6 +1,6 @@
 """Segments of an object: the joints between them, and their turns that a frame cannot tell apart.
 
-Both are learned from the states of the statistical model, without code of a scene. Lengths are scene units.
+Both are learned from the states of the statistical model. Lengths are scene units.
 
 Notation: s segments, c corners of each (a few anchors), n states, k modes, m material points, a angles.
 """
@@ -26,7 +26,7 @@ from mereo.scenes.statistical_model import StatisticalModel
 # --- joints -----------------------------------------------------------------------------------------------------------
 
 # Segments that touch form a tree. One branch of it is moved as the library moves it there, and the rest stays: a hand
-# half a turn round, with the arm as it is. A library of random states hardly ever holds such a state.
+# half a turn round, with the arm as it is, which random states hardly ever hold.
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,9 +34,8 @@ class Joints:
     """Joints of an object: which segments hang on which, and how states move them.
 
     Attributes:
-        model: the statistical model.
-        corners: material points, ``c`` of each segment.
-        branches: pairs of a segment, the one that hangs on it, and which segments go along with that.
+        corners: material points of each segment.
+        branches: as ``branches`` finds them.
         rotation, translation: of each segment in some states, from the mean: ``y = R x + t``.
     """
 
@@ -70,12 +69,8 @@ class Joints:
             moved = branch @ turn.transpose(0, 2, 1) + shift[:, None]
             shapes[:, moving] = moved.reshape(len(turn), -1, *corners.shape[2:])
             apart = different(moved.reshape(len(turn), -1), branch.ravel(), each)
-            shapes_of_branches.append(shapes[apart])
-        return (
-            self._expressed(np.concatenate(shapes_of_branches).reshape(-1, self.corners.size, 3), posed)
-            if shapes_of_branches
-            else []
-        )
+            shapes_of_branches.append(shapes[apart].reshape(-1, self.corners.size, 3))
+        return self._expressed(np.concatenate(shapes_of_branches), posed) if shapes_of_branches else []
 
     def _expressed(self, shapes: Float[np.ndarray, "n p 3"], posed: Posed) -> list[Posed]:
         """Find the states nearest to shapes of the corners in the frame of ``posed``'s modes."""
@@ -128,8 +123,7 @@ def segment_poses(
 ) -> tuple[Float[np.ndarray, "n s 3 3"], Float[np.ndarray, "n s 3"]]:
     """Rigid motion of each segment from the mean to each state."""
     middle, goal = mean.mean(axis=1, keepdims=True), states.mean(axis=2, keepdims=True)
-    covariance = np.matmul((mean - middle).transpose(0, 2, 1), states - goal)
-    rotation = best_rotations(covariance)
+    rotation = best_rotations(np.matmul((mean - middle).transpose(0, 2, 1), states - goal))
     return rotation, (goal[:, :, 0] - np.matmul(rotation, middle[:, 0, :, None])[..., 0])
 
 
@@ -168,8 +162,7 @@ def diverse_rows(
 
 def largest_distance(offset: Float[np.ndarray, "m p 3"]) -> Float[np.ndarray, " m"]:
     """Length of the longest offset of each row."""
-    longest: np.ndarray = np.linalg.norm(offset, axis=2).max(axis=1)
-    return longest
+    return np.asarray(np.linalg.norm(offset, axis=2).max(axis=1))
 
 
 def rms_distance(offset: Float[np.ndarray, "m p 3"]) -> Float[np.ndarray, " m"]:
@@ -193,23 +186,20 @@ ANGLES = np.deg2rad(np.arange(30, 331, 10))
 
 ALIKE = 0.06
 """Root mean square distance of a turned segment from itself up to which it looks the same, in mean distances from the
-axis. Of the robot's segments, which a view cannot tell half a turn round, .04 is the largest; its base has .08."""
+axis; the robot's segments, which a view cannot tell half a turn round, have .04, its base has .08."""
 
 BINS = 36
 """Bins of the angle by which states turn a segment against its neighbour."""
 
 COUNTED = 0.03
-"""Share of the loss of a turned segment that counts: it is turned stiffly here, and a fit from there takes most of that
-back. On training views of the shapes 78 % of the positions lay within the radii with all of it, 91 % with a tenth, 96 %
-with this."""
+"""Share of the loss of a turned segment that counts: it is turned stiffly, and a fit would take most of it back."""
 
 
 @dataclass(frozen=True, eq=False)
 class Symmetry:
-    """Turns of a segment about an axis of its own which hardly change its shape.
+    """Turns of a segment about an axis, which hardly change its shape.
 
     Attributes:
-        label: of the segment.
         center, axis: at rest.
         angles: of the turns, rad.
         plausible: how often states are so far apart in this turn, in how often they are alike.
@@ -270,8 +260,7 @@ def self_distances(
     points = (arm @ turned.transpose(0, 2, 1)).reshape(-1, 3) + center
     squared = igl.point_mesh_squared_distance(points, segment.vertices, segment.faces)[0]
     mean_arm = float(np.linalg.norm(np.cross(arm, axis), axis=1).mean())
-    off: np.ndarray = np.sqrt(squared.reshape(len(ANGLES), -1).mean(axis=1)) / mean_arm
-    return off
+    return np.asarray(np.sqrt(squared.reshape(len(ANGLES), -1).mean(axis=1)) / mean_arm)
 
 
 def plausibility(
@@ -283,9 +272,8 @@ def plausibility(
 ) -> Float[np.ndarray, " a"]:
     """``Symmetry.plausible`` against that neighbour of a segment against which it turns most; 1 for all without any.
 
-    It counts pairs of states in which the segment leans alike against the neighbour (.2 rad), so that the turn is a
-    freedom of its own: a rope that bends twists too, but never by itself. ``rotation`` is that of each segment in some
-    states, from rest.
+    It counts pairs of states in which the segment leans alike against the neighbour (.2 rad): a rope that bends twists
+    too, but never by itself. ``rotation`` is that of each segment in some states, from rest.
     """
     plausible = np.zeros(len(angles)) if neighbors else np.ones(len(angles))
     for other in neighbors:
@@ -310,8 +298,7 @@ def left_open(
 ) -> Float32[np.ndarray, "m 3 e"]:
     """Motion of each material point with e independent standard normal numbers, of the second moments of its turns.
 
-    ``observed_samples`` are in the frame of the registered material, ``sigma`` is the cloud's, ``total_weight`` how
-    many independent points all observed samples are worth.
+    ``observed_samples`` are in the frame of the registered material, together worth ``total_weight`` points.
     """
     turns = find_symmetries(model)
     motion = np.zeros((len(material), 3, 2 * len(turns)), dtype=np.float32)
@@ -322,12 +309,8 @@ def left_open(
     segments = model.mesh(material).segments
     for number, turn in enumerate(turns):
         rows, center, axis = turn.posed(model, material)
-        seen = observed_samples[owner == turn.label]
-        worse = (
-            _worse(segments[turn.label - 1], turn.angles, seen, center, axis, sigma)
-            * total_weight
-            / len(observed_samples)
-        )
+        seen, segment = observed_samples[owner == turn.label], segments[turn.label - 1]
+        worse = _worse(segment, turn.angles, seen, center, axis, sigma) * total_weight / len(observed_samples)
         weight = np.append(turn.plausible * np.exp(-0.5 * COUNTED * np.maximum(worse, 0.0)), 1.0)
         angle = np.append(turn.angles, 0.0)
         steps = np.stack([np.sin(angle), 1.0 - np.cos(angle)])
@@ -354,5 +337,4 @@ def _worse(
     points = ((seen - center) @ back.transpose(0, 2, 1)).reshape(-1, 3) + center
     squared = igl.point_mesh_squared_distance(points, segment.vertices, segment.faces)[0]
     loss = robust_square(np.sqrt(squared), sigma).reshape(len(back), -1).sum(axis=1)
-    worse: np.ndarray = loss[1:] - loss[0]
-    return worse
+    return np.asarray(loss[1:] - loss[0])

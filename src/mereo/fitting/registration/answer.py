@@ -38,9 +38,7 @@ class Candidate:
 
     Attributes:
         encoded: these points, and what the network made of them.
-        modes: the fit; None where none was wanted or none was found.
-        error: why none was found.
-        located_by: who found the object there.
+        modes: the fit; None where none was wanted, or none was found for ``error``.
     """
 
     encoded: EncodedFrame
@@ -169,11 +167,52 @@ class Answer:
             raise ValueError(self.recognition.reason)
         with stage("extract surfaces and labels"):
             if self.taken and self.registration is not None:
-                return registered_reconstruction(
-                    self.encoded, self.registration, self.model, self.resolution, self.label_points
-                )
+                return self._registered_reconstruction(self.registration)
             assert self.likelier is not None and self.model is not None  # else the registration is taken
             return extract(self.likelier, self.model, self.resolution, self.label_points)
+
+    def _registered_reconstruction(self, registration: Registration) -> Reconstruction:
+        """Make the reconstruction that is the registered model itself.
+
+        Confidence stays the network's: its mean probability of a segment over the voxels that the registration gives
+        it; NaN without a network.
+        """
+        seen, model = self.encoded, self.model
+        seconds = {**seen.timings_s, "fit": registration.seconds}
+        mesh = registration.mesh
+        with timed(seconds, "label"):
+            low, high = mesh.bounds
+            spacing = float((high - low).max()) / self.resolution
+            counts = np.ceil((high - low) / spacing).astype(int) + 3  # with one empty voxel around
+            check_nodes(self.resolution, *counts.tolist())
+            origin = (low + high - (counts - 1) * spacing) / 2
+            labels = label_grid(mesh, *(origin[axis] + np.arange(counts[axis]) * spacing for axis in range(3)))
+            grid = LabelGrid(labels, origin, np.full(3, spacing), mesh.names)
+        with timed(seconds, "measure"):
+            segments = measure(Extraction(mesh, grid, 0), model, seen.code)
+        observed = None
+        if self.label_points:
+            with timed(seconds, "points"):
+                points = seen.seen.points
+                owner, unknown = nearest_labels(registration.solids, points), np.full(len(points), np.nan)
+                observed = SegmentedCloud(seen.points, owner, unknown, unknown, mesh.names, mesh.colors)
+                if model is not None and seen.code is not None:
+                    logits = model.logits(seen.code, points)
+                    observed = segment_points(logits, seen.points, model.names, model.colors, model.calibration, owner)
+        result = Reconstruction(
+            surfaces=mesh,
+            labels=grid,
+            segments=segments,
+            timings_s=seconds,
+            evaluated=0,
+            clipped=False,
+            code=seen.code,
+            T_camera_input=seen.T_camera_input,
+            reading=seen.reading,
+            observed=observed,
+            calibrated=model is not None and model.calibrates,
+        )
+        return result if seen.axes == "camera" else turned_back(result)
 
     @cached_property
     def surfaces(self) -> SegmentedMesh:
@@ -186,66 +225,3 @@ class Answer:
         if self.candidate is not None and (self.model is None or self.candidate.encoded.code is not None):
             return self.candidate.encoded
         return encode_frame(self.hypothesis, self.model, self.seen.frame.axes)
-
-
-# --- surfaces ---------------------------------------------------------------------------------------------------------
-
-
-def registered_reconstruction(
-    seen: EncodedFrame,
-    registration: Registration,
-    model: Trained | None,
-    resolution: int = 128,
-    label_points: bool = False,
-) -> Reconstruction:
-    """Make the reconstruction that is the registered model itself, in the input's frame.
-
-    Confidence stays the network's: its mean probability of a segment over the voxels that the registration gives it;
-    NaN without a network.
-    """
-    seconds = {**seen.timings_s, "fit": registration.seconds}
-    mesh = registration.mesh
-    with timed(seconds, "label"):
-        grid = _label_grid(mesh, resolution)
-    with timed(seconds, "measure"):
-        segments = measure(Extraction(mesh, grid, 0), model, seen.code)
-    observed = None
-    if label_points:
-        with timed(seconds, "points"):
-            observed = _observed(seen, registration, model)
-    result = Reconstruction(
-        surfaces=mesh,
-        labels=grid,
-        segments=segments,
-        timings_s=seconds,
-        evaluated=0,
-        clipped=False,
-        code=seen.code,
-        T_camera_input=seen.T_camera_input,
-        reading=seen.reading,
-        observed=observed,
-        calibrated=model is not None and model.calibrates,
-    )
-    return result if seen.axes == "camera" else turned_back(result)
-
-
-def _label_grid(mesh: SegmentedMesh, resolution: int) -> LabelGrid:
-    """Labels of a mesh on a grid of so many cells along its longest side, with one empty voxel around it."""
-    low, high = mesh.bounds
-    spacing = float((high - low).max()) / resolution
-    counts = np.ceil((high - low) / spacing).astype(int) + 3
-    check_nodes(resolution, *counts.tolist())
-    origin = (low + high - (counts - 1) * spacing) / 2
-    labels = label_grid(mesh, *(origin[axis] + np.arange(counts[axis]) * spacing for axis in range(3)))
-    return LabelGrid(labels, origin, np.full(3, spacing), mesh.names)
-
-
-def _observed(seen: EncodedFrame, registration: Registration, model: Trained | None) -> SegmentedCloud:
-    """Segment of each observed point by the registration, with a network's probabilities of it, or NaN."""
-    points = seen.seen.points
-    labels = nearest_labels(registration.solids, points)
-    if model is None or seen.code is None:
-        rest, unknown = registration.mesh, np.full(len(points), np.nan)
-        return SegmentedCloud(seen.points, labels, unknown, unknown, rest.names, rest.colors)
-    logits = model.logits(seen.code, points)
-    return segment_points(logits, seen.points, model.names, model.colors, model.calibration, labels)

@@ -1,11 +1,9 @@
 """Carry what is defined in the rest model to where the object is, its inside included.
 
 Attachment -place-> Placed (rest model, scene units) -carry-> Carried (frame and unit of a registration)
-
-Volumes are resampled by ``resampled``.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -19,261 +17,14 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids, label_grid
 from mereo.geometry.subdivision import split_long_edges
 from mereo.geometry.transforms import best_rotations, transform_points
-from mereo.io.attachments import Attachment, Content, Placeable, Surfaces
+from mereo.io.attachments import Attachment, Content, Surfaces
 from mereo.io.bounds import check_value
 from mereo.io.config import CarryFrame
 from mereo.io.volume_files import Volume, is_labels
-from mereo.scenes.scene import SourceFrame
 from mereo.scenes.statistical_model import StatisticalModel
 
-# --- volumes ----------------------------------------------------------------------------------------------------------
-
-# output voxel -to_rest-> rest model, scene units -T_index_scene-> voxel index of the source -interpolation-> value
-#
-# ``Registration.to_rest`` takes a minute for a million points, so it is called at the corners of cells of 4 voxels,
-# then of 2, and linearly interpolated in those at whose centre that is right; in all others it is called everywhere.
-
-Interpolation = Literal["auto", "linear", "nearest"]
-"""Linear for intensities, nearest for labels; "auto" tells them apart (``is_labels``)."""
-
-MARGIN = 0.05
-"""Width of what is carried around the object, of half the rest box's longest side."""
-
-CELLS = (4, 2)
-"""Voxels along the sides of the cells in which rest positions are interpolated, one after the other."""
-
-TOLERANCE = 0.04
-"""Voxels of the source by which that may be off at a cell's centre. Elsewhere in it, where the nearest material points
-change, it is up to twice as much: inside the object less than 0.1."""
-
-QUERIES_AT_ONCE = 2000
-"""Points in one call of ``to_rest``: of more its weights leave the cache, and it takes twice as long."""
-
-CELLS_AT_ONCE = 1024
-POINTS_AT_ONCE = 500_000
-
-CUBE = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
-
-
-@dataclass(frozen=True, eq=False)
-class Resampled:
-    """Volume where a registered object is.
-
-    Attributes:
-        volume: in the registration's frame and unit.
-        inside: number of its voxels that lie inside a segment.
-        within: how many of these were within the source's voxels at rest; the others have the background's value.
-        interpolation: which was used.
-    """
-
-    volume: Volume
-    inside: int
-    within: int
-    interpolation: Interpolation
-
-
-def resampled(
-    source: Volume, registration: Registration, interpolation: Interpolation = "auto", most: int = 16_000_000
-) -> Resampled:
-    """Resample a volume that was defined in the rest model on a grid around the registered object.
-
-    Voxels inside the object have the source's value where they were at rest, and so have those around it, up to
-    ``MARGIN``, as if they moved along with the nearest segment. All others have the source's least value, in its own
-    meaning (after its slope and intercept).
-
-    Args:
-        source: its ``T_world_index`` leads to scene units of the rest model.
-        registration: of the object.
-        interpolation: "linear", "nearest", or "auto": nearest for labels, linear for all else.
-        most: voxels of the grid; its spacing is the source's finest, widened where the grid would have more.
-    """
-    margin = MARGIN * registration.model.half * registration.scene_unit
-    grid = _Grid.around(registration.mesh.bounds, margin, float(source.spacing.min()) * registration.scene_unit, most)
-    owner, inside = grid.owners(registration.solids, margin)
-    if interpolation == "auto":
-        interpolation = "nearest" if is_labels(source) else "linear"
-    background = (source.values.max() if source.slope < 0 else source.values.min()).item()
-    values = np.full(grid.shape, background, dtype=source.values.dtype)
-    fill = _Fill(source, interpolation, background, grid, registration, values, inside)
-    within = sum(fill.segment(label, owner == label) for label in range(1, len(registration.mesh.segments) + 1))
-    volume = replace(source, values=values, T_world_index=grid.T_world_index)
-    return Resampled(volume, int(inside.sum()), within, interpolation)
-
-
-def check_overlap(
-    name: str, volume: Volume, T_scene_file: Float[np.ndarray, "4 4"], model: StatisticalModel, solids: Solids
-) -> None:
-    """Raise ``ValueError`` for a volume, in scene units, without any voxel in the object."""
-    if volume.holds(volume.index_of(model.rest_points)).any():
-        return
-    ticks = [np.linspace(-0.5, n - 0.5, 24) for n in volume.values.shape]
-    sample = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
-    if solids.label(transform_points(volume.T_world_index, sample)).any():
-        return
-    volume_extent, object_extent = (
-        " to ".join(str(corner.round(2).tolist()) for corner in _box(np.linalg.inv(T_scene_file), bounds))
-        for bounds in (volume.bounds, model.rest.bounds)
-    )
-    raise ValueError(
-        f"{name} holds nothing of the object: in RAS its voxels lie from {volume_extent}, and the object's own files "
-        f"from {object_extent}; both must have one frame and unit: export the volume in that of the object's own "
-        "files, or say --carry-frame scene if it is in scene units"
-    )
-
-
-def _box(T: Float[np.ndarray, "4 4"], bounds: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "2 3"]:
-    """Axis-aligned box around a transformed box."""
-    corners = transform_points(T, np.stack(np.meshgrid(*bounds.T, indexing="ij"), axis=-1).reshape(-1, 3))
-    return np.stack([corners.min(axis=0), corners.max(axis=0)])
-
-
-@dataclass(frozen=True, eq=False)
-class _Grid:
-    """Axis-aligned grid, whose sides are multiples of the largest cell's.
-
-    Attributes:
-        shape: voxels along each axis.
-        origin: centre of voxel [0, 0, 0].
-        spacing: between voxel centres.
-    """
-
-    shape: tuple[int, int, int]
-    origin: Float[np.ndarray, "3"]
-    spacing: float
-
-    @classmethod
-    def around(cls, bounds: Float[np.ndarray, "2 3"], margin: float, spacing: float, most: int) -> "_Grid":
-        """Grid over a box and a margin, with at most so many voxels."""
-        size, cell = bounds[1] - bounds[0] + 2 * margin, CELLS[0]
-        while True:
-            cells = np.maximum(np.ceil(size / (cell * spacing)).astype(np.int64), 1)
-            if (count := int(cells.prod()) * cell**3) <= max(most, cell**3):
-                break
-            spacing *= max((count / most) ** (1 / 3), 1.01)
-        shape = (cell * int(cells[0]), cell * int(cells[1]), cell * int(cells[2]))
-        return cls(shape, bounds.mean(axis=0) - (np.array(shape) - 1) * spacing / 2, spacing)
-
-    @property
-    def T_world_index(self) -> Float[np.ndarray, "4 4"]:
-        """From voxel indices to positions."""
-        transform = np.diag([*[self.spacing] * 3, 1.0])
-        transform[:3, 3] = self.origin
-        return transform
-
-    def at(self, index: np.ndarray) -> Float[np.ndarray, "*n 3"]:
-        """Positions of voxel indices, which may have fractions."""
-        return self.origin + self.spacing * index
-
-    def at_rows(self, rows: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-        """Positions of voxels by their rows in the flattened grid."""
-        return self.at(np.stack(np.unravel_index(rows, self.shape), axis=1))
-
-    def owners(self, solids: Solids, margin: float) -> tuple[UInt8[np.ndarray, "x y z"], Bool[np.ndarray, "x y z"]]:
-        """Label of the segment that each voxel moves along with, 0 beyond the margin, and whether it is inside it."""
-        x, y, z = (self.origin[axis] + self.spacing * np.arange(self.shape[axis]) for axis in range(3))
-        owner = label_grid(solids.mesh, x, y, z)
-        inside = owner > 0
-        side = CELLS[0]
-        cells = np.argwhere(np.ones([n // side for n in self.shape], dtype=bool))
-        reach = margin + np.sqrt(3) / 2 * side * self.spacing
-        near = cells[solids.nearest(self.at(side * cells + (side - 1) / 2)).distance <= reach]
-        rows = _flat(side * near[:, None] + _offsets(side), self.shape).ravel()
-        rows = rows[owner.ravel()[rows] == 0]
-        for first in range(0, len(rows), POINTS_AT_ONCE):
-            part = rows[first : first + POINTS_AT_ONCE]
-            nearest = solids.nearest(self.at_rows(part))
-            owner.reshape(-1)[part] = np.where(nearest.distance <= margin, nearest.owner + 1, 0)
-        return owner, inside
-
-
-@dataclass(frozen=True, eq=False)
-class _Fill:
-    """Fills the voxels of a grid around the registered object with the values of a source.
-
-    Attributes:
-        source, interpolation, background: what is resampled, how, and the value outside its voxels.
-        grid, registration: where the voxels are, and where the object is.
-        values: of the voxels, filled in place.
-        inside: which of them lie in a segment.
-    """
-
-    source: Volume
-    interpolation: Interpolation
-    background: float | int
-    grid: _Grid
-    registration: Registration
-    values: Shaped[np.ndarray, "x y z"]
-    inside: Bool[np.ndarray, "x y z"]
-
-    def segment(self, label: int, todo: Bool[np.ndarray, "x y z"]) -> int:
-        """Fill one segment's voxels, ``todo``; returns how many of them inside the object were within the source."""
-        open_, within, shape = todo.reshape(-1), 0, self.grid.shape
-        for side in CELLS:
-            cells = np.argwhere(todo.reshape([part for n in shape for part in (n // side, side)]).any(axis=(1, 3, 5)))
-            corners, right = self._corners(cells, side, label)
-            share = _offsets(side)[:, None] / side
-            weights = np.where(CUBE, share, 1 - share).prod(axis=2)  # trilinear
-            cells, corners = cells[right], corners[right]
-            for first in range(0, len(cells), CELLS_AT_ONCE):
-                part = slice(first, first + CELLS_AT_ONCE)
-                rows = _flat(side * cells[part, None] + _offsets(side), shape)
-                wanted = open_[rows]
-                within += self._put(rows[wanted], (weights @ corners[part])[wanted], open_)
-        left = np.flatnonzero(open_)
-        for first in range(0, len(left), POINTS_AT_ONCE):
-            rows = left[first : first + POINTS_AT_ONCE]
-            index = _source_index(self.grid.at_rows(rows), label, self.registration, self.source)
-            within += self._put(rows, index, open_)
-        return within
-
-    def _put(self, rows: Int[np.ndarray, " n"], index: Float[np.ndarray, "n 3"], open_: Bool[np.ndarray, " v"]) -> int:
-        """Fill voxels with the source's values at indices with fractions, and close them."""
-        source, held = self.source.values, self.source.holds(index)
-        if self.interpolation == "nearest":
-            nearest = np.clip(np.rint(index).astype(np.int64), 0, np.array(source.shape) - 1)
-            sampled = source[tuple(nearest.T)]
-        else:
-            smooth = map_coordinates(source, index.T, order=1, mode="nearest", output=np.float64)
-            sampled = (np.rint(smooth) if source.dtype.kind in "iu" else smooth).astype(source.dtype)
-        sampled[~held] = self.background
-        self.values.reshape(-1)[rows] = sampled
-        open_[rows] = False
-        return int((held & self.inside.reshape(-1)[rows]).sum())
-
-    def _corners(
-        self, cells: Int[np.ndarray, "n 3"], side: int, label: int
-    ) -> tuple[Float[np.ndarray, "n 8 3"], Bool[np.ndarray, " n"]]:
-        """Indices in the source of cells' corners, and whether they may be interpolated, by the cells' centres."""
-        shape = [n // side + 1 for n in self.grid.shape]
-        nodes, row = np.unique(_flat(cells[:, None] + CUBE, shape), return_inverse=True)
-        at_nodes = side * np.stack(np.unravel_index(nodes, shape), axis=1)
-        corners = _source_index(self.grid.at(at_nodes), label, self.registration, self.source)[row.reshape(-1, 8)]
-        centers = _source_index(self.grid.at(side * (cells + 0.5)), label, self.registration, self.source)
-        return corners, np.linalg.norm(corners.mean(axis=1) - centers, axis=1) <= TOLERANCE
-
-
-def _source_index(
-    points: Float[np.ndarray, "n 3"], label: int, registration: Registration, source: Volume
-) -> Float[np.ndarray, "n 3"]:
-    """Voxel indices, with fractions, of where points that move along with a segment were at rest."""
-    rest = np.empty_like(points)
-    for first in range(0, len(points), QUERIES_AT_ONCE):
-        part = points[first : first + QUERIES_AT_ONCE]
-        rest[first : first + QUERIES_AT_ONCE] = registration.to_rest(part, np.full(len(part), label, dtype=np.uint8))
-    return source.index_of(rest)
-
-
-def _offsets(side: int) -> Int[np.ndarray, "v 3"]:
-    """Voxels of a cell, from its first."""
-    return np.argwhere(np.ones((side, side, side), dtype=bool))
-
-
-def _flat(index: Int[np.ndarray, "*n 3"], shape: Sequence[int]) -> Int[np.ndarray, "*n"]:
-    """Rows in the flattened array."""
-    return np.ravel_multi_index(tuple(np.moveaxis(index, -1, 0)), tuple(shape))
-
-
-# --- carry ------------------------------------------------------------------------------------------------------------
+Interpolation = Literal["linear", "nearest"]
+"""Linear for intensities, nearest for labels (``is_labels``)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,8 +51,9 @@ class Carried:
     Attributes:
         name: of its file.
         content: in the registration's frame and unit.
-        inside: number of its points that lie inside a segment.
-        farthest: largest distance of a point from the nearest segment at rest, in the registration's unit.
+        inside: number of its points, or of a volume's voxels, that lie inside a segment.
+        farthest: largest distance of a point from the nearest segment at rest; of a volume, width of what is carried
+            around the object; in the registration's unit.
     """
 
     name: str
@@ -310,20 +62,18 @@ class Carried:
     farthest: float
 
     @property
-    def count(self) -> int:
-        """Number of its points; of a volume, of its voxels."""
-        return self.content.values.size if isinstance(self.content, Volume) else len(self.content.points)
-
-    @property
     def description(self) -> str:
         """Phrase on what was carried."""
-        outside = self.count - self.inside
-        away = f"{outside} of them outside, up to {self.farthest:.4g} away" if outside else "all inside"
-        return f"carried {self.name}: {self.count} points, {away}"
+        assert not isinstance(self.content, Volume)
+        count = len(self.content.points)
+        away = f"{count - self.inside} of them outside, up to {self.farthest:.4g} away"
+        return f"carried {self.name}: {count} points, {away if count > self.inside else 'all inside'}"
 
     def facts(self) -> dict[str, object]:
         """Facts for a result's summary."""
-        return {"file": self.name, "points": self.count, "inside": self.inside, "farthest": self.farthest}
+        assert not isinstance(self.content, Volume)
+        points = len(self.content.points)
+        return {"file": self.name, "points": points, "inside": self.inside, "farthest": self.farthest}
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,10 +82,7 @@ class CarriedVolume(Carried):
 
     Attributes:
         content: the volume.
-        inside: number of its voxels that lie inside a segment.
-        farthest: width of what is carried around the object, in the registration's unit.
-        within: how many of the voxels inside were within the file's voxels at rest.
-        interpolation: "linear" or "nearest".
+        within: how many of the voxels inside were within the file's voxels at rest; the others have the background.
     """
 
     content: Volume
@@ -376,21 +123,102 @@ def place(attachments: Sequence[Attachment], registrar: Registrar, frame: CarryF
     to the object: most of its points are farther from it than it is long, or none of its voxels is in it.
     """
     check_value("files", frame, CarryFrame, "source")
-    T_scene_file = np.eye(4) if frame == "scene" else _source_frame(registrar).T_scene_source
+    T_scene_file = np.eye(4)
+    if frame == "source":
+        source = registrar.model.source_frame
+        if source is None and registrar.given is not None:
+            source = registrar.given.source_frame
+        if source is None:
+            raise ValueError(
+                f"the weights of {', '.join(registrar.model.rest.names)} do not say how the object's own files lie in "
+                "the scene: name the object's scene file with --scene, or carry files in scene units with "
+                "--carry-frame scene"
+            )
+        T_scene_file = source.T_scene_source
     solids = Solids(registrar.model.rest)
     return tuple(_placed(attachment, T_scene_file, registrar.model, solids) for attachment in attachments)
 
 
-def carry(placed: Placed, registration: Registration, interpolation: Interpolation = "auto") -> Carried:
+def _placed(
+    attachment: Attachment, T_scene_file: Float[np.ndarray, "4 4"], model: StatisticalModel, solids: Solids
+) -> Placed:
+    name, content, size = attachment.name, attachment.content, 2 * model.half
+    if isinstance(content, Volume):
+        volume = replace(content, T_world_index=T_scene_file @ content.T_world_index)
+        check_overlap(name, volume, T_scene_file, model, solids)
+        return Placed(name, volume, np.zeros((0, solids.count)), np.zeros(0))
+    turn = T_scene_file[:3, :3] / np.cbrt(np.linalg.det(T_scene_file[:3, :3]))  # orientations are not scaled
+    rotations = None if content.rotations is None else turn @ content.rotations
+    content = content.at(transform_points(T_scene_file, content.points), rotations)
+    shares, distance = _shares(solids, content.points)
+    far = int((distance > size).sum())
+    if far > len(distance) / 2:
+        raise ValueError(
+            f"{far} of {len(distance)} points of {name} are farther from the object than it is long (in the middle "
+            f"{np.median(distance):.4g} scene units, and it has {size:.4g}); it must lie in or near the object: "
+            "bring it to the frame and unit of the object's own files, or say --carry-frame scene if it is in scene "
+            "units"
+        )
+    if isinstance(content, Surfaces):  # with longer edges a plane could not bend
+        parts = content.mesh.segments
+        short = (split_long_edges(part.vertices, part.faces, 0.05 * model.half, 2_000_000) for part in parts)
+        parts = tuple(replace(part, vertices=v, faces=f) for part, (v, f) in zip(parts, short, strict=True))
+        content = Surfaces(SegmentedMesh(parts))
+        shares, distance = _shares(solids, content.points)
+    return Placed(name, content, shares, distance)
+
+
+def check_overlap(
+    name: str, volume: Volume, T_scene_file: Float[np.ndarray, "4 4"], model: StatisticalModel, solids: Solids
+) -> None:
+    """Raise ``ValueError`` for a volume, in scene units, without any voxel in the object."""
+    if volume.holds(volume.index_of(model.rest_points)).any():
+        return
+    ticks = [np.linspace(-0.5, n - 0.5, 24) for n in volume.values.shape]
+    sample = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+    if solids.label(transform_points(volume.T_world_index, sample)).any():
+        return
+    boxes = []
+    for bounds in (volume.bounds, model.rest.bounds):
+        corners = np.stack(np.meshgrid(*bounds.T, indexing="ij"), axis=-1).reshape(-1, 3)
+        corners = transform_points(np.linalg.inv(T_scene_file), corners)
+        boxes.append(
+            " to ".join(str(corner.round(2).tolist()) for corner in (corners.min(axis=0), corners.max(axis=0)))
+        )
+    raise ValueError(
+        f"{name} holds nothing of the object: in RAS its voxels lie from {boxes[0]}, and the object's own files "
+        f"from {boxes[1]}; both must have one frame and unit: export the volume in that of the object's own "
+        "files, or say --carry-frame scene if it is in scene units"
+    )
+
+
+def _shares(
+    solids: Solids, points: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n s"], Float[np.ndarray, " n"]]:
+    """Share of each segment in the motion of points, and their distance from the nearest segment, 0 inside.
+
+    Outside the share falls with the fourth power of the distance, so that a surface does not tear where another
+    segment comes nearer.
+    """
+    labels, away = solids.label(points), np.zeros(len(points))
+    shares = np.eye(solids.count)[np.maximum(labels, 1) - 1]
+    outside = np.flatnonzero(labels == 0)
+    if len(outside):
+        distance = np.stack([solids.segment_distance(i, points[outside]) for i in range(solids.count)], axis=1)
+        away[outside] = distance.min(axis=1)
+        closeness = (np.maximum(away[outside, None], 1e-6) / np.maximum(distance, 1e-6)) ** 4
+        shares[outside] = np.maximum(closeness - 1e-3, 0.0)
+    return shares / shares.sum(axis=1, keepdims=True), away
+
+
+def carry(placed: Placed, registration: Registration) -> Carried:
     """Carry an attachment to where the registered object is: points move along with their segments, poses turn so too.
 
-    A volume is resampled around the object, with this interpolation (``resampled``).
+    A volume is resampled around the object (``resampled``).
     """
     content = placed.content
     if isinstance(content, Volume):
-        result, margin = resampled(content, registration, interpolation), MARGIN * registration.model.half
-        farthest = margin * registration.scene_unit
-        return CarriedVolume(placed.name, result.volume, result.inside, farthest, result.within, result.interpolation)
+        return resampled(content, registration, placed.name)
     points = moved(registration, content.points, placed.shares)
     rotations = None
     if content.rotations is not None:
@@ -424,74 +252,177 @@ def local_rotations(
     return best_rotations(np.stack(columns, axis=1))  # rows are the Jacobian's columns: its transpose
 
 
-def _source_frame(registrar: Registrar) -> SourceFrame:
-    frame = registrar.model.source_frame
-    if frame is None and registrar.given is not None:
-        frame = registrar.given.source_frame
-    if frame is None:
-        raise ValueError(
-            f"the weights of {', '.join(registrar.model.rest.names)} do not say how the object's own files lie in the "
-            "scene: name the object's scene file with --scene, or carry files in scene units with --carry-frame scene"
-        )
-    return frame
+# --- volumes ----------------------------------------------------------------------------------------------------------
+
+# output voxel -to_rest-> rest model, scene units -T_index_scene-> voxel index of the source -interpolation-> value
+#
+# ``Registration.to_rest`` takes a minute for a million points, so it is called at the corners of cells of 4 voxels,
+# then of 2, and linearly interpolated in those at whose centre that is right; in all others it is called everywhere.
+
+MARGIN = 0.05
+"""Width of what is carried around the object, of half the rest box's longest side."""
+
+CELLS = (4, 2)
+"""Voxels along the sides of the cells in which rest positions are interpolated, one after the other."""
+
+TOLERANCE = 0.04
+"""Voxels of the source by which that may be off at a cell's centre. Elsewhere in it, where the nearest material points
+change, it is up to twice as much: inside the object less than 0.1."""
+
+QUERIES_AT_ONCE = 2000
+"""Points in one call of ``to_rest``: of more its weights leave the cache, and it takes twice as long."""
+
+CELLS_AT_ONCE, POINTS_AT_ONCE = 1024, 500_000
+
+CUBE = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
 
 
-def _placed(
-    attachment: Attachment, T_scene_file: Float[np.ndarray, "4 4"], model: StatisticalModel, solids: Solids
-) -> Placed:
-    if isinstance(attachment.content, Volume):
-        volume = attachment.content
-        inside = replace(volume, T_world_index=T_scene_file @ volume.T_world_index)
-        check_overlap(attachment.name, inside, T_scene_file, model, solids)
-        return Placed(attachment.name, inside, np.zeros((0, solids.count)), np.zeros(0))
-    content = _transformed(attachment.content, T_scene_file)
-    _check_near(attachment.name, _shares(solids, content.points)[1], 2 * model.half)
-    if isinstance(content, Surfaces):
-        content = _bendable(content, 0.05 * model.half)  # with longer edges a plane could not bend
-    return Placed(attachment.name, content, *_shares(solids, content.points))
+def resampled(source: Volume, registration: Registration, name: str = "", most: int = 16_000_000) -> CarriedVolume:
+    """Resample a volume that was defined in the rest model on a grid around the registered object.
 
+    Voxels inside the object have the source's value where they were at rest, and so have those around it, up to
+    ``MARGIN``, as if they moved along with the nearest segment. All others have the source's least value, in its own
+    meaning (after its slope and intercept).
 
-def _transformed(content: Placeable, T: Float[np.ndarray, "4 4"]) -> Placeable:
-    """Transform content by a similarity, which turns orientations and does not scale them."""
-    turn = T[:3, :3] / np.cbrt(np.linalg.det(T[:3, :3]))
-    rotations = None if content.rotations is None else turn @ content.rotations
-    return content.at(transform_points(T, content.points), rotations)
-
-
-def _shares(
-    solids: Solids, points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "n s"], Float[np.ndarray, " n"]]:
-    """Share of each segment in the motion of points, and their distance from the nearest segment, 0 inside.
-
-    Outside the share falls with the fourth power of the distance, so that a surface does not tear where another
-    segment comes nearer.
+    Args:
+        source: its ``T_world_index`` leads to scene units of the rest model.
+        registration: of the object.
+        name: of the volume's file.
+        most: voxels of the grid; its spacing is the source's finest, widened where the grid would have more.
     """
-    labels, away = solids.label(points), np.zeros(len(points))
-    shares = np.eye(solids.count)[np.maximum(labels, 1) - 1]
-    outside = np.flatnonzero(labels == 0)
-    if len(outside):
-        distance = np.stack([solids.segment_distance(i, points[outside]) for i in range(solids.count)], axis=1)
-        away[outside] = distance.min(axis=1)
-        closeness = (np.maximum(away[outside, None], 1e-6) / np.maximum(distance, 1e-6)) ** 4
-        shares[outside] = np.maximum(closeness - 1e-3, 0.0)
-    return shares / shares.sum(axis=1, keepdims=True), away
+    interpolation: Interpolation = "nearest" if is_labels(source) else "linear"
+    fill = _Fill.around(source, registration, interpolation, most)
+    owner, inside = fill.owners()
+    within = sum(fill.segment(label, owner == label, inside) for label in range(1, fill.registration.solids.count + 1))
+    transform = np.diag([*[fill.spacing] * 3, 1.0])
+    transform[:3, 3] = fill.origin
+    volume = replace(source, values=fill.values, T_world_index=transform)
+    return CarriedVolume(name, volume, int(inside.sum()), fill.margin, within, interpolation)
 
 
-def _check_near(name: str, distance: Float[np.ndarray, " n"], size: float) -> None:
-    far = int((distance > size).sum())
-    if far > len(distance) / 2:
-        raise ValueError(
-            f"{far} of {len(distance)} points of {name} are farther from the object than it is long (in the middle "
-            f"{np.median(distance):.4g} scene units, and it has {size:.4g}); it must lie in or near the object: "
-            "bring it to the frame and unit of the object's own files, or say --carry-frame scene if it is in scene "
-            "units"
-        )
+@dataclass(frozen=True, eq=False)
+class _Fill:
+    """Axis-aligned grid around a registered object, which is filled with the values of a source.
+
+    Attributes:
+        source, registration, interpolation: what is resampled, where the object is, and how.
+        margin: what is filled around the object.
+        origin, spacing: centre of voxel [0, 0, 0], and distance between centres.
+        background: value outside the source's voxels.
+        values: of the voxels, filled in place; the sides are multiples of the largest cell's.
+    """
+
+    source: Volume
+    registration: Registration
+    interpolation: Interpolation
+    margin: float
+    origin: Float[np.ndarray, "3"]
+    spacing: float
+    background: float | int
+    values: Shaped[np.ndarray, "x y z"]
+
+    @classmethod
+    def around(cls, source: Volume, registration: Registration, interpolation: Interpolation, most: int) -> "_Fill":
+        """Grid over the object and the margin, with at most so many voxels, all of them background."""
+        margin = MARGIN * registration.model.half * registration.scene_unit
+        spacing, bounds = float(source.spacing.min()) * registration.scene_unit, registration.mesh.bounds
+        size, cell = bounds[1] - bounds[0] + 2 * margin, CELLS[0]
+        while True:
+            cells = np.maximum(np.ceil(size / (cell * spacing)).astype(np.int64), 1)
+            if (count := int(cells.prod()) * cell**3) <= max(most, cell**3):
+                break
+            spacing *= max((count / most) ** (1 / 3), 1.01)
+        origin = bounds.mean(axis=0) - (cell * cells - 1) * spacing / 2
+        background = (source.values.max() if source.slope < 0 else source.values.min()).item()
+        values = np.full(cell * cells, background, dtype=source.values.dtype)
+        return cls(source, registration, interpolation, margin, origin, spacing, background, values)
+
+    def at(self, index: Shaped[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Positions of voxel indices, which may have fractions."""
+        return self.origin + self.spacing * index
+
+    def at_rows(self, rows: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+        """Positions of voxels by their rows in the flattened grid."""
+        return self.at(np.stack(np.unravel_index(rows, self.values.shape), axis=1))
+
+    def owners(self) -> tuple[UInt8[np.ndarray, "x y z"], Bool[np.ndarray, "x y z"]]:
+        """Label of the segment that each voxel moves along with, 0 beyond the margin, and whether it is inside it."""
+        shape, solids = self.values.shape, self.registration.solids
+        x, y, z = (self.origin[axis] + self.spacing * np.arange(shape[axis]) for axis in range(3))
+        owner = label_grid(solids.mesh, x, y, z)
+        inside = owner > 0
+        side = CELLS[0]
+        cells = np.argwhere(np.ones([n // side for n in shape], dtype=bool))
+        reach = self.margin + np.sqrt(3) / 2 * side * self.spacing
+        near = cells[solids.nearest(self.at(side * cells + (side - 1) / 2)).distance <= reach]
+        rows = _flat(side * near[:, None] + _offsets(side), shape).ravel()
+        rows = rows[owner.ravel()[rows] == 0]
+        for part in _parts(len(rows), POINTS_AT_ONCE):
+            nearest = solids.nearest(self.at_rows(rows[part]))
+            owner.reshape(-1)[rows[part]] = np.where(nearest.distance <= self.margin, nearest.owner + 1, 0)
+        return owner, inside
+
+    def segment(self, label: int, todo: Bool[np.ndarray, "x y z"], inside: Bool[np.ndarray, "x y z"]) -> int:
+        """Fill one segment's voxels, ``todo``; returns how many of them inside the object were within the source."""
+        open_, inside_, held, shape = todo.reshape(-1), inside.reshape(-1), 0, self.values.shape
+        for side in CELLS:
+            cells = np.argwhere(todo.reshape([part for n in shape for part in (n // side, side)]).any(axis=(1, 3, 5)))
+            corners, right = self._corners(cells, side, label)
+            share = _offsets(side)[:, None] / side
+            weights = np.where(CUBE, share, 1 - share).prod(axis=2)  # trilinear
+            cells, corners = cells[right], corners[right]
+            for part in _parts(len(cells), CELLS_AT_ONCE):
+                rows = _flat(side * cells[part, None] + _offsets(side), shape)
+                wanted = open_[rows]
+                held += int(inside_[self._put(rows[wanted], (weights @ corners[part])[wanted])].sum())
+                open_[rows] = False
+        left = np.flatnonzero(open_)
+        for part in _parts(len(left), POINTS_AT_ONCE):
+            index = self._source_index(self.at_rows(left[part]), label)
+            held += int(inside_[self._put(left[part], index)].sum())
+        return held
+
+    def _put(self, rows: Int[np.ndarray, " n"], index: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " m"]:
+        """Fill voxels with the source's values at indices with fractions; returns those that it holds."""
+        source, held = self.source.values, self.source.holds(index)
+        if self.interpolation == "nearest":
+            nearest = np.clip(np.rint(index).astype(np.int64), 0, np.array(source.shape) - 1)
+            sampled = source[tuple(nearest.T)]
+        else:
+            smooth = map_coordinates(source, index.T, order=1, mode="nearest", output=np.float64)
+            sampled = (np.rint(smooth) if source.dtype.kind in "iu" else smooth).astype(source.dtype)
+        sampled[~held] = self.background
+        self.values.reshape(-1)[rows] = sampled
+        return rows[held]
+
+    def _corners(
+        self, cells: Int[np.ndarray, "n 3"], side: int, label: int
+    ) -> tuple[Float[np.ndarray, "n 8 3"], Bool[np.ndarray, " n"]]:
+        """Indices in the source of cells' corners, and whether they may be interpolated, by the cells' centres."""
+        shape = [n // side + 1 for n in self.values.shape]
+        nodes, row = np.unique(_flat(cells[:, None] + CUBE, shape), return_inverse=True)
+        at_nodes = side * np.stack(np.unravel_index(nodes, shape), axis=1)
+        corners = self._source_index(self.at(at_nodes), label)[row.reshape(-1, 8)]
+        centers = self._source_index(self.at(side * (cells + 0.5)), label)
+        return corners, np.linalg.norm(corners.mean(axis=1) - centers, axis=1) <= TOLERANCE
+
+    def _source_index(self, points: Float[np.ndarray, "n 3"], label: int) -> Float[np.ndarray, "n 3"]:
+        """Voxel indices, with fractions, of where points that move along with a segment were at rest."""
+        rest, labels = np.empty_like(points), np.full(len(points), label, dtype=np.uint8)
+        for part in _parts(len(points), QUERIES_AT_ONCE):
+            rest[part] = self.registration.to_rest(points[part], labels[part])
+        return self.source.index_of(rest)
 
 
-def _bendable(content: Surfaces, longest: float) -> Surfaces:
-    """Surfaces with edges up to ``longest``."""
-    parts = []
-    for part in content.mesh.segments:
-        vertices, faces = split_long_edges(part.vertices, part.faces, longest, 2_000_000)
-        parts.append(replace(part, vertices=vertices, faces=faces))
-    return Surfaces(SegmentedMesh(tuple(parts)))
+def _parts(count: int, most: int) -> Iterator[slice]:
+    return (slice(first, first + most) for first in range(0, count, most))
+
+
+def _offsets(side: int) -> Int[np.ndarray, "v 3"]:
+    """Voxels of a cell, from its first."""
+    return np.argwhere(np.ones((side, side, side), dtype=bool))
+
+
+def _flat(index: Int[np.ndarray, "*n 3"], shape: Sequence[int]) -> Int[np.ndarray, "*n"]:
+    """Rows in the flattened array."""
+    return np.ravel_multi_index(tuple(np.moveaxis(index, -1, 0)), tuple(shape))

@@ -13,10 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from mereo.fitting.config import ELASTIC, AnswerMethod, FitConfig
-from mereo.fitting.draws.fit import fit_draws
+from mereo.fitting.draws.fit import DrawsFit, DrawsProblem, fit_draws
+from mereo.fitting.draws.fit import narrowing as draws_narrowing
 from mereo.fitting.draws.playback import MOST_DRAWS, STATES_SEED, Drawn, DrawnStates
-from mereo.fitting.draws.problem import DrawsFit, DrawsProblem
-from mereo.fitting.draws.problem import narrowing as draws_narrowing
 from mereo.fitting.modes import (
     PredictCorrespondences,
     ScoredFit,

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, SupportsIndex
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -16,7 +16,7 @@ from mereo.geometry.brief import counted
 from mereo.geometry.conventions import LARGEST, check_real
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids, owned_centroids, signed_distance_and_direction
-from mereo.geometry.transforms import fit_rigid, is_rigid
+from mereo.geometry.transforms import checked_pose, fit_rigid, transform_points
 from mereo.io.bounds import check_value
 from mereo.scenes.statistical_model import StatisticalModel, following
 
@@ -54,10 +54,9 @@ class Located:
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """A state of the object's own deformation model, in the frame of an observed cloud.
+    """A state of the object's statistical model, in the frame of an observed cloud.
 
     Attributes:
-        model: the statistical model: rest mesh and material points.
         material: positions of all material points in the camera frame, input unit.
         method: which description of the states it was found in.
         z: coefficients of the modes (at rest those nearest to it), or standard normal draws of the scene.
@@ -96,12 +95,6 @@ class Registration:
     radius_scale: float | None = None
     extra_radius: float = 0.0
     alike: int = 1
-
-    def __reduce_ex__(self, protocol: SupportsIndex) -> Any:
-        raise TypeError(
-            "a registration cannot be pickled or copied, as it holds search structures of compiled libraries: store "
-            "it with mereo.fitting.registration.state.save_state, or keep its material and mesh"
-        )
 
     def __repr__(self) -> str:
         trust = "" if self.accepted else "not believed, "
@@ -211,10 +204,15 @@ class Registration:
         check_value("at", at, Place, "camera")
         if self.uncertainty is None:
             return None
-        points = rows_of_three(points)
+        return self.uncertainty.of_rest(*self._at_rest(rows_of_three(points), labels, at))
+
+    def _at_rest(
+        self, points: Float[np.ndarray, "n 3"], labels: UInt8[np.ndarray, " n"] | None, at: Place
+    ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, " n"]]:
+        """Rest positions of points, with the segments that they move along with."""
         if labels is None:
             labels = nearest_labels(self.solids if at == "camera" else self.rest_solids, points)
-        return self.uncertainty.of_rest(self.to_rest(points, labels) if at == "camera" else points, labels)
+        return self.to_rest(points, labels) if at == "camera" else points, labels
 
     def explain(self, what: ArrayLike | str, *, at: Place = "camera") -> Explanation | None:
         """What decides where a point of the object is: observed points, the network, or what was known of its states.
@@ -236,28 +234,16 @@ class Registration:
             place = owned_centroids(self.mesh)[names.index(what)]
             decided = self.uncertainty.decided_centroid(names.index(what))
         else:
-            point = rows_of_three(np.asarray(what)[None])
-            label = nearest_labels(self.solids if at == "camera" else self.rest_solids, point)
-            rest = self.to_rest(point, label) if at == "camera" else point
+            rest, label = self._at_rest(rows_of_three(np.asarray(what)[None]), None, at)
             place = self.to_camera(rest, label)[0]
             decided = self.uncertainty.decided_point(rest, label)
-        return Explanation.of(place, decided, self.uncertainty, self._T_registration_fit)
-
-    @cached_property
-    def _T_registration_fit(self) -> Float[np.ndarray, "4 4"]:
-        """From the camera frame of the fit, in the input's unit, to that in which this registration is."""
-        assert self.optimum is not None
-        return fit_rigid(self.optimum.unit * self.optimum.posterior.material, self.material)
+        optimum = self.uncertainty.optimum  # in the camera frame of the fit, which need not be that of the registration
+        T_registration_fit = fit_rigid(optimum.unit * optimum.posterior.material, self.material)
+        return Explanation.of(place, decided, self.uncertainty, T_registration_fit)
 
     def moved(self, T_new_camera: Float[np.ndarray, "4 4"]) -> "Registration":
         """Registration in another frame; raises ``ValueError`` for a transform that is not rigid."""
-        check_real(T_new_camera, "the transform")
-        if not is_rigid(T_new_camera):
-            raise ValueError(
-                f"the transform is {T_new_camera.tolist()}; it must be rigid, a rotation and a translation, with "
-                "0 0 0 1 below: scale or shear the mesh instead"
-            )
-        return replace(self, material=self.material @ T_new_camera[:3, :3].T + T_new_camera[:3, 3])
+        return replace(self, material=transform_points(checked_pose(T_new_camera), self.material))
 
     @cached_property
     def _moved_anchors(self) -> tuple[Anchors, ...]:

@@ -15,7 +15,6 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float, Int
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
-from pydantic_core import ErrorDetails
 
 from mereo.fitting.draws.playback import Drawn, material_moved, shares_of
 from mereo.fitting.problem.problem import ACCEPTED
@@ -25,8 +24,9 @@ from mereo.fitting.registration.registration import BELIEVED, Method, Registrati
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.transforms import fit_rigid, is_rigid, transform_points
 from mereo.io.atomic_files import write_json
+from mereo.io.errors import first_problem
 from mereo.scenes.draw_recorder import SMOOTH
-from mereo.scenes.parameters import Played, draw_names, played_back
+from mereo.scenes.parameters import draw_names, played_back
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES, Scene
 from mereo.scenes.statistical_model import StatisticalModel
@@ -44,12 +44,10 @@ MOST_NUMBERS = 100_000
 WITNESSES = 8
 """Number of material points whose positions are in the file."""
 
-STATE_CURE = "give the state.json of a `mereo reconstruct`"
-
 
 def _rigid(rows: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...]:
     if not is_rigid(np.array(rows)):
-        raise ValueError("it must be a rigid transform: a rotation, a translation, and 0 0 0 1 below")
+        raise ValueError("must be a rigid transform: a rotation, a translation, and 0 0 0 1 below")
     return rows
 
 
@@ -69,13 +67,7 @@ class Block(BaseModel):
 
 
 class StateDraws(Block):
-    """Draws of a scene, beside their values.
-
-    Attributes:
-        seed: of what is not recorded.
-        sizes: how many numbers each call of the generator draws.
-        names: what each number is called, as its slider is; "" for one without.
-    """
+    """What plays the draws: seed, how many numbers each call draws, and what each is called, "" where it is not."""
 
     seed: Annotated[int, Field(ge=0, lt=2**63)]
     sizes: Annotated[tuple[Annotated[int, Field(ge=0, le=MOST_NUMBERS)], ...], Field(max_length=MOST_NUMBERS)]
@@ -83,25 +75,7 @@ class StateDraws(Block):
 
 
 class RegistrationState(Block):
-    """State of a registration: content of ``state.json``.
-
-    Attributes:
-        format: version of the file.
-        mereo: version of mereo that wrote it.
-        scene, segments: the object.
-        weights: how they were named.
-        model: digest of their statistical model.
-        method: which description of the states ``z`` belongs to.
-        z: coefficients of the modes in standard deviations, or the scene's draws, standard normal.
-        draws: what plays the draws; None for modes.
-        T_camera_model: rigid pose of the model in the camera frame, its translation in the input's unit.
-        scene_unit: length of a scene unit in the input's unit.
-        unit_m: metres in the input's unit; None where that is not known.
-        frame: axes of the input.
-        T_camera_input: from the input's frame to the camera frame.
-        unit_known, explained, accepted, seconds: as in ``Registration``.
-        witness: places of a few material points in the camera frame.
-    """
+    """State of a registration: content of ``state.json``, whose keys docs/registration.md explains."""
 
     format: int
     mereo: Text
@@ -153,36 +127,18 @@ def read_state(path: str | Path) -> RegistrationState:
         )
     with path.open("rb") as file:
         content = file.read(MOST_BYTES + 1)
-    if len(content) > MOST_BYTES:
-        raise ValueError(
-            f"{path} has more than {MOST_BYTES // 1024} kB; the state of a registration has a few: {STATE_CURE}"
-        )
     try:
+        if len(content) > MOST_BYTES:
+            raise ValueError(f"it has more than {MOST_BYTES // 1024} kB")
         return RegistrationState.model_validate_json(content)
-    except ValidationError as error:
-        problem = describe_error(error.errors()[0])
-        raise ValueError(f"{path} is no state of a registration: {problem}: {STATE_CURE}") from None
-
-
-def describe_error(problem: ErrorDetails) -> str:
-    """Say what is wrong first in a file, and its value."""
-    key = ".".join(str(step) for step in problem["loc"])
-    rule = problem["msg"].removeprefix("Value error, ").replace("Input should", "it must").replace("should", "must")
-    rule = rule[:1].lower() + rule[1:]
-    if problem["type"] == "json_invalid":
-        return "it is not JSON"
-    if not key:
-        return rule
-    if problem["type"] == "missing":
-        return f"`{key}` is missing"
-    if problem["type"] == "extra_forbidden":
-        return f"{key[:60]!r} means nothing here"
-    return f"`{key}` is {repr(problem['input'])[:60]}; {rule}"
+    except ValueError as error:
+        fault = first_problem(error) if isinstance(error, ValidationError) else error
+        raise ValueError(
+            f"{path} is no state of a registration: {fault}: give the state.json of a `mereo reconstruct`"
+        ) from None
 
 
 # --- state ------------------------------------------------------------------------------------------------------------
-
-Rows = tuple[tuple[float, ...], ...]
 
 
 def model_digest(model: StatisticalModel) -> str:
@@ -237,16 +193,16 @@ def state_of(
         method=registration.method,
         z=tuple(registration.z.tolist()),
         draws=draws,
-        T_camera_model=rows(fit_rigid(registration.scene_unit * unposed, registration.material)),
+        T_camera_model=_rows(fit_rigid(registration.scene_unit * unposed, registration.material)),
         scene_unit=registration.scene_unit,
         unit_m=unit_m,
         frame=frame,
-        T_camera_input=rows(np.eye(4) if T_camera_input is None else T_camera_input),
+        T_camera_input=_rows(np.eye(4) if T_camera_input is None else T_camera_input),
         explained=registration.explained,
         unit_known=registration.unit_known,
         accepted=registration.accepted,
         seconds=registration.seconds,
-        witness=rows(registration.material[witnesses(model)]),
+        witness=_rows(registration.material[_witnesses(model)]),
     )
 
 
@@ -276,7 +232,7 @@ def load_state(path: str | Path, model: StatisticalModel, scene: Scene | None = 
         model: statistical model of the weights that it was made with.
         scene: of a state of draws, where it is not a built-in one.
 
-    Raises as ``read_state`` and ``restored`` do.
+    Raises as ``read_state`` does, and ``ValueError`` for another model, and where the scene is another or has changed.
     """
     state = read_state(path)
     try:
@@ -286,15 +242,34 @@ def load_state(path: str | Path, model: StatisticalModel, scene: Scene | None = 
 
 
 def restored(state: RegistrationState, model: StatisticalModel, scene: Scene | None = None) -> Registration:
-    """Restore a registration; raises ``ValueError`` for another model, and for draws as ``played_state`` does."""
+    """Restore a registration, with arguments and errors of ``load_state``."""
     if model_digest(model) != state.model:
         raise ValueError(
             f"the state belongs to the statistical model of other weights (scene {state.scene!r}, weights "
-            f"{state.weights!r}); its numbers mean nothing here: name those weights with --weights"
+            f"{state.weights!r}); its numbers mean nothing here: give the model of those weights"
         )
-    unposed, drawn = _unposed(state, model, scene)
+    z, drawn = np.array(state.z, dtype=np.float64), None
+    if state.draws is None:
+        if len(z) != model.count:
+            raise ValueError(
+                f"the state has {len(z)} coefficients, but the model has {model.count} modes; the file is damaged: "
+                "register the frame again"
+            )
+        unposed = model.rest_points if state.method == "rest" else model.material(z)
+    else:
+        if scene is None and state.scene not in SCENES:  # a name from a file never runs another one
+            raise ValueError(f"the state belongs to the scene {state.scene!r}, which is not built in: give the scene")
+        scene = load_scene(state.scene) if scene is None else scene
+        if scene.name != state.scene:
+            raise ValueError(f"the state is one of the scene {state.scene!r}, not of {scene.name!r}: give that scene")
+        played = played_back(scene, state.draws.seed, shares_of(z, state.draws.sizes))
+        if (fault := other_mesh(scene, model)) is not None:
+            raise ValueError(f"{fault}: {CURE}")
+        smooth = np.concatenate([np.full(len(call.shares), call.kind in SMOOTH) for call in played.calls])
+        unposed = material_moved(scene, model, played.deformations)
+        drawn = Drawn(state.draws.seed, z, state.draws.sizes, smooth)
     material = transform_points(np.array(state.T_camera_model), state.scene_unit * unposed)
-    off = float(np.abs(material[witnesses(model)] - np.array(state.witness)).max()) / state.scene_unit
+    off = float(np.abs(material[_witnesses(model)] - np.array(state.witness)).max()) / state.scene_unit
     if off > 1e-3 * model.half:
         raise ValueError(
             f"the state leads {off:.2g} scene units away from where mereo {state.mereo} found it: the scene "
@@ -304,7 +279,7 @@ def restored(state: RegistrationState, model: StatisticalModel, scene: Scene | N
         model=model,
         material=material,
         method=state.method,
-        z=np.array(state.z, dtype=np.float64),
+        z=z,
         scene_unit=state.scene_unit,
         explained=state.explained,
         unit_known=state.unit_known,
@@ -316,53 +291,9 @@ def restored(state: RegistrationState, model: StatisticalModel, scene: Scene | N
     )
 
 
-def played_state(state: RegistrationState, scene: Scene) -> Played:
-    """Play the draws of a state in their scene.
-
-    Raises ``ValueError`` for a state of modes, for another scene, and where the scene does not take the draws.
-    """
-    if state.draws is None:
-        raise ValueError(f"the state of {state.scene!r} is one of modes; it has no draws that a scene could play")
-    if scene.name != state.scene:
-        raise ValueError(f"the state is one of the scene {state.scene!r}, not of {scene.name!r}: name that scene")
-    return played_back(scene, state.draws.seed, shares_of(np.array(state.z), state.draws.sizes))
-
-
-def scene_of(state: RegistrationState) -> Scene:
-    """Load the built-in scene of a state; ``ValueError`` for others: a name from a file never runs another one."""
-    if state.scene not in SCENES:
-        raise ValueError(
-            f"the state belongs to the scene {state.scene!r}, which is not built in: name its file with --scene"
-        )
-    return load_scene(state.scene)
-
-
-def _unposed(
-    state: RegistrationState, model: StatisticalModel, scene: Scene | None
-) -> tuple[Float[np.ndarray, "m 3"], Drawn | None]:
-    """Material points in scene units, before the pose, and the draws that lead there."""
-    z = np.array(state.z, dtype=np.float64)
-    if state.draws is None:
-        if len(z) != model.count:
-            raise ValueError(
-                f"the state has {len(z)} coefficients, but the model has {model.count} modes; the file is damaged: "
-                "register the frame again"
-            )
-        return (model.rest_points if state.method == "rest" else model.material(z)), None
-    scene = scene_of(state) if scene is None else scene
-    played = played_state(state, scene)
-    fault = other_mesh(scene, model)
-    if fault is not None:
-        raise ValueError(f"{fault}: {CURE}")
-    smooth = np.concatenate([np.full(len(call.shares), call.kind in SMOOTH) for call in played.calls])
-    return material_moved(scene, model, played.deformations), Drawn(state.draws.seed, z, state.draws.sizes, smooth)
-
-
-def witnesses(model: StatisticalModel) -> Int[np.ndarray, " w"]:
-    """A few material points of all segments."""
+def _witnesses(model: StatisticalModel) -> Int[np.ndarray, " w"]:
     return np.linspace(0, len(model.mean) - 1, WITNESSES).astype(np.int64)
 
 
-def rows(values: Float[np.ndarray, "n c"]) -> Rows:
-    """Rows of a matrix as JSON has them."""
-    return tuple(tuple(float(value) for value in row) for row in values)
+def _rows(values: Float[np.ndarray, "n c"]) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, values.tolist()))

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -35,13 +35,11 @@ class Results:
     """Reconstruction to be written, in the input's frame and unit.
 
     Attributes:
-        surfaces, labels: of a reconstruction.
+        surfaces, labels, summary, radii: of a reconstruction; the last say how sure it is.
         observed: the input's points with their segments; needed for the format "points" only.
         frame_rotation: from the input's frame to glTF's (y up).
         unit_m: metres per unit of the input.
         millimetres: write files that have no unit of their own in millimetres, and not in the input's unit.
-        summary: what the JSON file holds.
-        radii: how sure the surfaces and what is inside them are, in the input's frame and unit; None where not known.
     """
 
     surfaces: SegmentedMesh
@@ -63,49 +61,29 @@ class Results:
         """Surfaces for files that have no unit of their own."""
         return self.surfaces.transformed(np.diag([self.factor] * 3 + [1.0]))
 
-    @property
-    def scaled_radii(self) -> Radii | None:
-        """Radii for files that have no unit of their own."""
-        return None if self.radii is None else self.radii.scaled(self.factor)
-
     @cached_property
     def radii_on_grid(self) -> Float32[np.ndarray, "x y z"] | None:
         """Radii at the voxels of ``labels``, in the input's unit."""
         return None if self.radii is None else self.radii.on_grid(self.labels)
 
-    @property
-    def scaled_labels(self) -> LabelGrid:
-        """Label grid for files that have no unit of their own."""
-        return replace(self.labels, origin=self.labels.origin * self.factor, spacing=self.labels.spacing * self.factor)
-
-
-@dataclass(frozen=True)
-class Writer:
-    """Writer of one format.
-
-    Attributes:
-        file: name of the file or folder; of the main one where there are two.
-        write: makes it at this path.
-        require: raises ``ImportError`` where an extra is missing.
-    """
-
-    file: str
-    write: Callable[[Path, Results], None]
-    require: Callable[[], object] | None = None
-
 
 def _glb(path: Path, results: Results) -> None:
-    write_segments_glb(path, results.surfaces, results.frame_rotation, results.unit_m, results.radii)
+    content = results.surfaces, results.frame_rotation, results.unit_m, results.radii
+    write_segments_glb(path, *content)
     if results.radii is not None:
-        write_segments_glb(
-            path.with_name(SURE), results.surfaces, results.frame_rotation, results.unit_m, results.radii, colored=True
-        )
+        write_segments_glb(path.with_name(SURE), *content, colored=True)
+
+
+def _ply(path: Path, results: Results) -> None:
+    radii = None if results.radii is None else results.radii.scaled(results.factor)
+    write_segments_ply(path, results.scaled_surfaces, radii)
 
 
 def _vti(path: Path, results: Results) -> None:
-    radii = results.radii_on_grid
-    scaled = None if radii is None else radii * np.float32(results.factor)
-    write_labels_vti(path, results.scaled_labels, results.surfaces.colors, scaled)
+    radii, factor, grid = results.radii_on_grid, results.factor, results.labels
+    scaled = None if radii is None else radii * np.float32(factor)
+    grid = replace(grid, origin=grid.origin * factor, spacing=grid.spacing * factor)
+    write_labels_vti(path, grid, results.surfaces.colors, scaled)
 
 
 def _points(path: Path, results: Results) -> None:
@@ -116,16 +94,21 @@ def _points(path: Path, results: Results) -> None:
     write_points_ply(path, replace(cloud, points=cloud.points * results.factor))
 
 
+class Writer(NamedTuple):
+    """Name of a format's file or folder, the main one where there are two, and what makes it at a path."""
+
+    file: str
+    write: Callable[[Path, Results], None]
+
+
 WRITERS: dict[Format, Writer] = {
     "glb": Writer("segments.glb", _glb),
-    "ply": Writer("segments.ply", lambda path, r: write_segments_ply(path, r.scaled_surfaces, r.scaled_radii)),
+    "ply": Writer("segments.ply", _ply),
     "obj": Writer("segments.obj", lambda path, r: write_segments_obj(path, r.scaled_surfaces)),
     "stl": Writer("stl", lambda path, r: write_segments_stl(path, r.scaled_surfaces)),
     "npz": Writer("labels.npz", lambda path, r: write_labels_npz(path, r.labels, r.radii_on_grid)),
     "vti": Writer("labels.vti", _vti),
-    "nifti": Writer(
-        "labels.nii.gz", lambda path, r: write_labels_nifti(path, r.labels, r.surfaces.colors, r.unit_m), nibabel
-    ),
+    "nifti": Writer("labels.nii.gz", lambda path, r: write_labels_nifti(path, r.labels, r.surfaces.colors, r.unit_m)),
     "seg.nrrd": Writer(
         "labels.seg.nrrd", lambda path, r: write_labels_seg_nrrd(path, r.labels, r.surfaces.colors, r.unit_m)
     ),
@@ -138,16 +121,14 @@ WRITERS: dict[Format, Writer] = {
 def chosen_formats(names: Iterable[str]) -> tuple[Format, ...]:
     """Formats that these names mean, in the table's order; "all" means every one.
 
-    Raises ``ValueError`` for an unknown name and ``ImportError`` for a format whose extra is not installed, so that
-    nobody waits for a reconstruction that cannot be written.
+    Raises ``ValueError`` for an unknown name and ``ImportError`` for a format whose extra is not installed.
     """
     wanted = set(names)
     if unknown := sorted(wanted - {"all", *get_args(Format)}):
         raise ValueError(f"there is no format {unknown[0]!r}; the formats are {', '.join(WRITERS)} and all: choose one")
     chosen = tuple(name for name in WRITERS if name in wanted or "all" in wanted)
-    for name in chosen:
-        if require := WRITERS[name].require:
-            require()
+    if "nifti" in chosen:
+        nibabel()
     return chosen
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Shaped, UInt8
 
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
@@ -35,17 +35,16 @@ def write_segments_glb(
 ) -> None:
     """Write a GLB file: one named, coloured node per segment, below a root node that turns the frame for viewers.
 
-    Vertices stay as they are (rounded to float32, all that glTF holds), each with its normal; where faces meet at a
-    crease (``geometry.subdivision``), copies follow them, with the same attributes but normals of their own. Segments
-    without faces are left out; those around a nested segment that was found are translucent.
+    Vertices stay as they are (rounded to float32), each with its normal; where faces meet at a crease
+    (``geometry.subdivision``), copies follow them, with normals of their own. Segments without faces are left out;
+    those around a nested segment that was found are translucent.
 
     Args:
         path: the .glb file.
         surfaces: segments in the input's frame and units.
         frame_rotation: rotation of the root node, from the input's frame to glTF's (y up).
         unit_m: metres per unit of the input, the scale of the root node, because glTF is in metres.
-        radii: how sure the surfaces are: the vertex attribute ``_RADIUS95``, in the unit of the vertices, of which
-            ``extras`` of the meshes say the metres.
+        radii: how sure the surfaces are, in the same unit: the vertex attribute ``_RADIUS95``.
         colored: colour the vertices by these, and not by their segments.
 
     Raises ``ValueError`` where no segment has faces.
@@ -58,8 +57,14 @@ def write_segments_glb(
     meshes, materials = [], []
     for index, (label, segment) in enumerate(solid):
         creased, source = split_at_creases(segment)
-        attributes = {"POSITION": arrays.add(creased.vertices, "VEC3"), "NORMAL": arrays.add(_normals(creased), "VEC3")}
-        primitive = {"attributes": attributes, "indices": arrays.add_faces(creased.faces), "material": index}
+        normals = vertex_normals(creased)
+        normals[np.linalg.norm(normals, axis=1) < 0.5] = (0.0, 0.0, 1.0)  # of no face's area; glTF wants unit length
+        attributes = {"POSITION": arrays.add(creased.vertices, "VEC3"), "NORMAL": arrays.add(normals, "VEC3")}
+        primitive = {
+            "attributes": attributes,
+            "indices": arrays.add(creased.faces.reshape(-1, 1), "SCALAR"),
+            "material": index,
+        }
         # the exact colour, which a material's factors approximate
         extras: dict[str, Any] = {"label": label, "color": list(segment.color)}
         material = _material(segment, surfaces.opaque[label - 1])
@@ -101,15 +106,11 @@ class _Arrays:
     def __init__(self) -> None:
         self.chunks, self.views, self.accessors = list[bytes](), list[dict[str, Any]](), list[dict[str, Any]]()
 
-    def add(self, values: Float[np.ndarray, "n k"], kind: str) -> int:
-        """Number of the accessor of vertices' attributes, as single floats."""
-        return self._append(values.astype("<f4"), kind, 5126, 34962)
-
-    def add_faces(self, faces: Int[np.ndarray, "f 3"]) -> int:
-        """Number of the accessor of faces' corners."""
-        return self._append(faces.astype("<u4").reshape(-1, 1), "SCALAR", 5125, 34963)
-
-    def _append(self, array: np.ndarray, kind: str, component: int, target: int) -> int:
+    def add(self, values: Shaped[np.ndarray, "n k"], kind: str) -> int:
+        """Number of the accessor of vertices' attributes, as single floats, or of faces' corners."""
+        is_faces = values.dtype.kind == "i"
+        component, target = (5125, 34963) if is_faces else (5126, 34962)
+        array = values.astype("<u4" if is_faces else "<f4")
         start, number = sum(len(chunk) for chunk in self.chunks), len(self.accessors)
         self.chunks.append(array.tobytes())
         self.views.append({"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": target})
@@ -120,7 +121,6 @@ class _Arrays:
 
 
 def _material(segment: Segment, opaque: bool) -> dict[str, Any]:
-    """Material of a segment's colour; glTF's factors are linear light, ours are sRGB (glTF 2.0, section 3.9.2)."""
     color = [*_linear(np.array(segment.color, dtype=np.uint8)).round(6).tolist(), 1.0 if opaque else OUTER_OPACITY]
     surface = {"baseColorFactor": color, "metallicFactor": 0.0, "roughnessFactor": 0.7}
     material = {"name": segment.name, "doubleSided": True, "pbrMetallicRoughness": surface}
@@ -132,10 +132,3 @@ def _linear(srgb: UInt8[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     share = srgb / 255.0
     linear: np.ndarray = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
     return linear
-
-
-def _normals(segment: Segment) -> Float[np.ndarray, "v 3"]:
-    """Normals of the vertices; glTF wants unit length, so those of vertices without a face's area point up."""
-    normals = vertex_normals(segment)
-    normals[np.linalg.norm(normals, axis=1) < 0.5] = (0.0, 0.0, 1.0)
-    return normals

@@ -1,8 +1,7 @@
 """Surfaces and points as PLY, OBJ and STL, which have no unit: positions are in the frame and unit of what is written.
 
-PLY is binary (Turk, "The PLY Polygon File Format", 1994). Its labels are a property called ``label``, with names in
-the header, as comments that hold JSON. A binary STL file holds one surface, so there is one for each segment; its name
-is in the 80 bytes that STL leaves to the writer, as ``STL_NAME`` and UTF-8, and comes back from there.
+PLY is binary; labels are a property called ``label``, with names as JSON in comments of the header. A binary STL file
+holds one surface, so there is one for each segment, with its name in the 80 bytes that STL leaves to the writer.
 """
 
 import json
@@ -14,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, Int, Integer, UInt8
+from jaxtyping import Float, Int, UInt8
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -49,9 +48,8 @@ def with_faces(surfaces: SegmentedMesh) -> list[tuple[int, Segment]]:
 def settled(segment: Segment) -> Segment:
     """Segment whose edges of no length are closed up: both ends at one vertex, and the faces along them gone.
 
-    Files hold float32, and readers merge what is near; the two ends become one place there, but the faces between them
-    stay as slivers with open edges. Which is why such edges, shorter than either can tell, go before. No other vertex
-    moves or changes its number of faces; a segment that would not be closed any more stays as it is.
+    Files hold float32, and readers merge what is near: of edges shorter than either can tell slivers with open edges
+    would stay. A segment that would not be closed any more stays as it is.
     """
     extent = float(np.abs(segment.vertices).max(initial=0.0))
     edges = np.concatenate([segment.faces[:, pair] for pair in ((0, 1), (1, 2), (2, 0))])
@@ -91,8 +89,8 @@ def segment_table(names: Sequence[str], colors: Sequence[Color]) -> list[dict[st
 def write_segments_ply(path: str | Path, surfaces: SegmentedMesh, radii: Radii | None = None) -> None:
     """Write all surfaces as one PLY mesh whose vertices and faces have ``label``, ``red``, ``green``, ``blue`` (uchar).
 
-    Segments share no vertices, so each vertex has one label; positions are float32. With ``radii`` of the same unit
-    each vertex has ``radius95``, float32. Raises ``ValueError`` where no segment has faces.
+    Positions are float32, and ``radius95`` of ``radii`` of the same unit. Raises ``ValueError`` where no segment has
+    faces.
     """
     with_faces(surfaces)
     positions, faces, owner = surfaces.merged()
@@ -100,8 +98,10 @@ def write_segments_ply(path: str | Path, surfaces: SegmentedMesh, radii: Radii |
     vertex_owner = np.repeat(np.arange(len(colors)), [len(segment.vertices) for segment in surfaces.segments])
     corners = {"count": ("u1", np.full(len(faces), 3)), "vertex_indices": ("i4", faces)}
     sure: Columns = {} if radii is None else {"radius95": ("f4", np.concatenate(radii.vertices))}
-    vertices = _records(_positions(positions) | _colors(colors[vertex_owner]) | _label(vertex_owner + 1) | sure)
-    triangles = _records(corners | _colors(colors[owner]) | _label(owner + 1))
+    vertices = _records(
+        _positions(positions) | _colors(colors[vertex_owner]) | {"label": ("u1", vertex_owner + 1)} | sure
+    )
+    triangles = _records(corners | _colors(colors[owner]) | {"label": ("u1", owner + 1)})
     comments = _comments(surfaces.names, surfaces.colors)
     if radii is not None:
         comments.append(f"radius95 is in the unit of x, y, z{'' if radii.calibrated else '; it is not calibrated'}")
@@ -109,13 +109,10 @@ def write_segments_ply(path: str | Path, surfaces: SegmentedMesh, radii: Radii |
 
 
 def write_points_ply(path: str | Path, cloud: SegmentedCloud) -> None:
-    """Write the observed points with ``label``, its colour, ``confidence`` and ``occupancy``, see ``SegmentedCloud``.
-
-    The last two are a network's; without one they are left out. Positions are float32.
-    """
+    """Write the observed points with ``label``, its colour, and a network's ``confidence`` and ``occupancy``."""
     colors = np.array(cloud.colors, dtype=np.uint8)[cloud.labels - 1]
     sure = {name: ("f4", values) for name, values in cloud.chances.items()}
-    vertices = _records(_positions(cloud.points) | _colors(colors) | _label(cloud.labels) | sure)
+    vertices = _records(_positions(cloud.points) | _colors(colors) | {"label": ("u1", cloud.labels)} | sure)
     _write(path, _comments(cloud.names, cloud.colors), {"vertex": vertices})
 
 
@@ -136,17 +133,12 @@ def _colors(colors: UInt8[np.ndarray, "n 3"]) -> Columns:
     return {channel: ("u1", colors[:, k]) for k, channel in enumerate(("red", "green", "blue"))}
 
 
-def _label(labels: Integer[np.ndarray, " n"]) -> Columns:
-    return {"label": ("u1", labels)}
-
-
 def _comments(names: Sequence[str], colors: Sequence[Color]) -> list[str]:
     """Table of segments as ASCII lines, so that any name survives."""
     return [f"segment {json.dumps(row)}" for row in segment_table(names, colors)]
 
 
 def _records(columns: Columns) -> np.ndarray:
-    """Little-endian records without padding."""
     fields = [(name, f"<{kind}", values.shape[1:]) for name, (kind, values) in columns.items()]
     records = np.zeros(len(next(iter(columns.values()))[1]), np.dtype(fields))
     for name, (_, values) in columns.items():
@@ -155,25 +147,18 @@ def _records(columns: Columns) -> np.ndarray:
 
 
 def _write(path: str | Path, comments: list[str], elements: dict[str, np.ndarray]) -> None:
+    types = {"u1": "uchar", "i4": "int", "f4": "float"}
     lines = ["ply", "format binary_little_endian 1.0", "comment written by mereo", *(f"comment {c}" for c in comments)]
     for element, records in elements.items():
-        lines += [f"element {element} {len(records)}", *_properties(records.dtype)]
+        lines.append(f"element {element} {len(records)}")
+        kinds = {name: types[records.dtype[name].base.str[1:]] for name in records.dtype.names or ()}
+        if kinds.pop("count", None):  # with ``vertex_indices`` what PLY calls a list
+            kinds["vertex_indices"] = "list uchar int"
+        lines += [f"property {kind} {name}" for name, kind in kinds.items()]
     with atomic_file(path) as partial, partial.open("wb") as file:
         file.write("\n".join([*lines, "end_header\n"]).encode("ascii"))
         for records in elements.values():
             file.write(records.tobytes())
-
-
-def _properties(dtype: np.dtype) -> list[str]:
-    """Header lines of an element; ``count`` and ``vertex_indices`` together are what PLY calls a list."""
-    types = {"u1": "uchar", "i4": "int", "f4": "float"}
-    lines = []
-    for name in dtype.names or ():
-        if name == "vertex_indices":
-            lines.append("property list uchar int vertex_indices")
-        elif name != "count":
-            lines.append(f"property {types[dtype[name].str[1:]]} {name}")
-    return lines
 
 
 # --- OBJ --------------------------------------------------------------------------------------------------------------
@@ -182,9 +167,8 @@ def _properties(dtype: np.dtype) -> list[str]:
 def write_segments_obj(path: str | Path, surfaces: SegmentedMesh) -> None:
     """Write one OBJ object (``o``) per segment with a material of its colour; the materials go beside it, as STEM.mtl.
 
-    Objects and materials have the segments' names, materials with ``_`` for what is no letter or digit, because many
-    programs name what they read after its material (trimesh, VTK). Segments without faces are left out. Raises
-    ``ValueError`` where no segment has faces.
+    Materials have the segments' names, too, as many programs name what they read after its material (trimesh, VTK).
+    Segments without faces are left out. Raises ``ValueError`` where no segment has faces.
     """
     path = Path(path)
     library = path.with_suffix(".mtl")
@@ -196,25 +180,17 @@ def write_segments_obj(path: str | Path, surfaces: SegmentedMesh) -> None:
             file.write(f"# written by mereo\nmtllib {library.name}\n")
             first = 1  # OBJ counts vertices from 1, through all objects
             for (_, segment), material in zip(solid, materials, strict=True):
-                file.write(_object(material, segment, first))
+                file.write(f"o {' '.join(segment.name.split())}\nusemtl {material}\n")
+                file.writelines(f"v {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in segment.vertices.tolist())
+                file.writelines(f"f {a} {b} {c}\n" for a, b, c in (segment.faces + first).tolist())
                 first += len(segment.vertices)
 
 
 def material_names(solid: Sequence[tuple[int, Segment]]) -> list[str]:
     """Name of each segment's material: one word, and no other's; those that would be alike get their labels."""
-    words = [re.sub(r"\W+", "_", segment.name).strip("_") for _, segment in solid]
-    alike = Counter(words)
-    return [
-        word if word and alike[word] == 1 else f"{word}_label_{label}".lstrip("_")
-        for (label, _), word in zip(solid, words, strict=True)
-    ]
-
-
-def _object(material: str, segment: Segment, first: int) -> str:
-    lines = [f"o {' '.join(segment.name.split())}", f"usemtl {material}"]
-    lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in segment.vertices.tolist()]
-    lines += [f"f {a} {b} {c}" for a, b, c in (segment.faces + first).tolist()]
-    return "\n".join(lines) + "\n"
+    words = [(label, re.sub(r"\W+", "_", segment.name).strip("_")) for label, segment in solid]
+    alike = Counter(word for _, word in words)
+    return [word if word and alike[word] == 1 else f"{word}_label_{label}".lstrip("_") for label, word in words]
 
 
 def _materials(solid: list[tuple[int, Segment]], names: list[str], opaque: tuple[bool, ...]) -> str:
@@ -232,8 +208,7 @@ def _materials(solid: list[tuple[int, Segment]], names: list[str], opaque: tuple
 def write_segments_stl(directory: str | Path, surfaces: SegmentedMesh, force: bool = False) -> None:
     """Write a new directory of ``1-head.stl``, ``2-left-ear.stl``, ...: label and name of each segment with faces.
 
-    Positions are float32. Raises ``ValueError`` where no segment has faces, and ``FileExistsError`` for a directory
-    with content unless ``force``.
+    Positions are float32. Raises as ``new_directory``, and ``ValueError`` where no segment has faces.
     """
     solid = with_faces(surfaces)
     with new_directory(directory, force) as partial:
@@ -255,10 +230,7 @@ def stl_name(label: int, name: str) -> str:
 
 
 def _stl(segment: Segment) -> bytes:
-    """File as trimesh writes it, but for its header, which must not begin with "solid" as text files do.
-
-    A name that is too long for the header is left out, not cut short.
-    """
+    """File as trimesh writes it, but for its header: the name, where it is not too long for that."""
     mesh = trimesh.Trimesh(segment.vertices, segment.faces, process=False)
     content: bytes = trimesh.exchange.stl.export_stl(mesh)
     text = STL_NAME + segment.name.encode("utf-8")

@@ -4,10 +4,9 @@ NPZ and VTI are in the grid's frame and unit. The VTI is written by hand: it is 
 and VTK itself is 100 MB (https://docs.vtk.org/en/latest/vtk_file_formats/vtkxml_file_format.html).
 
 Files for medical viewers are in millimetres. The rule: **LPS coordinates in millimetres are the input's coordinates**,
-axis by axis (x to the patient's left, y to the back, z to the head). An axial slice, which viewers draw as seen from
-the feet with left on the right and back below, is then what the camera saw: x right, y down, z forward. NIfTI counts in
-RAS, so there the first two axes change sign. Why not another rule: docs/design/0012-files-out.md. NRRD is written here
-and not by pynrrd, which takes ASCII only (names may have any letters) and writes the time of day.
+axis by axis, so that an axial slice is what the camera saw (docs/design/0012-files-out.md). NIfTI counts in RAS, so
+there the first two axes change sign. NRRD is written here and not by pynrrd, which takes ASCII only (names may have any
+letters) and writes the time of day.
 """
 
 import base64
@@ -16,7 +15,6 @@ import json
 import struct
 import zlib
 from collections.abc import Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +24,7 @@ from jaxtyping import Float, Float32
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import Color
 from mereo.io.atomic_files import atomic_file
+from mereo.io.extras import library
 from mereo.io.volume_files import Volume, segment_fields
 from mereo.io.writers.meshes import segment_table
 
@@ -52,30 +51,28 @@ def write_labels_npz(path: str | Path, grid: LabelGrid, radii: Float32[np.ndarra
     """Write a label grid for numpy: the arrays ``labels``, ``origin``, ``spacing`` and ``names``.
 
     Voxel [i, j, k] is centred at ``origin + [i, j, k] * spacing``, in the input's frame and units. ``names[k]`` is the
-    segment of label k + 1; label 0 is empty space. Where ``radii`` are known, ``radius95`` is the radius around each
-    voxel that holds the true place of what is there with probability 0.95, in the input's unit, NaN in empty space.
-    Raises ``ValueError`` for a label without a name.
+    segment of label k + 1; label 0 is empty space. ``radii`` become ``radius95``, in the input's unit, NaN in empty
+    space. Raises ``ValueError`` for a label without a name.
     """
-    if grid.labels.size and int(grid.labels.max()) > len(grid.names):
-        raise ValueError(f"label {int(grid.labels.max())} has no name among {len(grid.names)}; name every segment")
-    arrays: dict[str, Any] = {
-        "labels": grid.labels,
-        "origin": np.asarray(grid.origin, dtype=np.float64),
-        "spacing": np.asarray(grid.spacing, dtype=np.float64),
-        "names": np.asarray(grid.names),
-    }
-    if radii is not None:
-        arrays["radius95"] = radii
+    if (most := int(grid.labels.max(initial=0))) > len(grid.names):
+        raise ValueError(f"label {most} has no name among {len(grid.names)}; name every segment")
+    sure: dict[str, Any] = {} if radii is None else {"radius95": radii}
     with atomic_file(path) as partial:
-        np.savez_compressed(partial, **arrays)
+        np.savez_compressed(
+            partial,
+            labels=grid.labels,
+            origin=np.asarray(grid.origin, dtype=np.float64),
+            spacing=np.asarray(grid.spacing, dtype=np.float64),
+            names=np.asarray(grid.names),
+            **sure,
+        )
 
 
 def write_points_npz(path: str | Path, cloud: SegmentedCloud) -> None:
-    """Write an NPZ file with the arrays of a ``SegmentedCloud``.
+    """Write the arrays of a cloud: ``points``, ``labels``, ``confidence``, ``occupancy``, ``names`` and ``colors``.
 
-    They are ``points``, ``labels``, ``confidence``, ``occupancy``, ``names`` and ``colors``; ``names[k]`` and
-    ``colors[k]`` are of label k + 1. ``confidence`` and ``occupancy`` are a network's, and left out without one.
-    Positions are in the cloud's frame and unit.
+    ``names[k]`` and ``colors[k]`` are of label k + 1. ``confidence`` and ``occupancy`` are a network's, and left out
+    without one.
     """
     chances: dict[str, Any] = dict(cloud.chances)
     with atomic_file(path) as partial:
@@ -97,15 +94,14 @@ def write_labels_vti(
 ) -> None:
     """Write VTK image data: the array ``label`` at voxel centres; field data ``segment_names``, ``segment_colors``.
 
-    ``segment_names[k]`` is the segment of label k + 1; label 0 is empty space. Coordinates are in the grid's frame and
-    unit, and so are ``radii``, which become the array ``radius95``.
+    Coordinates are in the grid's frame and unit, and so are ``radii``, which become the array ``radius95``.
     """
     array = '        <DataArray type="Float32" Name="radius95" format="binary">{}</DataArray>\n'
     codes = (str(code) for name in grid.names for code in (*name.encode("utf-8"), 0))
     text = VTI.format(
         extent=" ".join(f"0 {n - 1}" for n in grid.labels.shape),
-        origin=_numbers(grid.origin),
-        spacing=_numbers(grid.spacing),
+        origin=" ".join(map(repr, grid.origin.tolist())),
+        spacing=" ".join(map(repr, grid.spacing.tolist())),
         count=len(grid.names),
         names=" ".join(codes),
         colors=" ".join(str(value) for color in colors for value in color),
@@ -116,15 +112,8 @@ def write_labels_vti(
         partial.write_text(text, "utf-8")
 
 
-def _numbers(values: Float[np.ndarray, "3"]) -> str:
-    return " ".join(repr(float(value)) for value in values)
-
-
 def _compressed(values: np.ndarray) -> str:
-    """Values of voxels as one zlib block, x running fastest.
-
-    The head has the number of blocks, the bytes of each and of a partial one, and those that are packed.
-    """
+    """Values as one zlib block; its head has the number of blocks, the bytes of each, of a partial one, and packed."""
     packed = zlib.compress(values.tobytes(order="F"))
     head = struct.pack("<4Q", 1, values.nbytes, 0, len(packed))
     return base64.b64encode(head).decode() + base64.b64encode(packed).decode()
@@ -147,9 +136,10 @@ space: left-posterior-superior
 sizes: {sizes}
 space directions: {directions}
 kinds: domain domain domain
-{endian}encoding: gzip
+endian: little
+encoding: gzip
 space origin: {origin}
-{more}
+{fields}
 """
 
 
@@ -157,19 +147,11 @@ def write_labels_nifti(path: str | Path, grid: LabelGrid, colors: Sequence[Color
     """Write NIfTI-1 (``.nii`` or ``.nii.gz``): ``RAS = diag(-1, -1, 1) * position * 1000 * unit_m``.
 
     NIfTI has no place for the names of labels. They stand as JSON in a comment of the header:
-    ``{"segments": [{"label", "name", "color"}, ...]}``.
-
-    Args:
-        path: the file; ``.gz`` compresses it.
-        grid: labels in the input's frame and unit.
-        colors: of the segments.
-        unit_m: metres per unit of the input.
-
-    Raises ``ImportError`` without the extra `medical`.
+    ``{"segments": [{"label", "name", "color"}, ...]}``. ``grid`` is in the input's frame and unit, of which ``unit_m``
+    is the metres. Raises ``ImportError`` without the extra `medical`.
     """
     nifti: Any = nibabel()
-    image = nifti.Nifti1Image(grid.labels, T_ras_index(grid, unit_m))
-    _place_in_scanner(image)
+    image = nifti.Nifti1Image(grid.labels, RAS_FROM_LPS * _T_lps_index(grid, unit_m) + 0.0)  # no -0
     image.header.set_intent("label", name="mereo")
     table = json.dumps({"segments": segment_table(grid.names, colors)})
     # code 6: a comment of plain text
@@ -177,14 +159,10 @@ def write_labels_nifti(path: str | Path, grid: LabelGrid, colors: Sequence[Color
     _write_nifti(Path(path), image, 9)
 
 
-def _place_in_scanner(image: Any) -> None:
-    """State millimetres, and the image's affine in both of NIfTI's ways."""
+def _write_nifti(path: Path, image: Any, level: int) -> None:
     image.header.set_xyzt_units("mm")
     image.set_qform(image.affine, code="scanner")
     image.set_sform(image.affine, code="scanner")
-
-
-def _write_nifti(path: Path, image: Any, level: int) -> None:
     content = image.to_bytes()
     with atomic_file(path) as partial:
         # mtime: the same result gives the same bytes
@@ -194,50 +172,54 @@ def _write_nifti(path: Path, image: Any, level: int) -> None:
 
 def nibabel() -> Any:
     """Library that writes NIfTI; ``ImportError`` says how to get it."""
-    try:
-        return import_module("nibabel")
-    except ImportError:
-        raise ImportError("nibabel is needed to write NIfTI files: pip install 'mereo[medical]'") from None
+    return library("nibabel", "medical", "NIfTI")
 
 
-def T_ras_index(grid: LabelGrid, unit_m: float) -> Float[np.ndarray, "4 4"]:
-    """Transform from voxel indices to RAS coordinates in millimetres; ``unit_m`` is metres per unit of the grid."""
+def _T_lps_index(grid: LabelGrid, unit_m: float) -> Float[np.ndarray, "4 4"]:
+    """Transform from voxel indices to LPS coordinates in millimetres; ``unit_m`` is metres per unit of the grid."""
     transform = np.eye(4)
     transform[:3, :3] = np.diag(grid.spacing)
     transform[:3, 3] = grid.origin
     transform[:3] *= MM_PER_M * unit_m
-    return RAS_FROM_LPS * transform + 0.0  # no -0
+    return transform
 
 
 def write_labels_seg_nrrd(path: str | Path, grid: LabelGrid, colors: Sequence[Color], unit_m: float = 1.0) -> None:
     """Write a segmentation of 3D Slicer: ``LPS = position * 1000 * unit_m``, with names, colours and labels.
 
-    One layer: a voxel has one label, and inside a nested segment it is the inner one's.
-
-    Args:
-        path: the file; Slicer knows it as a segmentation by its end, ``.seg.nrrd``.
-        grid: labels in the input's frame and unit.
-        colors: of the segments.
-        unit_m: metres per unit of the input.
+    One layer: a voxel has one label, and inside a nested segment it is the inner one's. Slicer knows the file by its
+    end, ``.seg.nrrd``. ``grid`` is in the input's frame and unit, of which ``unit_m`` is the metres.
     """
-    scale = MM_PER_M * unit_m
-    segments = "".join(_segment_fields(grid, index, color) for index, color in enumerate(colors))
-    header = NRRD_HEADER.format(
-        magic="NRRD0004",
-        type="unsigned char",
-        sizes=" ".join(str(n) for n in grid.labels.shape),
-        directions=" ".join(_vector(row) for row in np.diag(grid.spacing * scale)),
-        endian="",
-        origin=_vector(grid.origin * scale),
-        more=f"{segments}Segmentation_ContainedRepresentationNames:=Binary labelmap|Closed surface|\n"
-        "Segmentation_MasterRepresentation:=Binary labelmap\nSegmentation_ReferenceImageExtentOffset:=0 0 0\n",
-    )
+    fields = dict[str, str]()
+    for index, color in enumerate(colors):
+        fields |= _segment_fields(grid, index, color)
+    fields |= {
+        "Segmentation_ContainedRepresentationNames": "Binary labelmap|Closed surface|",
+        "Segmentation_MasterRepresentation": "Binary labelmap",
+        "Segmentation_ReferenceImageExtentOffset": "0 0 0",
+    }
+    content = _nrrd("NRRD0004", grid.labels, _T_lps_index(grid, unit_m), fields, 9)
     with atomic_file(path) as partial:
-        partial.write_bytes(header.encode("utf-8") + gzip.compress(grid.labels.tobytes(order="F"), mtime=0))
+        partial.write_bytes(content)
 
 
-def _segment_fields(grid: LabelGrid, index: int, color: Color) -> str:
-    """Header lines of a segment. Slicer cuts layers to the extent of their first segment, so all state the grid's."""
+def _nrrd(
+    magic: str, values: np.ndarray, T_lps_index: Float[np.ndarray, "4 4"], fields: dict[str, str], level: int
+) -> bytes:
+    header = NRRD_HEADER.format(
+        magic=magic,
+        type={"float32": "float", "float64": "double"}.get(values.dtype.name, values.dtype.name),
+        sizes=" ".join(str(n) for n in values.shape),
+        directions=" ".join(_vector(axis) for axis in T_lps_index[:3, :3].T),
+        origin=_vector(T_lps_index[:3, 3]),
+        fields="".join(f"{key}:={value}\n" for key, value in fields.items()),
+    )
+    little = values.astype(values.dtype.newbyteorder("<"), copy=False)
+    return header.encode("utf-8") + gzip.compress(little.tobytes(order="F"), level, mtime=0)
+
+
+def _segment_fields(grid: LabelGrid, index: int, color: Color) -> dict[str, str]:
+    """Fields of a segment. Slicer cuts layers to the extent of their first segment, so all state the grid's."""
     name = " ".join(grid.names[index].split()).replace("\\", "\\\\")  # a backslash begins an escape in NRRD values
     values = {
         "Color": " ".join(f"{value / 255:.6g}" for value in color),
@@ -249,22 +231,17 @@ def _segment_fields(grid: LabelGrid, index: int, color: Color) -> str:
         "Name": name,
         "NameAutoGenerated": "0",
     }
-    return "".join(f"Segment{index}_{key}:={value}\n" for key, value in values.items())
+    return {f"Segment{index}_{key}": value for key, value in values.items()}
 
 
 def _vector(values: Float[np.ndarray, "3"]) -> str:
-    """A vector as NRRD writes it."""
-    return f"({','.join(repr(float(value)) for value in values)})"
-
-
-# --- volumes of numbers -----------------------------------------------------------------------------------------------
+    return f"({','.join(map(repr, values.tolist()))})"
 
 
 def write_volume(path: Path, volume: Volume, unit_m: float = 1.0) -> None:
-    """Write NIfTI-1 (``.nii``, ``.nii.gz``) or NRRD (``.nrrd``, ``.nhdr``), by the name, in millimetres.
+    """Write NIfTI-1 (``.nii``, ``.nii.gz``) or NRRD, by the name, in millimetres.
 
-    LPS coordinates in millimetres are the input's coordinates; NIfTI counts in RAS. A ``.nhdr`` has its values beside
-    it, in ``.raw.gz``.
+    LPS coordinates in millimetres are the input's coordinates; NIfTI counts in RAS.
 
     Args:
         path: the file.
@@ -278,8 +255,13 @@ def write_volume(path: Path, volume: Volume, unit_m: float = 1.0) -> None:
     T_lps_index[:3] *= MM_PER_M * unit_m
     if ".nii" in path.name.lower():
         _write_volume_nifti(path, volume, RAS_FROM_LPS * T_lps_index + 0.0)  # no -0
-    else:
-        _write_nrrd(path, volume, T_lps_index)
+        return
+    fields = segment_fields(volume.header)
+    whole = " ".join(f"0 {n - 1}" for n in volume.values.shape)  # of 3D Slicer's segments
+    fields |= {key: whole for key in fields if key.endswith("_Extent")}
+    fields |= {key: "0 0 0" for key in fields if key.endswith("Segmentation_ReferenceImageExtentOffset")}
+    with atomic_file(path) as partial:
+        partial.write_bytes(_nrrd("NRRD0005", volume.values, T_lps_index, fields, LEVEL))
 
 
 def _write_volume_nifti(path: Path, volume: Volume, T_ras_index: Float[np.ndarray, "4 4"]) -> None:
@@ -288,31 +270,4 @@ def _write_volume_nifti(path: Path, volume: Volume, T_ras_index: Float[np.ndarra
     image = nifti.Nifti1Image(volume.values, T_ras_index, header, dtype=volume.values.dtype)
     image.header.set_data_dtype(volume.values.dtype)
     image.header.set_slope_inter(volume.slope, volume.intercept)  # of values that are stored as they are
-    _place_in_scanner(image)
     _write_nifti(path, image, LEVEL)
-
-
-def _write_nrrd(path: Path, volume: Volume, T_lps_index: Float[np.ndarray, "4 4"]) -> None:
-    """NRRD of the values as they are stored; extents of 3D Slicer's segments are those of the whole grid."""
-    values = volume.values.astype(volume.values.dtype.newbyteorder("<"), copy=False)
-    detached = path.with_suffix(".raw.gz") if path.suffix.lower() == ".nhdr" else None
-    fields = segment_fields(volume.header)
-    whole = " ".join(f"0 {n - 1}" for n in values.shape)
-    fields |= {key: whole for key in fields if key.endswith("_Extent")}
-    fields |= {key: "0 0 0" for key in fields if key.endswith("Segmentation_ReferenceImageExtentOffset")}
-    more = "".join(f"{key}:={value}\n" for key, value in fields.items())
-    header = NRRD_HEADER.format(
-        magic="NRRD0005",
-        type={"float32": "float", "float64": "double"}.get(values.dtype.name, values.dtype.name),
-        sizes=" ".join(str(n) for n in values.shape),
-        directions=" ".join(_vector(axis) for axis in T_lps_index[:3, :3].T),
-        endian="endian: little\n",
-        origin=_vector(T_lps_index[:3, 3]),
-        more=more if detached is None else f"data file: {detached.name}\n{more}",
-    )
-    content = gzip.compress(values.tobytes(order="F"), LEVEL, mtime=0)
-    if detached is not None:
-        with atomic_file(detached) as partial:
-            partial.write_bytes(content)
-    with atomic_file(path) as partial:
-        partial.write_bytes(header.encode("utf-8") + (content if detached is None else b""))

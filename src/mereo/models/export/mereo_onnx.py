@@ -11,8 +11,8 @@ Written for Python 3.8 and later, because robots' computers are slow to change.
 """
 
 import argparse
+import io
 import json
-import os
 import sys
 from pathlib import Path
 
@@ -110,34 +110,21 @@ def main() -> int:
     parser.add_argument("cloud", help=".npy, [n, 3], camera frame")
     parser.add_argument("--points", required=True, help=".npy, [q, 3], same frame and unit")
     parser.add_argument("-o", "--output", required=True, help=".npz: labels, distances, directions, names")
-    parser.add_argument(
-        "--model", default=str(Path(__file__).parent), help="folder of the graphs; default: of this file"
-    )
-    parser.add_argument("--force", action="store_true", help="replace an existing output, unless it is read")
+    parser.add_argument("--model", default=str(Path(__file__).parent), help="folder of the graphs; default: this one")
+    parser.add_argument("--force", action="store_true", help="replace an existing output")
     options = parser.parse_args()
-    output = Path(options.output)
-    partial = Path(f"{options.output}.{os.getpid()}.partial.npz")
     try:
-        if output.is_symlink() or (output.exists() and not output.is_file()):
-            raise ValueError(f"{output} is no ordinary file, and would be replaced; choose another --output")
-        if output.exists() and not options.force:
-            raise ValueError(f"{output} exists; it is not overwritten: choose another --output or pass --force")
-        graphs = [Path(options.model, name) for name in ("encoder.onnx", "query.onnx", "model.json")]
-        read = [Path(options.cloud), Path(options.points), *graphs]
-        if output.exists() and any(path.exists() and output.samefile(path) for path in read):
-            raise ValueError(f"{output} is read by this command; it is not replaced: choose another --output")
+        if Path(options.output).exists() and not options.force:
+            raise ValueError(f"{options.output} exists; it is not overwritten: choose another --output or pass --force")
         runner = Runner(options.model)
-        answers = dict(
-            zip(("labels", "distances", "directions"), runner(*map(np.load, (options.cloud, options.points))))
-        )
-        np.savez_compressed(partial, names=np.array(runner.names), **answers)
-        os.replace(partial, output)
+        answers = runner(np.load(options.cloud), np.load(options.points))
+        content = io.BytesIO()
+        named = dict(zip(("labels", "distances", "directions"), answers))
+        np.savez_compressed(content, names=np.array(runner.names), **named)
+        Path(options.output).write_bytes(content.getvalue())
     except (ValueError, OSError, ImportError) as error:
         print(f"mereo_onnx: error: {error}", file=sys.stderr)
         return 2
-    finally:
-        if partial.exists():
-            partial.unlink()
     return 0
 
 

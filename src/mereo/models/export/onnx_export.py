@@ -36,18 +36,10 @@ from mereo.models.network import Network
 from mereo.models.rigid_alignment import Alignment, svd3
 from mereo.models.weights import load_model
 
-FORMAT_VERSION = 1
-
 RUNNER = Path(__file__).with_name("mereo_onnx.py")
-
-EXAMPLE_QUERIES = 24
-"""Number of queries of the traced example; any other may follow."""
 
 FIXED_SIZE = ("latent1", "latent2", "rotation", "shift", "viewpoint")
 """Code tensors whose size does not depend on the number of points."""
-
-UNBOUNDED = 2.0**60
-"""Upper bound from which on a size counts as open: torch's is infinite or the largest integer."""
 
 ANSWERS = ("logits", "distance", "direction")
 
@@ -137,10 +129,10 @@ def export_graphs(model: Model) -> Graphs:
         if config.additions.sight_neighbors:
             code |= {"cloud": cloud, "viewpoint": torch.tensor([[0.1, -0.2, -8.0]])}
         open_sizes = {name: None if name in FIXED_SIZE else {1: Open} for name in code}
-        points = _example_points(EXAMPLE_QUERIES)
+        points = _example_points(24)
         queried = torch.export.export(query, (points, code), dynamic_shapes=({1: Open}, open_sizes), strict=False)
     (bounds,) = traced.range_constraints.values()
-    most = None if float(bounds.upper) > UNBOUNDED else int(bounds.upper)
+    most = None if float(bounds.upper) > 2.0**60 else int(bounds.upper)  # torch's bound of an open size is huge
     return Graphs(traced, queried, tuple(code), outputs, most)
 
 
@@ -150,13 +142,17 @@ def _example_points(count: int) -> Float[Tensor, "1 n 3"]:
     return nn.functional.normalize(points, dim=-1)
 
 
-def write_onnx(graphs: Graphs, directory: Path) -> None:
-    """Write ``encoder.onnx`` and ``query.onnx``. Raises ``ImportError`` without the extra `onnx`."""
-    _require_onnx()
+def write_graphs(graphs: Graphs, directory: Path, format: Literal["onnx", "torch"]) -> None:
+    """Write ``encoder`` and ``query``, as ``.onnx`` or, for ``torch.export.load``, as ``.pt2``."""
     inputs = {"encoder": ["cloud"], "query": ["points", *graphs.inputs]}
     outputs = {"encoder": graphs.outputs, "query": ANSWERS}
     for name, program in (("encoder", graphs.encoder), ("query", graphs.query)):
-        with torch.no_grad(), _quiet():
+        if format == "torch":
+            content = io.BytesIO()  # torch ends the process where it writes a file itself and the disk is full
+            torch.export.save(program, content)
+            (directory / f"{name}.pt2").write_bytes(content.getbuffer())
+            continue
+        with torch.no_grad():
             written = torch.onnx.export(
                 program.run_decompositions(DECOMPOSITIONS),
                 input_names=inputs[name],
@@ -169,52 +165,12 @@ def write_onnx(graphs: Graphs, directory: Path) -> None:
         written.save(directory / f"{name}.onnx")
 
 
-def _require_onnx() -> None:
-    for package in ("onnx", "onnxscript"):
-        if find_spec(package) is None:
-            raise ImportError(f"{package} is needed to export to ONNX: pip install 'mereo[onnx]'")
-
-
-def write_torch(graphs: Graphs, directory: Path) -> None:
-    """Write ``encoder.pt2`` and ``query.pt2``, for ``torch.export.load``."""
-    for name, graph in (("encoder", graphs.encoder), ("query", graphs.query)):
-        content = io.BytesIO()  # torch ends the process where it writes a file itself and the disk is full
-        with _quiet():
-            torch.export.save(graph, content)
-        (directory / f"{name}.pt2").write_bytes(content.getbuffer())
-
-
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Context without the warnings of torch about its own internals and packages that nobody needs here."""
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logger.setLevel(level)
-
-
-def describe(model: Model, graphs: Graphs) -> dict[str, Any]:
-    """Content of ``model.json``: what is needed beside the graphs."""
-    return {
-        "version": FORMAT_VERSION,
-        "names": model.names if model.segmented else ["object"],
-        "colors": model.colors if model.segmented else [model.colors[0]],
-        "nested": model.nested,
-        "loss": model.loss,
-        "encoder_outputs": graphs.outputs,
-        "query_inputs": graphs.inputs,
-        "points": model.network.config.points,
-        "most_points_of_the_graph": graphs.most,
-        "fewest_points_of_a_cloud": MIN_POINTS,
-        "dense_factor": DENSE_FACTOR,
-        "normalizer": "center and half of the longest side of the observed cloud's box",
-        "provenance": model.provenance,
-    }
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    with warnings.catch_warnings(action="ignore"):
+        yield
 
 
 def export_weights(
@@ -225,14 +181,31 @@ def export_weights(
     Raises ``ValueError`` for an autodecoder, ``ImportError`` without the extra `onnx`, ``FileExistsError`` for a
     directory with content unless ``force``.
     """
-    if format == "onnx":
-        _require_onnx()
+    for package in ("onnx", "onnxscript") if format == "onnx" else ():
+        if find_spec(package) is None:
+            raise ImportError(f"{package} is needed to export to ONNX: pip install 'mereo[onnx]'")
     read = [] if isinstance(weights, Model) else [weights]
     with new_directory(output, force, read) as directory:
         model = weights if isinstance(weights, Model) else load_model(weights)
         graphs = export_graphs(model)
-        (write_onnx if format == "onnx" else write_torch)(graphs, directory)
-        write_json(directory / "model.json", describe(model, graphs))
+        with _quiet():
+            write_graphs(graphs, directory, format)
+        facts = {
+            "version": 1,
+            "names": model.names if model.segmented else ["object"],
+            "colors": model.colors if model.segmented else [model.colors[0]],
+            "nested": model.nested,
+            "loss": model.loss,
+            "encoder_outputs": graphs.outputs,
+            "query_inputs": graphs.inputs,
+            "points": model.network.config.points,
+            "most_points_of_the_graph": graphs.most,
+            "fewest_points_of_a_cloud": MIN_POINTS,
+            "dense_factor": DENSE_FACTOR,
+            "normalizer": "center and half of the longest side of the observed cloud's box",
+            "provenance": model.provenance,
+        }
+        write_json(directory / "model.json", facts)
         if format == "onnx":
             shutil.copyfile(RUNNER, directory / RUNNER.name)
     print(f"wrote {output}: encoder and query for clouds of {model.network.config.points} points")

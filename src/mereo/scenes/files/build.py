@@ -7,9 +7,9 @@ import hashlib
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -27,9 +27,7 @@ from mereo.io.simulation_states import files_of_states, frame_files
 from mereo.io.yaml_document import Document, similar
 from mereo.scenes.files.deformation_blocks import (
     AnyDeformation,
-    CameraBlock,
     ElasticBlock,
-    FilePart,
     Misfit,
     ModelPart,
     PartLook,
@@ -58,7 +56,7 @@ def load(path: Path) -> Scene:
     """
     document = Document(path)
     file = read(document)
-    return build(document, file, with_warnings(document, read_segments(document, file)))
+    return build(document, file, _with_warnings(document, read_segments(document, file)))
 
 
 def read(document: Document) -> SceneFile:
@@ -86,7 +84,7 @@ def _volume_meshes(path: Path, file: SceneFile) -> list[Path]:
     return [path.parent / name for name in names if name is not None]
 
 
-def with_warnings(document: Document, mesh: SegmentedMesh) -> SegmentedMesh:
+def _with_warnings(document: Document, mesh: SegmentedMesh) -> SegmentedMesh:
     """Mesh with segments that are no solids marked so, and one warning for each of them."""
     cure = f"repair it with `mereo scene check {document.path} --repair`"
     segments = []
@@ -105,7 +103,14 @@ def build(document: Document, file: SceneFile, mesh: SegmentedMesh) -> Scene:
     """Scene of a mesh in the file's unit: scaled to ``size`` and centred, with its deformations."""
     placement = placed(mesh, file.size)
     rest = mesh.with_vertices([placement.apply(segment.vertices) for segment in mesh.segments])
-    workspace = _workspace(document, file.camera, rest.bounds)
+    nearest, radius = file.camera.distance[0], float(np.linalg.norm(np.ptp(rest.bounds, axis=0))) / 2
+    if not nearest > radius:
+        raise document.error(
+            ("camera", "distance"),
+            f"`distance` starts at {nearest:g}; the camera must stay outside the object, which reaches {radius:.3g} "
+            "scene units from its centre: start farther away, or lower `size`",
+        )
+    workspace = file.camera.workspace()
     unit_m, definition = file.units / placement.scale, file.model_dump_json(exclude=SOURCES)
     if file.states is not None:
         scene = _recorded(document, file, rest, placement, workspace)
@@ -113,38 +118,31 @@ def build(document: Document, file: SceneFile, mesh: SegmentedMesh) -> Scene:
     else:
         blocks = file.deformations
         if blocks is None:
-            blocks = list(_default_deformations(_Keyed(_content(mesh), mesh)))
+            blocks = list(_kept(default_deformations, _Keyed(_content(mesh), (mesh,))))
             definition += str([block.model_dump() for block in blocks])
         motions = _random_motion(document, placement, rest, blocks)
         if volumes := _volume_meshes(document.path, file):
             definition += _digest(volumes)
         key = f"{_content(rest)} {placement.matrix.tolist()} {definition}"
-        rest = _refined(_Keyed(key, (rest, motions)))
+        rest = _kept(refined, _Keyed(key, (rest, motions)))
         scene = Scene(file.name, rest, replace(motions, rest=rest), workspace, file.source)
     return replace(scene, unit_m=unit_m, T_scene_source=placement.matrix, definition=definition)
 
 
 # --- what takes most of the time of loading a scene, which one command does several times ----------------------------
 
-Value = TypeVar("Value")
-
 
 @dataclass(frozen=True)
-class _Keyed(Generic[Value]):
-    """A value that is equal to another one of the same key."""
+class _Keyed:
+    """Arguments that are equal to others of the same key."""
 
     key: str
-    value: Value = field(compare=False)
+    arguments: tuple[Any, ...] = field(compare=False)
 
 
-@lru_cache(maxsize=4)
-def _default_deformations(mesh: _Keyed[SegmentedMesh]) -> tuple[AnyDeformation, ...]:
-    return default_deformations(mesh.value)
-
-
-@lru_cache(maxsize=4)
-def _refined(scene: _Keyed[tuple[SegmentedMesh, RandomMotion]]) -> SegmentedMesh:
-    return refined(*scene.value)
+@lru_cache(maxsize=8)
+def _kept(function: Callable[..., Any], keyed: _Keyed) -> Any:
+    return function(*keyed.arguments)
 
 
 def _content(mesh: SegmentedMesh) -> str:
@@ -188,24 +186,17 @@ def _digest(files: Sequence[Path]) -> str:
     return digest.hexdigest()
 
 
-def _workspace(document: Document, camera: CameraBlock, bounds: Float[np.ndarray, "2 3"]) -> Workspace:
-    radius = float(np.linalg.norm(bounds[1] - bounds[0])) / 2
-    if not camera.distance[0] > radius:
-        raise document.error(
-            ("camera", "distance"),
-            f"`distance` starts at {camera.distance[0]:g}; the camera must stay outside the object, which reaches "
-            f"{radius:.3g} scene units from its centre: start farther away, or lower `size`",
-        )
-    return camera.workspace()
-
-
 def _random_motion(
     document: Document, placement: Normalizer, rest: SegmentedMesh, blocks: Sequence[AnyDeformation]
 ) -> RandomMotion:
-    """All deformations of the file in their order; ``default_deformations`` where it has none."""
-    steps = []
+    """All deformations of the file in their order."""
+    steps, names = [], list(rest.names)
     for index, block in enumerate(blocks):
-        members = _members(document, rest, index, block)
+        for name in block.segments or ():
+            if name not in names:
+                place = ("deformations", index, "segments")
+                raise document.error(place, f"no segment is called {name!r}: {similar(name, names)}")
+        members = tuple(i for i, name in enumerate(names) if block.segments is None or name in block.segments)
         moved = SegmentedMesh(tuple(rest.segments[i] for i in members))
         try:
             target = Target(moved, rest.bounds, placement, document.path.parent)
@@ -215,19 +206,7 @@ def _random_motion(
     return RandomMotion(rest, tuple(steps))
 
 
-def _members(document: Document, rest: SegmentedMesh, index: int, block: AnyDeformation) -> tuple[int, ...]:
-    """Indices of the segments that a block moves."""
-    names = list(rest.names)
-    for name in block.segments or ():
-        if name not in names:
-            place = ("deformations", index, "segments")
-            raise document.error(place, f"no segment is called {name!r}: {similar(name, names)}")
-    return tuple(i for i, name in enumerate(names) if block.segments is None or name in block.segments)
-
-
 # --- segments ---------------------------------------------------------------------------------------------------------
-
-# The segments that a scene file names, in its own unit and frame: mesh files, parts of a model, or a label volume.
 
 
 def read_segments(document: Document, file: SceneFile) -> SegmentedMesh:
@@ -238,7 +217,11 @@ def read_segments(document: Document, file: SceneFile) -> SegmentedMesh:
     """
     folder = document.path.parent
     if file.segments is not None:
-        return _assembled(document, "segments", file.segments, _from_files(document, file.segments))
+        meshes = [
+            _read(document, ("segments", index, "file"), folder / part.file) for index, part in enumerate(file.segments)
+        ]
+        joined = [_joined(part, mesh.segments) for part, mesh in zip(file.segments, meshes, strict=True)]
+        return _assembled(document, "segments", file.segments, joined)
     if file.model is not None:
         model = _read(document, ("model",), folder / file.model)
         if file.parts is None:
@@ -255,14 +238,6 @@ def _read(document: Document, place: Sequence[int | str], path: Path) -> Segment
     """A mesh file; errors say which line names it."""
     with document.named_at(place):
         return read_segmented_mesh(path)
-
-
-def _from_files(document: Document, parts: Sequence[FilePart]) -> list[Segment]:
-    folder = document.path.parent
-    return [
-        _joined(part, _read(document, ("segments", index, "file"), folder / part.file).segments)
-        for index, part in enumerate(parts)
-    ]
 
 
 def _from_model(document: Document, parts: Sequence[ModelPart], model: SegmentedMesh) -> list[Segment]:
@@ -298,25 +273,20 @@ def _assembled(document: Document, key: str, parts: Sequence[PartLook], segments
                 (key, index, "nested_in"), f"no segment is called {part.nested_in!r}: {similar(part.nested_in, names)}"
             )
     nested = tuple((part.name, part.nested_in) for part in parts if part.nested_in is not None)
+    colors = [segment.color for segment in segments]
+    if len(set(colors)) < len(colors):  # the meshes' own do not tell the segments apart
+        colors = [PALETTE[index % len(PALETTE)] for index in range(len(colors))]
+    colored = (
+        replace(segment, color=part.color or color)
+        for segment, part, color in zip(segments, parts, colors, strict=True)
+    )
     try:
-        return SegmentedMesh(tuple(_colored(segments, parts)), nested)
+        return SegmentedMesh(tuple(colored), nested)
     except ValueError as error:
         raise document.error((key,), str(error)) from None
 
 
-def _colored(segments: Sequence[Segment], parts: Sequence[PartLook]) -> list[Segment]:
-    """The file's colours; without one the mesh's own, where they tell the segments apart, or the palette's."""
-    colors = [segment.color for segment in segments]
-    fallback = colors if len(set(colors)) == len(colors) else [PALETTE[i % len(PALETTE)] for i in range(len(colors))]
-    return [
-        Segment(segment.name, part.color or color, segment.vertices, segment.faces)
-        for segment, part, color in zip(segments, parts, fallback, strict=True)
-    ]
-
-
 # --- refinement -------------------------------------------------------------------------------------------------------
-
-# Faces small enough to bend: CAD programs write one long triangle where a surface is flat, and maps bend it.
 
 TOLERANCE = 0.05
 """How far, in scene units, a straight edge may leave the curve that the map makes of it: half of the noise."""
@@ -335,8 +305,6 @@ MOST_FACES = 20_000
 PLACES = ((0.5, 0.5), (0.25, 0.75), (0.75, 0.25))
 """Shares of an edge's two ends at which it is compared, symmetric, so that neighbours split a shared edge alike."""
 
-Ends = Float[np.ndarray, "e 2 3"]
-
 
 def refined(rest: SegmentedMesh, draw: Callable[[np.random.Generator], tuple[Deformation, ...]]) -> SegmentedMesh:
     """Mesh with all edges halved that ``draw``'s maps bend away from a straight line; itself where none is.
@@ -344,16 +312,13 @@ def refined(rest: SegmentedMesh, draw: Callable[[np.random.Generator], tuple[Def
     An edge is halved where in one of ``STATES`` random states the map of a place on it is farther than ``TOLERANCE``
     from the straight line between the maps of its ends. Affine maps, as those of joints, split nothing. Segments that
     share a map and an edge split it alike; where they touch without sharing edges they part or meet by at most twice
-    the tolerance.
-
-    Args:
-        rest: segments in scene units.
-        draw: one map for each segment.
+    the tolerance. ``rest`` is in scene units, and ``draw`` gives one map for each segment.
     """
     steps = draw.steps if isinstance(draw, RandomMotion) else ()
     cells = [sampler.solid.cell for sampler, _ in steps if isinstance(sampler, ElasticSampler)]
     shortest = max([SHORTEST, *cells])
-    if not any(_is_long(segment, shortest) for segment in rest.segments):
+    corners = [segment.vertices[segment.faces] for segment in rest.segments]
+    if not any((np.linalg.norm(c - np.roll(c, 1, axis=1), axis=2) > shortest).any() for c in corners):
         return rest
     states = [draw(example_rng(0, index)) for index in range(STATES)]
     tolerance = TOLERANCE
@@ -365,33 +330,24 @@ def refined(rest: SegmentedMesh, draw: Callable[[np.random.Generator], tuple[Def
             tolerance *= 2
 
 
-def _is_long(segment: Segment, shortest: float) -> bool:
-    """Whether any edge is longer than that."""
-    corners = segment.vertices[segment.faces]
-    return bool((np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2) > shortest).any())
-
-
 def _refined_surface(
     rest: SegmentedMesh, states: list[tuple[Deformation, ...]], limits: tuple[float, float], most: int
 ) -> SegmentedMesh:
     segments = []
     for index, segment in enumerate(rest.segments):
-        maps = [state[index] for state in states]
-
-        def bent(ends: Ends, maps: list[Deformation] = maps) -> Bool[np.ndarray, " e"]:
-            return _bent(ends, maps, *limits)
-
+        bent = partial(_bent, maps=[state[index] for state in states], limits=limits)
         vertices, faces = split_edges(segment.vertices, segment.faces, bent, most)
         most -= len(faces)
-        segments.append(
-            segment if len(faces) == len(segment.faces) else replace(segment, vertices=vertices, faces=faces)
-        )
+        same = len(faces) == len(segment.faces)
+        segments.append(segment if same else replace(segment, vertices=vertices, faces=faces))
     return replace(rest, segments=tuple(segments))
 
 
-def _bent(ends: Ends, maps: list[Deformation], tolerance: float, shortest: float) -> Bool[np.ndarray, " e"]:
-    """Which edges longer than ``shortest`` a map makes a curve of, farther than ``tolerance`` from its chord."""
-    result = np.zeros(len(ends), dtype=bool)
+def _bent(
+    ends: Float[np.ndarray, "e 2 3"], maps: list[Deformation], limits: tuple[float, float]
+) -> Bool[np.ndarray, " e"]:
+    """Which edges a map makes a curve of, farther from its chord than the first limit, if longer than the second."""
+    result, (tolerance, shortest) = np.zeros(len(ends), dtype=bool), limits
     long = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > shortest
     for deform in maps:
         rows = np.flatnonzero(long & ~result)

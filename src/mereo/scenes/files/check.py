@@ -1,7 +1,6 @@
 """``mereo scene check``: what a user should know of a scene's meshes before spending hours of training, and repairs."""
 
 import re
-from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import trimesh
 import yaml
 
 from mereo.deformation.samplers import JointSampler, RandomMotion
+from mereo.geometry.brief import counted
 from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import Segment, SegmentedMesh
@@ -29,12 +29,10 @@ from mereo.scenes.seeds import example_rng
 
 
 def check_scene(name: str, repair: bool = False) -> None:
-    """Print what each segment, the overlaps, the unit and random states are like; repair meshes where asked to.
+    """Print what each segment, the overlaps, the unit and random states of a built-in scene or a file are like.
 
-    Args:
-        name: a built-in name or a scene file.
-        repair: write repaired copies of faulty meshes beside a YAML file, as ``SEGMENT-repaired.ply``, and a scene file
-            ``NAME-repaired.yaml`` that names them. No existing file is changed.
+    With ``repair`` repaired copies of faulty meshes are written beside a YAML file, as ``SEGMENT-repaired.ply``, and a
+    scene file ``NAME-repaired.yaml`` that names them. No existing file is changed.
 
     Raises ``ValueError`` that counts the faults left, ``FileExistsError`` where a repaired file is there already.
     """
@@ -42,15 +40,20 @@ def check_scene(name: str, repair: bool = False) -> None:
         if repair:
             raise ValueError(f"--repair works on YAML scene files, and {name!r} is none: repair its meshes where it is")
         scene = load_scene(name)
-        faults = _report(scene.rest, _examined(scene.rest, ""), "cubic units")
+        faults = _report(scene.rest, [examine(segment) for segment in scene.rest.segments], "cubic units")
     else:
         document = Document(Path(name))
         file = read(document)
         mesh = read_segments(document, file)
         unit = next((key for key, value in UNITS_M.items() if value == file.units), "unit")
-        health = _examined(mesh, unit)
+        health = [examine(segment, unit) for segment in mesh.segments]
         faults = _report(mesh, health, f"{unit}³")
-        _report_size(mesh, file.units, unit)
+        sides = np.ptp(mesh.bounds, axis=0)
+        longest_m = float(sides.max()) * file.units
+        print(f"size: {' x '.join(f'{side:.4g}' for side in sides)} {unit}; the longest side is {longest_m:.3g} m")
+        if not PLAUSIBLE_M[0] <= longest_m <= PLAUSIBLE_M[1]:
+            guess = likely_unit(mesh.bounds)
+            print(f"  note: that is unlikely for a depth camera's object; the unit may be {guess}")
         if faults and repair:
             _check_repaired(document, mesh, health, unit)
             return
@@ -59,8 +62,10 @@ def check_scene(name: str, repair: bool = False) -> None:
         if any(condition.hopeless for condition in health):
             raise _refusal(name, faults)
         scene = build(document, file, _marked(mesh, health))
-        _report_refinement(mesh, scene.rest)
-    collisions = report_states(scene) if name not in SCENES else 0
+        before, now = (sum(len(segment.faces) for segment in each.segments) for each in (mesh, scene.rest))
+        if now > before:
+            print(f"faces: {before:,} in the files, {now:,} after dividing long ones, so that they bend")
+    collisions = _report_states(scene) if name not in SCENES else 0
     if faults + collisions:
         raise _refusal(name, faults, collisions)
     nested = "".join(f", {inner} nested in {outer}" for inner, outer in scene.rest.nested)
@@ -70,43 +75,29 @@ def check_scene(name: str, repair: bool = False) -> None:
 
 def _refusal(name: str, faults: int, collisions: int = 0) -> ValueError:
     """Error about faults of meshes and collisions in random states, which no repair of a mesh mends."""
-    count = faults + collisions
     cures = ["repair the meshes with --repair" if is_yaml(name) else "correct its meshes"] if faults else []
     cures += ["correct its deformations"] if collisions else []
-    return ValueError(f"{name} has {count} {'fault' if count == 1 else 'faults'}, listed above: {', and '.join(cures)}")
-
-
-def _report_refinement(mesh: SegmentedMesh, rest: SegmentedMesh) -> None:
-    """Print how many faces a scene has more than its files."""
-    before, now = (sum(len(segment.faces) for segment in each.segments) for each in (mesh, rest))
-    if now > before:
-        print(f"faces: {before:,} in the files, {now:,} after dividing long ones, so that they bend")
-
-
-def _examined(mesh: SegmentedMesh, unit: str) -> list[Health]:
-    return [examine(segment, unit) for segment in mesh.segments]
+    return ValueError(f"{name} has {counted(faults + collisions, 'fault')}, listed above: {', and '.join(cures)}")
 
 
 def _report(mesh: SegmentedMesh, health: list[Health], unit: str) -> int:
     """Print each segment and each overlap; returns the number of faults."""
-    faults = 0
-    usable = not any(condition.hopeless for condition in health)
+    faults, usable = 0, not any(condition.hopeless for condition in health)
     volumes = mesh.owned_volumes if usable else [np.nan] * len(health)
     for segment, condition, volume in zip(mesh.segments, health, volumes, strict=True):
         inside = volume if condition.sound or condition.hopeless else grid_volume(replace(segment, solid=False))
         amount = f"   volume {inside:.4g} {unit}" if np.isfinite(inside) else ""
         print(f"{segment.name:<20} {len(segment.faces):>7} faces{amount}")
-        for fault in (*condition.hopeless, *condition.dirty):
-            faults += 1
-            print(f"  fault: it {fault}")
-        for note in condition.notes:
-            print(f"  note: it {note}")
+        faults += len(condition.hopeless) + len(condition.dirty)
+        for kind, each in (("fault", (*condition.hopeless, *condition.dirty)), ("note", condition.notes)):
+            for what in each:
+                print(f"  {kind}: it {what}")
         if not condition.mendable:
             print(f"  cure: no repair makes a solid of it; export {segment.name} again as a closed surface")
     if usable:
         shared, count = overlaps(_marked(mesh, health)), len(health)
+        faults += len(shared)
         for overlap in shared:
-            faults += 1
             print(f"  fault: {overlap}")
         if count > 2 and len(shared) > count * (count - 1) / 4:
             print("  note: most pairs overlap; the files may each have a frame of their own: export them assembled")
@@ -119,14 +110,6 @@ def _marked(mesh: SegmentedMesh, health: list[Health]) -> SegmentedMesh:
     return replace(mesh, segments=tuple(marked))
 
 
-def _report_size(mesh: SegmentedMesh, unit_m: float, unit: str) -> None:
-    sides = mesh.bounds[1] - mesh.bounds[0]
-    longest_m = float(sides.max()) * unit_m
-    print(f"size: {' x '.join(f'{side:.4g}' for side in sides)} {unit}; the longest side is {longest_m:.3g} m")
-    if not PLAUSIBLE_M[0] <= longest_m <= PLAUSIBLE_M[1]:
-        print(f"  note: that is unlikely for a depth camera's object; the unit may be {likely_unit(mesh.bounds)}")
-
-
 # --- repairs ----------------------------------------------------------------------------------------------------------
 
 NOTABLE = 1e-3
@@ -136,17 +119,14 @@ NOTABLE = 1e-3
 def _check_repaired(document: Document, mesh: SegmentedMesh, health: list[Health], unit: str) -> None:
     """Repair, say what was changed, write it, and check what was written."""
     fixed = [repaired(segment, unit) for segment in mesh.segments]
-    changes = {fix.segment.name: list(fix.changes) for fix in fixed}
     whole, cuts = without_overlaps(replace(mesh, segments=tuple(fix.segment for fix in fixed)))
-    for name, cut in cuts.items():
-        changes[name] += cut
-    changed = [segment for segment in whole.segments if changes[segment.name]]
-    for segment in changed:
-        index = mesh.names.index(segment.name)
-        difference = _difference(mesh.segments[index], health[index], segment)
-        print(f"repaired {segment.name}: {'; '.join(changes[segment.name])} ({difference})")
-        print(f"  {_moved(mesh.segments[index], fixed[index].kept, segment, unit)}")
-    path = _write(document, whole, {segment.name for segment in changed})
+    changed = set[str]()
+    for before, condition, fix, after in zip(mesh.segments, health, fixed, whole.segments, strict=True):
+        if changes := [*fix.changes, *cuts.get(after.name, ())]:
+            changed.add(after.name)
+            print(f"repaired {after.name}: {'; '.join(changes)} ({_difference(before, condition, after)})")
+            print(f"  {_moved(before, fix.kept, after, unit)}")
+    path = _write(document, whole, changed)
     print(f"wrote {path} and the meshes that it names; checked again:")
     check_scene(str(path))
 
@@ -178,8 +158,13 @@ def _moved(before: Segment, kept: Segment, after: Segment, unit: str) -> str:
 def _write(document: Document, mesh: SegmentedMesh, changed: set[str]) -> Path:
     """The repaired meshes and a scene file that names them, beside the original."""
     path = document.path.with_name(f"{document.path.stem}-repaired{document.path.suffix}")
-    text, files = with_segment_files(document, mesh, changed)
-    meshes = {document.path.parent / file: _ply(mesh, name) for name, file in files.items()}
+    text, files = _with_segment_files(document, mesh, changed)
+    meshes = dict[Path, bytes]()
+    for name, file in files.items():
+        segment = mesh.segments[mesh.names.index(name)]
+        content = trimesh.Trimesh(segment.vertices, segment.faces, process=False).export(file_type="ply")
+        assert isinstance(content, bytes)
+        meshes[document.path.parent / file] = content
     # a mesh of the same bytes is one that this wrote before it was killed
     missing = {place: content for place, content in meshes.items() if not _holds(place, content)}
     for place in (path, *missing):
@@ -194,21 +179,10 @@ def _write(document: Document, mesh: SegmentedMesh, changed: set[str]) -> Path:
     return path
 
 
-def _ply(mesh: SegmentedMesh, name: str) -> bytes:
-    segment = mesh.segments[mesh.names.index(name)]
-    content = trimesh.Trimesh(segment.vertices, segment.faces, process=False).export(file_type="ply")
-    assert isinstance(content, bytes)
-    return content
-
-
 def _holds(place: Path, content: bytes) -> bool:
-    remove_abandoned(place)
+    remove_abandoned(place.parent, place.name)
     return place.is_file() and not place.is_symlink() and place.read_bytes() == content
 
-
-# --- repaired files ---------------------------------------------------------------------------------------------------
-
-# A scene file written anew with other meshes; its comments stay in the user's own file, which nobody changes.
 
 KINDS = ("segments", "model", "parts", "labels", "names", "cells")
 """Keys that say where the segments come from."""
@@ -219,26 +193,22 @@ HEADER = """\
 """
 
 
-def with_segment_files(document: Document, mesh: SegmentedMesh, changed: Collection[str]) -> tuple[str, dict[str, str]]:
+def _with_segment_files(document: Document, mesh: SegmentedMesh, changed: set[str]) -> tuple[str, dict[str, str]]:
     """Text of a scene file that says what ``document`` says with new files for changed segments, and their names.
 
     Where the segments were parts of a model or labels of a volume, all get a file of their own: one scene file takes
     its segments from one kind of source.
-
-    Args:
-        document: a valid scene file.
-        mesh: its segments, in the order of the file.
-        changed: names of the segments that need a new file.
-
-    Returns:
-        The text, and for each segment with a new file that file's name.
     """
-    if "segments" in document.data:
-        files = {name: repaired_name(name) for name in changed}
+    kept, outer = "segments" in document.data, dict(mesh.nested)
+    files = {name: re.sub(r"[^\w.-]+", "_", name) + "-repaired.ply" for name in (changed if kept else mesh.names)}
+    if kept:
         segments = [{**block, "file": files.get(block["name"], block["file"])} for block in document.data["segments"]]
     else:
-        files = {name: repaired_name(name) for name in mesh.names}
-        segments = _segment_blocks(mesh, files)
+        segments = [
+            {"name": segment.name, "file": files[segment.name], "color": list(segment.color)}
+            | ({"nested_in": outer[segment.name]} if segment.name in outer else {})
+            for segment in mesh.segments
+        ]
     first = next(key for key in document.data if key in KINDS)
     data: dict[str, Any] = {}
     for key, value in document.data.items():
@@ -250,23 +220,7 @@ def with_segment_files(document: Document, mesh: SegmentedMesh, changed: Collect
     return HEADER.format(name=document.path.name) + body, files
 
 
-def repaired_name(segment: str) -> str:
-    """Name of the file of a repaired segment."""
-    return re.sub(r"[^\w.-]+", "_", segment) + "-repaired.ply"
-
-
-def _segment_blocks(mesh: SegmentedMesh, files: dict[str, str]) -> list[dict[str, Any]]:
-    outer = dict(mesh.nested)
-    return [
-        {"name": segment.name, "file": files[segment.name], "color": list(segment.color)}
-        | ({"nested_in": outer[segment.name]} if segment.name in outer else {})
-        for segment in mesh.segments
-    ]
-
-
 # --- states -----------------------------------------------------------------------------------------------------------
-
-# What ``mereo scene check`` says of random states: how far they move, how they are seen, and what runs into what.
 
 STATES = 12
 """Random states in which segments are tested for overlap, and for being in view."""
@@ -278,7 +232,7 @@ WIDTH = 96
 """Of the depth image in pixels, the default of ``synthesis.config.GenerateConfig``."""
 
 
-def report_states(scene: Scene) -> int:
+def _report_states(scene: Scene) -> int:
     """Print how far random states move, how they are seen, and each overlap with its cause; returns their number."""
     moved = measure_motion(scene.rest, scene.sample_deformations)
     print(f"motion: {moved.mean:.1%} of the longest side in a typical state, {moved.largest:.1%} where it moves most")
@@ -289,8 +243,7 @@ def report_states(scene: Scene) -> int:
         print(f"symmetry: {sentence}")
     at_rest = {frozenset((each.small, each.large)) for each in overlaps(scene.rest)}  # faults by themselves
     worst: dict[frozenset[str], Overlap] = {}
-    seen = 1.0
-    pixels: list[int] = []
+    views = list[tuple[float, int]]()
     for index in range(STATES):
         rng = example_rng(0, index)
         mesh = scene.sample_state(rng).mesh
@@ -298,10 +251,8 @@ def report_states(scene: Scene) -> int:
             pair = frozenset((overlap.small, overlap.large))
             if pair not in at_rest:
                 worst[pair] = max(worst.get(pair, overlap), overlap, key=lambda each: each.share)
-        share, count = _view(scene.workspace, mesh, rng)
-        seen = min(seen, share)
-        pixels.append(count)
-    middle = np.median(pixels)
+        views.append(_view(scene.workspace, mesh, rng))
+    seen, middle = min(share for share, _ in views), np.median([count for _, count in views])
     print(f"picture: a typical view shows it in {middle:.0f} of {WIDTH**2:,} pixels ({middle / WIDTH**2:.1%})")
     for overlap in worst.values():
         print(f"  fault: in random states {overlap}: {_cure(scene, overlap)}")
@@ -330,9 +281,6 @@ def _view(workspace: Workspace, mesh: SegmentedMesh, rng: np.random.Generator) -
     hits = Solids(local).first_hit(camera.directions().reshape(-1, 3))
     within = ((places > 0) & (places < WIDTH)).all(axis=1)
     return float(within.mean()), int(np.isfinite(hits.distance).sum())
-
-
-# --- causes of overlaps -----------------------------------------------------------------------------------------------
 
 
 def _cure(scene: Scene, overlap: Overlap) -> str:

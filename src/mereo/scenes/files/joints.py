@@ -11,45 +11,31 @@ from itertools import combinations, product
 import igl
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from mereo.deformation.maps import Compose, Rigid
-from mereo.geometry.mesh import Segment, SegmentedMesh, surface_points
+from mereo.geometry.mesh import Segment, SegmentedMesh, area_vectors, connected, surface_points
 from mereo.geometry.mesh_check import overlaps
 
 # --- contacts ---------------------------------------------------------------------------------------------------------
 
-# Where parts of an assembly touch, and along which shape: a cylinder, on which they can turn, or a plane, to slide on.
-#
 # Points of one part's surface that are near the other, with normals against its normals, are the contact. Planes are
 # taken out of it first, as clusters of one normal and offset. What is left is a cylinder where its normals are all
 # across one axis, and then centre and radius are linear in points p and normals n: ``p - radius n = center``.
 
-CLEARANCE = 0.005
-"""Largest gap that counts as contact, in longest sides of the object: fits have some."""
+CLEARANCE, AGAINST = 0.005, -0.8
+"""Largest gap that counts as contact, in longest sides of the object, for fits have some; largest cosine of normals."""
 
-POINTS = 1500
-"""Places of a part's surface that are tried."""
-
-LEAST_POINTS = 12
-
-AGAINST = -0.8
-"""Largest cosine of two normals of a contact."""
+POINTS, LEAST_POINTS = 1500, 12
+"""Places of a part's surface that are tried, and fewest that are a contact."""
 
 PLANE_SHARE = 0.1
 """Share of a contact that has one normal before it counts as a plane; facets of a round face have less from 11 on."""
 
 SAME_NORMAL = float(np.cos(np.deg2rad(3.0)))
 
-FLATTEST = 0.02
-"""Mean square cosine of a cylinder's normals with its axis."""
-
-LEAST_ARC = 0.1
-"""Mean square of a cylinder's normals across their main direction: an arc of 80 degrees or so."""
-
-MISFIT = 0.05
-"""Root mean square distance of the points from the cylinder, in radii."""
+FLATTEST, LEAST_ARC, MISFIT = 0.02, 0.1, 0.05
+"""Mean square cosine of a cylinder's normals with its axis at most, and of them across their main direction at least
+(an arc of 80 degrees or so); root mean square distance of the points from the cylinder at most, in radii."""
 
 Points = Float[np.ndarray, "n 3"]
 Vector = Float[np.ndarray, "3"]
@@ -82,7 +68,8 @@ class Contact:
 def contacts(mesh: SegmentedMesh) -> tuple[Contact, ...]:
     """All contacts between segments, which need not be solids. Lengths are in the mesh's unit."""
     reach = CLEARANCE * float((mesh.bounds[1] - mesh.bounds[0]).max())
-    areas = [float(np.linalg.norm(_crossed(segment), axis=1).sum()) for segment in mesh.segments]
+    vectors = [area_vectors(segment.vertices, segment.faces) for segment in mesh.segments]
+    areas = [float(np.linalg.norm(each, axis=1).sum()) for each in vectors]
     touching: list[Contact] = []
     for pair in combinations(range(len(mesh.segments)), 2):
         first, second = sorted(pair, key=lambda index: areas[index])
@@ -92,18 +79,13 @@ def contacts(mesh: SegmentedMesh) -> tuple[Contact, ...]:
     return tuple(touching)
 
 
-def _crossed(segment: Segment) -> Float[np.ndarray, "f 3"]:
-    a, b, c = (segment.vertices[segment.faces[:, k]] for k in range(3))
-    return np.cross(b - a, c - a)
-
-
 def _normals(segment: Segment, face: Int[np.ndarray, " n"]) -> Points:
     """Unit normals of faces."""
-    crossed = _crossed(segment)[face]
-    return crossed / np.maximum(np.linalg.norm(crossed, axis=1, keepdims=True), 1e-30)
+    vectors = area_vectors(segment.vertices, segment.faces[face])
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)
 
 
-def distance(points: Points, segment: Segment) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+def _distance(points: Points, segment: Segment) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
     """Distance of points to a surface, and the nearest face."""
     vertices, faces = np.array(segment.vertices), np.array(segment.faces, dtype=np.int64)
     tree = igl.AABB()
@@ -122,9 +104,8 @@ def _touching(first: Segment, second: Segment, reach: float) -> tuple[Points, Po
     points, normals = points[near], _normals(first, face[near])
     if len(points) == 0:
         return points, normals
-    gap, opposite = distance(points, second)
-    other = _normals(second, opposite)
-    against = (gap < reach) & (np.einsum("ni,ni->n", normals, other) < AGAINST)
+    gap, opposite = _distance(points, second)
+    against = (gap < reach) & (np.einsum("ni,ni->n", normals, _normals(second, opposite)) < AGAINST)
     return points[against], normals[against]
 
 
@@ -140,7 +121,9 @@ def _shapes(first: int, second: int, points: Points, normals: Points, reach: flo
         touching.append(Contact(first, second, "plane", points[flat].mean(axis=0), axis, along, 0.0, extent))
         points, normals = points[~flat], normals[~flat]
     if len(points) >= LEAST_POINTS:
-        touching.append(_cylinder(first, second, points, normals) or _other(first, second, points))
+        along, extent = _longest(points)
+        other = Contact(first, second, "other", points.mean(axis=0), np.zeros(3), along, 0.0, extent)
+        touching.append(_cylinder(first, second, points, normals) or other)
     return touching
 
 
@@ -148,8 +131,7 @@ def _largest_plane(points: Points, normals: Points, reach: float) -> Bool[np.nda
     """The largest set of points of one normal and offset."""
     offsets = normals @ points.T  # of all points along each one's normal
     alike = (normals @ normals.T > SAME_NORMAL) & (np.abs(offsets - np.diag(offsets)[:, None]) < reach)
-    best: Bool[np.ndarray, " n"] = alike[alike.sum(axis=1).argmax()]
-    return best
+    return np.asarray(alike[alike.sum(axis=1).argmax()])
 
 
 def _longest(points: Points) -> tuple[Vector, float]:
@@ -179,11 +161,6 @@ def _cylinder(first: int, second: int, points: Points, normals: Points) -> Conta
     return Contact(first, second, "cylinder", middle, axis, axis, radius, float(np.ptp(height)))
 
 
-def _other(first: int, second: int, points: Points) -> Contact:
-    along, extent = _longest(points)
-    return Contact(first, second, "other", points.mean(axis=0), np.zeros(3), along, 0.0, extent)
-
-
 # --- joints -----------------------------------------------------------------------------------------------------------
 
 ANGLES_DEG = (30.0, 20.0, 10.0, 5.0)
@@ -193,24 +170,17 @@ SLIDES = (0.5, 0.25, 0.1)
 """Ranges of a slide that are tried, in lengths of the contact."""
 
 COLLIDES = 0.01
-"""Share of a segment that another may overlap within a joint's range: half of what a check allows, because states lie
-between those that are tried."""
+"""Share of a segment that another may overlap: half of what a check allows, because states lie between those tried."""
 
-STATES = 128
+STATES, MOST_MOVED = 128, 10_000_000
 """States in which all joints are tried: at most half of them corners of the box of ranges, then some with joints at
-rest, then random ones."""
-
-MOST_MOVED = 10_000_000
-"""Faces of all states together, times joints; what has more of them is tried in fewer states, an eighth at least."""
+rest, then random ones; an eighth at least, where faces of all of them times joints are more than the second number."""
 
 MOST_PASSES = 8
 """Passes over all states, in states; what still collides then is given up."""
 
-NARROWER = 0.8
-"""Factor of the ranges that take part in a collision."""
-
-NARROWEST = 0.2
-"""Share of a joint's range below which it is given up."""
+NARROWER, NARROWEST = 0.8, 0.2
+"""Factor of the ranges that take part in a collision, and share of a joint's range below which it is given up."""
 
 PARALLEL = float(np.cos(np.deg2rad(3.0)))
 
@@ -237,7 +207,7 @@ class Joint:
     contact: Contact
     hinge: bool
     moved: tuple[int, ...]
-    axis: Float[np.ndarray, "3"]
+    axis: Vector
     most: tuple[float, float]
     alone: tuple[float, float]
 
@@ -256,7 +226,10 @@ def proposed_joints(mesh: SegmentedMesh) -> tuple[Joint, ...]:
         if contact.kind == "other" or _held(contact, joints):
             continue
         joint = _joint(test, touching, contact, joints)
-        if joint is not None and not any(_same(joint, other) for other in joints):
+        if joint is not None and not any(
+            (joint.moved, joint.hinge) == (other.moved, other.hinge) and abs(joint.axis @ other.axis) > PARALLEL
+            for other in joints
+        ):
             joints.append(joint)
     return _narrowed(test, sorted(joints, key=lambda joint: len(joint.moved)))
 
@@ -271,10 +244,6 @@ def _held(contact: Contact, joints: Sequence[Joint]) -> bool:
     )
 
 
-def _same(first: Joint, second: Joint) -> bool:
-    return first.moved == second.moved and first.hinge == second.hinge and abs(first.axis @ second.axis) > PARALLEL
-
-
 def _joint(
     test: "_CollisionTest", touching: Sequence[Contact], contact: Contact, joints: Sequence[Joint]
 ) -> Joint | None:
@@ -283,14 +252,16 @@ def _joint(
     hinge = contact.kind == "cylinder"
     axis = contact.axis if hinge else contact.along
     axis = axis * np.sign(axis[np.abs(axis).argmax()])
-    side = _sides(len(mesh.segments), [each for each in touching if not _allows(each, contact, hinge, axis, reach)])
+    closed = [(each.first, each.second) for each in touching if not _allows(each, contact, hinge, axis, reach)]
+    side = connected(np.array(closed, dtype=np.int64).reshape(-1, 2), len(mesh.segments))
     if side[contact.first] == side[contact.second]:
         return None
     groups = [tuple(np.flatnonzero(side == side[index]).tolist()) for index in (contact.first, contact.second)]
     for moved in sorted(groups, key=lambda group: sum(abs(mesh.segments[index].volume) for index in group)):
-        if hinge and all(_is_round(mesh, index, contact.point, axis, reach) for index in moved):
+        if hinge and all(_is_round(mesh.segments[index], contact.point, axis, reach) for index in moved):
             continue
-        if any(_cross(set(moved), set(other.moved)) for other in joints):
+        # of two that share segments one holds all of the other's, or it turns about a pivot that the other carries away
+        if any(set(moved) & (rest := set(other.moved)) and set(moved) - rest and rest - set(moved) for other in joints):
             continue
         steps = ANGLES_DEG if hinge else tuple(contact.extent * share for share in SLIDES)
         joint = Joint(contact, hinge, moved, axis, (0.0, 0.0), (0.0, 0.0))
@@ -300,22 +271,7 @@ def _joint(
     return None
 
 
-def _cross(first: set[int], second: set[int]) -> bool:
-    """Whether neither of two sets holds the other and they share members.
-
-    One of two such joints would turn about a pivot at rest from which the other has carried its segments away.
-    """
-    return bool(first & second and first - second and second - first)
-
-
-def _sides(count: int, held: Sequence[Contact]) -> np.ndarray:
-    """For each segment the number of the group that contacts hold together."""
-    rows = np.array([(each.first, each.second) for each in held], dtype=np.int64).reshape(-1, 2)
-    graph = coo_array((np.ones(len(rows)), rows.T), shape=(count, count))
-    return np.asarray(connected_components(graph, directed=False)[1])
-
-
-def _allows(contact: Contact, joint: Contact, hinge: bool, axis: Float[np.ndarray, "3"], reach: float) -> bool:
+def _allows(contact: Contact, joint: Contact, hinge: bool, axis: Vector, reach: float) -> bool:
     """Whether a contact stays closed in a turn about, or a slide along, the axis of a joint."""
     aligned = abs(contact.axis @ axis)
     if contact.kind == "other":
@@ -327,26 +283,18 @@ def _allows(contact: Contact, joint: Contact, hinge: bool, axis: Float[np.ndarra
     return bool(aligned > PARALLEL and (coaxial or not hinge))
 
 
-def _is_round(
-    mesh: SegmentedMesh, index: int, point: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"], reach: float
-) -> bool:
+def _is_round(segment: Segment, point: Vector, axis: Vector, reach: float) -> bool:
     """Whether a turn about the axis brings a segment onto itself."""
-    segment = mesh.segments[index]
     points = surface_points(segment.vertices, segment.faces, 200)[0]
     turned = Rigid(ROUND_TEST_RAD * axis, np.zeros(3), point)(points)
-    return bool(distance(turned, segment)[0].max() < reach)
+    return bool(_distance(turned, segment)[0].max() < reach)
 
 
 # --- joints together --------------------------------------------------------------------------------------------------
 
 
 class _CollisionTest:
-    """Test whether segments collide where joints have moved them.
-
-    Attributes:
-        mesh: the segments at rest.
-        reach: largest gap of a contact.
-    """
+    """Test whether segments collide where joints have moved them; ``reach`` is the largest gap of a contact."""
 
     def __init__(self, mesh: SegmentedMesh) -> None:
         self.mesh = mesh
@@ -355,10 +303,8 @@ class _CollisionTest:
 
     def free(self, joint: Joint, steps: Sequence[float]) -> float:
         """First of the steps, from the farthest to the nearest, over which nothing collides; 0 where there is none."""
-        for step in steps:
-            if not any(self.pairs([joint], [step * share]) for share in (0.5, 1.0)):
-                return step
-        return 0.0
+        free = (step for step in steps if not any(self.pairs([joint], [step * share]) for share in (0.5, 1.0)))
+        return next(free, 0.0)
 
     def pairs(self, joints: Sequence[Joint], ways: Sequence[float]) -> list[tuple[int, int]]:
         """Indices of the segments that collide where each joint has gone its way, in degrees or the mesh's unit."""
@@ -416,7 +362,7 @@ def _narrowed(test: _CollisionTest, joints: Sequence[Joint]) -> tuple[Joint, ...
         clean = True
         for share in shares:
             tries += 1
-            while blamed := _blamed(test, joints, share, _ways(share, ranges)):
+            while blamed := _blamed(test, joints, share, ranges):
                 clean = False
                 tries += 1
                 for joint, side in blamed:
@@ -438,14 +384,14 @@ def _combinations(joints: int, states: int) -> Float[np.ndarray, "states joints"
     return np.concatenate([corners, mixed, rng.uniform(-1.0, 1.0, (states // 4, joints))])
 
 
-def _ways(share: Float[np.ndarray, " joints"], ranges: Float[np.ndarray, "joints 2"]) -> list[float]:
-    return (np.maximum(share, 0.0) * ranges[:, 1] + np.maximum(-share, 0.0) * ranges[:, 0]).tolist()
-
-
 def _blamed(
-    test: _CollisionTest, joints: Sequence[Joint], share: Float[np.ndarray, " joints"], ways: Sequence[float]
+    test: _CollisionTest,
+    joints: Sequence[Joint],
+    share: Float[np.ndarray, " joints"],
+    ranges: Float[np.ndarray, "joints 2"],
 ) -> set[tuple[int, int]]:
     """Joints, and the side (0 for the least, 1 for the most) of their ranges, that bring segments into collision."""
+    ways = (np.maximum(share, 0.0) * ranges[:, 1] + np.maximum(-share, 0.0) * ranges[:, 0]).tolist()
     return {
         (k, int(share[k] > 0))
         for pair in test.pairs(joints, ways)

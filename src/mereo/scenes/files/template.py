@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
@@ -21,7 +21,7 @@ from scipy.spatial import ConvexHull, QhullError
 from mereo.deformation.maps import Deformation, unit
 from mereo.deformation.samplers import RandomMotion, distance_from_line
 from mereo.geometry.brief import counted
-from mereo.geometry.conventions import UNITS_M
+from mereo.geometry.conventions import UNITS_M, Way
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, surface_points
 from mereo.geometry.mesh_check import likely_unit
 from mereo.geometry.transforms import Normalizer, fit_rigid, inverse_rigid, transform_points
@@ -44,46 +44,31 @@ from mereo.scenes.seeds import example_rng
 
 # --- how far states move ----------------------------------------------------------------------------------------------
 
-# How far an object moves in its random states: what its shape changes by, beyond turns and shifts of the whole.
-
-STATES = 24
-
-POINTS = 800
-"""Places of the surface at which motion is measured."""
+STATES, POINTS = 24, 800
+"""Random states in which motion is measured, and places of the surface at which it is."""
 
 Draw = Callable[[np.random.Generator], tuple[Deformation, ...]]
 
 
-@dataclass(frozen=True)
-class Motion:
-    """Motion of the surface in a typical (median) state, in shares of the object's longest side.
-
-    Attributes:
-        mean: root mean square over the surface, after the best rigid motion of the whole.
-        largest: that of the place which moves farthest, likewise.
-    """
+class Motion(NamedTuple):
+    """Root mean square and largest motion of the surface in a typical (median) state, in the object's longest sides."""
 
     mean: float
     largest: float
 
 
-def measure_motion(rest: SegmentedMesh, draw: Draw, states: int = STATES) -> Motion:
-    """Motion of an object in ``states`` random states, which are the same in every call."""
+def measure_motion(rest: SegmentedMesh, draw: Draw) -> Motion:
+    """Motion of an object in random states, which are the same in every call, beyond turns and shifts of the whole."""
     points, owner = material_points(rest, POINTS)
-    length = float((rest.bounds[1] - rest.bounds[0]).max())
-    means, most = [], []
-    for index in range(states):
-        moved = move(points, owner, draw(example_rng(0, index)))
-        way = np.linalg.norm(moved - transform_points(fit_rigid(points, moved), points), axis=1) / length
-        means.append(np.sqrt(np.mean(way**2)))
-        most.append(way.max())
-    return Motion(float(np.median(means)), float(np.median(most)))
+    states = [_moved(points, owner, draw(example_rng(0, index))) for index in range(STATES)]
+    ways = [moved - transform_points(fit_rigid(points, moved), points) for moved in states]
+    shares = np.linalg.norm(ways, axis=2) / float((rest.bounds[1] - rest.bounds[0]).max())
+    return Motion(float(np.median(np.sqrt(np.mean(shares**2, axis=1)))), float(np.median(shares.max(axis=1))))
 
 
-def move(
+def _moved(
     points: Float[np.ndarray, "n 3"], owner: Int[np.ndarray, " n"], deformations: tuple[Deformation, ...]
 ) -> Float[np.ndarray, "n 3"]:
-    """Points of segments (indices ``owner``), each moved by its segment's map."""
     result = np.empty_like(points)
     for index in np.unique(owner):
         rows = owner == index
@@ -103,48 +88,20 @@ def material_points(mesh: SegmentedMesh, count: int) -> tuple[Float[np.ndarray, 
 MOTION = 0.05
 """Motion of the surface in a typical state, in longest sides: that of the bunny and of the liver."""
 
-LATTICES = 2
-
-MOST_STRENGTH = 0.9
-
-MOST_BEND_DEG = 120.0
+LATTICES, MOST_STRENGTH, MOST_BEND_DEG = 2, 0.9, 120.0
 
 BEND_SHARE = 0.8
 """Largest bend, as a share of that at which space folds over; ``samplers.FOLD_SHARE`` is the bound."""
 
-NEAR = 100.0
-"""Nearest distance of the camera, as in the paper, in scene units; farther for what would fill a wider view."""
-
-FARTHER = 1.25
-"""Farthest distance, in nearest ones. Twice, as in the paper, leaves a quarter of the picture's pixels."""
-
-MOST_VIEW_RAD = float(np.deg2rad(40.0))
-
-STATES_SEEN, VIEWS = 16, 64
-"""Random states in which an object is seen, and from how many places in all."""
-
-FRAMED = 1000
-"""Places of the surface that a view must show, and at most so many vertices of each segment."""
-
-MARGIN = 1.03
-"""Width of the picture, in widths of the widest of ``VIEWS`` views from the nearest distance."""
-
-
 UNPLACED = Normalizer(np.zeros(3), 1.0)
 
-
-Way = Literal["auto", "rigid", "soft", "stiff", "articulated"]
-"""How an object deforms: not at all, as a soft or a stiff elastic solid, by its joints, or as its meshes suggest."""
+Blocks = tuple[ElasticBlock | BendBlock | LatticeBlock, ...]
 
 
-def default_deformations(
-    mesh: SegmentedMesh, motion: float = SOFT
-) -> tuple[ElasticBlock | BendBlock | LatticeBlock, ...]:
+def default_deformations(mesh: SegmentedMesh, motion: float = SOFT) -> Blocks:
     """States of an elastic solid; of segments that do not touch, those of a box of rubber around them.
 
-    Args:
-        mesh: segments in the file's frame and unit.
-        motion: as ``ElasticBlock.motion``.
+    ``mesh`` is in the file's frame and unit, ``motion`` as ``ElasticBlock.motion``.
     """
     elastic = ElasticBlock(type="elastic", motion=motion)
     try:
@@ -154,12 +111,8 @@ def default_deformations(
     return (elastic,) if pieces == 1 else rubber(mesh)
 
 
-def rubber(mesh: SegmentedMesh) -> tuple[BendBlock | LatticeBlock, ...]:
-    """Deformations under which the surface moves by about ``MOTION``, or by as much as does not fold space over.
-
-    Args:
-        mesh: segments in the file's frame and unit.
-    """
+def rubber(mesh: SegmentedMesh) -> Blocks:
+    """Deformations under which the surface moves by about ``MOTION``, or by as much as does not fold space over."""
     strength = 1.0
     for _ in range(4):  # motion is nearly proportional to the strength
         blocks = _blocks(mesh, strength)
@@ -170,7 +123,7 @@ def rubber(mesh: SegmentedMesh) -> tuple[BendBlock | LatticeBlock, ...]:
     return _blocks(mesh, strength)
 
 
-def _blocks(mesh: SegmentedMesh, strength: float) -> tuple[BendBlock | LatticeBlock, ...]:
+def _blocks(mesh: SegmentedMesh, strength: float) -> Blocks:
     """A bend along the longest side and ``LATTICES`` lattices, numbers rounded as they are written."""
     low, high = mesh.bounds
     longest = int((high - low).argmax())
@@ -178,16 +131,11 @@ def _blocks(mesh: SegmentedMesh, strength: float) -> tuple[BendBlock | LatticeBl
     origin[longest] = low[longest]
     radius = distance_from_line(mesh.merged()[0], origin, axis)
     most = min(BEND_SHARE * np.rad2deg(length / radius), MOST_BEND_DEG)
-    x, y, z = (rounded(value) for value in origin)
+    (x, y, z), (u, v, w) = (rounded(value) for value in origin), axis.tolist()
     angle, size = float(np.floor(most * strength)), rounded(length)
     share = rounded(MOST_STRENGTH * strength, 2)
-    bend = BendBlock(type="bend", origin=(x, y, z), axis=_direction(longest), length=size, angle=(-angle, angle))
+    bend = BendBlock(type="bend", origin=(x, y, z), axis=(u, v, w), length=size, angle=(-angle, angle))
     return (bend, *(LATTICES * [LatticeBlock(type="lattice", spacing=rounded(length / 2), strength=share)]))
-
-
-def _direction(index: int) -> tuple[float, float, float]:
-    x, y, z = np.eye(3)[index]
-    return float(x), float(y), float(z)
 
 
 def rounded(value: float, digits: int = 4) -> float:
@@ -208,20 +156,15 @@ THICKNESS_SHARE = 0.08
 """Depth of what counts as the plane of a base, in ratios of the hull's volume to its area (a ball's radius is three):
 scans of flat faces are bumpy."""
 
-SAME_NORMAL = 0.98
-"""Least cosine of a face's normal with that of the base."""
+SAME_NORMAL, MOST_FACETS = 0.98, 200
+"""Least cosine of a face's normal with that of the base; faces of the hull, the largest first, that are tried."""
 
-LEAST_BASE = 0.08
-"""Share of the hull's area within the outline of a base."""
-
-LEAST_COVER = 0.25
-"""Share of that outline that is surface of the object: three places of a rounded body are no base."""
+LEAST_BASE, LEAST_COVER = 0.08, 0.25
+"""Share of the hull's area within the outline of a base, and of that outline that is surface of the object: three
+places of a rounded body are no base."""
 
 LEAST_TILT = float(np.tan(np.deg2rad(15.0)))
 """Slope on which the object still stands."""
-
-MOST_FACETS = 200
-"""Faces of the hull, the largest first, whose normals are tried."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,7 +215,6 @@ def flat_base(mesh: SegmentedMesh, up: Sequence[float]) -> FlatBase | None:
 
 
 def _base(solid: trimesh.Trimesh, hull: trimesh.Trimesh, normal: Float[np.ndarray, "3"]) -> FlatBase | None:
-    """Base with about this normal."""
     heights = solid.vertices @ normal
     top = heights.max() - THICKNESS_SHARE * hull.volume / hull.area
     crossed = solid.triangles_cross * np.sign(solid.triangles_cross @ normal)[:, None]
@@ -283,9 +225,7 @@ def _base(solid: trimesh.Trimesh, hull: trimesh.Trimesh, normal: Float[np.ndarra
     normal = unit(crossed[on].sum(axis=0))
     across = np.linalg.svd(normal[None])[2][1:]
     outline = ConvexHull(solid.vertices[np.unique(solid.faces[on])] @ across.T)
-    center = (
-        solid.center_mass if solid.volume > 0.01 * hull.volume else hull.center_mass
-    )  # of open meshes it is nonsense
+    center = (solid if solid.volume > 0.01 * hull.volume else hull).center_mass  # of open meshes it is nonsense
     inside = -float((outline.equations[:, :2] @ (across @ center) + outline.equations[:, 2]).max())
     share, cover = outline.volume / hull.area, areas[on].sum() / 2 / outline.volume
     height = float((solid.vertices @ normal).max() - center @ normal)
@@ -297,10 +237,26 @@ def _base(solid: trimesh.Trimesh, hull: trimesh.Trimesh, normal: Float[np.ndarra
 
 # --- the camera -------------------------------------------------------------------------------------------------------
 
+NEAR, FARTHER, MOST_VIEW_RAD = 100.0, 1.25, float(np.deg2rad(40.0))
+"""Nearest distance of the camera in scene units, as in the paper, or as far as the object fills no wider view; and the
+farthest in nearest ones. Twice, as in the paper, leaves a quarter of the picture's pixels."""
+
+STATES_SEEN, VIEWS, MARGIN = 16, 64, 1.03
+"""Random states in which an object is seen, and views of them; width of the picture, in widths of the widest view."""
+
+FRAMED = 1000
+"""Places of the surface that a view must show, and at most so many vertices of each segment."""
+
 
 def _default_view(rest: SegmentedMesh, draw: Draw, workspace: Workspace) -> tuple[float, float, int]:
     """Nearest and farthest distance in scene units, and field of view in degrees, that random states fill uncut."""
-    states = _states(rest, draw)
+    points, owner = material_points(rest, FRAMED)
+    corners = [segment.vertices[:: 1 + len(segment.vertices) // FRAMED] for segment in rest.segments]
+    owner = np.concatenate([owner, np.repeat(np.arange(len(corners)), [len(part) for part in corners])])
+    points = np.concatenate([points, *corners])
+    moved = [_moved(points, owner, draw(example_rng(0, index))) for index in range(STATES_SEEN)]
+    # the camera aims at the middle of their box
+    states = [(places, (places.min(axis=0) + places.max(axis=0)) / 2) for places in moved]
     reach = max(float(np.linalg.norm(points - center, axis=1).max()) for points, center in states)
     near = max(NEAR, float(np.ceil(reach / np.sin(MOST_VIEW_RAD / 2))))
     widest = 0.0
@@ -314,16 +270,6 @@ def _default_view(rest: SegmentedMesh, draw: Draw, workspace: Workspace) -> tupl
     return near, float(np.ceil(FARTHER * near)), view
 
 
-def _states(rest: SegmentedMesh, draw: Draw) -> list[tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "3"]]]:
-    """Places of the surface in random states, and the middle of their box, at which the camera aims."""
-    points, owner = material_points(rest, FRAMED)
-    corners = [segment.vertices[:: 1 + len(segment.vertices) // FRAMED] for segment in rest.segments]
-    owner = np.concatenate([owner, np.repeat(np.arange(len(corners)), [len(part) for part in corners])])
-    points = np.concatenate([points, *corners])
-    moved = [move(points, owner, draw(example_rng(0, index))) for index in range(STATES_SEEN)]
-    return [(places, (places.min(axis=0) + places.max(axis=0)) / 2) for places in moved]
-
-
 def placed(mesh: SegmentedMesh, size: float) -> Normalizer:
     """Map from the file's frame to the scene's: the joint box centred, its shortest side ``size`` long."""
     low, high = mesh.bounds
@@ -335,16 +281,13 @@ def placed(mesh: SegmentedMesh, size: float) -> Normalizer:
 
 # --- the file ---------------------------------------------------------------------------------------------------------
 
-SIZE = 20.0
+SIZE, LONGEST = 20.0, 80.0
 """Shortest side in scene units, as in the paper, unless the object is longer than ``LONGEST`` then."""
-
-LONGEST = 80.0
 
 LABEL_CELLS = 64
 
 
-@dataclass(frozen=True, eq=False)
-class _Source:
+class _Source(NamedTuple):
     """Segments of files in their unit, the lines that name them, and the likely unit and upward axis, with reasons.
 
     ``assembly`` is whether the segments are parts, which may have joints, and not regions of one body.
@@ -375,8 +318,7 @@ def write_scene_file(
         output: by default ``NAME.yaml`` in the working directory, after the first file.
         units: a key of ``geometry.conventions.UNITS_M``; None guesses.
         name: of the scene; by default that of ``output``.
-        aperture: of the cone of directions, about the side that is up, from which the camera looks, in degrees above 0
-            to 360: all around.
+        aperture: of the cone about the side that is up from which the camera looks, above 0 to 360 degrees: all around.
         report: called with each sentence about what was found, once the file is written.
         deformations: how the object moves.
 
@@ -391,7 +333,7 @@ def write_scene_file(
     check_file_place(path)
     if path.exists():
         raise FileExistsError(f"{path} exists; it is not overwritten: choose another --output")
-    source = _source(list(files), path.parent)
+    source = _source(files, path.parent)
     text, notes = _draft(name, source, units, aperture, deformations)
     with atomic_file(path, force=False) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -407,7 +349,7 @@ def identifier(text: str) -> str:
     return f"my-{name}" if name in SCENES else name
 
 
-def _source(files: list[Path], folder: Path) -> _Source:
+def _source(files: Sequence[Path], folder: Path) -> _Source:
     relative = [Path(os.path.relpath(file, folder)).as_posix() for file in files]
     for file, text in zip(files, relative, strict=True):
         if text != text.encode("utf-8", "replace").decode():
@@ -418,21 +360,19 @@ def _source(files: list[Path], folder: Path) -> _Source:
                 f"{len(files)} files are given, with a label volume among them; it comes alone: name it only"
             )
         return _from_volume(files[0], relative[0])
-    if len(files) > 1:
-        return _from_meshes(files, relative)
-    mesh = read_segmented_mesh(files[0])
-    return _from_meshes(files, relative) if len(mesh.segments) == 1 else _from_model(files[0], relative[0], mesh)
-
-
-def _from_meshes(files: Sequence[Path], relative: Sequence[str]) -> _Source:
-    """One segment for each file, called after it, with all of its parts."""
+    meshes = [read_segmented_mesh(file) for file in files]
+    if len(files) == 1 and len(meshes[0].segments) > 1:
+        return _from_model(files[0], relative[0], meshes[0])
+    # one segment for each file, called after it, with all of its parts
     names = _segment_names([file.stem for file in files], "files")
-    mesh = SegmentedMesh(tuple(_whole_file(name, file) for name, file in zip(names, files, strict=True)))
+    parts = [Segment(name, PALETTE[0], *mesh.merged()[:2]) for name, mesh in zip(names, meshes, strict=True)]
+    mesh = SegmentedMesh(tuple(parts))
     lines = ["segments:  # one closed mesh for each; their order is that of the labels"]
-    for number, (name, file) in enumerate(zip(names, relative, strict=True)):
-        lines += [f"  - name: {quoted(name)}", f"    file: {quoted(file)}", f"    color: {_color(number)}"]
+    for number, (name, text) in enumerate(zip(names, relative, strict=True)):
+        color = list(PALETTE[number % len(PALETTE)])
+        lines += [f"  - name: {quoted(name)}", f"    file: {quoted(text)}", f"    color: {color}"]
     lines.append("    # nested_in: NAME  # for a segment that lies inside another one, which has to come after it")
-    return _Source("\n".join(lines), mesh, *_unit_of(files[0], mesh.bounds), *_up_of(files[0]))
+    return _Source("\n".join(lines), mesh, *_likely_frame(files[0], mesh.bounds))
 
 
 def _segment_names(names: Sequence[str], kind: str) -> tuple[str, ...]:
@@ -448,22 +388,16 @@ def _segment_name(text: str) -> str:
     return "".join(each if each.isprintable() and each not in "/\\" else "_" for each in text)
 
 
-def _whole_file(name: str, file: Path) -> Segment:
-    """All parts of a file."""
-    vertices, faces, _ = read_segmented_mesh(file).merged()
-    return Segment(name, PALETTE[0], vertices, faces)
-
-
 def _from_model(file: Path, relative: str, mesh: SegmentedMesh) -> _Source:
     lines = [f"model: {quoted(relative)}", "parts:  # delete what is not wanted; their order is that of the labels"]
     names = _segment_names(mesh.names, "parts")
     for number, (part, name) in enumerate(zip(mesh.names, names, strict=True)):
         lines.append(f"  - name: {quoted(name)}")
         lines += [f"    parts: [{quoted(part)}]"] if part != name else []
-        lines.append(f"    color: {_color(number)}")
+        lines.append(f"    color: {list(PALETTE[number % len(PALETTE)])}")
     mesh = SegmentedMesh(tuple(replace(part, name=name) for part, name in zip(mesh.segments, names, strict=True)))
     lines.append("    # parts: [A, B]  # parts of the model to join into this segment, instead of the one of its name")
-    return _Source("\n".join(lines), mesh, *_unit_of(file, mesh.bounds), *_up_of(file))
+    return _Source("\n".join(lines), mesh, *_likely_frame(file, mesh.bounds))
 
 
 def _from_volume(file: Path, relative: str) -> _Source:
@@ -479,22 +413,14 @@ def _from_volume(file: Path, relative: str) -> _Source:
     return _Source("\n".join(lines), mesh, "mm", "the convention of NIfTI and NRRD", 2, "z is to the head", False)
 
 
-def _unit_of(file: Path, bounds: Float[np.ndarray, "2 3"]) -> tuple[str, str]:
-    if file.suffix.lower() in (".glb", ".gltf"):
-        return "m", "the rule of glTF"
-    if file.suffix.lower() == ".3mf":
-        return "mm", "the default of 3MF"
-    unit = likely_unit(bounds)
-    longest_m = float((bounds[1] - bounds[0]).max()) * UNITS_M[unit]
-    return unit, f"guessed: the object would be {longest_m:.3g} m long"
-
-
-def _up_of(file: Path) -> tuple[int, str]:
-    """Axis that points upwards in a mesh file, and why."""
-    kind = file.suffix.lower().lstrip(".")
-    if kind in ("glb", "gltf", "obj"):
-        return 1, f"y is up, as in most files of the kind .{kind}"
-    return 2, f"z is up, as in most files of the kind .{kind}"
+def _likely_frame(file: Path, bounds: Float[np.ndarray, "2 3"]) -> tuple[str, str, int, str]:
+    """Unit of a mesh file, and why; the axis that points upwards in it, and why."""
+    kind, guess = file.suffix.lower().lstrip("."), likely_unit(bounds)
+    longest_m = float((bounds[1] - bounds[0]).max()) * UNITS_M[guess]
+    known = {"glb": ("m", "the rule of glTF"), "gltf": ("m", "the rule of glTF"), "3mf": ("mm", "the default of 3MF")}
+    unit, reason = known.get(kind, (guess, f"guessed: the object would be {longest_m:.3g} m long"))
+    up = 1 if kind in ("glb", "gltf", "obj") else 2
+    return unit, reason, up, f"{'xyz'[up]} is up, as in most files of the kind .{kind}"
 
 
 # --- the text ---------------------------------------------------------------------------------------------------------
@@ -506,8 +432,9 @@ def _draft(name: str, source: _Source, units: str | None, aperture: float, way: 
     size = rounded(min(SIZE, LONGEST * float(sides.min() / sides.max())), 3)
     placement = placed(source.mesh, size)
     joints = proposed_joints(source.mesh) if source.assembly else ()
-    way, why = choose_way(way, joints)
-    moves = Moves.of(source.mesh, way, joints)
+    way, why = _chosen(way, joints)
+    motion = {"soft": SOFT, "stiff": STIFF}.get(way)
+    moves = _Moves(way, joints, () if motion is None else default_deformations(source.mesh, motion))
     rest = source.mesh.with_vertices([placement.apply(segment.vertices) for segment in source.mesh.segments])
     x, y, z = np.eye(3)[source.up].tolist()
     up_reason, base = source.up_reason, flat_base(source.mesh, (x, y, z)) if source.assembly else None
@@ -521,23 +448,19 @@ def _draft(name: str, source: _Source, units: str | None, aperture: float, way: 
         block=source.block,
         unit=unit,
         reason=reason,
-        sides=" x ".join(f"{side:.4g}" for side in sides),
-        size=f"{size:g}",
-        aperture=f"{aperture:g}",
-        up=_numbers(np.array((x, y, z))),
         up_reason=up_reason,
-        near=f"{near:g}",
-        far=f"{far:g}",
+        **{key: f"{value:g}" for key, value in (("size", size), ("aperture", aperture), ("near", near), ("far", far))},
+        sides=" x ".join(f"{side:.4g}" for side in sides),
+        up=_numbers(np.array((x, y, z))),
         roll="true" if workspace.any_roll else "false",
         view=view,
         deformations=_deformations(source.mesh, moves),
     )
-    return text, [f"deformations: {moves.description}, {why}"] + _notes(source.mesh, moves) + (
-        [f"base: {base.describe(workspace)}"] if base is not None else []
-    )
+    notes = [f"deformations: {moves.describe()}, {why}", *_notes(source.mesh, moves)]
+    return text, notes if base is None else [*notes, f"base: {base.describe(workspace)}"]
 
 
-def choose_way(way: Way, joints: Sequence[Joint]) -> tuple[Way, str]:
+def _chosen(way: Way, joints: Sequence[Joint]) -> tuple[Way, str]:
     """How an object deforms, and why; ``ValueError`` where it is to be articulated and has no joints."""
     if way == "auto":
         if hinges := sum(joint.hinge for joint in joints):
@@ -551,33 +474,16 @@ def choose_way(way: Way, joints: Sequence[Joint]) -> tuple[Way, str]:
     return way, "as you said"
 
 
-@dataclass(frozen=True)
-class Moves:
-    """How the object of a new scene file moves.
-
-    Attributes:
-        way: in a word.
-        joints: that its contacts suggest.
-        blocks: that move all segments; none of what is rigid or articulated.
-    """
+class _Moves(NamedTuple):
+    """How the object of a new scene file moves: joints that its contacts suggest, and blocks that move all segments."""
 
     way: Way
     joints: Sequence[Joint]
-    blocks: tuple[DeformationBlock, ...]
+    blocks: Blocks
 
-    @classmethod
-    def of(cls, mesh: SegmentedMesh, way: Way, joints: Sequence[Joint]) -> "Moves":
-        """Moves of segments in the file's frame and unit."""
-        motions = {"soft": SOFT, "stiff": STIFF}
-        return cls(way, joints, default_deformations(mesh, motions[way]) if way in motions else ())
-
-    @property
-    def description(self) -> str:
-        """Phrase on how it moves."""
-        if self.way == "articulated":
-            return "by its joints"
-        if self.way == "rigid":
-            return "none"
+    def describe(self) -> str:
+        if not self.blocks:
+            return "by its joints" if self.way == "articulated" else "none"
         if not isinstance(self.blocks[0], ElasticBlock):
             return "as in a box of rubber, for its segments do not touch"
         return f"as a {self.way} elastic solid"
@@ -592,18 +498,15 @@ class Moves:
 
 def _joint_block(joint: Joint) -> JointBlock:
     (x, y, z), (u, v, w) = joint.contact.point.tolist(), joint.axis.tolist()
-    most = (float(joint.most[0]), float(joint.most[1]))
-    angle, slide = (most, (0.0, 0.0)) if joint.hinge else ((0.0, 0.0), most)
+    angle, slide = (joint.most, (0.0, 0.0)) if joint.hinge else ((0.0, 0.0), joint.most)
     return JointBlock(type="joint", pivot=(x, y, z), axis=(u, v, w), angle=angle, slide=slide)
 
 
-def _notes(mesh: SegmentedMesh, moves: Moves) -> list[str]:
+def _notes(mesh: SegmentedMesh, moves: _Moves) -> list[str]:
     """Sentences about proposed joints."""
-    if not moves.joints:
-        return []
-    count = counted(len(moves.joints), "joint")
     ending = "" if moves.way == "articulated" else ", proposed in comments: remove the # where it has them"
-    notes = [f"joints: its parts touch like {count}{ending}"]
+    count = counted(len(moves.joints), "joint")
+    notes = [f"joints: its parts touch like {count}{ending}"] if moves.joints else []
     for joint in moves.joints:
         if joint.narrowed:
             names = ", ".join(mesh.names[index] for index in joint.moved)
@@ -617,13 +520,13 @@ def _narrowed(joint: Joint) -> str:
     return f"narrowed from {_range(joint.alone)}: beyond, joints collide together"
 
 
-def _deformations(mesh: SegmentedMesh, moves: Moves) -> str:
+def _deformations(mesh: SegmentedMesh, moves: _Moves) -> str:
     """The key ``deformations`` with its lines: joints, what bends the whole, and others in comments."""
     sides, joints = np.ptp(mesh.bounds, axis=0), _joints(mesh, moves.joints)
     longest = int(sides.argmax())
     start = (mesh.bounds[0] + mesh.bounds[1]) / 2
     start[longest] = mesh.bounds[0, longest]
-    end, axis, length = _numbers(start), [int(value) for value in _direction(longest)], f"{rounded(sides[longest]):g}"
+    end, axis, length = _numbers(start), np.eye(3, dtype=int)[longest].tolist(), f"{rounded(sides[longest]):g}"
     push, reach = f"{0.1 * sides.min():.3g}", f"{0.5 * sides.min():.3g}"
     further = FURTHER.format(end=end, axis=axis, length=length, push=push, reach=reach)
     if moves.way == "rigid":
@@ -634,28 +537,22 @@ def _deformations(mesh: SegmentedMesh, moves: Moves) -> str:
     return f"deformations:\n{joints}{_soft(mesh, moves.blocks)}{further}"
 
 
-def _soft(mesh: SegmentedMesh, blocks: Sequence[DeformationBlock]) -> str:
+def _soft(mesh: SegmentedMesh, blocks: Blocks) -> str:
     """Lines of what bends the whole object."""
     if isinstance(blocks[0], ElasticBlock):
         vertices, longest = mesh.merged()[0], int(np.ptp(mesh.bounds, axis=0).argmax())
         return ELASTIC_TEXT.format(
-            motion=f"{blocks[0].motion:g}",
-            soft=f"{SOFT:g}",
-            stiff=f"{STIFF:g}",
+            motion=blocks[0].motion,
+            soft=SOFT,
+            stiff=STIFF,
             part=quoted(mesh.names[-1]),
             end=_numbers(vertices[vertices[:, longest].argmin()]),
-            held=f"{0.15 * np.ptp(mesh.bounds, axis=0).max():.3g}",
+            held=0.15 * np.ptp(mesh.bounds, axis=0).max(),
         )
     bend, lattice = blocks[0], blocks[-1]
     assert isinstance(bend, BendBlock) and isinstance(lattice, LatticeBlock)
-    return RUBBER.format(
-        spacing=f"{lattice.spacing:g}",
-        strength=f"{lattice.strength:g}",
-        end=_numbers(np.array(bend.origin)),
-        axis=[int(value) for value in bend.axis],
-        length=f"{bend.length:g}",
-        angle=f"{bend.angle[1]:g}",
-    )
+    end, axis = _numbers(np.array(bend.origin)), [int(value) for value in bend.axis]
+    return RUBBER.format(lattice=lattice, end=end, axis=axis, length=bend.length, angle=bend.angle[1])
 
 
 def _joints(mesh: SegmentedMesh, joints: Sequence[Joint]) -> str:
@@ -680,10 +577,6 @@ def _joints(mesh: SegmentedMesh, joints: Sequence[Joint]) -> str:
 
 def _range(values: tuple[float, float]) -> str:
     return f"[{values[0]:.4g}, {values[1]:.4g}]"
-
-
-def _color(number: int) -> str:
-    return str(list(PALETTE[number % len(PALETTE)]))
 
 
 def quoted(text: str) -> str:
@@ -711,11 +604,11 @@ EXAMPLE_JOINT = """\
 
 ELASTIC_TEXT = """\
   - type: elastic  # all segments as one solid under random loads
-    motion: {motion}  # of a typical place, in half longest sides: {soft} is soft, as organs are, {stiff} is stiff
+    motion: {motion:g}  # of a typical place, in half longest sides: {soft:g} is soft, as organs are, {stiff:g} is stiff
 #    stiffness: {{{part}: 10}}  # of a segment, in that of the others
 #    held:  # what does not move, such as an attachment: a ball, or a side of a plane (direction instead of radius)
 #      - center: {end}
-#        radius: {held}
+#        radius: {held:.3g}
 """
 
 ELASTIC_COMMENT = """\
@@ -727,14 +620,14 @@ RUBBER = """\
   - type: bend  # along the longest side, to any side
     origin: {end}
     axis: {axis}
-    length: {length}
-    angle: [-{angle}, {angle}]
+    length: {length:g}
+    angle: [-{angle:g}, {angle:g}]
   - type: lattice  # smooth and free-form: the object in a box of rubber
-    spacing: {spacing}  # of the points that are moved: wider is smoother
-    strength: {strength}  # from 0 to below 1, at which space might fold over
+    spacing: {lattice.spacing:g}  # of the points that are moved: wider is smoother
+    strength: {lattice.strength:g}  # from 0 to below 1, at which space might fold over
   - type: lattice  # once more, for one alone is stiffer than rubber
-    spacing: {spacing}
-    strength: {strength}
+    spacing: {lattice.spacing:g}
+    strength: {lattice.strength:g}
 """
 
 FURTHER = """\

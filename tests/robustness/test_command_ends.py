@@ -1,5 +1,6 @@
-"""TERM and HUP end a command as Ctrl-C does: by an exception in the main thread, which leaves nothing half-written."""
+"""How a command ends: by TERM and HUP as by Ctrl-C, with nothing half-written; what nobody has foreseen is one line."""
 
+import json
 import os
 import signal
 import subprocess
@@ -31,10 +32,10 @@ def hang_ups_count() -> Iterator[None]:
     signal.signal(signal.SIGHUP, before)
 
 
-def run(work: Callable[[], None], monkeypatch: pytest.MonkeyPatch) -> int:
-    """Exit code of the command line when a command does this work."""
+def run(work: Callable[[], object], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    """Exit code of the command line when a command does this work, whatever its arguments."""
     monkeypatch.setattr(command_line, "parse", lambda _: SimpleNamespace(run=work))
-    return command_line.main([])
+    return command_line.main(list(arguments))
 
 
 @pytest.mark.parametrize("number", STOPPING)
@@ -77,14 +78,6 @@ def test_what_is_ignored_stays_ignored() -> None:
             assert signal.getsignal(number) == signal.SIG_IGN
     finally:
         signal.signal(number, before)
-
-
-def test_a_command_runs_outside_the_main_thread_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
-    codes: list[int] = []
-    thread = threading.Thread(target=lambda: codes.append(run(lambda: None, monkeypatch)))
-    thread.start()
-    thread.join(20)
-    assert codes == [0]
 
 
 def test_a_stream_ends_with_its_summary(
@@ -134,3 +127,41 @@ def test_a_real_signal_leaves_complete_shards_only(tmp_path: Path, number: signa
     shards = names - {"manifest.json", "statistical_model.safetensors", "template.safetensors"}
     assert len(names) - len(shards) == 3 and shards, names
     assert all(len(load_file(output / name)["labels"]) == 64 for name in shards)
+
+
+# --- what nobody has foreseen: one line that names the command and its files, and exit code 70 ------------------------
+
+
+@pytest.mark.parametrize(
+    ("error", "end"),
+    [
+        (TypeError("a\nbug"), "TypeError: a bug; this is a fault of mereo: run it again with MEREO_TRACEBACK=1, and "),
+        (MemoryError(), "MemoryError; the memory does not suffice: ask for less"),
+        (RuntimeError("CUDA out of memory. " + 99 * "Tried. "), "...; the memory does not suffice: ask for less"),
+        (RecursionError("too deep"), "RecursionError: too deep; something is nested too deeply, or in itself: look"),
+    ],
+)
+def test_whatever_else_happens_is_one_line_that_names_command_and_files(
+    error: Exception, end: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    def fail() -> None:
+        raise error
+
+    monkeypatch.delenv(command_line.TRACEBACK_VARIABLE, raising=False)
+    assert run(fail, monkeypatch, "scene", "check", "cube", "--output", str(tmp_path), "\0") == command_line.FAULT == 70
+    printed = capsys.readouterr().err
+    assert printed.startswith(f"mereo: error: mereo scene check on {tmp_path}: {type(error).__name__}")
+    assert end in printed and printed.count("\n") == 1
+    monkeypatch.setenv(command_line.TRACEBACK_VARIABLE, "1")
+    with pytest.raises(type(error)):
+        command_line.main([])
+
+
+def test_what_a_library_says_of_its_arguments_is_no_sentence_for_users(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """``json`` names neither the file nor a cure, and a ``ValueError`` of its own is a ``ValueError``."""
+    monkeypatch.delenv(command_line.TRACEBACK_VARIABLE, raising=False)
+    assert run(lambda: json.loads("{"), monkeypatch, "align", "my.py", __file__) == command_line.FAULT
+    assert f"mereo align on {__file__}: JSONDecodeError: Expecting" in (line := capsys.readouterr().err)
+    assert "this is a fault of mereo, or of the Python file: run it again with MEREO_TRACEBACK=1" in line

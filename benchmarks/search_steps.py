@@ -1,6 +1,6 @@
 """See how an object is found without a network, step by step, in a frame that shows a half of it.
 
-    python examples/search_steps.py [--scene rope] [--output search_steps.png]
+    python benchmarks/search_steps.py [--scene rope] [--output search_steps.png]
 
 Pictures, from left to right: what each line of sight says (orange met the object, blue went past it, of red nothing is
 known); a start; the best pose after rigid steps; the best state after it was bent by few points; the fit; and the fit
@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import tyro
+from occluded_views import occlude
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.evidence import Evidence
@@ -24,7 +25,6 @@ from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
-from mereo.synthesis.occluded_views import occlude
 from mereo.visualization.contact_sheets import save_png
 from mereo.visualization.renderer import Viewpoint, shaded_canvas
 
@@ -73,7 +73,7 @@ def main(options: Options) -> None:
         canvas.draw_points(points, np.broadcast_to(BLACK, points.shape), 1.0)
         tiles.append(canvas.picture())
     save_png(options.output, np.concatenate(tiles, axis=1))
-    print(f"{found.tried} candidates fitted, {found.alike} explain the frame; wrote {options.output}")
+    print(f"{found.alike} candidates explain the frame; wrote {options.output}")
 
 
 def sight_picture(seen: Observation) -> np.ndarray:

@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Hits, Solids
 from mereo.io.sensor_frame import SensorFrame
-from mereo.synthesis.clutter import OBJECT, Backdrop, Capsule, Screen, Surroundings, farthest, sample_occluder
+from mereo.synthesis.clutter import OBJECT, Backdrop, Capsule, Surroundings, farthest, sample_occluder
 from mereo.synthesis.config import GenerateConfig, Occluder
 from mereo.synthesis.depth_sensor import observe, render_depth
 from mereo.synthesis.examples import View
@@ -35,6 +35,27 @@ NEARER = 0.95
 
 WALL_SIZES = 1.5
 """Distance between the object and the wall behind it, in longest sides of the object."""
+
+
+@dataclass(frozen=True, eq=False)
+class Screen:
+    """Flat occluder with one straight edge: all points of a depth whose slope (x/z, y/z) along an axis is small enough.
+
+    Attributes:
+        depth: z of its points.
+        axis: unit vector in the image plane, across the edge.
+        limit: largest slope along the axis.
+    """
+
+    depth: float
+    axis: Float[np.ndarray, "2"]
+    limit: float
+
+    def first_hit(self, directions: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Hits]:
+        """Rows of the rays from the origin that hit the screen, and where."""
+        slope = directions[:, :2] / directions[:, 2:]
+        rows = np.flatnonzero(slope @ self.axis <= self.limit)
+        return rows, Hits(self.depth / directions[rows, 2], np.tile([0.0, 0.0, 1.0], (len(rows), 1)))
 
 
 @dataclass(frozen=True, eq=False)
