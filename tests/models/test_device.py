@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from mereo_experiments.speed.roofline import count_operations
+from mereo_experiments.speed.stages import count_operations
 from torch.nn import functional as F
 
 from mereo import __main__ as command_line
