@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+from PIL import Image, ImageDraw
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 
 from mereo.geometry.camera import PointCloud, camera_axes
@@ -17,13 +18,13 @@ from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import transform_points
 from mereo.visualization.color_scales import viridis
 from mereo.visualization.contact_sheets import (
+    INK,
     Picture,
     cloud_picture,
     contact_sheet,
+    fit_font,
     legend,
-    name_plate,
     save_png,
-    scale_bar,
 )
 from mereo.visualization.previews import CAMERA_VIEWS
 from mereo.visualization.renderer import Canvas, Triangles, Vector, Viewpoint
@@ -354,3 +355,28 @@ def overlay(placed: SegmentedMesh, limit: float, cloud: PointCloud, scan: ScanFi
     captions += [f"distance 0 (dark) to {mm:.2g} mm (bright), red: more"] * len(views)
     sheet = contact_sheet(pictures, captions, len(views), f"{scan.path.name} on {len(mesh.segments)} segments")
     return np.concatenate([sheet, legend(mesh.names, mesh.colors, sheet.shape[1])])
+
+
+def scale_bar(
+    colors: Float[np.ndarray, "n 3"], title: str, words: tuple[str, str, str], width: int
+) -> UInt8[np.ndarray, "44 _ 3"]:
+    """Strip with a bar of colours from left to right, its title before it, and words below its ends and its middle."""
+    strip = Image.new("RGB", (width, 44), "white")
+    pen = ImageDraw.Draw(strip)
+    length = width // 4
+    left = (width - length) // 2
+    bar = np.broadcast_to(np.rint(colors).astype(np.uint8), (14, len(colors), 3))
+    strip.paste(Image.fromarray(np.ascontiguousarray(bar)).resize((length, 14)), (left, 2))
+    pen.text((left - 12, 9), title, fill=INK, font=fit_font(14, title, left - 24), anchor="rm")
+    for place, word, anchor in zip((0, length // 2, length), words, ("lm", "mm", "rm"), strict=True):
+        pen.text((left + place, 28), word, fill=INK, font=fit_font(14, word, length // 3), anchor=anchor)
+    return np.asarray(strip)
+
+
+def name_plate(name: str, width: int, height: int) -> Picture:
+    """Caption as a picture of its own; it may have several lines."""
+    longest = max(name.splitlines(), key=len, default="")
+    plate = Image.new("RGB", (width, height), "white")
+    pen = ImageDraw.Draw(plate)
+    pen.text((width // 2, height // 2), name, fill=INK, font=fit_font(18, longest, width - 4), anchor="mm")
+    return np.asarray(plate)

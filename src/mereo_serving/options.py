@@ -59,7 +59,7 @@ class FrameOptions(BaseModel):
 
     def _config(self, kind: type[Config], changed: dict[str, Any]) -> Config:
         """Settings whose fields are parameters of the same names, but for those that are changed."""
-        names = {item.name for item in fields(kind)} & type(self).model_fields.keys()  # type: ignore[arg-type]
+        names = {item.name for item in fields(kind)} & type(self).model_fields.keys()
         try:
             return kind(**{name: getattr(self, name) for name in names} | changed)
         except ValueError as error:

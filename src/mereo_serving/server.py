@@ -3,7 +3,6 @@
 import asyncio
 import logging
 import re
-import signal
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -38,7 +37,7 @@ def serve(
     config: ServeConfig | None = None,
     inference: InferenceConfig | None = None,
 ) -> None:
-    """Serve objects until Ctrl-C, TERM or HUP: then what is begun is answered, and the rest refused.
+    """Serve objects until Ctrl-C or TERM: then what is begun is answered, and the rest refused.
 
     Args:
         served: the objects, from ``served_objects``.
@@ -89,7 +88,7 @@ class GracefulServer(uvicorn.Server):
         self._loop: asyncio.AbstractEventLoop | None = None
 
     async def serve(self, sockets: Any = None) -> None:
-        """Serve until a signal; a closed terminal (HUP) is one too, unless it is ignored (``nohup``)."""
+        """Serve until a signal."""
         self._loop = asyncio.get_running_loop()
         await super().serve(sockets)
 
@@ -98,20 +97,6 @@ class GracefulServer(uvicorn.Server):
         await super().startup(sockets)
         if not self.should_exit:
             print(self._greeting, flush=True)
-
-    @contextmanager
-    def capture_signals(self) -> Iterator[None]:
-        """Take HUP as the others, which ``uvicorn`` knows."""
-        hang_up = getattr(signal, "SIGHUP", None)
-        before = None if hang_up is None else signal.getsignal(hang_up)
-        with super().capture_signals():
-            if hang_up is not None and before not in (signal.SIG_IGN, None):
-                signal.signal(hang_up, self.handle_exit)
-            try:
-                yield
-            finally:
-                if hang_up is not None and before is not None:
-                    signal.signal(hang_up, before)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Begin to end."""

@@ -7,14 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from mereo.geometry.downsampling import farthest_point_order
 from mereo.models.weights import load_model
 from mereo.synthesis.sample_views import load_view
-from mereo_experiments.speed import fitted_model
-from mereo_experiments.speed.baseline import Rival, farthest_points
-from mereo_experiments.speed.report import table
-from mereo_experiments.speed.roofline import Machine, Work, count_operations
-from mereo_experiments.speed.stages import Bench, Stage, needed_nodes
+from mereo_experiments.speed import report
+from mereo_experiments.speed.stages import Bench, Machine, Rival, Stage, Work, count_operations, needed_nodes
 from mereo_learning.config import PRESETS
 
 MACHINE = Machine(1e11, 1e10)
@@ -28,15 +24,6 @@ def test_the_rival_answers_as_the_model() -> None:
     theirs = Rival(model, *model.normalized_cloud(cloud)).logits(points)
     np.testing.assert_allclose(theirs, ours, atol=1e-3 * np.abs(ours).max())
     assert len(np.unique(ours.argmax(axis=1))) > 3
-
-
-def test_the_rivals_points_are_the_farthest() -> None:
-    points = np.random.default_rng(0).normal(size=(80, 3)).astype(np.float32)
-    order = farthest_point_order(points, 80)
-    found = farthest_points(torch.from_numpy(points[order]), 40)
-    assert torch.equal(found, torch.arange(40))
-    repeated = torch.from_numpy(points[order][:30]).repeat(3, 1)
-    assert torch.equal(farthest_points(repeated, 70), torch.arange(70))
 
 
 def test_needed_nodes_are_the_corners_of_cells_with_a_change() -> None:
@@ -58,10 +45,10 @@ def test_work_is_bound_by_operations_or_bytes() -> None:
 
 
 def test_a_fitted_network_knows_its_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fitted_model, "STEPS", 60)
-    monkeypatch.setattr(fitted_model, "QUERIES", 512)
+    monkeypatch.setattr(report, "STEPS", 60)
+    monkeypatch.setattr(report, "BATCH", 512)
     view = load_view("rope")
-    model = fitted_model.fitted_model("tiny", view)
+    model = report.fitted_model("tiny", view)
     grid, kept = view.truth.grid, view.truth.kept
     cells = np.argwhere(kept & (grid.labels > 0))[::50]
     labels = model.query(model.encode(view.depth.to_points()), grid.positions(cells)).label
@@ -82,7 +69,7 @@ def test_the_table_names_ratio_and_floor() -> None:
         "gigabytes_per_second": 10.0,
         "load": 0.25,
     }
-    told = table([replace(stage, differing=0.0), replace(stage, rival=None)], facts)
+    told = report.table([replace(stage, differing=0.0), replace(stage, rival=None)], facts)
     assert "| encoder | 20 | 30 | 5 | 4.0 | 100 | 5.0 | 0.000% |" in told
     assert "load 0.2 before it began" in told
 

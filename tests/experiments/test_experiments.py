@@ -16,7 +16,7 @@ from mereo_experiments.paper.plan import Cost, Plan, cost
 from mereo_experiments.paper.registry import EXPERIMENTS, experiment, run_experiment
 from mereo_experiments.paper.result import Claim, Result, Row, markdown, published, write_result
 from mereo_experiments.paper.scales import SCALES
-from mereo_experiments.paper.store import Score, Store, read_score
+from mereo_experiments.paper.store import Score, Store
 from mereo_learning.cases import EvaluatedView
 from mereo_learning.config import PRESETS
 from mereo_learning.error_maps import comparison_picture
@@ -70,21 +70,6 @@ def test_results_are_three_files(tmp_path: Path) -> None:
     found = json.loads((tmp_path / "noise" / "results.json").read_text())
     assert found["rows"][0]["score"]["miou"] is None
     assert found["claims"][0]["verdict"] == "We agree (rope)."
-
-
-def test_scores_are_read_back_with_what_they_lack(tmp_path: Path) -> None:
-    path = tmp_path / "metrics.json"
-    metrics = {"iou": 0.5, "miou": None, "example_mean": {"iou": 0.4, "miou": None}, "per_segment": {"object": 0.5}}
-    path.write_text(json.dumps({**metrics, "examples": 8, "seed": 1_000_000}))
-    found = read_score(path)
-    assert (found.iou, found.example_iou, found.per_segment) == (0.5, 0.4, {"object": 0.5})
-    assert found.miou != found.miou
-
-
-def test_small_scales_need_no_download() -> None:
-    assert SCALES["smoke"].choose(("human", "rope", "shapes")) == ("rope",)
-    assert SCALES["cpu"].choose(("human", "rope", "shapes")) == ("human", "rope")
-    assert SCALES["paper"].choose(("human", "rope", "shapes")) == ("human", "rope", "shapes")
 
 
 def test_objects_can_be_asked_for_by_name(tmp_path: Path) -> None:

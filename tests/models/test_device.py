@@ -19,8 +19,7 @@ from mereo.models.device import ROWS, bfloat16_pays, find_device, in_threads, li
 from mereo.models.model import CPU_QUERY_CHUNK, Model
 from mereo.models.weights import load_for, load_model
 from mereo.synthesis.sample_views import load_view
-from mereo_experiments.speed.roofline import count_operations
-from mereo_experiments.speed.stages import random_points
+from mereo_experiments.speed.stages import count_operations, random_points
 
 CPU = InferenceConfig(device="cpu", precision="bfloat16")
 

@@ -5,8 +5,6 @@ import pytest
 from analytic import Distance, ball, half, logits_of, plate, union
 
 from mereo.geometry.mesh import PALETTE, Segment
-from mereo.models.weights import load_model
-from mereo.models.weights_place import shipped_names
 from mereo.reconstruction.isosurfaces import (
     Extraction,
     Field,
@@ -17,12 +15,6 @@ from mereo.reconstruction.isosurfaces import (
     sample_coarse_to_fine,
     sample_dense,
 )
-from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import AssetUnavailable
-from mereo.scenes.seeds import example_rng
-from mereo.synthesis.config import GenerateConfig
-from mereo.synthesis.examples import sample_view
-from mereo_learning.scoring import trained_scene
 
 BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 
@@ -166,23 +158,3 @@ def test_locate_grows_until_the_object_is_inside() -> None:
 def test_impossible_grids(box: np.ndarray, resolution: int, text: str) -> None:
     with pytest.raises(ValueError, match=text):
         _grid(box, resolution)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", shipped_names())
-def test_trained_networks_give_the_dense_labels(name: str) -> None:
-    """Where labels differ the logits must agree to rounding: batches of other sizes add in another order."""
-    model = load_model(name)
-    try:
-        scene = load_scene(trained_scene(model))
-    except AssetUnavailable as error:
-        pytest.skip(str(error))
-    view = sample_view(scene, GenerateConfig(), example_rng(1_000_003, 0))
-    code = model.encode(view.depth.to_points())
-    field: Field = lambda points: model.logits(code, points)  # noqa: E731
-    names, colors = model.names, model.colors
-    fine, dense = (extract(field, view.mesh.bounds, 40, names, colors, dense=every) for every in (False, True))
-    odd = np.argwhere(fine.grid.labels != dense.grid.labels)
-    if len(odd):
-        logits = np.sort(field(fine.grid.positions(odd)), axis=1)
-        assert len(odd) < 10 and (logits[:, -1] - logits[:, -2]).max() < 1e-3

@@ -28,7 +28,6 @@ from mereo.reconstruction.config import IsolationConfig
 from mereo.scenes.registry import load_scene
 from mereo.synthesis.config import SENSORS, SequenceConfig
 from mereo.synthesis.recording import CAMERA, FRAMES, write_recording
-from mereo.synthesis.sample_views import load_view
 
 COUNT, BAD, RATE_HZ = 6, 3, 30.0
 
@@ -72,37 +71,6 @@ def test_names_on_standard_input_are_frames(
     frames = list(frames_of("-", reading, IsolationConfig()))
     assert [Path(frame.name).name for frame in frames] == ["0000.png", "0001.png"]
     assert len(frames[1].load().cloud) > 32
-
-
-def damaged_clouds(folder: Path, cloud: np.ndarray) -> set[str]:
-    """Write files that no reader can make anything of, and clouds that show nothing; returns their names."""
-    np.save(folder / "1 equal.npy", np.ones((500, 3)))
-    np.save(folder / "1 one point.npy", np.ones((1, 3)))
-    np.save(folder / "1 no number.npy", np.full((500, 3), np.nan))
-    whole, archive = (folder / "0.npy").read_bytes(), io.BytesIO()
-    np.savez(archive, points=cloud)
-    shape = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1" + b"0" * 30 + b", 3), }"
-    for name, content in {
-        "empty": b"",
-        "header cut": whole[:40],
-        "data cut": whole[:300],
-        "header of brackets": whole[:30] + b"(" * 30 + whole[60:],
-        "endless": whole[:10] + shape.ljust(118) + whole[128:],
-        "archive cut": archive.getvalue()[:500],
-    }.items():
-        (folder / f"1 {name}.npy").write_bytes(content)
-    return {file.name for file in folder.glob("1 *")}
-
-
-def test_no_damaged_frame_ends_a_stream(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    cloud = load_view("rope").depth.to_points().points
-    np.save(tmp_path / "0.npy", cloud)
-    np.save(tmp_path / "2.npy", cloud)
-    bad = damaged_clouds(tmp_path, cloud)
-    summary, lines, _ = streamed(capsys, tmp_path, every_frame=True)
-    assert (summary.answered, summary.failed) == (2, len(bad))
-    errors = {row["frame"]: row["error"] for row in lines if "error" in row}
-    assert errors.keys() == bad and "\n" not in "".join(errors.values())
 
 
 def test_a_sequence_that_breaks_off_is_told_after_its_frames_and_their_summary(

@@ -11,7 +11,6 @@ from PIL import Image
 
 from mereo.geometry.camera import Camera
 from mereo.io.config import InputConfig
-from mereo.io.readers import read_point_cloud
 from mereo.io.sensor_frame import read_frame
 from mereo.models.weights import load_model
 from mereo.reconstruction.config import IsolationConfig
@@ -130,26 +129,6 @@ def test_size_against_training(tmp_path: Path) -> None:
     assert size_warning(find_object(read_frame(tmp_path / "c.npy", InputConfig(unit_m=1.0))), provenance) is None
     text = size_warning(find_object(read_frame(tmp_path / "c.npy", InputConfig(unit_m=0.001))), provenance)
     assert text is not None and "m long, but 0.12 to 0.254 m in training" in text
-
-
-def test_zdf_is_an_organized_cloud_in_millimetres(tmp_path: Path) -> None:
-    netcdf = pytest.importorskip("netCDF4", reason="netCDF4 comes with the extra sensors")
-    points = np.random.default_rng(0).normal((0, 0, 700), 40, (6, 8, 3)).astype(np.float32)
-    points[1, 2] = np.nan
-    with netcdf.Dataset(tmp_path / "z.zdf", "w") as file:
-        group = file.createGroup("data")
-        for name, size in (("rows", 6), ("cols", 8), ("xyz", 3)):
-            group.createDimension(name, size)
-        group.createVariable("pointcloud", "f4", ("rows", "cols", "xyz"))[:] = points
-    with pytest.raises(ValueError, match="1 of 48 points without a measurement.*--drop-invalid"):
-        read_point_cloud(tmp_path / "z.zdf")
-    seen = find_object(read_frame(tmp_path / "z.zdf", InputConfig(drop_invalid=True)))
-    np.testing.assert_array_equal(seen.cloud.points, np.delete(points.reshape(-1, 3), 10, axis=0))
-    assert seen.frame.unit_m == 0.001 and 0.5 < seen.depth_m[1] < 0.9
-    with netcdf.Dataset(tmp_path / "other.zdf", "w") as file:
-        file.createGroup("nothing")
-    with pytest.raises(ValueError, match="other.zdf cannot be read as a point cloud"):
-        read_point_cloud(tmp_path / "other.zdf")
 
 
 def test_missing_extras_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,9 +5,6 @@ None of the objects is one of ours and no truth is known, so this ends at what i
 """
 
 import os
-from collections.abc import Callable
-from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +13,6 @@ from PIL import Image
 from scipy import ndimage
 
 from mereo.io.config import InputConfig
-from mereo.io.intrinsics import read_camera
-from mereo.io.readers import read_depth_image
 from mereo.io.sensor_frame import read_frame
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.isolation import readings
@@ -53,53 +48,6 @@ def test_the_object_is_cut_out_of_every_real_image(name: str) -> None:
     assert found.depth_m[1] == pytest.approx(middle_m, abs=0.01)
     (only,) = readings(found.cloud)
     assert only.dropped == 0, "no strays are seen in what was cut out well"
-
-
-@cache
-def millimetres() -> np.ndarray:
-    return np.array(Image.open(TABLE)).astype(np.uint16)
-
-
-def organized() -> np.ndarray:
-    """The table as an organized cloud in metres [h, w, 3], zero where nothing was measured."""
-    image = read_depth_image(TABLE, read_camera(KINECT))
-    points = np.zeros((*image.depth.shape, 3))
-    points[image.valid] = image.to_points().points
-    return points
-
-
-def save_picture(values: np.ndarray) -> Callable[[Path], None]:
-    return lambda path: Image.fromarray(values).save(path)
-
-
-INVALID = InputConfig(drop_invalid=True)
-FORMATS: dict[str, tuple[Callable[[Path], None], InputConfig]] = {
-    "millimetres.tif": (lambda path: save_picture(millimetres())(path), InputConfig(KINECT)),
-    "metres.tiff": (lambda path: save_picture(millimetres() / np.float32(1000))(path), InputConfig(KINECT)),
-    "tenths.png": (lambda path: save_picture(10 * millimetres())(path), InputConfig(KINECT, depth_scale=10_000.0)),
-    "image.npy": (lambda path: np.save(path, millimetres()), InputConfig(KINECT)),
-    "organized.npy": (lambda path: np.save(path, organized()), INVALID),
-    "integers.npy": (  # as the Azure Kinect's kit gives them
-        lambda path: np.save(path, np.rint(1000 * organized()).astype(np.int16)),
-        replace(INVALID, unit_m=0.001),
-    ),
-    "cloud.npz": (
-        lambda path: np.savez(path, points=1000 * organized().reshape(-1, 3)),
-        replace(INVALID, unit_m=0.001),
-    ),
-}
-
-
-@pytest.mark.parametrize("name", FORMATS)
-def test_the_bottle_is_the_same_from_images_and_arrays(tmp_path: Path, name: str) -> None:
-    """Formats with a writer of their own are in `tests/io`."""
-    save, reading = FORMATS[name]
-    save(tmp_path / name)
-    found = find_object(read_frame(tmp_path / name, reading), BOTTLE)
-    known = find_object(read_frame(TABLE, InputConfig(KINECT)), BOTTLE)
-    assert len(found.cloud) == pytest.approx(len(known.cloud), rel=0.01)
-    assert found.size_m == pytest.approx(known.size_m, abs=0.002)
-    assert found.depth_m == pytest.approx(known.depth_m, abs=0.002)
 
 
 def masked(folder: Path, pixels: int) -> Observation:

@@ -43,8 +43,6 @@ def test_files_in_millimetres_come_to_the_scene(tmp_path: Path) -> None:
         ("bunny", "bunny/bunny.off"),
         ("liver", "liver/lapgym_liver_visual.stl"),
         ("tumor", "liver/lapgym_gallbladder_visual.stl"),
-        ("liver-simulated", "liver/lapgym_liver_visual.stl"),
-        pytest.param("skull", "skull/sofa_skull_and_teeth_coarse.obj", marks=pytest.mark.slow),
         pytest.param("human", "human/makehuman_base.obj", marks=pytest.mark.slow),
     ],
 )
@@ -55,8 +53,6 @@ def test_built_in_scenes_say_how_their_files_lie_in_them(
     require_asset("human/makehuman_default.mhskel" if scene == "human" else file)
     loaded, mesh = load_scene(scene), read_segmented_mesh(require_asset(file))
     own = mesh.segments[0].vertices if scene != "human" else mesh.segments[mesh.names.index("body")].vertices
-    if scene == "skull":
-        own = next(part.vertices for part in mesh.segments if "skull_bone" in part.name)
     distance = Solids(loaded.rest).nearest(transform_points(loaded.T_scene_source, own)).distance
     assert np.median(distance) < 0.05, np.median(distance)
 

@@ -51,31 +51,33 @@ def test_every_frame_is_answered_in_order_when_asked_at_the_recorded_pace(monkey
 
 
 def test_a_slow_answer_gets_the_latest_frame_and_dropped_ones_are_not_decoded() -> None:
-    """Ten frames arrive while the first is answered: the next answer is for the tenth."""
-    arrived, begun = threading.Event(), threading.Event()
+    """Ten frames arrive while the first is answered, two meanwhile the next one: the last of them is answered."""
+    arrived, begun = ([threading.Event(), threading.Event()] for _ in range(2))
     decoded: list[str] = []
 
     def frames() -> Iterator[StreamFrame]:
         yield frame(0)
-        begun.wait(10)
-        for i in range(1, 11):
-            yield frame(i)
-        arrived.set()
+        for number, last in enumerate((11, 13)):
+            begun[number].wait(10)
+            for i in range(last - (10, 2)[number], last):
+                yield frame(i)
+            arrived[number].set()
 
     def slow(frame: StreamFrame) -> int:
-        begun.set()
-        arrived.wait(10)
+        if len(decoded) < 2:
+            begun[len(decoded)].set()
+            arrived[len(decoded)].wait(10)
         decoded.append(frame.name)
         return frame.load()
 
     outcomes = list(stream(frames(), slow))
-    assert [(o.result, o.dropped) for o in outcomes] == [(0, 0), (10, 9)] and decoded == ["0", "10"]
+    assert [(o.result, o.dropped) for o in outcomes] == [(0, 0), (10, 9), (12, 1)] and decoded == ["0", "10", "12"]
     assert outcomes[0].latency_s >= outcomes[0].work_s > 0
     summary = Summary()
     for outcome in outcomes:
         summary.add(outcome)
-    assert (summary.answered, summary.dropped, summary.failed) == (2, 9, 0)
-    assert "9 dropped for newer ones, 0 bad" in str(summary)
+    assert (summary.answered, summary.dropped, summary.failed) == (3, 10, 0)
+    assert "10 dropped for newer ones, 0 bad" in str(summary)
 
 
 def test_the_memory_of_a_summary_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:

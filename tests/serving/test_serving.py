@@ -129,15 +129,14 @@ def clouds(count: int) -> Iterator[np.ndarray]:
         yield CLOUD[kept] * (1 + 0.1 * number) + [0.01 * number, 0.0, 0.02 * number]
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_every_client_gets_the_answer_to_its_own_frame(workers: int, tmp_path: Path) -> None:
+def test_every_client_gets_the_answer_to_its_own_frame(tmp_path: Path) -> None:
     """Bit by bit, whether it comes alone or with others."""
     count = 8
 
     async def ask() -> None:
         async with running(tmp_path) as alone:
             single = [figures(await alone.post(npy(points))) for points in clouds(count)]
-        async with running(tmp_path, workers=workers) as server:
+        async with running(tmp_path, workers=2) as server:
             answers = await asyncio.gather(*(server.post(npy(points)) for points in clouds(count)))
             for found, expected in zip(answers, single, strict=True):
                 assert figures(found) == expected, "the analytic model answers from the cloud's own box"

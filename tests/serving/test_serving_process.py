@@ -20,10 +20,6 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
 import serving as bench
 
-from mereo.models.config import InferenceConfig
-from mereo_serving.messages import Served, Setup
-from mereo_serving.workers import WorkerProcess
-
 ADDRESS = "/v1/{weights}/reconstruct"
 
 
@@ -94,11 +90,3 @@ def test_processes_end_with_a_server_that_is_killed(tmp_path: Path) -> None:
         server.send_signal(signal.SIGKILL)
         server.wait(20)
         assert within(10, lambda: not any(map(is_there, workers)))
-
-
-@pytest.mark.slow
-def test_weights_that_cannot_be_loaded_are_said_by_the_server(tmp_path: Path) -> None:
-    (tmp_path / "bad.safetensors").write_bytes(b"nonsense")
-    setup = Setup((Served("bad", str(tmp_path / "bad.safetensors")),), "network", InferenceConfig(precision="float32"))
-    with pytest.raises(ValueError, match=r"bad\.safetensors is not a safetensors file"):
-        WorkerProcess(setup).wait_until_ready()

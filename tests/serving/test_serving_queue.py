@@ -98,7 +98,7 @@ def test_a_frame_whose_client_has_left_is_not_begun(tmp_path: Path) -> None:
             worker = held_up(server)
             first = asyncio.create_task(server.post(npy()))
             await until(worker.begun.is_set)
-            told, sent = asyncio.Event(), list[dict[str, Any]]()
+            told, statuses = asyncio.Event(), list[int | None]()
             messages = iter([{"type": "http.request", "body": npy(), "more_body": False}])
 
             async def receive() -> dict[str, Any]:
@@ -108,23 +108,16 @@ def test_a_frame_whose_client_has_left_is_not_begun(tmp_path: Path) -> None:
                 return {"type": "http.disconnect"}
 
             async def send(message: dict[str, Any]) -> None:
-                sent.append(message)
+                statuses.append(message.get("status"))
 
             headers = [(b"host", b"localhost"), (b"content-type", b"application/x-npy")]
             scope = {"type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": "POST"}
-            scope |= {
-                "scheme": "http",
-                "path": ADDRESS,
-                "raw_path": ADDRESS.encode(),
-                "root_path": "",
-                "query_string": b"",
-            }
-            scope |= {"headers": headers, "client": ("127.0.0.1", 1), "server": ("127.0.0.1", 8000)}
+            scope |= {"scheme": "http", "path": ADDRESS, "root_path": "", "query_string": b"", "headers": headers}
             left = asyncio.create_task(server.app(scope, receive, send))
             await until(lambda: server.dispatcher.held == 1)
             told.set()
             await left
-            assert server.dispatcher.held == 0 and sent[0]["status"] == 499
+            assert server.dispatcher.held == 0 and statuses[0] == 499
             worker.go.set()
             assert (await first).status_code == 200
             assert len(worker.asked) == 1, "only the first was ever begun"

@@ -22,7 +22,7 @@ from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
 from mereo.visualization.color_scales import ColorScale
 from mereo.visualization.units import Unit
 from mereo_viewer import server as viewer_server
-from mereo_viewer.display import CLOUD_SIZES, POINT_SHARE, chips, heading, message, point_size
+from mereo_viewer.display import chips, heading, message
 from mereo_viewer.result_page import Content, Probed, ResultPage, probe_html
 
 needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
@@ -91,22 +91,6 @@ def test_points_give_way_to_colours_and_a_probe_is_shown(server: object) -> None
     page.move_probe(np.array([0.0, 0.0, 148.0]))
     assert "box_1" in page.facts.content and "2 mm inside the nearest surface" in page.facts.content
     assert nodes["/probe"].visible and nodes["/arrow"].visible
-
-
-def test_points_take_a_share_of_their_spacing_within_bounds() -> None:
-    low, high = CLOUD_SIZES
-    assert point_size(grid(60, 0.02)) == pytest.approx(POINT_SHARE * 0.02)
-    assert point_size(grid(60, 1e-4)) == low and point_size(grid(5, 0.5)) == high
-    # a cloud's points more than once, one alone, all at one place
-    assert point_size(np.repeat(grid(60, 0.02), 2, axis=0)) == high
-    twice = np.concatenate([grid(60, 0.02), grid(60, 0.02)[:100]])
-    assert point_size(twice) == pytest.approx(POINT_SHARE * 0.02)
-    assert point_size(np.zeros((1, 3))) == high and point_size(np.zeros((9, 3))) == high
-
-
-def grid(count: int, spacing: float) -> np.ndarray:
-    axis = np.arange(count) * spacing
-    return np.stack(np.meshgrid(axis, axis, [0.0]), axis=-1).reshape(-1, 3)
 
 
 # --- server -----------------------------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -50,8 +50,6 @@ from mereo.synthesis.recording import CAMERA, FRAMES, is_recording_folder
 STANDARD_INPUT = "-"
 """Source that means names of files on standard input."""
 
-Result = TypeVar("Result")
-
 RECENT = 10_000
 """Answers whose latencies a summary is made of: a stream may run for weeks in the same memory."""
 
@@ -72,7 +70,7 @@ class StreamFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome(Generic[Result]):
+class Outcome:
     """Outcome of a frame: its answer or error, and the time it took.
 
     Attributes:
@@ -86,7 +84,7 @@ class Outcome(Generic[Result]):
 
     name: str
     time_s: float
-    result: Result | None
+    result: Any
     error: str
     latency_s: float
     work_s: float
@@ -99,11 +97,11 @@ Arrived = tuple[StreamFrame, float, int]
 
 def stream(
     frames: Iterable[StreamFrame | None],
-    answer: Callable[[StreamFrame], Result],
+    answer: Callable[[StreamFrame], Any],
     *,
     recorded_pace: bool = False,
     every_frame: bool = False,
-) -> Iterator[Outcome[Result]]:
+) -> Iterator[Outcome]:
     """Answer the latest frame, again and again, until the sequence ends.
 
     Args:
@@ -191,7 +189,7 @@ class Summary:
     latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
     start_s: float = field(default_factory=time.perf_counter)
 
-    def add(self, outcome: Outcome[Any]) -> None:
+    def add(self, outcome: Outcome) -> None:
         """Count an outcome."""
         self.dropped += outcome.dropped
         if outcome.error:
@@ -217,9 +215,6 @@ LOOK_S = 0.05
 PATIENCE_S = 10.0
 """Seconds after which a file that is still empty, or still changes, is handed over as it is."""
 
-Version = tuple[int, int]
-"""Time of the last change in nanoseconds, and size in bytes."""
-
 
 class WatchedFolder:
     """Files of a folder into which a camera's program writes, each handed over once for every time it was written.
@@ -235,15 +230,15 @@ class WatchedFolder:
 
     def __init__(self, folder: Path, wanted: Callable[[Path], bool]) -> None:
         self.folder, self.wanted = folder, wanted
-        # of each file the version at the last look, since when it is waited for, and the version handed over
-        self._seen: dict[Path, tuple[Version, float, Version | None]] = {}
+        # of each file time and size at the last look, since when it is waited for, and those when it was handed over
+        self._seen: dict[Path, tuple[tuple[int, int], float, tuple[int, int] | None]] = {}
 
     def look(self, now_s: float) -> list[Path]:
         """Files that are complete since the last look, the oldest first; ``now_s`` is the time by any clock.
 
         Raises ``OSError`` where the folder is gone.
         """
-        before, self._seen, complete = self._seen, {}, dict[Path, Version]()
+        before, self._seen, complete = self._seen, {}, dict[Path, tuple[int, int]]()
         for file in list(self.folder.iterdir()):
             try:
                 facts = file.stat() if self.wanted(file) else None
@@ -399,7 +394,7 @@ def stream_reconstructions(command: StreamCommand) -> Summary:
     return summary
 
 
-def line(outcome: Outcome["FrameAnswer"]) -> dict[str, Any]:
+def line(outcome: Outcome) -> dict[str, Any]:
     """JSON that is printed of one frame; lengths in the input's unit, times in milliseconds."""
     return {
         "frame": outcome.name,
@@ -527,7 +522,7 @@ class SurfaceFolder:
                 "--force, which replaces the files of the same names"
             )
 
-    def written(self, outcome: Outcome[FrameAnswer], axes: CloudAxes) -> Outcome[FrameAnswer]:
+    def written(self, outcome: Outcome, axes: CloudAxes) -> Outcome:
         """Write the surfaces of an answered frame; where that fails, the outcome is a failed one.
 
         A frame that comes again replaces its own file; two frames never share one.

@@ -54,7 +54,6 @@ class IsolationConfig:
                 f"the box is {_numbers(self.box)}; each of x0 y0 z0 must be less than its x1 y1 z1: give the lower "
                 "corner, then the upper one, in metres"
             )
-
         if self.cluster_gap > 0 and not self.largest_cluster:
             raise ValueError(
                 f"the cluster gap is {self.cluster_gap:g} m; it belongs to the largest cluster: give for example "

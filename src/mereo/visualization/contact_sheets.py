@@ -152,28 +152,3 @@ def legend(names: Sequence[str], colors: Sequence[Color], width: int) -> Picture
         pen.rounded_rectangle((left, top + 2, left + 15, top + 17), 4, fill=color)
         pen.text((left + 22, top + 10), name, fill=INK, font=font(15), anchor="lm")
     return np.asarray(strip)
-
-
-def scale_bar(
-    colors: Float[np.ndarray, "n 3"], title: str, words: tuple[str, str, str], width: int
-) -> UInt8[np.ndarray, "44 _ 3"]:
-    """Strip with a bar of colours from left to right, its title before it, and words below its ends and its middle."""
-    strip = Image.new("RGB", (width, 44), "white")
-    pen = ImageDraw.Draw(strip)
-    length = width // 4
-    left = (width - length) // 2
-    bar = np.broadcast_to(np.rint(colors).astype(np.uint8), (14, len(colors), 3))
-    strip.paste(Image.fromarray(np.ascontiguousarray(bar)).resize((length, 14)), (left, 2))
-    pen.text((left - 12, 9), title, fill=INK, font=fit_font(14, title, left - 24), anchor="rm")
-    for place, word, anchor in zip((0, length // 2, length), words, ("lm", "mm", "rm"), strict=True):
-        pen.text((left + place, 28), word, fill=INK, font=fit_font(14, word, length // 3), anchor=anchor)
-    return np.asarray(strip)
-
-
-def name_plate(name: str, width: int, height: int) -> Picture:
-    """Caption as a picture of its own; it may have several lines."""
-    longest = max(name.splitlines(), key=len, default="")
-    plate = Image.new("RGB", (width, height), "white")
-    pen = ImageDraw.Draw(plate)
-    pen.text((width // 2, height // 2), name, fill=INK, font=fit_font(18, longest, width - 4), anchor="mm")
-    return np.asarray(plate)

@@ -1,17 +1,31 @@
-"""Stages of an answer, each timed against its floor and, where there is one, the straightforward implementation."""
+"""Stages of an answer, each timed against its floor and, where there is one, the straightforward implementation.
 
+The floor (roofline) is the least time that a stage can take here, by the measured rates of large products and of
+copies. The straightforward implementation of the same network is what one writes first: float32, eager; the code is
+concatenated to every query instead of being multiplied once per cloud; normalization is a layer of its own; farthest
+points are sampled inside the network, and the encoder is run again for every chunk of queries. It takes its weights
+from a model and gives its labels. Nearest neighbours, which only local features need, are found as in the model itself.
+"""
+
+import math
 import statistics
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor, nn
+from torch.utils.flop_counter import FlopCounterMode
 
 from mereo.geometry.transforms import Normalizer
+from mereo.models.decoder import Code, Decoder, Prediction, line_of_sight
+from mereo.models.device import linear
 from mereo.models.model import Model
+from mereo.models.network import Network
 from mereo.models.trained import EncodedCloud
 from mereo.reconstruction.isosurfaces import (
     changing_cells,
@@ -24,8 +38,168 @@ from mereo.reconstruction.isosurfaces import (
 )
 from mereo.reconstruction.pipeline import SEARCH_BOX
 from mereo.synthesis.sample_views import SampleView
-from mereo_experiments.speed.baseline import Rival
-from mereo_experiments.speed.roofline import Machine, Work, count_operations, timed
+
+# --- the floor --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Measured rates of a machine.
+
+    Attributes:
+        operations: floating-point operations per second.
+        bandwidth: bytes per second.
+    """
+
+    operations: float
+    bandwidth: float
+
+
+@dataclass(frozen=True)
+class Work:
+    """Work that a stage must do at least.
+
+    Attributes:
+        operations: floating-point operations of matrix products, two for a multiplication with addition.
+        bytes: bytes that are read and written at least once.
+    """
+
+    operations: float
+    bytes: float
+
+    def seconds(self, machine: Machine) -> float:
+        """Least time on a machine that does both at once: the longer of the two."""
+        return max(self.operations / machine.operations, self.bytes / machine.bandwidth)
+
+
+def _operations_of_linear(rows: Sequence[int], weight: Sequence[int], *_: object, **__: object) -> int:
+    """Floating-point operations of a product of these shapes."""
+    return 2 * math.prod(rows) * weight[0]
+
+
+ONEDNN = {torch.ops.mkldnn._linear_pointwise: _operations_of_linear}
+"""Products of ``mereo.models.device`` that torch's counter does not know."""
+
+
+def timed(work: Callable[[], Any], device: torch.device) -> tuple[float, Any]:
+    """Seconds that ``work`` takes, until the device has done what it was asked, and what it gives."""
+    start = time.perf_counter()
+    result = work()
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter() - start, result
+
+
+def measure_machine(device: torch.device, dtype: torch.dtype = torch.float32) -> Machine:
+    """Rates of a machine: of a product of 4096 x 512 by 512 x 512 and of copying 256 MB, each the median of 15."""
+    left, right = torch.ones(4096, 512, device=device, dtype=dtype), torch.ones(512, 512, device=device, dtype=dtype)
+    source = torch.ones(64 * 2**20, device=device)
+    target = torch.empty_like(source)
+    with torch.inference_mode():
+        product = _median(lambda: linear(left, right), device)
+    copied = _median(lambda: target.copy_(source), device)
+    return Machine(2 * left.numel() * right.shape[0] / product, 2 * source.nbytes / copied)
+
+
+def _median(work: Callable[[], object], device: torch.device, repeats: int = 15) -> float:
+    return statistics.median([timed(work, device)[0] for _ in range(repeats + 2)][2:])
+
+
+def count_operations(work: Callable[[], object]) -> int:
+    """Number of floating-point operations in the matrix products that ``work`` asks torch for."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # the counter sees what its own thread asks for
+    try:
+        with FlopCounterMode(display=False, custom_mapping=ONEDNN) as counter:
+            work()
+    finally:
+        torch.set_num_threads(threads)
+    return counter.get_total_flops()
+
+
+# --- the straightforward implementation -------------------------------------------------------------------------------
+
+CHUNK = 50_000
+"""Number of queries that are answered at once."""
+
+
+class Rival:
+    """Straightforward implementation of a model's answers about one cloud.
+
+    Attributes:
+        model: the model whose weights are taken.
+        cloud: normalized points of the cloud, in any order.
+        normalizer: the way from the user's frame to normalized coordinates.
+        viewpoint: the normalized place of the camera.
+    """
+
+    def __init__(self, model: Model, cloud: Float[Tensor, "1 n 3"], normalizer: Normalizer) -> None:
+        self.model, self.cloud, self.normalizer = model, cloud, normalizer
+        self.viewpoint = torch.from_numpy(normalizer.viewpoint[None].astype(np.float32)).to(cloud.device)
+
+    @torch.inference_mode()
+    def logits(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n c"]:
+        """Class logits at points in the user's frame, chunk by chunk."""
+        normalized = self.normalizer.apply(points).astype(np.float32)
+        chunks = []
+        for start in range(0, len(normalized), CHUNK):
+            queries = torch.from_numpy(normalized[start : start + CHUNK])[None].to(self.cloud.device)
+            spread = self.model.class_logits(self._predict(self.model.network, queries), queries)
+            chunks.append(spread[0].cpu())
+        return torch.cat(chunks).numpy()
+
+    def _predict(self, network: Network, queries: Float[Tensor, "1 q 3"]) -> Prediction:
+        count = int(self.cloud.shape[1] * network.config.pointnet2.ratio1)
+        first = farthest_points(self.cloud[0], count)
+        rest = torch.ones(self.cloud.shape[1], dtype=torch.bool, device=first.device)
+        rest[first] = False
+        ordered = torch.cat([self.cloud[:, first], self.cloud[:, rest]], dim=1)
+        alignment = None if network.aligner is None else network.aligner(ordered).alignment
+        encoding = network.encoder(ordered if alignment is None else alignment.apply(ordered))
+        code = network.decoder.prepare(encoding, ordered, self.viewpoint, alignment)
+        return decode(network.decoder, code, encoding.latent, queries)
+
+
+def farthest_points(points: Float[Tensor, "n 3"], count: int) -> Int[Tensor, " m"]:
+    """Rows of points by greedy farthest-point sampling from the first one on; repeated points come last."""
+    distance = torch.full((len(points),), torch.inf, device=points.device)
+    chosen = [torch.zeros((), dtype=torch.long, device=points.device)]
+    while len(chosen) < count:
+        distance = torch.minimum(distance, (points - points[chosen[-1]]).square().sum(dim=-1))
+        distance[chosen[-1]] = -1.0  # where points are repeated, each is still taken once
+        chosen.append(distance.argmax())
+    return torch.stack(chosen)
+
+
+def decode(decoder: Decoder, code: Code, latent: Float[Tensor, "1 z"], queries: Float[Tensor, "1 q 3"]) -> Prediction:
+    """Prediction as of ``Decoder.forward``, with the latent vector at every query; the layers are the decoder's own."""
+    layers, added = decoder.config.decoder, decoder.config.additions
+    everywhere = latent[:, None].expand(-1, queries.shape[1], -1)
+    placed = queries if code.alignment is None else code.alignment.apply(queries)
+    encoded = decoder.encode(placed) if layers.encode_positions else placed
+    rows = [everywhere, encoded]
+    if added.local_neighbors:
+        rows += [layer(level, placed) for layer, level in zip(decoder.local, code.levels, strict=True)]
+    if added.sight_neighbors:
+        rows.append(line_of_sight(queries, code.cloud, code.viewpoint, added.sight_neighbors))
+    hidden = encoded
+    for number, norm in enumerate(decoder.norms):
+        if number > 0:
+            rows = [hidden]
+        if number == layers.skip_after:
+            rows += [everywhere, encoded]
+            if decoder.lookup is not None:
+                rows.append(decoder.lookup(hidden, placed)[1])
+        local_layers = decoder.summands(number)
+        weight = torch.cat([layer.weight for layer in local_layers], dim=1)
+        hidden = nn.functional.linear(torch.cat(rows, dim=-1), weight, local_layers[0].bias)
+        hidden = torch.relu(norm(hidden.flatten(0, 1))).unflatten(0, hidden.shape[:2])
+    logits, distance, direction = decoder.head(hidden).split([decoder.classes, 1, 3], dim=-1)
+    return Prediction(logits, distance[..., 0], direction)
+
+
+# --- stages -----------------------------------------------------------------------------------------------------------
+
 
 Labels = UInt8[np.ndarray, "x y z"]
 
