@@ -344,7 +344,7 @@ def test_a_scene_with_a_hole_warns_and_makes_examples(tmp_path: Path) -> None:
     ) as caught:
         scene = load_scene(path)
     assert len(caught) == 1
-    assert [segment.solid for segment in scene.rest.segments] == [False, True]
+    assert [segment.solid for segment in scene.rest.segments] == [False, True] and len(set(scene.rest.colors)) == 2
     settings = GenerateConfig(points=64, sampling=SamplingConfig(per_segment=32))
     queries = synthesize(scene, settings, example_rng(0, 0)).queries
     assert (queries.labels == 1).sum() >= 16 and np.isfinite(queries.distances).all()
