@@ -244,7 +244,7 @@ def test_check_counts_faults_and_repair_leaves_the_users_files(
         check_scene(str(path), repair=True)
 
 
-def test_parts_of_a_model_get_files_of_their_own(tmp_path: Path) -> None:
+def test_parts_of_a_model_get_files_of_their_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = trimesh.Scene()
     parts = {
         "a": box((0, 0, 0), (2, 2, 2)),
@@ -260,6 +260,7 @@ def test_parts_of_a_model_get_files_of_their_own(tmp_path: Path) -> None:
         "  - name: a\n  - {name: core, nested_in: b b}\n  - {name: b b, color: [1, 2, 3]}\n\nsize: 12 # s\n"
     )
     check_scene(str(path), repair=True)
+    assert "reaches at most 0.5 m out of the new one (near [" in capsys.readouterr().out
     data = yaml.safe_load((tmp_path / "two-repaired.yaml").read_text())
     assert list(data) == ["name", "units", "segments", "size"] and data["size"] == 12
     assert [block["file"] for block in data["segments"]] == ["a-repaired.ply", "core-repaired.ply", "b_b-repaired.ply"]
@@ -344,7 +345,7 @@ def test_a_scene_with_a_hole_warns_and_makes_examples(tmp_path: Path) -> None:
     ) as caught:
         scene = load_scene(path)
     assert len(caught) == 1
-    assert [segment.solid for segment in scene.rest.segments] == [False, True]
+    assert [segment.solid for segment in scene.rest.segments] == [False, True] and len(set(scene.rest.colors)) == 2
     settings = GenerateConfig(points=64, sampling=SamplingConfig(per_segment=32))
     queries = synthesize(scene, settings, example_rng(0, 0)).queries
     assert (queries.labels == 1).sum() >= 16 and np.isfinite(queries.distances).all()

@@ -243,6 +243,10 @@ def test_what_is_round_or_falls_over_has_no_base() -> None:
     for shape in (trimesh.creation.torus(3, 1), rod, pebble):
         part = Segment("part", (0, 0, 0), np.array(shape.vertices), np.array(shape.faces))
         assert flat_base(SegmentedMesh((part,)), (0.0, 0.0, 1.0)) is None
+    leaning = box((0, 0, 0), (1, 1, 2.5))
+    leaning = replace(leaning, vertices=leaning.vertices + 0.32 * leaning.vertices[:, 2:] * [1, 0, 0])
+    base = flat_base(SegmentedMesh((leaning,)), (0.0, 0.0, 1.0))
+    assert base is not None and abs(base.normal[2]) < 0.5, "it lies on a side"
 
 
 def test_a_base_is_named_where_the_camera_looks_from_below(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -291,6 +291,18 @@ def test_every_number_has_the_name_of_its_slider() -> None:
     )
 
 
+def test_many_numbers_with_one_slider_are_counted() -> None:
+    rope = load_scene("rope")
+    swing = next(
+        played
+        for played in (random_state(rope, seed) for seed in range(20))
+        if any(call.name.parts == ("swing",) for call in played.calls)
+    )
+    names = draw_names(swing)
+    assert {f"swing: amplitudes {number}" for number in range(1, 9)} <= set(names)
+    assert len(names) == len(set(names)) == sum(len(call.shares) for call in swing.calls)
+
+
 @pytest.mark.parametrize("sizes", [(3,), (3, 2), (4, 1), ()])
 def test_other_draws_than_the_scene_makes_are_refused(sizes: tuple[int, ...]) -> None:
     with pytest.raises(Refused, match=f"the scene 'toy' does not take these {len(sizes)} draws; .* register the frame"):

@@ -137,6 +137,13 @@ def test_pixels_drop_out_as_probably_as_their_slant_says(tilt_deg: float) -> Non
     assert kept[expected == 0].all()
 
 
+def test_dropout_rises_with_the_angle() -> None:
+    angle = np.linspace(0, np.pi / 2, 91)
+    probability = dropout_probability(angle, 0.7)
+    assert (probability[:61] < 1e-9).all() and (np.diff(probability[60:]) > 0).all()
+    assert probability[-1] == pytest.approx(0.7)
+
+
 def test_holes_take_the_expected_area() -> None:
     """Independent radii: pi r^2 each, on a wall where few reach over the border or overlap."""
     views = [look(wall(150.0), seed, holes=2.0, hole_radius_m=0.02).image.valid for seed in range(150)]
