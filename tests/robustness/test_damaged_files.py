@@ -166,9 +166,7 @@ def test_a_pipe_or_device_that_is_named_like_a_file_is_refused_at_once(tmp_path:
     }
     for suffix, read in readers.items():
         os.mkfifo(path := tmp_path / f"a{suffix}")
-        with pytest.raises(
-            (ValueError, FileNotFoundError), match=f"a{suffix} (is not a regular file; |does not exist|)"
-        ):
+        with pytest.raises((ValueError, FileNotFoundError), match=f"a{suffix}"):
             read(path)
 
 
