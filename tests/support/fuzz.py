@@ -470,10 +470,7 @@ class Target(NamedTuple):
 ALL: dict[str, Target] = {
     "ascii.ply": Target(partial(write_cloud, save_ply, "ascii"), exactly_read),
     "labelled.ply": Target(lambda p: write_points_ply(p, cloud()), exactly_read),
-    **{
-        f"{kind}.pcd": Target(partial(write_cloud, save_pcd, kind), exactly_read)
-        for kind in ("ascii", "binary", "binary_compressed")
-    },
+    **{f"{kind}.pcd": Target(partial(write_cloud, save_pcd, kind), exactly_read) for kind in PCD},
     "cloud.csv": Target(rows(",", "x,y,z\n"), exactly_read),
     "cloud.pts": Target(rows(" ", "40\n"), read_point_cloud),
     "cloud.npy": Target(image(POINTS), exactly_read),
