@@ -290,8 +290,8 @@ def test_options_keep_urls(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "text, sentence",
     [
-        ("generate rope --examples 2 --output ftp://h/x", "has none of the protocols s3, gs and file"),
-        ("train s3://bucket --output run", "names no folder in a bucket"),
+        ("generate rope --examples 2 --output ftp://h/x", "names no folder of a storage, s3 or gs"),
+        ("train s3://bucket --output run", "names no folder of a storage"),
         ("dataset check nowhere", "nowhere has no manifest.json"),
         ("dataset check memory://nowhere", "memory://nowhere has no manifest.json"),
         ("train memory://nowhere/x --output s3://b/run", "the output s3://b/run is a URL, and a local path is"),
