@@ -120,7 +120,8 @@ def test_parts_of_an_obj_keep_their_order_names_and_closedness(tmp_path: Path) -
     lines, offset = [], 1
     for name, shift in (("zebra", 0.0), ("ant", 3.0), ("middle part", 6.0)):
         lines += [f"v {x + shift} {y} {z}" for x, y, z in box.vertices]
-        lines += [f"g {name}"] + [f"f {a + offset}//1 {b + offset}//2 {c + offset}" for a, b, c in box.faces]
+        start = -8 if name == "ant" else offset  # those below 0 count from the latest vertex
+        lines += [f"g {name}"] + [f"f {a + start}//1 {b + start}//2 {c + start}" for a, b, c in box.faces]
         offset += 8
     (tmp_path / "parts.obj").write_text("\n".join(lines))
     mesh = read_segmented_mesh(tmp_path / "parts.obj")
