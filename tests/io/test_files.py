@@ -44,6 +44,12 @@ def test_every_format_gives_back_the_points(tmp_path: Path, name: str) -> None:
     np.testing.assert_array_equal(read_point_cloud(tmp_path / name).points, POINTS.astype(np.float64))
 
 
+def test_repeated_values_come_out_of_a_compressed_file(tmp_path: Path) -> None:
+    points = np.repeat(POINTS[:3], 40, axis=0)
+    (tmp_path / "a.pcd").write_bytes(save_pcd(points, "binary_compressed"))
+    np.testing.assert_array_equal(read_point_cloud(tmp_path / "a.pcd").points, points)
+
+
 def test_arrays_in_numpy_files(tmp_path: Path) -> None:
     np.save(tmp_path / "flat.npy", POINTS)
     np.save(tmp_path / "organized.npy", POINTS[:56].reshape(7, 8, 3))
