@@ -283,28 +283,6 @@ def test_a_process_killed_while_it_replaces_loses_neither_result(renames: int, t
     assert os.listdir(tmp_path) == ["out"]
 
 
-@pytest.mark.parametrize("unlinked", [0, 2])
-def test_a_result_that_was_being_removed_is_not_put_back(unlinked: int, tmp_path: Path) -> None:
-    """Not even where the user has deleted the new one meanwhile: it lacks files. The next run removes what is left."""
-    out = tmp_path / "out"
-    with new_directory(out) as folder:
-        for name in "abc":
-            (folder / name).write_text("first")
-    killed(
-        f"plain, left = os.unlink, iter(range({unlinked}))\n"
-        "def unlink(*place, **options):\n"
-        " next(left, None) is not None or die()\n"
-        " plain(*place, **options)\n"
-        "os.unlink = unlink\n"
-        f"with atomic_files.new_directory({str(out)!r}, force=True) as folder:\n (folder / 'n').touch()"
-    )
-    assert {path.name for path in out.iterdir()} == {"n", MARKER}
-    shutil.rmtree(out)
-    write(out, "second")
-    assert read(out) == "second" and {path.name for path in out.iterdir()} == {"deep", MARKER}
-    assert os.listdir(tmp_path) == ["out"]
-
-
 def test_a_living_process_keeps_what_it_is_writing(tmp_path: Path) -> None:
     """Another one that writes the same file at the same time removes none of it."""
     with atomic_file(tmp_path / "a.txt") as first:

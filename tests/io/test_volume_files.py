@@ -5,6 +5,7 @@ import json
 import re
 import sys
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -16,7 +17,13 @@ from written_results import CENTER, COLORS, NAMES, centroid, cloud, grid
 from mereo.io.readers import read_point_cloud
 from mereo.io.volume_files import read_label_volume
 from mereo.io.writers.meshes import write_points_ply
-from mereo.io.writers.volumes import write_labels_nifti, write_labels_seg_nrrd, write_labels_vti, write_points_npz
+from mereo.io.writers.volumes import (
+    write_labels_nifti,
+    write_labels_npz,
+    write_labels_seg_nrrd,
+    write_labels_vti,
+    write_points_npz,
+)
 
 RAS_OF_INPUT = np.array([-1.0, -1.0, 1.0])
 

@@ -227,7 +227,9 @@ def test_show_says_what_a_dataset_is(data: Path, capsys: pytest.CaptureFixture[s
 @pytest.mark.parametrize(
     "text, sentence",
     [
-        ("generate rope --examples 2 --output ftp://h/x", "has none of the protocols s3, gs and file"),
+        ("generate rope --examples 2 --output ftp://h/x", "names no folder of a storage, s3 or gs"),
+        ("train s3://bucket --output run", "names no folder of a storage"),
+        ("dataset check nowhere", "nowhere has no manifest.json"),
         ("dataset check memory://nowhere", "memory://nowhere has no manifest.json"),
         ("train memory://nowhere/x --output s3://b/run", "the output s3://b/run is a URL, and a local path is"),
     ],

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from fuzz import zipped
 from PIL import Image
+from point_files import save_pcd, save_ply
 
 from mereo.io.errors import LIMIT_VARIABLE, PAGES, max_bytes
 from mereo.io.intrinsics import read_intrinsics
@@ -26,21 +27,8 @@ from mereo.scenes.registry import load_scene
 
 POINTS = np.random.default_rng(0).normal(size=(57, 3)).astype(np.float32)
 TEXT = "".join(f"{x} {y} {z}\n" for x, y, z in POINTS.tolist()).encode()
-DATA, TRIANGLE = POINTS.tobytes(), b"3 0 1 2\n"
-ASCII, BINARY = "ascii", "binary_little_endian"
-
-
-def ply(order: str, count: int, data: bytes, faces: int | None = None) -> bytes:
-    head = f"ply\n{f'format {order} 1.0' if order else 'comment none'}\nelement vertex {count}\n"
-    head += "property float x\nproperty float y\nproperty float z\n"
-    if faces is not None:
-        head += f"element face {faces}\nproperty list uchar int vertex_indices\n"
-    return f"{head}end_header\n".encode() + data
-
-
-def pcd(count: int, layout: str, data: bytes, width: int | None = None) -> bytes:
-    head = "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nHEIGHT 1\n"
-    return f"{head}WIDTH {count if width is None else width}\nPOINTS {count}\nDATA {layout}\n".encode() + data
+PLY, PCD = save_ply(POINTS, "binary_little_endian"), save_pcd(POINTS, "binary")
+TRIANGLE = b"3 0 1 2\n"
 
 
 def npy(*shape: int) -> bytes:
@@ -57,17 +45,20 @@ def one_sentence(read: Callable[[Path], object], path: Path, content: bytes, exp
 
 
 LYING_CLOUDS = {
-    "fewer than none.ply": (ply(ASCII, -5, TEXT), "its header states -5 of element 'vertex'"),
-    "no such format.ply": (ply("binary_middle_endian", 57, DATA), "its format is 'binary_middle_endian'"),
-    "more than there are.ply": (ply(BINARY, 10**12, DATA), "PLY is unexpected length"),
-    "fewer than none.pcd": (pcd(-5, "ascii", TEXT), "its header states -5 points"),
-    "two counts.pcd": (pcd(20, "binary", DATA, 57), "its header states 20 points and 57 x 1"),
+    "fewer than none.ply": (PLY.replace(b"vertex 57", b"vertex -5"), "its header states -5 of element 'vertex'"),
+    "no such format.ply": (PLY.replace(b"little", b"middle"), "its format is 'binary_middle_endian'"),
+    "more than there are.ply": (PLY.replace(b"57", b"1000000000000"), "PLY is unexpected length"),
+    "fewer than none.pcd": (PCD.replace(b"POINTS 57", b"POINTS -5"), "its header states -5 points"),
+    "two counts.pcd": (PCD.replace(b"POINTS 57", b"POINTS 20"), "its header states 20 points and 57 x 1"),
     "too far back.pcd": (
-        pcd(4, "binary_compressed", struct.pack("<II", 5, 48) + bytes([1, 65, 66, 32, 10])),
+        PCD.partition(b"DATA")[0].replace(b"57", b"4")
+        + b"DATA binary_compressed\n"
+        + struct.pack("<II", 5, 80)
+        + bytes([1, 65, 66, 32, 10]),
         "its compressed data are damaged",
     ),
     "cut short.pts": (b"58\n" + TEXT, "truncated: 57 of 58 points"),
-    "huge.npz": (zipped({"points.npy": npy(10**15, 3) + DATA}), "takes more than 8 GB of memory to read"),
+    "huge.npz": (zipped({"points.npy": npy(10**15, 3) + PLY}), "takes more than 8 GB of memory to read"),
 }
 
 
@@ -77,7 +68,10 @@ def test_a_cloud_whose_header_lies_is_refused(tmp_path: Path, name: str) -> None
 
 
 LYING_MESHES = {
-    "fewer faces.ply": (ply(ASCII, 57, TEXT + TRIANGLE, 5), "truncated: 58 of 62 rows"),
+    "fewer faces.ply": (
+        save_ply(POINTS, "ascii").replace(b"end_header", b"element face 5\nproperty list uchar int i\nend_header"),
+        "truncated: 57 of 62 rows",
+    ),
     "fewer faces.off": (b"OFF\n3 5 0\n0 0 0\n1 0 0\n0 1 0\n" + TRIANGLE, "truncated: 1 of 5 faces"),
     "fewer than none.off": (b"OFF\n-3 1 0\n0 0 0\n" + TRIANGLE, "its header states -3 vertices"),
     "huge.stl": (bytes(80) + b"\xff" * 4 + bytes(100), "cannot be read as a mesh"),
@@ -166,9 +160,7 @@ def test_a_pipe_or_device_that_is_named_like_a_file_is_refused_at_once(tmp_path:
     }
     for suffix, read in readers.items():
         os.mkfifo(path := tmp_path / f"a{suffix}")
-        with pytest.raises(
-            (ValueError, FileNotFoundError), match=f"a{suffix} (is not a regular file; |does not exist|)"
-        ):
+        with pytest.raises((ValueError, FileNotFoundError), match=f"a{suffix}"):
             read(path)
 
 

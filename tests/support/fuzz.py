@@ -21,7 +21,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib.util import find_spec
 from pathlib import Path
 from random import Random
@@ -37,6 +37,7 @@ import yaml
 from camera_files import write_camera
 from lattice import pvd_text, xdmf_text
 from PIL import Image
+from point_files import save_pcd, save_ply
 from scene_code import EVERYTHING
 from scene_files import write_bar
 from shapes import ball
@@ -281,15 +282,7 @@ camera_matrix: {rows: 3, cols: 3, data: [20, 0, 7.5, 0, 20, 5.5, 0, 0, 1]}
 distortion_model: plumb_bob
 distortion_coefficients: {rows: 1, cols: 5, data: [0.1, 0, 0, 0, 0]}
 """
-PLY = """\
-ply
-format ascii 1.0
-element vertex 40
-property float x
-property float y
-property float z
-end_header
-"""
+PCD = ("ascii", "binary", "binary_compressed")
 BOP = {str(i): {"cam_K": [20, 0, 8, 0, 20, 6, 0, 0, 1], "depth_scale": 0.1} for i in (1, 2)}
 Write = Callable[[Path], object]
 
@@ -302,16 +295,8 @@ def rows(mark: str, head: str) -> Write:
     return text(head + "".join(mark.join(map(str, row)) + "\n" for row in POINTS.tolist()))
 
 
-def pcd(layout: str) -> Write:
-    head = "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 40\nHEIGHT 1\nPOINTS 40\n"
-    columns = np.ascontiguousarray(POINTS.T.astype("<f4")).tobytes()  # literals alone are valid LZF
-    packed = b"".join(bytes([len(c) - 1]) + c for c in (columns[i : i + 32] for i in range(0, len(columns), 32)))
-    body = {
-        "ascii": "".join("{} {} {}\n".format(*row) for row in POINTS.tolist()).encode(),
-        "binary": POINTS.astype("<f4").tobytes(),
-        "binary_compressed": struct.pack("<II", len(packed), len(columns)) + packed,
-    }
-    return lambda path: path.write_bytes(f"{head}DATA {layout}\n".encode() + body[layout])
+def write_cloud(save: Callable[[np.ndarray, str], bytes], layout: str, path: Path) -> None:
+    path.write_bytes(save(POINTS.astype(np.float32), layout))
 
 
 def image(values: np.ndarray, **options: Any) -> Write:
@@ -483,9 +468,9 @@ class Target(NamedTuple):
 
 
 ALL: dict[str, Target] = {
-    "ascii.ply": Target(rows(" ", PLY), exactly_read),
+    "ascii.ply": Target(partial(write_cloud, save_ply, "ascii"), exactly_read),
     "labelled.ply": Target(lambda p: write_points_ply(p, cloud()), exactly_read),
-    **{f"{kind}.pcd": Target(pcd(kind), exactly_read) for kind in ("ascii", "binary", "binary_compressed")},
+    **{f"{kind}.pcd": Target(partial(write_cloud, save_pcd, kind), exactly_read) for kind in PCD},
     "cloud.csv": Target(rows(",", "x,y,z\n"), exactly_read),
     "cloud.pts": Target(rows(" ", "40\n"), read_point_cloud),
     "cloud.npy": Target(image(POINTS), exactly_read),

@@ -126,7 +126,7 @@ def _depth_image(path: Path, reading: InputConfig) -> SensorFrame:
 def _recording_options(reading: InputConfig) -> tuple[str | None, Camera | None, float | None]:
     known = None if reading.intrinsics is None else read_intrinsics(reading.intrinsics)
     scale = known.depth_scale if known and reading.depth_scale is None else reading.depth_scale
-    return reading.topic, known and known.camera, scale
+    return reading.topic, known.camera if known else None, scale
 
 
 def _recorded(message: RecordedFrame, path: Path, reading: InputConfig) -> SensorFrame:
