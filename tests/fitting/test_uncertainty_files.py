@@ -5,7 +5,6 @@ import json
 import re
 import zlib
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +30,6 @@ from mereo.reconstruction.stream import Outcome
 from mereo.visualization.reconstruction_report import UNEXPLAINED, explain_centroids, point_marks
 from mereo.visualization.result_files import write_answer
 from mereo.visualization.units import Unit
-
-needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
 
 
 @pytest.fixture(scope="module")
@@ -178,19 +175,6 @@ def test_a_calibration_comes_from_the_weights(model: Model, cloud: PointCloud) -
     tracker = Tracker(registrar)
     followed = [tracker.follow(observe(cloud), 0.05 * number).registration for number in range(2)]
     assert all(one is not None and one.radius_scale == 2.5 for one in followed)
-
-
-@needs_viser
-def test_the_viewer_colours_it_and_says_it_of_a_place(found: Answer, server: object) -> None:
-    from mereo_viewer.result_page import SURE, ResultPage, content_of_answer
-
-    page = ResultPage(server, content_of_answer(replace(found, seen=observe(found.seen.cloud, unit_m=1.0))))
-    colors, scale = page.content.colorings[SURE]()
-    mesh = page.content.mesh
-    assert [len(part) for part in colors] == [len(s.vertices) for s in mesh.segments]
-    assert scale is not None and "mm" in scale.words[1]
-    page.probe(mesh.segments[0].vertices[0])
-    assert re.search(r"± [\d.]+ mm \(95\s%\)", page.facts.content)
 
 
 def test_the_command_explains_segments_and_places(
