@@ -445,9 +445,9 @@ class _Trail:
 
     def go_on(self, stage: SearchRound) -> None:
         """Fit the candidates of a round that may be the best, and explore from there."""
-        found, fitted = candidates(self.problem, stage), list[ScoredFit]()
-        for cost, posed in found[: stage.fitted]:
-            if fitted and cost > RIVAL * found[0][0] and min(fitted, key=_total).explains(self.problem):
+        ranked, fitted = candidates(self.problem, stage), list[ScoredFit]()
+        for cost, posed in ranked[: stage.fitted]:
+            if fitted and cost > RIVAL * ranked[0][0] and min(fitted, key=_total).explains(self.problem):
                 break
             fitted.append(refined(self.problem, fit_wide(self.problem, posed)))
         self.fitted += fitted
