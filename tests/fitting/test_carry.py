@@ -104,6 +104,10 @@ def test_a_surface_outside_does_not_tear(registrar: Registrar, bent: Registratio
     plane = Segment("plan", (1, 2, 3), corners, np.array([[0, 1, 2], [0, 2, 3]]))
     placed = placed_one(registrar, Surfaces(SegmentedMesh((plane,))))
     assert isinstance(placed.content, Surfaces) and (placed.distance > 0).all()
+    # shares fall with the fourth power of the distance
+    distance = np.stack([Solids(SCENE.rest).segment_distance(i, placed.content.points) for i in range(4)], axis=1)
+    relative, nearer = placed.shares / placed.shares.max(axis=1, keepdims=True), distance.min(axis=1, keepdims=True)
+    np.testing.assert_allclose(relative, (nearer / distance) ** 4, atol=2e-3)
     found, faces = carry(placed, bent).content.points, placed.content.mesh.segments[0].faces
     nearest = bent.to_camera(placed.content.points)
 

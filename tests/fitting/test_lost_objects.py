@@ -10,26 +10,74 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tracked_views import CAMERA, bare, lump_model, mesh_of, rms, vertices, view, whole
 
 from mereo.api.result import Result
 from mereo.cli.stream import Answering, Outcome, StreamFrame, SurfaceFolder, line
 from mereo.fitting import tracking
-from mereo.fitting.registration.answer import Candidate
+from mereo.fitting.problem.gauss_newton import Posed
+from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.answer_frame import search_hypotheses
 from mereo.fitting.registration.register import Registrar
+from mereo.fitting.search import rotations
 from mereo.fitting.tracking import BackgroundSearch, SynchronousExecutor, TrackedFrame, Tracker
-from mereo.geometry.camera import PointCloud
+from mereo.geometry.camera import Camera, PointCloud
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.reconstruction.observation import Observation, observe
+from mereo.geometry.solids import Solids
+from mereo.io.sensor_frame import SensorFrame
+from mereo.models.weights import load_model
+from mereo.reconstruction.observation import Observation, find_object, observe
 from mereo.reconstruction.pipeline import EncodedFrame
-from mereo.synthesis.clutter import Capsule
+from mereo.scenes.statistical_model import StatisticalModel
+from mereo.synthesis import depth_sensor
+from mereo.synthesis.clutter import Backdrop, Capsule, Surroundings, farthest
+from mereo.synthesis.config import SENSORS
 from mereo.synthesis.depth_sensor import SimulatedView
+
+CAMERA = Camera.from_fov(96, 96, 0.5)
+PLACE = np.array([1.0, -2.0, 130.0])
+
+
+def mesh_of(model: StatisticalModel, turn: int, share: float = 0.0) -> SegmentedMesh:
+    """Segments before the camera, on the way from one state of the library to another."""
+    z = ((1 - share) * model.library[3] + share * model.library[4]).astype(np.float64)
+    R = rotations(97)[turn]
+    posed = Posed(R, PLACE - R @ model.mean.mean(axis=0), z)
+    return model.mesh(posed.place(model.material(z)))
+
+
+def view(mesh: SegmentedMesh, seed: int = 0, occluders: tuple[Capsule, ...] = ()) -> SimulatedView:
+    """View before a far wall."""
+    solids, rng, away = Solids(mesh), np.random.default_rng(seed), np.array([0.0, 0.0, 1.0])
+    wall = Backdrop(away, farthest(solids, away) + 60.0)
+    return depth_sensor.observe(solids, CAMERA, 0.02, SENSORS["paper"], rng, around=Surroundings(occluders, wall))
+
+
+def bare(seen: SimulatedView) -> Observation:
+    """The object's points alone."""
+    return observe(seen.image.to_points())
+
+
+def whole(seen: SimulatedView) -> Observation:
+    """All that was measured, with the object's mask."""
+    image = seen.image
+    return find_object(SensorFrame(Path("simulated"), image.to_points(), None, "camera", image, whole=seen.whole))
+
+
+def vertices(mesh: SegmentedMesh) -> np.ndarray:
+    return np.concatenate([segment.vertices for segment in mesh.segments])
+
+
+def rms(answer: Answer, mesh: SegmentedMesh) -> float:
+    """Root mean square distance of all vertices."""
+    return float(np.sqrt(((vertices(answer.surfaces) - vertices(mesh)) ** 2).sum(axis=1).mean()))
 
 
 @pytest.fixture(scope="module")
 def registrar() -> Registrar:
-    return Registrar(None, lump_model())
+    """Registrar of a lobe with a core inside and a tip that lies on it, which bends."""
+    model = load_model("tests/golden/lump.safetensors").statistical_model
+    assert model is not None
+    return Registrar(None, model)
 
 
 class HeldExecutor(Executor):
@@ -198,23 +246,19 @@ def test_an_executor_that_works_at_once_finds_it_in_the_same_frame(
 
 
 def test_the_own_thread_blocks_no_frame_and_ends(
-    registrar: Registrar,
-    frames: dict[str, Observation],
-    searches: Searches,
-    monkeypatch: pytest.MonkeyPatch,
+    registrar: Registrar, frames: dict[str, Observation], searches: Searches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waiting, goes_on, search = threading.Event(), threading.Event(), tracking.search_hypotheses
 
     def slow(seen: Observation, *rest: Any) -> tuple[Candidate, EncodedFrame]:
         waiting.set()
-        assert goes_on.wait(60) and threading.current_thread().name.startswith("mereo-search")
+        assert goes_on.wait(60)
         return search(seen, *rest)
 
+    def threads() -> list[threading.Thread]:
+        return [one for one in threading.enumerate() if one.name.startswith("mereo-search")]
+
     monkeypatch.setattr(tracking, "search_hypotheses", slow)
-
-    def threads() -> list[str]:
-        return [one.name for one in threading.enumerate() if one.name.startswith("mereo-search")]
-
     with Tracker(registrar) as tracker:
         tracker.follow(frames["here"], 0.0, scene_unit=1.0)
         assert not threads()
@@ -229,10 +273,8 @@ def test_the_own_thread_blocks_no_frame_and_ends(
         tracker.forget()
         assert tracker.follow(frames["here"], 0.15, scene_unit=1.0).tracking == "found"
         assert tracker.follow(frames["thing"], 0.18, scene_unit=1.0).tracking == "lost"
-    tracker.close()
-    for one in threading.enumerate():
-        if one.name.startswith("mereo-search"):
-            one.join(60)
+    for one in threads():
+        one.join(60)
     assert not threads()
 
 

@@ -153,6 +153,13 @@ def test_what_neighbours_share_is_no_noise(points: np.ndarray) -> None:
     assert shared(own + 0.5, around, 0.45) > 1.3 and shared(own + half, around, 0.45) > 1.3
 
 
+def test_noise_that_neighbours_share_is_spread_evenly_and_a_wrong_state_is_not() -> None:
+    rng, around = np.random.default_rng(0), np.zeros((2700, 8), dtype=int)
+    windows = 0.1 * np.repeat(rng.normal(size=300), 9)
+    assert is_noise(windows, around, is_shared=True) and not is_noise(10 * windows, around, is_shared=True)
+    assert not is_noise(np.where(rng.random(2700) < 0.1, 0.6, windows), around, is_shared=True)
+
+
 def test_a_noisy_cloud_is_explained_where_only_noise_is_left(
     model: Model, registrar: Registrar, points: np.ndarray
 ) -> None:

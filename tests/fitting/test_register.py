@@ -125,9 +125,8 @@ def test_a_scene_that_has_changed_since_is_said_and_not_played(
             Registrar.of(model, "full", given)
     with pytest.raises(ValueError, match=f"{said}, so its draws"):  # named as that of other weights
         assert Registrar.of(replace(model, provenance={"scene": "mine"}), scene=changed).states_or_none
-    for method in ("auto", "modes", "full"):
-        with pytest.raises(ValueError, match=f"{said}, so places cannot be compared: .* with --method network"):
-            evaluate(model, EvaluationConfig(changed, 1, method=method))
+    with pytest.raises(ValueError, match=f"{said}, so places cannot be compared: .* with --method network"):
+        evaluate(model, EvaluationConfig(changed, 1, method="modes"))
     assert evaluate(model, EvaluationConfig(changed, 1, cells=12, method="network")).sources == ("network",)
 
 
@@ -200,14 +199,9 @@ MOTION = "the pose is .* must be 4 x 4 finite numbers: a rotation and a translat
 REFUSED: dict[str, tuple[Callable[[Registration], object], str]] = {
     "pairs": (lambda r: r.to_camera([[0.0, 1.0]]), r"have the shape \(1, 2\); they must be rows of x, y, z"),
     "NaN": (lambda r: r.to_camera([[np.nan, 0, 0], [0, 0, 0]]), "1 of 2 points are NaN, infinite or beyond 1e"),
-    "infinity": (lambda r: r.query([0, np.inf, 0]), "1 of 1 point are NaN, infinite or beyond"),
     "complex": (lambda r: r.to_rest(np.ones((2, 3)) * 1j), "has values of type complex128; they must be real numbers"),
-    "words": (lambda r: r.radius95(["abc"], at="camera"), "has values of type <U3; they must be real numbers"),
     "a place": (lambda r: r.radius95([0, 0, 0], at="Rest"), "at is 'Rest'; it must be one of camera, rest"),
-    "a place to explain": (lambda r: r.explain([0, 0, 0], at="Rest"), "at is 'Rest'; it must be one of camera, rest"),
     "a shear": (lambda r: r.moved(np.eye(4) + np.eye(4, k=1)), MOTION),
-    "no motion": (lambda r: r.moved(np.full((4, 4), np.nan)), MOTION),
-    "a rotation": (lambda r: r.moved(np.eye(3)), MOTION),
 }
 
 

@@ -163,16 +163,17 @@ def test_a_registration_from_a_file_has_no_radii(found: Registration, material: 
 
 
 def test_the_shares_of_all_evidence_sum_to_one(found: Registration) -> None:
-    """And a hidden point is unsure by what was known of the states, not by the points' noise, more than a seen one."""
+    """And hidden points are unsure by what was known of the states, not by the points' noise, more than seen ones."""
     shown = seen_points(found.material, PointCloud(seen(found.model.mesh(found.material))), 1.0)
     shares = []
-    for row in (int(np.flatnonzero(shown)[5]), int(np.flatnonzero(~shown)[5])):
-        one = found.explain(found.model.rest_points[row], at="rest")
-        assert one is not None
-        assert sum(one.shares.values()) == pytest.approx(1.0, abs=1e-3) and min(one.shares.values()) > -1e-6
-        assert one.weights.sum() == pytest.approx(1.0) and (one.weights >= 0).all()
-        shares.append(one.shares["states"])
-    assert shares[1] > shares[0]
+    for part in (shown, ~shown):
+        each = [found.explain(place, at="rest") for place in found.model.rest_points[part][::60]]
+        for one in each:
+            assert one is not None
+            assert sum(one.shares.values()) == pytest.approx(1.0, abs=1e-3) and min(one.shares.values()) > -1e-6
+            assert one.weights.sum() == pytest.approx(1.0) and (one.weights >= 0).all()
+        shares.append(np.mean([one.shares["states"] for one in each if one is not None]))
+    assert shares[1] > 1.1 * shares[0]
 
 
 def test_an_influence_is_how_far_a_moved_point_moves_the_place(found: Registration) -> None:

@@ -5,7 +5,6 @@ import json
 import re
 import zlib
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +26,6 @@ from mereo.reconstruction.observation import observe
 from mereo.synthesis.sample_views import load_view
 from mereo.visualization.reconstruction_report import UNEXPLAINED, explain_centroids, point_marks
 from mereo.visualization.result_files import write_answer
-
-needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
 
 
 @pytest.fixture(scope="module")

@@ -258,8 +258,9 @@ def test_a_given_pose_weighs_as_its_error_says(held: tuple[Scene, StatisticalMod
 
 def test_pairs_by_direction_tell_the_sides_of_a_thin_part_apart(model: StatisticalModel) -> None:
     samples = SampledSurface.of(model, 2000).posed(Posed(np.eye(3), np.array([0.0, 0.0, 120.0]), np.zeros(model.count)))
-    top, across = samples.normal[:, 2] < -0.9, np.ptp(samples.points[:, 2])
-    beneath, normals = samples.points[top] + np.array([0.0, 0.0, 0.8 * across]), samples.normal[top].astype(np.float64)
+    points, top = samples.position.astype(np.float64), samples.normal[:, 2] < -0.9
+    across, normals = np.ptp(points[:, 2]), samples.normal[top].astype(np.float64)
+    beneath = points[top] + np.array([0.0, 0.0, 0.8 * across])
     # of all samples and not of facing ones alone, the nearest are those of the other side
     _, by_place, _ = samples.planes(beneath, normals, 0.0)
     _, by_direction, _ = samples.planes(beneath, normals, 2.0 * across)

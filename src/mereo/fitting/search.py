@@ -74,8 +74,8 @@ class SightTable:
         across = corner + (np.stack(np.meshgrid(*(np.arange(cells) + 0.5,) * 2, indexing="ij"), -1)) * side / cells
         sight = np.concatenate([across.reshape(-1, 2), np.ones((cells * cells, 1))], axis=1) @ T
         sight /= np.linalg.norm(sight, axis=1, keepdims=True)
-        T, corner, *along = (part.astype(np.float32) for part in (T, corner, *evidence.along(sight)))
-        return cls(T, corner, side / cells, *along, evidence.pitch)
+        toward, front, free = (part.astype(np.float32) for part in evidence.along(sight))
+        return cls(T.astype(np.float32), corner.astype(np.float32), side / cells, toward, front, free, evidence.pitch)
 
     def violations(
         self, position: Float32[np.ndarray, "n w 3"], slack: float
@@ -304,8 +304,8 @@ class Screen:
         rows = np.concatenate([np.cross(seen, normal), normal, -np.einsum("npi,npi->np", seen, normal)[..., None]], 2)
         toward = np.matmul(direction, poses.rotation)  # in the model's frame, where a sample moves the other way
         pull = -np.concatenate([np.cross(few, toward), toward, -np.einsum("nwi,nwi->nw", few, toward)[..., None]], 2)
-        residual = np.einsum("npi,npi->np", offset, normal), -amount / size[..., 0]
-        parts = (rows, pull), residual, (weight, np.where(amount > 0, weight_outside, 0.0))
+        across, beyond = np.einsum("npi,npi->np", offset, normal), -amount / size[..., 0]
+        parts = (rows, pull), (across, beyond), (weight, np.where(amount > 0, weight_outside, 0.0))
         rows, residual, weight = (np.concatenate(part, axis=1) for part in parts)
         matrix, gradient = _normal_equations(rows, residual, weight)
         # with planes alone, poses far away would slide past each other
@@ -445,9 +445,9 @@ class _Trail:
 
     def go_on(self, stage: SearchRound) -> None:
         """Fit the candidates of a round that may be the best, and explore from there."""
-        found, fitted = candidates(self.problem, stage), list[ScoredFit]()
-        for cost, posed in found[: stage.fitted]:
-            if fitted and cost > RIVAL * found[0][0] and min(fitted, key=_total).explains(self.problem):
+        ranked, fitted = candidates(self.problem, stage), list[ScoredFit]()
+        for cost, posed in ranked[: stage.fitted]:
+            if fitted and cost > RIVAL * ranked[0][0] and min(fitted, key=_total).explains(self.problem):
                 break
             fitted.append(refined(self.problem, fit_wide(self.problem, posed)))
         self.fitted += fitted
