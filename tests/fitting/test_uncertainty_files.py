@@ -173,8 +173,8 @@ def test_a_calibration_comes_from_the_weights(model: Model, cloud: PointCloud) -
     assert all(one is not None and one.radius_scale == 2.5 for one in followed)
 
 
-@needs_viser
 def test_the_viewer_colours_it_and_says_it_of_a_place(found: Answer, server: object) -> None:
+    pytest.importorskip("viser", reason="viser (extra `view`) is not installed")
     from mereo_viewer.result_page import SURE, ResultPage, content_of_answer
 
     page = ResultPage(server, content_of_answer(replace(found, seen=observe(found.seen.cloud, unit_m=1.0))))
