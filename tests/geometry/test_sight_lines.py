@@ -1,17 +1,18 @@
 """Lines of sight beside the object: what a frame rules out is empty, and where it could not see is unknown."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import pytest
 from sight_parts import pixels
-from tracked_views import whole
 
 from mereo.fitting.problem.evidence import Evidence
 from mereo.geometry.camera import DepthImage, SightLines
 from mereo.geometry.solids import Solids
-from mereo.reconstruction.observation import Observation
+from mereo.io.sensor_frame import SensorFrame
+from mereo.reconstruction.observation import Observation, find_object
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.clutter import (
@@ -48,7 +49,9 @@ class Occluded:
 
     @property
     def found(self) -> Observation:
-        return whole(self.seen)
+        image = self.seen.image
+        frame = SensorFrame(Path("simulated"), image.to_points(), None, "camera", image, whole=self.seen.whole)
+        return find_object(frame)
 
     def kinds(self, lines: SightLines) -> np.ndarray:
         """Image of "p" and "u" where a line of sight is kept, "" elsewhere; each line is in one pixel of its own."""

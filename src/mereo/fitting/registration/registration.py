@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal, SupportsIndex
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -95,6 +95,12 @@ class Registration:
     radius_scale: float | None = None
     extra_radius: float = 0.0
     alike: int = 1
+
+    def __reduce_ex__(self, protocol: SupportsIndex) -> Any:
+        raise TypeError(
+            "a registration cannot be pickled or copied, as it holds search structures of compiled libraries: store "
+            "it with mereo.fitting.registration.state.save_state, or keep its material and mesh"
+        )
 
     def __repr__(self) -> str:
         trust = "" if self.accepted else "not believed, "
