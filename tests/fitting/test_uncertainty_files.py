@@ -1,6 +1,7 @@
 """How sure a registered model is, where people and programs read it: files, summary, report, stream, viewer."""
 
 import base64
+import copy
 import json
 import re
 import zlib
@@ -57,6 +58,11 @@ def folder(found: Answer, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def radii_of(found: Answer) -> np.ndarray:
     assert found.registered is not None and found.registered.uncertainty is not None
     return np.concatenate(found.registered.uncertainty.vertices)
+
+
+def test_a_registration_says_that_it_cannot_be_sent(found: Answer) -> None:
+    with pytest.raises(TypeError, match="a registration cannot be pickled or copied.*save_state"):
+        copy.copy(found.registered)
 
 
 def test_a_ply_has_the_radius_of_each_vertex_in_its_unit(found: Answer, folder: Path) -> None:
