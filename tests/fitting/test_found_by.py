@@ -12,6 +12,7 @@ from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.answer_frame import (
     ASTRAY,
     answer_frame,
+    fit_hypotheses,
     is_astray,
     misfit_in,
     more_evident,
@@ -22,6 +23,10 @@ from mereo.geometry.camera import PointCloud, SightLines
 from mereo.models.model import Model
 from mereo.models.weights import load_model
 from mereo.reconstruction.observation import observe
+from mereo.scenes.registry import load_scene
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.config import SENSORS, GenerateConfig
+from mereo.synthesis.examples import sample_view
 from mereo.synthesis.sample_views import load_view
 
 HYPOTHESES = "mereo.fitting.registration.answer_frame"
@@ -140,6 +145,28 @@ def test_a_fit_that_alone_explains_the_frame_is_taken(liver: Model, cloud: Point
     searched = replace(by_network, modes=replace(by_network.modes, posed=astray), located_by="search")
     assert searched.is_accepted and not refused.is_accepted
     assert more_evident(refused, searched) is searched
+
+
+def test_a_noisy_frame_that_two_fits_explain_apart_is_not_known(liver: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The search ends where the network does, or a tenth of the length beside it, as if that explained it too."""
+    settings = GenerateConfig(sensor=SENSORS["time-of-flight"])
+    view = sample_view(load_scene("liver").for_seed(1000), settings, example_rng(1000, 1))
+    seen, registrar = observe(view.depth.to_points()), Registrar.of(liver)
+    by_network = fit_hypotheses(seen, liver, registrar, False, 1.0)[0]
+    assert by_network.is_noisy and by_network.is_accepted and by_network.modes is not None
+    posed, half = by_network.modes.posed, by_network.modes.problem.model.half
+    for offset, known in ((0.02, True), (0.2, "unsure")):
+        moved = replace(posed, translation=posed.translation + [offset * half, 0.0, 0.0])
+        searched = replace(by_network, modes=replace(by_network.modes, posed=moved))
+        vars(searched)["is_accepted"] = True
+        monkeypatch.setattr(f"{HYPOTHESES}.search_hypotheses", lambda *_, other=searched: (other, other.encoded))
+        answer = answer_frame(seen, liver, registrar, scene_unit=1.0, resolution=24)
+        assert answer.candidate is not None and answer.candidate.rival == pytest.approx(offset, rel=1e-3)
+        assert answer.recognition.known == known and answer.located_by == "network"
+    assert answer.recognition.facts()["rival"] == answer.candidate.rival
+    assert "two fits explain this noisy frame, and the places of the object are 20% of" in str(
+        answer.recognition.reason
+    )
 
 
 @pytest.mark.usefixtures("confused", "without_turns")

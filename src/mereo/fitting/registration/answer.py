@@ -39,12 +39,15 @@ class Candidate:
     Attributes:
         encoded: these points, and what the network made of them.
         modes: the fit; None where none was wanted, or none was found for ``error``.
+        rival: how far another fit, which explains a noisy frame too, has the object from this one, root mean square, as
+            a share of half its length; None where none was made.
     """
 
     encoded: EncodedFrame
     modes: ModesFit | None = None
     error: ValueError | None = None
     located_by: LocatedBy = "network"
+    rival: float | None = None
 
     @property
     def hypothesis(self) -> Reading:
@@ -55,6 +58,17 @@ class Candidate:
     def is_accepted(self) -> bool:
         """Whether the fit explains the frame."""
         return self.modes is not None and self.modes.registration().accepted
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether the frame was fitted as one with more noise than the paper's."""
+        return self.modes is not None and self.modes.problem.noisy
+
+    def placed(self) -> Float[np.ndarray, "m 3"]:
+        """Material points of the fit, in the frame's axes and unit."""
+        assert self.modes is not None
+        material = self.modes.registration().material
+        return transform_points(inverse_rigid(self.encoded.T_camera_input), material)
 
     @cached_property
     def off_surface(self) -> Float[np.ndarray, " n"]:

@@ -105,7 +105,8 @@ def answer_of(
     displaced = None if registration is None else candidate.displaced(registration)
     stated = None if registrar is None else registrar.stated_scene_unit(seen.frame.unit_m)
     refusal = None if candidate.error is None else str(candidate.error)
-    recognition = recognize(registration, None if model is None else model.calibration, displaced, stated, refusal)
+    calibration = None if model is None else model.calibration
+    recognition = recognize(registration, calibration, displaced, stated, refusal).with_rival(candidate.rival)
     taken = registrar is not None and registration is not None and registrar.takes(registration)
     hypothesis = candidate.hypothesis if taken else likelier.reading
     if taken and registrar is not None and registration is not None:
@@ -141,8 +142,10 @@ def find(
     """Find the best fit to a frame by itself, and the hypothesis on its points that is likelier without a fit.
 
     A network starts the fit where there is one, in tenths of a second; where that is doubtful (``is_doubtful``), a
-    search follows, and the fit with the greater evidence is taken. Takes the arguments of ``answer_frame``, and raises
-    as it does for unusable clouds.
+    search follows, and the fit with the greater evidence is taken. In a noisy frame many states explain the points: a
+    search follows too, and how far its fit is from the network's is kept (``Candidate.rival``).
+
+    Takes the arguments of ``answer_frame``, and raises as it does for unusable clouds.
     """
     if seen.initial_pose is not None and (registrar is None or scene_unit_of(seen, registrar, scene_unit) is None):
         raise ValueError(
@@ -153,10 +156,14 @@ def find(
         return search_hypotheses(seen, registrar, keep_all, scene_unit)
     assert model is not None
     candidate, likelier = fit_hypotheses(seen, model, registrar, keep_all, scene_unit)
-    if registrar is None or not registrar.asks_search or not is_doubtful(seen, candidate):
+    if registrar is None or not registrar.asks_search:
+        return candidate, likelier
+    doubtful = is_doubtful(seen, candidate)
+    if not doubtful and not candidate.is_noisy:
         return candidate, likelier
     searched, _ = search_hypotheses(seen, registrar, keep_all, scene_unit)
-    return more_evident(candidate, searched), likelier
+    best = more_evident(candidate, searched) if doubtful else candidate
+    return replace(best, rival=rival_distance(candidate, searched)), likelier
 
 
 def is_doubtful(seen: Observation, candidate: Candidate) -> bool:
@@ -207,6 +214,18 @@ def more_evident(first: Candidate, second: Candidate) -> Candidate:
         for each in (first.modes, second.modes)
     ]
     return second if cost[1] < cost[0] else first
+
+
+def rival_distance(first: Candidate, second: Candidate) -> float | None:
+    """Root mean square distance of two fits that explain a noisy frame, as a share of half the object's length.
+
+    None where not both do, or the frame is clean.
+    """
+    if not (first.is_accepted and second.is_accepted and (first.is_noisy or second.is_noisy)):
+        return None
+    assert first.modes is not None
+    offset = first.placed() - second.placed()
+    return float(np.sqrt((offset**2).sum(axis=1).mean())) / (first.modes.problem.model.half * first.modes.unit)
 
 
 def misfit_in(frame: ModesFit, fitted: ModesFit) -> float:
