@@ -156,7 +156,7 @@ def test_a_noisy_frame_that_two_fits_explain_apart_is_not_known(liver: Model, mo
     assert by_network.is_noisy and by_network.is_accepted and by_network.modes is not None
     posed, half = by_network.modes.posed, by_network.modes.problem.model.half
     for offset, known in ((0.02, True), (0.2, "unsure")):
-        moved = replace(posed, translation=posed.translation + [offset * half, 0.0, 0.0])
+        moved = replace(posed, translation=posed.translation + np.array([offset * half, 0.0, 0.0]))
         searched = replace(by_network, modes=replace(by_network.modes, posed=moved))
         vars(searched)["is_accepted"] = True
         monkeypatch.setattr(f"{HYPOTHESES}.search_hypotheses", lambda *_, other=searched: (other, other.encoded))
