@@ -1,6 +1,7 @@
 """Who finds the object: the network at once where it can, a search where the network's fit explains too little."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,10 @@ from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.answer_frame import (
     ASTRAY,
     answer_frame,
-    fit_hypotheses,
     is_astray,
     misfit_in,
     more_evident,
+    rival_distance,
     search_modes,
 )
 from mereo.fitting.registration.register import Registrar
@@ -148,25 +149,26 @@ def test_a_fit_that_alone_explains_the_frame_is_taken(liver: Model, cloud: Point
 
 
 def test_a_noisy_frame_that_two_fits_explain_apart_is_not_known(liver: Model, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The search ends where the network does, or a tenth of the length beside it, as if that explained it too."""
     settings = GenerateConfig(sensor=SENSORS["time-of-flight"])
     view = sample_view(load_scene("liver").for_seed(1000), settings, example_rng(1000, 1))
-    seen, registrar = observe(view.depth.to_points()), Registrar.of(liver)
-    by_network = fit_hypotheses(seen, liver, registrar, False, 1.0)[0]
-    assert by_network.is_noisy and by_network.is_accepted and by_network.modes is not None
-    posed, half = by_network.modes.posed, by_network.modes.problem.model.half
-    for offset, known in ((0.02, True), (0.2, "unsure")):
-        moved = replace(posed, translation=posed.translation + np.array([offset * half, 0.0, 0.0]))
-        searched = replace(by_network, modes=replace(by_network.modes, posed=moved))
-        vars(searched)["is_accepted"] = True
-        monkeypatch.setattr(f"{HYPOTHESES}.search_hypotheses", lambda *_, other=searched: (other, other.encoded))
-        answer = answer_frame(seen, liver, registrar, scene_unit=1.0, resolution=24)
-        assert answer.candidate is not None and answer.candidate.rival == pytest.approx(offset, rel=1e-3)
-        assert answer.recognition.known == known and answer.located_by == "network"
-    assert answer.recognition.facts()["rival"] == answer.candidate.rival
-    assert "two fits explain this noisy frame, and the places of the object are 20% of" in str(
-        answer.recognition.reason
-    )
+    answer = answer_frame(observe(view.depth.to_points()), liver, Registrar.of(liver), scene_unit=1.0, resolution=24)
+    candidate = answer.candidate
+    assert candidate is not None and candidate.is_noisy and candidate.modes is not None
+    assert candidate.rival is not None and candidate.rival < 0.125 and answer.recognition.known is True
+    # a search that ends beside it, where a distance of 50 units is an explanation
+    modes, posed = candidate.modes, candidate.modes.posed
+    for tolerance in (50.0, 1e-3):
+        config = replace(modes.problem.config, tolerance=tolerance)
+        lax = replace(candidate, modes=replace(modes, problem=replace(modes.problem, config=config)))
+        beside = posed.translation + np.array([0.2 * modes.problem.model.half, 0.0, 0.0])
+        best = SimpleNamespace(posed=replace(posed, translation=beside))
+        monkeypatch.setattr(f"{HYPOTHESES}.search", lambda _, best=best: SimpleNamespace(best=best))
+        rival = rival_distance(lax)
+        assert rival == (pytest.approx(0.2, rel=1e-3) if tolerance > 1 else None)
+        doubted = answer.recognition.with_rival(rival)
+        assert doubted.known == ("unsure" if tolerance > 1 else True) and doubted.facts()["rival"] == rival
+    doubted = answer.recognition.with_rival(0.2)
+    assert "two fits explain this noisy frame, and the places of the object are 20% of" in str(doubted.reason)
 
 
 @pytest.mark.usefixtures("confused", "without_turns")

@@ -64,12 +64,6 @@ class Candidate:
         """Whether the frame was fitted as one with more noise than the paper's."""
         return self.modes is not None and self.modes.problem.noisy
 
-    def placed(self) -> Float[np.ndarray, "m 3"]:
-        """Material points of the fit, in the frame's axes and unit."""
-        assert self.modes is not None
-        material = self.modes.registration().material
-        return transform_points(inverse_rigid(self.encoded.T_camera_input), material)
-
     @cached_property
     def off_surface(self) -> Float[np.ndarray, " n"]:
         """Distance of each of all points from the facing surface, scene units."""

@@ -142,8 +142,8 @@ def find(
     """Find the best fit to a frame by itself, and the hypothesis on its points that is likelier without a fit.
 
     A network starts the fit where there is one, in tenths of a second; where that is doubtful (``is_doubtful``), a
-    search follows, and the fit with the greater evidence is taken. In a noisy frame many states explain the points: a
-    search follows too, and how far its fit is from the network's is kept (``Candidate.rival``).
+    search follows, and the fit with the greater evidence is taken. In a noisy frame many states explain the points:
+    how far a fit from another start is from the network's is kept (``rival_distance``).
 
     Takes the arguments of ``answer_frame``, and raises as it does for unusable clouds.
     """
@@ -158,12 +158,10 @@ def find(
     candidate, likelier = fit_hypotheses(seen, model, registrar, keep_all, scene_unit)
     if registrar is None or not registrar.asks_search:
         return candidate, likelier
-    doubtful = is_doubtful(seen, candidate)
-    if not doubtful and not candidate.is_noisy:
-        return candidate, likelier
+    if not is_doubtful(seen, candidate):
+        return (replace(candidate, rival=rival_distance(candidate)) if candidate.is_noisy else candidate), likelier
     searched, _ = search_hypotheses(seen, registrar, keep_all, scene_unit)
-    best = more_evident(candidate, searched) if doubtful else candidate
-    return replace(best, rival=rival_distance(candidate, searched)), likelier
+    return more_evident(candidate, searched), likelier
 
 
 def is_doubtful(seen: Observation, candidate: Candidate) -> bool:
@@ -216,16 +214,23 @@ def more_evident(first: Candidate, second: Candidate) -> Candidate:
     return second if cost[1] < cost[0] else first
 
 
-def rival_distance(first: Candidate, second: Candidate) -> float | None:
-    """Root mean square distance of two fits that explain a noisy frame, as a share of half the object's length.
+def rival_distance(candidate: Candidate) -> float | None:
+    """Distance of a fit from the best that one round of search makes of the same frame, noise and all, without network.
 
-    None where not both do, or the frame is clean.
+    Root mean square over the material points, as a share of half the object's length; None where the search explains
+    too little.
     """
-    if not (first.is_accepted and second.is_accepted and (first.is_noisy or second.is_noisy)):
+    modes = candidate.modes
+    assert modes is not None
+    problem = modes.problem
+    with limit_blas_threads():
+        config = replace(problem.config, search_rounds=1)
+        outcome = search(replace(problem, network=NetworkTerm.none(problem.model), config=config))
+    rival = replace(modes, posed=outcome.best.posed, rest=None).registration()
+    if not rival.accepted:
         return None
-    assert first.modes is not None
-    offset = first.placed() - second.placed()
-    return float(np.sqrt((offset**2).sum(axis=1).mean())) / (first.modes.problem.model.half * first.modes.unit)
+    offset = rival.material - modes.registration().material
+    return float(np.sqrt((offset**2).sum(axis=1).mean())) / (problem.model.half * modes.unit)
 
 
 def misfit_in(frame: ModesFit, fitted: ModesFit) -> float:
