@@ -1,6 +1,6 @@
 """One wrong answer of each kind, with what mereo says of it: the picture of docs/trust.md.
 
-    python examples/wrong_answers.py --output wrong.png
+    python examples/wrong_answers.py --output wrong_answers.png
 
 Every column is one frame, made of a built-in object: the truth above, the answer below, both seen from beside the
 camera, with the observed points as dark dots. Views are of test seeds, chosen because their answers are wrong.
@@ -98,12 +98,13 @@ CASES = (
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--output", type=Path, default=Path("wrong_answers.png"))
     output = parser.parse_args().output
     check_file_place(output)
     columns = [case.draw() for case in CASES]
     gap = np.full((len(columns[0]), 12, 3), 255, dtype=np.uint8)
     save_png(output, np.concatenate([part for column in columns for part in (column, gap)][:-1], axis=1))
+    print(f"wrote {output}")
 
 
 if __name__ == "__main__":

@@ -15,15 +15,16 @@ EXPECTED = {
     "loop.py": "wrote loop.webp: 9 frames",
     "query_points.py": "to the nearest surface",
     "reconstruct_cloud.py": "report.html",
-    "search_steps.py": "wrote search_steps.png",
     "sensors.py": "wrote",
     "shipped_weights.py": "wrote objects.png",
     "simulate_liver.py": "3 states of 98 nodes",
+    "wrong_answers.py": "wrote wrong_answers.png",
 }
 ASSETS = {
     "isolate_object.py": ("bunny/bunny.off", "bunny/bun000.ply"),
     "loop.py": ("bunny/bunny.off",),
     "simulate_liver.py": ("liver/lapgym_liver_volumetric.vtk",),
+    "wrong_answers.py": ("bunny/bunny.off", "human/makehuman_base.obj", "liver/lapgym_liver_visual.stl"),
 }
 """Downloads that they need."""
 
@@ -31,8 +32,8 @@ OPTIONS = {"loop.py": ("--fps", "1"), "shipped_weights.py": ("--weights", "rope"
 """What keeps an example short."""
 
 LONG = (
-    *("isolate_object.py", "loop.py", "reconstruct_cloud.py", "search_steps.py", "shipped_weights.py"),
-    "simulate_liver.py",
+    *("isolate_object.py", "loop.py", "reconstruct_cloud.py", "shipped_weights.py", "simulate_liver.py"),
+    "wrong_answers.py",
 )
 """Those that take longer; what they call has tests of its own."""
 

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from analytic import untrained
-from PIL import Image
 
 from mereo import __main__ as command_line
 from mereo.cli.scenes import SceneModes
@@ -97,12 +96,9 @@ def test_the_number_of_modes_needed_is_the_smallest_that_is_enough(rope: Statist
     assert rope.modes_for(np.inf) == 0 and rope.modes_for(rope.residue / 2) is None
 
 
-def test_the_command_says_how_many_and_draws_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    picture = tmp_path / "modes.png"
-    assert command_line.main(["scene", "modes", "rope", "--states", "100", "--output", str(picture)]) == 0
+def test_the_command_says_how_many(capsys: pytest.CaptureFixture[str]) -> None:
+    assert command_line.main(["scene", "modes", "rope", "--states", "100"]) == 0
     assert "modes leave" in capsys.readouterr().out
-    drawn = np.asarray(Image.open(picture).convert("RGB"))
-    assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 100
 
 
 def test_weights_show_the_model_that_they_carry(
@@ -117,8 +113,6 @@ def test_weights_show_the_model_that_they_carry(
         SceneModes(str(tmp_path / "without.safetensors"), states=100).run()
 
 
-def test_bad_wishes_are_refused(tmp_path: Path) -> None:
+def test_too_few_states_are_refused() -> None:
     with pytest.raises(ValueError, match="fewer than 100 say little"):
         SceneModes("rope", states=5).run()
-    with pytest.raises(ValueError, match="the picture is a PNG file"):
-        SceneModes("rope", tmp_path / "modes.jpg", 100).run()
