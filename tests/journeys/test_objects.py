@@ -142,6 +142,8 @@ def test_an_initial_pose_takes_the_place_of_a_search(
 def test_what_is_defined_in_the_meshes_is_carried(found: mereo.Result, scene: Scene) -> None:
     corners = found.carry(scene.rest.merged()[0], files="scene")
     assert np.abs(corners - found.surfaces.merged()[0]).max() < 0.02 * np.ptp(corners, axis=0).max()
+    mesh = found.carry(scene.rest, files="scene")
+    assert mesh.names == found.names and np.abs(mesh.bounds - found.surfaces.bounds).max() < 0.02 * np.ptp(mesh.bounds)
 
 
 def test_it_is_served_without_weights(folder: Path, meshes: list[str], points: np.ndarray) -> None:

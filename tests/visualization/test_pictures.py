@@ -11,6 +11,7 @@ from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
 from mereo.geometry.transforms import rigid
 from mereo.synthesis.examples import View
+from mereo.visualization import previews
 from mereo.visualization.contact_sheets import contact_sheet, depth_to_rgb, legend
 from mereo.visualization.previews import preview_states, render_cloud_and_segments
 from mereo.visualization.renderer import SUPERSAMPLE, Canvas, Triangles, Viewpoint, corner_normals, shade
@@ -263,6 +264,10 @@ def test_a_preview_of_states_has_three_pictures_for_each_state(tmp_path: Path) -
     thirds = np.array_split(picture[:, 12:], 9, axis=1)
     reds = [int(hue_is(part, (255, 0, 0)).sum()) for part in thirds]
     assert [red > 50 for red in reds[:6]] == [True, True, False] * 2
+    toward = np.array([0.0, 0.6, 0.8])
+    arrow = previews._arrow(np.ones(3), toward, 2.0).vertices - 1  # from the camera's side to the object
+    np.testing.assert_allclose(sorted({round(far, 6) for far in arrow @ toward}), [1.7, 2.06, 2.7])
+    assert np.linalg.norm(arrow - np.outer(arrow @ toward, toward), axis=1).max() < 0.17
 
 
 SPACING = np.array([0.5, 0.3, 0.4])
