@@ -50,8 +50,16 @@ SATELLITES = {
 }
 """Packages beside mereo, in the same wheel, and the modules of mereo that may import each."""
 
-BUDGET = {"src/mereo": (43748, 185), "tests": (35121, 231)}
-"""Lines and files that a folder may have at most; they fall to 35,000 and 200, and to 25,000 lines of tests."""
+BUDGET = {
+    "src/mereo": (34_000, 152),
+    "src/mereo_learning": (6_550, 22),
+    "src/mereo_objects": (4_350, 28),
+    "src/mereo_serving": (1_770, 13),
+    "src/mereo_viewer": (1_380, 5),
+    "src/mereo_experiments": (1_610, 17),
+    "tests": (28_950, 203),
+}
+"""Lines and files that a folder may have at most; they only fall, those of tests to 25,000."""
 
 TEST_FOLDERS = ("theorems", "journeys", "robustness", "house", "support")
 """Folders of tests beside those of the rooms: see CONTRIBUTING.md."""
