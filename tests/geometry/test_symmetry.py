@@ -68,6 +68,11 @@ def test_segments_that_change_places_are_told_from_those_that_land_on_none() -> 
     assert {symmetry.lands_on for symmetry in halves} == {(0, 1), (1, 0)}
     assert {symmetry.swaps for symmetry in halves if symmetry.lands_on == (1, 0)} == {True}
     core = trimesh.creation.icosphere(radius=5)
+    beam = trimesh.creation.box((20, 4, 4))  # it would survive a half turn
+    (bottle,) = find_symmetries(
+        posed(beam, trimesh.creation.cone(15, 60, sections=64).apply_translation((0, 0, -20))), 0.3
+    )
+    assert bottle.angle is None and bottle.lands_on == (None, 1)
     (hidden,) = find_symmetries(posed(moved(core, 8), BALL, nested=(("a", "b"),)), 0.3)
     assert hidden.lands_on == (None, 1)
     assert not hidden.swaps

@@ -21,7 +21,7 @@ TOLERANCE = 0.45
 """Scene units up to which a turned surface looks the same: a fit explains a point by a surface up to there."""
 
 SAMPLES, FEW = 4000, 300
-"""Samples of all surfaces, and those among the visible ones that compare a turn before it is settled."""
+"""Samples of all surfaces, and how many of the visible ones, or of a segment's vertices, stand for all."""
 
 ALIKE_MOMENTS = 0.1
 """Difference of two second moments, as a share of the greater, up to which turns about all axes between count."""
@@ -33,7 +33,7 @@ BEYOND = 0.005
 """Share of the visible surface that may lie farther than the tolerance from the turned one."""
 
 NEARLY = 0.9
-"""Share of the samples of a segment that must come to lie on the same segment, and of the turns about an axis that must
+"""Share of the vertices of a segment that must come to lie on the same segment, and of the turns about an axis that must
 be symmetries for all to be."""
 
 
@@ -91,6 +91,8 @@ def find_symmetries(mesh: SegmentedMesh, tolerance: float) -> tuple[Symmetry, ..
     if not 0 < tolerance < np.inf:
         raise ValueError(f"the tolerance is {tolerance:g}; it must be above 0: take the noise of the camera")
     surface = _Surface.of(mesh, tolerance)
+    if len(surface.visible) < FEW:  # nearly all of it lies in other segments
+        return ()
     center, moments, axes = surface.moments()
     alike = np.diff(moments) <= ALIKE_MOMENTS * moments[1:]
     if not alike.any():
@@ -100,13 +102,15 @@ def find_symmetries(mesh: SegmentedMesh, tolerance: float) -> tuple[Symmetry, ..
         halves = [surface.settle(_about(center, np.pi * axis)) for axis in axes]
         middle = _fixed_point(halves)
         if np.mean([surface.is_kept(_about(middle, turn)) for turn in turns[:100]]) >= NEARLY:
-            return (Symmetry(halves[0], None, None, surface.landing(halves[0])),)
+            whole = _about(middle, turns[0])
+            return (Symmetry(whole, None, None, surface.landing(whole)),)
         return _settled(surface, center, turns)
     main, around = axes[0 if alike[1] else 2], np.arange(1, round(2 * np.pi / STEP)) * STEP
     half = surface.settle(_about(center, np.pi * main))
     axis, middle = _axis_of(half), _fixed_point([half])
     if np.mean([surface.is_kept(_about(middle, angle * axis)) for angle in around]) >= NEARLY:
-        return (Symmetry(half, None, axis, surface.landing(half)), *_settled(surface, middle, np.pi * axes[1:2]))
+        whole = _about(middle, axis)  # by 1 rad, which nothing but a round part inside survives
+        return (Symmetry(whole, None, axis, surface.landing(whole)), *_settled(surface, middle, np.pi * axes[1:2]))
     between = np.arange(round(np.pi / STEP))[:, None] * STEP
     across = np.cos(between) * axes[1] + np.sin(between) * np.cross(main, axes[1])
     return _settled(surface, center, np.concatenate([around[:, None] * main, np.pi * across]))
@@ -125,7 +129,7 @@ class _Surface:
 
     Attributes:
         mesh, tolerance: of ``find_symmetries``.
-        points, normals, owner: of the samples; normals are outward.
+        points, normals: of the samples; normals are outward.
         visible: rows of those samples that border on empty space.
     """
 
@@ -133,12 +137,11 @@ class _Surface:
     tolerance: float
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
-    owner: Int[np.ndarray, " n"]
     visible: Int[np.ndarray, " v"]
 
     @classmethod
     def of(cls, mesh: SegmentedMesh, tolerance: float) -> "_Surface":
-        vertices, faces, labels = mesh.merged()
+        vertices, faces, _ = mesh.merged()
         corners = vertices[faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         area = np.linalg.norm(normals, axis=1)
@@ -150,7 +153,7 @@ class _Surface:
         normals = normals[face] / area[face, None]
         size = float(np.ptp(vertices, axis=0).max())
         outside = Solids(mesh).label(points + 1e-3 * size * normals) == 0
-        return cls(mesh, tolerance, points, normals, labels[face].astype(np.int64), np.flatnonzero(outside))
+        return cls(mesh, tolerance, points, normals, np.flatnonzero(outside))
 
     @cached_property
     def _tree(self) -> tuple[igl.AABB, np.ndarray, np.ndarray]:
@@ -201,16 +204,13 @@ class _Surface:
         return turn
 
     def landing(self, turn: Float[np.ndarray, "4 4"]) -> tuple[int | None, ...]:
-        """For each segment the one on whose surface most of it comes to lie."""
-        moved = transform_points(turn, self.points)
-        segments = self.mesh.segments
-        distance = np.stack(
-            [np.sqrt(igl.point_mesh_squared_distance(moved, s.vertices, s.faces)[0]) for s in segments], axis=1
-        )
+        """For each segment the one on whose surface most of its vertices come to lie."""
+        segments, limit = self.mesh.segments, (2 * self.tolerance) ** 2
         result = list[int | None]()
-        for index in range(len(segments)):
-            near = (distance[self.owner == index] <= 2 * self.tolerance).mean(axis=0)
-            result.append(int(near.argmax()) if near.size and near.max() >= NEARLY else None)
+        for segment in segments:
+            moved = transform_points(turn, segment.vertices[:: max(1, len(segment.vertices) // FEW)])
+            near = [(igl.point_mesh_squared_distance(moved, s.vertices, s.faces)[0] <= limit).mean() for s in segments]
+            result.append(int(np.argmax(near)) if max(near) >= NEARLY else None)
         return tuple(result) if len(set(result)) == len(result) or None in result else (None,) * len(result)
 
 
@@ -243,7 +243,7 @@ def _about(
 def _axis_of(turn: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "3"]:
     """Axis of a turn, a unit vector."""
     vector = Rotation.from_matrix(turn[:3, :3]).as_rotvec()
-    return vector / float(np.linalg.norm(vector))
+    return vector / max(float(np.linalg.norm(vector)), 1e-12)
 
 
 def _fixed_point(turns: list[Float[np.ndarray, "4 4"]]) -> Float[np.ndarray, "3"]:
