@@ -33,8 +33,8 @@ BEYOND = 0.005
 """Share of the visible surface that may lie farther than the tolerance from the turned one."""
 
 NEARLY = 0.9
-"""Share of the vertices of a segment that must come to lie on the same segment, and of the turns about an axis that must
-be symmetries for all to be."""
+"""Share of the vertices of a segment that must come to lie on one segment, and of the turns about an axis that must be
+symmetries for all to be."""
 
 
 @dataclass(frozen=True, eq=False)
