@@ -3,10 +3,12 @@
     python examples/wrong_answers.py --output wrong_answers.png
 
 Every column is one frame, made of a built-in object: the truth above, the answer below, both seen from beside the
-camera, with the observed points as dark dots. Views are of test seeds, chosen because their answers are wrong.
+camera, with the observed points as dark dots; the unit is stated. Views are of test seeds, chosen because their
+answers are wrong.
 """
 
 import argparse
+import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +30,7 @@ from mereo.visualization.previews import points_on_segments
 from mereo.visualization.reconstruction_report import VERDICTS, trust
 from mereo.visualization.result_files import frame_facts
 
-SIDE, TEXT = 300, 96
+SIDE, TEXT = 280, 130
 """In pixels: of each picture, and the height of the words below a column."""
 
 BESIDE = ((0.75, 0.2, 0.6), (0.0, -1.0, 0.0))
@@ -64,10 +66,10 @@ class Case:
         view = sample_view(scene.for_seed(TEST_SEED_START), settings, example_rng(TEST_SEED_START, self.index))
         points = self.change(view.depth.to_points().points)
         given = self.name if self.finder == "weights" else load_scene(self.name)
-        result = mereo.reconstruct(PointCloud(points), given)
+        result = mereo.reconstruct(PointCloud(points), given, unit_m=scene.unit_m)
         score = "" if self.seen else scores(view.mesh, result.surfaces)
         verdict = trust(frame_facts(result))
-        words = [self.title, f"{score}", f"{VERDICTS[verdict.level]}: {verdict.why}"]
+        words = [self.title, score, f"{VERDICTS[verdict.level]}: {verdict.why}".replace("\N{NO-BREAK SPACE}", " ")]
         print(" | ".join(words), flush=True)
         pictures = [points_on_segments(points, mesh, [BESIDE], SIDE)[0] for mesh in (view.mesh, result.surfaces)]
         return np.concatenate([*pictures, written(words)])
@@ -82,16 +84,17 @@ def scores(truth: SegmentedMesh, answer: SegmentedMesh) -> str:
 def written(words: list[str]) -> Picture:
     plate = Image.new("RGB", (SIDE, TEXT), "white")
     pen = ImageDraw.Draw(plate)
-    for row, (text, size) in enumerate(zip(words, (17, 14, 14), strict=True)):
-        pen.text((SIDE // 2, 16 + 24 * row), text, fill=INK, font=fit_font(size, text, SIDE - 8), anchor="mm")
+    title, score, verdict = words
+    for row, text in enumerate((title, score, *textwrap.wrap(verdict, 44))):
+        pen.text((SIDE // 2, 14 + 19 * row), text, fill=INK, font=fit_font(13 if row else 17, text, SIDE), anchor="mm")
     return np.asarray(plate)
 
 
 CASES = (
-    Case("look-alike ends exchanged", "rope", 0, finder="meshes"),
+    Case("a coil, its bend guessed", "rope", 0, finder="meshes"),
     Case("a thin sheet, noisy camera", "sheet", 0, camera="time-of-flight"),
     Case("another object", "bunny", 0, seen="skull"),
-    Case("a wrong unit", "liver", 0, change=lambda points: 1.35 * points),
+    Case("1.35 times its size", "liver", 0, change=lambda points: 1.35 * points),
     Case("half of it cut away", "human", 0, change=lambda points: points[points[:, 1] < np.median(points[:, 1])]),
 )
 

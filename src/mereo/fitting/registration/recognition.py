@@ -205,7 +205,7 @@ def recognize(
 
 # --- reasons ----------------------------------------------------------------------------------------------------------
 
-RIVAL = 0.125
+RIVAL = 0.2
 """``Candidate.rival`` from which on a noisy frame does not say where the object is.
 
 Of training views by time of flight, four of the sheet whose answers were wrong (IoU .34 to .61) had .14 to .88, one
