@@ -208,8 +208,8 @@ def recognize(
 RIVAL = 0.2
 """``Candidate.rival`` from which on a noisy frame does not say where the object is.
 
-Of 44 noisy training views of ten objects, two of six wrong answers (IoU below .7) lie beyond it, and two of 32 right
-ones (docs/experiments/070.md)."""
+Of 50 noisy training views of ten objects, three of eight wrong answers (IoU below .7) lie beyond it, and one of 36
+right ones (docs/experiments/070.md)."""
 
 LOOK = "look at the result before you rely on it"
 WIDEN = f"{LOOK}, or name the weights of what it is; if it is this object, widen the scene's ranges and learn it anew"
