@@ -111,13 +111,13 @@ def has_left(process: int) -> bool:
     return bool(processes(folder_of_ray(process)) or files)
 
 
-def started(line: str, **options: Any) -> "subprocess.Popen[str]":
-    """A command, as soon as workers of its own cluster are at a task."""
+def started(line: str, **options: Any) -> "tuple[subprocess.Popen[str], list[int]]":
+    """A command, as soon as workers of its own cluster are at a task, and these: they may be done a moment later."""
     command = subprocess.Popen([sys.executable, "-m", "mereo", *line.split()], text=True, stderr=-1, **options)
     until = time.monotonic() + 300
-    while not working(folder_of_ray(command.pid)) and time.monotonic() < until and command.poll() is None:
+    while not (busy := working(folder_of_ray(command.pid))) and time.monotonic() < until and command.poll() is None:
         time.sleep(0.1)
-    return command
+    return command, busy
 
 
 @pytest.mark.parametrize("workers", [1, 3])
@@ -158,7 +158,7 @@ def test_a_stopped_command_leaves_nothing(number: signal.Signals, tmp_path: Path
     output = tmp_path / "data"
     options = "--ray local --workers 2 --image-size 32 --points 64 --per-segment 8"
     line = f"generate shapes --examples 6400 --test --seed 1000003 --output {output} {options}"
-    command = started(line, stdout=subprocess.DEVNULL, start_new_session=True)
+    command, _ = started(line, stdout=subprocess.DEVNULL, start_new_session=True)
     try:
         os.killpg(command.pid, number) if number == signal.SIGINT else command.send_signal(number)
         errors = command.communicate(timeout=60)[1]
@@ -214,7 +214,7 @@ def test_with_json_nothing_of_ray_gets_to_standard_output(tmp_path: Path) -> Non
         np.save(tmp_path / f"frames/{number}.npy", 0.001 * view.depth.to_points().points)
     line = f"reconstruct {tmp_path}/frames --units mm --unit-m 1 --resolution 24 --output {tmp_path}/out --json"
     objects = " ".join(map(str, known))
-    command = started(f"{line} --ray local --threads 1 --object {objects}", stdout=subprocess.PIPE)
-    os.kill(working(folder_of_ray(command.pid))[0], signal.SIGKILL)
+    command, busy = started(f"{line} --ray local --threads 1 --object {objects}", stdout=subprocess.PIPE)
+    os.kill(busy[0], signal.SIGKILL)
     out, errors = command.communicate(timeout=500)
     assert command.returncode in (0, 3) and len(json.loads(out)["frames"]) == 3, errors

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from itertools import permutations
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -301,6 +302,10 @@ class ElasticSampler:
     count: int
     motion: float
     held: Bool[np.ndarray, " n"] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """State without the factors of the Poisson system, which cannot be pickled; a first state makes them again."""
+        return {key: value for key, value in self.__dict__.items() if key != "_state"}
 
     @cached_property
     def digest(self) -> str:
