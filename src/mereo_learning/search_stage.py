@@ -162,8 +162,9 @@ def search_line(scores: SearchScores) -> str:
 
 def symmetry_lines(scene: Scene) -> list[str]:
     """Sentences on segments that no frame tells apart, and so no training either."""
-    exchanged = [each for each in find_symmetries(scene.rest, TOLERANCE) if not each.keeps_segments]
-    return [f"{sentence}, so no training can" for sentence in describe_symmetries(exchanged, scene.rest.names)]
+    symmetries = find_symmetries(scene.rest, TOLERANCE)
+    sentences = describe_symmetries(symmetries, scene.rest.names, of_segments=True)
+    return [f"{sentence}, so no training can" for sentence in sentences]
 
 
 def _digests(scene: Scene) -> dict[str, str | None]:

@@ -29,7 +29,7 @@ from mereo.fitting.draws.fit import (
 from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
 from mereo.fitting.problem.evidence import OBSERVED_SAMPLES
 from mereo.fitting.problem.gauss_newton import Posed
-from mereo.fitting.problem.segments import ANGLES, find_symmetries, left_open
+from mereo.fitting.problem.segments import ANGLES, find_segment_turns, left_open
 from mereo.fitting.registration.register import CloudToFit, ModesFit
 from mereo.fitting.uncertainty import Posterior, covariance_factor
 from mereo.geometry.mesh import Segment, SegmentedMesh
@@ -97,20 +97,20 @@ def model_of(move: object, sides: int = 36, peg: float = 0.0) -> StatisticalMode
 
 
 def test_a_smooth_wheel_that_spins_may_be_turned_anyhow() -> None:
-    (turn,) = find_symmetries(model_of(free))
+    (turn,) = find_segment_turns(model_of(free))
     assert turn.label == 2 and len(turn.angles) == len(ANGLES)
     assert abs(turn.axis[2]) > 0.999 and turn.plausible.min() > 0.5
 
 
 def test_of_a_wheel_of_six_sides_only_sixths_look_alike() -> None:
-    (turn,) = find_symmetries(model_of(free, sides=6))
+    (turn,) = find_segment_turns(model_of(free, sides=6))
     degrees = np.rad2deg(turn.angles).round()
     assert np.isin([60, 120, 180, 240, 300], degrees).all() and not np.isin([30, 90, 150, 210, 270, 330], degrees).any()
 
 
 def test_turns_that_no_state_makes_by_themselves_do_not_count() -> None:
-    assert find_symmetries(model_of(held)) == ()
-    for turn in find_symmetries(model_of(coupled)):  # it may stand on its head
+    assert find_segment_turns(model_of(held)) == ()
+    for turn in find_segment_turns(model_of(coupled)):  # it may stand on its head
         assert abs(turn.axis[2]) < 0.01
 
 
@@ -120,7 +120,7 @@ def test_what_is_left_open_has_the_second_moments_of_the_turns() -> None:
     material = transform_points(IN_FRONT, model.rest_points)
     block = material[model.rest_points[:, 2] < 0.0]
     motion = left_open(model, material, block, 0.2, 1500.0).astype(np.float64)
-    (turn,) = find_symmetries(model)
+    (turn,) = find_segment_turns(model)
     weight, squared = np.append(turn.plausible, 1.0), np.zeros(len(material))
     wheel = model.labels == 2
     for angle, share in zip(turn.angles, weight / weight.sum(), strict=False):
@@ -132,7 +132,7 @@ def test_what_is_left_open_has_the_second_moments_of_the_turns() -> None:
 def test_a_peg_that_is_seen_leaves_no_turn_open() -> None:
     """One so small that the shapes are alike; where it is hidden, some turns stay open."""
     model = model_of(free, sides=6, peg=0.6)
-    assert len(find_symmetries(model)) == 1
+    assert len(find_segment_turns(model)) == 1
     material = transform_points(IN_FRONT, model.rest_points)
     vertices = material[: sum(model.vertex_counts)][model.labels[: sum(model.vertex_counts)] == 2]
     rest = model.rest_points[: sum(model.vertex_counts)][model.labels[: sum(model.vertex_counts)] == 2]
@@ -201,11 +201,11 @@ def test_of_many_draws_those_jump_that_slide_along_the_surface() -> None:
 
 def test_an_object_without_states_is_at_rest() -> None:
     model = model_of(free)
-    assert find_symmetries(model.around(model.mean, np.zeros((len(model.mean), 3, 0), dtype=np.float32))) == ()
+    assert find_segment_turns(model.around(model.mean, np.zeros((len(model.mean), 3, 0), dtype=np.float32))) == ()
 
 
 def test_a_wheel_with_a_long_peg_is_not_like_itself() -> None:
-    assert find_symmetries(model_of(free, peg=6.0)) == ()
+    assert find_segment_turns(model_of(free, peg=6.0)) == ()
 
 
 # --- segments turned together -----------------------------------------------------------------------------------------

@@ -119,7 +119,7 @@ def exists(name: str) -> bool:
     parts = parts if parts[0].startswith("mereo_") else ["mereo", *parts]
     depth = next(n for n in range(len(parts), 0, -1) if is_module(ROOT.joinpath("src", *parts[:n])))
     if depth == len(parts):
-        return True  # not imported: Triton's kernels cannot be everywhere
+        return True  # not imported: some modules need an extra
     found: object = importlib.import_module(".".join(parts[:depth]))
     for part in parts[depth:]:
         if not hasattr(found, part) and part not in getattr(found, "__annotations__", {}):

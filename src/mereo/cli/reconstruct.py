@@ -418,9 +418,7 @@ def print_source(answer: Answer) -> None:
     if answer.recognition.description is not None:
         print(answer.recognition.description)
     model = registration.model
-    for symmetry in describe_symmetries(
-        [each for each in model.symmetries if not each.keeps_segments], model.rest.names
-    ):
+    for symmetry in describe_symmetries(model.symmetries, model.rest.names, of_segments=True):
         print(symmetry)
 
 

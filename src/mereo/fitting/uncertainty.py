@@ -89,7 +89,7 @@ class Posterior:
         factor: p x p, ``factor factor^T`` is the covariance of the parameters.
         residue: root mean square distance of the object's states from what the coefficients can express.
         open: motion of the material points with further standard normal numbers, by the second moments of what is far
-            from Gaussian (``find_symmetries``, a state beside rest), in the camera's axes; None without.
+            from Gaussian (``find_segment_turns``, a state beside rest), in the camera's axes; None without.
     """
 
     posed: Posed

@@ -116,8 +116,12 @@ def find_symmetries(mesh: SegmentedMesh, tolerance: float) -> tuple[Symmetry, ..
     return _settled(surface, center, np.concatenate([around[:, None] * main, np.pi * across]))
 
 
-def describe_symmetries(symmetries: Sequence[Symmetry], names: tuple[str, ...]) -> list[str]:
-    """Make one sentence for each thing that no camera tells: of symmetries with the same effect the first."""
+def describe_symmetries(symmetries: Sequence[Symmetry], names: tuple[str, ...], of_segments: bool = False) -> list[str]:
+    """Make one sentence for each thing that no camera tells: of symmetries with the same effect the first.
+
+    With ``of_segments`` those are left out that turn each segment onto itself.
+    """
+    symmetries = [each for each in symmetries if not (of_segments and each.keeps_segments)]
     first = {symmetry.lands_on: symmetry for symmetry in reversed(symmetries)}
     kept = [symmetry for symmetry in symmetries if first[symmetry.lands_on] is symmetry]
     return [symmetry.describe(names) for symmetry in kept]

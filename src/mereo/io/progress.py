@@ -67,11 +67,6 @@ class Progress:
         finally:
             self._paused_s += time.monotonic() - begun
 
-    @property
-    def unit_s(self) -> float:
-        """Seconds that a unit took, in the mean; 0 before the first."""
-        return (time.monotonic() - self._started - self._paused_s) / self.done if self.done else 0.0
-
 
 @contextmanager
 def progress(

@@ -33,7 +33,7 @@ from mereo.fitting.problem.residuals import (
     robust_square,
     silhouette_losses,
 )
-from mereo.fitting.problem.segments import Symmetry, branches, find_symmetries
+from mereo.fitting.problem.segments import SegmentTurns, branches, find_segment_turns
 from mereo.geometry.mesh import barycentric
 from mereo.geometry.transforms import best_rotations
 from mereo.scenes.draw_recorder import SMOOTH, OutOfDraws, Recorder
@@ -637,7 +637,7 @@ def redraw_choices(scene: Scene, drawn: Drawn, count: int) -> list[Drawn]:
 # An arm looks the same with the forearm half a turn round, the wrist bent the other way and the hand turned back. No
 # jump of one draw leads there, but the shape is known, so that the draws can approach it as that of the modes.
 
-Twins = tuple[tuple[Symmetry, float], ...]
+Twins = tuple[tuple[SegmentTurns, float], ...]
 """Segments that hang on each other, and the angle by which each is turned."""
 
 
@@ -647,8 +647,8 @@ def symmetric_groups(model: StatisticalModel) -> tuple[Twins, ...]:
 
     Others are left to single draws, which slide along their surface.
     """
-    single = dict[int, tuple[Symmetry, float]]()
-    for turn in find_symmetries(model):
+    single = dict[int, tuple[SegmentTurns, float]]()
+    for turn in find_segment_turns(model):
         middle = float(turn.angles.mean())
         if np.abs(turn.angles - middle).max() <= np.deg2rad(15.0):  # one run of two or three, 10 degrees apart
             single[turn.label - 1] = turn, middle

@@ -196,7 +196,7 @@ COUNTED = 0.03
 
 
 @dataclass(frozen=True, eq=False)
-class Symmetry:
+class SegmentTurns:
     """Turns of a segment about an axis, which hardly change its shape.
 
     Attributes:
@@ -221,11 +221,11 @@ class Symmetry:
 
 
 @lru_cache(maxsize=8)
-def find_symmetries(model: StatisticalModel) -> tuple[Symmetry, ...]:
+def find_segment_turns(model: StatisticalModel) -> tuple[SegmentTurns, ...]:
     """Find all such turns of an object that its states make, once for a model; none without states."""
     if model.count == 0:
         return ()
-    corners, symmetries = corners_of(model), list[Symmetry]()
+    corners, symmetries = corners_of(model), list[SegmentTurns]()
     # from the rest pose, not from the mean, in which a part that spins is crushed
     rotation = segment_poses(model.rest_points[corners], sampled_positions(model, corners))[0]
     joints = branches(model)
@@ -237,7 +237,7 @@ def find_symmetries(model: StatisticalModel) -> tuple[Symmetry, ...]:
             plausible = plausibility(rotation, index, neighbors, axis, alike)
             kept = plausible > 0.02
             if kept.any():
-                symmetries.append(Symmetry(index + 1, center, axis, alike[kept], plausible[kept]))
+                symmetries.append(SegmentTurns(index + 1, center, axis, alike[kept], plausible[kept]))
     return tuple(symmetries)
 
 
@@ -270,7 +270,7 @@ def plausibility(
     axis: Float[np.ndarray, "3"],
     angles: Float[np.ndarray, " a"],
 ) -> Float[np.ndarray, " a"]:
-    """``Symmetry.plausible`` against that neighbour of a segment against which it turns most; 1 for all without any.
+    """``SegmentTurns.plausible`` against that neighbour of a segment against which it turns most; 1 for all if alone.
 
     It counts pairs of states in which the segment leans alike against the neighbour (.2 rad): a rope that bends twists
     too, but never by itself. ``rotation`` is that of each segment in some states, from rest.
@@ -300,7 +300,7 @@ def left_open(
 
     ``observed_samples`` are in the frame of the registered material, together worth ``total_weight`` points.
     """
-    turns = find_symmetries(model)
+    turns = find_segment_turns(model)
     motion = np.zeros((len(material), 3, 2 * len(turns)), dtype=np.float32)
     if not turns:
         return motion
