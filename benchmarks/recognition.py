@@ -1,4 +1,4 @@
-"""Is it my object, in a state that I know: how well the answer tells, and how reliable probabilities are.
+"""Can an answer be trusted: whether it is the object, how far off it may be, how reliable probabilities are.
 
     python benchmarks/recognition.py [OBJECT ...] [--views N] [--strangers N] [--seed S] [--calibration-views N]
                                      [--method modes|auto] [--output FOLDER]
@@ -8,7 +8,8 @@ receiver operating characteristic (AUROC) by which ``Recognition.strangeness`` t
 N views of every other shipped object, from planes and heaps, from balls and random points as large as it is, from two
 of it side by side, from the half of its points on one side, from clouds in another unit than is stated, from states
 with all draws 1.5 times as far and, with weights, from its own views as a network of the preset `tiny` understands
-them after ten steps; the shares of clean and of simulated cameras' views that are "unsure" and refused; and the
+them after ten steps; the shares of clean views, of those of which a tool hides 30 %, and of simulated cameras' views
+that are "unsure" and refused; the shares of their true material points, seen and hidden, within the 95 % radii; and the
 expected calibration error of the network's probabilities as they are and calibrated. Weights without a calibration
 are calibrated here, on training seeds, and not written. Test seeds begin at 1,000,000: tune on others.
 
@@ -30,37 +31,38 @@ from typing import Any
 
 import numpy as np
 import torch
+from occluded_views import occlude
 
 from mereo.api.generate import generate
 from mereo.api.objects import load_object
 from mereo.deformation.maps import Deformation
+from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.recognition import MOST, Recognition
 from mereo.fitting.registration.register import Registrar
 from mereo.geometry.camera import PointCloud
-from mereo.geometry.metrics import truth_grid
+from mereo.geometry.metrics import grid_confusion, intersection_over_union, labels_on, truth_grid
 from mereo.io.atomic_files import atomic_file
 from mereo.models.model import Model
 from mereo.models.weights import load_model
-from mereo.reconstruction.observation import observe
+from mereo.reconstruction.config import IsolationConfig
+from mereo.reconstruction.observation import Observation, find_object, observe
 from mereo.scenes.draw_recorder import OutOfDraws, Recorder
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene, SourceFrame
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
-from mereo.synthesis.config import GenerateConfig
-from mereo.synthesis.examples import sample_view
+from mereo.synthesis.config import SENSORS, GenerateConfig
+from mereo.synthesis.examples import View, sample_view
 from mereo_learning.calibrate import (
     VIEWS,
-    CalibrationView,
     calibrate,
     ece_of,
-    object_views,
     other_objects,
     strange_frames,
 )
-from mereo_learning.cases import sample_cells
+from mereo_learning.cases import RegistrationErrors, nearest_truth, sample_cells, seen_points
 from mereo_learning.config import PRESETS
-from mereo_learning.scoring import trained_scene
+from mereo_learning.scoring import trained_scene, true_material
 from mereo_learning.trainer import train
 
 FACTORS = (25.4, 0.1, 1000.0, 0.0254, 10.0, 1 / 25.4, 0.001, 2.54)
@@ -76,22 +78,42 @@ STEPS, EXAMPLES = 10, 40
 CELLS = 100
 """Cells of the paper's grid along each axis."""
 
+WRONG = 0.7
+"""IoU below which a registration is wrong."""
+
+
+OWN = ("clean", "occluded", "cameras")
+"""Views of the object itself: by the paper's camera, with 30 % behind a tool, and by simulated cameras."""
+
 
 @dataclass
-class Found:
+class Measured:
     """What was said of the frames of one object.
 
     Attributes:
-        own: of clean views.
-        noisy: of views by simulated cameras.
+        own: of views of the object, by their kind in ``OWN``.
+        errors, iou: of the registrations of those of these views that are said to show the object.
         strange: of everything else, by its kind.
         ece: expected calibration error as the network gives probabilities, and calibrated.
     """
 
-    own: list[Recognition] = field(default_factory=list)
-    noisy: list[Recognition] = field(default_factory=list)
+    own: dict[str, list[Recognition]] = field(default_factory=lambda: {kind: [] for kind in OWN})
+    errors: dict[str, list[RegistrationErrors]] = field(default_factory=lambda: {kind: [] for kind in OWN})
+    iou: dict[str, list[float]] = field(default_factory=lambda: {kind: [] for kind in OWN})
     strange: dict[str, list[Recognition]] = field(default_factory=lambda: defaultdict(list))
     ece: tuple[float, float] = (float("nan"), float("nan"))
+
+    def add(self, kind: str, answer: Answer | Recognition, view: View, seen: PointCloud) -> None:
+        """Take in what was said of a view of the object, in scene units."""
+        self.own[kind].append(answer if isinstance(answer, Recognition) else answer.recognition)
+        if isinstance(answer, Recognition) or answer.registration is None or answer.recognition.known is not True:
+            return
+        fit = answer.registration
+        positions = nearest_truth(fit.model, fit.material, true_material(view, fit.model))
+        self.errors[kind].append(RegistrationErrors.of(fit, positions, seen_points(positions, seen, 1.0), 1.0))
+        truth = truth_grid(view.mesh, CELLS)
+        labels = labels_on(fit.mesh, truth.grid)
+        self.iou[kind].append(intersection_over_union(grid_confusion(truth, labels, len(view.mesh.names))).iou)
 
 
 def auroc(own: Sequence[float], strange: Sequence[float]) -> float:
@@ -102,12 +124,18 @@ def auroc(own: Sequence[float], strange: Sequence[float]) -> float:
     return float((ahead > 0).mean() + 0.5 * (ahead == 0).mean())
 
 
-def said_of(cloud: PointCloud, model: Model | None, registrar: Registrar, unit_m: float | None = 1.0) -> Recognition:
-    """What `mereo.reconstruct` says of a cloud of this unit; a scene unit is a metre (``sized``)."""
+def answered(seen: Observation, model: Model | None, registrar: Registrar) -> Answer | Recognition:
+    """What `mereo.reconstruct` says of a frame; a scene unit is a metre (``sized``)."""
     try:
-        return answer_frame(observe(cloud, unit_m=unit_m), model, registrar).recognition
+        return answer_frame(seen, model, registrar)
     except ValueError as error:  # nothing is found, and no network answers
         return Recognition(False, str(error), MOST)
+
+
+def recognized(cloud: PointCloud, model: Model | None, registrar: Registrar, unit_m: float | None = 1.0) -> Recognition:
+    """Whether it says that a cloud of this unit shows the object."""
+    answer = answered(observe(cloud, unit_m=unit_m), model, registrar)
+    return answer if isinstance(answer, Recognition) else answer.recognition
 
 
 def sized(registrar: Registrar) -> Registrar:
@@ -223,7 +251,20 @@ def barely_trained(scene: Scene, folder: Path) -> Model:
     return load_model(train(folder / "data", folder / "run", config, device="cpu"))
 
 
-def measured(name: str, arguments: argparse.Namespace) -> Found:
+def own_views(scene: Scene, count: int, seed: int) -> Iterator[tuple[str, View, Observation]]:
+    """Views of the object of each kind in ``OWN``, in scene units, which are metres."""
+    scene = scene.for_seed(seed)
+    for index in range(count):
+        view = sample_view(scene, GenerateConfig(), example_rng(seed, index))
+        yield "clean", view, observe(view.depth.to_points(), unit_m=1.0)
+        hidden = occlude(view, "tool", 0.3, np.random.default_rng([seed, index]))
+        yield "occluded", view, find_object(hidden.frame(1.0), IsolationConfig())
+        sensor = SENSORS["time-of-flight" if index % 2 else "structured-light"]
+        view = sample_view(scene, GenerateConfig(sensor=sensor), example_rng(seed + 6, index))
+        yield "cameras", view, observe(view.depth.to_points(), unit_m=1.0)
+
+
+def measured(name: str, arguments: argparse.Namespace) -> Measured:
     """All frames of one object."""
     thing = load_object(name)
     model = thing.network
@@ -237,36 +278,36 @@ def measured(name: str, arguments: argparse.Namespace) -> Found:
             model = replace(model, calibration=calibrate(model, scene, views=arguments.calibration_views, quiet=False))
         unsized = Registrar.of(model, arguments.method, scene)
     registrar = sized(unsized)
-    found, seed = Found(), arguments.seed
-    views = list(object_views(scene, 2 * arguments.views, seed))
-    clean = [view for view in views if view.is_clean]
-    found.own = [said_of(view.seen, model, registrar) for view in clean]
-    found.noisy = [said_of(view.seen, model, registrar) for view in views if not view.is_clean]
-    for index, view in enumerate(clean):
-        wrong = PointCloud(view.seen.points * FACTORS[index % len(FACTORS)])
-        found.strange["wrong unit"].append(said_of(wrong, model, registrar))
+    result, seed, clean = Measured(), arguments.seed, []
+    for kind, view, seen in own_views(scene, arguments.views, seed):
+        result.add(kind, answered(seen, model, registrar), view, seen.cloud)
+        clean += [view] if kind == "clean" else []
+    clouds = [view.depth.to_points() for view in clean]
+    for index, cloud in enumerate(clouds):
+        wrong = PointCloud(cloud.points * FACTORS[index % len(FACTORS)])
+        result.strange["wrong unit"].append(recognized(wrong, model, registrar))
     for kind, cloud in strange_frames(scene, other_objects(scene), arguments.strangers, seed):
-        found.strange[kind].append(said_of(cloud, model, unsized, unit_m=None))
-    for kind, cloud in clouds_like([view.seen for view in clean], seed):
-        found.strange[kind].append(said_of(cloud, model, registrar))
+        result.strange[kind].append(recognized(cloud, model, unsized, unit_m=None))
+    for kind, cloud in clouds_like(clouds, seed):
+        result.strange[kind].append(recognized(cloud, model, registrar))
     for cloud in clouds_beyond(scene, arguments.views, seed):
-        found.strange["state beyond"].append(said_of(cloud, model, registrar))
+        result.strange["state beyond"].append(recognized(cloud, model, registrar))
     if model is None:
-        return found
+        return result
     with TemporaryDirectory() as folder:
         poor = barely_trained(scene, Path(folder))
         of_poor = sized(Registrar.of(poor, "modes", scene))
-        found.strange["ten steps"] = [said_of(view.seen, poor, of_poor) for view in clean]
-    found.ece = calibration_error(model, clean)
-    return found
+        result.strange["ten steps"] = [recognized(cloud, poor, of_poor) for cloud in clouds]
+    result.ece = calibration_error(model, clean)
+    return result
 
 
-def calibration_error(model: Model, views: Sequence[CalibrationView]) -> tuple[float, float]:
+def calibration_error(model: Model, views: Sequence[View]) -> tuple[float, float]:
     """Expected calibration error of the probabilities as they are and calibrated, over cells of the paper's metric."""
     logits, truth = [], []
     for view in views:
         points, labels = sample_cells(truth_grid(view.mesh, CELLS))
-        logits.append(model.logits(model.encode(view.seen), points))
+        logits.append(model.logits(model.encode(view.depth.to_points()), points))
         truth.append(labels)
     calibration = model.calibration
     assert calibration is not None and calibration.temperature is not None
@@ -274,32 +315,48 @@ def calibration_error(model: Model, views: Sequence[CalibrationView]) -> tuple[f
     return ece_of(*every), ece_of(*every, calibration.scaling)
 
 
-def row(name: str, found: Found, seconds: float) -> dict[str, str | float | list[float]]:
-    """Row of the table: what was found, in numbers."""
-    own = [one.strangeness for one in found.own]
-    shares = [share(views, said) for views in (found.own, found.noisy) for said in ("unsure", False)]
+def row(name: str, result: Measured, seconds: float) -> dict[str, Any]:
+    """Row of the table: what was measured, in numbers."""
+    own = [each.strangeness for each in result.own["clean"]]
     return {
-        "object": name,
-        "auroc": [auroc(own, [one.strangeness for one in found.strange[kind]]) for kind in KINDS],
-        "passed": [share(found.strange[kind], True) for kind in KINDS],
-        "frames": [len(found.own), len(found.noisy), *(len(found.strange[kind]) for kind in KINDS)],
-        "told": shares,
-        "ece": list(found.ece),
+        "object": Path(name).stem,
+        "auroc": [auroc(own, [each.strangeness for each in result.strange[kind]]) for kind in KINDS],
+        "passed": [share(result.strange[kind], True) for kind in KINDS],
+        "frames": [len(result.strange[kind]) for kind in KINDS],
+        "own": {kind: own_row(result, kind) for kind in OWN},
+        "ece": list(result.ece),
         "seconds": round(seconds),
     }
 
 
-def line(one: dict[str, Any]) -> str:
+def own_row(result: Measured, kind: str) -> dict[str, Any]:
+    """What was measured of one kind of the object's own views."""
+    errors = result.errors[kind]
+    return {
+        "views": len(result.own[kind]),
+        **{name: share(result.own[kind], known) for name, known in (("unsure", "unsure"), ("refused", False))},
+        "wrong": sum(iou < WRONG for iou in result.iou[kind]),
+        "iou": result.iou[kind],
+        "radii": RegistrationErrors.together(errors).coverage() if errors else None,
+    }
+
+
+def line(numbers: dict[str, Any]) -> str:
     """Row as a line of the table."""
-    cells = [f"{area:.3f} ({rate:.0%})" for area, rate in zip(one["auroc"], one["passed"], strict=True)]
-    cells += [f"{rate:.0%}" for rate in one["told"]] + [f"{error:.3f}" for error in one["ece"]]
-    cells += [", ".join(str(count) for count in one["frames"]), str(one["seconds"])]
-    return f"| {one['object']} | {' | '.join(cells)} |"
+    strangers = zip(numbers["auroc"], numbers["passed"], numbers["frames"], strict=True)
+    cells = [f"{area:.3f} ({rate:.0%} of {count})" for area, rate, count in strangers]
+    for own in numbers["own"].values():
+        radii = own["radii"] or {}
+        covered = (radii.get(part) for part in ("seen", "hidden"))
+        within = " / ".join("-" if share is None else f"{share:.3f}" for share in covered)
+        cells.append(f"{own['unsure']:.0%}, {own['refused']:.0%}, {own['wrong']} of {own['views']}; {within}")
+    cells += [f"{error:.3f}" for error in numbers["ece"]] + [str(numbers["seconds"])]
+    return f"| {numbers['object']} | {' | '.join(cells)} |"
 
 
-def share(said: Sequence[Recognition], known: object) -> float:
+def share(recognitions: Sequence[Recognition], known: object) -> float:
     """Share of frames of which this was said."""
-    return sum(one.known == known for one in said) / len(said) if said else float("nan")
+    return sum(each.known == known for each in recognitions) / len(recognitions) if recognitions else float("nan")
 
 
 def kept_row(name: str, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -312,12 +369,11 @@ def kept_row(name: str, arguments: argparse.Namespace) -> dict[str, Any]:
             raise SystemExit(f"{place} has a row of other settings ({kept['settings']}): name another folder")
         return kept
     started = time.perf_counter()
-    found: dict[str, Any] = {**row(name, measured(name, arguments), time.perf_counter() - started)}
-    found["settings"] = settings
+    numbers = {**row(name, measured(name, arguments), time.perf_counter() - started), "settings": settings}
     if place is not None:
         with atomic_file(place) as partial:
-            partial.write_text(json.dumps(found, indent=1), encoding="utf-8")
-    return found
+            partial.write_text(json.dumps(numbers, indent=1), encoding="utf-8")
+    return numbers
 
 
 def main() -> None:
@@ -333,8 +389,8 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     heads = [f"{kind} (known)" for kind in KINDS]
-    heads += ["own unsure", "own refused", "cameras' unsure", "refused", "ECE", "calibrated"]
-    heads += ["frames: own, cameras', each kind", "seconds"]
+    heads += [f"{kind}: unsure, refused, wrong and known; within radii, seen / hidden" for kind in OWN]
+    heads += ["ECE", "calibrated", "seconds"]
     lines = [f"| AUROC against | {' | '.join(heads)} |", "|---" * (len(heads) + 1) + "|"]
     print("\n".join(lines), flush=True)
     if arguments.output is not None:

@@ -7,9 +7,11 @@ import pytest
 from answers import answer_to
 from toy_scene import toy_scene
 
+from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.problem import ACCEPTED
 from mereo.fitting.registration.recognition import (
     CONSERVATIVE,
+    FEATURELESS,
     MOST,
     NOT_EVALUATED,
     Signs,
@@ -191,6 +193,25 @@ def test_strangers_are_other_objects_planes_and_heaps(monkeypatch: pytest.Monkey
 
 
 # --- the whole way ----------------------------------------------------------------------------------------------------
+
+
+def patch(bend: float) -> PointCloud:
+    """A square of 3 units, seen 100 units away, which bends as a paraboloid."""
+    x, y = np.meshgrid(*[np.linspace(-1.5, 1.5, 24)] * 2)
+    return PointCloud(np.stack([x, y, 100.0 + 0.1 * x + bend * (x * x - x * y)], axis=-1).reshape(-1, 3))
+
+
+def test_a_smooth_patch_is_not_believed(model: StatisticalModel) -> None:
+    """As large a part of the object explains it, and of everything else."""
+    recognition = answer_to(patch(0.0), None, Registrar(None, model), 24).recognition
+    assert recognition.known == "unsure" and recognition.reason == FEATURELESS
+
+
+def test_only_a_patch_is_explained_by_a_patch() -> None:
+    smooth, points = patch(0.05), patch(0.0).points
+    rough = points + [0.0, 0.0, 1.0] * np.where(np.abs(points[:, :1]) < 0.5, 0.4, 0.0)
+    assert Evidence.of(smooth.points).patch_share(0.01) == 1.0
+    assert Evidence.of(rough).patch_share(0.1) < 0.8
 
 
 @pytest.mark.slow

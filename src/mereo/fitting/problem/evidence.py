@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
 from mereo.deformation.moving_least_squares import spread
@@ -155,6 +156,21 @@ class Evidence:
         _, front, free = self.along(around)
         is_hidden = np.where(free < 0, front == 0, free == 0)
         return float(is_hidden.mean()) if len(is_hidden) else 0.0
+
+    def patch_share(self, tolerance: float) -> float:
+        """Share of the points within a tolerance of one smooth patch: a quadratic function over their best plane."""
+        centered = self.points - self.points.mean(axis=0)
+        x, y, height = (centered @ np.linalg.svd(centered, full_matrices=False)[2].T).T
+        terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+
+        def away(patch: Float[np.ndarray, "6"]) -> Float[np.ndarray, " n"]:
+            slope = np.hypot(patch[1] + 2 * patch[3] * x + patch[4] * y, patch[2] + patch[4] * x + 2 * patch[5] * y)
+            distance: np.ndarray = (height - terms @ patch) / np.hypot(1.0, slope)
+            return distance
+
+        start = np.linalg.lstsq(terms, height, rcond=None)[0]
+        patch = least_squares(away, start, loss="cauchy", f_scale=tolerance, x_scale="jac").x
+        return float((np.abs(away(patch)) <= tolerance).mean())
 
     def violations(
         self, vertices: Float[np.ndarray, "n 3"], slack: float

@@ -31,6 +31,15 @@ from mereo.reconstruction.pipeline import (
     turned_back,
 )
 
+NO_OUTLINE = 0.9
+"""Share of the silhouette beside which nothing is known from which on a frame shows no outline.
+
+Planes of which a model explains a part have 1, training views of seven objects of which 0 to 75 % are hidden at most
+.58."""
+
+PATCH = 0.02
+"""Share of the points by which a smooth patch may explain fewer than the object, and still explains as many."""
+
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
@@ -69,6 +78,17 @@ class Candidate:
         """Distance of each of all points from the facing surface, scene units."""
         assert self.modes is not None
         return self.modes.off_surface(transform_points(self.encoded.T_camera_input, self.hypothesis.whole.points))
+
+    @property
+    def is_featureless(self) -> bool:
+        """Whether the frame shows neither outline nor relief, so that any smooth surface explains it as well.
+
+        Parts of planes show neither, and many objects with an unknown unit, or with a flat side, explain them.
+        """
+        if self.modes is None:
+            return False
+        evidence, fit = self.modes.problem.evidence, self.modes.registration()
+        return evidence.hidden_edge > NO_OUTLINE and evidence.patch_share(self.modes.tolerance) > fit.explained - PATCH
 
     def explained(self, tolerance: float) -> float:
         """Share of all points, outliers included, that lie on the facing surface up to a tolerance in scene units."""

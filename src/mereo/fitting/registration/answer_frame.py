@@ -18,7 +18,7 @@ from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.problem import GivenPose, Problem
 from mereo.fitting.problem.residuals import NetworkTerm, Surface
 from mereo.fitting.registration.answer import Answer, Candidate
-from mereo.fitting.registration.recognition import Recognition, recognize
+from mereo.fitting.registration.recognition import FEATURELESS, Recognition, recognize
 from mereo.fitting.registration.register import CloudToFit, ModesFit, Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.search import WHOLE, Screen, rotations, search, tables_of
@@ -113,6 +113,8 @@ def answer_of(
     refusal = None if candidate.error is None else str(candidate.error)
     calibration = None if model is None else model.calibration
     recognition = recognize(registration, calibration, displaced, stated, refusal).with_rival(candidate.rival)
+    if recognition.known is True and candidate.is_featureless:
+        recognition = recognition.doubted(FEATURELESS)
     taken = registrar is not None and registration is not None and registrar.takes(registration)
     hypothesis = candidate.hypothesis if taken else likelier.reading
     if taken and registrar is not None and registration is not None:

@@ -139,13 +139,17 @@ class Recognition:
 
     def with_rival(self, rival: float | None) -> "Recognition":
         """The same with how far another fit is that explains the frame too; from ``RIVAL`` on nothing is known."""
-        if rival is None or rival < RIVAL or self.known is not True:
-            return replace(self, rival=rival)
-        reason = (
+        recognition = replace(self, rival=rival)
+        if rival is None or rival < RIVAL:
+            return recognition
+        return recognition.doubted(
             f"two fits explain this noisy frame, and the places of the object are {rival:.0%} of half its length apart "
             f"in them: {LOOK}, or take a frame with less noise, from nearer, or from another side"
         )
-        return replace(self, known="unsure", reason=reason, rival=rival)
+
+    def doubted(self, reason: str) -> "Recognition":
+        """The same, unsure for this reason where the object was known."""
+        return replace(self, known="unsure", reason=reason) if self.known is True else self
 
     @property
     def description(self) -> str | None:
@@ -210,6 +214,12 @@ RIVAL = 0.2
 
 Of 50 noisy training views of ten objects, three of eight wrong answers (IoU below .7) lie beyond it, and one of 36
 right ones (docs/experiments/070.md)."""
+
+FEATURELESS = (
+    "neither the object's outline nor any relief is in the frame, and any smooth surface explains its points as well: "
+    "take a frame that shows more of the object"
+)
+"""Reason of ``Candidate.is_featureless``."""
 
 LOOK = "look at the result before you rely on it"
 WIDEN = f"{LOOK}, or name the weights of what it is; if it is this object, widen the scene's ranges and learn it anew"
