@@ -120,7 +120,7 @@ class RegistrationErrors:
         )
         ratios = np.sqrt(np.maximum(off**2 - other**2, 0.0)) / gaussian
         errors = cls(distances / scene_unit, ratios, gaussian, other, seen, registration.radius_scale is not None)
-        return errors.scaled(sure.scale)
+        return errors.scaled(sure.factor)
 
     @classmethod
     def together(cls, each: Sequence["RegistrationErrors"]) -> "RegistrationErrors":

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed
 from mereo.fitting.registration.registration import Registration
-from mereo.fitting.uncertainty import Posterior, radius95
+from mereo.fitting.uncertainty import NOISY_FACTOR, ModesOptimum, Posterior, radius95
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import owned_centroids, owned_gradients
@@ -121,6 +121,13 @@ def test_a_calibration_scales_radii_and_intervals(found: Registration) -> None:
     assert wide.summary()["calibrated"] and wide.summary()["median"] == pytest.approx(
         3 * found.uncertainty.summary()["median"]
     )
+
+
+def test_radii_of_noisy_frames_are_wider_where_nothing_is_calibrated(found: Registration) -> None:
+    optimum, sure = found.optimum, found.uncertainty
+    assert isinstance(optimum, ModesOptimum) and sure is not None
+    noisy = replace(sure, optimum=replace(optimum, problem=replace(optimum.problem, noisy=True)))
+    assert noisy.factor == NOISY_FACTOR > 1.0 == sure.factor and replace(noisy, scale=0.7).factor == 0.7
 
 
 def test_the_interval_of_a_volume_is_around_it_and_not_far_from_the_true_one(

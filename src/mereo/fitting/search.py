@@ -401,6 +401,11 @@ HEAVY, HEAVIER_STEPS, HELPS = 3000.0, (0.04, 12), 0.65
 """Weight of a cloud that an elastic solid explains only under it, the first sigma and the steps of the fit with it, and
 the share of the misfit that may be left: bends of a bunny's ears leave .45 to .54, states of livers .77 up."""
 
+HOPELESS = 4.0
+"""Misfit of the cloud after two rounds from which on a third, which takes as long as both, is not made.
+
+After two rounds training views of six objects, cameras' too, have at most 2.6, most other things 4.3 to 6."""
+
 WHOLE = 150.0
 """Misfit by which an object that is seen whole may be explained worse than one that something hides in part: it is on
 36 of 40 whole training views, and on none of 40 of which 30 % are hidden."""
@@ -514,7 +519,8 @@ def search(whole: Problem, partial: Problem | None = None, start: Posed | None =
         heavier = chosen.with_heavier_cloud()
         if heavier is not None and heavier.is_explained:
             return heavier.outcome()
-        if chosen.is_explained or (number > 0 and chosen.best.misfit.cloud < whole.config.unexplained):
+        cloud = chosen.best.misfit.cloud
+        if chosen.is_explained or (number > 0 and not whole.config.unexplained <= cloud <= HOPELESS):
             break
         if number > 0:
             better = heavier or chosen.as_noisy()
