@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from folder_contents import contents
 
-from mereo import __main__ as command_line
 from mereo.io.atomic_files import MARKER, OLD, atomic_file, new_directory, write_json
 from mereo.io.errors import words_of
 from mereo.io.object_storage import claim
@@ -217,18 +216,6 @@ def test_the_input_is_never_replaced(tmp_path: Path) -> None:
         new_directory(tmp_path / "out", True, inputs),
     ):
         pytest.fail("the work was begun")
-
-
-def test_reconstruct_does_not_delete_the_folder_of_its_input(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    np.save(tmp_path / "cloud.npy", np.ones((100, 3)))
-    (tmp_path / "thesis.tex").write_text("precious")
-    before = contents(tmp_path)
-    command = ["reconstruct", tmp_path / "cloud.npy", "--weights", "rope", "--output", tmp_path, "--force"]
-    assert command_line.main([str(part) for part in command]) == 2
-    assert "which is read; it is not replaced" in capsys.readouterr().err
-    assert contents(tmp_path) == before
 
 
 DIES = """
