@@ -11,6 +11,7 @@ from architecture import (
     ROOMS,
     SATELLITES,
     SUBROOMS,
+    Package,
     banned_names,
     cycles,
     heavy_libraries,
@@ -18,11 +19,11 @@ from architecture import (
     misplaced,
     misplaced_tests,
     over_budget,
+    read_package,
     satellite_imports,
     torch_imports,
     upward_imports,
 )
-from package_imports import Package, read_package
 
 TOP = Path(__file__).parents[2]
 

@@ -146,10 +146,7 @@ def _trained(*_: object) -> None:
 
 
 def test_the_scores_decide_whether_anything_is_trained(
-    scored: list[SearchScores],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    scored: list[SearchScores], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(learning, "_train", _trained)
     scene, out = write_bar(tmp_path), tmp_path / "out"

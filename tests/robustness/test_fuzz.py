@@ -1,18 +1,23 @@
-"""Every reader, with damaged files: each is taken, or refused with one sentence (``fuzz``).
+"""Every reader, with damaged files: each is taken, or refused with one sentence (``fuzz``)."""
 
-``MEREO_FUZZ_SEED`` draws other damage; the nightly tests spend ``MEREO_FUZZ_MINUTES`` (30) on as much as they allow.
-"""
-
+import json
 import os
+import struct
 import time
+from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import pytest
-from fuzz import TARGETS, inputs, limits, listing
+import torch
+from fuzz import TARGETS, fault_of, inputs, limits, listing, zipped
+from PIL import Image
+from safetensors import numpy as arrays
+from safetensors.torch import load_file, save_file
 
 from mereo import __main__ as command_line
+from mereo.io.errors import quiet, reason, without_output, words_of
 
 SEED = int(os.environ.get("MEREO_FUZZ_SEED", "0"))
 MINUTES = float(os.environ.get("MEREO_FUZZ_MINUTES", "30"))
@@ -77,3 +82,117 @@ def test_what_a_reader_refuses_the_command_refuses(
         lines = [line for line in printed.splitlines() if not line.startswith("mereo: warning: ")]
         assert code == 2 and len(lines) == 1 and lines[0].startswith("mereo: error: "), (code, printed[:2000])
         assert lines[0].isprintable() and listing(tmp_path) == before
+
+
+# --- what damage once got through, as small as it can be, and what is said of it now ----------------------------------
+
+
+def at(place: int, piece: bytes) -> Callable[[bytes], bytes]:
+    return lambda content: content[:place] + piece + content[place + len(piece) :]
+
+
+def json_with(**values: object) -> Callable[[bytes], bytes]:
+    return lambda content: json.dumps(json.loads(content) | values).encode()
+
+
+def chunk_size(content: bytes) -> bytes:
+    """The first chunk begins where the table of offsets says, and with its line and its size."""
+    starts = (place for place in range(len(content) - 8) if struct.unpack_from("<Q", content, place)[0] == place + 8)
+    return at(next(starts) + 12, struct.pack("<i", -1))(content)
+
+
+def pair_at_infinity(content: bytes) -> bytes:
+    """Finite as it is written, but not its products: LAPACK's decomposition of these never ended."""
+    facts = json.loads(content)
+    facts["object"]["scan"][3][0] = 1e308
+    return json.dumps(facts).encode()
+
+
+def complex_centres(content: bytes) -> bytes:
+    """A shard without its checksum, whose numbers torch would make real with a warning."""
+    tensors = arrays.load(content)
+    return arrays.save({**tensors, "center": tensors["center"].astype(np.complex64)})
+
+
+def labels_of_infinity(content: bytes) -> bytes:
+    nibabel = pytest.importorskip("nibabel")
+    return bytes(nibabel.Nifti1Image(np.full((4, 4, 4), np.inf, "f4"), np.eye(4)).to_bytes())
+
+
+CASES: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
+    "pixels that OpenEXR prints about": ("depth.exr", chunk_size, "cannot be read as a depth image"),
+    "a header of 4 GB": ("cloud.npy", at(6, b"\2\0" + b"\xff" * 4), "expected 4294967295 bytes"),
+    "no array": ("surfaces.npz", lambda c: zipped({"a": b"text"}), "its entry 'a' is no array"),
+    "a zero in YAML": ("bar.yaml", lambda c: c + b"\0", "this is not YAML in UTF-8 .unacceptable character"),
+    "a number beyond all": ("bar.yaml", lambda c: c.replace(b"[120, 5", b"[1e308, 5", 1), "`pivot` is .* less than"),
+    "a pose that no rotation fits": ("start.json", json_with(object=np.ones((4, 4)).tolist()), "start.json cannot"),
+    "a point at infinity": ("start.json", pair_at_infinity, "scan of the start of the object must be rows of 3 finite"),
+    "a camera of no size": (
+        "frames.mcap",
+        lambda c: c.replace(struct.pack("<d", 10.0), struct.pack("<d", np.nan)),
+        "is no camera .focal",
+    ),
+    "complex places": ("shard-00000.safetensors", complex_centres, "its tensor 'center' has complex numbers"),
+    "labels beyond all numbers": ("labels.nii", labels_of_infinity, "holds values that are no labels"),
+    "a scan of two lines": ("truth.json", json_with(scan="\u2028"), r"the name of its scan is '.u2028'"),
+    "an extension of 2 GB": ("labels.nii", at(352, struct.pack("<i", 2**31 - 16)), "labels.nii cannot be read"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_it_is_one_sentence_now(case: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    name, change, expected = CASES[case]
+    if name not in TARGETS:
+        pytest.skip(f"nothing is installed that reads {name}")
+    target, path = TARGETS[name], tmp_path / name
+    target.write(path)
+    path.write_bytes(change(path.read_bytes()))
+    with pytest.raises(ValueError, match=expected):
+        target.read(path)
+    assert fault_of(target.read, path) == (False, "")
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("name", ["depth.tif", "text.stl", "labels.nii"])
+def test_libraries_say_nothing_of_their_own(name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Pillow warned, trimesh logged a traceback and nibabel what it had changed in the header."""
+    changes: dict[str, Callable[[bytes], bytes]] = {
+        "depth.tif": lambda c: c[:-7],
+        "text.stl": lambda c: c.replace(b"normal ", b"normal x", 1),
+        "labels.nii": at(0, b"\0"),
+    }
+    target, path = TARGETS[name], tmp_path / name
+    target.write(path)
+    path.write_bytes(changes[name](path.read_bytes()))
+    assert fault_of(target.read, path)[1] == "" and capfd.readouterr() == ("", "")
+
+
+def test_a_checkpoint_of_another_run_is_refused_before_training_begins(tmp_path: Path) -> None:
+    target, path = TARGETS["checkpoint.safetensors"], tmp_path / "checkpoint.safetensors"
+    target.write(path)
+    whole = load_file(path)
+    for name, size in (("optimizer/0/exp_avg", 7), ("optimizer/0", 1), ("network/x", 2)):
+        save_file({**whole, name: torch.ones(size)}, path, metadata={"step": "3"})
+        with pytest.raises(ValueError, match=r"checkpoint.safetensors cannot be read \(.*\); delete it to train"):
+            target.read(path)
+
+
+def test_a_librarys_text_is_short_and_its_output_is_dropped(capfd: pytest.CaptureFixture[str]) -> None:
+    error = ValueError("the segment \x1b[31mred\x07 is unknown;\n\u2028correct it")
+    assert words_of(error) == r"the segment \x1b[31mred\x07 is unknown; correct it"
+    assert len(reason(ValueError("a" * 5000))) == 303
+    with without_output():
+        print("text")
+        os.write(2, b"text")
+    assert capfd.readouterr() == ("", "")
+    with quiet():
+        assert np.float64(1e308) * 10 == np.inf
+
+
+def test_a_depth_that_signals_is_no_measurement(tmp_path: Path) -> None:
+    path = tmp_path / "depth.tif"
+    TARGETS["depth.tif"].write(path)
+    values = np.full((12, 16), 0.7, "<f4")
+    values.view("<u4")[0, 0] = 0x7F800001
+    Image.fromarray(values).save(path)
+    assert fault_of(TARGETS["depth.tif"].read, path) == (True, "")

@@ -83,12 +83,7 @@ def test_every_command_refuses_a_pipe_first(
     assert Path("pipe").is_fifo() and os.listdir() == ["pipe"]
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        "scene export bar.yaml --output rest.ply",
-    ],
-)
+@pytest.mark.parametrize("command", ["scene export bar.yaml --output rest.ply"])
 def test_force_replaces_a_file(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """So a command can run twice, and leaves nothing beside its output."""
     monkeypatch.chdir(tmp_path)

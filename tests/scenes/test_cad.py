@@ -26,12 +26,7 @@ from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.scenes.files.build import TOLERANCE, refined
 from mereo.scenes.files.check import STATE_TOLERANCE, check_scene
 from mereo.scenes.files.joints import contacts
-from mereo.scenes.files.template import (
-    flat_base,
-    material_points,
-    measure_motion,
-    write_scene_file,
-)
+from mereo.scenes.files.template import flat_base, material_points, measure_motion, write_scene_file
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene

@@ -20,10 +20,7 @@ from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo.synthesis.examples import sample_view, synthesize
-from mereo.synthesis.query_sampling import (
-    sample_queries,
-    sort_sample,
-)
+from mereo.synthesis.query_sampling import sample_queries, sort_sample
 
 CORE, ORGAN = ((2.0, 0.0, 0.0), 2.6), ((0.0, 0.0, 0.0), 5.0)
 """Centre and radius; the core comes as near as 0.4 to the organ's surface."""

@@ -172,12 +172,7 @@ def test_parts_of_a_model_are_renamed_joined_and_left_out(tmp_path: Path) -> Non
         ("type: lattice", "type: latice", 11, ("'latice'", "did you mean 'lattice'?")),
         ("type: lattice", "strength: 0.1", 11, ("`type` is missing", "bend", "waves")),
         ("type: lattice", "type: lattice\n    segments: [rigth]", 12, ("'rigth'", "did you mean 'right'?")),
-        (
-            "type: lattice",
-            "type: lattice\n    spacing: 1",
-            12,
-            ("`spacing` is 1", "make it 2 or more"),
-        ),
+        ("type: lattice", "type: lattice\n    spacing: 1", 12, ("`spacing` is 1", "make it 2 or more")),
         ("angle: [0, 100]", "angle: [100, 0]", 16, ("[least, most]",)),
         ("angle: [0, 100]", "angle: [0, 300]", 16, ("reaches 300 degrees", "folds over beyond", "bend less")),
         ("type: lattice", "{type: push, distance: [0, 5], tip: 1, reach: 6}", 11, ("reach must be above 10.8",)),
