@@ -51,7 +51,6 @@ OPTIONS = [
 
 
 def outside(bounds: Bounds, kind: Any) -> list[Any]:
-    """Values just beyond the bounds, and what is no number."""
     values = ["1", True, float("nan"), float("inf"), float("-inf")]
     if bounds.most < 1e9:
         values.append(bounds.most if bounds.below else bounds.most + 1)
@@ -123,7 +122,6 @@ OTHERS: dict[type, Any] = {
 
 
 def another(name: str, value: Any) -> Any:
-    """A value of the same kind that is not the default."""
     if name == "encoder":
         return get_args(Encoder)[-1]
     if name == "skip_after":

@@ -59,7 +59,6 @@ def test_the_error_is_the_distance_of_confidence_from_right_answers() -> None:
 
 
 def test_scaling_finds_what_made_the_probabilities_wrong(logits: np.ndarray) -> None:
-    """Logits that are sharper, and favour a class, by known amounts; labels come from the true ones."""
     assert ece_of(logits, drawn(logits)) < 0.01
     truth = drawn(logits)
     sharper = fit_scaling(2.5 * logits, truth)
@@ -151,7 +150,6 @@ def some_radii() -> Radii:
 
 
 def test_radii_between_points_are_between_theirs_and_their_scale_ends_at_all_but_a_twentieth() -> None:
-    """And at a point they are its own; other segments' points do not count."""
     radii = some_radii()
     np.testing.assert_allclose(radii.at(radii.points[:10], 1), radii.values[:10])
     between = radii.at(np.full((1, 3), 0.5), 2)
@@ -177,7 +175,6 @@ def measured(off: np.ndarray, misfit: float = 0.1, displaced: float = 0.04) -> M
 
 
 def test_a_scale_is_measured_on_all_clean_views() -> None:
-    """Those that are elsewhere too; of noisy ones only on those that are not, and on too few views not at all."""
     rng = np.random.default_rng(0)
     right = [measured(rng.normal(size=200)) for _ in range(20)]
     elsewhere = measured(30.0 + rng.random(200))

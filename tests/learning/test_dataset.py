@@ -114,7 +114,6 @@ def test_augmented_cloud_fills_the_unit_box_and_camera_stays_in_front(data: Data
 
 
 def test_roll_is_a_rigid_motion_about_the_optical_axis(data: Dataset) -> None:
-    """Distances keep their ratios, depth order is unchanged, and directions still end where they did on the surface."""
     plain = data.batch(torch.arange(6), 96, 0, NONE, rng())
     rolled = augment_batch(plain, AugmentConfig(roll=True), rng(1))
 

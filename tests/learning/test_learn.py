@@ -2,7 +2,6 @@
 
 import json
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -48,7 +47,6 @@ LIGHT = replace(
 """The recipe with less to look at, which shipped weights fit all the same."""
 
 RATES = Rates(generate_s=0.05, train_s=0.04, score_s=0.02)
-NOTHING = "deformations:\n  - {type: squash, factor: [0.999, 1.001]}\n"
 
 
 # --- the plan ---------------------------------------------------------------------------------------------------------
@@ -101,26 +99,23 @@ def test_meshes_get_a_scene_file_once(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 def test_what_hardly_deforms_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    scene = write_bar(tmp_path, NOTHING)
+    scene = write_bar(tmp_path, "deformations:\n  - {type: squash, factor: [0.999, 1.001]}\n")
     check_object([scene], None)
     assert "warning: bar hardly deforms: by 0.0" in capsys.readouterr().out
-    assert deformation(load_scene(scene)) < 0.001
-    assert deformation(load_scene(write_bar(tmp_path))) > 0.006
+    assert deformation(load_scene(scene)) < 0.001 and deformation(load_scene(write_bar(tmp_path))) > 0.006
 
 
 def test_a_faulty_object_is_refused_with_what_may_mend_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(checks, "STATES", 3)
-    path = write_bar(tmp_path)
-    (tmp_path / "right.stl").write_bytes((tmp_path / "left.stl").read_bytes())
-    with pytest.raises(ValueError, match=r"bar.yaml --repair` try, and learn .*bar-repaired.yaml"):
-        learn([path], tmp_path / "out")
-    meshes = [tmp_path / "left.stl", tmp_path / "right.stl"]
-    with pytest.raises(
-        ValueError, match=r"let `mereo scene new .*right.stl --output left.yaml` and `mereo scene check"
+    path, meshes = write_bar(tmp_path), [tmp_path / "left.stl", tmp_path / "right.stl"]
+    meshes[1].write_bytes(meshes[0].read_bytes())
+    for files, message in (
+        ([path], r"bar.yaml --repair` try, and learn .*bar-repaired.yaml"),
+        (meshes, r"let `mereo scene new .*right.stl --output left.yaml` and `mereo scene check"),
+        ([tmp_path / "none.stl"], "none.stl does not exist"),
     ):
-        learn(meshes, tmp_path / "out")
-    with pytest.raises(FileNotFoundError, match="none.stl does not exist"):
-        learn([tmp_path / "none.stl"], tmp_path / "out")
+        with pytest.raises((ValueError, FileNotFoundError), match=message):
+            learn(files, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -172,15 +167,10 @@ def test_the_command_names_the_scene_where_it_is_not_built_in() -> None:
 # --- the whole --------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
 @pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch, without_turns: None, cache: Path) -> None:
+def small(monkeypatch: pytest.MonkeyPatch, without_turns: None, tmp_path_factory: pytest.TempPathFactory) -> None:
     """So little of everything that a run takes seconds."""
-    monkeypatch.setenv(CACHE_VARIABLE, str(cache))
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "models"))
     for module, name, value in (
         (checks, "STATES", 3),
         (learning, "EXAMPLES", 12),
@@ -205,10 +195,6 @@ def small(monkeypatch: pytest.MonkeyPatch, without_turns: None, cache: Path) -> 
         (search_stage, "LEAST_VIEWS", 1),
     ):
         monkeypatch.setattr(module, name, value)
-
-
-def learnt(folder: Path) -> dict[str, torch.Tensor]:
-    return load_file(folder / "weights.safetensors")
 
 
 def test_one_command_and_the_same_again(
@@ -236,23 +222,12 @@ def test_one_command_and_the_same_again(
     assert learn([scene], out, LearnConfig(minutes=0.05, init="rope", train="always")) == scores
     assert (out / "weights.safetensors").read_bytes() == calibrated
     assert before == {path: path.stat().st_mtime_ns for path in (out / "data").glob("shard-*")}
-    for arguments, message in (
-        (
-            {"minutes": 1.0, "init": "rope"},
-            r"was begun with minutes = 0.05, not 1.0; .* repeat those, or choose another --output",
-        ),
-        ({"minutes": 0.05, "init": "skull"}, "was begun with init = 'rope', not 'skull'"),
+    for minutes, init, message in (
+        (1.0, "rope", r"was begun with minutes = 0.05, not 1.0; .* repeat those, or choose another --output"),
+        (0.05, "skull", "was begun with init = 'rope', not 'skull'"),
     ):
         with pytest.raises(ValueError, match=message):
-            learn([scene], out, LearnConfig(**arguments))  # type: ignore[arg-type]
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "mine.txt").write_text("mine")
-    with pytest.raises(FileExistsError, match="is not empty and holds no config.json"):
-        learn([scene], tmp_path / "full", LearnConfig(minutes=0.05))
-
-
-def _stop(*_: object, **__: object) -> None:
-    raise KeyboardInterrupt
+            learn([scene], out, LearnConfig(minutes=minutes, init=init))
 
 
 @pytest.mark.slow
@@ -269,22 +244,18 @@ def test_the_nearest_weights_are_those_that_adapt_fastest(
 
 @pytest.mark.slow
 def test_killed_at_any_stage_it_ends_with_the_same_weights(small: None, tmp_path: Path) -> None:
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
     scene, whole, parts = write_bar(tmp_path), tmp_path / "whole", tmp_path / "parts"
-    learn([scene], whole, LearnConfig(minutes=0.05, init="rope", train="always"))
-    stops: list[tuple[object, str, Callable[..., None]]] = [
-        (learning, "search_scores", _stop),
-        (learning, "measure", _stop),
-        (learning, "generate", _stop),
-        (Trainer, "save", _stop),
-        (learning, "evaluate_weights", _stop),
-        (learning, "scores_of_views", _stop),
-        (learning, "write_example_frame", _stop),
-    ]
-    for owner, name, stop in stops:
+    config = LearnConfig(minutes=0.05, init="rope", train="always")
+    learn([scene], whole, config)
+    stages = "search_scores measure generate save evaluate_weights scores_of_views write_example_frame"
+    for name in stages.split():
         with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
-            patch.setattr(owner, name, stop)
-            learn([scene], parts, LearnConfig(minutes=0.05, init="rope", train="always"))
+            patch.setattr(Trainer if name == "save" else learning, name, stop)
+            learn([scene], parts, config)
         assert not [place for place in parts.rglob(".*") if place.name.endswith(".mereo")]
-    learn([scene], parts, LearnConfig(minutes=0.05, init="rope", train="always"))
-    ours, theirs = learnt(whole), learnt(parts)
+    learn([scene], parts, config)
+    ours, theirs = (load_file(folder / "weights.safetensors") for folder in (whole, parts))
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)

@@ -21,7 +21,6 @@ from mereo.scenes.random_states import CACHE_VARIABLE, scene_model
 from mereo.scenes.registry import load_scene
 from mereo_learning import learn as learning
 from mereo_learning import search_stage
-from mereo_learning import search_stage as scoring
 from mereo_learning.cases import nearest_truth
 from mereo_learning.learn import LearnConfig, learn
 from mereo_learning.search_stage import SearchScores, best_method, is_to_train, shortcomings
@@ -67,16 +66,8 @@ def test_the_search_is_good_enough_by_stated_numbers(changed: dict[str, float], 
         ({"both": {"seconds": 2.0}}, "search", "as good as both, and faster, 2.00 s a frame with both, 1.50 s with"),
         ({"both": {"miou_up_to_symmetry": 0.95}}, "auto", "mIoU 0.950, not 0.900 of the search alone"),
         ({"both": {"miou_up_to_symmetry": 0.85}}, "search", "mIoU 0.900, not 0.850 of both"),
-        (
-            {"search": {"explained": 0.5}},
-            "auto",
-            "it explains more, 100% of the views by both, 50% by the search alone",
-        ),
-        (
-            {"both": {"explained": 0.75}},
-            "search",
-            "it explains more, 75% of the views by both, 100% by the search alone",
-        ),
+        ({"search": {"explained": 0.5}}, "auto", "it explains more, 100% of the views by both, 50% by the search"),
+        ({"both": {"explained": 0.75}}, "search", "it explains more, 75% of the views by both, 100% by the search"),
         ({"network": {"miou_up_to_symmetry": 0.98}}, "network", "mIoU 0.980, not 0.905 of both"),
         ({"network": {"miou_up_to_symmetry": 0.91}}, "auto", "as good as the search alone"),
         ({name: {"miou_up_to_symmetry": None} for name in ROWS}, "auto", "as good as the search alone"),
@@ -120,12 +111,12 @@ def test_time_ends_the_views_but_not_before_the_least_and_begun_ones_are_kept(
         made.append(index)
         return {"confusion": np.eye(9, dtype=int).tolist(), "explained": True, "seconds": 0.1}
 
-    monkeypatch.setattr(scoring, "_scored", scored)
-    monkeypatch.setattr(scoring, "kept_model", lambda scene: mereo.load_model("rope").statistical_model)
+    monkeypatch.setattr(search_stage, "_scored", scored)
+    monkeypatch.setattr(search_stage, "kept_model", lambda scene: mereo.load_model("rope").statistical_model)
     scene = mereo.load_scene("rope")
-    begun = scoring.score_search(scene, views=5, least=2, budget_s=-1.0)
+    begun = search_stage.score_search(scene, views=5, least=2, budget_s=-1.0)
     assert len(begun.views) == 2 and made == [0, 1]
-    assert len(scoring.score_search(scene, views=4, begun=begun).views) == 4 and made == [0, 1, 2, 3]
+    assert len(search_stage.score_search(scene, views=4, begun=begun).views) == 4 and made == [0, 1, 2, 3]
     assert "score the search: 2 views in" in capsys.readouterr().err
 
 
@@ -134,7 +125,6 @@ def test_time_ends_the_views_but_not_before_the_least_and_begun_ones_are_kept(
 
 @pytest.fixture
 def scored(monkeypatch: pytest.MonkeyPatch) -> list[SearchScores]:
-    """Scores that the search has: the last of the list."""
     given = [scores_of([100, 90], [True, True])]
     monkeypatch.setattr(search_stage, "score_search", lambda scene, **_: given[-1])
     monkeypatch.setattr(learning, "check_object", lambda files, units: None)

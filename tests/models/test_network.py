@@ -169,7 +169,6 @@ def test_a_loss_trains_its_own_heads_only(loss: Loss, rows: list[int]) -> None:
 
 
 def lived_in(config: NetworkConfig) -> Network:
-    """A network whose normalization has statistics of its own, as after training."""
     torch.manual_seed(0)
     network = Network(config, 3)
     for norm in network.modules():
@@ -192,7 +191,6 @@ def lived_in(config: NetworkConfig) -> Network:
     ids=["everything", "the paper's", "plain positions", "point transformer"],
 )
 def test_a_folded_network_answers_the_same(config: NetworkConfig) -> None:
-    """Folding changes the arithmetic, not the answers."""
     network = lived_in(config)
     before = {name: value.clone() for name, value in network.state_dict().items()}
     folded = fold_batch_norm(network)
@@ -227,7 +225,6 @@ TRANSFORMER = NetworkConfig().changed(
 
 
 def settled_transformer(config: NetworkConfig = TRANSFORMER) -> PointTransformer:
-    """In evaluation mode, with batch statistics that are not the trivial initial ones."""
     torch.manual_seed(1)
     encoder = PointTransformer(config.transformer, config.latent).train()
     encoder(cloud_of(config, batch=4))
@@ -265,7 +262,6 @@ def test_vector_attention_is_equation_3() -> None:
 
 
 def test_encoder_ignores_which_points_fill_up_a_cloud_and_the_order_of_what_is_not_kept() -> None:
-    """The first quarter are the points of the second level; the rest is a set."""
     encoder, cloud = settled_transformer(), cloud_of(TRANSFORMER)
     front, again = cloud[:, :80], torch.randperm(80, generator=torch.Generator().manual_seed(2))[:48]
     with torch.inference_mode():
@@ -332,7 +328,6 @@ def test_grid_of_a_ball_is_its_signed_distance() -> None:
 
 
 def test_true_rest_coordinates_find_the_right_segment() -> None:
-    """Through deformation, camera and sampler: an inside query's rest coordinates lie in its own segment."""
     scene = toy_scene()
     lookup = lookup_of(*torch.from_numpy(rest_distances(scene.rest)).float())
     queries = synthesize(scene, GenerateConfig(image_size=48), example_rng(3, 0)).queries

@@ -165,7 +165,6 @@ def test_segments_that_touch_are_joined(arm: StatisticalModel) -> None:
 
 
 def test_one_joint_moves_and_the_rest_stays(arm: StatisticalModel) -> None:
-    """Among the states that are tried is a hand half a turn round on the arm as it is."""
     posed = Posed(Rotation.from_euler("y", 0.5).as_matrix(), np.array([0.0, 1.0, 90.0]), arm.library[0].astype(float))
     here = np.split(posed.place(arm.material(posed.z)), 3)
     moved = [np.split(other.place(arm.material(other.z)), 3) for other in Joints.of(arm).others(posed, 4)]

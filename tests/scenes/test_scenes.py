@@ -55,7 +55,6 @@ def states(scene: Scene) -> list[State]:
 
 
 def interior_points(scene: Scene, rng: np.random.Generator, count: int = 300) -> list[np.ndarray]:
-    """Points inside each segment at rest."""
     solids, points = Solids(scene.rest), []
     for index, segment in enumerate(scene.rest.segments):
         draws = rng.uniform(*segment.bounds, size=(4000, 3))
@@ -84,7 +83,6 @@ def assert_in_view(scene: Scene, mesh: SegmentedMesh, rng: np.random.Generator) 
 
 
 def assert_seen(scene: Scene, mesh: SegmentedMesh, rng: np.random.Generator) -> None:
-    """By enough pixels of a random camera."""
     size = GenerateConfig().image_size
     T_camera_world = inverse_rigid(scene.workspace.sample(rng, mesh.bounds.mean(axis=0)))
     depth = render_depth(mesh.transformed(T_camera_world), Camera.from_fov(size, size, scene.workspace.fov_rad))
@@ -92,7 +90,6 @@ def assert_seen(scene: Scene, mesh: SegmentedMesh, rng: np.random.Generator) -> 
 
 
 def assert_sound(scene: Scene, mesh: SegmentedMesh, volumes: tuple[float, float]) -> None:
-    """Closed, of positive volume, about as large as at rest."""
     mesh.check()
     for segment, rest in zip(mesh.segments, scene.rest.segments, strict=True):
         # soft matter keeps its volume roughly; a strongly bent ear gains on its outer side; a tumour's size varies

@@ -113,8 +113,6 @@ class ThreadWorker(WorkerProcess):
 
 
 class Server:
-    """Server under test: its parts, and a client."""
-
     def __init__(self, folder: Path, workers: list[ThreadWorker], config: ServeConfig, token: str = "") -> None:
         self.workers, metrics = workers, Metrics()
         self.dispatcher = Dispatcher(workers, config, metrics)
@@ -153,7 +151,6 @@ async def running(
 
 
 def run(work: Coroutine[Any, Any, Any]) -> Any:
-    """What a test does, in an event loop of its own."""
     return asyncio.run(work)
 
 
@@ -201,7 +198,6 @@ def test_the_answer_is_that_of_the_command(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_what_is_told_is_in_the_words_of_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whose options are the parameters of the address."""
     large = replace(balls(), provenance={"visible_m": [2, 3]})
     monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: large)
 
@@ -216,7 +212,6 @@ def test_what_is_told_is_in_the_words_of_the_command(tmp_path: Path, monkeypatch
 
 
 def test_a_depth_image_is_registered_as_alone(tmp_path: Path, rope: Model, rope_only: None) -> None:
-    """Intrinsics as a part and in the address, and a mask; surfaces with how sure they are."""
     view = load_view("rope")
     frame, mask, camera = tmp_path / "frame.png", tmp_path / "mask.png", tmp_path / "intrinsics.json"
     Image.fromarray(np.rint(view.depth.depth * 0.01 * 20_000).astype(np.uint16)).save(frame)
@@ -257,7 +252,6 @@ def test_a_depth_image_is_registered_as_alone(tmp_path: Path, rope: Model, rope_
 
 
 def clouds(count: int) -> Iterator[np.ndarray]:
-    """Different ones: of another size, at another place, of other points."""
     for number in range(count):
         rng = np.random.default_rng(number)
         kept = np.sort(rng.choice(len(CLOUD), 700 + 20 * number, replace=False))
@@ -265,7 +259,6 @@ def clouds(count: int) -> Iterator[np.ndarray]:
 
 
 def test_every_client_gets_the_answer_to_its_own_frame(tmp_path: Path) -> None:
-    """Bit by bit, whether it comes alone or with others."""
     count = 8
 
     async def ask() -> None:
@@ -334,7 +327,6 @@ ROOT = Path(__file__).parents[2]
 
 
 def moved(metres: float) -> np.ndarray:
-    """The cloud, farther away."""
     return CLOUD + np.array([0.0, 0.0, metres])
 
 
@@ -366,7 +358,6 @@ def test_a_full_queue_refuses_and_goes_on(tmp_path: Path) -> None:
 
 
 def test_impatience_leaves_no_work_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is begun is finished and its answer dropped; what waits is never begun."""
     monkeypatch.setattr("mereo_serving.dispatcher.HANGS", 100.0)
 
     async def ask() -> None:
@@ -422,7 +413,6 @@ def test_a_frame_whose_client_has_left_is_not_begun(tmp_path: Path) -> None:
 
 
 def test_a_frame_that_ends_its_process_costs_no_other(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """One of four that wait is deadly: it alone is refused, and the process is started again."""
     deadly = npy(np.full((40, 3), 0.6))
 
     async def ask() -> None:
@@ -490,7 +480,6 @@ def test_the_end_answers_what_is_begun_and_refuses_the_rest(tmp_path: Path) -> N
 
 @contextmanager
 def listening(folder: Path) -> Iterator[int]:
-    """A server of uvicorn's in a thread; its port."""
     worker = ThreadWorker(Answerer.of(setup()))
     server = Server(folder, [worker], ServeConfig())
     settings = uvicorn.Config(server.app, http="h11", ws="none", log_level="critical", lifespan="on")
@@ -602,12 +591,10 @@ LINE = np.linspace(0.1, 1.0, 600)[:, None] * [1.0, 0.5, 2.0]
 
 
 def form(**parts: Any) -> dict[str, Any]:
-    """Request with these parts beside a whole frame."""
     return {"files": {"frame": ("a.npy", npy()), **parts}}
 
 
 def asked(query: str, **request: Any) -> dict[str, Any]:
-    """Request with these parameters."""
     return {"address": f"{ADDRESS}?{query}", **(request or {"content": npy()})}
 
 
@@ -697,7 +684,6 @@ def test_no_name_of_a_client_is_a_path(root: Path, tmp_path: Path) -> None:
 
 
 def test_a_body_is_counted_as_it_comes(root: Path) -> None:
-    """Without Content-Length, with one that is too large, and with one that lies."""
     sent = 0
 
     async def endless() -> AsyncIterator[bytes]:

@@ -74,7 +74,6 @@ def nodes() -> Iterator[Any]:
 
 
 def processes(*words: str) -> list[int]:
-    """Living processes whose command lines have all of these words."""
     found = []
     for place in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
@@ -84,7 +83,6 @@ def processes(*words: str) -> list[int]:
 
 
 def parent(process: int) -> int:
-    """Process that has started another one; 0 where that is gone."""
     try:
         return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
     except OSError:
