@@ -19,28 +19,13 @@ from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.readers import read_point_cloud
 from mereo.io.volume_files import read_label_volume
+from mereo.io.writers import meshes, volumes
 from mereo.io.writers.glb import write_segments_glb
-from mereo.io.writers.meshes import (
-    material_names,
-    settled,
-    stl_name,
-    write_points_ply,
-    write_segments_obj,
-    write_segments_ply,
-    write_segments_stl,
-)
-from mereo.io.writers.volumes import (
-    write_labels_nifti,
-    write_labels_npz,
-    write_labels_seg_nrrd,
-    write_labels_vti,
-    write_points_npz,
-)
 
 BOX = np.stack([CENTER - SIDES / 2, CENTER + SIDES / 2])
 
 
-@pytest.mark.parametrize("write", [write_segments_glb, write_segments_obj])
+@pytest.mark.parametrize("write", [write_segments_glb, meshes.write_segments_obj])
 def test_a_file_gives_back_names_colours_and_vertices(
     write: Callable[[Path, SegmentedMesh], None], tmp_path: Path
 ) -> None:
@@ -82,7 +67,9 @@ def test_a_glb_has_normals_that_point_outward(tmp_path: Path) -> None:
         assert (np.einsum("ij,ij->i", part.vertex_normals, outward) > 0.2 * np.linalg.norm(outward, axis=1)).all()
 
 
-@pytest.mark.parametrize("write", [write_segments_glb, write_segments_ply, write_segments_obj, write_segments_stl])
+@pytest.mark.parametrize(
+    "write", [write_segments_glb, meshes.write_segments_ply, meshes.write_segments_obj, meshes.write_segments_stl]
+)
 def test_results_without_surfaces_are_refused(tmp_path: Path, write: Callable[[Path, SegmentedMesh], None]) -> None:
     with pytest.raises(ValueError, match="all segments are without faces"):
         write(tmp_path / "s", SegmentedMesh((segments().segments[1],)))
@@ -91,7 +78,7 @@ def test_results_without_surfaces_are_refused(tmp_path: Path, write: Callable[[P
 
 def test_a_ply_has_positions_labels_and_colours_of_vertices_and_faces(tmp_path: Path) -> None:
     mesh = segments()
-    write_segments_ply(tmp_path / "s.ply", mesh)
+    meshes.write_segments_ply(tmp_path / "s.ply", mesh)
     found = trimesh.load_mesh(tmp_path / "s.ply", process=False)
     raw = found.metadata["_ply_raw"]
     for element, count in (("vertex", len(found.vertices)), ("face", len(found.faces))):
@@ -110,7 +97,7 @@ def test_a_ply_has_positions_labels_and_colours_of_vertices_and_faces(tmp_path: 
 
 
 def test_an_obj_gives_back_its_colours_from_the_library_beside_it(tmp_path: Path) -> None:
-    write_segments_obj(tmp_path / "s.obj", segments())
+    meshes.write_segments_obj(tmp_path / "s.obj", segments())
     library = (tmp_path / "s.mtl").read_text("utf-8")
     for damaged in (library.replace("Kd", "map_Kd ear.png\nKd"), "newmtl", library.replace("Kd ", "Kd spectral ")):
         (tmp_path / "s.mtl").write_text(damaged, "utf-8")
@@ -121,7 +108,7 @@ def test_an_obj_gives_back_its_colours_from_the_library_beside_it(tmp_path: Path
 
 def test_an_obj_does_not_choose_which_other_files_are_opened(tmp_path: Path) -> None:
     (tmp_path / "inner").mkdir()
-    write_segments_obj(tmp_path / "s.obj", segments())
+    meshes.write_segments_obj(tmp_path / "s.obj", segments())
     text = (tmp_path / "s.obj").read_text("utf-8").replace("mtllib s.mtl", "mtllib ../s.mtl")
     (tmp_path / "inner/t.obj").write_text(text, "utf-8")
     assert read_segmented_mesh(tmp_path / "inner/t.obj").colors == PALETTE[:2]
@@ -129,7 +116,7 @@ def test_an_obj_does_not_choose_which_other_files_are_opened(tmp_path: Path) -> 
 
 def test_other_programs_see_the_obj_in_its_colours(tmp_path: Path) -> None:
     """trimesh splits at materials; each is one segment, at its place, in its colour."""
-    write_segments_obj(tmp_path / "s.obj", segments())
+    meshes.write_segments_obj(tmp_path / "s.obj", segments())
     scene = trimesh.load_scene(tmp_path / "s.obj", process=False, split_object=True, group_material=False)
     parts = {part.visual.material.name: part for part in scene.geometry.values()}
     assert set(parts) == {"zebra_head", "Öhrchen"}
@@ -153,7 +140,7 @@ def nearly_pinched() -> SegmentedMesh:
 def test_what_is_closed_is_closed_again_in_other_programs(tmp_path: Path, suffix: str) -> None:
     mesh = nearly_pinched()
     assert trimesh.Trimesh(mesh.segments[0].vertices, mesh.segments[0].faces, process=False).is_watertight
-    writers = {"glb": write_segments_glb, "obj": write_segments_obj, "stl": write_segments_stl}
+    writers = {"glb": write_segments_glb, "obj": meshes.write_segments_obj, "stl": meshes.write_segments_stl}
     writers[suffix](tmp_path / f"s.{suffix}", mesh)
     path = tmp_path / (f"s.{suffix}" if suffix != "stl" else "s.stl/1-ball.stl")
     (part,) = trimesh.load_scene(path).geometry.values()
@@ -165,17 +152,17 @@ def test_what_is_closed_is_closed_again_in_other_programs(tmp_path: Path, suffix
 
 def test_only_edges_without_length_are_closed_up() -> None:
     mesh = nearly_pinched().segments[0]
-    less = settled(mesh)
+    less = meshes.settled(mesh)
     assert len(less.vertices) == len(mesh.vertices) - 3
     assert {tuple(vertex) for vertex in less.vertices} <= {tuple(vertex) for vertex in mesh.vertices}
-    assert settled(less) is less
+    assert meshes.settled(less) is less
     # a whole segment smaller than that keeps its shape
     grain = replace(mesh, vertices=1e-9 * mesh.vertices)
-    assert settled(grain) is grain
+    assert meshes.settled(grain) is grain
 
 
 def test_stl_files_are_closed_solids_at_their_place(tmp_path: Path) -> None:
-    write_segments_stl(tmp_path / "stl", segments())
+    meshes.write_segments_stl(tmp_path / "stl", segments())
     assert sorted(path.name for path in (tmp_path / "stl").glob("[!.]*")) == ["1-zebra-head.stl", "3-Öhrchen.stl"]
     box = trimesh.load_mesh(tmp_path / "stl/3-Öhrchen.stl")
     assert box.is_watertight and box.volume == pytest.approx(SIDES.prod(), rel=1e-5)
@@ -187,20 +174,20 @@ def test_stl_files_are_closed_solids_at_their_place(tmp_path: Path) -> None:
 
 
 def test_an_stl_keeps_the_name_of_its_segment(tmp_path: Path) -> None:
-    write_segments_stl(tmp_path / "stl", segments())
+    meshes.write_segments_stl(tmp_path / "stl", segments())
     assert read_segmented_mesh(tmp_path / "stl").names == (NAMES[0], NAMES[2])
     assert (tmp_path / "stl/1-zebra-head.stl").read_bytes().startswith(b"written by mereo: zebra head ")
     # what does not fit, or would break the text, is left to the file's name
     long = SegmentedMesh((replace(segments().segments[0], name="x" * 90),))
-    write_segments_stl(tmp_path / "long", long)
+    meshes.write_segments_stl(tmp_path / "long", long)
     assert read_segmented_mesh(tmp_path / "long").names == (f"1-{'x' * 90}",)
 
 
 def test_names_of_files_and_materials_are_safe_and_distinct() -> None:
-    assert [stl_name(*name) for name in ((1, "../../etc/passwd"), (4, "//"))] == ["1-etc-passwd.stl", "4.stl"]
+    assert [meshes.stl_name(*name) for name in ((1, "../../etc/passwd"), (4, "//"))] == ["1-etc-passwd.stl", "4.stl"]
     part = segments().segments[0]
     found = [(label, replace(part, name=name)) for label, name in ((1, "a b"), (2, "a/b"), (3, "//"), (7, "c"))]
-    assert material_names(found) == ["a_b_label_1", "a_b_label_2", "label_3", "c"]
+    assert meshes.material_names(found) == ["a_b_label_1", "a_b_label_2", "label_3", "c"]
 
 
 # --- volumes and points -----------------------------------------------------------------------------------------------
@@ -211,7 +198,7 @@ RAS_OF_INPUT = np.array([-1.0, -1.0, 1.0])
 
 def test_a_vti_is_the_format_that_vtk_documents(tmp_path: Path) -> None:
     """Where VTK is absent: its head, decoded by hand, and its one block."""
-    write_labels_vti(tmp_path / "l.vti", grid(), COLORS)
+    volumes.write_labels_vti(tmp_path / "l.vti", grid(), COLORS)
     image = ElementTree.parse(tmp_path / "l.vti").getroot()[0]
     assert image.attrib["WholeExtent"] == "0 6 0 10 0 19"
     assert [float(value) for value in image.attrib["Origin"].split()] == grid().origin.tolist()
@@ -224,7 +211,7 @@ def test_a_vti_is_the_format_that_vtk_documents(tmp_path: Path) -> None:
 
 def test_nibabel_sees_the_labels_in_ras_millimetres(tmp_path: Path) -> None:
     nibabel = pytest.importorskip("nibabel", reason="nibabel is not installed: pip install 'mereo[medical]'")
-    write_labels_nifti(tmp_path / "l.nii.gz", grid(), COLORS)
+    volumes.write_labels_nifti(tmp_path / "l.nii.gz", grid(), COLORS)
     image = nibabel.load(tmp_path / "l.nii.gz")
     values = np.asarray(image.dataobj)
     np.testing.assert_array_equal(values, grid().labels)
@@ -247,7 +234,7 @@ def test_nibabel_sees_the_labels_in_ras_millimetres(tmp_path: Path) -> None:
 
 def test_pynrrd_sees_the_labels_in_lps_millimetres(tmp_path: Path) -> None:
     nrrd = pytest.importorskip("nrrd", reason="pynrrd is not installed: pip install 'mereo[medical]'")
-    write_labels_seg_nrrd(tmp_path / "l.seg.nrrd", grid(), COLORS)
+    volumes.write_labels_seg_nrrd(tmp_path / "l.seg.nrrd", grid(), COLORS)
     values, header = nrrd.read(str(tmp_path / "l.seg.nrrd"))
     np.testing.assert_array_equal(values, grid().labels)
     assert header["space"] == "left-posterior-superior"
@@ -258,7 +245,7 @@ def test_pynrrd_sees_the_labels_in_lps_millimetres(tmp_path: Path) -> None:
 
 def test_slicer_finds_what_it_looks_for(tmp_path: Path) -> None:
     """The fields that vtkMRMLSegmentationStorageNode reads; its loop over segments ends at the first missing ID."""
-    write_labels_seg_nrrd(tmp_path / "l.seg.nrrd", grid(), COLORS)
+    volumes.write_labels_seg_nrrd(tmp_path / "l.seg.nrrd", grid(), COLORS)
     head = (tmp_path / "l.seg.nrrd").read_bytes().partition(b"\n\n")[0].decode("utf-8")
     fields = dict(re.findall(r"^(Seg\w+):=(.*)$", head, re.MULTILINE))
     for index, (name, color) in enumerate(zip(NAMES, COLORS, strict=True)):
@@ -278,8 +265,8 @@ def test_both_volumes_coincide(tmp_path: Path, unit_m: float) -> None:
     """Read as anatomical volumes (RAS), and in millimetres whatever the input's unit."""
     pytest.importorskip("nibabel", reason="nibabel is not installed: pip install 'mereo[medical]'")
     pytest.importorskip("nrrd", reason="pynrrd is not installed: pip install 'mereo[medical]'")
-    write_labels_nifti(tmp_path / "l.nii", grid(), COLORS, unit_m)
-    write_labels_seg_nrrd(tmp_path / "l.seg.nrrd", grid(), COLORS, unit_m)
+    volumes.write_labels_nifti(tmp_path / "l.nii", grid(), COLORS, unit_m)
+    volumes.write_labels_seg_nrrd(tmp_path / "l.seg.nrrd", grid(), COLORS, unit_m)
     nifti, nrrd = read_label_volume(tmp_path / "l.nii"), read_label_volume(tmp_path / "l.seg.nrrd")
     np.testing.assert_array_equal(nifti.labels, nrrd.labels)
     np.testing.assert_allclose(nifti.T_world_index, nrrd.T_world_index, atol=1e-3 * unit_m)
@@ -289,8 +276,8 @@ def test_both_volumes_coincide(tmp_path: Path, unit_m: float) -> None:
 
 def test_the_same_result_gives_the_same_bytes(tmp_path: Path) -> None:
     for number in range(2):
-        write_labels_seg_nrrd(tmp_path / f"{number}.seg.nrrd", grid(), COLORS)
-        write_labels_nifti(tmp_path / f"{number}.nii.gz", grid(), COLORS)
+        volumes.write_labels_seg_nrrd(tmp_path / f"{number}.seg.nrrd", grid(), COLORS)
+        volumes.write_labels_nifti(tmp_path / f"{number}.nii.gz", grid(), COLORS)
     for end in ("seg.nrrd", "nii.gz"):
         assert (tmp_path / f"0.{end}").read_bytes() == (tmp_path / f"1.{end}").read_bytes()
 
@@ -300,22 +287,22 @@ def test_a_missing_library_is_named_with_its_extra(tmp_path: Path, monkeypatch: 
     with pytest.raises(
         ImportError, match=r"NIfTI needs nibabel, which is not installed: pip install 'mereo\[medical\]'"
     ):
-        write_labels_nifti(tmp_path / "l.nii.gz", grid(), COLORS)
+        volumes.write_labels_nifti(tmp_path / "l.nii.gz", grid(), COLORS)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_labels_have_names(tmp_path: Path) -> None:
-    write_labels_npz(tmp_path / "l.npz", grid())
+    volumes.write_labels_npz(tmp_path / "l.npz", grid())
     with np.load(tmp_path / "l.npz", allow_pickle=False) as loaded:
         assert all(np.array_equal(loaded[name], getattr(grid(), name)) for name in loaded.files) and len(loaded) == 4
     with pytest.raises(ValueError, match="label 3 has no name among 2"):
-        write_labels_npz(tmp_path / "l.npz", replace(grid(), names=("a", "b")))
+        volumes.write_labels_npz(tmp_path / "l.npz", replace(grid(), names=("a", "b")))
 
 
 def test_labelled_points_come_back(tmp_path: Path) -> None:
     written = cloud()
-    write_points_ply(tmp_path / "p.ply", written)
-    write_points_npz(tmp_path / "p.npz", written)
+    meshes.write_points_ply(tmp_path / "p.ply", written)
+    volumes.write_points_npz(tmp_path / "p.npz", written)
     found = trimesh.load(tmp_path / "p.ply", process=False)
     data = found.metadata["_ply_raw"]["vertex"]["data"]
     np.testing.assert_allclose(found.vertices, written.points, atol=1e-7)

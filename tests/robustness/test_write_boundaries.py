@@ -23,12 +23,9 @@ from mereo.synthesis.sample_views import load_view
 class Case(NamedTuple):
     """Command that writes ``out`` (or ``out.SUFFIX``), with INPUTS for the folder of its inputs.
 
-    Attributes:
-        arguments: the command line.
-        again: what is added where the same command refuses because its result, or a part of it, is there; where
-            nothing can be added, what it says of a whole result.
-        first: a command that writes the result which this one replaces.
-        dear: it takes seconds, so it is killed only where it gives a file its name.
+    ``again`` is added where the same command refuses because its result, or a part of it, is there; where nothing can
+    be added, it is what that says of a whole result. ``first`` writes the result which this one replaces. A command
+    that is ``dear`` takes seconds, so it is killed only where it gives a file its name.
     """
 
     arguments: str

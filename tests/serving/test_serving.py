@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 import zipfile
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -54,6 +54,8 @@ from mereo_serving.messages import GLB, FrameRequest, Reply, Served, Setup
 from mereo_serving.metrics import Metrics
 from mereo_serving.server import served_objects
 from mereo_serving.workers import WorkerDied, WorkerProcess
+
+pytestmark = pytest.mark.anyio
 
 NPY = {"Content-Type": "application/x-npy"}
 CLOUD = np.concatenate([front(*BIG, -1.0), front(*SMALL, -1.0)])
@@ -150,10 +152,6 @@ async def running(
         await server.dispatcher.close()
 
 
-def run(work: Coroutine[Any, Any, Any]) -> Any:
-    return asyncio.run(work)
-
-
 async def until(condition: Callable[[], bool]) -> None:
     """Wait for what other tasks and threads bring about."""
     async with asyncio.timeout(60):
@@ -162,6 +160,11 @@ async def until(condition: Callable[[], bool]) -> None:
 
 
 EXACT = InferenceConfig(precision="float32")
+
+
+@pytest.fixture
+def anyio_backend() -> str:
+    return "asyncio"
 
 
 @pytest.fixture(autouse=True)
@@ -174,44 +177,39 @@ def rope_only(rope: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: rope)
 
 
-def test_the_answer_is_that_of_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_answer_is_that_of_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "s").mkdir()
     monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: replace(balls(), name="balls"))
     np.save(tmp_path / "frame.npy", CLOUD)
     options = ReconstructCommand((), weights="any", resolution=12, inference=EXACT, method="network")
     reconstruct_file(tmp_path / "frame.npy", tmp_path / "out", FrameJob(options))
     expected = figures((tmp_path / "out/summary.json").read_bytes())
 
-    async def ask() -> None:
-        async with running(tmp_path / "s") as server:
-            found = await server.post(npy())
-            assert found.status_code == 200, found.text
-            assert figures(found) == {**expected, "warnings": []}
-            assert found.headers["content-type"] == "application/json"
-            assert (found.headers["mereo-known"], found.headers["mereo-answer"]) == ("unsure", "network")
-            surfaces = await server.post(npy(), headers=NPY | {"Accept": GLB})
-            assert surfaces.headers["content-type"] == GLB
-            assert surfaces.content == (tmp_path / "out/segments.glb").read_bytes()
-
-    (tmp_path / "s").mkdir()
-    run(ask())
+    async with running(tmp_path / "s") as server:
+        found = await server.post(npy())
+        assert found.status_code == 200, found.text
+        assert figures(found) == {**expected, "warnings": []}
+        assert found.headers["content-type"] == "application/json"
+        assert (found.headers["mereo-known"], found.headers["mereo-answer"]) == ("unsure", "network")
+        surfaces = await server.post(npy(), headers=NPY | {"Accept": GLB})
+        assert surfaces.headers["content-type"] == GLB
+        assert surfaces.content == (tmp_path / "out/segments.glb").read_bytes()
     assert not list((tmp_path / "s").iterdir()), "what requests brought is removed"
 
 
-def test_what_is_told_is_in_the_words_of_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_what_is_told_is_in_the_words_of_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     large = replace(balls(), provenance={"visible_m": [2, 3]})
     monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: large)
 
-    async def ask() -> None:
-        async with running(tmp_path) as server:
-            assert figures(await server.post(npy()))["warnings"] == [], "of no unit that anybody has said"
-            (told,) = figures(await server.post(npy(), f"{ADDRESS}?unit-m=1"))["warnings"]
-            assert "the visible part is 0.18 m long, but 2 to 3 m in training" in told
-            assert "--unit-m 0.001" in told and "--box" in told
-
-    run(ask())
+    async with running(tmp_path) as server:
+        assert figures(await server.post(npy()))["warnings"] == [], "of no unit that anybody has said"
+        (told,) = figures(await server.post(npy(), f"{ADDRESS}?unit-m=1"))["warnings"]
+        assert "the visible part is 0.18 m long, but 2 to 3 m in training" in told
+        assert "--unit-m 0.001" in told and "--box" in told
 
 
-def test_a_depth_image_is_registered_as_alone(tmp_path: Path, rope: Model, rope_only: None) -> None:
+async def test_a_depth_image_is_registered_as_alone(tmp_path: Path, rope: Model, rope_only: None) -> None:
+    (tmp_path / "s").mkdir()
     view = load_view("rope")
     frame, mask, camera = tmp_path / "frame.png", tmp_path / "mask.png", tmp_path / "intrinsics.json"
     Image.fromarray(np.rint(view.depth.depth * 0.01 * 20_000).astype(np.uint16)).save(frame)
@@ -223,26 +221,22 @@ def test_a_depth_image_is_registered_as_alone(tmp_path: Path, rope: Model, rope_
     files = {name: (path.name, path.read_bytes()) for name, path in (("frame", frame), ("mask", mask))}
     address = f"{ADDRESS}?depth-scale=20000"
 
-    async def ask() -> None:
-        given = Setup((Served("balls", "rope"),), "modes", EXACT)
-        async with running(tmp_path / "s", given=given) as server:
-            parts = {**files, "intrinsics": ("c.json", camera.read_bytes())}
-            found = await server.post(address=address, files=parts)
-            assert found.status_code == 200, found.text
-            told = figures(found)
-            assert told.pop("warnings") == [] and told == {**expected, "weights": "balls"}
-            assert told["registration"]["answer"] == found.headers["mereo-answer"] == "registration"
-            assert told["recognition"]["known"] is True and found.headers["mereo-known"] == "true"
-            assert told["radius95"]["median"] > 0 and "centroid_radius95" in told["segments"][0]
-            again = await server.client.post(
-                address, params={"intrinsics": camera.read_text(), "depth-scale": 20_000}, files=files,
-                headers={"Accept": GLB},
-            )  # fmt: skip
-            assert again.content == alone.save(tmp_path / "segments.glb").read_bytes()
-            (tmp_path / "served.glb").write_bytes(again.content)
-
-    (tmp_path / "s").mkdir()
-    run(ask())
+    given = Setup((Served("balls", "rope"),), "modes", EXACT)
+    async with running(tmp_path / "s", given=given) as server:
+        parts = {**files, "intrinsics": ("c.json", camera.read_bytes())}
+        found = await server.post(address=address, files=parts)
+        assert found.status_code == 200, found.text
+        told = figures(found)
+        assert told.pop("warnings") == [] and told == {**expected, "weights": "balls"}
+        assert told["registration"]["answer"] == found.headers["mereo-answer"] == "registration"
+        assert told["recognition"]["known"] is True and found.headers["mereo-known"] == "true"
+        assert told["radius95"]["median"] > 0 and "centroid_radius95" in told["segments"][0]
+        again = await server.client.post(
+            address, params={"intrinsics": camera.read_text(), "depth-scale": 20_000}, files=files,
+            headers={"Accept": GLB},
+        )  # fmt: skip
+        assert again.content == alone.save(tmp_path / "segments.glb").read_bytes()
+        (tmp_path / "served.glb").write_bytes(again.content)
     length = struct.unpack("<I", (tmp_path / "served.glb").read_bytes()[12:16])[0]
     document = json.loads((tmp_path / "served.glb").read_bytes()[20 : 20 + length])
     assert all("_RADIUS95" in mesh["primitives"][0]["attributes"] for mesh in document["meshes"])
@@ -258,66 +252,57 @@ def clouds(count: int) -> Iterator[np.ndarray]:
         yield CLOUD[kept] * (1 + 0.1 * number) + [0.01 * number, 0.0, 0.02 * number]
 
 
-def test_every_client_gets_the_answer_to_its_own_frame(tmp_path: Path) -> None:
+async def test_every_client_gets_the_answer_to_its_own_frame(tmp_path: Path) -> None:
     count = 8
 
-    async def ask() -> None:
-        async with running(tmp_path) as alone:
-            single = [figures(await alone.post(npy(points))) for points in clouds(count)]
-        async with running(tmp_path, workers=2) as server:
-            answers = await asyncio.gather(*(server.post(npy(points)) for points in clouds(count)))
-            for found, expected in zip(answers, single, strict=True):
-                assert figures(found) == expected, "the analytic model answers from the cloud's own box"
-            assert sum(len(worker.asked) for worker in server.workers) == count
-            places = [tuple(found["segments"][0]["centroid"]) for found in map(figures, answers)]
-            assert len(set(places)) == count, "no two clouds have the same answer"
-
-    run(ask())
+    async with running(tmp_path) as alone:
+        single = [figures(await alone.post(npy(points))) for points in clouds(count)]
+    async with running(tmp_path, workers=2) as server:
+        answers = await asyncio.gather(*(server.post(npy(points)) for points in clouds(count)))
+        for found, expected in zip(answers, single, strict=True):
+            assert figures(found) == expected, "the analytic model answers from the cloud's own box"
+        assert sum(len(worker.asked) for worker in server.workers) == count
+        places = [tuple(found["segments"][0]["centroid"]) for found in map(figures, answers)]
+        assert len(set(places)) == count, "no two clouds have the same answer"
 
 
-def test_weights_health_and_the_page_are_there(tmp_path: Path) -> None:
-    async def ask() -> None:
-        async with running(tmp_path) as server:
-            (told,) = (await server.client.get("/v1/weights")).json()["weights"]
-            assert [one["name"] for one in told["segments"]] == ["big", "small", "absent"]
-            assert (told["name"], told["method"], told["calibrated"]) == ("balls", "network", False)
-            assert (await server.client.get("/healthz")).json() == {"status": "ok"}
-            assert (await server.client.get("/readyz")).status_code == 200
-            described = (await server.client.get("/openapi.json")).json()
-            asked = described["paths"]["/v1/{weights}/reconstruct"]["post"]
-            assert {"depth-range", "unit-m", "keep-all"} <= {p["name"] for p in asked["parameters"]}
-            assert "multipart/form-data" in asked["requestBody"]["content"] and "429" in asked["responses"]
-            page = (await server.client.get("/docs")).text
-            assert "depth-range" in page and "POST /v1/{weights}/reconstruct" in page
-            assert "http://" not in page and "https://" not in page and "<script" not in page
-            assert "width=device-width" in page and "`" not in page and "<code>error</code>" in page
-            assert "Parts of a form: <code>frame</code>, <code>mask</code> (where there is one)" in page
-            assert page.count("<td>text/plain<td>Always") == 1 and "<td>503<td>application/json<td>Not ready" in page
-
-    run(ask())
+async def test_weights_health_and_the_page_are_there(tmp_path: Path) -> None:
+    async with running(tmp_path) as server:
+        (told,) = (await server.client.get("/v1/weights")).json()["weights"]
+        assert [one["name"] for one in told["segments"]] == ["big", "small", "absent"]
+        assert (told["name"], told["method"], told["calibrated"]) == ("balls", "network", False)
+        assert (await server.client.get("/healthz")).json() == {"status": "ok"}
+        assert (await server.client.get("/readyz")).status_code == 200
+        described = (await server.client.get("/openapi.json")).json()
+        asked = described["paths"]["/v1/{weights}/reconstruct"]["post"]
+        assert {"depth-range", "unit-m", "keep-all"} <= {p["name"] for p in asked["parameters"]}
+        assert "multipart/form-data" in asked["requestBody"]["content"] and "429" in asked["responses"]
+        page = (await server.client.get("/docs")).text
+        assert "depth-range" in page and "POST /v1/{weights}/reconstruct" in page
+        assert "http://" not in page and "https://" not in page and "<script" not in page
+        assert "width=device-width" in page and "`" not in page and "<code>error</code>" in page
+        assert "Parts of a form: <code>frame</code>, <code>mask</code> (where there is one)" in page
+        assert page.count("<td>text/plain<td>Always") == 1 and "<td>503<td>application/json<td>Not ready" in page
 
 
-def test_numbers_for_prometheus_count(tmp_path: Path) -> None:
-    async def ask() -> None:
-        async with running(tmp_path) as server:
-            await server.post(npy())
-            await server.post(b"nonsense")
-            await server.client.get("/nowhere/17")
-            text = (await server.client.get("/metrics")).text
-        endpoint = 'endpoint="/v1/{weights}/reconstruct"'
-        for line in (
-            f'mereo_requests_total{{code="200",{endpoint}}} 1.0',
-            f'mereo_requests_total{{code="422",{endpoint}}} 1.0',
-            'mereo_requests_total{code="404",endpoint="other"} 1.0',
-            f"mereo_request_seconds_count{{{endpoint}}} 2.0",
-            'mereo_stage_seconds_count{stage="encode"} 1.0',
-            'mereo_stage_seconds_count{stage="wait"} 2.0',
-            "mereo_waiting_frames 0.0",
-            "mereo_processes 1.0",
-        ):
-            assert line in text, line
-
-    run(ask())
+async def test_numbers_for_prometheus_count(tmp_path: Path) -> None:
+    async with running(tmp_path) as server:
+        await server.post(npy())
+        await server.post(b"nonsense")
+        await server.client.get("/nowhere/17")
+        text = (await server.client.get("/metrics")).text
+    endpoint = 'endpoint="/v1/{weights}/reconstruct"'
+    for line in (
+        f'mereo_requests_total{{code="200",{endpoint}}} 1.0',
+        f'mereo_requests_total{{code="422",{endpoint}}} 1.0',
+        'mereo_requests_total{code="404",endpoint="other"} 1.0',
+        f"mereo_request_seconds_count{{{endpoint}}} 2.0",
+        'mereo_stage_seconds_count{stage="encode"} 1.0',
+        'mereo_stage_seconds_count{stage="wait"} 2.0',
+        "mereo_waiting_frames 0.0",
+        "mereo_processes 1.0",
+    ):
+        assert line in text, line
 
 
 # --- the queue: bounded, fair to clients that leave, whole when a process dies or it ends -----------------------------
@@ -337,142 +322,124 @@ def held_up(server: Server) -> ThreadWorker:
     return worker
 
 
-def test_a_full_queue_refuses_and_goes_on(tmp_path: Path) -> None:
-    async def ask() -> None:
-        async with running(tmp_path, ServeConfig(queue=2)) as server:
-            worker = held_up(server)
-            first = asyncio.create_task(server.post(npy()))
-            await until(worker.begun.is_set)
-            waiting = [asyncio.create_task(server.post(npy(moved(n)))) for n in range(2)]
-            await until(lambda: server.dispatcher.held == 2)
-            refused = await server.post(npy())
-            assert refused.status_code == 429 and 1 <= int(refused.headers["retry-after"]) <= 60
-            assert "2 frames wait already" in refused.json()["error"]
-            assert (await server.client.get("/healthz")).status_code == 200, "while all are busy"
-            worker.go.set()
-            answers = await asyncio.gather(first, *waiting)
-            assert [answer.status_code for answer in answers] == [200] * 3
-            assert (await server.post(npy())).status_code == 200
-
-    run(ask())
+async def test_a_full_queue_refuses_and_goes_on(tmp_path: Path) -> None:
+    async with running(tmp_path, ServeConfig(queue=2)) as server:
+        worker = held_up(server)
+        first = asyncio.create_task(server.post(npy()))
+        await until(worker.begun.is_set)
+        waiting = [asyncio.create_task(server.post(npy(moved(n)))) for n in range(2)]
+        await until(lambda: server.dispatcher.held == 2)
+        refused = await server.post(npy())
+        assert refused.status_code == 429 and 1 <= int(refused.headers["retry-after"]) <= 60
+        assert "2 frames wait already" in refused.json()["error"]
+        assert (await server.client.get("/healthz")).status_code == 200, "while all are busy"
+        worker.go.set()
+        answers = await asyncio.gather(first, *waiting)
+        assert [answer.status_code for answer in answers] == [200] * 3
+        assert (await server.post(npy())).status_code == 200
 
 
-def test_impatience_leaves_no_work_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_impatience_leaves_no_work_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mereo_serving.dispatcher.HANGS", 100.0)
 
-    async def ask() -> None:
-        async with running(tmp_path, ServeConfig(timeout=0.3)) as server:
-            worker = held_up(server)
-            answers = await asyncio.gather(server.post(npy()), server.post(npy()))
-            assert [answer.status_code for answer in answers] == [504, 504]
-            assert "not answered within 0.3 s" in answers[0].json()["error"]
-            assert len(worker.asked) == 1 and server.dispatcher.held == 0
-            worker.go.set()
-            await until(lambda: not list(tmp_path.iterdir()))
-            object.__setattr__(server.service, "config", ServeConfig())  # now there is time
-            assert (await server.post(npy())).status_code == 200
-            assert len(worker.asked) == 2
-            text = (await server.client.get("/metrics")).text
-            assert 'mereo_dropped_frames_total{reason="timeout"} 2.0' in text
-
-    run(ask())
+    async with running(tmp_path, ServeConfig(timeout=0.3)) as server:
+        worker = held_up(server)
+        answers = await asyncio.gather(server.post(npy()), server.post(npy()))
+        assert [answer.status_code for answer in answers] == [504, 504]
+        assert "not answered within 0.3 s" in answers[0].json()["error"]
+        assert len(worker.asked) == 1 and server.dispatcher.held == 0
+        worker.go.set()
+        await until(lambda: not list(tmp_path.iterdir()))
+        object.__setattr__(server.service, "config", ServeConfig())  # now there is time
+        assert (await server.post(npy())).status_code == 200
+        assert len(worker.asked) == 2
+        text = (await server.client.get("/metrics")).text
+        assert 'mereo_dropped_frames_total{reason="timeout"} 2.0' in text
 
 
-def test_a_frame_whose_client_has_left_is_not_begun(tmp_path: Path) -> None:
-    async def ask() -> None:
-        async with running(tmp_path) as server:
-            worker = held_up(server)
-            first = asyncio.create_task(server.post(npy()))
-            await until(worker.begun.is_set)
-            told, statuses = asyncio.Event(), list[int | None]()
-            messages = iter([{"type": "http.request", "body": npy(), "more_body": False}])
+async def test_a_frame_whose_client_has_left_is_not_begun(tmp_path: Path) -> None:
+    async with running(tmp_path) as server:
+        worker = held_up(server)
+        first = asyncio.create_task(server.post(npy()))
+        await until(worker.begun.is_set)
+        told, statuses = asyncio.Event(), list[int | None]()
+        messages = iter([{"type": "http.request", "body": npy(), "more_body": False}])
 
-            async def receive() -> dict[str, Any]:
-                for message in messages:
-                    return message
-                await told.wait()
-                return {"type": "http.disconnect"}
+        async def receive() -> dict[str, Any]:
+            for message in messages:
+                return message
+            await told.wait()
+            return {"type": "http.disconnect"}
 
-            async def send(message: dict[str, Any]) -> None:
-                statuses.append(message.get("status"))
+        async def send(message: dict[str, Any]) -> None:
+            statuses.append(message.get("status"))
 
-            headers = [(b"host", b"localhost"), (b"content-type", b"application/x-npy")]
-            scope = {"type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": "POST"}
-            scope |= {"scheme": "http", "path": ADDRESS, "root_path": "", "query_string": b"", "headers": headers}
-            left = asyncio.create_task(server.app(scope, receive, send))
-            await until(lambda: server.dispatcher.held == 1)
-            told.set()
-            await left
-            assert server.dispatcher.held == 0 and statuses[0] == 499
-            worker.go.set()
-            assert (await first).status_code == 200
-            assert len(worker.asked) == 1, "only the first was ever begun"
-            assert not list(tmp_path.iterdir())
-
-    run(ask())
+        headers = [(b"host", b"localhost"), (b"content-type", b"application/x-npy")]
+        scope = {"type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": "POST"}
+        scope |= {"scheme": "http", "path": ADDRESS, "root_path": "", "query_string": b"", "headers": headers}
+        left = asyncio.create_task(server.app(scope, receive, send))
+        await until(lambda: server.dispatcher.held == 1)
+        told.set()
+        await left
+        assert server.dispatcher.held == 0 and statuses[0] == 499
+        worker.go.set()
+        assert (await first).status_code == 200
+        assert len(worker.asked) == 1, "only the first was ever begun"
+        assert not list(tmp_path.iterdir())
 
 
-def test_a_frame_that_ends_its_process_costs_no_other(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_frame_that_ends_its_process_costs_no_other(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     deadly = npy(np.full((40, 3), 0.6))
 
-    async def ask() -> None:
-        async with running(tmp_path) as server:
-            (worker,) = server.workers
+    async with running(tmp_path) as server:
+        (worker,) = server.workers
 
-            worker.dies = lambda frame: frame.path.read_bytes() == deadly
-            worker.go.clear()
-            first = asyncio.create_task(server.post(npy()))
-            await until(worker.begun.is_set)
-            bodies = [npy(moved(1)), deadly, npy(moved(2)), npy(moved(3))]
-            rest = [asyncio.create_task(server.post(body)) for body in bodies]
-            await until(lambda: server.dispatcher.held == 4)
-            worker.go.set()
-            answers = await asyncio.gather(first, *rest)
-            assert [answer.status_code for answer in answers] == [200, 200, 500, 200, 200]
-            assert "has ended over it" in answers[2].json()["error"]
-            depths = [figures(answer)["segments"][0]["centroid"][2] for answer in answers if answer.status_code == 200]
-            np.testing.assert_allclose(np.diff(depths), 1.0, atol=0.01)
-            assert worker.restarts == 1
-            assert server.dispatcher.ready and not list(tmp_path.iterdir())
-
-    run(ask())
+        worker.dies = lambda frame: frame.path.read_bytes() == deadly
+        worker.go.clear()
+        first = asyncio.create_task(server.post(npy()))
+        await until(worker.begun.is_set)
+        bodies = [npy(moved(1)), deadly, npy(moved(2)), npy(moved(3))]
+        rest = [asyncio.create_task(server.post(body)) for body in bodies]
+        await until(lambda: server.dispatcher.held == 4)
+        worker.go.set()
+        answers = await asyncio.gather(first, *rest)
+        assert [answer.status_code for answer in answers] == [200, 200, 500, 200, 200]
+        assert "has ended over it" in answers[2].json()["error"]
+        depths = [figures(answer)["segments"][0]["centroid"][2] for answer in answers if answer.status_code == 200]
+        np.testing.assert_allclose(np.diff(depths), 1.0, atol=0.01)
+        assert worker.restarts == 1
+        assert server.dispatcher.ready and not list(tmp_path.iterdir())
     assert "it is started again" in caplog.text
 
 
-def test_a_process_that_hangs_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_process_that_hangs_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mereo_serving.dispatcher.HANGS", 0.002)  # of a minute
 
-    async def ask() -> None:
-        async with running(tmp_path) as server:
-            worker = held_up(server)
-            found = await server.post(npy())
-            assert found.status_code == 500 and "or took far too long" in found.json()["error"]
-            monkeypatch.setattr("mereo_serving.dispatcher.HANGS", 2.0)
-            worker.dies = lambda message: False
-            await until(lambda: worker.restarts == 1 and server.dispatcher.ready)
-            assert (await server.post(npy())).status_code == 200
-
-    run(ask())
+    async with running(tmp_path) as server:
+        worker = held_up(server)
+        found = await server.post(npy())
+        assert found.status_code == 500 and "or took far too long" in found.json()["error"]
+        monkeypatch.setattr("mereo_serving.dispatcher.HANGS", 2.0)
+        worker.dies = lambda message: False
+        await until(lambda: worker.restarts == 1 and server.dispatcher.ready)
+        assert (await server.post(npy())).status_code == 200
 
 
-def test_the_end_answers_what_is_begun_and_refuses_the_rest(tmp_path: Path) -> None:
-    async def ask() -> None:
-        async with running(tmp_path) as server:
-            worker = held_up(server)
-            first = asyncio.create_task(server.post(npy()))
-            await until(worker.begun.is_set)
-            waits = asyncio.create_task(server.post(npy()))
-            await until(lambda: server.dispatcher.held == 1)
-            server.dispatcher.stop()
-            assert (await waits).status_code == 503
-            late = await server.post(npy())
-            assert late.status_code == 503 and "the server is being stopped" in late.json()["error"]
-            assert (await server.client.get("/readyz")).status_code == 503
-            worker.go.set()
-            assert (await first).status_code == 200
-            await until(lambda: not list(tmp_path.iterdir()))
-
-    run(ask())
+async def test_the_end_answers_what_is_begun_and_refuses_the_rest(tmp_path: Path) -> None:
+    async with running(tmp_path) as server:
+        worker = held_up(server)
+        first = asyncio.create_task(server.post(npy()))
+        await until(worker.begun.is_set)
+        waits = asyncio.create_task(server.post(npy()))
+        await until(lambda: server.dispatcher.held == 1)
+        server.dispatcher.stop()
+        assert (await waits).status_code == 503
+        late = await server.post(npy())
+        assert late.status_code == 503 and "the server is being stopped" in late.json()["error"]
+        assert (await server.client.get("/readyz")).status_code == 503
+        worker.go.set()
+        assert (await first).status_code == 200
+        await until(lambda: not list(tmp_path.iterdir()))
 
 
 # --- over a real socket -----------------------------------------------------------------------------------------------
@@ -638,23 +605,20 @@ REFUSED: dict[str, tuple[int, str, dict[str, Any]]] = {
 }
 
 
-def test_each_refusal_is_a_status_and_a_sentence(root: Path, tmp_path: Path) -> None:
-    async def ask() -> None:
-        async with running(root, given=setup(max_points=1000)) as server:
-            for name, (status, words, request) in REFUSED.items():
-                found = await server.post(**request)
-                assert found.status_code == status, (name, found.text)
-                (said,) = found.json().values()
-                assert words in said and len(said.splitlines()) == 1 and str(tmp_path) not in said, (name, said)
-            assert (await server.client.get(ADDRESS)).status_code == 405
-            assert server.dispatcher.held == 0
-
-    run(ask())
+async def test_each_refusal_is_a_status_and_a_sentence(root: Path, tmp_path: Path) -> None:
+    async with running(root, given=setup(max_points=1000)) as server:
+        for name, (status, words, request) in REFUSED.items():
+            found = await server.post(**request)
+            assert found.status_code == status, (name, found.text)
+            (said,) = found.json().values()
+            assert words in said and len(said.splitlines()) == 1 and str(tmp_path) not in said, (name, said)
+        assert (await server.client.get(ADDRESS)).status_code == 405
+        assert server.dispatcher.held == 0
     assert [path.name for path in sorted(tmp_path.iterdir())] == ["root", "secret.npy"]
     assert not list(root.iterdir())
 
 
-def test_no_name_of_a_client_is_a_path(root: Path, tmp_path: Path) -> None:
+async def test_no_name_of_a_client_is_a_path(root: Path, tmp_path: Path) -> None:
     (root / "link.npy").symlink_to(tmp_path / "secret.npy")
     tricks = (
         "../secret.npy",
@@ -666,24 +630,21 @@ def test_no_name_of_a_client_is_a_path(root: Path, tmp_path: Path) -> None:
         "é.npy",
     )
 
-    async def ask() -> None:
-        async with running(root) as server:
-            whole = figures(await server.post(npy()))
-            assert whole["title"] == whole["source"] == "frame.npy"
-            for name in tricks:
-                found = await server.post(files={"frame": (name, npy())})
-                assert found.status_code == 200, (name, found.text)
-                assert figures(found) == whole, name
-            camera = f'{{"fx": 1, "include": "{tmp_path}/secret.npy"}}'
-            found = await server.post(address=f"{ADDRESS}?format=png", params={"intrinsics": camera}, content=b"x")
-            assert found.status_code == 415 or "secret" not in found.text
-
-    run(ask())
+    async with running(root) as server:
+        whole = figures(await server.post(npy()))
+        assert whole["title"] == whole["source"] == "frame.npy"
+        for name in tricks:
+            found = await server.post(files={"frame": (name, npy())})
+            assert found.status_code == 200, (name, found.text)
+            assert figures(found) == whole, name
+        camera = f'{{"fx": 1, "include": "{tmp_path}/secret.npy"}}'
+        found = await server.post(address=f"{ADDRESS}?format=png", params={"intrinsics": camera}, content=b"x")
+        assert found.status_code == 415 or "secret" not in found.text
     assert (tmp_path / "secret.npy").read_bytes() == npy() and len(list(tmp_path.iterdir())) == 2
     assert [path.name for path in root.iterdir()] == ["link.npy"]
 
 
-def test_a_body_is_counted_as_it_comes(root: Path) -> None:
+async def test_a_body_is_counted_as_it_comes(root: Path) -> None:
     sent = 0
 
     async def endless() -> AsyncIterator[bytes]:
@@ -692,50 +653,41 @@ def test_a_body_is_counted_as_it_comes(root: Path) -> None:
             sent += 10_000
             yield bytes(10_000)
 
-    async def ask() -> None:
-        async with running(root, ServeConfig(max_body_mb=0.1)) as server:
-            found = await server.post(endless())
-            assert found.status_code == 413 and "the body has more than 0.1 MB" in found.json()["error"]
-            assert sent < 500_000, "of what is left no more is taken than a body may have"
-            assert (await server.post(bytes(200_000))).status_code == 413
-            parts = await server.post(files={"frame": ("a.npy", bytes(200_000))})
-            assert parts.status_code == 413
-            assert not list(root.iterdir()) and server.dispatcher.held == 0
-            assert (await server.post(npy())).status_code == 200
-
-    run(ask())
+    async with running(root, ServeConfig(max_body_mb=0.1)) as server:
+        found = await server.post(endless())
+        assert found.status_code == 413 and "the body has more than 0.1 MB" in found.json()["error"]
+        assert sent < 500_000, "of what is left no more is taken than a body may have"
+        assert (await server.post(bytes(200_000))).status_code == 413
+        parts = await server.post(files={"frame": ("a.npy", bytes(200_000))})
+        assert parts.status_code == 413
+        assert not list(root.iterdir()) and server.dispatcher.held == 0
+        assert (await server.post(npy())).status_code == 200
 
 
-def test_a_body_that_does_not_come_is_not_waited_for(root: Path) -> None:
+async def test_a_body_that_does_not_come_is_not_waited_for(root: Path) -> None:
     async def slow() -> AsyncIterator[bytes]:
         yield npy()[:100]
         await asyncio.sleep(20)
 
-    async def ask() -> None:
-        async with running(root, ServeConfig(timeout=0.2)) as server:
-            found = await server.post(slow())
-            assert found.status_code == 408 and "has not come within 0.2 s" in found.json()["error"]
-            assert server.dispatcher.held == 0 and not list(root.iterdir())
-
-    run(ask())
+    async with running(root, ServeConfig(timeout=0.2)) as server:
+        found = await server.post(slow())
+        assert found.status_code == 408 and "has not come within 0.2 s" in found.json()["error"]
+        assert server.dispatcher.held == 0 and not list(root.iterdir())
 
 
-def test_what_unpacks_to_too_much_is_refused(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_what_unpacks_to_too_much_is_refused(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(LIMIT_VARIABLE, "0.5")
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("points.npy", bytes(1_000_000_000))
     assert len(packed.getvalue()) < 1_100_000
 
-    async def ask() -> None:
-        async with running(root) as server:
-            found = await server.post(packed.getvalue(), f"{ADDRESS}?format=npz")
-            assert found.status_code == 413 and "frame.npz takes more than 0.5 GB" in found.json()["error"]
-
-    run(ask())
+    async with running(root) as server:
+        found = await server.post(packed.getvalue(), f"{ADDRESS}?format=npz")
+        assert found.status_code == 413 and "frame.npz takes more than 0.5 GB" in found.json()["error"]
 
 
-def test_a_fault_of_the_server_is_logged_and_not_told(
+async def test_a_fault_of_the_server_is_logged_and_not_told(
     root: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def fail(*_: object, **__: object) -> None:
@@ -743,17 +695,14 @@ def test_a_fault_of_the_server_is_logged_and_not_told(
 
     monkeypatch.setattr("mereo_serving.answering.find_object", fail)
 
-    async def ask() -> None:
-        async with running(root) as server:
-            found = await server.post(npy())
-            assert found.status_code == 500
-            assert found.json()["error"].startswith("the frame cannot be answered for a fault of the server")
-
-    run(ask())
+    async with running(root) as server:
+        found = await server.post(npy())
+        assert found.status_code == 500
+        assert found.json()["error"].startswith("the frame cannot be answered for a fault of the server")
     assert "inner secret" in caplog.text and "Traceback" in caplog.text
 
 
-def test_damaged_bodies_are_never_a_fault(root: Path) -> None:
+async def test_damaged_bodies_are_never_a_fault(root: Path) -> None:
     boundary = b"--b\r\nContent-Disposition: form-data; name="
     form = (
         boundary + b'"frame"; filename="a.npy"\r\n\r\n' + npy(CLOUD[::8]) + b"\r\n"
@@ -761,41 +710,35 @@ def test_damaged_bodies_are_never_a_fault(root: Path) -> None:
     )  # fmt: skip
     kinds = {"multipart/form-data; boundary=b": form, "application/x-npy": npy(CLOUD[::8])}
 
-    async def ask() -> None:
-        async with running(root, ServeConfig(max_body_mb=1)) as server:
-            for kind, whole in kinds.items():
-                for number in range(60):
-                    content = damaged(whole, Random(f"serving/{kind}/{number}"))
-                    found = await server.post(content, headers={"Content-Type": kind})
-                    assert found.status_code in (200, 400, 413, 415, 422), (kind, number, found.text)
-                    if found.status_code != 200:
-                        assert len(json.loads(found.content)["error"].splitlines()) == 1, (kind, number)
-            assert not list(root.iterdir()) and server.dispatcher.held == 0
-            await until(lambda: server.dispatcher.ready)
-
-    run(ask())
+    async with running(root, ServeConfig(max_body_mb=1)) as server:
+        for kind, whole in kinds.items():
+            for number in range(60):
+                content = damaged(whole, Random(f"serving/{kind}/{number}"))
+                found = await server.post(content, headers={"Content-Type": kind})
+                assert found.status_code in (200, 400, 413, 415, 422), (kind, number, found.text)
+                if found.status_code != 200:
+                    assert len(json.loads(found.content)["error"].splitlines()) == 1, (kind, number)
+        assert not list(root.iterdir()) and server.dispatcher.held == 0
+        await until(lambda: server.dispatcher.ready)
 
 
-def test_others_than_this_machine_need_the_token(root: Path) -> None:
-    async def ask() -> None:
-        async with running(root) as server:
-            client = server.client
-            for headers in ({"Host": "evil.example"}, {"Origin": "http://evil.example"}):
-                assert (await client.get("/healthz", headers=headers)).status_code == 403
-                assert (await server.post(npy(), headers=NPY | headers)).status_code == 403
-        async with running(root, token="word") as server:
-            client = server.client
-            assert (await client.get("/v1/weights")).status_code == 401
-            assert (await client.get("/v1/weights?token=wrong")).status_code == 401
-            refused = await server.post(npy(), headers=NPY | {"Authorization": "Bearer wrong"})
-            assert refused.status_code == 401 and refused.headers["www-authenticate"] == "Bearer"
-            assert "there is no token, or another one" in refused.json()["error"]
-            assert (await client.get("/healthz")).status_code == 200
-            assert (await client.get("/metrics")).status_code == 401
-            assert (await server.post(npy(), headers=NPY | {"Authorization": "Bearer word"})).status_code == 200
-            assert (await server.post(npy(), f"{ADDRESS}?token=word&unit-m=1")).status_code == 200
-            assert (
-                await client.get("/v1/weights?token=word", headers={"Origin": "http://evil.example"})
-            ).status_code == 403
-
-    run(ask())
+async def test_others_than_this_machine_need_the_token(root: Path) -> None:
+    async with running(root) as server:
+        client = server.client
+        for headers in ({"Host": "evil.example"}, {"Origin": "http://evil.example"}):
+            assert (await client.get("/healthz", headers=headers)).status_code == 403
+            assert (await server.post(npy(), headers=NPY | headers)).status_code == 403
+    async with running(root, token="word") as server:
+        client = server.client
+        assert (await client.get("/v1/weights")).status_code == 401
+        assert (await client.get("/v1/weights?token=wrong")).status_code == 401
+        refused = await server.post(npy(), headers=NPY | {"Authorization": "Bearer wrong"})
+        assert refused.status_code == 401 and refused.headers["www-authenticate"] == "Bearer"
+        assert "there is no token, or another one" in refused.json()["error"]
+        assert (await client.get("/healthz")).status_code == 200
+        assert (await client.get("/metrics")).status_code == 401
+        assert (await server.post(npy(), headers=NPY | {"Authorization": "Bearer word"})).status_code == 200
+        assert (await server.post(npy(), f"{ADDRESS}?token=word&unit-m=1")).status_code == 200
+        assert (
+            await client.get("/v1/weights?token=word", headers={"Origin": "http://evil.example"})
+        ).status_code == 403

@@ -14,13 +14,9 @@ MODULE_NAME = re.compile(r"\w+\.[\w.]*")
 
 @dataclass(frozen=True)
 class Import:
-    """One place where a module names another one, in an import statement or in a string.
+    """One place where a module names another one, or a library (``torch``), in an import statement or in a string.
 
-    Attributes:
-        source: the module that imports.
-        line: where, counted from 1.
-        target: the module of the package that is imported, or a library's name (``torch``).
-        at_start: it is a statement of the module itself, which importing it executes.
+    ``at_start`` it is a statement of the module itself, which importing it executes.
     """
 
     source: str

@@ -50,14 +50,7 @@ NEAR_SIZE, NEAR_SHARE = 0.002, 0.01
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Points that are answered, with their truth.
-
-    Attributes:
-        points: observed points.
-        truth: the segments, in the points' frame and unit.
-        axes: of both.
-        unit_m: metres per unit; None where the answer has to find it.
-    """
+    """Points that are answered, with their truth; ``unit_m`` is None where the answer has to find it."""
 
     points: np.ndarray
     truth: SegmentedMesh
