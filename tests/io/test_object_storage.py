@@ -91,7 +91,7 @@ def test_a_folder_of_objects_is_as_one_of_files(folder: ObjectPath) -> None:
 
 
 @pytest.mark.parametrize("kind", ["folder", "s3"])
-def test_one_of_several_claims_a_folder(
+def test_one_of_many_claims_a_folder(
     kind: str, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = request.getfixturevalue(kind)
@@ -111,9 +111,7 @@ def test_without_a_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize("answer", ["AccessDenied", "timed out", "no route to http://me:secret@host/x"])
-def test_what_a_storage_refuses_is_no_missing_file_and_one_sentence(
-    answer: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_storage_refuses_is_no_missing_file_but_a_sentence(answer: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nor do credentials show."""
 
     def fails(*_: object, **__: object) -> bytes:
@@ -173,9 +171,7 @@ def contents(folder: Path | ObjectPath) -> dict[str, bytes]:
     return {name: (folder / name).read_bytes() for name in names_in(folder)}
 
 
-def test_a_dataset_is_made_shared_damaged_continued_and_read(
-    s3: ObjectPath, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_dataset_is_shared_and_made_again(s3: ObjectPath, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     make = partial(generate, toy_scene(), settings=SMALL, examples=4, seed=3)
     make(tmp_path / "data")
     whole = contents(tmp_path / "data")

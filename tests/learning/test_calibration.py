@@ -103,7 +103,7 @@ def test_all_else_of_a_file_stays_and_biases_of_other_classes_are_refused(tmp_pa
         load_model(calibrated)
 
 
-def test_the_command_writes_what_was_measured_and_replaces_no_weights_unasked(
+def test_the_command_writes_what_was_measured_beside_the_weights(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A network that knows nothing: its probabilities become those of the classes' shares."""

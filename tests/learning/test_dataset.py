@@ -186,9 +186,7 @@ def assert_same(one: Batch, other: Batch) -> None:
         assert torch.equal(getattr(one, name), getattr(other, name)), name
 
 
-def test_a_batch_depends_on_its_generator_alone_and_with_probability_0_on_no_further_one(
-    pair: tuple[Dataset, Dataset],
-) -> None:
+def test_a_batch_depends_on_its_generator_and_at_probability_0_on_no_further_one(pair: tuple[Dataset, Dataset]) -> None:
     plain, seen = pair
     assert (plain.further, seen.further) == (0, KINDS)
     for seed in range(3):

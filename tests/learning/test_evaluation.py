@@ -203,7 +203,7 @@ def test_a_sample_view_survives_its_file(tmp_path: Path) -> None:
         load_view("teapot")
 
 
-def test_the_demo_reconstructs_and_scores(
+def test_the_demo_scores_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     mesh = two_cuboids()
@@ -222,7 +222,7 @@ def test_the_demo_reconstructs_and_scores(
 
 
 @pytest.mark.slow
-def test_the_demo_itself_needs_no_assets(
+def test_the_demo_needs_no_assets(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def missing(name: str) -> Path:

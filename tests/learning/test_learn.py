@@ -312,9 +312,7 @@ def test_the_search_is_good_enough_by_stated_numbers(changed: dict[str, float], 
         ({name: {"miou_up_to_symmetry": None} for name in ROWS}, "auto", "as good as the search alone"),
     ],
 )
-def test_the_best_answer_is_the_fastest_of_those_alike(
-    changed: dict[str, dict[str, Any]], method: str, reason: str
-) -> None:
+def test_the_best_answer_is_the_fastest_of_equals(changed: dict[str, dict[str, Any]], method: str, reason: str) -> None:
     best, sentence = best_method({name: {**row, **changed.get(name, {})} for name, row in ROWS.items()})
     titles = {"auto": "both", "search": "the search alone", "network": "the network alone"}
     assert best == method and sentence.startswith(f"use {titles[method]}: {reason}")
@@ -427,7 +425,7 @@ def test_a_folder_knows_its_scene(scored: list[SearchScores], tmp_path: Path) ->
     assert "--object mine.py" in learning.command(out, "mine.py", is_trained=False)
 
 
-def test_a_folder_without_weights_is_an_object(
+def test_a_folder_is_an_object(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))

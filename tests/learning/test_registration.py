@@ -371,9 +371,7 @@ def test_what_no_longer_belongs_together_is_refused(
         read_truth(folder / "truth/truth.json")
 
 
-def test_a_truth_file_never_runs_a_python_scene_that_the_user_has_not_named(
-    bar: tuple[Path, Scene, np.ndarray], tmp_path: Path
-) -> None:
+def test_a_truth_file_runs_no_python_that_nobody_has_named(bar: tuple[Path, Scene, np.ndarray], tmp_path: Path) -> None:
     folder = shutil.copytree(bar[0], tmp_path / "sent")
     (folder / "evil.py").write_text(
         "from pathlib import Path\nfrom dataclasses import replace\nfrom mereo.scenes.registry import load_scene\n"
@@ -451,7 +449,7 @@ def bunny_truth_pose(name: str) -> tuple[SegmentedMesh, np.ndarray]:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("name", SCANS)
-def test_scans_of_the_bunny_come_back_to_their_published_pose(
+def test_scans_of_the_bunny_come_to_their_known_pose(
     name: str, seed: int, require_asset: Callable[[str], Path]
 ) -> None:
     """From 15 to 20 degrees and a tenth of its size beside it."""

@@ -155,9 +155,7 @@ def test_training_starts_from_another_objects_weights(dataset: Path, first: Path
     assert len(same) > 40 and all(torch.equal(started[name], given[name]) for name in same)
 
 
-def test_only_the_first_process_claims_the_directory(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_the_first_process_claims_a_folder(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A process that comes while the first one writes the settings waits instead of refusing the directory."""
     data, waited = Dataset.load(dataset), []
     with pytest.raises(ValueError, match="batch of 8 cannot be shared by 3 processes"):

@@ -78,9 +78,7 @@ def test_what_is_wrong_with_weights_is_one_sentence(text: str, tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_names_that_look_like_markup_are_printed_as_they_are(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_names_that_look_like_markup_are_printed_unchanged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     weights = changed(tmp_path, lambda h, t: h.update(names=["[/x]", ":heart:[red]"]))
     cloud = tmp_path / "[red] [y].npy"
     np.save(cloud, np.random.default_rng(0).normal((0, 0, 20), 1, (200, 3)))

@@ -75,9 +75,7 @@ def test_mirror_comes_first_and_is_checked(monkeypatch: pytest.MonkeyPatch, tmp_
     assert all(part in str(caught.value) for part in (str(path), found, asset.sha256))
 
 
-def test_download_once_then_from_the_cache(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, server: str, empty_cache: Path
-) -> None:
+def test_one_download_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, server: str, empty_cache: Path) -> None:
     asset = register(monkeypatch, f"{server}/toy.off")
     (tmp_path / "web" / "toy.off").write_bytes(CONTENT)
     assert assets.location(asset.name) is None
@@ -88,7 +86,7 @@ def test_download_once_then_from_the_cache(
     assert assets.get(asset.name) == path == assets.location(asset.name)
 
 
-def test_wrong_or_missing_download_leaves_nothing(
+def test_a_wrong_download_leaves_nothing(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, server: str, empty_cache: Path
 ) -> None:
     asset = register(monkeypatch, f"{server}/toy.off")

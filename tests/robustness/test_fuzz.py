@@ -54,9 +54,7 @@ def check_kind(name: str, folder: Path, capfd: pytest.CaptureFixture[str], count
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_damaged_files_are_taken_or_refused_with_one_sentence(
-    name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_damaged_files_are_taken_or_refused(name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     check_kind(name, tmp_path, capfd, COUNT[name], SEED, float("inf"))
 
 

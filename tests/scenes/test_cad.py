@@ -99,7 +99,7 @@ def test_meshes_that_are_no_solids_are_measured_on_a_grid() -> None:
     assert found.share == pytest.approx(5 / 16, abs=0.01)
 
 
-def test_an_overlap_in_random_states_is_told_with_its_cause(
+def test_an_overlap_in_states_names_its_cause(
     tmp_path: Path, written: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     head = written.read_text().split("deformations:")[0]
@@ -264,9 +264,7 @@ def test_a_word_says_how_the_object_moves(tmp_path: Path, capsys: pytest.Capture
     assert not (tmp_path / "b.yaml").exists()
 
 
-def test_joints_that_collide_together_are_narrowed_until_no_combination_does(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_joints_are_narrowed_until_no_combination_collides(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write_scene_file(write_parts(tmp_path, tongs()), tmp_path / "tongs.yaml")
     check_scene(str(path))
     assert "fault" not in capsys.readouterr().out

@@ -60,9 +60,7 @@ def test_all_are_those_that_differ_from_the_examples_own_sensor_and_an_unknown_o
 # --- the same bits ----------------------------------------------------------------------------------------------------
 
 
-def test_state_first_cloud_and_queries_are_those_without_and_the_manifest_states_sensors(
-    data: tuple[Path, Path],
-) -> None:
+def test_state_first_cloud_and_queries_are_those_without_and_the_manifest_has_sensors(data: tuple[Path, Path]) -> None:
     for name in shards_of(data[0]):
         plain, seen = (load_file(directory / name) for directory in data)
         assert seen.keys() - plain.keys() == {"seen", "seen_count"}

@@ -161,9 +161,7 @@ def test_parts_of_a_model_are_renamed_joined_and_left_out(tmp_path: Path) -> Non
         ("type: lattice", "{type: push, distance: [0, 5], tip: 1, reach: 6}", 11, ("reach must be above 10.8",)),
     ],
 )
-def test_errors_name_file_line_value_rule_and_cure(
-    old: str, new: str, line: int, parts: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_errors_name_line_value_and_cure(old: str, new: str, line: int, parts: tuple[str, ...], tmp_path: Path) -> None:
     tail = "size: 20\ndeformations:\n  - type: lattice\n  - type: bend\n    origin: [100, 5, 5]\n    axis: [1, 0, 0]\n"
     head = HEAD + tail + "    length: 40\n    angle: [0, 100]\n"
     load_scene(write_bar(tmp_path, head=head))

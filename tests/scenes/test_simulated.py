@@ -107,9 +107,7 @@ def test_the_interior_estimate_is_near_the_solid_that_made_the_surface() -> None
 # --- training and testing ---------------------------------------------------------------------------------------------
 
 
-def test_generation_and_evaluation_take_held_out_states_for_test_seeds_only(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_test_seeds_take_held_out_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shards, "rest_distances", lambda rest: np.zeros((4, 2, 2, 2), dtype=np.float16))  # slow
 
     def forbidden(rng: np.random.Generator) -> tuple:

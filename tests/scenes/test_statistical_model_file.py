@@ -99,7 +99,7 @@ def test_the_command_says_how_many(capsys: pytest.CaptureFixture[str]) -> None:
         SceneModes("rope", states=5).run()
 
 
-def test_weights_show_the_model_that_they_carry(
+def test_weights_show_the_model_in_them(
     rope: StatisticalModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     network = replace(untrained(rope.rest.names), provenance={"scene": "rope"})

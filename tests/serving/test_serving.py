@@ -463,7 +463,7 @@ def listening(folder: Path) -> Iterator[int]:
             thread.join(20)
 
 
-def test_the_client_of_the_documentation_works(
+def test_the_documented_client_works(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs/serving.md").read_text(), re.DOTALL)

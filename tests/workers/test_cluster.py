@@ -184,7 +184,7 @@ def test_a_wrong_address_is_one_sentence(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_single_frame_or_object_is_no_task(
+def test_a_single_frame_is_no_task(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -185,7 +185,7 @@ def test_scores_are_those_of_one_process(rope: Model, tmp_path: Path) -> None:
     assert (tmp_path / "one/errors.png").read_bytes() == (tmp_path / "two/errors.png").read_bytes()
 
 
-def test_frames_are_answered_as_by_one_process(
+def test_frames_have_the_answers_of_one_process(
     tmp_path: Path, loads: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = frames(tmp_path / "frames", "a.npy", "b.npy", "c.npy")
