@@ -99,7 +99,7 @@ def test_all_else_of_a_file_stays_and_biases_of_other_classes_are_refused(tmp_pa
     assert tensors(path) == tensors(calibrated)
     assert load_model(calibrated).calibration == SCALED and load_model(path).calibration is None
     calibrated.write_bytes(with_calibration(path, SCALED.model_copy(update={"biases": (0.0, 1.0)})))
-    with pytest.raises(ValueError, match="a calibration with 2 biases, and 3 classes; calibration.calibrate it again"):
+    with pytest.raises(ValueError, match="a calibration with 2 biases, and 3 classes; calibrate it again"):
         load_model(calibrated)
 
 
