@@ -36,8 +36,9 @@ def lzf_compress(data: bytes) -> bytes:
         pairs = zip(data[at : at + 264], data[at - 4 : at + 260], strict=False) if at > 3 else ()
         length = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
         if length < 3:
-            out += bytes([0, data[at]])
-            at += 1
+            literals = data[at : at + 3]
+            out += bytes([len(literals) - 1]) + literals
+            at += len(literals)
             continue
         out += bytes([(length - 2) << 5, 3] if length < 9 else [7 << 5, length - 9, 3])
         at += length
