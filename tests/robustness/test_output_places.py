@@ -99,7 +99,7 @@ def test_force_replaces_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 @pytest.mark.parametrize(
     "command",
     [
-        "reconstruct left.ply --weights rope --output .",
+        "reconstruct left.ply --weights rope --output {}",
         "scene export bar.yaml --output right.ply",
         "scene export bar.yaml --output linked.ply",
         "scene preview bar.yaml --output bar.yaml",
@@ -121,6 +121,6 @@ def test_not_even_force_replaces_an_input(
     for name in ("weights.safetensors", "assets/bunny/bunny.off"):
         Path(name).write_text("precious")
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    assert command_line.main([*command.split(), "--force"]) == 2
+    assert command_line.main([*command.format(tmp_path).split(), "--force"]) == 2
     assert re.search("is read.*; it is not replaced.*: choose another", capsys.readouterr().err)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
