@@ -35,6 +35,16 @@ def rings(mesh: SegmentedMesh) -> np.ndarray:
     return np.stack(loops)
 
 
+def test_rope_does_not_pass_through_itself(states: list[SegmentedMesh]) -> None:
+    """Cross-sections more than a half turn apart along the rope are more than a diameter apart in space."""
+    for mesh in states:
+        centers = rings(mesh).mean(axis=1)
+        place = np.repeat(np.arange(rope.SEGMENTS), rope.RINGS + 1) * rope.SEGMENT_LENGTH
+        place = place + np.tile(np.linspace(0, rope.SEGMENT_LENGTH, rope.RINGS + 1), rope.SEGMENTS)
+        far = np.abs(place[:, None] - place) > np.pi / rope.MAX_BEND
+        assert np.linalg.norm(centers[:, None] - centers, axis=-1)[far].min() > 2.3 * rope.RADIUS
+
+
 def test_only_the_rope_moves_and_it_leaves_the_base_at_a_right_angle(states: list[SegmentedMesh]) -> None:
     rest = rope.rest_mesh()
     for mesh in states:
