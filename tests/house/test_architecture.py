@@ -3,26 +3,9 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import architecture as rules
 import pytest
-from architecture import (
-    BUDGET,
-    MAY_IMPORT_TORCH,
-    ROOM_ROW,
-    ROOMS,
-    SATELLITES,
-    SUBROOMS,
-    banned_names,
-    cycles,
-    heavy_libraries,
-    long_signatures,
-    misplaced,
-    misplaced_tests,
-    over_budget,
-    satellite_imports,
-    torch_imports,
-    upward_imports,
-)
-from package_imports import Package, read_package
+from architecture import ROOMS, SATELLITES, Package, cycles, read_package, upward_imports
 
 TOP = Path(__file__).parents[2]
 
@@ -37,7 +20,9 @@ def mereo() -> Package:
     return read_package(TOP / "src" / "mereo")
 
 
-@pytest.mark.parametrize("rule", [upward_imports, torch_imports, satellite_imports, cycles, misplaced])
+@pytest.mark.parametrize(
+    "rule", [upward_imports, rules.torch_imports, rules.satellite_imports, cycles, rules.misplaced]
+)
 def test_the_package_keeps_its_rules(rule: Rule, mereo: Package) -> None:
     assert rule(mereo) == []
 
@@ -45,8 +30,8 @@ def test_the_package_keeps_its_rules(rule: Rule, mereo: Package) -> None:
 def test_settings_are_light(mereo: Package) -> None:
     light = [m for m in mereo.trees if m.rpartition("/")[2] == "config" or m == "geometry/conventions"]
     names = [f"mereo.{module.replace('/', '.')}" for module in light]
-    assert len(light) > 5 and heavy_libraries([*names, "mereo_learning.config"]) == []
-    assert "numpy" in heavy_libraries(["mereo.geometry.mesh"])
+    assert len(light) > 5 and rules.heavy_libraries([*names, "mereo_learning.config"]) == []
+    assert "numpy" in rules.heavy_libraries(["mereo.geometry.mesh"])
 
 
 def test_only_charts_ask_for_the_extra_plots(mereo: Package) -> None:
@@ -54,31 +39,31 @@ def test_only_charts_ask_for_the_extra_plots(mereo: Package) -> None:
 
 
 def test_the_page_names_the_rooms() -> None:
-    assert set(ROOM_ROW.findall((TOP / "docs" / "architecture.md").read_text("utf-8"))) == set(ROOMS)
+    assert set(rules.ROOM_ROW.findall((TOP / "docs" / "architecture.md").read_text("utf-8"))) == set(ROOMS)
 
 
 def test_tests_lie_in_the_rooms_they_test(tmp_path: Path) -> None:
-    assert misplaced_tests(TOP / "tests") == []
+    assert rules.misplaced_tests(TOP / "tests") == []
     for name in ("geometry/test_a.py", "serving/test_b.py", "conftest.py", "test_d.py", "odd/test_e.py"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
-    assert misplaced_tests(tmp_path) == ["tests/odd/test_e.py", "tests/test_d.py"]
+    assert rules.misplaced_tests(tmp_path) == ["tests/odd/test_e.py", "tests/test_d.py"]
 
 
 @pytest.mark.parametrize("name", ["mereo", *SATELLITES])
 def test_every_package_keeps_the_rules_of_names(name: str) -> None:
     package = read_package(TOP / "src" / name)
-    assert banned_names(package) + long_signatures(package) + cycles(package) == []
+    assert rules.banned_names(package) + rules.long_signatures(package) + cycles(package) == []
 
 
 def test_the_house_keeps_its_budget(tmp_path: Path) -> None:
-    assert over_budget(TOP, BUDGET) == []
+    assert rules.over_budget(TOP, rules.BUDGET) == []
     for name, lines in {"src/a/b.py": 3, "src/c.py": 2, "docs/d.py": 999}.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("#\n" * lines, "utf-8")
-    assert over_budget(tmp_path, {"src": (5, 2)}) == []
+    assert rules.over_budget(tmp_path, {"src": (5, 2)}) == []
     too_many = ["src has 5 lines, more than 4: cut as much as you add", "src has 2 files, more than 1: cut as much"]
-    faults = over_budget(tmp_path, {"src": (4, 1)})
+    faults = rules.over_budget(tmp_path, {"src": (4, 1)})
     assert [fault[: len(start)] for fault, start in zip(faults, too_many, strict=True)] == too_many
 
 
@@ -97,7 +82,7 @@ def package_of(folder: Path, files: dict[str, str]) -> Package:
 
 MESH, LATER = "geometry/mesh.py", {"io/readers.py": "", "io/formats/ply.py": ""}
 READERS, ROOT = "imports io.readers, a later room", "imports __init__, the root, which lies above all rooms"
-TORCH = f"imports torch, which only {', '.join(MAY_IMPORT_TORCH)} may"
+TORCH = f"imports torch, which only {', '.join(rules.MAY_IMPORT_TORCH)} may"
 OBJECTS = f"imports mereo_objects, which only {', '.join(SATELLITES['mereo_objects'])} may"
 LAZY = "def f():\n    from mereo_objects.assets import get"
 
@@ -111,23 +96,31 @@ FAULTS: list[tuple[Rule, dict[str, str], list[str]]] = [
     (upward_imports, {MESH: "def f(name):\n    import_module(f'mereo.{name}')", **LATER}, [f"{MESH}:2 {ROOT}"]),
     (upward_imports, {MESH: "", "io/x.py": "import numpy\nfrom mereo.geometry.mesh import M\nX = 'mereo.json'"}, []),
     (upward_imports, {"__main__.py": "from mereo.io import readers", **LATER}, []),
-    (torch_imports, {"fitting/x.py": "def f():\n    import torch.nn", "models/x.py": ""}, [f"fitting/x.py:2 {TORCH}"]),
-    (torch_imports, {"models/x.py": "import torch", "cli/tools.py": "from torch import Tensor"}, []),
-    (satellite_imports, {"io/x.py": LAZY, "scenes/registry.py": LAZY}, [f"io/x.py:2 {OBJECTS}"]),
-    (cycles, {"io/a.py": "import mereo.io.b", "io/b.py": "def f():\n    import mereo.io.a"}, []),
-    (misplaced, {"bench/report.py": ""}, ["bench/__init__.py lies in no room", "bench/report.py lies in no room"]),
     (
-        misplaced,
+        rules.torch_imports,
+        {"fitting/x.py": "def f():\n    import torch.nn", "models/x.py": ""},
+        [f"fitting/x.py:2 {TORCH}"],
+    ),
+    (rules.torch_imports, {"models/x.py": "import torch", "cli/tools.py": "from torch import Tensor"}, []),
+    (rules.satellite_imports, {"io/x.py": LAZY, "scenes/registry.py": LAZY}, [f"io/x.py:2 {OBJECTS}"]),
+    (cycles, {"io/a.py": "import mereo.io.b", "io/b.py": "def f():\n    import mereo.io.a"}, []),
+    (
+        rules.misplaced,
+        {"bench/report.py": ""},
+        ["bench/__init__.py lies in no room", "bench/report.py lies in no room"],
+    ),
+    (
+        rules.misplaced,
         {"frames.py": "", "fitting/loose.py": ""},
         ["fitting/loose.py lies in no sub-room", "frames.py lies in"],
     ),
-    (misplaced, {"io/__init__.py": "X = 1"}, ["io/__init__.py is not its docstring alone"]),
-    (banned_names, {MESH: "def f(x):\n    x.said_so = 1"}, [f"{MESH}:2 defines said_so"]),
-    (banned_names, {MESH: "class FoundBy: pass"}, [f"{MESH}:1 defines FoundBy"]),
-    (banned_names, {MESH: "def f():\n    with g() as at_hand: pass"}, [f"{MESH}:2 defines at_hand"]),
-    (banned_names, {MESH: "def f(x):\n    raise FileNotFoundError(x.own_data)\nbone = owner = phone = 1"}, []),
-    (long_signatures, {MESH: "def more(a, b, c, d, e, f, *, g, h): pass"}, [f"{MESH}:1 more has 8 parameters"]),
-    (long_signatures, {MESH: "class A:\n    def most(self, a, b, c, d, e, f, g): pass"}, []),
+    (rules.misplaced, {"io/__init__.py": "X = 1"}, ["io/__init__.py is not its docstring alone"]),
+    (rules.banned_names, {MESH: "def f(x):\n    x.said_so = 1"}, [f"{MESH}:2 defines said_so"]),
+    (rules.banned_names, {MESH: "class FoundBy: pass"}, [f"{MESH}:1 defines FoundBy"]),
+    (rules.banned_names, {MESH: "def f():\n    with g() as at_hand: pass"}, [f"{MESH}:2 defines at_hand"]),
+    (rules.banned_names, {MESH: "def f(x):\n    raise FileNotFoundError(x.own_data)\nbone = owner = phone = 1"}, []),
+    (rules.long_signatures, {MESH: "def more(a, b, c, d, e, f, *, g, h): pass"}, [f"{MESH}:1 more has 8 parameters"]),
+    (rules.long_signatures, {MESH: "class A:\n    def most(self, a, b, c, d, e, f, g): pass"}, []),
 ]
 
 
@@ -147,7 +140,7 @@ def test_a_circle_is_found(tmp_path: Path) -> None:
 def test_each_room_is_later_than_the_one_before(tmp_path: Path) -> None:
     package = package_of(tmp_path, {f"{room}/x.py": f"from mereo import {', '.join(ROOMS)}" for room in ROOMS})
     assert len(upward_imports(package)) == len(ROOMS) * (len(ROOMS) - 1) / 2
-    for room, order in SUBROOMS.items():
+    for room, order in rules.SUBROOMS.items():
         code = "".join(f"import mereo.{room}.{name}.x\n" for name in order)
         package = package_of(tmp_path / room, {f"{room}/{name}/x.py": code for name in order})
         assert len(upward_imports(package)) == len(order) * (len(order) - 1) / 2

@@ -1,13 +1,17 @@
-"""The documentation: every link and anchor leads somewhere, every command and import it shows exists."""
+"""The documentation: every link leads somewhere, every command and import exists, the tour is of the code as it is."""
 
 import ast
+import copy
 import importlib
 import importlib.util
 import re
+import runpy
 import shlex
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import yaml
@@ -163,22 +167,64 @@ def test_decisions_are_short() -> None:
 def test_citation_is_of_this_version() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert (citation["title"], citation["version"], citation["license"]) == (
-        project["name"],
-        project["version"],
-        project["license"],
-    )
-    assert citation["authors"] == project["authors"]
+    assert citation["title"] == project["name"]
+    assert all(citation[key] == project[key] for key in ("version", "license", "authors"))
 
 
 def test_every_library_has_a_lowest_version() -> None:
-    spec = importlib.util.spec_from_file_location("lowest", ROOT / ".ci" / "lowest.py")
-    assert spec is not None
-    assert spec.loader is not None
-    lowest = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(lowest)
-    constraints = lowest.constraints((ROOT / "pyproject.toml").read_text(), (ROOT / "constraints.txt").read_text())
+    lowest = runpy.run_path(str(ROOT / ".ci" / "lowest.py"))
+    constraints = lowest["constraints"](*((ROOT / name).read_text() for name in ("pyproject.toml", "constraints.txt")))
     assert {"torch==2.8", "numpy==1.26"} <= set(constraints)
     assert any(line.startswith("ruff==") for line in constraints)  # the tools are pinned as ever
     with pytest.raises(ValueError, match="'ray<3' has no lower bound; write the oldest version that works as >="):
-        lowest.lowest("ray<3")
+        lowest["lowest"]("ray<3")
+
+
+# --- the tour ---------------------------------------------------------------------------------------------------------
+
+
+DOCS = ROOT / "docs"
+MOST_BYTES = 400_000
+
+
+@pytest.fixture(scope="module")
+def tool() -> SimpleNamespace:
+    return SimpleNamespace(**runpy.run_path(str(DOCS / "notebook.py")))
+
+
+@pytest.fixture(scope="module")
+def tour(tool: SimpleNamespace) -> dict[str, Any]:
+    notebook: dict[str, Any] = tool.read()
+    return notebook
+
+
+def test_what_is_shown_is_of_the_code_as_it_is(tool: SimpleNamespace, tour: dict[str, Any]) -> None:
+    assert tour["metadata"]["mereo"]["code"] == tool.digest(tour), "a cell has changed: run python docs/notebook.py"
+    cells = [cell for cell in tour["cells"] if cell["cell_type"] == "code"]
+    assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
+    for cell, code in zip(cells, tool.code_of(tour), strict=True):
+        compile(code, "tour.ipynb", "exec")
+        assert cell["outputs"] and all(output["output_type"] != "error" for output in cell["outputs"])
+        assert all(output.get("name") != "stderr" for output in cell["outputs"])
+    changed = copy.deepcopy(tour)
+    changed["cells"][1]["source"].append("\n# another line")
+    assert tool.digest(changed) != tool.digest(tour)
+
+
+def test_it_is_small_and_names_nobodys_folders() -> None:
+    text = (DOCS / "tour.ipynb").read_text("utf-8")
+    assert len(text.encode()) < MOST_BYTES
+    assert not re.search(r"/(?:home|root|tmp|work|Users)/", re.sub(r"base64,[^\\\"]+", "", text))
+
+
+def test_it_is_a_page(tool: SimpleNamespace, tour: dict[str, Any]) -> None:
+    page = tool.page(tour)
+    assert page.startswith("# A tour") and page.count("data:image/png;base64,") == 6
+    assert all(f"```python\n{code}\n```" in page for code in tool.code_of(tour))
+    assert "<td>not found</td>" not in page
+
+
+@pytest.mark.slow
+def test_it_runs(tool: SimpleNamespace, tour: dict[str, Any]) -> None:
+    pytest.importorskip("nbclient")
+    assert tool.shown(tool.executed(tour)) == tool.shown(tour)

@@ -111,7 +111,6 @@ def test_files_that_cannot_be_carried_say_why(tmp_path: Path) -> None:
 
 
 def test_splitting_long_edges_keeps_the_surface() -> None:
-    """No edge is long, the body stays closed with its volume, and the given vertices stay where they are."""
     part = box((0, 0, 0), (8, 3, 1), "a")
     vertices, faces = split_long_edges(part.vertices, part.faces, 0.7, 100_000)
     mesh = trimesh.Trimesh(vertices, faces, process=False)

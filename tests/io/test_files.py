@@ -44,12 +44,6 @@ def test_every_format_gives_back_the_points(tmp_path: Path, name: str) -> None:
     np.testing.assert_array_equal(read_point_cloud(tmp_path / name).points, POINTS.astype(np.float64))
 
 
-def test_repeated_values_come_out_of_a_compressed_file(tmp_path: Path) -> None:
-    points = np.repeat(POINTS[:3], 40, axis=0)
-    (tmp_path / "a.pcd").write_bytes(save_pcd(points, "binary_compressed"))
-    np.testing.assert_array_equal(read_point_cloud(tmp_path / "a.pcd").points, points)
-
-
 def test_arrays_in_numpy_files(tmp_path: Path) -> None:
     np.save(tmp_path / "flat.npy", POINTS)
     np.save(tmp_path / "organized.npy", POINTS[:56].reshape(7, 8, 3))
@@ -78,10 +72,8 @@ def numpy_bytes(path: Path, array: np.ndarray) -> bytes:
 BAD_CLOUDS: dict[str, tuple[str, Callable[[Path], bytes], str]] = {
     "empty file": ("a.ply", lambda _: b"", "is empty"),
     "no vertices": ("a.ply", lambda _: save_ply(POINTS[:0], "ascii"), "0 vertices"),
-    "cut binary ply": ("a.ply", lambda _: save_ply(POINTS, "binary_big_endian")[:-40], "cannot be read"),
     "cut at a line": ("a.ply", lambda _: b"\n".join(save_ply(POINTS, "ascii").split(b"\n")[:-5]), "53 of 57|54 of 57"),
     "cut binary pcd": ("a.pcd", lambda _: save_pcd(POINTS, "binary")[:-1], "truncated: 56 of 57"),
-    "cut compressed pcd": ("a.pcd", lambda _: save_pcd(POINTS, "binary_compressed")[:-9], "cannot be read"),
     "words": ("a.xyz", lambda _: b"once upon a time\nthere was a cloud\n", "no row of three numbers"),
     "a word among numbers": ("a.xyz", lambda _: b"1 2 3\n4 five 6\n", "cannot be read.*five"),
     "empty cell": ("a.csv", lambda _: b"1,2,3\n4,,6\n", "cannot be read"),
@@ -90,8 +82,6 @@ BAD_CLOUDS: dict[str, tuple[str, Callable[[Path], bytes], str]] = {
     "transposed": ("a.npy", lambda p: numpy_bytes(p, POINTS.T), r"shape is \(3, 57\)"),
     "words in an array": ("a.npy", lambda p: numpy_bytes(p, np.array([["a", "b", "c"]])), "not a number"),
     "suffix": ("a.las", lambda _: b"LASF", "suffix '.las'.*convert"),
-    "all NaN": ("a.npy", lambda p: numpy_bytes(p, np.full((4, 3), np.nan)), "all 4 points"),
-    "no rows": ("a.npy", lambda p: numpy_bytes(p, np.empty((0, 3))), "0 points"),
 }
 
 
@@ -225,24 +215,12 @@ MILLIMETRES[2, 3] = 0
 METRES = np.where(MILLIMETRES > 0, MILLIMETRES / np.float32(1000), np.nan).astype(np.float32)
 
 
-def save_big_endian_tiff(path: Path) -> None:
-    """One strip of 16-bit grey, most significant byte first: Pillow writes the other order only."""
-    tags = [(256, 8), (257, 6), (258, 16), (259, 1), (262, 1), (273, 8), (277, 1), (278, 6), (279, 96)]
-    entries = b"".join(np.array([tag, 3, 0, 1, value, 0], ">u2").tobytes() for tag, value in tags)
-    start = (8 + 96).to_bytes(4, "big")
-    head = b"MM\x00\x2a" + start + MILLIMETRES.astype(">u2").tobytes()
-    path.write_bytes(head + len(tags).to_bytes(2, "big") + entries + bytes(4))
-
-
-@pytest.mark.parametrize("name", ["short.tif", "float.tiff", "big.tif", "short.npy", "float.npy", "double.npy"])
+@pytest.mark.parametrize("name", ["short.tif", "float.tiff", "big.tif", "short.npy", "double.npy"])
 def test_every_format_gives_the_same_metres(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
-    if name == "big.tif":
-        save_big_endian_tiff(path)
-    elif path.suffix == ".npy":
-        np.save(path, {"short": MILLIMETRES, "float": METRES, "double": METRES.astype(">f8")}[path.stem])
-    else:
-        Image.fromarray(MILLIMETRES if path.stem == "short" else METRES).save(path, compression="tiff_lzw")
+    values = {"short": MILLIMETRES, "big": MILLIMETRES.astype(">u2"), "double": METRES.astype(">f8")}
+    stored = values.get(path.stem, METRES)
+    np.save(path, stored) if path.suffix == ".npy" else save_depth(path, stored)
     depth = read_depth_image(path, CAMERA).depth
     np.testing.assert_allclose(depth, MILLIMETRES / 1000, rtol=1e-6)
     assert depth[2, 3] == 0, "NaN and 0 both say that nothing was measured"
@@ -264,9 +242,9 @@ def test_exr(tmp_path: Path, channels: dict[str, float], monkeypatch: pytest.Mon
 
 
 def test_what_is_no_depth_image_is_said_so(tmp_path: Path) -> None:
-    Image.fromarray(np.zeros((6, 8), np.uint8)).save(tmp_path / "grey.tif")
-    pages = [Image.fromarray(MILLIMETRES)] * 2
-    pages[0].save(tmp_path / "pages.tif", save_all=True, append_images=pages[1:])
+    save_depth(tmp_path / "grey.tif", np.zeros((6, 8), np.uint8))
+    page = Image.fromarray(MILLIMETRES)
+    page.save(tmp_path / "pages.tif", save_all=True, append_images=[page])
     np.save(tmp_path / "words.npy", np.array([["a", "b"]]))
     (tmp_path / "photo.jpg").write_bytes(b"JFIF")
     for name, expected in (

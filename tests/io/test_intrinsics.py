@@ -64,11 +64,6 @@ def test_bad_intrinsics_get_one_sentence(tmp_path: Path, content: str, expected:
     assert "\n" not in str(caught.value)
 
 
-def test_the_size_may_come_from_the_image(tmp_path: Path) -> None:
-    (tmp_path / "c.json").write_text('{"fx": 5, "fy": 5, "cx": 2, "cy": 2}')
-    assert read_camera(tmp_path / "c.json", (4, 3)) == Camera(4, 3, 5.0, 5.0, 2.5, 2.5)
-
-
 BOP = {"0": {"cam_K": FLAT, "depth_scale": 0.1}, "7": {"cam_K": [600.0, *FLAT[1:]], "depth_scale": 1.0}}
 NERF = {"fl_y": 520, "cx": 320.0, "cy": 240.0, "w": 640, "h": 480}
 FRAMES = [{"fl_x": 525, "depth_file_path": "depth/a.png"}, {"fl_x": 600, "depth_file_path": "depth/b.png"}]

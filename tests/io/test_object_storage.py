@@ -1,14 +1,22 @@
-"""Places by URL: which texts are local paths, storages, or refused; and what a storage's folder does."""
+"""Places by URL: which are local paths, storages, or refused; what a folder of objects does, in memory and in S3."""
 
+import os
 import subprocess
 import sys
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
+from toy_data import SMALL, make_small_datasets
+from toy_scene import toy_scene
 
+from mereo.__main__ import main
+from mereo.api.generate import generate
 from mereo.io.atomic_files import check_place
 from mereo.io.object_storage import ObjectPath, StorageError, claim, names_in, place_of, write_whole
+from mereo_learning.dataset import Dataset
 
 
 @pytest.fixture
@@ -82,7 +90,11 @@ def test_a_folder_of_objects_is_as_one_of_files(folder: ObjectPath) -> None:
     assert (folder / "a").read_bytes() == b"3"
 
 
-def test_one_of_several_claims_a_folder(folder: ObjectPath, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("kind", ["folder", "s3"])
+def test_one_of_many_claims_a_folder(
+    kind: str, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = request.getfixturevalue(kind)
     assert claim(folder, "m.json", {"a": [1, 2.5]}, "a dataset") is None
     assert claim(folder, "m.json", {"a": 3}, "a dataset") == {"a": [1, 2.5]}
     # another machine, whose manifest came between our look and our put
@@ -99,9 +111,7 @@ def test_without_a_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize("answer", ["AccessDenied", "timed out", "no route to http://me:secret@host/x"])
-def test_what_a_storage_refuses_is_no_missing_file_and_one_sentence(
-    answer: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_storage_refuses_is_no_missing_file_but_a_sentence(answer: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nor do credentials show."""
 
     def fails(*_: object, **__: object) -> bytes:
@@ -118,3 +128,89 @@ def test_what_a_storage_refuses_is_no_missing_file_and_one_sentence(
 def test_the_libraries_are_loaded_where_they_are_needed_alone() -> None:
     code = "import mereo.__main__, sys; print([name for name in ('fsspec', 's3fs', 'pydantic') if name in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
+
+
+# --- S3, as a server on this machine speaks it ------------------------------------------------------------------------
+
+
+AWS = {
+    "AWS_DEFAULT_REGION": "us-east-1",
+    "AWS_EC2_METADATA_DISABLED": "true",
+    "AWS_ACCESS_KEY_ID": "testing-id",
+    "AWS_SECRET_ACCESS_KEY": "testing-secret",
+    **dict.fromkeys(("AWS_CONFIG_FILE", "AWS_SHARED_CREDENTIALS_FILE"), "/none"),
+}
+"""What a user sets; nothing of this machine's user is read."""
+
+
+@pytest.fixture(scope="module")
+def endpoint() -> Iterator[str]:
+    """Address of a server with a bucket."""
+    server = pytest.importorskip("moto.server").ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    yield f"http://127.0.0.1:{server.get_host_and_port()[1]}"
+    server.stop()
+
+
+@pytest.fixture
+def s3(endpoint: str, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Iterator[ObjectPath]:
+    """A folder of a test's in the bucket."""
+    make_small_datasets(monkeypatch)
+    systems = pytest.importorskip("s3fs").S3FileSystem
+    for name in {name for name in os.environ if name.startswith("AWS_")} - AWS.keys():
+        monkeypatch.delenv(name)
+    for name, value in (AWS | {"AWS_ENDPOINT_URL": endpoint}).items():
+        monkeypatch.setenv(name, value)
+    systems.clear_instance_cache()
+    systems().makedirs("bucket", exist_ok=True)
+    yield ObjectPath(f"s3://bucket/sets/{abs(hash(request.node.name))}")
+    systems.clear_instance_cache()
+
+
+def contents(folder: Path | ObjectPath) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in names_in(folder)}
+
+
+def test_a_dataset_is_shared_and_made_again(s3: ObjectPath, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    make = partial(generate, toy_scene(), settings=SMALL, examples=4, seed=3)
+    make(tmp_path / "data")
+    whole = contents(tmp_path / "data")
+    for part in (1, 0):
+        make(s3, shard=(part, 2))
+    assert contents(s3) == whole
+    write_whole(s3 / "shard-00001.safetensors", whole["shard-00000.safetensors"])
+    assert main(["dataset", "check", str(s3)]) == 2
+    assert "shard-00001.safetensors: it begins with example 0 instead of 2" in capsys.readouterr().out
+    make(s3, resume=True)
+    assert contents(s3) == whole and len(Dataset.load(s3)) == 4
+
+
+NO_NETWORK = {"AWS_ENDPOINT_URL": "http://127.0.0.1:9"}
+WRONG = [
+    ({}, "dataset check s3://nobucket/x", "check the bucket 'nobucket'"),
+    ({"AWS_ACCESS_KEY_ID": None}, "dataset check s3://bucket/x", "check the bucket 'bucket', your credentials for it"),
+    (NO_NETWORK, "dataset show s3://bucket/x", "your credentials for it and the network"),
+    ({"AWS_PROFILE": "none"}, "dataset check s3://bucket/x", "(The config profile (none) could not be found)"),
+    ({}, "dataset check s3://bucket/nothing", "s3://bucket/nothing has no manifest.json; a dataset is"),
+]
+
+
+@pytest.mark.parametrize("change, text, sentence", WRONG)
+def test_what_goes_wrong_is_one_sentence_without_credentials(
+    s3: ObjectPath,
+    change: dict[str, str | None],
+    text: str,
+    sentence: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, value in change.items():
+        monkeypatch.delenv(name) if value is None else monkeypatch.setenv(name, value)
+    pytest.importorskip("s3fs").S3FileSystem.clear_instance_cache()
+    assert main(text.split()) == 2
+    said = capsys.readouterr()
+    assert said.err.startswith("mereo: error: s3://") and sentence in said.err and said.err.count("\n") == 1
+    assert "testing-" not in said.err + said.out
+    assert not any(tmp_path.iterdir())

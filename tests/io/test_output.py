@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from folder_contents import contents
 
-from mereo import __main__ as command_line
 from mereo.io.atomic_files import MARKER, OLD, atomic_file, new_directory, write_json
 from mereo.io.errors import words_of
 from mereo.io.object_storage import claim
@@ -105,7 +104,6 @@ def test_json_knows_arrays_and_has_no_nan(tmp_path: Path) -> None:
 
 
 def test_a_directory_is_claimed_once(tmp_path: Path) -> None:
-    """Whoever comes later, with whatever settings, is told those of the first."""
     place = tmp_path / "deep" / "new"
     (place / ".settings.json.1a2b3c4d.mereo").mkdir(parents=True)  # what a killed process left
     assert claim(place, "settings.json", {"a": [1, 2.5]}, "a run") is None
@@ -209,7 +207,6 @@ def test_two_runs_at_once_into_one_folder_are_refused_at_once(tmp_path: Path) ->
 
 
 def test_the_input_is_never_replaced(tmp_path: Path) -> None:
-    """Not even where mereo wrote it."""
     write(tmp_path / "out", "first")
     inputs = [tmp_path / "missing", tmp_path / "out/deep/a.txt"]
     with (
@@ -217,18 +214,6 @@ def test_the_input_is_never_replaced(tmp_path: Path) -> None:
         new_directory(tmp_path / "out", True, inputs),
     ):
         pytest.fail("the work was begun")
-
-
-def test_reconstruct_does_not_delete_the_folder_of_its_input(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    np.save(tmp_path / "cloud.npy", np.ones((100, 3)))
-    (tmp_path / "thesis.tex").write_text("precious")
-    before = contents(tmp_path)
-    command = ["reconstruct", tmp_path / "cloud.npy", "--weights", "rope", "--output", tmp_path, "--force"]
-    assert command_line.main([str(part) for part in command]) == 2
-    assert "which is read; it is not replaced" in capsys.readouterr().err
-    assert contents(tmp_path) == before
 
 
 DIES = """
@@ -284,7 +269,6 @@ def test_a_process_killed_while_it_replaces_loses_neither_result(renames: int, t
 
 
 def test_a_living_process_keeps_what_it_is_writing(tmp_path: Path) -> None:
-    """Another one that writes the same file at the same time removes none of it."""
     with atomic_file(tmp_path / "a.txt") as first:
         first.write_text("first")
         with atomic_file(tmp_path / "a.txt") as second:

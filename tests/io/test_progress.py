@@ -40,7 +40,7 @@ def test_lines_say_stage_rate_and_time_left(wait: Callable[[float], None], capsy
     ]
 
 
-def test_pauses_count_for_the_end_and_not_for_the_rate(
+def test_pauses_count_for_the_end_not_the_rate(
     wait: Callable[[float], None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     with progress("train", 4, "steps", each=2) as shown:
@@ -65,7 +65,7 @@ def test_a_failure_is_not_called_done_and_nothing_to_do_says_nothing(capsys: pyt
     assert capsys.readouterr().err == ""
 
 
-def test_a_terminal_gets_a_bar_and_what_is_printed_stays_above_it(
+def test_a_terminal_gets_a_bar_below_what_is_printed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     drawn = io.StringIO()

@@ -19,16 +19,7 @@ from mereo.models.weights import load_model, save_model, with_calibration
 from mereo.reconstruction.pipeline import segment_points
 from mereo.scenes.registry import load_scene
 from mereo.visualization.color_scales import radius_scale
-from mereo_learning.calibrate import (
-    GOOD_ENOUGH,
-    LEAST,
-    MeasuredRadii,
-    ViewRadii,
-    calibrate,
-    ece_of,
-    factors_of,
-    fit_scaling,
-)
+from mereo_learning import calibrate as calibration
 from mereo_learning.cases import BINS, RegistrationErrors, Reliability
 
 NAMES = ("one", "two")
@@ -59,16 +50,15 @@ def test_the_error_is_the_distance_of_confidence_from_right_answers() -> None:
 
 
 def test_scaling_finds_what_made_the_probabilities_wrong(logits: np.ndarray) -> None:
-    """Logits that are sharper, and favour a class, by known amounts; labels come from the true ones."""
-    assert ece_of(logits, drawn(logits)) < 0.01
+    assert calibration.ece_of(logits, drawn(logits)) < 0.01
     truth = drawn(logits)
-    sharper = fit_scaling(2.5 * logits, truth)
+    sharper = calibration.fit_scaling(2.5 * logits, truth)
     assert sharper.biases is None and sharper.temperature == pytest.approx(2.5, rel=0.03)
-    favoured = fit_scaling(2.5 * (logits + FAVOUR), truth)
+    favoured = calibration.fit_scaling(2.5 * (logits + FAVOUR), truth)
     assert favoured.biases is not None and favoured.temperature == pytest.approx(2.5, rel=0.03)
     np.testing.assert_allclose(favoured.biases, [0.0, -2.0, 1.0], atol=0.08)
-    before = ece_of(2.5 * (logits + FAVOUR), truth)
-    assert ece_of(2.5 * (logits + FAVOUR), truth, favoured) < GOOD_ENOUGH / 2 < before / 5
+    before = calibration.ece_of(2.5 * (logits + FAVOUR), truth)
+    assert calibration.ece_of(2.5 * (logits + FAVOUR), truth, favoured) < calibration.GOOD_ENOUGH / 2 < before / 5
 
 
 def test_labels_stay_and_probabilities_are_scaled() -> None:
@@ -113,7 +103,7 @@ def test_all_else_of_a_file_stays_and_biases_of_other_classes_are_refused(tmp_pa
         load_model(calibrated)
 
 
-def test_the_command_writes_what_was_measured_and_replaces_no_weights_unasked(
+def test_the_command_writes_what_was_measured_beside_the_weights(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A network that knows nothing: its probabilities become those of the classes' shares."""
@@ -141,7 +131,7 @@ def test_the_command_writes_what_was_measured_and_replaces_no_weights_unasked(
 )
 def test_test_seeds_and_too_few_views_are_refused(options: dict[str, int], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
-        calibrate(untrained(load_scene("rope").rest.names), **options)
+        calibration.calibrate(untrained(load_scene("rope").rest.names), **options)
 
 
 def some_radii() -> Radii:
@@ -151,7 +141,6 @@ def some_radii() -> Radii:
 
 
 def test_radii_between_points_are_between_theirs_and_their_scale_ends_at_all_but_a_twentieth() -> None:
-    """And at a point they are its own; other segments' points do not count."""
     radii = some_radii()
     np.testing.assert_allclose(radii.at(radii.points[:10], 1), radii.values[:10])
     between = radii.at(np.full((1, 3), 0.5), 2)
@@ -169,24 +158,23 @@ def test_radii_between_points_are_between_theirs_and_their_scale_ends_at_all_but
     np.testing.assert_allclose(rounded_to(np.array([0.0123456, 98765.0, 1.0]), 3), [0.0123, 98800.0, 1.0], rtol=1e-9)
 
 
-def measured(off: np.ndarray, misfit: float = 0.1, displaced: float = 0.04) -> MeasuredRadii:
+def measured(off: np.ndarray, misfit: float = 0.1, displaced: float = 0.04) -> calibration.MeasuredRadii:
     """A view whose radii are all 1, and whose points are so far off."""
     one = np.ones(len(off))
     errors = RegistrationErrors(np.abs(off), np.abs(off), one, 0 * one, one > 0)
-    return MeasuredRadii(errors, misfit, displaced, half=20.0)
+    return calibration.MeasuredRadii(errors, misfit, displaced, half=20.0)
 
 
 def test_a_scale_is_measured_on_all_clean_views() -> None:
-    """Those that are elsewhere too; of noisy ones only on those that are not, and on too few views not at all."""
     rng = np.random.default_rng(0)
     right = [measured(rng.normal(size=200)) for _ in range(20)]
     elsewhere = measured(30.0 + rng.random(200))
-    views = ViewRadii()
-    views.clean[0].extend(right[: LEAST - 1])
-    views.noisy[1].extend([*right[:LEAST], elsewhere])
-    alone = RegistrationErrors.together([one.errors for one in right[:LEAST]]).scale()
+    views = calibration.ViewRadii()
+    views.clean[0].extend(right[: calibration.LEAST - 1])
+    views.noisy[1].extend([*right[: calibration.LEAST], elsewhere])
+    alone = RegistrationErrors.together([one.errors for one in right[: calibration.LEAST]]).scale()
     assert views.fields() == {"noisy_draws_radius_scale": pytest.approx(alone)}
-    views.clean[0].extend([*right[LEAST - 1 :], elsewhere])
+    views.clean[0].extend([*right[calibration.LEAST - 1 :], elsewhere])
     fields = views.fields()
     assert fields["radius_scale"] > 2.2 > 1.96 > alone - 0.3  # 99 % and more of the right ones
     assert (fields["usual_misfit"], fields["usual_displaced"]) == (0.1, 0.04)
@@ -197,7 +185,7 @@ def test_a_frame_that_is_misfitted_or_where_the_network_is_elsewhere_has_wider_r
     rng = np.random.default_rng(0)
     right = [measured(rng.normal(size=400)) for _ in range(18)]
     lost = [measured(3.0 * rng.normal(size=400), misfit=0.2), measured(4.0 + rng.random(400), displaced=0.4)]
-    factors = factors_of([*right, *lost])
+    factors = calibration.factors_of([*right, *lost])
     assert factors.scale == pytest.approx(1.96, rel=0.05)
     plain = RegistrationErrors.together([one.errors for one in (*right, *lost)]).scale()
     assert plain > 4.0

@@ -1,16 +1,34 @@
-"""Batches: augmentation moves everything together, and every batch depends on its generator alone."""
+"""Batches depend on their generator alone; augmentation moves all together; further observations and their training."""
 
+import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
-from observed_views import observed
 from safetensors.torch import load_file
-from toy_data import write_toy_dataset
+from small_training import SMALL
+from toy_data import half_balls, read_all, write_toy_dataset
 
-from mereo_learning.config import AugmentConfig
-from mereo_learning.dataset import Dataset, Draws, augment_batch, choose_points, shuffled_index
+from mereo.models.weights import load_model
+from mereo_learning import trainer
+from mereo_learning.config import PRESETS, AugmentConfig
+from mereo_learning.dataset import (
+    Batch,
+    Dataset,
+    Draws,
+    augment_batch,
+    choose_points,
+    draw_observations,
+    shuffled_index,
+)
+from mereo_learning.metrics_log import FIELDS, SENSOR_FIELDS
+from mereo_learning.run_directory import fit_config
+from mereo_learning.validation import choose_offsets, held_out, validate
+
+pytestmark = pytest.mark.usefixtures("without_curves")
 
 NONE = AugmentConfig()
 FULL = AugmentConfig(keep_points=(0.4, 0.9), hole_probability=1.0, jitter_std=0.01, roll=True)
@@ -34,6 +52,15 @@ def test_the_size_of_what_is_seen_is_known_where_the_unit_is(tmp_path: Path) -> 
 
 def rng(seed: int = 0) -> Draws:
     return Draws.of(seed)
+
+
+def observed(generator: np.random.Generator, points: int, queries: int) -> dict[str, np.ndarray]:
+    """Half balls, and three halves of their cloud, of which the last has fewer points."""
+    row = half_balls(generator, points, queries)
+    cloud, half = row["cloud"], points // 2
+    parts = [cloud[:half], cloud[-half:], cloud[10:40]]
+    seen = np.stack([part[np.arange(points) % len(part)] for part in parts]).astype(np.float16)
+    return row | {"seen": seen, "seen_count": np.array([len(part) for part in parts], dtype=np.int32)}
 
 
 def test_without_augmentation_a_batch_is_the_stored_data(data: Dataset) -> None:
@@ -87,7 +114,6 @@ def test_augmented_cloud_fills_the_unit_box_and_camera_stays_in_front(data: Data
 
 
 def test_roll_is_a_rigid_motion_about_the_optical_axis(data: Dataset) -> None:
-    """Distances keep their ratios, depth order is unchanged, and directions still end where they did on the surface."""
     plain = data.batch(torch.arange(6), 96, 0, NONE, rng())
     rolled = augment_batch(plain, AugmentConfig(roll=True), rng(1))
 
@@ -128,3 +154,105 @@ def test_domain_holds_every_segment_point_with_a_margin(data: Dataset) -> None:
     extent = occupied.amax(dim=0) - occupied.amin(dim=0)
     assert torch.allclose(occupied.amin(dim=0) - low, 0.15 * extent, atol=1e-5)
     assert torch.allclose(high - occupied.amax(dim=0), 0.15 * extent, atol=1e-5)
+
+
+# --- further observations ---------------------------------------------------------------------------------------------
+
+
+KINDS = 3
+FIRST = torch.zeros(8, dtype=torch.long)
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The same examples without and with further observations."""
+    folder = tmp_path_factory.mktemp("toy")
+    seen = write_toy_dataset(folder / "seen", example=observed)
+    return write_toy_dataset(folder / "plain"), seen
+
+
+@pytest.fixture(scope="module")
+def pair(folders: tuple[Path, Path]) -> tuple[Dataset, Dataset]:
+    return Dataset.load(folders[0]), Dataset.load(folders[1])
+
+
+def batch_of(data: Dataset, probability: float, observation: torch.Tensor | None = None, seed: int = 0) -> Batch:
+    augment = AugmentConfig(observations=probability, keep_points=(0.7, 1.0), jitter_std=0.003)
+    return data.batch(torch.arange(8), 48, 32, augment, rng(seed), observation)
+
+
+def assert_same(one: Batch, other: Batch) -> None:
+    for name in ("cloud", "viewpoint", "positions", "labels", "distances", "directions"):
+        assert torch.equal(getattr(one, name), getattr(other, name)), name
+
+
+def test_a_batch_depends_on_its_generator_and_at_probability_0_on_no_further_one(pair: tuple[Dataset, Dataset]) -> None:
+    plain, seen = pair
+    assert (plain.further, seen.further) == (0, KINDS)
+    for seed in range(3):
+        assert_same(batch_of(seen, 0.0, seed=seed), batch_of(plain, 0.5, seed=seed))
+    assert_same(batch_of(seen, 1.0, FIRST), batch_of(plain, 1.0))
+    assert_same(batch_of(pair[1], 0.5, seed=4), batch_of(pair[1], 0.5, seed=4))
+    assert not torch.equal(batch_of(pair[1], 0.5, seed=4).cloud, batch_of(pair[1], 0.5, seed=5).cloud)
+
+
+def test_further_ones_are_seen_as_often_as_asked_and_by_default_in_half_of_the_draws() -> None:
+    drawn = draw_observations(300, KINDS, 1.0, rng())
+    assert set(drawn.tolist()) == {1, 2, 3} and torch.bincount(drawn)[1:].min() > 70
+    counts = torch.bincount(draw_observations(3000, KINDS, AugmentConfig().observations, rng()))
+    assert abs(counts[0] / 3000 - 0.5) < 0.05 and counts[1:].min() > 400
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_queries_and_cloud_stay_in_one_frame(pair: tuple[Dataset, Dataset], number: int) -> None:
+    """The box is normalized anew, so distances between queries, cloud and camera keep their ratios to the stored."""
+    seen = read_all(pair[1])
+    found = pair[1].batch(torch.arange(8), 96, 0, AugmentConfig(), rng(), FIRST + number)
+    assert torch.allclose((found.cloud.amax(dim=1) - found.cloud.amin(dim=1)).amax(dim=1), torch.full((8,), 2.0))
+    count = int(seen.seen_count[0, number - 1])
+    stored = seen.seen[:8, number - 1, :count].float()
+    scale = (found.positions[:, 0] - found.positions[:, 1]).norm(dim=-1) / (
+        seen.positions[:8, 0] - seen.positions[:8, 1]
+    ).norm(dim=-1)
+    for now, then in (
+        (found.positions[:, :5] - found.viewpoint[:, None], seen.positions[:8, :5] - seen.viewpoint[:8, None]),
+        (found.cloud[:, :count] - found.viewpoint[:, None], stored - seen.viewpoint[:8, None]),
+        (found.distances, seen.distances[:8]),
+    ):
+        assert torch.allclose(now, then * scale.view(-1, *[1] * (then.dim() - 1)), rtol=1e-4, atol=1e-3)
+
+
+def test_a_run_scores_sensors_apart_and_says_what_it_saw(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    headers, models = [], []
+    for folder in folders:
+        run = tmp_path / folder.name
+        models.append(load_model(trainer.train(folder, run, replace(SMALL, epochs=0.3))))
+        with (run / "metrics.csv").open() as file:
+            reader = csv.DictReader(file)
+            rows = list(reader)
+        headers.append(tuple(reader.fieldnames or ()))
+        recipe = json.loads((run / "config.json").read_text())["train"]
+        assert recipe["augment"].get("observations") == (0.5 if folder.name == "seen" else None)
+    assert headers == [FIELDS, FIELDS + SENSOR_FIELDS]
+    assert 0 <= float(rows[-1]["sensor_iou"]) <= 1 and 0 <= float(rows[-1]["sensor_miou"]) <= 1
+    assert models[1].provenance["recipe"]["augment"]["observations"] == 0.5  # type: ignore[index]
+
+
+def test_held_out_scores_and_offsets_are_of_the_first_cloud(pair: tuple[Dataset, Dataset]) -> None:
+    plain, seen = pair
+    config = fit_config(replace(SMALL, offset_examples=8), seen)
+    network = trainer.start_network(config, seen)
+    manifest = {**seen.manifest, "settings": {"sampling": {"per_segment": 32}}}
+    plain, seen = (replace(item, manifest=manifest) for item in (plain, seen))
+    assert validate(network, seen, config).iou == validate(network, plain, config).iou
+    first, other = (choose_offsets(network, item, config) for item in (seen, plain))
+    assert first is not None and other is not None and torch.equal(first, other)
+    assert len(held_out(seen, config)) > KINDS
+    assert validate(network, seen, config, further=True).iou != validate(network, seen, config).iou
+
+
+def test_an_autodecoder_sees_every_example_as_it_is(pair: tuple[Dataset, Dataset]) -> None:
+    """Its codes are of examples, not of clouds."""
+    assert fit_config(PRESETS["paper-autodecoder"], pair[1]).augment.observations == 0.0
+    assert fit_config(PRESETS["paper"], pair[1]).augment.observations == 0.5
+    assert fit_config(PRESETS["paper"], pair[0]).augment.observations == 0.0

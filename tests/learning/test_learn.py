@@ -1,44 +1,40 @@
-"""``mereo learn``: the plan is arithmetic, each stage leaves something whole, and the same command continues it."""
+"""``mereo learn``: the plan is arithmetic, each stage leaves something whole; it trains what a search cannot answer."""
 
 import json
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from angle import write_angle
 from safetensors.torch import load_file
 from scene_files import write_bar
 
+import mereo
+from mereo import __main__ as command_line
+from mereo.cli.options import loaded_object
 from mereo.fitting.draws.playback import DrawnStates
+from mereo.geometry.transforms import rigid, transform_points
 from mereo.io.config import InputConfig
 from mereo.io.sensor_frame import read_frame
 from mereo.models.weights import load_model
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import find_object, size_warning
-from mereo.scenes.files import check as checks
-from mereo.scenes.random_states import CACHE_VARIABLE
+from mereo.scenes.files import check
+from mereo.scenes.files.object_files import scene_of_folder
+from mereo.scenes.random_states import CACHE_VARIABLE, scene_model
 from mereo.scenes.registry import load_scene
 from mereo_learning import calibrate as calibration
 from mereo_learning import learn as learning
 from mereo_learning import search_stage, shards
+from mereo_learning.cases import nearest_truth
 from mereo_learning.config import PRESETS
-from mereo_learning.learn import (
-    LearnConfig,
-    Plan,
-    Rates,
-    check_object,
-    deformation,
-    epochs_for,
-    holdout,
-    learn,
-    plan_for,
-    scene_for,
-    views_for,
-    write_example_frame,
-)
+from mereo_learning.learn import LearnConfig, Plan, Rates, learn, plan_for
+from mereo_learning.search_stage import SearchScores, best_method, is_to_train, shortcomings
 from mereo_learning.trainer import Trainer
 
 BASE = PRESETS["base"]
@@ -48,7 +44,6 @@ LIGHT = replace(
 """The recipe with less to look at, which shipped weights fit all the same."""
 
 RATES = Rates(generate_s=0.05, train_s=0.04, score_s=0.02)
-NOTHING = "deformations:\n  - {type: squash, factor: [0.999, 1.001]}\n"
 
 
 # --- the plan ---------------------------------------------------------------------------------------------------------
@@ -61,10 +56,10 @@ def test_stages_fill_the_time_that_is_left(left_s: float, generate_s: float) -> 
     plan = plan_for(left_s, rates, "rope", 6)
     assert plan.generation_s + plan.training_s + plan.evaluation_s == pytest.approx(left_s, rel=0.02)
     assert plan.evaluation_s == pytest.approx(learning.EVALUATION_SHARE * left_s)
-    steps = plan.epochs * (plan.examples - holdout(plan.examples)) / 6
+    steps = plan.epochs * (plan.examples - learning.holdout(plan.examples)) / 6
     assert steps == pytest.approx(round(steps))
     # the tail is in it: what is expected of training is its steps and its scores, and some more
-    scores_s = (20 * holdout(plan.examples) + min(learning.OFFSET_EXAMPLES, plan.examples)) * rates.score_s
+    scores_s = (20 * learning.holdout(plan.examples) + min(learning.OFFSET_EXAMPLES, plan.examples)) * rates.score_s
     assert learning.MARGIN * plan.training_s == pytest.approx(6 * steps * rates.train_s + scores_s)
 
 
@@ -72,9 +67,9 @@ def test_no_time_gives_the_least_and_late_examples_leave_less_training() -> None
     plan = plan_for(-5.0, RATES, "rope", 6)
     assert plan.evaluation_s == 0
     assert plan.examples == learning.LEAST_EXAMPLES and plan.epochs * (plan.examples - 6) >= plan.examples - 6
-    on_time, late = (epochs_for(left_s, RATES, "rope", 1000, 6) for left_s in (300, 150))
+    on_time, late = (learning.epochs_for(left_s, RATES, "rope", 1000, 6) for left_s in (300, 150))
     assert 1 <= late.epochs < on_time.epochs
-    assert [views_for(100, 2.0), views_for(0, 2.0), views_for(1e9, 2.0)] == [50, 4, 64]
+    assert [learning.views_for(100, 2.0), learning.views_for(0, 2.0), learning.views_for(1e9, 2.0)] == [50, 4, 64]
 
 
 # --- the object -------------------------------------------------------------------------------------------------------
@@ -84,43 +79,43 @@ def test_meshes_get_a_scene_file_once(tmp_path: Path, capsys: pytest.CaptureFixt
     write_bar(tmp_path)
     meshes = [tmp_path / "left.stl", tmp_path / "right.stl"]
     (tmp_path / "out").mkdir()
-    path = Path(scene_for(meshes, tmp_path / "out", "mm"))
+    path = Path(learning.scene_for(meshes, tmp_path / "out", "mm"))
     assert "as a soft elastic solid, for its parts touch in planes alone" in capsys.readouterr().out
     scene = load_scene(path)
     assert scene.name == "left" and scene.rest.names == ("left", "right")
     path.write_text(re.sub(r"motion: \S+", "motion: 0.1", path.read_text()))  # a user's change is kept
     changed = path.read_text()
-    assert scene_for(meshes, tmp_path / "out", "mm") == str(path) and path.read_text() == changed
-    assert scene_for([tmp_path / "bar.yaml"], tmp_path, None) == str(tmp_path / "bar.yaml")
+    assert learning.scene_for(meshes, tmp_path / "out", "mm") == str(path) and path.read_text() == changed
+    assert learning.scene_for([tmp_path / "bar.yaml"], tmp_path, None) == str(tmp_path / "bar.yaml")
     for files, units, message in (
         ([], None, "no object is given; name a scene file, or its meshes"),
         ([tmp_path / "bar.yaml"], "mm", "--units is mm, but .* says its own"),
     ):
         with pytest.raises(ValueError, match=message):
-            scene_for(files, tmp_path, units)
+            learning.scene_for(files, tmp_path, units)
 
 
 def test_what_hardly_deforms_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    scene = write_bar(tmp_path, NOTHING)
-    check_object([scene], None)
+    scene = write_bar(tmp_path, "deformations:\n  - {type: squash, factor: [0.999, 1.001]}\n")
+    learning.check_object([scene], None)
     assert "warning: bar hardly deforms: by 0.0" in capsys.readouterr().out
-    assert deformation(load_scene(scene)) < 0.001
-    assert deformation(load_scene(write_bar(tmp_path))) > 0.006
+    assert (
+        learning.deformation(load_scene(scene)) < 0.001
+        and learning.deformation(load_scene(write_bar(tmp_path))) > 0.006
+    )
 
 
 def test_a_faulty_object_is_refused_with_what_may_mend_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(checks, "STATES", 3)
-    path = write_bar(tmp_path)
-    (tmp_path / "right.stl").write_bytes((tmp_path / "left.stl").read_bytes())
-    with pytest.raises(ValueError, match=r"bar.yaml --repair` try, and learn .*bar-repaired.yaml"):
-        learn([path], tmp_path / "out")
-    meshes = [tmp_path / "left.stl", tmp_path / "right.stl"]
-    with pytest.raises(
-        ValueError, match=r"let `mereo scene new .*right.stl --output left.yaml` and `mereo scene check"
+    monkeypatch.setattr(check, "STATES", 3)
+    path, meshes = write_bar(tmp_path), [tmp_path / "left.stl", tmp_path / "right.stl"]
+    meshes[1].write_bytes(meshes[0].read_bytes())
+    for files, message in (
+        ([path], r"bar.yaml --repair` try, and learn .*bar-repaired.yaml"),
+        (meshes, r"let `mereo scene new .*right.stl --output left.yaml` and `mereo scene check"),
+        ([tmp_path / "none.stl"], "none.stl does not exist"),
     ):
-        learn(meshes, tmp_path / "out")
-    with pytest.raises(FileNotFoundError, match="none.stl does not exist"):
-        learn([tmp_path / "none.stl"], tmp_path / "out")
+        with pytest.raises((ValueError, FileNotFoundError), match=message):
+            learn(files, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -145,7 +140,7 @@ def test_arguments_bind_once_something_is_made_of_them(tmp_path: Path) -> None:
 
 def test_the_example_frame_is_as_long_as_the_object(tmp_path: Path) -> None:
     scene = load_scene(write_bar(tmp_path))
-    text = write_example_frame(scene, tmp_path / "frame.ply")
+    text = learning.write_example_frame(scene, tmp_path / "frame.ply")
     assert "in metres" in text and b"comment unit: metres" in (tmp_path / "frame.ply").read_bytes()
     seen = find_object(read_frame(tmp_path / "frame.ply", InputConfig(unit_m=1.0)), IsolationConfig())
     assert 0.01 < max(seen.size_m) < 0.06  # 40 mm at rest
@@ -172,17 +167,12 @@ def test_the_command_names_the_scene_where_it_is_not_built_in() -> None:
 # --- the whole --------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
 @pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch, without_turns: None, cache: Path) -> None:
+def small(monkeypatch: pytest.MonkeyPatch, without_turns: None, tmp_path_factory: pytest.TempPathFactory) -> None:
     """So little of everything that a run takes seconds."""
-    monkeypatch.setenv(CACHE_VARIABLE, str(cache))
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "models"))
     for module, name, value in (
-        (checks, "STATES", 3),
+        (check, "STATES", 3),
         (learning, "EXAMPLES", 12),
         (shards, "states_for", lambda _: 12),
         (DrawnStates, "of", partial(DrawnStates.of, count=30)),
@@ -205,10 +195,6 @@ def small(monkeypatch: pytest.MonkeyPatch, without_turns: None, cache: Path) -> 
         (search_stage, "LEAST_VIEWS", 1),
     ):
         monkeypatch.setattr(module, name, value)
-
-
-def learnt(folder: Path) -> dict[str, torch.Tensor]:
-    return load_file(folder / "weights.safetensors")
 
 
 def test_one_command_and_the_same_again(
@@ -236,23 +222,12 @@ def test_one_command_and_the_same_again(
     assert learn([scene], out, LearnConfig(minutes=0.05, init="rope", train="always")) == scores
     assert (out / "weights.safetensors").read_bytes() == calibrated
     assert before == {path: path.stat().st_mtime_ns for path in (out / "data").glob("shard-*")}
-    for arguments, message in (
-        (
-            {"minutes": 1.0, "init": "rope"},
-            r"was begun with minutes = 0.05, not 1.0; .* repeat those, or choose another --output",
-        ),
-        ({"minutes": 0.05, "init": "skull"}, "was begun with init = 'rope', not 'skull'"),
+    for minutes, init, message in (
+        (1.0, "rope", r"was begun with minutes = 0.05, not 1.0; .* repeat those, or choose another --output"),
+        (0.05, "skull", "was begun with init = 'rope', not 'skull'"),
     ):
         with pytest.raises(ValueError, match=message):
-            learn([scene], out, LearnConfig(**arguments))  # type: ignore[arg-type]
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "mine.txt").write_text("mine")
-    with pytest.raises(FileExistsError, match="is not empty and holds no config.json"):
-        learn([scene], tmp_path / "full", LearnConfig(minutes=0.05))
-
-
-def _stop(*_: object, **__: object) -> None:
-    raise KeyboardInterrupt
+            learn([scene], out, LearnConfig(minutes=minutes, init=init))
 
 
 @pytest.mark.slow
@@ -269,22 +244,222 @@ def test_the_nearest_weights_are_those_that_adapt_fastest(
 
 @pytest.mark.slow
 def test_killed_at_any_stage_it_ends_with_the_same_weights(small: None, tmp_path: Path) -> None:
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
     scene, whole, parts = write_bar(tmp_path), tmp_path / "whole", tmp_path / "parts"
-    learn([scene], whole, LearnConfig(minutes=0.05, init="rope", train="always"))
-    stops: list[tuple[object, str, Callable[..., None]]] = [
-        (learning, "search_scores", _stop),
-        (learning, "measure", _stop),
-        (learning, "generate", _stop),
-        (Trainer, "save", _stop),
-        (learning, "evaluate_weights", _stop),
-        (learning, "scores_of_views", _stop),
-        (learning, "write_example_frame", _stop),
-    ]
-    for owner, name, stop in stops:
+    config = LearnConfig(minutes=0.05, init="rope", train="always")
+    learn([scene], whole, config)
+    stages = "search_scores measure generate save evaluate_weights scores_of_views write_example_frame"
+    for name in stages.split():
         with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
-            patch.setattr(owner, name, stop)
-            learn([scene], parts, LearnConfig(minutes=0.05, init="rope", train="always"))
+            patch.setattr(Trainer if name == "save" else learning, name, stop)
+            learn([scene], parts, config)
         assert not [place for place in parts.rglob(".*") if place.name.endswith(".mereo")]
-    learn([scene], parts, LearnConfig(minutes=0.05, init="rope", train="always"))
-    ours, theirs = learnt(whole), learnt(parts)
+    learn([scene], parts, config)
+    ours, theirs = (load_file(folder / "weights.safetensors") for folder in (whole, parts))
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+
+
+# --- trained is only what the search does not answer well -------------------------------------------------------------
+
+
+GOOD = {"examples": 16, "iou": 0.96, "miou_up_to_symmetry": 0.92, "lowest_miou": 0.8, "explained": 1.0, "seconds": 1.5}
+
+ROWS: dict[str, dict[str, Any]] = {
+    "search": {"iou": 0.96, "miou_up_to_symmetry": 0.90, "explained": 1.0, "seconds": 1.5},
+    "network": {"iou": 0.80, "miou_up_to_symmetry": 0.70, "seconds": 0.5},
+    "both": {"iou": 0.96, "miou_up_to_symmetry": 0.905, "explained": 1.0, "seconds": 0.8},
+}
+
+
+def scores_of(hits: list[int], explained: list[bool]) -> SearchScores:
+    """Scores of views of an object in two segments, of which so many of 100 cells each are answered rightly."""
+    confusions = [[[500, 0, 0], [100 - hit, hit, 0], [100 - hit, 0, hit]] for hit in hits]
+    views = zip(confusions, explained, strict=True)
+    return SearchScores(("a", "b"), [{"confusion": c, "explained": e, "seconds": 0.5} for c, e in views])
+
+
+# --- the decision -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "changed, reasons",
+    [
+        ({}, []),
+        ({"miou_up_to_symmetry": 0.85, "lowest_miou": 0.5}, []),
+        ({"explained": 15 / 16}, ["1 of 16 views are not explained"]),
+        ({"miou_up_to_symmetry": 0.849}, ["mIoU 0.849 is below 0.85"]),
+        ({"lowest_miou": 0.2}, ["mIoU of the worst view, 0.200, is below 0.5"]),
+    ],
+)
+def test_the_search_is_good_enough_by_stated_numbers(changed: dict[str, float], reasons: list[str]) -> None:
+    assert shortcomings({**GOOD, **changed}) == reasons
+    assert [is_to_train(choice, reasons) for choice in ("auto", "always", "never")] == [bool(reasons), True, False]
+
+
+@pytest.mark.parametrize(
+    "changed, method, reason",
+    [
+        ({}, "auto", "as good as the search alone, and faster, 0.80 s a frame with both, 1.50 s with the search alone"),
+        ({"both": {"seconds": 2.0}}, "search", "as good as both, and faster, 2.00 s a frame with both, 1.50 s with"),
+        ({"both": {"miou_up_to_symmetry": 0.95}}, "auto", "mIoU 0.950, not 0.900 of the search alone"),
+        ({"both": {"miou_up_to_symmetry": 0.85}}, "search", "mIoU 0.900, not 0.850 of both"),
+        ({"search": {"explained": 0.5}}, "auto", "it explains more, 100% of the views by both, 50% by the search"),
+        ({"both": {"explained": 0.75}}, "search", "it explains more, 75% of the views by both, 100% by the search"),
+        ({"network": {"miou_up_to_symmetry": 0.98}}, "network", "mIoU 0.980, not 0.905 of both"),
+        ({"network": {"miou_up_to_symmetry": 0.91}}, "auto", "as good as the search alone"),
+        ({name: {"miou_up_to_symmetry": None} for name in ROWS}, "auto", "as good as the search alone"),
+    ],
+)
+def test_the_best_answer_is_the_fastest_of_equals(changed: dict[str, dict[str, Any]], method: str, reason: str) -> None:
+    best, sentence = best_method({name: {**row, **changed.get(name, {})} for name, row in ROWS.items()})
+    titles = {"auto": "both", "search": "the search alone", "network": "the network alone"}
+    assert best == method and sentence.startswith(f"use {titles[method]}: {reason}")
+
+
+# --- the scores -------------------------------------------------------------------------------------------------------
+
+
+def test_scores_are_of_all_views_together() -> None:
+    scores = scores_of([100, 60], [True, False])
+    facts = {"examples": 2, "iou": 0.8, "miou": 0.8, "lowest_miou": 0.6, "explained": 0.5, "seconds": 0.5}
+    assert scores.summary() == {**facts, "miou_up_to_symmetry": 0.8}
+    assert search_stage.search_line(scores) == (
+        "search alone, without training: IoU 0.800, mIoU 0.800 on 2 test views, 1 of them explained, 0.50 s a frame"
+    )
+
+
+def test_segments_that_no_frame_tells_apart_are_right_either_way() -> None:
+    right, exchanged = [[500, 0, 0], [4, 96, 0], [4, 0, 96]], [[500, 0, 0], [4, 0, 96], [4, 96, 0]]
+    views = [{"confusion": each, "explained": True, "seconds": 0.5} for each in (right, exchanged)]
+    summary = SearchScores(("a", "b"), views, ((1, 0),)).summary()
+    assert (summary["miou_up_to_symmetry"], summary["lowest_miou"]) == (0.96, 0.96) and summary["miou"] < 0.5
+    assert shortcomings(summary) == [] and shortcomings(SearchScores(("a", "b"), views).summary())
+    assert "(0.960 up to symmetry)" in search_stage.search_line(SearchScores(("a", "b"), views, ((1, 0),)))
+
+
+def test_time_ends_the_views_but_not_before_the_least_and_begun_ones_are_kept(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made: list[int] = []
+
+    def scored(scene: object, registrar: object, cells: int, index: int) -> dict[str, Any]:
+        made.append(index)
+        return {"confusion": np.eye(9, dtype=int).tolist(), "explained": True, "seconds": 0.1}
+
+    monkeypatch.setattr(search_stage, "_scored", scored)
+    monkeypatch.setattr(search_stage, "kept_model", lambda scene: mereo.load_model("rope").statistical_model)
+    scene = mereo.load_scene("rope")
+    begun = search_stage.score_search(scene, views=5, least=2, budget_s=-1.0)
+    assert len(begun.views) == 2 and made == [0, 1]
+    assert len(search_stage.score_search(scene, views=4, begun=begun).views) == 4 and made == [0, 1, 2, 3]
+    assert "score the search: 2 views in" in capsys.readouterr().err
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def scored(monkeypatch: pytest.MonkeyPatch) -> list[SearchScores]:
+    given = [scores_of([100, 90], [True, True])]
+    monkeypatch.setattr(search_stage, "score_search", lambda scene, **_: given[-1])
+    monkeypatch.setattr(learning, "check_object", lambda files, units: None)
+    return given
+
+
+def _trained(*_: object) -> None:
+    raise InterruptedError
+
+
+def test_the_scores_decide_whether_anything_is_trained(
+    scored: list[SearchScores], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(learning, "_train", _trained)
+    scene, out = write_bar(tmp_path), tmp_path / "out"
+    metrics = learn([scene], out)
+    said = capsys.readouterr().out
+    assert metrics["method"] == "search" and not metrics["trained"] and metrics["miou"] == 0.95
+    assert json.loads((out / "metrics.json").read_text()) == metrics
+    assert "nothing is trained: the search alone is good enough (every view is explained, mIoU is 0.85 or more" in said
+    assert f"A network may still be faster: mereo learn {scene} --output {out} --train always" in said
+    assert f"mereo reconstruct {out}/frame.ply --object {out} --output {out}/result" in said
+    assert {path.name for path in out.iterdir()} == {"config.json", "search.json", "metrics.json", "frame.ply"}
+    scored.append(scores_of([100, 10], [True, False]))
+    assert learn([scene], out) == metrics  # what was scored is kept
+    with pytest.raises(InterruptedError):
+        learn([scene], out, LearnConfig(train="always"))
+    assert "it is trained: --train is always" in capsys.readouterr().out
+    with pytest.raises(InterruptedError):
+        learn([scene], tmp_path / "bad")
+    assert "the search alone is not good enough, 1 of 2 views are not explained, mIoU 0.5" in capsys.readouterr().out
+    assert not learn([scene], tmp_path / "bad", LearnConfig(train="never"))["trained"]
+    said = capsys.readouterr().out
+    assert "nothing is trained, as --train is never; the search alone is not good enough: 1 of 2 views" in said
+    assert "A network may help: mereo learn" in said
+
+
+def test_what_is_begun_with_other_words_is_refused(scored: list[SearchScores], tmp_path: Path) -> None:
+    scene, out = write_bar(tmp_path), tmp_path / "out"
+    learn([scene], out)
+    (out / "plan.json").write_text("{}")
+    with pytest.raises(ValueError, match=r"was trained, or begun to be, but --train is never: leave it out"):
+        learn([scene], out, LearnConfig(train="never"))
+    (out / "plan.json").unlink()
+    write_bar(tmp_path, "deformations:\n  - {type: squash, factor: [0.5, 0.9]}\n")
+    with pytest.raises(ValueError, match=r"was begun with another object or other deformations than bar has now"):
+        learn([scene], out)
+    write_bar(tmp_path)
+    (out / "search.json").write_text("[]")
+    with pytest.raises(ValueError, match=r"search.json holds no scores; remove it, and they are made again"):
+        learn([scene], out)
+
+
+def test_a_folder_knows_its_scene(scored: list[SearchScores], tmp_path: Path) -> None:
+    scene, out = write_bar(tmp_path), tmp_path / "out"
+    learn([scene], out)
+    assert scene_of_folder(out) == str(scene) and scene_of_folder(tmp_path) is None
+    content = json.loads((out / "search.json").read_text())
+    (out / "search.json").write_text(json.dumps({**content, "scene": "mine.py"}))  # never run by a folder's word
+    assert scene_of_folder(out) is None
+    assert "--object mine.py" in learning.command(out, "mine.py", is_trained=False)
+
+
+def test_a_folder_is_an_object(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    for module, name, value in (
+        (search_stage, "LEAST_VIEWS", 1),
+        (search_stage, "VIEWS", 1),
+        (learning, "search_scores", partial(search_stage.search_scores, cells=24)),
+        (check, "STATES", 3),
+    ):
+        monkeypatch.setattr(module, name, value)
+    out, meshes = tmp_path / "out", [str(path) for path in write_angle(tmp_path)]
+    command = ["learn", *meshes, "--units", "mm", "--train", "never", "--output", str(out)]
+    assert command_line.main(command) == 0
+    said, scores = capsys.readouterr().out, (out / "search.json").read_bytes()
+    assert re.findall(r"\[(\d)/6\]", said) == ["1", "2"]
+    assert "1 test views, which training has not seen" in said and "nothing is trained" in said
+    assert f"--object {out} --output" in said
+    assert command_line.main(command) == 0
+    assert (out / "search.json").read_bytes() == scores
+    assert 0.5 < json.loads((out / "metrics.json").read_text())["iou"] <= 1
+    angle = loaded_object([str(out)], None)  # as every command with --object has it
+    assert angle.network is None and angle.names == ("long", "short")
+
+
+def test_radii_are_measured_against_the_nearest_of_the_truths_that_no_frame_tells_apart(tmp_path: Path) -> None:
+    scene = load_scene(str(write_bar(tmp_path, "deformations: stiff\n")))
+    model = scene_model(scene, 12)
+    assert model.swaps == ((1, 0),)
+    T = rigid(np.eye(3), np.array([0.0, 0.0, 150.0]))
+    truth = transform_points(T, model.rest_points)
+    over_end = next(each for each in model.symmetries if each.swaps)
+    turned = transform_points(T @ over_end.turn, model.rest_points)  # the answer has taken each half for the other
+    for material in (truth, turned):
+        nearest = nearest_truth(model, material, truth)
+        assert np.linalg.norm(nearest - material, axis=1).max() < 0.5, "as much as the turn that was settled is off"
+    part = truth[:10]
+    assert nearest_truth(model, turned, part) is part

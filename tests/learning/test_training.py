@@ -1,28 +1,44 @@
-"""Training: it learns, and stopping, resuming or sharing the work changes nothing."""
+"""Training: it learns, and stopping, resuming or sharing the work changes nothing, or says why it cannot go on."""
 
 import csv
+import errno
 import json
+import math
 import os
+import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 from small_training import SMALL, TRANSFORMER
 from toy_data import NAMES, write_toy_dataset
+from training_runs import diverge_at, kill_after
 from two_balls import front
 
+from mereo import __main__ as command_line
 from mereo.geometry.metrics import confusion_matrix, intersection_over_union
 from mereo.models.weights import load_model
-from mereo_learning import trainer
+from mereo_learning import metrics_log, trainer
 from mereo_learning.config import PRESETS, AugmentConfig, TrainConfig
 from mereo_learning.dataset import Dataset
 from mereo_learning.run_directory import claim_run, describe_seen, seen_by, seen_in_training, start_network
 from mereo_learning.validation import class_offsets
 
-pytestmark = pytest.mark.usefixtures("without_curves")
+BRIEF = replace(SMALL, epochs=0.6)  # five steps
+DRAW = metrics_log.draw_curves
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _quick_curves() -> Iterator[None]:
+    """Curves that tell of how many rows they are."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(metrics_log, "draw_curves", lambda rows, path: path.write_bytes(b"row " * len(rows)))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -33,14 +49,13 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def finished(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that has ended; not to be changed."""
-    run = tmp_path_factory.mktemp("finished") / "run"
-    trainer.train(dataset, run, SMALL)
-    return run
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(metrics_log, "draw_curves", DRAW)
+        return trainer.train(dataset, tmp_path_factory.mktemp("finished") / "run", SMALL).parent
 
 
 @pytest.fixture(scope="module")
 def first(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Weights of a short run."""
     return trainer.train(dataset, tmp_path_factory.mktemp("first") / "run", replace(SMALL, epochs=0.2))
 
 
@@ -49,13 +64,6 @@ def test_a_finished_run_is_left_alone_and_not_continued_with_other_settings(data
     assert trainer.train(dataset, finished, SMALL).read_bytes() == first
     with pytest.raises(ValueError, match=r"another train setting learning_rate \(0\.004 instead of 0\.1\)"):
         trainer.train(dataset, finished, replace(SMALL, learning_rate=0.1))
-
-
-def test_a_directory_with_other_things_is_not_a_run(dataset: Path, tmp_path: Path) -> None:
-    (tmp_path / "thesis.tex").write_text("precious")
-    with pytest.raises(FileExistsError, match=r"is not empty and holds no config\.json"):
-        trainer.train(dataset, tmp_path, SMALL)
-    assert os.listdir(tmp_path) == ["thesis.tex"]
 
 
 def test_run_directory_tells_the_story(finished: Path) -> None:
@@ -117,25 +125,21 @@ def test_every_loss_variant_trains_and_answers(dataset: Path, tmp_path: Path, lo
 
 
 def test_training_starts_from_given_weights(dataset: Path, first: Path, tmp_path: Path) -> None:
-    """Without any step, the network is that of the weights; other networks are refused."""
     data, config = Dataset.load(dataset), replace(SMALL, init=str(first))
-    network = start_network(config, data)
-    assert all(torch.equal(v, load_file(first)[k]) for k, v in network.state_dict().items())
     other_counts = config.network.changed(points=48, neighbors=6)  # the same weights fit
-    network = start_network(replace(config, network=other_counts), data)
-    assert all(torch.equal(v, load_file(first)[k]) for k, v in network.state_dict().items())
-    assert network.config == other_counts
-    with pytest.raises(ValueError, match="another network setting sight_neighbors"):
-        start_network(replace(config, network=config.network.changed(sight_neighbors=0)), data)
-    with pytest.raises(ValueError, match="another network setting width"):
-        start_network(replace(config, network=config.network.changed(width=32)), data)
+    for settings in (config.network, other_counts):
+        network = start_network(replace(config, network=settings), data)
+        assert network.config == settings
+        assert all(torch.equal(value, load_file(first)[key]) for key, value in network.state_dict().items())
+    for changed in ({"sight_neighbors": 0}, {"width": 32}):
+        with pytest.raises(ValueError, match=f"another network setting {next(iter(changed))}"):
+            start_network(replace(config, network=config.network.changed(**changed)), data)
     with pytest.raises(FileNotFoundError, match="no weights 'lost'"):
         trainer.train(dataset, tmp_path / "second", replace(config, init="lost"))
     assert not (tmp_path / "second").exists()
 
 
 def test_training_starts_from_another_objects_weights(dataset: Path, first: Path) -> None:
-    """All that is not about segments is taken; segments and template are new."""
     data = Dataset.load(dataset)
     manifest = data.manifest | {"segments": [{"name": "whole", "color": [1, 2, 3]}]}
     data = replace(data, manifest=manifest, template=torch.rand(1, 64, 64, 64))
@@ -151,9 +155,7 @@ def test_training_starts_from_another_objects_weights(dataset: Path, first: Path
     assert len(same) > 40 and all(torch.equal(started[name], given[name]) for name in same)
 
 
-def test_only_the_first_process_claims_the_directory(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_the_first_process_claims_a_folder(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A process that comes while the first one writes the settings waits instead of refusing the directory."""
     data, waited = Dataset.load(dataset), []
     with pytest.raises(ValueError, match="batch of 8 cannot be shared by 3 processes"):
@@ -171,9 +173,9 @@ def test_only_the_first_process_claims_the_directory(
 
 def test_paper_preset_is_the_papers_recipe() -> None:
     paper = PRESETS["paper"]
-    assert paper == TrainConfig()
+    assert paper == TrainConfig() and paper.augment == AugmentConfig()
     assert (paper.batch, paper.learning_rate, paper.epochs, paper.l1_weight) == (40, 5e-4, 300.0, 100.0)
-    assert paper.augment == AugmentConfig() and paper.schedule == "constant" and paper.loss == "ce+l1"
+    assert paper.schedule == "constant" and paper.loss == "ce+l1"
     assert [preset for preset, recipe in PRESETS.items() if not recipe.learned_box] == ["paper", "paper-autodecoder"]
 
 
@@ -215,3 +217,122 @@ def test_a_rare_class_trained_as_if_common_is_drawn_smaller_and_what_is_right_is
     assert miou(fresh + offsets, truth) > miou(fresh, truth) + 0.01
     labels = torch.arange(3).repeat(50)
     assert torch.equal(class_offsets(5.0 * torch.nn.functional.one_hot(labels).float(), labels), torch.zeros(3))
+
+
+# --- ends and new beginnings ------------------------------------------------------------------------------------------
+
+
+FILES = ("weights.safetensors", "checkpoint.safetensors", "metrics.csv", "curves.png")
+
+
+@pytest.fixture(scope="module")
+def brief(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of five steps that has ended; not to be changed."""
+    return trainer.train(dataset, tmp_path_factory.mktemp("runs") / "whole", BRIEF).parent
+
+
+def files(run: Path) -> dict[str, bytes]:
+    return {name: (run / name).read_bytes() for name in FILES}
+
+
+@pytest.mark.parametrize("lost", ["weights.safetensors", "checkpoint.safetensors", "curves.png"])
+def test_what_a_finished_run_lacks_is_written(lost: str, dataset: Path, brief: Path, tmp_path: Path) -> None:
+    shutil.copytree(brief, tmp_path / "run")
+    (tmp_path / "run" / lost).unlink()
+    trainer.train(dataset, tmp_path / "run", BRIEF)
+    assert files(tmp_path / "run") == files(brief)
+
+
+def test_weights_of_an_earlier_step_are_replaced(dataset: Path, brief: Path, tmp_path: Path) -> None:
+    """As a run leaves them that is killed between its last checkpoint and its weights."""
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        kill_after(patch, 4)
+        trainer.train(dataset, tmp_path / "run", BRIEF, checkpoint_every_s=0.0)
+    shutil.copy(brief / "checkpoint.safetensors", tmp_path / "run")
+    trainer.train(dataset, tmp_path / "run", BRIEF)
+    assert (tmp_path / "run/weights.safetensors").read_bytes() == (brief / "weights.safetensors").read_bytes()
+
+
+@pytest.mark.parametrize("step", ["save_model", "save_checkpoint"])
+def test_a_disk_that_is_full_at_the_end_costs_nothing(
+    step: str, dataset: Path, brief: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left"):
+        patch.setattr(trainer, step, full)
+        trainer.train(dataset, tmp_path / "run", BRIEF)
+    trainer.train(dataset, tmp_path / "run", BRIEF)
+    assert files(tmp_path / "run") == files(brief)
+
+
+def test_lost_metrics_do_not_keep_a_finished_run_from_ending(dataset: Path, brief: Path, tmp_path: Path) -> None:
+    shutil.copytree(brief, tmp_path / "run")
+    (tmp_path / "run/metrics.csv").unlink()
+    trainer.train(dataset, tmp_path / "run", BRIEF)
+    assert (tmp_path / "run/metrics.csv").read_text().count("\n") == 2, "the titles and the last held-out scores"
+    assert (tmp_path / "run/weights.safetensors").read_bytes() == (brief / "weights.safetensors").read_bytes()
+    (tmp_path / "run/metrics.csv").write_text("step,loss\n1,high\n")
+    with pytest.raises(ValueError, match=r"metrics\.csv is not the table of a run \(.*'high'\); delete it"):
+        trainer.train(dataset, tmp_path / "run", BRIEF)
+
+
+@pytest.mark.parametrize("often", [0.0, 1e9])
+def test_a_resumed_run_leaves_the_same_files(often: float, dataset: Path, brief: Path, tmp_path: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        kill_after(patch, 3)
+        trainer.train(dataset, tmp_path / "run", BRIEF, checkpoint_every_s=0.0)
+    assert not list((tmp_path / "run").glob(".*"))  # a file being written has a hidden name
+    trainer.train(dataset, tmp_path / "run", BRIEF, checkpoint_every_s=often)
+    assert files(tmp_path / "run") == files(brief)
+
+
+@pytest.mark.parametrize(
+    ("loss", "gradient", "clip", "says"),
+    [
+        (math.nan, math.nan, 1.0, "the loss is nan in step 4 of 5"),
+        (0.0, math.inf, 0.0, "the gradient's norm is (inf|nan) in step 4 of 5"),
+    ],
+)
+def test_a_diverged_training_stops_and_keeps_what_was_good(
+    loss: float, gradient: float, clip: float, says: str, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = replace(BRIEF, clip_norm=clip, precision="bfloat16")
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        kill_after(patch, 2)
+        trainer.train(dataset, tmp_path / "run", config, checkpoint_every_s=0.0)
+    good = files(tmp_path / "run")
+    diverge_at(monkeypatch, 4, loss, gradient)
+    cure = "step 2 are kept: choose another --output and a --learning-rate below 0.004 or --precision float32"
+    with pytest.raises(ValueError, match=rf"{says}, on the examples \d+, .*{cure}, or check these examples"):
+        trainer.train(dataset, tmp_path / "run", config)
+    assert files(tmp_path / "run") == good
+
+
+def test_a_divergence_before_anything_is_saved_is_an_error_of_the_command(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    diverge_at(monkeypatch, 1, math.nan, math.nan)
+    command = f"train {dataset} --output {tmp_path / 'run'} --preset tiny --batch 8 --precision float32"
+    assert command_line.main(command.split()) == 2
+    message = capsys.readouterr().err
+    assert message.startswith("mereo: error: the loss is nan in step 1 of ") and message.count("\n") == 1
+    assert "nothing is saved" in message and "--precision" not in message
+    assert os.listdir(tmp_path / "run") == ["config.json"]
+
+
+def test_a_checkpoint_of_a_diverged_run_is_not_continued(dataset: Path, brief: Path, tmp_path: Path) -> None:
+    """Earlier versions wrote such ones."""
+    shutil.copytree(brief, tmp_path / "run")
+    spoil(tmp_path / "run/checkpoint.safetensors")
+    with pytest.raises(ValueError, match=r"checkpoint of step 5 in .*run holds numbers that are not finite"):
+        trainer.train(dataset, tmp_path / "run", BRIEF)
+
+
+def spoil(path: Path) -> None:
+    with safe_open(path, framework="pt") as file:
+        metadata = file.metadata()
+    tensors = load_file(path)
+    tensors["network/decoder.head.bias"].fill_(math.nan)
+    save_file(tensors, path, metadata=metadata)

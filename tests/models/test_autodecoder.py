@@ -92,7 +92,6 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def run(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """250 passes over twelve examples."""
     run = tmp_path_factory.mktemp("pairs") / "run"
     trainer.train(dataset, run, SMALL)
     return run
@@ -109,7 +108,6 @@ def data(dataset: Path) -> Dataset:
 
 
 def seen(dataset: Path, number: int) -> np.ndarray:
-    """The cloud of an example as a camera saw it."""
     shard = load_file(dataset / "shard-00000.safetensors")
     return (shard["cloud"][number] / shard["scale"][number] + shard["center"][number]).double().numpy()
 
@@ -188,14 +186,12 @@ def test_a_search_in_the_codes_spread_stays_among_codes_like_them() -> None:
 
 
 def test_killed_and_resumed_equals_uninterrupted(dataset: Path, tmp_path: Path) -> None:
-    """Codes, their momentum, the dropout masks and the averaged codes included."""
     config = replace(SMALL, batch=5, epochs=1.2, ema_decay=0.9, holdout=1)
     config = replace(config, network=config.network.changed(dropout=0.2, search_steps=3))
     assert_resumes_exactly(dataset, tmp_path, config, steps=2)
 
 
 def test_the_curve_shows_a_few_held_out_examples(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Never those with a trained code."""
     monkeypatch.setattr(validation, "SEARCHED", 2)
     config = replace(SMALL, holdout=5)
     assert validation.held_out(data, config) == range(7, 9)

@@ -54,7 +54,6 @@ def test_auto_takes_bfloat16_where_the_processor_gains_by_it(
 
 
 def cloud_file(folder: Path) -> Path:
-    """A blob of the bunny's size in front of the camera."""
     np.save(folder / "cloud.npy", np.random.default_rng(0).normal((0, 0, 0.6), 0.04, (600, 3)))
     return folder / "cloud.npy"
 
@@ -146,7 +145,6 @@ def test_the_processor_decides_and_no_clock(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.fixture
 def threads() -> Iterator[None]:
-    """Two threads of torch; their number is put back after the test."""
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     yield

@@ -147,7 +147,6 @@ def test_missing_packages_are_named_with_their_extra(tmp_path: Path, monkeypatch
 
 
 def raw_cloud(count: int, seed: int = 0) -> np.ndarray:
-    """In metres, a tenth of a metre wide, some points twice."""
     points = np.concatenate([seen(count - 5, seed), seen(count - 5, seed)[:5]])
     return np.random.default_rng(seed).permutation(0.05 * points.astype(np.float64) + [0.1, -0.2, 0.7])
 
@@ -250,7 +249,6 @@ runpy.run_path("mereo_onnx.py", run_name="__main__")
 
 @pytest.mark.slow
 def test_the_runner_answers_as_the_model_without_torch(exported: tuple[Model, Path]) -> None:
-    """The whole path from a raw cloud in metres, in another process."""
     model, folder = exported
     cloud = raw_cloud(3000)
     low, high = cloud.min(axis=0), cloud.max(axis=0)

@@ -1,15 +1,28 @@
-"""The network's structure: what it must ignore, what it must share, and its paper sizes."""
+"""The networks: what they must ignore, what they must share, the paper's equations and sizes, the template."""
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from torch import nn
+from shapes import one
+from torch import Tensor, nn
+from toy_scene import toy_scene
 
+from mereo.api.generate import generate
 from mereo.models.config import Loss, NetworkConfig, Supervision
-from mereo.models.decoder import FrequencyEncoding, Prediction
+from mereo.models.decoder import FrequencyEncoding, Prediction, RestLookup
+from mereo.models.encoders import PointTransformer, VectorAttention
 from mereo.models.model import fold_batch_norm
+from mereo.models.neighbors import nearest
 from mereo.models.network import Network
+from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH, rest_distances
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.config import GenerateConfig, SamplingConfig
+from mereo.synthesis.examples import synthesize
 from mereo_learning.config import PRESETS
+from mereo_learning.dataset import Dataset
 from mereo_learning.losses import occupancy_loss
 
 TINY = PRESETS["tiny"].network
@@ -156,7 +169,6 @@ def test_a_loss_trains_its_own_heads_only(loss: Loss, rows: list[int]) -> None:
 
 
 def lived_in(config: NetworkConfig) -> Network:
-    """A network whose normalization has statistics of its own, as after training."""
     torch.manual_seed(0)
     network = Network(config, 3)
     for norm in network.modules():
@@ -179,7 +191,6 @@ def lived_in(config: NetworkConfig) -> Network:
     ids=["everything", "the paper's", "plain positions", "point transformer"],
 )
 def test_a_folded_network_answers_the_same(config: NetworkConfig) -> None:
-    """Folding changes the arithmetic, not the answers."""
     network = lived_in(config)
     before = {name: value.clone() for name, value in network.state_dict().items()}
     folded = fold_batch_norm(network)
@@ -199,3 +210,165 @@ def test_a_folded_network_answers_the_same(config: NetworkConfig) -> None:
     assert sum(isinstance(module, nn.BatchNorm1d) for module in folded.modules()) < norms / 2
     with pytest.raises(ValueError, match="training mode"):
         fold_batch_norm(network.train())
+
+
+# --- Point Transformer ------------------------------------------------------------------------------------------------
+
+
+TRANSFORMER = NetworkConfig().changed(
+    encoder="point-transformer",
+    points=128,
+    transformer_widths=(8, 12, 16, 20, 24),
+    transformer_neighbors=6,
+    mlp_global=(40,),
+)
+
+
+def settled_transformer(config: NetworkConfig = TRANSFORMER) -> PointTransformer:
+    torch.manual_seed(1)
+    encoder = PointTransformer(config.transformer, config.latent).train()
+    encoder(cloud_of(config, batch=4))
+    return encoder.eval()
+
+
+def attended(layer: VectorAttention, p: Tensor, x: Tensor, neighbors: list[int], i: int) -> Tensor:
+    """Equation 3 of Zhao et al. for one point, term by term."""
+
+    def two_layers(mlp: torch.nn.Sequential, v: Tensor) -> Tensor:
+        hidden = torch.clamp(mlp[0].weight @ v + mlp[0].bias, min=0)
+        out = mlp[2].weight @ hidden
+        return out if mlp[2].bias is None else out + mlp[2].bias
+
+    exponents, values = [], []
+    for j in neighbors:
+        delta = two_layers(layer.theta, p[i] - p[j])
+        relation = layer.phi.weight @ x[i] - layer.psi.weight @ x[j] + delta
+        exponents.append(two_layers(layer.gamma, relation).exp())
+        values.append(layer.alpha.weight @ x[j] + delta)
+    total = sum(exponents[1:], exponents[0])
+    return sum((e / total * v for e, v in zip(exponents, values, strict=True)), torch.zeros_like(values[0]))
+
+
+def test_vector_attention_is_equation_3() -> None:
+    torch.manual_seed(0)
+    layer = VectorAttention(6)
+    points, features = torch.randn(2, 10, 3), torch.randn(2, 10, 6)
+    index = nearest(points, points, 4)
+    with torch.no_grad():
+        fast = layer(points, features, index)
+        for b in range(2):
+            slow = [attended(layer, points[b], features[b], index[b, i].tolist(), i) for i in range(10)]
+            assert torch.allclose(fast[b], torch.stack(slow), atol=1e-5)
+
+
+def test_encoder_ignores_which_points_fill_up_a_cloud_and_the_order_of_what_is_not_kept() -> None:
+    encoder, cloud = settled_transformer(), cloud_of(TRANSFORMER)
+    front, again = cloud[:, :80], torch.randperm(80, generator=torch.Generator().manual_seed(2))[:48]
+    with torch.inference_mode():
+        one = encoder(torch.cat([front, front[:, :48]], dim=1)).latent
+        other = encoder(torch.cat([front, front[:, again]], dim=1)).latent
+        assert torch.allclose(one, other, atol=1e-5)
+    first = TRANSFORMER.points // 4
+    order = torch.randperm(TRANSFORMER.points - first, generator=torch.Generator().manual_seed(2))
+    shuffled = torch.cat([cloud[:, :first], cloud[:, first:][:, order]], dim=1)
+    with torch.inference_mode():
+        assert torch.allclose(encoder(cloud).latent, encoder(shuffled).latent, atol=1e-5)
+        assert not torch.allclose(encoder(cloud).latent, encoder(cloud.flip(2)).latent, atol=1e-3)
+
+
+def test_paper_sizes() -> None:
+    """Five blocks and 1024 numbers; with local features, as many centres and channels as the levels of `base`."""
+    network = Network(PRESETS["paper"].network.changed(encoder="point-transformer"), 5)
+    assert isinstance(network.encoder, PointTransformer)
+    assert [block.leave.in_features for block in network.encoder.blocks] == [32, 64, 128, 256, 512]
+    assert network.decoder.latent1.in_features == 1024
+    base = PRESETS["base"].network
+    cloud = cloud_of(base)
+    networks = [
+        Network(base.changed(encoder=name, align_points=0), 2).eval() for name in ("pointnet2", "point-transformer")
+    ]
+    with torch.inference_mode():
+        ours, theirs = ([level.features.shape for level in each.encoder(cloud).levels] for each in networks)
+    assert ours == theirs
+    with pytest.raises(ValueError, match=r"transformer_widths are \(8, 16\); a Point Transformer needs at least three"):
+        Network(TRANSFORMER.changed(transformer_widths=(8, 16)), 2)
+
+
+# --- the template -----------------------------------------------------------------------------------------------------
+
+
+AXIS = torch.linspace(-TEMPLATE_REACH, TEMPLATE_REACH, TEMPLATE_NODES)
+SPACING = 2 * TEMPLATE_REACH / (TEMPLATE_NODES - 1)
+
+
+def lookup_of(*fields: torch.Tensor) -> RestLookup:
+    lookup = RestLookup(8, len(fields))
+    lookup.distance.copy_(torch.stack(fields))
+    return lookup
+
+
+def random_rest(batch: int, queries: int, reach: float = 1.0) -> torch.Tensor:
+    return (torch.rand(batch, queries, 3, generator=torch.Generator().manual_seed(4)) * 2 - 1) * reach
+
+
+def test_linear_fields_are_read_exactly_and_along_the_right_axes() -> None:
+    x, y, z = torch.meshgrid(AXIS, AXIS, AXIS, indexing="ij")
+    rest = random_rest(3, 50)
+    assert torch.allclose(lookup_of(x, y, z).distances(rest), rest, atol=1e-5)
+    mixed = lookup_of(0.3 * x - 0.5 * y + 0.1 * z).distances(rest)
+    assert torch.allclose(mixed[..., 0], rest @ torch.tensor([0.3, -0.5, 0.1]), atol=1e-5)
+
+
+def test_grid_of_a_ball_is_its_signed_distance() -> None:
+    """A ball fills the rest box: its radius is the unit of length."""
+    ball = toy_scene().rest.segments[3]
+    grid = rest_distances(one(ball)).astype(np.float64)
+    nodes = np.stack(np.meshgrid(*(AXIS.numpy(),) * 3, indexing="ij"), axis=-1)
+    assert np.abs(grid[0] - (np.linalg.norm(nodes, axis=-1) - 1)).max() < 0.02  # the ball is a polyhedron
+
+
+def test_true_rest_coordinates_find_the_right_segment() -> None:
+    scene = toy_scene()
+    lookup = lookup_of(*torch.from_numpy(rest_distances(scene.rest)).float())
+    queries = synthesize(scene, GenerateConfig(image_size=48), example_rng(3, 0)).queries
+    inside = np.flatnonzero(queries.labels)
+    found = lookup.distances(torch.from_numpy(queries.rest[inside]).float()[None])[0]
+    labels = torch.from_numpy(queries.labels[inside].astype(np.int64)) - 1
+    own = found[torch.arange(len(inside)), labels]
+    assert (own < SPACING / 2).all()  # trilinear reading rounds edges off by less than this
+    clear = -own > SPACING / 2
+    assert clear.float().mean() > 0.6 and torch.equal(found.argmin(dim=1)[clear], labels[clear])
+
+
+def test_a_new_lookup_changes_no_answer() -> None:
+    torch.manual_seed(0)
+    plain = Network(TINY.changed(rest_template=False), segments=3).eval()
+    added = Network(TINY, segments=3).eval()
+    added.load_state_dict(added.state_dict() | plain.state_dict())
+    cloud, viewpoint, queries = random_rest(2, TINY.points), torch.tensor([[0.0, 0.0, -8.0]] * 2), random_rest(2, 9)
+    with torch.inference_mode():
+        before, after = (network(cloud, viewpoint, queries).prediction for network in (plain, added))
+    for answer, same in zip(after[:3], before[:3], strict=True):
+        torch.testing.assert_close(answer, same)  # products of other widths may be added in another order
+    assert before.rest is None and after.rest.shape == queries.shape
+
+
+def test_what_is_read_corrects_the_coordinates() -> None:
+    """The gradient of the answer reaches the predicted coordinates: towards less distance is towards the segment."""
+    x, y, z = torch.meshgrid(AXIS, AXIS, AXIS, indexing="ij")
+    lookup = lookup_of((x.square() + y.square() + z.square()).sqrt() - 0.1)
+    torch.nn.init.constant_(lookup.read.weight, 1.0)
+    rest, seen = lookup(torch.zeros(1, 20, 8), random_rest(1, 20, reach=0.5))
+    (slope,) = torch.autograd.grad(seen.sum(), rest)
+    assert (torch.nn.functional.cosine_similarity(slope, rest, dim=-1) > 0.9).all()
+
+
+@pytest.mark.slow
+def test_an_older_dataset_gets_its_template_on_resume(tmp_path: Path) -> None:
+    scene, settings = toy_scene(), GenerateConfig(image_size=48, points=64, sampling=SamplingConfig(per_segment=8))
+    for resume in (False, True):
+        generate(scene, tmp_path / "data", settings, examples=2, seed=3, resume=resume)
+        template = Dataset.load(tmp_path / "data").template
+        assert template is not None and np.array_equal(template.numpy(), rest_distances(scene.rest).astype(np.float32))
+        (tmp_path / "data" / "template.safetensors").unlink()
+    assert Dataset.load(tmp_path / "data").template is None

@@ -152,7 +152,6 @@ def test_fit_finds_the_motion_that_was_made(flatten: float) -> None:
 
 
 def test_a_moved_object_gets_the_same_answers_turned_along(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the right alignment, the network cannot tell how the object was turned."""
     torch.manual_seed(0)
     network = Network(TINY.changed(sight_neighbors=0), segments=3).train()
     cloud, queries, viewpoint = cloud_of(), cloud_of(points=30), torch.tensor([[0.0, 0.0, -8.0]] * 2)

@@ -5,28 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-import trimesh
+from analytic import untrained
+from shapes import ball
 
 from mereo import __main__ as command_line
-from mereo.geometry.mesh import Segment, SegmentedMesh, check_segment
-from mereo.models.model import Model
-from mereo.models.network import Network
-from mereo.models.weights import load_model, save_model
-from mereo_learning.config import PRESETS
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("weights") / "untrained.safetensors"
-    network = Network(PRESETS["tiny"].network, 2).eval()
-    save_model(Model(network, ("a", "b"), ((1, 2, 3), (4, 5, 6))), path)
-    return path
-
-
-def sphere() -> Segment:
-    ball = trimesh.creation.icosphere(3)
-    return Segment("ball", (1, 2, 3), np.asarray(ball.vertices), np.asarray(ball.faces, np.int64))
+from mereo.geometry.mesh import SegmentedMesh, check_segment
 
 
 def refused(capsys: pytest.CaptureFixture[str], folder: Path, text: str, *arguments: object) -> None:
@@ -53,12 +36,12 @@ BAD_CLOUDS = {
 
 
 @pytest.mark.parametrize("case", BAD_CLOUDS)
-def test_bad_clouds(case: str, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_clouds(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     points, text = BAD_CLOUDS[case]
     path = tmp_path / "missing.npy"
     if points is not None:
         np.save(path, points)
-    refused(capsys, tmp_path, text, "reconstruct", path, "--weights", weights, "--output", tmp_path / "out")
+    refused(capsys, tmp_path, text, "reconstruct", path, "--weights", "rope", "--output", tmp_path / "out")
 
 
 @pytest.mark.parametrize("number", ["1e400", "1e300", "nan"])
@@ -70,52 +53,37 @@ def test_a_mesh_beyond_all_numbers(number: str, tmp_path: Path, capsys: pytest.C
 
 
 def test_bad_segments_are_named_with_the_cure() -> None:
-    ball = sphere()
+    whole = ball((0, 0, 0), 1.0, level=3)
+    vertices, faces = whole.vertices, whole.faces
     cases = {
-        r"segment 'ball' has 3 open edges; it must be closed: fill its holes": replace(ball, faces=ball.faces[1:]),
-        r"segment 'ball' has volume -.*it must be positive.*reverse them": replace(ball, faces=ball.faces[:, ::-1]),
-        r"edges whose faces disagree in orientation": replace(
-            ball, faces=np.concatenate([ball.faces[:1, ::-1], ball.faces[1:]])
-        ),
-        r"NaN or infinite vertices": replace(ball, vertices=np.where(ball.vertices > 0.99, np.nan, ball.vertices)),
-        r"refers to vertex 700 of 642": replace(ball, faces=np.concatenate([ball.faces, [[0, 1, 700]]])),
-        r"has no faces": replace(ball, faces=ball.faces[:0]),
+        r"segment 'ball' has 3 open edges; it must be closed: fill its holes": replace(whole, faces=faces[1:]),
+        r"segment 'ball' has volume -.*it must be positive.*reverse them": replace(whole, faces=faces[:, ::-1]),
+        r"edges whose faces disagree": replace(whole, faces=np.concatenate([faces[:1, ::-1], faces[1:]])),
+        r"NaN or infinite vertices": replace(whole, vertices=np.where(vertices > 0.99, np.nan, vertices)),
+        r"refers to vertex 700 of 642": replace(whole, faces=np.concatenate([faces, [[0, 1, 700]]])),
+        r"has no faces": replace(whole, faces=faces[:0]),
     }
-    check_segment(ball)
+    check_segment(whole)
     for text, segment in cases.items():
         with pytest.raises(ValueError, match=text):
             check_segment(segment)
 
 
 def test_segment_names_are_unique_and_few() -> None:
-    with pytest.raises(ValueError, match="'ball' is used twice"):
-        SegmentedMesh((sphere(), sphere()))
-    with pytest.raises(ValueError, match="0 segments"):
-        SegmentedMesh(())
-    with pytest.raises(ValueError, match="at most 254"):
-        SegmentedMesh(tuple(replace(sphere(), name=str(i)) for i in range(255)))
+    part = ball((0, 0, 0), 1.0, level=1)
+    many = tuple(replace(part, name=str(i)) for i in range(255))
+    for parts, text in (((part, part), "'ball' is used twice"), ((), "0 segments"), (many, "at most 254")):
+        with pytest.raises(ValueError, match=text):
+            SegmentedMesh(parts)
 
 
-def test_half_precision_weights_answer_alike(weights: Path, tmp_path: Path) -> None:
-    model = load_model(weights)
-    assert model.names == ("a", "b") and model.colors == ((1, 2, 3), (4, 5, 6)) and not model.network.training
-    save_model(model, tmp_path / "half.safetensors", torch.float16)
-    half = load_model(tmp_path / "half.safetensors")
-    points = cloud()
-    full, rounded = (m.query(m.encode(points), points[:50]).probability for m in (model, half))
-    assert np.abs(full - rounded).max() < 0.02
-    assert (tmp_path / "half.safetensors").stat().st_size < 0.6 * weights.stat().st_size
-
-
-def test_nothing_is_found_where_nothing_ever_was_in_training(weights: Path) -> None:
+def test_nothing_is_found_where_nothing_ever_was_in_training() -> None:
     """An untrained network says anything anywhere; outside its domain the answer is empty all the same."""
-    points = cloud()
-    wild = replace(load_model(weights), domain=None)
-    code = wild.encode(points)
+    wild = untrained(("a", "b"))
+    code = wild.encode(cloud())
     places = code.normalizer.invert(np.random.default_rng(1).uniform(-4, 4, size=(3000, 3)))
     outside = (np.abs(code.normalizer.apply(places)) > 1.5).any(axis=1)
-    tame = replace(wild, domain=((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5)))
-    assert (wild.query(code, places).label[outside] > 0).any()
-    answer = tame.query(code, places)
+    said = wild.query(code, places).label
+    answer = replace(wild, domain=((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5))).query(code, places)
+    assert (said[outside] > 0).any() and np.array_equal(answer.label[~outside], said[~outside])
     assert (answer.label[outside] == 0).all() and answer.probability[outside, 0].min() > 0.999
-    assert np.array_equal(answer.label[~outside], wild.query(code, places).label[~outside])

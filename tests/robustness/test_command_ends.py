@@ -80,9 +80,7 @@ def test_what_is_ignored_stays_ignored() -> None:
         signal.signal(number, before)
 
 
-def test_a_stream_ends_with_its_summary(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_stream_sums_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "a.npy").touch()
     with monkeypatch.context() as patched:
         nothing = SimpleNamespace(network=None, registrar=lambda _: None)

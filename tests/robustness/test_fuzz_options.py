@@ -28,26 +28,8 @@ ONLY_READ = COMMANDS[:4]
 """Commands that could start work without an input: their options are read, and no more."""
 
 ODD = (
-    *(
-        "0",
-        "-1",
-        "1e999",
-        "nan",
-        "1e-400",
-        "9" * 400,
-        "0x10",
-        "1_000",
-        "１",
-        "1.5",
-        "²",
-        "",
-        " 1",
-        "-",
-        "--",
-        "=",
-        "None",
-    ),
-    *("True", "\n", "\x1b[31m", "\ud800", "a" * 3000, "../..", "/dev/null", "~", "*", "[x]", "\0"),
+    *("0", "-1", "1e999", "nan", "1e-400", "9" * 400, "0x10", "1_000", "１", "1.5", "²", "", " 1", "-", "--", "="),
+    *("None", "True", "\n", "\x1b[31m", "\ud800", "a" * 3000, "../..", "/dev/null", "~", "*", "[x]", "\0"),
 )
 VALUES = st.sampled_from(ODD) | st.text(max_size=8) | st.integers().map(str) | st.floats().map(str)
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import trimesh
-from failpoints import MOVES, Commands, command_server
+from failpoints import MOVES, run_command
 from fuzz import weights as tiny_weights
 from scene_files import write_bar
 from toy_data import write_toy_dataset
@@ -23,12 +23,9 @@ from mereo.synthesis.sample_views import load_view
 class Case(NamedTuple):
     """Command that writes ``out`` (or ``out.SUFFIX``), with INPUTS for the folder of its inputs.
 
-    Attributes:
-        arguments: the command line.
-        again: what is added where the same command refuses because its result, or a part of it, is there; where
-            nothing can be added, what it says of a whole result.
-        first: a command that writes the result which this one replaces.
-        dear: it takes seconds, so it is killed only where it gives a file its name.
+    ``again`` is added where the same command refuses because its result, or a part of it, is there; where nothing can
+    be added, it is what that says of a whole result. ``first`` writes the result which this one replaces. A command
+    that is ``dear`` takes seconds, so it is killed only where it gives a file its name.
     """
 
     arguments: str
@@ -72,14 +69,6 @@ TIMES = re.compile(rb'"timings_s": {[^}]*}|"seconds": [0-9.e+-]+')
 
 
 @pytest.fixture(scope="module")
-def commands() -> Iterator[Commands]:
-    if not hasattr(os, "fork"):
-        pytest.skip("processes are forked, which this system cannot")
-    with command_server() as server:
-        yield server
-
-
-@pytest.fixture(scope="module")
 def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("inputs")
     write_toy_dataset(folder / "data", examples=16)
@@ -103,25 +92,25 @@ def names(folder: Path) -> set[str]:
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
 
 
-def go_on(commands: Commands, case: Case, arguments: str, place: Path, where: str) -> None:
+def go_on(case: Case, arguments: str, place: Path, where: str) -> None:
     """The same command again, as a person would give it: it succeeds, or refuses and succeeds with ``case.again``."""
-    done = commands.run(place, arguments)
+    done = run_command(place, arguments)
     if done.code:
         assert (done.code, done.said.count("mereo: error: ")) == (2, 1), f"{where}\n{done.said}"
         assert case.again and case.again in done.said, f"{where}\n{done.said}"
         if not case.again.startswith("--"):
             return
-        done = commands.run(place, f"{arguments} {case.again}")
+        done = run_command(place, f"{arguments} {case.again}")
     assert done.code == 0, f"{where}\n{done.said}"
 
 
-def prepare(commands: Commands, case: Case, inputs: Path, place: Path) -> str:
+def prepare(case: Case, inputs: Path, place: Path) -> str:
     """Arguments of the command; the result that it replaces, and files of somebody else, are there."""
     for name in FOREIGN:
         (place / name).parent.mkdir(parents=True, exist_ok=True)
         (place / name).write_text("precious")
     if case.first:
-        assert commands.run(place, case.first.replace("INPUTS", str(inputs))).code == 0
+        assert run_command(place, case.first.replace("INPUTS", str(inputs))).code == 0
     return case.arguments.replace("INPUTS", str(inputs))
 
 
@@ -139,20 +128,20 @@ def boundaries(calls: list[str]) -> Iterator[tuple[int, bool]]:
 
 
 @pytest.mark.parametrize("name", ["scene export", *SLOW])
-def test_a_killed_command_is_finished_by_the_next(name: str, commands: Commands, inputs: Path, tmp_path: Path) -> None:
+def test_a_killed_command_is_finished_by_the_next(name: str, inputs: Path, tmp_path: Path) -> None:
     """With the bytes of one that was never disturbed; nothing is left over, and no file of somebody else changes."""
     case, before = CASES[name], content(inputs)
     fresh, whole, place = (tmp_path / folder for folder in ("fresh", "whole", "place"))
-    arguments = prepare(commands, case, inputs, fresh)
+    arguments = prepare(case, inputs, fresh)
     shutil.copytree(fresh, whole)
-    undisturbed = commands.run(whole, arguments, every_call=not case.dear)
+    undisturbed = run_command(whole, arguments, every_call=not case.dear)
     assert undisturbed.code == 0 and undisturbed.calls, undisturbed.said
     for number, after in boundaries(undisturbed.calls):
         shutil.copytree(fresh, place)
-        killed = commands.run(place, arguments, at=number, after=after, every_call=not case.dear)
+        killed = run_command(place, arguments, at=number, after=after, every_call=not case.dear)
         where = f"killed {'after' if after else 'before'} call {number}: {killed.calls[-1]}"
         assert killed.code == -9, f"{where}\n{killed.said}"
-        go_on(commands, case, arguments, place, where)
+        go_on(case, arguments, place, where)
         assert names(place) == names(whole) and content(place) == content(whole), where
         shutil.rmtree(place)
     assert content(inputs) == before
@@ -176,16 +165,14 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         *(pytest.param(name, room, marks=pytest.mark.slow) for name in CASES for room in (0, 8_192)),
     ],
 )
-def test_a_full_disk_is_said_and_leaves_nothing(
-    name: str, room: int, commands: Commands, inputs: Path, small_disk: Path
-) -> None:
+def test_a_full_disk_is_said_and_leaves_nothing(name: str, room: int, inputs: Path, small_disk: Path) -> None:
     """No room at all, and some for folders, locks and the smallest files; with more the command does its work."""
     case, place = CASES[name], small_disk
-    arguments = prepare(commands, case, inputs, place)
+    arguments = prepare(case, inputs, place)
     before = content(place)
     with (place / "ballast").open("wb") as file:
         file.write(bytes(os.statvfs(place).f_bavail * os.statvfs(place).f_frsize - room))
-    full = commands.run(place, arguments)
+    full = run_command(place, arguments)
     if room and full.code == 0:  # a small file had room
         return
     assert (full.code, full.said.count("mereo: error: ")) == (2, 1) and "Traceback" not in full.said, full.said
@@ -195,5 +182,5 @@ def test_a_full_disk_is_said_and_leaves_nothing(
     if arguments.startswith(("train", "generate", "scene check")):  # whole files stay, and the work is continued
         after = {file: after[file] for file in before}
     assert after == before
-    go_on(commands, case, arguments, place, "after a full disk")
+    go_on(case, arguments, place, "after a full disk")
     assert {str(path) for path in place.rglob(".*.mereo")} == {str(place / ".out.mine.mereo")}

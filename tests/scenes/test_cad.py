@@ -19,19 +19,13 @@ from mereo.deformation.warps import Squash
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.mesh_check import mesh_of, overlaps
-from mereo.geometry.subdivision import TooManyFaces, split_edges
 from mereo.geometry.symmetry import describe_symmetries
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.scenes.files.build import TOLERANCE, refined
 from mereo.scenes.files.check import STATE_TOLERANCE, check_scene
 from mereo.scenes.files.joints import contacts
-from mereo.scenes.files.template import (
-    flat_base,
-    material_points,
-    measure_motion,
-    write_scene_file,
-)
+from mereo.scenes.files.template import flat_base, material_points, measure_motion, write_scene_file
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
@@ -87,23 +81,6 @@ def test_neighbours_split_a_shared_edge_alike(pliers: Scene) -> None:
     assert rims[0] == rims[1] and len(rims[0]) >= 40
 
 
-def test_edges_are_asked_once_and_faces_are_bounded() -> None:
-    part = box((0, 0, 0), (4, 4, 4))
-    asked: list[tuple[tuple[float, ...], ...]] = []
-
-    def longer(ends: np.ndarray) -> np.ndarray:
-        asked.extend(tuple(sorted(map(tuple, pair))) for pair in ends.tolist())
-        return np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > 2.5  # the halves of diagonals are halved again
-
-    vertices, faces = split_edges(part.vertices, part.faces, longer, 1000)
-    whole = replace(part, vertices=vertices, faces=faces)
-    assert whole.edge_imbalance() == (0, 0) and whole.volume == pytest.approx(64) and len(asked) == len(set(asked))
-    corners = vertices[faces]
-    assert np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max() <= 2.5
-    with pytest.raises(TooManyFaces, match="1,000 triangles or more"):
-        split_edges(part.vertices, part.faces, lambda ends: np.ones(len(ends), dtype=bool), 1000)
-
-
 # --- overlaps ---------------------------------------------------------------------------------------------------------
 
 
@@ -122,7 +99,7 @@ def test_meshes_that_are_no_solids_are_measured_on_a_grid() -> None:
     assert found.share == pytest.approx(5 / 16, abs=0.01)
 
 
-def test_an_overlap_in_random_states_is_told_with_its_cause(
+def test_an_overlap_in_states_names_its_cause(
     tmp_path: Path, written: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     head = written.read_text().split("deformations:")[0]
@@ -160,10 +137,8 @@ def test_a_rigid_motion_is_none_and_a_stretch_is_its_own() -> None:
     mesh = SegmentedMesh((box((-1, -1, -1), (1, 1, 1)),))
     turn = Rigid(np.array([0.3, 0.2, 0.1]), np.array([5.0, 0, 0]), np.zeros(3))
     assert measure_motion(mesh, lambda rng: (turn,)).largest < 1e-12
-    squash = Squash(np.zeros(3), np.array([0, 0, 1.0]), 1.1)
-    points, _ = material_points(mesh, 800)
-    way = np.linalg.norm(squash(points) - points, axis=1) / 2
-    found = measure_motion(mesh, lambda rng: (squash,))
+    squash, (points, _) = Squash(np.zeros(3), np.array([0, 0, 1.0]), 1.1), material_points(mesh, 800)
+    way, found = np.linalg.norm(squash(points) - points, axis=1) / 2, measure_motion(mesh, lambda rng: (squash,))
     assert found.mean == pytest.approx(np.sqrt(np.mean(way**2)), rel=0.02)
     assert found.largest == pytest.approx(way.max(), rel=0.1)
 
@@ -219,23 +194,18 @@ def dome() -> Segment:
     return replace(whole, vertices=np.maximum(whole.vertices, (-np.inf, -np.inf, -0.3)))
 
 
-def test_a_flat_base_is_found_in_any_position() -> None:
+def test_a_flat_base_is_found_in_any_position_and_of_a_box_the_side_that_is_down() -> None:
     for turns in ([0.0, 0.0, 0.0], [0.3, -0.5, 0.2]):
         turn = Rigid(np.array(turns), np.ones(3), np.ones(3))
         base = flat_base(SegmentedMesh((replace(dome(), vertices=turn(dome().vertices)),)), (0.0, 0.0, 1.0))
-        assert base is not None
         start, end = turn(np.array([[0.0, 0, 0], [0, 0, -1]]))
-        assert base.normal @ (end - start) > 0.999
+        assert base is not None and base.normal @ (end - start) > 0.999
         # a disc of radius sqrt(1 - 0.3^2), and the cap of height 1.3 above it
         assert base.share == pytest.approx(0.91 / (0.91 + 2 * 1.3), abs=0.01)
-
-
-def test_a_box_stands_on_the_side_that_is_down() -> None:
     for up in ((0, 0, 1), (0, -1, 0)):
         base = flat_base(SegmentedMesh((box((0, 0, 0), (4, 3, 3)),)), up)
-        assert base is not None
+        assert base is not None and base.share == pytest.approx(12 / 66)
         np.testing.assert_array_equal(base.normal, -np.array(up))
-        assert base.share == pytest.approx(12 / 66)
 
 
 def test_what_is_round_or_falls_over_has_no_base() -> None:
@@ -294,10 +264,7 @@ def test_a_word_says_how_the_object_moves(tmp_path: Path, capsys: pytest.Capture
     assert not (tmp_path / "b.yaml").exists()
 
 
-def test_joints_that_collide_together_are_narrowed_until_no_combination_does(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Each lever turns by 30 degrees alone; both inwards meet at the middle, which the check refuses."""
+def test_joints_are_narrowed_until_no_combination_collides(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write_scene_file(write_parts(tmp_path, tongs()), tmp_path / "tongs.yaml")
     check_scene(str(path))
     assert "fault" not in capsys.readouterr().out
@@ -322,7 +289,6 @@ def test_joints_that_collide_together_are_narrowed_until_no_combination_does(
 
 
 def test_planes_cylinders_and_other_contacts() -> None:
-    """A lid on a box is a plane, a shaft in it a cylinder, a ball in a socket neither."""
     turn = Rigid(np.array([0.3, -0.5, 0.2]), np.zeros(3), np.zeros(3))
     shaft = Manifold.cylinder(6, 1, 1, 32)
     body = Manifold.cube((8, 4, 4), True) - shaft.translate((2, 0, -1))

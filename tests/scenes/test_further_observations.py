@@ -45,18 +45,12 @@ def example(settings: GenerateConfig, index: int = 0) -> Example:
     return synthesize(TOY, settings, example_rng(SEED, index))
 
 
-# --- which ------------------------------------------------------------------------------------------------------------
-
-
-def test_all_are_those_that_differ_from_the_examples_own_sensor() -> None:
+def test_all_are_those_that_differ_from_the_examples_own_sensor_and_an_unknown_one_is_answered_with_these() -> None:
     assert not SMALL.further
     assert SEEN.further == {name: sensor for name, sensor in OBSERVATIONS.items() if name != "paper"}
     other = replace(SEEN, sensor=SENSORS["structured-light"]).further
     assert set(other) == set(OBSERVATIONS) - {"structured-light"}
     assert list(replace(SMALL, observations=("tool", "paper", "tool")).further) == ["tool", "paper"]
-
-
-def test_an_unknown_one_is_answered_with_the_known_ones() -> None:
     settings = GenerateConfig()
     object.__setattr__(settings, "observations", ("tool", "lidar"))  # which the type checker of the tests would refuse
     with pytest.raises(ValueError, match="observations has 'lidar'; known are paper, .*mask and all: name some"):
@@ -66,32 +60,25 @@ def test_an_unknown_one_is_answered_with_the_known_ones() -> None:
 # --- the same bits ----------------------------------------------------------------------------------------------------
 
 
-def test_state_first_cloud_and_queries_are_those_without(data: tuple[Path, Path]) -> None:
+def test_state_first_cloud_and_queries_are_those_without_and_the_manifest_has_sensors(data: tuple[Path, Path]) -> None:
     for name in shards_of(data[0]):
         plain, seen = (load_file(directory / name) for directory in data)
         assert seen.keys() - plain.keys() == {"seen", "seen_count"}
         assert all(seen[key].tobytes() == value.tobytes() for key, value in plain.items())
+    plain, seen = (json.loads((directory / "manifest.json").read_text())["settings"] for directory in data)
+    assert not plain.keys() & {"observations", "sensors"} and seen["observations"] == list(SEEN.further)
+    assert seen["sensors"] == {name: asdict(sensor) for name, sensor in SEEN.further.items()}
 
 
-def test_an_observation_is_the_same_whichever_others_there_are() -> None:
+def test_an_observation_is_the_same_whichever_others_there_are_and_its_size_is_known_beforehand() -> None:
     every, alone = example(SEEN).observations, example(replace(SMALL, observations=("tool",))).observations
     assert np.array_equal(every[list(SEEN.further).index("tool")], alone[0])
-
-
-def test_their_size_on_disk_is_known_beforehand() -> None:
     for settings in (SMALL, SEEN):
         size = sum(value.nbytes for value in pack(example(settings), settings.points).values())
         assert size == example_bytes(settings, len(TOY.rest.segments))
 
 
 # --- datasets ---------------------------------------------------------------------------------------------------------
-
-
-def test_the_manifest_states_their_sensors_and_nothing_where_there_are_none(data: tuple[Path, Path]) -> None:
-    plain, seen = (json.loads((directory / "manifest.json").read_text())["settings"] for directory in data)
-    assert not plain.keys() & {"observations", "sensors"}
-    assert seen["observations"] == list(SEEN.further)
-    assert seen["sensors"] == {name: asdict(sensor) for name, sensor in SEEN.further.items()}
 
 
 def test_resuming_needs_the_same_observations(data: tuple[Path, Path]) -> None:

@@ -20,10 +20,7 @@ from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo.synthesis.examples import sample_view, synthesize
-from mereo.synthesis.query_sampling import (
-    sample_queries,
-    sort_sample,
-)
+from mereo.synthesis.query_sampling import sample_queries, sort_sample
 
 CORE, ORGAN = ((2.0, 0.0, 0.0), 2.6), ((0.0, 0.0, 0.0), 5.0)
 """Centre and radius; the core comes as near as 0.4 to the organ's surface."""
@@ -56,21 +53,24 @@ def true_labels(points: np.ndarray) -> np.ndarray:
 # --- the declaration --------------------------------------------------------------------------------------------------
 
 
-def test_what_is_nested_in_a_nested_segment_is_nested_too() -> None:
-    assert onion().nesting == ((0, 1), (0, 2), (1, 2))
-    assert organ(()).nesting == ()
+def test_what_is_nested_in_a_nested_segment_is_nested_too_and_owns_its_shell() -> None:
+    assert onion().nesting == ((0, 1), (0, 2), (1, 2)) and organ(()).nesting == ()
+    meshes = np.array([segment.volume for segment in onion().segments])
+    np.testing.assert_allclose(onion().owned_volumes, np.diff(meshes, prepend=0.0))
+    np.testing.assert_allclose(onion().owned_volumes / (4 / 3 * np.pi), [1, 7, 19], rtol=0.01)
 
 
-def test_the_inner_segment_comes_first() -> None:
-    with pytest.raises(ValueError, match=r"'organ' is declared nested in 'core' but does not come before it;.*first"):
-        organ((("organ", "core"),))
-    with pytest.raises(ValueError, match="'core' is declared nested in 'core' but does not come before it"):
-        organ((("core", "core"),))
-
-
-def test_a_declaration_of_unknown_segments_names_them() -> None:
-    with pytest.raises(ValueError, match=r"'core' is declared nested in 'liver', but no segment is called 'liver'"):
-        organ((("core", "liver"),))
+@pytest.mark.parametrize(
+    ("inner", "outer", "fault"),
+    [
+        ("organ", "core", " but does not come before it;.*first"),
+        ("core", "core", " but does not come before it"),
+        ("core", "liver", ", but no segment is called 'liver'"),
+    ],
+)
+def test_the_inner_segment_comes_first_and_both_exist(inner: str, outer: str, fault: str) -> None:
+    with pytest.raises(ValueError, match=f"'{inner}' is declared nested in '{outer}'{fault}"):
+        organ(((inner, outer),))
 
 
 # --- overlap ----------------------------------------------------------------------------------------------------------
@@ -94,15 +94,6 @@ def test_the_inner_segment_must_be_inside() -> None:
     larger = SegmentedMesh((ball(*ORGAN, "core"), ball(*CORE, "organ", 1)), organ().nested)
     (found,) = overlaps(larger)
     assert found.nested and found.share == pytest.approx(0.86, abs=0.01)
-
-
-# --- who owns a point -------------------------------------------------------------------------------------------------
-
-
-def test_owned_volumes_are_those_of_shells() -> None:
-    meshes = np.array([segment.volume for segment in onion().segments])
-    np.testing.assert_allclose(onion().owned_volumes, np.diff(meshes, prepend=0.0))
-    np.testing.assert_allclose(onion().owned_volumes / (4 / 3 * np.pi), [1, 7, 19], rtol=0.01)
 
 
 # --- distance ---------------------------------------------------------------------------------------------------------
@@ -191,16 +182,11 @@ def test_a_declared_outer_surface_leaves_out_the_wall_of_the_cavity(nested: tupl
 
 
 def move_together(rng: np.random.Generator) -> tuple[Deformation, ...]:
-    shear = Shear(*(rng.uniform(-1, 1, size=3) * [1.5, 0.2, 0.15]))
-    return (shear, shear)
-
-
-def nested_scene() -> Scene:
-    return Scene("organ", organ(), move_together)
+    return (Shear(*(rng.uniform(-1, 1, size=3) * [1.5, 0.2, 0.15])),) * 2
 
 
 def test_rest_coordinates_lie_in_the_owner_at_rest() -> None:
-    scene, settings = nested_scene(), GenerateConfig(sampling=SamplingConfig(per_segment=128))
+    scene, settings = Scene("organ", organ(), move_together), GenerateConfig(sampling=SamplingConfig(per_segment=128))
     example, view = synthesize(scene, settings, example_rng(1, 0)), sample_view(scene, settings, example_rng(1, 0))
     queries, (center, half) = example.queries, rest_frame(scene.rest)
     rest = queries.rest * half + center

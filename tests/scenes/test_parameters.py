@@ -157,8 +157,7 @@ def test_loops_that_keep_what_they_draw_keep_their_sliders() -> None:
 def test_many_numbers_move_together_and_stay_as_random_as_they_were() -> None:
     shares = np.random.default_rng(0).random(4000)
     for turn in (0.1, 0.3, 0.77):
-        moved = turned(shares, turn, 5)
-        assert kstest(moved, "uniform").pvalue > 0.01
+        assert kstest(turned(shares, turn, 5), "uniform").pvalue > 0.01
     np.testing.assert_allclose(turned(shares, 1.0, 5), shares, atol=1e-9)
     assert np.abs(turned(shares, 0.01, 5) - shares).max() < 0.1
     assert np.abs(np.corrcoef(turned(shares, 0.25, 5), shares)[0, 1]) < 0.05
@@ -224,8 +223,8 @@ def test_a_scene_names_its_draws_and_the_source_names_the_others() -> None:
 
 def test_draws_of_one_name_are_counted() -> None:
     def sample(rng: np.random.Generator) -> tuple[Deformation, ...]:
-        first, *others = (named(rng, "step").uniform(0.0, 1.0, size=2) for _ in range(3))
-        return shifted(first[0], sum(step.sum() for step in others), named(rng, "other").uniform())
+        steps = [named(rng, "step").uniform(0.0, 1.0, size=2).sum() for _ in range(3)]
+        return shifted(*steps[:2], named(rng, "other").uniform())
 
     names = [f.name for f in parameters(random_state(scene_of(sample), 0))]
     assert names == ["step 1 1", "step 1 2", "step 2 1", "step 2 2", "step 3 1", "step 3 2", "other"]
@@ -284,20 +283,11 @@ def test_the_same_draws_give_the_same_state_and_sliders_that_move_it(name: str) 
     )
 
 
-def test_every_number_has_the_name_of_its_slider() -> None:
-    assert draw_names(random_state(toy_scene(), 0)) == (
-        *("whole: shear x", "whole: shear y", "whole: shear z"),
-        "ball: lift",
-    )
-
-
-def test_many_numbers_with_one_slider_are_counted() -> None:
-    rope = load_scene("rope")
-    swing = next(
-        played
-        for played in (random_state(rope, seed) for seed in range(20))
-        if any(call.name.parts == ("swing",) for call in played.calls)
-    )
+def test_every_number_has_the_name_of_its_slider_and_those_of_one_are_counted() -> None:
+    toy = draw_names(random_state(toy_scene(), 0))
+    assert toy == ("whole: shear x", "whole: shear y", "whole: shear z", "ball: lift")
+    states = (random_state(load_scene("rope"), seed) for seed in range(20))
+    swing = next(played for played in states if any(call.name.parts == ("swing",) for call in played.calls))
     names = draw_names(swing)
     assert {f"swing: amplitudes {number}" for number in range(1, 9)} <= set(names)
     assert len(names) == len(set(names)) == sum(len(call.shares) for call in swing.calls)

@@ -10,7 +10,6 @@ from analytic import untrained
 from mereo import __main__ as command_line
 from mereo.cli.scenes import SceneModes
 from mereo.deformation.maps import Identity
-from mereo.geometry.mesh import SegmentedMesh
 from mereo.models.weights import save_model
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
@@ -39,10 +38,7 @@ def test_a_model_survives_its_file_up_to_rounding(rope: StatisticalModel, tmp_pa
     assert np.abs(read.library - np.clip(rope.library, -4, 4)).max() <= 1 / 32
     assert np.array_equal(read.mean, rope.mean.astype(np.float32))
     assert np.array_equal(read.pairs.first, rope.pairs.first) and np.allclose(read.pairs.std, rope.pairs.std)
-    same_rest(read.rest, rope.rest)
-
-
-def same_rest(found: SegmentedMesh, expected: SegmentedMesh) -> None:
+    found, expected = read.rest, rope.rest
     assert (found.names, found.colors, found.nested) == (expected.names, expected.colors, expected.nested)
     for one, other in zip(found.segments, expected.segments, strict=True):
         assert np.array_equal(one.faces, other.faces) and one.solid == other.solid
@@ -99,9 +95,11 @@ def test_the_number_of_modes_needed_is_the_smallest_that_is_enough(rope: Statist
 def test_the_command_says_how_many(capsys: pytest.CaptureFixture[str]) -> None:
     assert command_line.main(["scene", "modes", "rope", "--states", "100"]) == 0
     assert "modes leave" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="fewer than 100 say little"):
+        SceneModes("rope", states=5).run()
 
 
-def test_weights_show_the_model_that_they_carry(
+def test_weights_show_the_model_in_them(
     rope: StatisticalModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     network = replace(untrained(rope.rest.names), provenance={"scene": "rope"})
@@ -111,8 +109,3 @@ def test_weights_show_the_model_that_they_carry(
     save_model(network, tmp_path / "without.safetensors")
     with pytest.raises(ValueError, match="carries no statistical model: name the scene"):
         SceneModes(str(tmp_path / "without.safetensors"), states=100).run()
-
-
-def test_too_few_states_are_refused() -> None:
-    with pytest.raises(ValueError, match="fewer than 100 say little"):
-        SceneModes("rope", states=5).run()

@@ -45,7 +45,6 @@ def is_there(pid: int) -> bool:
 
 @pytest.mark.slow
 def test_twenty_seconds_of_four_clients_and_the_end(tmp_path: Path) -> None:
-    """Every answer is right; a process that is killed is replaced; TERM answers what is begun."""
     scratch = tmp_path / "scratch"
     scratch.mkdir()
     frames, _ = bench.one_after_the_other(bench.frames_of(["rope"], 6, tmp_path), "modes", 24, tmp_path)

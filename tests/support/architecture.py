@@ -1,18 +1,90 @@
-"""The rules of the package's rooms.
-
-Every rule is a function of what ``read_package`` returns, or of files, and answers with its violations, one readable
-sentence each. An empty list means that the rule holds.
-"""
+"""The rules of the package's rooms, which read its sources alone: nothing is imported or run."""
 
 import ast
 import re
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
-from package_imports import Package
+MODULE_NAME = re.compile(r"\w+\.[\w.]*")
+
+
+@dataclass(frozen=True)
+class Import:
+    """One place where a module names another one, or a library (``torch``), in an import statement or in a string.
+
+    ``at_start`` it is a statement of the module itself, which importing it executes.
+    """
+
+    source: str
+    line: int
+    target: str
+    at_start: bool
+
+    @property
+    def place(self) -> str:
+        return f"{self.source}.py:{self.line}"
+
+
+@dataclass(frozen=True)
+class Package:
+    """The modules of a package below ``root``: the syntax of each, and all that they import."""
+
+    root: Path
+    trees: Mapping[str, ast.Module]
+    imports: tuple[Import, ...]
+
+    def __iter__(self) -> Iterator[Import]:
+        return iter(self.imports)
+
+
+def read_package(root: Path) -> Package:
+    """Read every module below ``root``, the package's folder, whose name is the package's."""
+    files = sorted(root.rglob("*.py"))
+    trees = {f.relative_to(root).with_suffix("").as_posix(): ast.parse(f.read_text("utf-8"), str(f)) for f in files}
+    modules = {".".join([root.name, *m.split("/")]).removesuffix(".__init__"): m for m in trees}
+    imports = (found for module, tree in trees.items() for found in _imports(root.name, module, tree, modules))
+    return Package(root, trees, tuple(dict.fromkeys(imports)))
+
+
+def _imports(package: str, source: str, tree: ast.Module, modules: Mapping[str, str]) -> Iterator[Import]:
+    for node in ast.walk(tree):
+        names = list[str]()
+        match node:
+            case ast.Import(names=aliases):
+                names = [alias.name for alias in aliases]
+            case ast.ImportFrom(module=str(module), names=aliases, level=0):
+                names = [f"{module}.{alias.name}" for alias in aliases]
+            case ast.Call(func=ast.Name(id="import_module"), args=[ast.Constant(value=str(name)), *_]):
+                names = [name]
+            case ast.Constant(value=str(text)) if MODULE_NAME.fullmatch(text):
+                names = _spelled(text.rstrip("."), package, modules)
+        for name in names:
+            library = name.partition(".")[0]
+            target = _module_of(name, modules) if library == package else library
+            yield Import(source, node.lineno, target, node in tree.body)  # type: ignore[attr-defined]
+
+
+def _spelled(name: str, package: str, modules: Mapping[str, str]) -> list[str]:
+    """The module that a string names: for ``import_module``, in a table, or as the constant start of an f-string.
+
+    Without the package's name, as ``"geometry.mesh"``, it must be a whole module: ``"training.csv"`` is a file. An
+    f-string that goes on right after ``"mereo."`` can mean any room, so it counts as the root.
+    """
+    if name.partition(".")[0] != package:
+        return [f"{package}.{name}"] if f"{package}.{name}" in modules else []
+    return [name] if _module_of(name, modules) != "__init__" or name == package else []
+
+
+def _module_of(name: str, modules: Mapping[str, str]) -> str:
+    """The module that a dotted name lies in: itself, or the longest beginning that is one; else the root."""
+    while name not in modules and name:
+        name = name.rpartition(".")[0]
+    return modules.get(name, "__init__")
+
 
 ROOMS = (
     "geometry",

@@ -50,14 +50,7 @@ NEAR_SIZE, NEAR_SHARE = 0.002, 0.01
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Points that are answered, with their truth.
-
-    Attributes:
-        points: observed points.
-        truth: the segments, in the points' frame and unit.
-        axes: of both.
-        unit_m: metres per unit; None where the answer has to find it.
-    """
+    """Points that are answered, with their truth; ``unit_m`` is None where the answer has to find it."""
 
     points: np.ndarray
     truth: SegmentedMesh
@@ -66,7 +59,6 @@ class Frame:
 
 
 def frames_of(name: str) -> Iterator[tuple[str, Frame]]:
-    """Frames of an object, by their names."""
     if name == "scans":
         for scan in SCANS:
             posed = bunny_posed(scan)
@@ -90,14 +82,12 @@ def scene_of(name: str) -> Scene:
 
 @cache
 def object_of(name: str) -> mereo.Object:
-    """Object that answers the frames of a name."""
     weights = weights_of(name) if name in OWN else "bunny" if name == "scans" else name
     scene = scene_of(name) if name in OWN else None
     return mereo.load_object(weights, scene, device="cpu", precision="float32")
 
 
 def facts_of(name: str, frame: Frame) -> dict[str, Any]:
-    """What is kept of the answer to a frame."""
     found = mereo.reconstruct(
         frame.points, object_of(name), resolution=RESOLUTION, axes=frame.axes, unit_m=frame.unit_m
     )
@@ -139,7 +129,6 @@ def facts_of(name: str, frame: Frame) -> dict[str, Any]:
 
 
 def significant(value: float) -> float:
-    """A number to six digits."""
     return float(f"{value:.6g}")
 
 
@@ -149,7 +138,6 @@ def digest(*arrays: np.ndarray) -> str:
 
 
 def answers_of(name: str) -> dict[str, dict[str, Any]]:
-    """Answers to all frames of an object."""
     import torch
 
     torch.set_num_threads(1)
@@ -177,23 +165,19 @@ def difference(kept: dict[str, Any], now: dict[str, Any]) -> str | None:
 
 
 def mean_score(answers: dict[str, dict[str, Any]], score: str) -> float:
-    """Mean score of an object's views."""
     return float(np.mean([facts[score] for facts in answers.values()]))
 
 
 def is_same(kept: dict[str, Any], now: dict[str, Any]) -> bool:
-    """Whether two answers have the same bits."""
     return all(kept.get(fact) == now.get(fact) for fact in ("surfaces", "material"))
 
 
 def kept_of(name: str) -> dict[str, dict[str, Any]]:
-    """Kept answers to the frames of an object."""
     kept: dict[str, dict[str, Any]] = json.loads((FOLDER / f"{name}.json").read_text("utf-8"))
     return kept
 
 
 def write(name: str, answers: dict[str, dict[str, Any]]) -> None:
-    """Keep the answers of an object, one line a frame."""
     lines = ",\n".join(f"{json.dumps(frame)}: {json.dumps(facts)}" for frame, facts in answers.items())
     (FOLDER / f"{name}.json").write_text(f"{{\n{lines}\n}}\n", "utf-8")
 

@@ -23,14 +23,8 @@ def records(points: np.ndarray, names: str = "xyz", kind: str = "f4", skip: int 
     """Structured array of points: ``skip`` bytes, the axes in the order of ``names``, then a colour."""
     size = np.dtype(kind).itemsize
     offsets = [skip + size * index for index in range(3)]
-    layout = np.dtype(
-        {
-            "names": [*names, "rgb"],
-            "formats": [kind] * 3 + ["u4"],
-            "offsets": [*offsets, skip + 3 * size],
-            "itemsize": skip + 3 * size + 7,
-        }
-    )
+    formats, places = [kind] * 3 + ["u4"], [*offsets, skip + 3 * size]
+    layout = np.dtype({"names": [*names, "rgb"], "formats": formats, "offsets": places, "itemsize": places[3] + 7})
     made = np.full(points.shape[:-1], 7, layout)
     for index, axis in enumerate("xyz"):
         made[axis] = points[..., index]
@@ -110,24 +104,21 @@ FORMS: dict[str, Any] = {
     "fortran": np.asfortranarray(POINTS),
     "masked array": np.ma.masked_array(POINTS),
     "lists": POINTS.tolist(),
-    "tuples of whole numbers": tuple(tuple(int(value) for value in row) for row in POINTS),
+    "tuples of whole numbers": tuple(map(tuple, POINTS.astype(int).tolist())),
     "list of rows": list(POINTS),
     "organized": GRID,
     "tensor": torch.tensor(POINTS, requires_grad=True),
     "tensor of this machine's device": torch.tensor(POINTS, device="cuda" if torch.cuda.is_available() else "cpu"),
     "bfloat16": torch.tensor(POINTS, dtype=torch.bfloat16, requires_grad=True),
-    "organized tensor": torch.tensor(GRID, dtype=torch.bfloat16),
     "tensor of another library": Tensor(POINTS.astype(np.float32)),
     "convertible": Convertible(),
     "trimesh cloud": trimesh.PointCloud(POINTS),
     "trimesh mesh": trimesh.Trimesh(POINTS, [[0, 1, 2]], process=False),
     "open3d": SimpleNamespace(points=Vectors(POINTS), colors=Vectors(POINTS * 0)),
-    "open3d mesh": SimpleNamespace(vertices=Vectors(POINTS), triangles=None),
     "open3d tensors": SimpleNamespace(point=TensorMap(positions=Tensor(POINTS), colors=Tensor(POINTS * 0))),
     "open3d tensor mesh": SimpleNamespace(vertex=TensorMap(positions=Tensor(POINTS))),
     "structured": records(POINTS),
     "structured, shuffled": records(POINTS, "zxy", ">i2", skip=5),
-    "record array": records(POINTS).view(np.recarray),
     "list of records": list(records(POINTS)),
     "masked records": np.ma.masked_array(records(POINTS)),
     "message": message(POINTS),

@@ -1,6 +1,7 @@
 """Point clouds written as PLY and PCD by hand."""
 
 import struct
+from itertools import takewhile
 
 import numpy as np
 
@@ -29,30 +30,16 @@ def save_pcd(points: np.ndarray, layout: str) -> bytes:
 
 
 def lzf_compress(data: bytes) -> bytes:
-    """A slow, greedy encoder: the longest earlier match of at least three bytes, else literals."""
-    out, literals, at = bytearray(), bytearray(), 0
-
-    def flush() -> None:
-        for start in range(0, len(literals), 32):
-            run = literals[start : start + 32]
-            out.extend(bytes([len(run) - 1]) + run)
-        literals.clear()
-
+    """Runs of four bytes that come again, 3 to 264 bytes long, and literals."""
+    out, at = bytearray(), 0
     while at < len(data):
-        best, offset = 0, 0
-        for back in range(1, min(at, 64) + 1):
-            length = 0
-            while at + length < len(data) and length < 264 and data[at + length] == data[at - back + length]:
-                length += 1
-            if length > best:
-                best, offset = length, back
-        if best < 3:
-            literals.append(data[at])
-            at += 1
+        pairs = zip(data[at : at + 264], data[at - 4 : at + 260], strict=False) if at > 3 else ()
+        length = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
+        if length < 3:
+            literals = data[at : at + 3]
+            out += bytes([len(literals) - 1]) + literals
+            at += len(literals)
             continue
-        flush()
-        long, high, low = best - 2, (offset - 1) >> 8, (offset - 1) & 255
-        out.extend(bytes([(long << 5) | high, low]) if long < 7 else bytes([(7 << 5) | high, long - 7, low]))
-        at += best
-    flush()
+        out += bytes([(length - 2) << 5, 3] if length < 9 else [7 << 5, length - 9, 3])
+        at += length
     return bytes(out)

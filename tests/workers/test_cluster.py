@@ -1,4 +1,4 @@
-"""Work on a Ray cluster: the contract of worker processes, and one sentence for what cannot be."""
+"""Work in other processes and on a Ray cluster: its contract, and one sentence for what cannot be."""
 
 import os
 import socket
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from cluster_work import die, die_once, fail_on_three, report, square, wait_long
-from object_work import folder_of_objects
+from scene_files import write_bar
 
 from mereo import __main__ as command_line
 from mereo.io.cores import THREAD_VARIABLES
@@ -22,6 +22,20 @@ from mereo.workers import spread as spreading
 from mereo.workers.spread import Cluster, TaskResources, choose_cluster, connect, spread
 from mereo_learning import learn as learning
 from mereo_learning.learn import LearnConfig, learn_objects, list_objects
+
+
+def folder_of_objects(top: Path) -> Path:
+    """Two objects: a subfolder of meshes, and a scene file."""
+    (top / "objects/bar").mkdir(parents=True)
+    write_bar(top / "objects/bar").unlink()
+    (top / "meshes").mkdir()
+    write_bar(top / "meshes")
+    scene = (top / "meshes/bar.yaml").read_text().replace("file: ", "file: ../meshes/")
+    (top / "objects/pole.yaml").write_text(scene.replace("name: bar", "name: pole"))
+    (top / "objects/notes").mkdir()
+    (top / "objects/notes/readme.txt").write_text("no object")
+    return top / "objects"
+
 
 HERE = Cluster(local_cpus=2)
 
@@ -170,7 +184,7 @@ def test_a_wrong_address_is_one_sentence(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_single_frame_or_object_is_no_task(
+def test_a_single_frame_is_no_task(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -223,3 +237,52 @@ def test_a_failed_object_stops_no_other_and_the_same_call_continues(
     assert printed.out.endswith(f"\n{out}/pole: IoU 0.900, mIoU -, method auto\n")
     learn_objects(folder, out, LearnConfig(minutes=2.0))
     assert learnt == ["bar", "pole", "bar", "pole"]
+
+
+# --- processes of this machine ----------------------------------------------------------------------------------------
+
+
+def test_one_worker_works_here_and_in_order() -> None:
+    assert list(spread(square, [3, 1, 2])) == [(3, 9), (1, 1), (2, 4)]
+    assert next(spread(report, [0], 8))[1][0] == os.getpid()
+    assert list(spread(square, [], 4)) == []
+
+
+def test_an_error_arrives_as_it_was_raised_or_is_replaced() -> None:
+    with pytest.raises(ValueError, match="three is bad"):
+        list(spread(fail_on_three, range(5)))
+    assert dict(spread(fail_on_three, range(5), 1, lambda item, error: -item))[3] == -3
+
+
+def test_work_that_cannot_be_sent_is_refused_with_the_cure() -> None:
+    with pytest.raises(ValueError, match="cannot be sent to other processes .*top level of a module, .* use one"):
+        list(spread(lambda number: number, [1, 2], 2))
+
+
+@pytest.mark.slow
+def test_every_item_once_in_processes_of_this_machine() -> None:
+    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
+    assert dict(spread(square, range(20), 2)) == {n: n * n for n in range(20)}
+    workers, variables, _ = zip(*dict(spread(report, range(20), 2)).values(), strict=True)
+    assert os.getpid() not in workers and len(set(workers)) <= 2
+    assert all(value == ["1"] * len(THREAD_VARIABLES) for value in variables)
+    assert before == {name: os.environ.get(name) for name in THREAD_VARIABLES}
+
+
+@pytest.mark.slow
+def test_an_error_in_a_worker_ends_the_work() -> None:
+    with pytest.raises(ValueError, match="three is bad"):
+        list(spread(fail_on_three, range(50), 2))
+
+
+@pytest.mark.slow
+def test_a_killed_worker_is_one_sentence_and_no_hang() -> None:
+    with pytest.raises(ChildProcessError, match="a worker process was killed, most often for memory.*--resume"):
+        list(spread(die, range(50), 2))
+
+
+@pytest.mark.slow
+def test_closing_ends_work_in_progress() -> None:
+    results = spread(wait_long, range(50), 2)
+    assert next(results) == (0, 0)
+    results.close()  # returns, though one worker would not have for a minute

@@ -74,7 +74,6 @@ def nodes() -> Iterator[Any]:
 
 
 def processes(*words: str) -> list[int]:
-    """Living processes whose command lines have all of these words."""
     found = []
     for place in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
@@ -84,7 +83,6 @@ def processes(*words: str) -> list[int]:
 
 
 def parent(process: int) -> int:
-    """Process that has started another one; 0 where that is gone."""
     try:
         return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
     except OSError:
@@ -187,7 +185,7 @@ def test_scores_are_those_of_one_process(rope: Model, tmp_path: Path) -> None:
     assert (tmp_path / "one/errors.png").read_bytes() == (tmp_path / "two/errors.png").read_bytes()
 
 
-def test_frames_are_answered_as_by_one_process(
+def test_frames_have_the_answers_of_one_process(
     tmp_path: Path, loads: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = frames(tmp_path / "frames", "a.npy", "b.npy", "c.npy")
