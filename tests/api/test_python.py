@@ -30,6 +30,7 @@ from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.fitting.registration.registration import Located
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.io.atomic_files import MARKER
+from mereo.io.config import InputConfig
 from mereo.reconstruction.observation import SizeWarning
 from mereo.scenes.registry import load_scene
 from mereo.visualization.units import Unit
@@ -112,16 +113,19 @@ def contents(folder: Path) -> dict[str, Any]:
     return found
 
 
-def test_a_result_is_saved_as_the_command_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("unit_m", [None, 0.5])
+def test_a_result_is_saved_as_the_command_does(
+    unit_m: float | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     np.save(tmp_path / "cloud.npy", seen())
     monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: MODEL)
-    reconstruct_file(
-        tmp_path / "cloud.npy", tmp_path / "command", FrameJob(ReconstructCommand((), weights="any", resolution=24))
-    )
-    found = mereo.reconstruct(tmp_path / "cloud.npy", MODEL, resolution=24)
+    command = ReconstructCommand((), weights="any", resolution=24, reading=InputConfig(unit_m=unit_m))
+    reconstruct_file(tmp_path / "cloud.npy", tmp_path / "command", FrameJob(command))
+    found = mereo.reconstruct(tmp_path / "cloud.npy", MODEL, resolution=24, unit_m=unit_m)
     assert found.save(tmp_path / "python") == tmp_path / "python"
     ours, theirs = contents(tmp_path / "python"), contents(tmp_path / "command")
     assert ours == theirs and len(ours) == 5 and (tmp_path / "python" / MARKER).is_file()
+    assert ours["summary.json"]["unit_m"] == unit_m and found.unit_m == unit_m
 
 
 def test_one_file_is_that_of_the_folder(result: Result, tmp_path: Path) -> None:
@@ -217,18 +221,6 @@ def test_a_notebook_shows_pictures_and_figures(result: Result) -> None:
     np.testing.assert_allclose([float(value) for value in place.split()], [20, -30, 600], atol=2)
 
 
-def test_a_cloud_has_metres_only_where_somebody_says_so(tmp_path: Path) -> None:
-    np.save(tmp_path / "cloud.npy", seen())
-    assumed = mereo.reconstruct(mereo.load_frame(tmp_path / "cloud.npy"), MODEL, resolution=16)
-    assert assumed.seen.frame.unit_m is None and assumed.unit_m is None
-    told = mereo.reconstruct(mereo.load_frame(tmp_path / "cloud.npy", unit_m=1.0), MODEL, resolution=16)
-    assert told.unit_m == 1.0
-    assumed.save(tmp_path / "assumed.html")
-    told.save(tmp_path / "told.html")
-    assert "volume (units³)" in (tmp_path / "assumed.html").read_text(encoding="utf-8")
-    assert "volume (cm³)" in (tmp_path / "told.html").read_text(encoding="utf-8")
-
-
 def images(page: str) -> list[str]:
     return re.findall(r'base64,([^"]+)"', page)
 
@@ -236,17 +228,11 @@ def images(page: str) -> list[str]:
 # --- frames -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_frame_may_be_many_things(result: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_size_of_none_is_warned_of_at_the_call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     np.save(tmp_path / "cloud.npy", seen())
-    frame = mereo.load_frame(tmp_path / "cloud.npy", unit_m=0.5)
-    assert frame.unit_m == 0.5 and result.seen.frame.unit_m == 1.0
-    grid = result.reconstruction.labels.labels
-    for one in (tmp_path / "cloud.npy", frame, result.seen, PointCloud(seen()), seen().tolist()):
-        found = mereo.reconstruct(one, MODEL, "network", resolution=24)
-        np.testing.assert_array_equal(found.reconstruction.labels.labels, grid)
     known = replace(MODEL, provenance={"visible_m": [2, 3]})
     monkeypatch.setattr(reconstruct, "reconstruct_observation", unchecked(reconstruct.reconstruct_observation))
-    for one in (tmp_path / "cloud.npy", seen(), [seen()]):
+    for one in (tmp_path / "cloud.npy", [seen()]):
         with pytest.warns(SizeWarning, match="the visible part is 0.18 m long, but 2 to 3 m in training") as warned:
             unchecked(mereo.reconstruct)(one, known, resolution=8, unit_m=1.0)
         assert warned[0].filename == __file__ and "--" not in str(warned[0].message)

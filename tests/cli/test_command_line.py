@@ -1,18 +1,29 @@
 """The command line as a user meets it: help at once, one line for every error, the exit codes of a good citizen."""
 
+import inspect
 import os
 import signal
 import subprocess
 import sys
+from importlib import import_module
 from importlib.metadata import version
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 import mereo.__main__ as command_line
 from mereo.cli import training
+from mereo.cli.answers import ReconstructCommand
+from mereo.cli.options import Outcome
+from mereo.cli.reconstruct import FrameJob
+from mereo.io.config import InputConfig
+from mereo.models.config import InferenceConfig
 from mereo.scenes.scene import SCENES
+from mereo.synthesis.config import GenerateConfig
 from mereo_learning.config import PRESETS
+from mereo_learning.scoring import EvaluationConfig
+from mereo_learning.shards import DatasetConfig
 
 
 def mereo(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -162,4 +173,43 @@ def test_arguments_that_mean_no_command_are_explained_in_a_box(
     assert not printed.out and all(part in printed.err for part in parts), printed.err
 
 
-# --- commands that need no weights ------------------------------------------------------------------------------------
+# --- what a command calls, with which options -------------------------------------------------------------------------
+
+OUT = {"output": Path("out")}
+READING = InputConfig(Path("k.json"), 5000.0, Path("m.png"))
+COMMAND = ReconstructCommand((Path("a.png"),), weights="rope", output=Path("out"), reading=READING, force=True)
+CALLS = {
+    "generate rope --examples 7 --seed 3 --output out --workers 2 --shard 1/4 --resume": (
+        "mereo_learning.shards.generate",
+        {"config": DatasetConfig(GenerateConfig(), 7, 3), "workers": 2, "shard": (1, 4), "resume": True} | OUT,
+    ),
+    "train data --output out --preset tiny": (
+        "mereo.api.steps.train",
+        {"dataset": Path("data"), "config": PRESETS["tiny"]} | OUT,
+    ),
+    "evaluate bunny --output out --examples 4 --seed 1000001": (
+        "mereo_learning.evaluation_report.evaluate_weights",
+        {"weights": "bunny", "config": EvaluationConfig(None, 4, 1_000_001), "workers": 1} | OUT,
+    ),
+    "reconstruct a.png --weights rope --output out --intrinsics k.json --depth-scale 5000 --mask m.png --force": (
+        "mereo.cli.reconstruct.reconstruct_inputs",
+        {"inputs": (Path("a.png"),), "job": FrameJob(COMMAND, InferenceConfig())} | OUT,
+    ),
+}
+
+
+@pytest.mark.parametrize("line", CALLS)
+def test_command_calls_the_library_with_its_options(line: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    place, expected = CALLS[line]
+    module, _, function = place.rpartition(".")
+    library, calls = import_module(module), list[dict[str, object]]()
+    signature = inspect.signature(getattr(library, function))
+
+    def called(*given: object, **named: object) -> Outcome:
+        calls.append(signature.bind(*given, **named).arguments)
+        return Outcome({})
+
+    monkeypatch.setattr(library, function, called)
+    assert command_line.main(line.split()) == 0
+    assert {name: calls[0][name] for name in expected} == expected

@@ -132,15 +132,6 @@ def test_units_and_youngs_modulus_change_nothing() -> None:
     np.testing.assert_allclose(modes(young=3500.0)[0], 3500 * modes()[0], rtol=1e-8)
 
 
-def test_the_same_solid_gives_the_same_bits() -> None:
-    again = find_modes(build_lattice(block(), 8), COUNT, Material())
-    for before, after in zip(modes(), again, strict=True):
-        assert np.array_equal(before, after)
-    coefficients = np.random.default_rng(0).normal(size=COUNT)
-    first, second = (StateMap(solid(), modes()[1])(coefficients).nodes for _ in range(2))
-    assert np.array_equal(first, second)
-
-
 # --- states -----------------------------------------------------------------------------------------------------------
 
 

@@ -63,14 +63,6 @@ def test_a_rigid_pose_carries_everything_rigidly(model: StatisticalModel, regist
     assert found.farthest == pytest.approx(0.001 * distance.max())
 
 
-def test_the_rest_mesh_is_carried_to_the_registered_mesh(registrar: Registrar, bent: Registration) -> None:
-    found = carry(placed_one(registrar, Surfaces(SCENE.rest)), bent)
-    assert isinstance(found.content, Surfaces)
-    for carried, own in zip(found.content.mesh.segments, bent.mesh.segments, strict=True):
-        error = np.linalg.norm(carried.vertices[: len(own.vertices)] - own.vertices, axis=1)
-        assert error.max() < 0.05 and np.median(error) < 0.005
-
-
 def test_interior_points_follow_the_scenes_own_maps(registrar: Registrar, state: State, bent: Registration) -> None:
     points = np.random.default_rng(1).uniform(*SCENE.rest.bounds, size=(500, 3))
     labels = Solids(SCENE.rest).label(points)

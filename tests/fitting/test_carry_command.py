@@ -120,11 +120,6 @@ def test_the_command_refuses_before_any_work(
     assert message in " ".join(capsys.readouterr().err.split()) and not (folder / "refused").exists()
 
 
-def test_a_frame_of_nothing_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(folder, "--carry-frame", "scene", output="refused") != 0
-    assert "--carry-frame is 'scene' and nothing is carried" in capsys.readouterr().err
-
-
 @pytest.mark.slow
 def test_without_a_registration_nothing_is_written(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

@@ -91,17 +91,6 @@ def test_a_material_point_keeps_its_value(bent: Registration) -> None:
     assert np.abs(at_points(found.content, centers) - (points @ RAMP + 100)).max() < SPACING * np.linalg.norm(RAMP)
 
 
-def test_few_points_are_asked_where_the_motion_is_smooth(
-    model: StatisticalModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked, to_rest = [], Registration.to_rest
-    monkeypatch.setattr(
-        Registration, "to_rest", lambda self, p, labels: asked.append(len(p)) or to_rest(self, p, labels)
-    )
-    found = resampled(ramp(), registered(model, transform_points(T, model.rest_points)))
-    assert sum(asked) < 0.3 * found.inside
-
-
 def test_far_from_the_object_there_is_background(model: StatisticalModel) -> None:
     """Also where the file's voxels end before the object does."""
     here = registered(model, transform_points(T, model.rest_points))

@@ -9,19 +9,18 @@ from fit_cases import IN_FRONT, SCENE, said, seen, shown
 from scipy.spatial.transform import Rotation
 
 from mereo.fitting.config import FitConfig
-from mereo.fitting.draws.fit import DrawsProblem, Shape, approach, derivatives, fit_draws, lay_on_shape, secant
+from mereo.fitting.draws.fit import DrawsProblem, Shape, approach, fit_draws, lay_on_shape, secant
 from mereo.fitting.draws.fit import narrowing as narrowing_of_draws
 from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
 from mereo.fitting.modes import narrowing, turns
-from mereo.fitting.problem.correspondences import Correspondences, nothing
+from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, along
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
-from mereo.fitting.problem.residuals import NetworkTerm
 from mereo.fitting.registration.recognition import recognize
 from mereo.fitting.registration.register import CloudToFit, ModesFit, is_drawn
 from mereo.fitting.registration.registration import Registration
-from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
+from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.scenes.random_states import state_points
 from mereo.scenes.scene import State
 from mereo.scenes.seeds import example_rng
@@ -61,25 +60,6 @@ def test_a_known_state_is_found(model: StatisticalModel, index: int) -> None:
     error = np.linalg.norm(found.material - true_material(model, view), axis=1)
     assert np.median(error) < 0.05
     assert found.accepted and found.explained > 0.99 and found.beyond_states < 0.05
-
-
-def test_the_fit_turns_with_the_frame(model: StatisticalModel, view: View, registration: Registration) -> None:
-    """Everything is turned about the camera: so is the answer."""
-    T = rigid(Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix(), np.zeros(3))
-    found = told(model, view, 1.0)
-    turned = replace(found, points=transform_points(T, found.points))
-    again = fit_correspondences(transform_points(T, view.depth.to_points().points), turned, model, 1.0)
-    np.testing.assert_allclose(again.material, registration.moved(T).material, atol=0.05)
-
-
-@pytest.mark.parametrize("known", [True, False])
-def test_the_unit_changes_nothing(model: StatisticalModel, view: View, registration: Registration, known: bool) -> None:
-    unit = 0.006
-    points, found = view.depth.to_points().points, told(model, view, 1.0)
-    scaled = fit_correspondences(points * unit, found.scaled(unit), model, unit if known else None)
-    assert scaled.scene_unit == pytest.approx(unit, rel=0.01)
-    free = registration if known else fit_correspondences(points, found, model)
-    np.testing.assert_allclose(scaled.material / unit, free.material, atol=0.05)
 
 
 def test_what_the_frame_rules_out_is_told(model: StatisticalModel, view: View, registration: Registration) -> None:
@@ -283,18 +263,6 @@ def test_all_points_follow_the_played_ones(model: StatisticalModel, states: Draw
     assert np.quantile(error, 0.95) < 0.02 * model.half
 
 
-def test_derivatives_predict_a_small_step(states: DrawnStates) -> None:
-    drawn = Drawn.of(SCENE, 1005)
-    here = drawn.deformations(SCENE, drawn.z)
-    step = np.where(drawn.smooth, 0.02 * np.cos(np.arange(len(drawn.z))), 0.0)
-    there = drawn.deformations(SCENE, drawn.z + step)
-    assert here is not None and there is not None
-    points = states.played.moved(here)
-    moved = states.played.moved(there) - points
-    predicted = derivatives(states, drawn, drawn.z, points) @ step
-    assert np.abs(predicted - moved).max() < 0.1 * np.abs(moved).max()
-
-
 def test_a_secant_agrees_with_the_step_and_only_there() -> None:
     rng = np.random.default_rng(0)
     motion, step = rng.normal(size=(5, 3, 4)).astype(np.float32), rng.normal(size=4)
@@ -331,19 +299,6 @@ def test_the_simpler_description_is_preferred_by_its_evidence(model: Statistical
         assert is_drawn(problem, replace(drawn, misfit=modes + gain), fitted.posed) == taken
 
 
-def test_draws_that_move_nothing_narrow_nothing(model: StatisticalModel, states: DrawnStates) -> None:
-    points, material = shown(model, 0.5)
-    fitted = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
-    problem = DrawsProblem.of(fitted.problem, states, fitted.correspondences)
-    drawn = fit_draws(problem, fitted.posed)
-    assert drawn is not None and drawn.motion is not None
-    one_moves, none_moves = drawn.motion.copy(), np.zeros_like(drawn.motion)
-    one_moves[:, :, 1:] = 0.0
-    narrowed = [narrowing_of_draws(problem, replace(drawn, motion=motion)) for motion in (one_moves, none_moves)]
-    assert narrowed[0] > 1.0
-    assert narrowed[1] == pytest.approx(0.0, abs=1e-6)
-
-
 def test_a_second_pass_follows_where_the_first_has_failed(
     model: StatisticalModel, states: DrawnStates, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -358,16 +313,3 @@ def test_a_second_pass_follows_where_the_first_has_failed(
     assert once is not None and twice is not None and twice.misfit < 0.9 * once.misfit
     monkeypatch.setattr("mereo.fitting.draws.fit.refine", None)  # not called where the first explains the cloud
     assert fit_draws(replace(problem, config=replace(problem.config, passes=1, hopeless=9.0)), fitted.posed) is not None
-
-
-def test_after_a_search_nobody_is_asked_about_a_frame_that_is_not_explained(
-    model: StatisticalModel, states: DrawnStates
-) -> None:
-    """A search has no correspondences, and draws are fitted all the same."""
-    points, material = shown(model, 0.5)
-    fitted = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
-    base = replace(fitted.problem, network=NetworkTerm.none(model))
-    problem = DrawsProblem.of(base, states, nothing())
-    strict = replace(problem, config=replace(problem.config, explained=0.0, jumps=0))
-    assert strict.config.network_start
-    assert fit_draws(strict, fitted.posed) is not None

@@ -136,18 +136,6 @@ def test_a_search_is_asked_too_where_a_part_is_hidden(
     assert answer_frame(observe(cloud), liver, registrar, resolution=24).taken and not asked
 
 
-def test_a_fit_that_alone_explains_the_frame_is_taken(liver: Model, cloud: PointCloud) -> None:
-    """As a noisy one, although its misfit is greater in a problem that knows no noise."""
-    by_network = answer(liver, cloud).candidate
-    assert by_network is not None and by_network.modes is not None
-    strict = replace(by_network.modes.problem, config=replace(by_network.modes.problem.config, tolerance=1e-3))
-    refused = replace(by_network, modes=replace(by_network.modes, problem=strict))
-    astray = replace(by_network.modes.posed, translation=by_network.modes.posed.translation + 0.05)
-    searched = replace(by_network, modes=replace(by_network.modes, posed=astray), located_by="search")
-    assert searched.is_accepted and not refused.is_accepted
-    assert more_evident(refused, searched) is searched
-
-
 def test_a_noisy_frame_that_two_fits_explain_apart_is_not_known(liver: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = GenerateConfig(sensor=SENSORS["time-of-flight"])
     view = sample_view(load_scene("liver").for_seed(1000), settings, example_rng(1000, 1))

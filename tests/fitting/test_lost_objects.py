@@ -235,16 +235,6 @@ def test_what_was_found_must_explain_the_newest_frame(
     assert late.tracking == "lost" and "it was last followed 8.8 s before" in str(late.recognition.reason)
 
 
-def test_an_executor_that_works_at_once_finds_it_in_the_same_frame(
-    registrar: Registrar, frames: dict[str, Observation], searches: Searches, there: SegmentedMesh
-) -> None:
-    tracker = Tracker(registrar, executor=SynchronousExecutor())
-    shown = [frames[name] for name in ("here", "there", "thing", "thing")]
-    answers = [tracker.follow(one, 0.03 * number, scene_unit=1.0) for number, one in enumerate(shown)]
-    assert [one.tracking for one in answers] == ["found", "found", "lost", "lost"]
-    assert searches == shown and rms(answers[1], there) < 0.7
-
-
 def test_the_own_thread_blocks_no_frame_and_ends(
     registrar: Registrar, frames: dict[str, Observation], searches: Searches, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -5,9 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from answers import answer_to
-from toy_scene import toy_scene
 
-from mereo.fitting.problem.problem import ACCEPTED
 from mereo.fitting.registration.recognition import (
     CONSERVATIVE,
     MOST,
@@ -29,15 +27,11 @@ from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
 from mereo.synthesis.sample_views import load_view
 from mereo_learning.calibrate import (
-    CalibrationView,
     RecognitionSigns,
-    object_views,
     other_objects,
     strange_frames,
     usual_of,
 )
-
-SCENE = toy_scene()
 
 
 @pytest.fixture(scope="module")
@@ -94,12 +88,6 @@ def test_the_more_is_wrong_the_less_is_known(registration: Registration) -> None
     assert order == sorted(order)
 
 
-def test_a_noisy_frame_may_leave_more_unexplained(registration: Registration) -> None:
-    clean, noisy = (replace(registration, explained=0.88, needed=needed) for needed in (0.95, ACCEPTED))
-    assert recognize(noisy).strangeness < recognize(clean).strangeness
-    assert recognize(noisy).known is True
-
-
 def test_the_object_at_rest_is_known_whatever_was_learned(registration: Registration) -> None:
     odd = replace(registration, z=registration.z + 10.0)
     assert recognize(odd).known is False and recognize(replace(odd, method="rest")).known is True
@@ -132,13 +120,6 @@ def test_a_size_off_by_a_factor_of_two_is_never_the_objects(
     assert said.known is known and (known or "its size differs by a factor of" in str(said.reason))
 
 
-def test_signs_add_up() -> None:
-    """Two signs of three standard deviations are stranger than one, by the root of two; what is usual adds none."""
-    usual = {name: Usual(mean=0.0, std=1.0) for name in ("unusual", "displaced", "beyond")}
-    one, two = (Signs(unusual=np.exp(3.0), displaced=d, beyond=0.01) for d in (0.01, np.exp(3.0)))
-    assert strangeness(two.strange(usual)) == pytest.approx(np.sqrt(2) * strangeness(one.strange(usual)), rel=1e-3)
-
-
 # --- how limits are measured ------------------------------------------------------------------------------------------
 
 
@@ -166,14 +147,6 @@ def test_a_view_that_was_not_understood_moves_no_limit() -> None:
 
 
 # --- what is seen -----------------------------------------------------------------------------------------------------
-
-
-def test_views_are_clean_and_noisy_in_turn_and_the_same_every_time() -> None:
-    views: list[CalibrationView] = list(object_views(SCENE, 5, 710_000))
-    assert [view.camera for view in views[:4]] == ["paper", "structured-light", "paper", "time-of-flight"]
-    assert [view.scene_unit for view in views] == [1.0] * 4 + [None]
-    again = next(object_views(SCENE, 1, 710_000))
-    np.testing.assert_array_equal(views[0].seen.points, again.seen.points)
 
 
 def test_strangers_are_other_objects_planes_and_heaps(monkeypatch: pytest.MonkeyPatch) -> None:

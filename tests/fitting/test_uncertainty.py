@@ -15,7 +15,6 @@ from mereo.fitting.uncertainty import Posterior, radius95
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import owned_centroids, owned_gradients
-from mereo.geometry.transforms import rigid, transform_points
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo_learning.cases import RegistrationErrors, seen_points
 
@@ -85,14 +84,6 @@ def test_the_gradients_of_volumes_and_centroids_are_their_differences() -> None:
         said = np.einsum("sqvi,vi->sq", gradients, change)
         np.testing.assert_allclose(said[:, 0], (more - less) / 2e-5, rtol=1e-5)
         np.testing.assert_allclose(said[:, 1:], (center - other) / 2e-5, rtol=1e-3, atol=1e-5)
-
-
-def test_hidden_points_have_larger_radii_than_seen_ones(found: Registration, material: np.ndarray) -> None:
-    assert found.uncertainty is not None
-    radii = found.uncertainty.material
-    shown = seen_points(material, PointCloud(seen(found.model.mesh(material))), 1.0)
-    assert np.median(radii[~shown]) > 1.2 * np.median(radii[shown])
-    assert (radii > 0).all()
 
 
 def test_radii_are_in_the_unit_of_the_input(model: StatisticalModel, material: np.ndarray, found: Registration) -> None:
@@ -205,29 +196,3 @@ def test_segments_are_explained_by_name(found: Registration) -> None:
     with pytest.raises(ValueError, match="x, y, z"):
         found.explain([1.0, 2.0])
     assert replace(found, optimum=None).explain(name) is None
-
-
-def test_what_is_near_a_seen_point_decides_it(found: Registration) -> None:
-    """More than what is far; and of a frame that is turned the same is said, turned."""
-    row = int(np.flatnonzero(seen_points(found.material, PointCloud(seen(found.model.mesh(found.material))), 1.0))[20])
-    one = found.explain(found.material[row])
-    assert one is not None and len(one.unexplained) == 0
-    away = np.linalg.norm(one.points - one.place, axis=1)
-    assert one.weights[away < 4].mean() > 2 * one.weights[away > 12].mean()
-    T = rigid(Rotation.from_euler("xyz", [40, 10, 80], degrees=True).as_matrix(), np.array([5.0, 1.0, -3.0]))
-    turned = found.moved(T).explain(transform_points(T, found.material[[row]])[0])
-    assert turned is not None
-    np.testing.assert_allclose(turned.points, transform_points(T, one.points), atol=1e-6)
-    np.testing.assert_allclose(turned.influence, one.influence @ T[:3, :3].T, atol=1e-4)
-
-
-def test_points_are_as_sure_as_the_vertices_that_they_are(found: Registration) -> None:
-    """A vertex asked as a point follows its neighbours, which move much as it does."""
-    assert found.uncertainty is not None
-    rows = np.arange(0, sum(found.model.vertex_counts), 7)
-    labels = found.model.labels[rows]
-    for place, points in (("rest", found.model.rest_points), ("camera", found.material)):
-        asked = found.radius95(points[rows], labels, at=place)  # type: ignore[arg-type]
-        assert asked is not None
-        np.testing.assert_allclose(asked, found.uncertainty.material[rows], rtol=0.1)
-    assert [len(part) for part in found.uncertainty.vertices] == list(found.model.vertex_counts)

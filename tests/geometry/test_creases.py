@@ -62,15 +62,6 @@ def test_a_cylinder_is_smooth_around_and_has_rims(sides: int, times: int) -> Non
     np.testing.assert_allclose(vertex_normals(split)[~round_it, 2], np.sign(split.vertices[~round_it, 2]), atol=1e-9)
 
 
-def test_a_crease_that_ends_leaves_its_end_whole() -> None:
-    """A sheet that is folded along half of a line: the fold's inner end has one group of faces around it."""
-    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.6], [-1, 0, 0], [0, -1, 0.6], [2, 0, 1.5]], dtype=float)
-    faces = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]])
-    flat = Segment("sheet", RED, vertices * [1, 1, 0.5], faces)
-    split, source = split_at_creases(flat, angle_deg=40.0)
-    assert len(split.vertices) == len(source) and 0 not in source[len(vertices) :]
-
-
 def test_faces_without_area_and_edges_of_many_faces_are_no_trouble() -> None:
     one = box()
     thin = np.concatenate([one.faces, [[0, 1, 1], [0, 0, 0]]])

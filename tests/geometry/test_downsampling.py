@@ -67,28 +67,12 @@ def gap_to_chosen(points: np.ndarray, order: np.ndarray) -> np.ndarray:
     return np.minimum.accumulate(distances, axis=1).T
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_each_next_point_is_the_farthest_from_all_before(seed: int) -> None:
-    points = np.random.default_rng(seed).normal(size=(400, 3))
-    order = farthest_point_order(points, 200)
-    gaps = gap_to_chosen(points, order)
-    chosen = gaps[np.arange(199), order[1:]]
-    assert np.allclose(chosen, gaps.max(axis=1), rtol=1e-6)
-
-
 def test_on_a_lattice_the_choice_is_exact_and_ties_go_to_smaller_coordinates() -> None:
     points = lattice(5)
     order = farthest_point_order(points, 60)
     gaps = gap_to_chosen(points, order)
     # rows of the lattice are sorted by x, y, z, and argmax takes the first: the rule in one line
     assert np.array_equal(order[1:], gaps.argmax(axis=1))
-
-
-def test_a_smaller_sample_is_a_prefix_of_a_larger_one() -> None:
-    points = np.random.default_rng(1).normal(size=(300, 3))
-    longest = farthest_point_order(points, 300)
-    assert all(np.array_equal(farthest_point_order(points, m), longest[:m]) for m in (1, 2, 37, 128))
-    assert sorted(longest) == list(range(300))
 
 
 @pytest.mark.parametrize("points", [lattice(4), np.random.default_rng(2).normal(size=(200, 3))], ids=["ties", "random"])

@@ -93,19 +93,6 @@ def test_each_fault_is_found_repaired_and_said(faulty: Segment, fault: str, chan
     assert fixed.segment.volume == pytest.approx(volume, rel=0.01)
 
 
-@pytest.mark.slow
-def test_the_last_resort_is_a_new_surface_that_keeps_the_shape() -> None:
-    # one surface that runs through itself: no hole to fill and no shell to unite
-    part = ball((0, 0, 0), 2.0)
-    x, y, z = part.vertices.T
-    twisted = replace(part, vertices=np.stack([x, y * (1 - 1.2 * np.exp(-4 * (x - 1) ** 2)), z], axis=1))
-    assert any("intersects itself" in text for text in examine(twisted).dirty) or examine(twisted).hopeless
-    fixed = repaired(twisted)
-    assert "new surface" in fixed.changes[-1]
-    assert examine(fixed.segment).sound
-    np.testing.assert_allclose(fixed.segment.bounds, twisted.bounds, atol=0.05)
-
-
 def horned(radius: float, horns: int) -> Segment:
     """Ball of radius 1 with thin horns, a hole, and an arm that comes around and runs back into the ball."""
     shell = ball((0, 0, 0), 1.0)
@@ -148,15 +135,6 @@ def test_what_is_too_thin_for_the_finest_cells_is_said() -> None:
     assert distance == pytest.approx(0.6, abs=0.02)
     np.testing.assert_allclose(place, [-1.6, 0, 0], atol=1e-4)
     assert max(way for way, _ in farthest(fixed.segment, fixed.kept)) < 0.1
-
-
-def test_a_narrow_gap_that_is_closed_is_no_loss() -> None:
-    low, high, slit = box((0, 0, 0), (4, 4, 1.99)), box((0, 0, 2), (4, 4, 4)), box((0, 0, 0), (4, 4, 4))
-    (lost, _), (filled, place) = farthest(joined(low, high), slit)
-    assert lost == pytest.approx(0, abs=1e-12) and filled == pytest.approx(1.99, abs=0.05)
-    np.testing.assert_allclose(place[:2], [2, 2], atol=0.05)
-    (lost, place), (filled, _) = farthest(slit, low)
-    assert lost == pytest.approx(2.01) and place[2] == 4 and filled == pytest.approx(0, abs=1e-12)
 
 
 def test_all_faults_of_a_segment_are_named_at_once() -> None:
@@ -267,23 +245,6 @@ def test_parts_of_a_model_get_files_of_their_own(tmp_path: Path, capsys: pytest.
     rest = load_scene(tmp_path / "two-repaired.yaml").rest
     assert (rest.nested, rest.colors[2]) == ((("core", "b b"),), (1, 2, 3))
     check_overlap(rest)
-
-
-def test_a_mesh_without_an_inside_is_reported_and_turned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = write_bar(tmp_path)
-    part = trimesh.load_mesh(tmp_path / "left.stl")
-    write_mesh(
-        Segment("left", (0, 0, 0), np.array(part.vertices), np.array(part.faces)[:, ::-1]), tmp_path / "left.stl"
-    )
-    with pytest.raises(ValueError, match="has 1 fault, listed above"):
-        check_scene(str(path))
-    assert "left                     192 faces\n  fault: it has 100% of its surface facing" in capsys.readouterr().out
-    check_scene(str(path), repair=True)
-    printed = capsys.readouterr().out
-    assert "repaired left: turned 192 faces around" in printed
-    assert "  longest side 20 mm before, 20 now; the old surface reaches at most 0 mm out of the new one\n" in printed
-    files = [block["file"] for block in yaml.safe_load((tmp_path / "bar-repaired.yaml").read_text())["segments"]]
-    assert files == ["left-repaired.ply", "right.stl"]
 
 
 # --- meshes that are no solids ----------------------------------------------------------------------------------------

@@ -12,7 +12,6 @@ from toy_frames import MODEL, seen
 from two_balls import scene
 
 import mereo
-from mereo.__main__ import main
 from mereo.fitting.registration.answer import Answer
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import CloudAxes
@@ -63,14 +62,11 @@ def npy(path: Path) -> Path:
 CLOUDS: dict[str, Callable[[Path], Any]] = {
     "array": lambda _: seen(),
     "list": lambda _: seen().tolist(),
-    "tuple of rows": lambda _: tuple(map(tuple, seen().tolist())),
     "PointCloud": lambda _: PointCloud(seen()),
-    "npy": lambda folder: npy(folder / "cloud.npy"),
     "npy, a string": lambda folder: str(npy(folder / "cloud.npy")),
     "ply": lambda folder: ply(folder / "cloud.ply"),
     "load_frame of an array": lambda _: mereo.load_frame(seen()),
     "load_frame of a file": lambda folder: mereo.load_frame(npy(folder / "cloud.npy")),
-    "what a result was made from": lambda _: asked(seen()).seen,
 }
 
 
@@ -132,17 +128,3 @@ def test_a_depth_image_has_one_answer(tmp_path: Path) -> None:
     ):
         same(found, wanted)
     assert wanted.unit_m == 1.0 and asked(image).unit_m is None, "an image of any unit, unless it is said"
-
-
-@pytest.mark.parametrize("unit_m", [None, 0.5])
-def test_the_command_writes_what_python_finds(
-    unit_m: float | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: MODEL)
-    unit = [] if unit_m is None else ["--unit-m", str(unit_m)]
-    arguments = ["reconstruct", str(npy(tmp_path / "cloud.npy")), "--weights", "any", "--method", "network"]
-    assert main([*arguments, "--resolution", str(RESOLUTION), "--output", str(tmp_path / "out"), *unit]) == 0
-    written = json.loads((tmp_path / "out/summary.json").read_text())
-    for frame in (seen(), tmp_path / "cloud.npy"):
-        assert figures(written) == figures(asked(frame, unit_m=unit_m))
-    assert written["unit_m"] == unit_m and (written["visible_size_m"] is None) == (unit_m is None)

@@ -3,12 +3,10 @@
 import io
 import json
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 from written_results import segments
 
@@ -17,12 +15,10 @@ from mereo.cli.answers import StreamCommand
 from mereo.cli.stream import (
     FrameAnswer,
     Outcome,
-    StreamFrame,
     Summary,
     frames_of,
     stream_reconstructions,
 )
-from mereo.geometry.camera import PointCloud
 from mereo.io.config import InputConfig
 from mereo.reconstruction.config import IsolationConfig
 from mereo.scenes.registry import load_scene
@@ -71,20 +67,6 @@ def test_names_on_standard_input_are_frames(
     frames = list(frames_of("-", reading, IsolationConfig()))
     assert [Path(frame.name).name for frame in frames] == ["0000.png", "0001.png"]
     assert len(frames[1].load().cloud) > 32
-
-
-def test_a_sequence_that_breaks_off_is_told_after_its_frames_and_their_summary(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def frames(*_: object) -> Iterator[StreamFrame]:
-        yield StreamFrame("first", 0.0, lambda: PointCloud(np.ones((40, 3))))
-        raise ValueError("it is cut off")
-
-    monkeypatch.setattr("mereo.cli.stream.frames_of", frames)
-    with pytest.raises(ValueError, match="^it is cut off$"):
-        stream_reconstructions(StreamCommand(str(tmp_path), weights="rope"))
-    out, err = capsys.readouterr()
-    assert json.loads(out)["frame"] == "first" and "1 bad" in err
 
 
 def test_sources_that_are_none_are_refused(tmp_path: Path) -> None:

@@ -15,9 +15,8 @@ from answers import answer_to, reconstruct
 from two_balls import BIG, NAMES, SMALL, front, scene, two_balls
 
 import mereo
-from mereo.cli.answers import ReconstructCommand, StreamCommand
+from mereo.cli.answers import ReconstructCommand
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
-from mereo.cli.stream import stream_reconstructions
 from mereo.fitting.registration.answer import Answer
 from mereo.io.config import InputConfig
 from mereo.reconstruction.config import IsolationConfig
@@ -69,17 +68,6 @@ def test_components_are_counted_and_nothing_is_removed() -> None:
     segment = reconstruct(cloud, AnalyticModel.of(apart, ("one",)), resolution=96).segments[0]
     assert segment.components == 3
     assert segment.volume == pytest.approx(4 / 3 * np.pi * (0.5**3 + 0.1**3 + 0.04**3), rel=0.02)
-
-
-def test_the_unit_of_the_cloud_does_not_matter() -> None:
-    """A factor of two to the ten is exact in floating point, so labels agree bit by bit."""
-    field = logits_of(ball((0.1, 0.2, 0.3), 0.9), ball((0.1, 0.2, 1.5), 0.4), ball((-0.9, -0.4, 0.0), 0.1))
-    cloud, model = scene("camera")[0], AnalyticModel.of(field, NAMES, normalized=True)
-    small, large = (reconstruct(factor * cloud, model, resolution=40) for factor in (1.0, 1024.0))
-    np.testing.assert_array_equal(small.labels.labels, large.labels.labels)
-    np.testing.assert_array_equal(1024.0 * small.labels.spacing, large.labels.spacing)
-    for a, b in zip(small.segments, large.segments, strict=True):
-        assert 1024.0**3 * a.volume == pytest.approx(b.volume, rel=1e-9)
 
 
 def test_files(answer: Answer, tmp_path: Path) -> None:
@@ -165,20 +153,6 @@ def test_strays_are_dropped_and_said_unless_all_are_to_be_kept(
         read(tmp_path / "all", replace(job, command=replace(job.command, isolation=IsolationConfig(keep_all=True))))
     assert "strays:" not in capsys.readouterr().out
     assert json.loads((tmp_path / "all/summary.json").read_text())["points"] == 1230
-
-
-@pytest.mark.parametrize("keep_all, strays", [(False, 30), (True, 0)])
-def test_a_stream_drops_strays_and_counts_them(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, keep_all: bool, strays: int
-) -> None:
-    cloud, _, model = with_strays()
-    np.save(tmp_path / "cloud.npy", cloud)
-    monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: model)
-    isolation = IsolationConfig(keep_all=keep_all)
-    stream_reconstructions(
-        StreamCommand(str(tmp_path), weights="any", resolution=16, every_frame=True, isolation=isolation)
-    )
-    assert json.loads(capsys.readouterr().out)["strays"] == strays
 
 
 def test_every_public_name_exists_and_importing_the_package_loads_nothing() -> None:

@@ -16,7 +16,6 @@ from mereo.cli import stream as stream_module
 from mereo.cli.answers import StreamCommand
 from mereo.cli.stream import (
     PATIENCE_S,
-    Outcome,
     StreamFrame,
     Summary,
     WatchedFolder,
@@ -78,15 +77,6 @@ def test_a_slow_answer_gets_the_latest_frame_and_dropped_ones_are_not_decoded() 
         summary.add(outcome)
     assert (summary.answered, summary.dropped, summary.failed) == (3, 10, 0)
     assert "10 dropped for newer ones, 0 bad" in str(summary)
-
-
-def test_the_memory_of_a_summary_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mereo.cli.stream.RECENT", 3)
-    summary = Summary()
-    assert "0 frames answered" in str(summary)
-    for latency_s in (100.0, 1.0, 2.0, 3.0):
-        summary.add(Outcome("", 0.0, 0, "", latency_s, 0.0, 0))
-    assert list(summary.latencies_s) == [1.0, 2.0, 3.0] and "latency 2000 ms (median)" in str(summary)
 
 
 @pytest.mark.parametrize(
@@ -183,21 +173,6 @@ def test_an_empty_or_restless_file_is_waited_for_within_bounds(watched: WatchedF
         assert watched.look(float(second)) == []
     write(restless, b"the end?", 99)
     assert watched.look(PATIENCE_S) == [empty, restless]
-
-
-def test_frames_are_answered_as_their_files_arrive(tmp_path: Path) -> None:
-    np.save(tmp_path / "first.npy", np.ones((40, 3)))
-    (tmp_path / "second.npy").touch()
-    (tmp_path / ".third.partial.npy").write_bytes(b"a writer renames it when it is whole")
-    isolation = IsolationConfig(box=(-9, -9, 0, 9, 9, 9))
-    frames = watched_frames(str(tmp_path), InputConfig(), isolation)
-    outcomes = stream(frames, lambda frame: len(frame.load().cloud), every_frame=True)
-    assert (found := next(outcomes)).name == "first.npy" and found.result == 40
-    np.save(tmp_path / "second.npy", np.ones((50, 3)))
-    assert (found := next(outcomes)).name == "second.npy" and found.result == 50
-    np.save(tmp_path / "first.npy", np.ones((60, 3)))
-    assert (found := next(outcomes)).name == "first.npy" and found.result == 60
-    outcomes.close()  # type: ignore[attr-defined]
 
 
 def test_watching_ends_with_ctrl_c(

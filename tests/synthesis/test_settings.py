@@ -1,6 +1,5 @@
 """Sensors and workspaces from the options to the files: presets, datasets that state them, evaluation with them."""
 
-import json
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import get_args
@@ -10,20 +9,18 @@ import pytest
 from toy_scene import toy_scene
 
 import mereo.__main__ as command_line
-from mereo.api.generate import generate
 from mereo.cli import training
 from mereo.geometry.camera import PointCloud
 from mereo.models.model import Model
 from mereo.models.trained import EncodedCloud
 from mereo.models.weights import load_model
 from mereo.scenes.scene import PAPER_APERTURE_RAD, WHOLE_SPHERE_RAD, Workspace
-from mereo.synthesis.config import SENSOR_TERMS, SENSORS, GenerateConfig, SamplingConfig, Sensor, SensorConfig
+from mereo.synthesis.config import SENSOR_TERMS, SENSORS, GenerateConfig, Sensor, SensorConfig
 from mereo_learning.evaluation_report import evaluate_weights
 from mereo_learning.model_card import card
 from mereo_learning.scoring import EvaluationConfig
 from mereo_learning.tables import read_metrics
 
-SMALL = GenerateConfig(image_size=48, points=64, sampling=SamplingConfig(per_segment=8))
 NARROW = Workspace(axis=(0.0, 1.0, 0.0), aperture_rad=0.5)
 ALL_AROUND = Workspace(axis=(1.0, 0.0, 0.0), aperture_rad=WHOLE_SPHERE_RAD, any_roll=True, distance=(90.0, 95.0))
 
@@ -96,29 +93,6 @@ def test_a_scene_has_its_own_workspace_a_cone_and_the_sphere() -> None:
     expected = asdict(ALL_AROUND) | {"aperture_rad": PAPER_APERTURE_RAD, "any_roll": False}
     assert asdict(scene.workspace_named("cone")) == expected
     assert replace(scene, cone=NARROW).workspace_named("cone") is NARROW
-
-
-@pytest.mark.parametrize(
-    "change, other",
-    [
-        ({"sensor": SENSORS["time-of-flight"]}, "settings.sensor.model = 'time-of-flight', not 'structured-lig"),
-        ({"workspace": "cone"}, "settings.workspace = 'cone', not 'own'; resuming needs equal"),
-    ],
-)
-def test_the_manifest_states_the_settings_and_resuming_needs_the_same(
-    tmp_path: Path, change: dict[str, object], other: str
-) -> None:
-    scene, settings = replace(toy_scene(), workspace=ALL_AROUND), replace(SMALL, **change)  # type: ignore[arg-type]
-    generate(scene, tmp_path / "data", settings, examples=2, seed=3)
-    manifest = json.loads((tmp_path / "data" / "manifest.json").read_text())
-    assert SensorConfig(**manifest["settings"].get("sensor", {})) == settings.sensor
-    assert manifest["settings"].get("workspace", "own") == settings.workspace
-    workspace = scene.workspace_named(settings.workspace)
-    assert manifest["workspace"] == json.loads(json.dumps(asdict(workspace)))
-    assert manifest["any_roll"] is workspace.any_roll
-    generate(scene, tmp_path / "data", settings, examples=2, seed=3, resume=True)
-    with pytest.raises(ValueError, match=f"was made with {other}"):
-        generate(scene, tmp_path / "data", SMALL, examples=2, seed=3, resume=True)
 
 
 def test_evaluation_looks_through_the_sensor_from_the_workspace_and_says_so(

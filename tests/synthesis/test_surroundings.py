@@ -12,7 +12,7 @@ from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.scenes.seeds import example_rng
-from mereo.synthesis.clutter import BACKGROUND, NOTHING, OBJECT, OCCLUDER, Capsule
+from mereo.synthesis.clutter import BACKGROUND, OBJECT, OCCLUDER, Capsule
 from mereo.synthesis.config import GenerateConfig, SamplingConfig, SensorConfig
 from mereo.synthesis.depth_sensor import SimulatedView, observe
 from mereo.synthesis.examples import sample_view, synthesize
@@ -87,22 +87,6 @@ def test_occluders_are_in_front_hide_the_object_and_come_from_outside(term: str)
         edge = np.concatenate([occluder[0], occluder[-1], occluder[:, 0], occluder[:, -1]])
         borders += bool(edge.any())
     assert np.mean(np.array(hidden) > 0) > 0.9 and np.mean(hidden) > 10 and borders >= 38
-
-
-def test_a_background_is_behind_everything_and_outside_a_true_mask() -> None:
-    vertices = PAIR.mesh.merged()[0]
-    clear = look(0)
-    for seed in range(10):
-        seen = look(seed, background=1.0)
-        assert (seen.source != NOTHING).all() and np.array_equal(seen.image.depth, clear.image.depth)
-        plane = seen.source == BACKGROUND
-        points = (seen.whole.depth[..., None] * CAMERA.directions())[plane]
-        center = points.mean(axis=0)
-        normal = np.linalg.svd(points - center, full_matrices=False)[2][2]
-        normal *= np.sign(normal[2])
-        assert normal[2] > np.cos(np.pi / 4) - 1e-9
-        gap = (center - vertices) @ normal
-        assert gap.min() > -1e-6 and gap.min() < 0.05 / OFF.metres_per_unit + 1e-6
 
 
 def test_a_wrong_mask_lets_background_and_tools_in_and_loses_the_object() -> None:
