@@ -51,8 +51,6 @@ def result() -> Result:
     return mereo.reconstruct(seen(), MODEL, resolution=24, unit_m=1.0, label_points=True)
 
 
-# --- arguments --------------------------------------------------------------------------------------------------------
-
 LINE = np.linspace(0.1, 1.0, 99)[:, None] * [1.0, 0.5, 2.0]
 CAMERA = Camera(32, 32, 40.0, 40.0, 16.0, 16.0)
 
@@ -94,9 +92,6 @@ def test_a_result_says_that_it_cannot_be_sent(result: Result) -> None:
         with pytest.raises(TypeError, match=r"a result cannot be pickled or copied.*write it with result.save\(\)"):
             send(result)
     assert pickle.loads(pickle.dumps(list(result)))[0].name == result.names[0]
-
-
-# --- saving -----------------------------------------------------------------------------------------------------------
 
 
 def contents(folder: Path) -> dict[str, Any]:
@@ -169,9 +164,6 @@ def test_other_names_are_refused(result: Result, tmp_path: Path) -> None:
     assert result.save(tmp_path / "take-1.2", formats=("npz",)).is_dir()
 
 
-# --- told -------------------------------------------------------------------------------------------------------------
-
-
 def test_values_tell_themselves_in_one_line(result: Result) -> None:
     view = load_scene("rope")
     camera = Camera.from_fov(4, 3, 0.5)
@@ -225,9 +217,6 @@ def images(page: str) -> list[str]:
     return re.findall(r'base64,([^"]+)"', page)
 
 
-# --- frames -----------------------------------------------------------------------------------------------------------
-
-
 def test_a_size_of_none_is_warned_of_at_the_call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     np.save(tmp_path / "cloud.npy", seen())
     known = replace(MODEL, provenance={"visible_m": [2, 3]})
@@ -257,9 +246,6 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
         mereo.load_frame(seen(), mask=tmp_path / "mask.png")
     with pytest.raises(TypeError, match="unit"):
         mereo.load_frame(tmp_path / "x.ply", unit=1.0)
-
-
-# --- the viewer -------------------------------------------------------------------------------------------------------
 
 
 class Server:
@@ -296,7 +282,6 @@ def test_a_page_stays_open_where_somebody_goes_on(
 
 
 def test_a_result_is_viewed_as_it_is(result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is computed again: the page's surfaces are the result's."""
     shown: list[Any] = []
     for module in (result_page, view):
         monkeypatch.setattr(module, "import_viser", lambda: None)

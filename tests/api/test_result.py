@@ -29,9 +29,6 @@ def result() -> Result:
     return mereo.reconstruct(seen(), MODEL, "network", resolution=24)
 
 
-# --- segments ---------------------------------------------------------------------------------------------------------
-
-
 def test_segments_are_had_by_their_names(result: Result) -> None:
     assert result.names == NAMES and len(result) == 3
     for name, center, radius in zip(NAMES, CENTERS, RADII, strict=False):
@@ -50,9 +47,6 @@ def test_an_absent_segment_is_there_and_says_so(result: Result) -> None:
     with pytest.raises(KeyError, match="there is no segment 'bigg'; the segments are big, <small>, absent"):
         result["bigg"]
     assert repr(absent) == "SegmentResult('absent', not found)" and "volume" in repr(result["big"])
-
-
-# --- the pose ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -112,9 +106,6 @@ def test_a_unit_that_nobody_states_is_found_by_the_true_size(rope: Model, regist
     free = Result.of(answer_to(cloud, rope, unsized, 16))
     assert free.taken and free.unit_m is None and free.pose is not None
     assert free.registered is not None and free.model_scale == free.registered.scene_unit
-
-
-# --- where it is saved ------------------------------------------------------------------------------------------------
 
 
 def test_without_a_name_it_is_saved_beside_the_last(

@@ -48,7 +48,6 @@ def _own_cache(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def hidden(program: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run a program for which torch is not installed."""
     end = "\nassert not Hidden.asked, Hidden.asked\n"
     return subprocess.run(
         [sys.executable, "-c", HIDDEN + program + end], cwd=folder, capture_output=True, text=True, timeout=300

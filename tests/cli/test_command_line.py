@@ -42,15 +42,10 @@ def assert_one_line_error(result: subprocess.CompletedProcess[str], *parts: str)
 
 
 def raising(error: BaseException) -> SimpleNamespace:
-    """A command whose work raises ``error``."""
-
     def run() -> None:
         raise error
 
     return SimpleNamespace(run=run)
-
-
-# --- help and version -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("command", ["", "evaluate", "reconstruct", "scene"])
@@ -76,9 +71,6 @@ def test_version(option: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out == f"mereo {version('mereo')}\n"
 
 
-# --- what the options mean --------------------------------------------------------------------------------------------
-
-
 def test_train_options_override_the_preset() -> None:
     text = (
         "train data --epochs 2 --preset paper --network.width 64 --loss ce --network.no-encode-positions --output run"
@@ -96,9 +88,6 @@ def test_wrong_shard_is_explained(shard: str) -> None:
     assert training.part_of("3/12") == (3, 12)
     with pytest.raises(ValueError, match="it must be i/n with i from 0 to n - 1"):
         training.part_of(shard)
-
-
-# --- errors -----------------------------------------------------------------------------------------------------------
 
 
 def test_library_errors_are_one_line() -> None:
@@ -172,8 +161,6 @@ def test_arguments_that_mean_no_command_are_explained_in_a_box(
     printed = capsys.readouterr()
     assert not printed.out and all(part in printed.err for part in parts), printed.err
 
-
-# --- what a command calls, with which options -------------------------------------------------------------------------
 
 OUT = {"output": Path("out")}
 READING = InputConfig(Path("k.json"), 5000.0, Path("m.png"))

@@ -40,7 +40,6 @@ def written(folder: Path, content: Any, name: str = "options.json") -> Path:
 
 @pytest.mark.parametrize("command", LINES)
 def test_what_a_command_writes_says_the_same_as_its_line(command: str, tmp_path: Path) -> None:
-    """Through JSON and back, every option has its value; files are absolute then."""
     before = command_line.parse(LINES[command].split())
     content = json.loads(json.dumps(options_of(before, command)))
     assert content.pop("command") == command

@@ -36,7 +36,6 @@ def help_of(command: str) -> str:
 
 
 def commands(group: str = "") -> Iterator[str]:
-    """Every command that does something, those of groups by both words."""
     listed = re.findall(r"^│ +• ([a-z-]+)", help_of(group), re.MULTILINE)
     for name in listed:
         yield from commands(f"{group} {name}".strip())

@@ -106,9 +106,6 @@ def cube(rng: np.random.Generator, count: int = 300) -> np.ndarray:
     return rng.uniform(*BOX, size=(count, 3))
 
 
-# --- all of them ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", MAKERS)
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1))
@@ -186,9 +183,6 @@ def test_rigid_preserves_distances_and_moves_its_center_by_the_translation() -> 
     moved = motion(points)
     assert np.allclose(np.linalg.norm(np.diff(moved, axis=0), axis=1), np.linalg.norm(np.diff(points, axis=0), axis=1))
     assert np.allclose(motion(motion.center[None])[0], motion.center + motion.translation)  # type: ignore[attr-defined]
-
-
-# --- each shape -------------------------------------------------------------------------------------------------------
 
 
 def test_bend_preserves_arc_length_and_has_the_closed_form_jacobian() -> None:

@@ -29,11 +29,7 @@ def moved_vertices() -> dict[str, np.ndarray]:
 
 
 def soup() -> dict[str, np.ndarray]:
-    """For each segment the vertex of each corner of each face, as in an STL file."""
     return {part.name: part.faces.ravel() for part in boxes().segments}
-
-
-# --- formats ----------------------------------------------------------------------------------------------------------
 
 
 def nodes_npz(path: Path) -> Path:
@@ -69,11 +65,7 @@ def meshes(suffix: str, rest: bool) -> Callable[[Path], Path]:
     return write
 
 
-# --- other programs' files --------------------------------------------------------------------------------------------
-
-
 def grid(nodes: np.ndarray, **data: np.ndarray) -> Any:
-    """The lattice as pyvista has it, in the files' coordinates."""
     pyvista = pytest.importorskip("pyvista", reason="pyvista is not installed: pip install 'mereo[dev]'")
     made = pyvista.UnstructuredGrid({pyvista.CellType.TETRA: lattice().elements}, to_file(nodes))
     made.point_data.update(data)
@@ -207,9 +199,6 @@ def test_a_sequence_of_positions_starts_at_rest_and_hexahedra_are_divided(tmp_pa
     record = read_states(tmp_path, ("left", "right"))
     assert isinstance(record, TetrahedralRecord) and np.abs(record.displacements[0]).max() == 0
     assert np.abs(Tetrahedra(record.rest_nodes, record.tetrahedra).volumes).sum() == pytest.approx(6 * 3 * 3)
-
-
-# --- what does not fit ------------------------------------------------------------------------------------------------
 
 
 def tetrahedral(**changes: np.ndarray) -> dict[str, np.ndarray]:

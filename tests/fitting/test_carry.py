@@ -48,7 +48,6 @@ def placed_one(registrar: Registrar, content: Surfaces | Positions | PoseTable, 
 
 
 def test_a_rigid_pose_carries_everything_rigidly(model: StatisticalModel, registrar: Registrar) -> None:
-    """Inside, outside and poses, in any unit."""
     rng = np.random.default_rng(0)
     points = rng.uniform(*model.rest.bounds, size=(200, 3)) * 1.3
     turns = Rotation.random(200, rng=rng).as_matrix()

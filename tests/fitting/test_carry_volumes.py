@@ -56,7 +56,6 @@ def around(spacing: float = SPACING, margin: float = 4.0) -> Volume:
 
 
 def ramp(dtype: str = "float64", **changes: object) -> Volume:
-    """``RAMP @ position + 100`` in every voxel."""
     grid = around()
     values = grid.values @ RAMP + 100
     return replace(grid, values=(np.rint(values) if dtype.startswith("int") else values).astype(dtype), **changes)
@@ -71,13 +70,11 @@ def halves(dtype: str = "int16") -> Volume:
 
 
 def at_points(volume: Volume, points: np.ndarray) -> np.ndarray:
-    """Values of the voxels that hold points."""
     index = np.rint(volume.index_of(points)).astype(int)
     return np.asarray(volume.values[tuple(index.T)])
 
 
 def test_a_material_point_keeps_its_value(bent: Registration) -> None:
-    """A linear function of the position at rest, at points inside, is there where they have been moved to."""
     found = resampled(ramp(), bent)
     assert found.interpolation == "linear" and found.within == found.inside > 5000
     np.testing.assert_allclose(found.content.spacing, 10 * SPACING)
@@ -92,7 +89,6 @@ def test_a_material_point_keeps_its_value(bent: Registration) -> None:
 
 
 def test_far_from_the_object_there_is_background(model: StatisticalModel) -> None:
-    """Also where the file's voxels end before the object does."""
     here = registered(model, transform_points(T, model.rest_points))
     source = ramp("int16")
     found = resampled(source, here)

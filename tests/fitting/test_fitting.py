@@ -32,14 +32,12 @@ CLEAN = replace(GenerateConfig(), noise_std=0.0)
 
 
 def true_material(model: StatisticalModel, view: View) -> np.ndarray:
-    """Material points of the state that a view shows, camera frame."""
     state = State(view.mesh.transformed(view.T_world_camera), view.deformations)
     points = state_points(state, model.nodes, model.node_labels)
     return transform_points(inverse_rigid(view.T_world_camera), points)
 
 
 def told(model: StatisticalModel, view: View, error: float = 0.0) -> Correspondences:
-    """What a network might say: 200 material points, wrong by ``error`` units."""
     return said(model, true_material(model, view), max(error, 1e-12))
 
 
@@ -63,7 +61,6 @@ def test_a_known_state_is_found(model: StatisticalModel, index: int) -> None:
 
 
 def test_what_the_frame_rules_out_is_told(model: StatisticalModel, view: View, registration: Registration) -> None:
-    """Nothing of a right fit; half of a cloud leaves the model's other half where nothing of it was seen."""
     assert registration.ruled_out == 0.0 and recognize(registration).known is True
     points = view.depth.to_points().points
     half = fit_correspondences(points[points[:, 0] < np.median(points[:, 0])], told(model, view), model, 1.0)
@@ -114,9 +111,6 @@ def test_vertices_in_front_or_beside_are_pushed_back(view: View) -> None:
     assert direction[0] @ middle > 0 and direction[1, 0] < 0
 
 
-# --- draws ------------------------------------------------------------------------------------------------------------
-
-
 def test_draws_find_a_state_of_the_scene(model: StatisticalModel) -> None:
     view = sample_view(SCENE, CLEAN, example_rng(5, 1))
     states = DrawnStates.of(SCENE, model, 100, 1000)
@@ -124,9 +118,6 @@ def test_draws_find_a_state_of_the_scene(model: StatisticalModel) -> None:
     assert found.method == "draws"
     error = np.linalg.norm(found.material - true_material(model, view), axis=1)
     assert np.median(error) < 0.05
-
-
-# --- the object at rest -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("noise", "unit"), [(0.0, 1.0), (0.1, 1.0), (0.1, 0.004)])
@@ -173,9 +164,6 @@ def test_what_the_frame_does_not_show_narrows_nothing(model: StatisticalModel, m
         Problem, "known", lambda self, p, prior, slack: NormalEquations.prior(p.z, *vars(prior).values(), 0.0, 1.0)
     )
     assert narrowing(problem, posed) == pytest.approx(0.0, abs=1e-6)
-
-
-# --- the camera turned in place ---------------------------------------------------------------------------------------
 
 
 AXIS = np.array([0.3, -0.2, 2.0])
@@ -246,9 +234,6 @@ def test_noise_that_hides_how_wrong_a_fit_is_hides_it_from_a_last_try_no_more(mo
     assert last.registration().accepted and np.median(mended) < 0.5
 
 
-# --- draws: what is played, and the approach to a shape ---------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def states(model: StatisticalModel) -> DrawnStates:
     return DrawnStates.of(SCENE, model, 30, 1000)
@@ -273,7 +258,6 @@ def test_a_secant_agrees_with_the_step_and_only_there() -> None:
 
 
 def test_the_approach_reaches_a_state_of_the_scene(model: StatisticalModel, states: DrawnStates) -> None:
-    """From another state, to the shape of one whose draws are known, in any pose."""
     points = states.material[7][states.played.index].astype(np.float64) @ np.diag([-1.0, -1.0, 1.0]) + 5.0
     shape = Shape.of(points, 0.04 * model.half, np.ones(len(points)))
     drawn = Drawn.of(SCENE, states.seeds[3])

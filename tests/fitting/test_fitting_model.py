@@ -25,7 +25,6 @@ def test_the_residue_is_that_of_held_out_states(model: StatisticalModel) -> None
 
 
 def test_the_pose_of_the_states_does_not_matter() -> None:
-    """Each state in a pose of its own gives the same modes."""
     scene, rng = toy_scene(), np.random.default_rng(0)
     nodes, labels = interior_nodes(scene.rest)
     states = sample_states(scene, nodes, labels, 60, 3)
@@ -45,7 +44,6 @@ def test_one_state_is_no_model() -> None:
 
 
 def test_inside_points_follow_the_scene(model: StatisticalModel) -> None:
-    """Against the scene's own map of space, at points that are no material points."""
     scene = toy_scene()
     deformations = sample_deformations(example_rng(7, 1))
     points = np.random.default_rng(1).uniform([-17, -5, -4], [-7, 5, 4], size=(300, 3))
@@ -53,6 +51,3 @@ def test_inside_points_follow_the_scene(model: StatisticalModel) -> None:
     material = state_points(scene.deform(deformations), model.nodes, model.node_labels)
     error = np.linalg.norm(model.weights(points, labels)(material) - deformations[0](points), axis=1)
     assert error.max() < 0.1
-
-
-# --- as arrays --------------------------------------------------------------------------------------------------------

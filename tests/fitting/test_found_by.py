@@ -115,7 +115,6 @@ def test_a_network_far_from_what_it_starts_is_no_start(liver: Model, cloud: Poin
 def test_a_search_is_asked_too_where_a_part_is_hidden(
     liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whatever the network's fit explains; the fit with the greater evidence is taken."""
     across = cloud.points[:, 0] / cloud.points[:, 2]
     kept = cloud.points[across > np.quantile(across, 0.2)]
     asked = []

@@ -46,14 +46,12 @@ def mesh_of(model: StatisticalModel, turn: int, share: float = 0.0) -> Segmented
 
 
 def view(mesh: SegmentedMesh, seed: int = 0, occluders: tuple[Capsule, ...] = ()) -> SimulatedView:
-    """View before a far wall."""
     solids, rng, away = Solids(mesh), np.random.default_rng(seed), np.array([0.0, 0.0, 1.0])
     wall = Backdrop(away, farthest(solids, away) + 60.0)
     return depth_sensor.observe(solids, CAMERA, 0.02, SENSORS["paper"], rng, around=Surroundings(occluders, wall))
 
 
 def bare(seen: SimulatedView) -> Observation:
-    """The object's points alone."""
     return observe(seen.image.to_points())
 
 
@@ -68,7 +66,6 @@ def vertices(mesh: SegmentedMesh) -> np.ndarray:
 
 
 def rms(answer: Answer, mesh: SegmentedMesh) -> float:
-    """Root mean square distance of all vertices."""
     return float(np.sqrt(((vertices(answer.surfaces) - vertices(mesh)) ** 2).sum(axis=1).mean()))
 
 
@@ -296,9 +293,6 @@ def test_a_stream_says_that_an_object_is_lost(
     assert lines[1]["reason"].startswith("the object is lost: only")
     # surfaces of the frame that was there by this name before it was lost are gone
     assert not list((tmp_path / "out").iterdir())
-
-
-# --- what passes in front ---------------------------------------------------------------------------------------------
 
 
 FRAMES, BEFORE, AFTER = 11, 3, 8

@@ -63,7 +63,6 @@ def with_rim(points: np.ndarray) -> np.ndarray:
 def candidates(
     model: Model, registrar: Registrar | None, points: np.ndarray, keep_all: bool = False, unit: float | None = 1.0
 ) -> tuple[Candidate, EncodedFrame]:
-    """The best fit, and what the network alone answers from."""
     return fit_hypotheses(observe(PointCloud(points)), model, registrar, keep_all, unit)
 
 
@@ -107,14 +106,12 @@ def test_an_answer_says_which_points_it_is_of(model: Model, registrar: Registrar
 
 
 def noisy(points: np.ndarray, std: float) -> np.ndarray:
-    """Points with noise along their rays."""
     noise = np.random.default_rng(0).normal(scale=std, size=(len(points), 1))
     return points + noise * points / np.linalg.norm(points, axis=1)[:, None]
 
 
 @pytest.mark.slow
 def test_a_noisy_frame_is_fitted_by_its_own_noise(model: Model, registrar: Registrar, points: np.ndarray) -> None:
-    """Seen in the constants, in what is believed, and in any unit."""
     clean, found = (fitted(model, registrar, cloud).modes for cloud in (points, noisy(points, 0.4)))
     assert clean is not None and found is not None
     assert clean.problem.config == FitConfig()
@@ -149,7 +146,6 @@ def test_noise_that_neighbours_share_is_spread_evenly_and_a_wrong_state_is_not()
 def test_a_noisy_cloud_is_explained_where_only_noise_is_left(
     model: Model, registrar: Registrar, points: np.ndarray
 ) -> None:
-    """Whatever the misfit is; that of a clean one is what counts."""
     found = fitted(model, registrar, noisy(points, 0.4)).modes
     assert found is not None and found.problem.noisy
     problem, aside = found.problem, found.surface.material + np.array([0.0, 0.0, 1.0])

@@ -52,9 +52,6 @@ def registration(model: StatisticalModel) -> Registration:
     )
 
 
-# --- what is said -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("change", "options", "sentence"),
     [
@@ -79,7 +76,6 @@ def test_each_sign_has_its_say(
 
 
 def test_the_more_is_wrong_the_less_is_known(registration: Registration) -> None:
-    """Known, unsure, refused; and strangeness never falls."""
     said = [recognize(replace(registration, explained=share)) for share in (1.0, 0.98, 0.9, 0.8, 0.5, 0.1, 0.0)]
     each = [one.strangeness for one in said]
     assert each == sorted(each) and [said[0].known, said[-1].known] == [True, False]
@@ -100,7 +96,6 @@ def test_what_was_not_found_is_not_the_object_and_what_was_not_asked_is_unsure()
 
 
 def test_calibrated_weights_have_their_own_limits(registration: Registration) -> None:
-    """The same signs, twice as usual: nothing to say. And of weights that never saw such: refused."""
     odd = replace(registration, explained=0.8)
     usual = {"unexplained": Usual(mean=np.log(4.1), std=0.3)}
     lenient = Recognizing(clean=usual, noisy=usual, unsure=3.0, refused=6.0)
@@ -118,9 +113,6 @@ def test_a_size_off_by_a_factor_of_two_is_never_the_objects(
     wide = Calibration(seed=1, views=8, recognizing=CONSERVATIVE.model_copy(update={"unsure": 90.0, "refused": 99.0}))
     said = recognize(registration, wide, stated_scene_unit=unit)
     assert said.known is known and (known or "its size differs by a factor of" in str(said.reason))
-
-
-# --- how limits are measured ------------------------------------------------------------------------------------------
 
 
 def signs(rng: np.random.Generator, factor: float = 1.0) -> Signs:
@@ -146,9 +138,6 @@ def test_a_view_that_was_not_understood_moves_no_limit() -> None:
     assert all(abs(usual[name].mean - spoiled[name].mean) < 0.15 for name in usual)
 
 
-# --- what is seen -----------------------------------------------------------------------------------------------------
-
-
 def test_strangers_are_other_objects_planes_and_heaps(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mereo_learning.calibrate.SCENES", ("rope", "robot", "liver", "tumor"))
     rope: Scene = load_scene("rope")
@@ -161,9 +150,6 @@ def test_strangers_are_other_objects_planes_and_heaps(monkeypatch: pytest.Monkey
     low, high = rope.rest.bounds
     assert all(len(cloud) > 10 for _, cloud in frames)
     assert all(np.ptp(cloud.points, axis=0).max() < 2 * (high - low).max() for _, cloud in frames[1:])
-
-
-# --- the whole way ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

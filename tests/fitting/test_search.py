@@ -28,13 +28,11 @@ def model() -> StatisticalModel:
 
 
 def state(model: StatisticalModel, index: int) -> Posed:
-    """A state of the library, turned at random, before the camera."""
     turn = rotations(97)[(31 * index + 7) % 97]
     return Posed(turn, FAR - turn @ model.mean.mean(axis=0), model.library[index].astype(np.float64))
 
 
 def view(model: StatisticalModel, posed: Posed) -> np.ndarray:
-    """Cloud that the camera sees of a state."""
     return seen(model.mesh(posed.place(model.material(posed.z))))
 
 
@@ -47,7 +45,6 @@ def cut(points: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def off(model: StatisticalModel, material: np.ndarray, posed: Posed) -> float:
-    """Root mean square distance of the found places from the true ones, in half lengths."""
     true = posed.place(model.material(posed.z))
     return float(np.sqrt(((material - true) ** 2).sum(axis=1).mean()) / model.half)
 

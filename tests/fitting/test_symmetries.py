@@ -130,7 +130,6 @@ def test_what_is_left_open_has_the_second_moments_of_the_turns() -> None:
 
 
 def test_a_peg_that_is_seen_leaves_no_turn_open() -> None:
-    """One so small that the shapes are alike; where it is hidden, some turns stay open."""
     model = model_of(free, sides=6, peg=0.6)
     assert len(find_segment_turns(model)) == 1
     material = transform_points(IN_FRONT, model.rest_points)
@@ -144,7 +143,6 @@ def test_a_peg_that_is_seen_leaves_no_turn_open() -> None:
 
 
 def test_radii_hold_what_is_left_open() -> None:
-    """Beside what the Gaussian says, and for points that follow the material points too."""
     model = model_of(free, sides=6)
     material = transform_points(IN_FRONT, model.rest_points)
     turns = left_open(model, material, material[model.rest_points[:, 2] < 0.0], 0.2, 1500.0)
@@ -206,9 +204,6 @@ def test_an_object_without_states_is_at_rest() -> None:
 
 def test_a_wheel_with_a_long_peg_is_not_like_itself() -> None:
     assert find_segment_turns(model_of(free, peg=6.0)) == ()
-
-
-# --- segments turned together -----------------------------------------------------------------------------------------
 
 
 X, Y, WRIST = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), np.array([6.0, 0.0, 0.0])
@@ -281,7 +276,6 @@ def test_an_arm_has_one_group_of_forearm_and_wrist() -> None:
 
 
 def test_the_turned_shape_is_that_of_other_draws() -> None:
-    """Exactly, as the segments lie on the axis of the roll; and twice turned is the same."""
     (together,) = symmetric_groups(model())
     there = turn_segments(model(), moved(TRUTH), together)
     assert np.abs(there - moved(TRUTH)).max() > 4.0
@@ -290,7 +284,6 @@ def test_the_turned_shape_is_that_of_other_draws() -> None:
 
 
 def test_a_state_that_is_turned_so_is_found() -> None:
-    """What it is told from is the correspondences alone; a right state stays what it is."""
     problem = problem_of(TRUTH)
     right, wrong = state(problem, TRUTH), descend(problem, state(problem, flipped(TRUTH)), 1)
     assert np.abs(wrong.surface.material - right.surface.material).max() > 4.0

@@ -50,7 +50,6 @@ def seen(scene: Scene, mesh: SegmentedMesh, noise: float = 0.0, seed: int = 0) -
 
 
 def states(scene: Scene, seed: int, count: int, change_s: float) -> list[SegmentedMesh]:
-    """A slow walk, seen from one place; camera frame."""
     meshes = [scene.deform(one.deformations).mesh for one in walk(scene, seed, np.arange(count) / RATE_HZ, change_s)]
     T = inverse_rigid(scene.workspace.sample(example_rng(seed, 0), meshes[0].bounds.mean(axis=0)))
     return [mesh.transformed(T) for mesh in meshes]
@@ -72,7 +71,6 @@ def vertices(mesh: SegmentedMesh) -> np.ndarray:
 
 
 def apart(found: Answer, mesh: SegmentedMesh) -> float:
-    """Mean distance of the vertices."""
     return float(np.linalg.norm(vertices(found.surfaces) - vertices(mesh), axis=1).mean())
 
 

@@ -32,7 +32,6 @@ def found(model: StatisticalModel, material: np.ndarray) -> Registration:
 
 
 def test_the_radius_holds_95_percent_of_a_gaussian() -> None:
-    """Exact for one direction and for three alike; between, by draws."""
     one, three = np.diag([4.0, 0.0, 0.0]), 4.0 * np.eye(3)
     np.testing.assert_allclose(radius95(np.stack([one, three])), 2.0 * np.sqrt(chi2.ppf(0.95, [1, 3])), rtol=1e-9)
     rng = np.random.default_rng(0)
@@ -65,7 +64,6 @@ def test_the_posterior_of_a_linear_problem_is_its_closed_form() -> None:
 
 
 def test_the_gradients_of_volumes_and_centroids_are_their_differences() -> None:
-    """Of a box with a ball in it, which takes its volume away."""
     mesh = SCENE.rest
     nested = SegmentedMesh((mesh.segments[3], replace(mesh.segments[0], name="around")), (("ball", "around"),))
     rng = np.random.default_rng(0)
@@ -87,7 +85,6 @@ def test_the_gradients_of_volumes_and_centroids_are_their_differences() -> None:
 
 
 def test_radii_are_in_the_unit_of_the_input(model: StatisticalModel, material: np.ndarray, found: Registration) -> None:
-    """The same frame in millimetres and in metres, and turned about the camera."""
     assert found.uncertainty is not None
     turn = Rotation.from_euler("z", 40, degrees=True).as_matrix()
     points, network = seen(model.mesh(material)), said(model, material)
@@ -127,7 +124,6 @@ def test_the_interval_of_a_volume_is_around_it_and_not_far_from_the_true_one(
 
 
 def test_the_scale_is_that_which_holds_95_percent(found: Registration, material: np.ndarray) -> None:
-    """Ratios of radii that are too small by a known factor, and what is said of them with it."""
     shown = seen_points(material, PointCloud(seen(found.model.mesh(material))), 1.0)
     one = RegistrationErrors.of(found, material, shown, 1.0)
     np.testing.assert_array_equal(one.seen, shown)
@@ -168,7 +164,6 @@ def test_the_shares_of_all_evidence_sum_to_one(found: Registration) -> None:
 
 
 def test_an_influence_is_how_far_a_moved_point_moves_the_place(found: Registration) -> None:
-    """By the normal equations: one point's residual changed, and their step from there."""
     optimum = found.optimum
     assert optimum is not None
     row = 40

@@ -138,7 +138,6 @@ def test_the_summary_tells_centroids_volumes_and_the_whole(found: Answer, folder
 
 @pytest.mark.usefixtures("without_turns")
 def test_points_that_the_model_does_not_explain_are_red(model: Model, cloud: PointCloud) -> None:
-    """A lump beside the object, taken for it."""
     lump = cloud.points[:40] - [0.0, 0.0, 3.0 * load_unit(model, cloud)]
     points = np.concatenate([cloud.points, lump])
     registration = answer_to(points, model, Registrar.of(model, "modes"), 16, keep_all=True).registered

@@ -10,7 +10,6 @@ from mereo.geometry.downsampling import farthest_point_order, means_along_sight,
 
 @pytest.mark.parametrize("limit", [1, 7, 49, 50, 51])
 def test_a_random_subset_is_the_same_every_time(limit: int) -> None:
-    """Rows of the cloud, each at most once; all of them, in their order, where they are few enough."""
     points = np.random.default_rng(3).normal(size=(50, 3))
     chosen = random_subset(points, limit)
     assert len(chosen) == min(limit, 50) == len(np.unique(chosen, axis=0))
@@ -21,13 +20,11 @@ def test_a_random_subset_is_the_same_every_time(limit: int) -> None:
 
 
 def wall(pixels: int, depth: float, noise: float) -> Float[np.ndarray, "n 3"]:
-    """What a camera sees of a wall."""
     directions = Camera.from_fov(pixels, pixels, 0.6).directions().reshape(-1, 3)
     return directions * (depth + noise * np.random.default_rng(5).normal(size=(len(directions), 1)))
 
 
 def test_means_of_neighbours_average_the_noise() -> None:
-    """Of k pixels each, it falls by the square root of k, and the wall stays where it is."""
     points = wall(200, 50.0, 0.2)
     means = means_along_sight(points, 2500)
     assert 1800 < len(means) <= 2500
@@ -37,7 +34,6 @@ def test_means_of_neighbours_average_the_noise() -> None:
 
 
 def test_no_mean_lies_between_two_surfaces() -> None:
-    """A near wall's edge before a far one: every mean is on either; in any unit the same."""
     points = wall(200, 50.0, 0.05)
     near = points[:, 0] > 0.013 * points[:, 2]
     points[near] *= 0.8
@@ -53,11 +49,7 @@ def test_points_on_one_line_of_sight_are_few_already_or_parted(count: int) -> No
     assert 1 <= len(means_along_sight(points, 1)) <= count
 
 
-# --- farthest-point order ---------------------------------------------------------------------------------------------
-
-
 def lattice(side: int) -> np.ndarray:
-    """Points with as many equal distances as possible."""
     return np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1).reshape(-1, 3).astype(float)
 
 

@@ -36,7 +36,6 @@ def hollow() -> Segment:
 
 
 def soup(part: Segment, noise: float) -> Segment:
-    """Every face with vertices of its own, moved a little."""
     vertices = part.vertices[part.faces].reshape(-1, 3)
     rng = np.random.default_rng(0)
     return replace(
@@ -94,7 +93,6 @@ def test_each_fault_is_found_repaired_and_said(faulty: Segment, fault: str, chan
 
 
 def horned(radius: float, horns: int) -> Segment:
-    """Ball of radius 1 with thin horns, a hole, and an arm that comes around and runs back into the ball."""
     shell = ball((0, 0, 0), 1.0)
     whole = solid_of(shell.vertices, shell.faces)
     arm = manifold3d.Manifold.cylinder(3.2, 0.3, 0.3, 24).rotate((0, 90, 0)).translate((0.9, 0, 0))
@@ -181,9 +179,6 @@ def test_overlaps_are_cut_from_the_larger_segment() -> None:
     assert list(changes) == ["small"] and fixed.segments[1] is large
 
 
-# --- the command ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_check_counts_faults_and_repair_leaves_the_users_files(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -245,9 +240,6 @@ def test_parts_of_a_model_get_files_of_their_own(tmp_path: Path, capsys: pytest.
     rest = load_scene(tmp_path / "two-repaired.yaml").rest
     assert (rest.nested, rest.colors[2]) == ((("core", "b b"),), (1, 2, 3))
     check_overlap(rest)
-
-
-# --- meshes that are no solids ----------------------------------------------------------------------------------------
 
 
 WHOLE = ball((0, 0, 0), 2.0, level=3)

@@ -32,9 +32,6 @@ def nodes(axes: list[np.ndarray]) -> np.ndarray:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-# --- inside, distance, direction --------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_depth_in_a_convex_solid_is_the_distance_to_the_nearest_face_plane(seed: int) -> None:
     part, normal, offset = convex_polyhedron(seed)
@@ -100,9 +97,6 @@ def test_the_first_segment_owns_an_overlap() -> None:
     assert label_grid(mesh, points[:, 0], points[:1, 1], points[:1, 2]).ravel().tolist() == [1, 1, 2, 0]
 
 
-# --- label grids ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_a_label_grid_is_the_labels_of_its_nodes(seed: int) -> None:
     mesh = SegmentedMesh((knobbly_torus(seed), knobbly_torus(seed + 9, "other", 1), ball((0, 0, 0), 1.0, color=2)))
@@ -127,9 +121,6 @@ def test_columns_through_vertices_and_edges_leave_no_crack(seed: int) -> None:
     labels = label_grid(one(part), axis, axis, z)
     assert np.array_equal(labels, label_grid(one(part), axis + 1e-5, axis + 1e-8, z))
     assert labels.any()
-
-
-# --- overlap ----------------------------------------------------------------------------------------------------------
 
 
 def test_touching_and_distant_segments_do_not_overlap() -> None:

@@ -10,7 +10,6 @@ from mereo.geometry.surface_patches import longest_side, smoothed, surface_point
 
 
 def rays(size: int = 96) -> np.ndarray:
-    """Lines of sight through the pixels of an image, scaled to z = 1."""
     return Camera.from_fov(size, size, 0.5).directions()
 
 
@@ -72,14 +71,10 @@ def test_points_closer_than_their_noise_are_a_surface() -> None:
     assert surface_points(points * (1 + rng.normal(0, 0.05, (len(points), 1)))).mean() > 0.99
 
 
-# --- smoothing --------------------------------------------------------------------------------------------------------
-
-
 SIGHT = Camera.from_fov(48, 48, 0.5).directions().reshape(-1, 3)
 
 
 def plane(tilt: float) -> Float[np.ndarray, "n 3"]:
-    """A plane through (0, 0, 50), tilted about x."""
     normal = np.array([0.0, np.sin(tilt), -np.cos(tilt)])
     return SIGHT * (normal[2] * 50.0 / (SIGHT @ normal))[:, None]
 
@@ -97,7 +92,6 @@ def test_planes_stay_and_their_noise_falls(tilt: float) -> None:
 
 
 def test_points_stay_on_their_lines_of_sight_in_any_frame_and_unit() -> None:
-    """Turned about the camera and in other units, all is the same."""
     points = noisy(plane(0.4), 0.3)
     moved = smoothed(points)
     along = np.einsum("ij,ij->i", moved, points) / (np.linalg.norm(moved, axis=1) * np.linalg.norm(points, axis=1))
@@ -109,7 +103,6 @@ def test_points_stay_on_their_lines_of_sight_in_any_frame_and_unit() -> None:
 
 
 def test_an_edge_stays_sharp() -> None:
-    """Nothing lies between a near wall and a far one."""
     points = plane(0.0)
     points[SIGHT[:, 0] > 0.02] *= 0.8
     depth = smoothed(points)[:, 2]

@@ -14,7 +14,6 @@ POSE = rigid(Rotation.from_euler("xyz", [20, 30, 40], degrees=True).as_matrix(),
 
 
 def posed(*parts: trimesh.Trimesh, pose: np.ndarray = POSE, nested: tuple[tuple[str, str], ...] = ()) -> SegmentedMesh:
-    """Segments a, b, ... of parts, in a pose that is along no axis."""
     segments = [
         Segment("abc"[i], (1, 2, 3), transform_points(pose, np.asarray(part.vertices)), np.asarray(part.faces))
         for i, part in enumerate(parts)

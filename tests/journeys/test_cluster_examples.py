@@ -39,7 +39,6 @@ SEPARATE = "TORCH_DISABLE_SHARE_RDZV_TCP_STORE"
 
 
 def commands(script: Path) -> list[list[str]]:
-    """Commands of a script, as words, with its variables filled in."""
     text = re.sub(r"\\\n\s*", " ", script.read_text())
     for name, value in FILLED.items():
         text = re.sub(rf"{re.escape(name)}\b", value, text)
@@ -49,7 +48,6 @@ def commands(script: Path) -> list[list[str]]:
 
 
 def ran_by_torchrun(words: list[str]) -> tuple[Any, Train]:
-    """Options of torchrun, and the command that it starts."""
     assert words[0] == "torchrun"
     options = get_args_parser().parse_args(words[1:])
     assert options.module and options.training_script == "mereo"

@@ -34,7 +34,6 @@ def asked(frame: Any, **reading: Any) -> mereo.Result:
 
 
 def same(found: Answer, wanted: Answer) -> None:
-    """The answers are one, in all that programs read."""
     np.testing.assert_array_equal(found.seen.cloud.points, wanted.seen.cloud.points)
     np.testing.assert_array_equal(found.reconstruction.labels.labels, wanted.reconstruction.labels.labels)
     np.testing.assert_array_equal(found.surfaces.merged()[0], wanted.surfaces.merged()[0])

@@ -187,9 +187,6 @@ def test_without_a_frame_its_laboratory_opens(meshes: list[str], monkeypatch: py
     assert scene.rest.names == registrar.model.rest.names and network is None and registrar.network is None
 
 
-# --- what cannot be found ---------------------------------------------------------------------------------------------
-
-
 def test_a_mesh_without_volume_is_a_sentence(tmp_path: Path) -> None:
     flat = trimesh.Trimesh([[0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
     flat.export(tmp_path / "flat.stl")

@@ -157,7 +157,6 @@ def test_the_table_of_distances_follows_the_formulas() -> None:
 
 
 def test_the_colour_threshold_finds_the_orange_ball(run: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
-    """The largest orange thing, and nothing of a smaller one, of specks and of other colours."""
     row, column = np.mgrid[:120, :160]
     ball = (row - 60) ** 2 + (column - 70) ** 2 < 30**2
     picture = np.full((120, 160, 3), (60, 90, 200), np.uint8)

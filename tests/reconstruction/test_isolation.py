@@ -12,7 +12,6 @@ from mereo.reconstruction.observation import find_object, observe
 
 
 def half_ball(count: int = 3000, center: tuple[float, float, float] = (0.0, 0.0, 0.8)) -> np.ndarray:
-    """The near side of a ball of 10 cm."""
     return front(center, 0.1, -1.0, count)
 
 
@@ -29,7 +28,6 @@ EVERYTHING = np.concatenate([BALL, WALL, STRAYS])
 def isolate(
     seen: PointCloud | DepthImage, config: IsolationConfig, unit_m: float = 1.0
 ) -> tuple[PointCloud, tuple[IsolationStep, ...]]:
-    """Points of the object, and what each step left out."""
     cloud = seen.to_points() if isinstance(seen, DepthImage) else seen
     found = find_object(observe(cloud, unit_m=unit_m).frame, config)
     return found.cloud, found.steps
@@ -48,7 +46,6 @@ def test_nothing_happens_by_default_and_a_depth_image_is_taken_as_its_points() -
 
 
 def test_crops_are_in_metres_whatever_the_unit() -> None:
-    """Millimetres are 0.001 m a unit; both limits belong to the range."""
     for unit_m in (1.0, 0.001):
         crop = IsolationConfig(depth_range=(0.7, 0.8), box=(-0.1, -0.1, 0.0, 0.0, 0.1, 2.0))
         corners = np.array([[-0.05, 0, 0.7], [0.05, 0, 0.7], [-0.05, 0, 0.69], [-0.05, 0.2, 0.75]])
@@ -79,6 +76,12 @@ def test_the_plane_is_the_one_of_least_squares() -> None:
     assert largest_plane(line, np.full(50, 0.1), np.random.default_rng(5)) is None
 
 
+def test_outliers_go_and_the_object_stays() -> None:
+    left = kept(np.concatenate([BALL, STRAYS]), IsolationConfig(remove_outliers=True))
+    off = np.linalg.norm(left - [0, 0, 0.8], axis=1) - 0.1
+    assert (np.abs(off) < 1e-9).sum() >= 0.999 * len(BALL) and (off > 0.03).mean() < 0.002
+
+
 def test_the_largest_cluster_is_kept_whole() -> None:
     small = half_ball(500, (0.5, 0.0, 0.8))
     left = kept(np.concatenate([small, BALL, STRAYS]), IsolationConfig(largest_cluster=True))
@@ -97,7 +100,6 @@ def test_clusters_follow_neighbours_not_distance() -> None:
 
 
 def test_groups_within_the_gap_are_kept_with_those_behind_them() -> None:
-    """A few floating points are no group, however near."""
     row = [half_ball(n, (x, 0.0, 0.8)) for n, x in ((3000, 0.0), (800, 0.25), (500, 0.5), (700, -0.5))]
     row.append(np.array([0.0, 0.0, 0.66]) + np.zeros((5, 1)))
     gap = IsolationConfig(largest_cluster=True, cluster_gap=0.06)

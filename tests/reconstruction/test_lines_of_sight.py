@@ -64,7 +64,6 @@ def test_each_pixel_has_its_kind_and_a_lone_depth_between_object_and_wall_is_no_
 
 
 def test_a_depth_as_far_as_the_object_is_unknown() -> None:
-    """What it stands on touches it: neither before nor behind."""
     depth = np.where(SHOWN, 1.0, np.where(np.arange(50)[:, None] >= 35, 1.02, 2.0))
     labels = lines_of_image(DepthImage(depth, CAMERA), SHOWN)
     assert 1.02 not in labels.past[:, 2] and (np.isclose(depth[pixels(labels.unknown, CAMERA)], 1.02)).sum() > 500
@@ -93,7 +92,6 @@ def test_many_lines_are_thinned_far_from_the_object_only() -> None:
 
 
 def test_a_cloud_has_the_kinds_of_its_image() -> None:
-    """What isolation leaves out of a cloud is compared as the pixels that a mask leaves out; no pixel is no point."""
     whole = DepthImage(scene(), CAMERA)
     cut = DepthImage(np.where(SHOWN, whole.depth, 0.0), CAMERA)
     frame = SensorFrame(Path("x"), cut.to_points(), 1.0, "camera", cut, whole=whole)

@@ -103,7 +103,6 @@ def test_a_scan_has_no_depth(tmp_path: Path) -> None:
 
 
 def test_the_unit_of_a_cloud(tmp_path: Path) -> None:
-    """Boxes are in metres, points stay in the file's unit."""
     points = np.random.default_rng(0).uniform((-100, -100, 500), (100, 100, 600), (400, 3))
     np.save(tmp_path / "c.npy", points)
     near = IsolationConfig(box=(-0.1, -0.1, 0.5, 0.1, 0.1, 0.55))

@@ -39,7 +39,6 @@ def found(answer: Answer) -> Reconstruction:
 
 
 def test_labels_are_the_fields_at_their_positions(found: Reconstruction) -> None:
-    """Grid, origin and spacing are in the input's frame: every voxel has the label of its own place."""
     grid = found.labels
     index = np.indices(grid.labels.shape).reshape(3, -1).T
     expected = two_balls(grid.positions(index)).argmax(axis=1)
@@ -100,7 +99,6 @@ def test_files(answer: Answer, tmp_path: Path) -> None:
 def test_what_is_read_and_left_out_is_printed_and_kept(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Something else beside the object is left out when asked; the summary says so."""
     cloud, model = scene("camera")
     np.save(tmp_path / "cloud.npy", np.concatenate([cloud, front((0.9, 0.0, 0.9), 0.03, -1.0)]))
     monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: replace(model, provenance={"visible_m": [2, 3]}))
@@ -133,7 +131,6 @@ def with_strays() -> tuple[np.ndarray, np.ndarray, AnalyticModel]:
 def test_strays_are_dropped_and_said_unless_all_are_to_be_kept(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The answer is that to the object's own points, bit for bit."""
     cloud, own, model = with_strays()
     np.save(tmp_path / "cloud.npy", cloud)
     monkeypatch.setattr(

@@ -34,7 +34,6 @@ def strays_left(reading: Reading, points: np.ndarray, genuine: np.ndarray) -> in
 
 
 def lengthened(reading: Reading, points: np.ndarray, genuine: np.ndarray) -> float:
-    """Times that the reading's box is as long as that of the object's points."""
     return longest_side(reading.cloud.points) / longest_side(points[genuine])
 
 
@@ -86,7 +85,6 @@ def test_clean_views_lose_nothing(name: str) -> None:
 
 
 def test_views_of_a_sensor_come_back_to_the_objects_size() -> None:
-    """Three views of structured light with 14, 105 and 5 strays."""
     for points, genuine in views("shapes", "structured-light", (2, 3, 4)):
         taken, other = readings(points)
         assert lengthened(other, points, genuine) > 1.08 and strays_left(other, points, genuine) >= 5

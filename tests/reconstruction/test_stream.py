@@ -40,7 +40,6 @@ def raise_(problem: Exception) -> None:
 
 
 def test_every_frame_is_answered_in_order_when_asked_at_the_recorded_pace(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a time that passes by waiting alone."""
     now = [100.0]
     waiting = SimpleNamespace(perf_counter=lambda: now[0], sleep=lambda seconds: now.append(now.pop() + seconds))
     monkeypatch.setattr(stream_module, "time", waiting)
@@ -50,7 +49,6 @@ def test_every_frame_is_answered_in_order_when_asked_at_the_recorded_pace(monkey
 
 
 def test_a_slow_answer_gets_the_latest_frame_and_dropped_ones_are_not_decoded() -> None:
-    """Ten frames arrive while the first is answered, two meanwhile the next one: the last of them is answered."""
     arrived, begun = ([threading.Event(), threading.Event()] for _ in range(2))
     decoded: list[str] = []
 
@@ -129,9 +127,6 @@ def test_leaving_early_ends_the_reading_thread(comes: bool) -> None:
         if thread.name == "frames":
             thread.join(5)
             assert not thread.is_alive()
-
-
-# --- a folder that a camera fills -------------------------------------------------------------------------------------
 
 
 def write(path: Path, content: bytes, changed_s: int) -> Path:

@@ -66,7 +66,6 @@ def test_killed_and_resumed_equals_uninterrupted(
 
 
 def test_tensors_are_as_documented_and_a_paper_size_dataset_fits_in_2_5_gigabytes(whole: Path) -> None:
-    """28,800 examples of a five-segment scene, on disk and in memory."""
     shard = load_file(whole / "shard-00000.safetensors")
     queries = SMALL.sampling.total(4)
     assert {key: (value.dtype.name, value.shape) for key, value in shard.items()} == {

@@ -32,7 +32,6 @@ MODELS: tuple[SensorModel, ...] = ("structured-light", "time-of-flight")
 
 
 def wall(z: float, tilt_deg: float = 0.0) -> Solids:
-    """A plane through (0, 0, z), turned about the y axis; it fills the image."""
     part = box((-9000, -9000, 0), (9000, 9000, 5))
     cosine, sine = np.cos(np.deg2rad(tilt_deg)), np.sin(np.deg2rad(tilt_deg))
     turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
@@ -194,14 +193,10 @@ def test_any_sensor_leaves_later_draws_as_they_were(name: str) -> None:
 
 
 def test_a_term_does_not_change_what_others_draw() -> None:
-    """The same pixels drop out, the same noise is drawn, with and without the rest."""
     alone = look(wall(150.0, 70.0), dropout=0.9).image.valid
     assert np.array_equal(look(wall(150.0, 70.0), dropout=0.9, axial=1.0, flying=0.5).image.valid, alone)
     noise = look(wall(150.0), axial=1.0).whole.depth
     assert np.array_equal(look(wall(150.0), axial=1.0, background=1.0, tool=0.0).whole.depth, noise)
-
-
-# --- the depth camera -------------------------------------------------------------------------------------------------
 
 
 NARROW = Camera.from_fov(96, 96, float(np.deg2rad(30)))

@@ -83,7 +83,6 @@ def test_unknown_and_contradictory_options_are_refused_before_anything_is_writte
 
 
 def test_a_scene_has_its_own_workspace_a_cone_and_the_sphere() -> None:
-    """Where it has no cone of its own, the paper's."""
     scene = replace(toy_scene(), workspace=NARROW)
     assert scene.workspace_named("own") is scene.workspace_named("cone") is NARROW
     assert scene.workspace_named("sphere") is not NARROW

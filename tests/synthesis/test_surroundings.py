@@ -66,7 +66,6 @@ BOXES = [
 
 @pytest.mark.parametrize("part", [ball((-38, 30, 130), 14.0), ball((0, 0, 10), 14.0), *BOXES])
 def test_rays_that_are_left_out_would_have_missed(part: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same bits as with all rays, for segments in any part of the image, at its border and around the camera."""
     culled = Solids(one(part)).first_hit(RAYS).distance
     monkeypatch.setattr("mereo.geometry.solids.toward", lambda directions, low, high: np.arange(len(directions)))
     found = Solids(one(part)).first_hit(RAYS).distance

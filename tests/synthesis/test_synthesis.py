@@ -55,7 +55,6 @@ def test_the_cloud_is_the_depth_image_unprojected_and_normalized(case: Case) -> 
 
 
 def test_labels_distances_and_directions_are_those_of_the_deformed_segments(case: Case) -> None:
-    """Walking the distance along the direction ends on the surface."""
     example, view = case
     queries, solids = example.queries, Solids(view.mesh)
     points = example.normalizer.invert(queries.positions)

@@ -16,7 +16,6 @@ def model(toy_model: StatisticalModel) -> StatisticalModel:
 
 
 def test_more_noise_never_makes_the_residual_smaller(model: StatisticalModel) -> None:
-    """The same directions of noise, more and more of it."""
     points, material = shown(model, 0.5)
     noise = np.random.default_rng(0).normal(size=(len(points), 1)) * points / np.linalg.norm(points, axis=1)[:, None]
     residuals = []
@@ -32,7 +31,6 @@ def test_more_noise_never_makes_the_residual_smaller(model: StatisticalModel) ->
 def test_a_state_outside_the_bounds_is_said_to_be_outside(
     model: StatisticalModel, excess: float, outside: bool
 ) -> None:
-    """A state that no seed of the scene can have: the cloud shows it, and the registration says so."""
     points, material = shown(model, excess)
     registration = fit_correspondences(points, said(model, material), model, 1.0)
     if outside:
@@ -64,7 +62,6 @@ def test_noise_along_the_lines_of_sight_says_nothing_of_where_the_surface_is(
 
 
 def test_what_a_line_of_sight_misses_or_meets_far_off_is_compared_with_the_nearest_place(at_rest: Surface) -> None:
-    """Beside the object, and behind it."""
     low, high = at_rest.material.min(axis=0), at_rest.material.max(axis=0)
     beside, middle = high + np.array([1.0, 1.0, 0.0]), (low + high) / 2 + np.array([0.0, 0.0, 4.0])
     points = np.stack([beside, middle])

@@ -83,9 +83,6 @@ def test_a_slider_has_few_digits_and_a_hundred_steps(
     assert slider_range(replace(slider, low=2.0, high=5.0, whole=True)) == (2.0, 5.0, 1.0)
 
 
-# --- page -------------------------------------------------------------------------------------------------------------
-
-
 @needs_viser
 def test_sliders_and_buttons_change_what_is_shown(server: object) -> None:
     page = LabPage(server, Laboratory(toy_scene(), None, None))

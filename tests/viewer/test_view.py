@@ -93,9 +93,6 @@ def test_points_give_way_to_colours_and_a_probe_is_shown(server: object) -> None
     assert nodes["/probe"].visible and nodes["/arrow"].visible
 
 
-# --- server -----------------------------------------------------------------------------------------------------------
-
-
 def first_message(port: int, host: str, origin: str | None) -> bytes:
     """First message of the websocket, of which a page of ``origin`` asks the name ``host``."""
     from viser import __version__ as version

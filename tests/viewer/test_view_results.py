@@ -45,7 +45,6 @@ needs_browser = pytest.mark.skipif(
 
 
 def radii_of(mesh: SegmentedMesh) -> Radii:
-    """Radii that grow from vertex to vertex."""
     points = np.concatenate([segment.vertices for segment in mesh.segments])
     counts = tuple(len(segment.vertices) for segment in mesh.segments)
     labels = np.repeat(np.arange(1, len(counts) + 1), counts).astype(np.uint8)
@@ -70,14 +69,10 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def opened() -> Iterator[list[Any]]:
-    """Pages that a test opens; closed at its end."""
     pages: list[Any] = []
     yield pages
     for page in pages:
         page.close()
-
-
-# --- what is read -----------------------------------------------------------------------------------------------------
 
 
 def test_a_report_is_read_again(folder: Path) -> None:
@@ -152,9 +147,6 @@ def test_any_glb_is_read_with_its_places_and_colours(tmp_path: Path) -> None:
     assert colors is not None and {tuple(color) for color in colors.tolist()} == {(255, 0, 0), (0, 0, 255)}
     assert parts["plain"][0].color == (255, 0, 0) and parts["plain"][1] is None
     assert len(parts["plain"][0].vertices) == 8 and parts["round"][0].color == (0, 128, 255)
-
-
-# --- contents ---------------------------------------------------------------------------------------------------------
 
 
 def test_a_folder_is_shown_with_all_that_its_files_keep(folder: Path) -> None:
@@ -240,9 +232,6 @@ def test_weights_without_a_model_are_asked_alone_and_it_is_said(rope: Model) -> 
     colors, scale = content.colorings["confidence"]()
     assert [len(part) for part in colors] == [len(s.vertices) for s in content.mesh.segments]
     assert scale is not None and scale.title == "confidence of the surface"
-
-
-# --- pages ------------------------------------------------------------------------------------------------------------
 
 
 @needs_viser

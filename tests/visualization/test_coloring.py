@@ -1,20 +1,28 @@
 """What surfaces are coloured by, on shapes where the right numbers are known."""
 
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
+from answers import answer_to
 from shapes import ball
 
+import mereo
+from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh, vertex_normals
-from mereo.models.trained import Answer
+from mereo.models.model import Model
+from mereo.models.trained import Answer, EncodedCloud
+from mereo.models.weights import load_model
+from mereo.synthesis.sample_views import load_view
 from mereo.visualization.color_scales import (
     ColorScale,
     confidence,
     distance_scale,
     observed_distance,
 )
-from mereo_viewer.result_page import first_point
+from mereo_viewer.result_page import ask_network, first_point, probe_answer
 
 GREYS = ColorScale("grey", 1.0, 3.0, ((0, 0, 0), (100, 100, 100), (250, 250, 250)), ("low", "high"))
 
@@ -65,3 +73,28 @@ def test_a_ray_meets_the_nearest_surface_that_is_shown() -> None:
     np.testing.assert_allclose(first_point(mesh, origin, along, [False, True]), [4.0, 0.01, 0.02], atol=0.05)
     assert first_point(mesh, origin, along, [False, False]) is None
     assert first_point(mesh, origin, -along, [True, True]) is None
+
+
+@pytest.fixture
+def encoded(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
+    """The points of every cloud that a model encodes."""
+    clouds: list[np.ndarray] = []
+    encode = Model.encode
+
+    def counted(model: Model, cloud: PointCloud) -> EncodedCloud:
+        clouds.append(np.asarray(cloud.points))
+        return encode(model, cloud)
+
+    monkeypatch.setattr(Model, "encode", counted)
+    return clouds
+
+
+def test_no_cloud_is_encoded_twice(encoded: list[np.ndarray], tmp_path: Path) -> None:
+    cloud = load_view("rope").depth.to_points()
+    mereo.reconstruct(cloud, load_model("rope"), "network", resolution=16).save(tmp_path / "result")
+    assert len(encoded) == 1
+    model = load_model("rope")
+    answer = answer_to(cloud, model, None, 16)
+    probe_answer(answer, cloud.points[:5])
+    confidence(answer.reconstruction.surfaces, partial(ask_network, answer))
+    assert len(encoded) == 2, "once for each"

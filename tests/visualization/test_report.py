@@ -5,6 +5,7 @@ import io
 import re
 import subprocess
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -14,10 +15,11 @@ from PIL import Image
 from reported_scenes import ball, example, page_data, positions, wall
 from scipy.spatial import cKDTree
 
+from mereo.fitting.registration.recognition import MOST, NOT_EVALUATED, Recognition, Signs
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.visualization.contact_sheets import MISSING, MOST_DEPTH_PX, depth_data
-from mereo.visualization.reconstruction_report import BUDGET_BYTES, Report, cluster
+from mereo.visualization.reconstruction_report import BUDGET_BYTES, VERDICTS, Report, cluster, trust
 from mereo.visualization.units import Unit
 from mereo_learning.evaluation_report import write_evaluation_report
 
@@ -171,6 +173,48 @@ def test_places_and_volumes_are_told_as_exactly_as_they_are_known() -> None:
     assert Unit(None).place(place, 0.0) == "-0.0247 -1e-06 1.59 ± 0", "without an error as without a radius"
     assert Unit(0.01).volume(648.0, (633.2, 663.1)) == "648 (633 to 663)"
     assert Unit(None).volume(4.9012, (4.889, 4.9204)) == "4.901 (4.889 to 4.920)"
+
+
+TAKEN = {"answer": "registration", "explained": 0.989, "accepted": True}
+KEPT = {"answer": "network", "explained": 0.668, "accepted": False}
+FLAT = {"answer": "network", "refusal": "the cloud is flat"}
+NOTHING = "Network alone: nothing says whether this is the object."
+LITTLE = "Doubtful: the model explains only 66.8 % of the points, so this is"
+UNCHECKED = "Not checked: nothing says whether this is the object; the model explains 98.9"
+
+
+def recognized(known: bool | str, reason: str | None = None) -> Recognition:
+    return Recognition(known, reason, 5.0, Signs(size=0.01, unexplained=0.2))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "recognition, registration, level, line, cure",
+    [
+        (recognized(True), TAKEN, "yes", "Trust it: the frame shows the object; the model explains 98.9 %", None),
+        (recognized("unsure", "3% are not: look, or crop"), TAKEN, "doubt", "Doubtful: 3% are not.", "look, or crop"),
+        (recognized(False, "size: unit (-u: m)"), TAKEN, "no", "Do not trust it: size.", "unit (-u: m)"),
+        (recognized(False, "off: look"), KEPT, "no", "Do not trust it: off; the model explains only 66.8 %", "look"),
+        (recognized(False, "only 3% of the points: turn"), KEPT, "no", "Do not trust it: only 3% of the p", "turn"),
+        (Recognition(False, "the cloud is flat", MOST), FLAT, "no", "Do not trust it: the cloud is flat.", None),
+        (recognized(True), KEPT, "doubt", LITTLE, None),
+        (recognized(True), {**TAKEN, "explained": 0.7, "accepted": False}, "doubt", "Doubtful: the model ex", None),
+        (NOT_EVALUATED, None, "alone", NOTHING, None),
+        (None, None, "alone", NOTHING, None),
+        (None, TAKEN, "unchecked", UNCHECKED, None),
+    ],
+)
+def test_a_verdict_is_one_line_with_its_reason(
+    recognition: Recognition | None, registration: dict[str, Any] | None, level: str, line: str, cure: str | None
+) -> None:
+    summary: dict[str, Any] = {} if recognition is None else {"recognition": recognition.facts()}
+    found = trust(summary if registration is None else {**summary, "registration": registration})
+    verdict = f"{VERDICTS[found.level]}: {found.why}.".replace("\N{NO-BREAK SPACE}", " ")
+    assert (found.level, found.cure) == (level, cure) and verdict.startswith(line)
+
+
+@pytest.mark.parametrize("junk", [None, 3, [], {"known": None, "explained": float("nan"), "answer": 7}])
+def test_a_damaged_summary_is_not_trusted(junk: object) -> None:
+    assert trust({"recognition": junk, "registration": junk}).level not in ("yes", "doubt")
 
 
 METRICS = {

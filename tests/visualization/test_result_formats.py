@@ -33,7 +33,6 @@ def model() -> AnalyticModel:
 
 
 def view() -> np.ndarray:
-    """The front halves of both balls."""
     return np.concatenate([front(*BIG, -1.0), front(*SMALL, -1.0)])
 
 
