@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -91,17 +92,13 @@ def numpy_and_volume(path: Path) -> tuple[Path, Path]:
     return path / "run.npy", path / "volume.vtk"
 
 
-def numpy_and(suffix: str) -> Callable[[Path], tuple[Path, Path]]:
+def numpy_and(suffix: str, path: Path) -> tuple[Path, Path]:
     """Positions beside the simulated mesh as Gmsh or Abaqus writes it."""
-
-    def write(path: Path) -> tuple[Path, Path]:
-        meshio = pytest.importorskip("meshio", reason="meshio is not installed: pip install 'mereo[dev]'")
-        np.save(path / "run.npy", to_file(states()))
-        faces = ("triangle", lattice().surface)
-        meshio.Mesh(to_file(lattice().nodes), [faces, ("tetra", lattice().elements)]).write(path / f"volume{suffix}")
-        return path / "run.npy", path / f"volume{suffix}"
-
-    return write
+    meshio = pytest.importorskip("meshio", reason="meshio is not installed: pip install 'mereo[dev]'")
+    np.save(path / "run.npy", to_file(states()))
+    faces = ("triangle", lattice().surface)
+    meshio.Mesh(to_file(lattice().nodes), [faces, ("tetra", lattice().elements)]).write(path / f"volume{suffix}")
+    return path / "run.npy", path / f"volume{suffix}"
 
 
 def numpy_and_surface(path: Path) -> tuple[Path, Path]:
@@ -159,8 +156,8 @@ FORMATS: dict[str, Callable[[Path], Path | tuple[Path, Path]]] = {
     "obj": meshes("obj", rest=False),
     "stl": meshes("stl", rest=True),
     "NPY, VTK": numpy_and_volume,
-    "NPY, MSH": numpy_and(".msh"),
-    "NPY, INP": numpy_and(".inp"),
+    "NPY, MSH": partial(numpy_and, ".msh"),
+    "NPY, INP": partial(numpy_and, ".inp"),
     "NPY, PLY": numpy_and_surface,
     "VTU": folder_of_displacements,
     "VTK": pattern_of_both,

@@ -7,6 +7,7 @@ import pytest
 from answers import fit_correspondences
 from fit_cases import IN_FRONT, SCENE, said, seen, shown
 from scipy.spatial.transform import Rotation
+from toy_scene import sample_deformations, toy_scene
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.draws.fit import DrawsProblem, Shape, approach, fit_draws, lay_on_shape, secant
@@ -15,13 +16,12 @@ from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
 from mereo.fitting.modes import narrowing, turns
 from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.evidence import Evidence
-from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, along
-from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
+from mereo.fitting.problem.gauss_newton import POSE, Posed, along
 from mereo.fitting.registration.recognition import recognize
 from mereo.fitting.registration.register import CloudToFit, ModesFit, is_drawn
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.transforms import inverse_rigid, transform_points
-from mereo.scenes.random_states import state_points
+from mereo.scenes.random_states import build_model, interior_nodes, sample_states, state_points
 from mereo.scenes.scene import State
 from mereo.scenes.seeds import example_rng
 from mereo.scenes.statistical_model import StatisticalModel
@@ -147,23 +147,6 @@ def test_under_noise_draws_are_asked_too_and_an_object_at_rest_stays_at_rest(mod
     assert noisy.may_take_draws and not clean.may_take_draws
     found = noisy.with_draws(DrawnStates.of(SCENE, model, 30))
     assert found.method == "rest" and found.seconds > clean.seconds
-
-
-def test_what_the_frame_does_not_show_narrows_nothing(model: StatisticalModel, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without evidence the coefficients' posterior is their prior; with more evidence it only narrows."""
-    points, material = shown(model, 0.5)
-    problem = Problem.of(model, said(model, material), Evidence.of(points), KNOWN_SCALE_STD, FitConfig())
-    posed = Posed(IN_FRONT[:3, :3], IN_FRONT[:3, 3], np.zeros(model.count))
-    assert narrowing(problem, posed) > 1.0
-
-    def nothing(self: Problem, normal: NormalEquations, *rest: object) -> NormalEquations:
-        return NormalEquations(normal.matrix + 1e-9 * np.eye(len(normal.matrix)), normal.gradient)
-
-    monkeypatch.setattr(Problem, "seen", nothing)
-    monkeypatch.setattr(
-        Problem, "known", lambda self, p, prior, slack: NormalEquations.prior(p.z, *vars(prior).values(), 0.0, 1.0)
-    )
-    assert narrowing(problem, posed) == pytest.approx(0.0, abs=1e-6)
 
 
 AXIS = np.array([0.3, -0.2, 2.0])
@@ -297,3 +280,46 @@ def test_a_second_pass_follows_where_the_first_has_failed(
     assert once is not None and twice is not None and twice.misfit < 0.9 * once.misfit
     monkeypatch.setattr("mereo.fitting.draws.fit.refine", None)  # not called where the first explains the cloud
     assert fit_draws(replace(problem, config=replace(problem.config, passes=1, hopeless=9.0)), fitted.posed) is not None
+
+
+def test_modes_reproduce_states_they_were_not_built_from(model: StatisticalModel) -> None:
+    scene = toy_scene()
+    for index in range(5):
+        state = state_points(scene.sample_state(example_rng(7, index)), model.nodes, model.node_labels)
+        T, z = model.project(state)
+        found = model.material(z) @ T[:3, :3].T + T[:3, 3]
+        assert np.linalg.norm(found - state, axis=1).max() < 0.15
+        assert np.abs(z).max() < 5
+
+
+def test_the_residue_is_that_of_held_out_states(model: StatisticalModel) -> None:
+    assert 0 < model.residue < 0.01 * model.half
+
+
+def test_the_pose_of_the_states_does_not_matter() -> None:
+    scene, rng = toy_scene(), np.random.default_rng(0)
+    nodes, labels = interior_nodes(scene.rest)
+    states = sample_states(scene, nodes, labels, 60, 3)
+    turned = np.stack([s @ Rotation.random(rng=rng).as_matrix().T + rng.normal(size=3) * 50 for s in states])
+    plain = build_model(scene.rest, nodes, labels, states)
+    posed = build_model(scene.rest, nodes, labels, turned.astype(np.float32))
+    assert plain.count == posed.count
+    np.testing.assert_allclose(plain.mean, posed.mean, atol=0.02)
+    np.testing.assert_allclose(plain.motion, posed.motion, rtol=0.02)
+
+
+def test_one_state_is_no_model() -> None:
+    scene = toy_scene()
+    nodes, labels = interior_nodes(scene.rest)
+    with pytest.raises(ValueError, match="asked of 1 states; it needs 2 or more: record more states"):
+        build_model(scene.rest, nodes, labels, sample_states(scene, nodes, labels, 1, 3))
+
+
+def test_inside_points_follow_the_scene(model: StatisticalModel) -> None:
+    scene = toy_scene()
+    deformations = sample_deformations(example_rng(7, 1))
+    points = np.random.default_rng(1).uniform([-17, -5, -4], [-7, 5, 4], size=(300, 3))
+    labels = np.ones(300, dtype=np.uint8)
+    material = state_points(scene.deform(deformations), model.nodes, model.node_labels)
+    error = np.linalg.norm(model.weights(points, labels)(material) - deformations[0](points), axis=1)
+    assert error.max() < 0.1

@@ -184,17 +184,6 @@ def test_where_no_registration_is_found_auto_says_why(model: Model, view: Sample
         mereo.reconstruct(view.depth.to_points(), known, "modes", resolution=32)
 
 
-def test_points_may_be_plain_lists(found: Answer) -> None:
-    registration = found.registration
-    assert registration is not None
-    rest = registration.model.rest_points[:3]
-    np.testing.assert_array_equal(registration.to_camera(rest.tolist()), registration.to_camera(rest))
-    there = registration.to_camera(rest)
-    np.testing.assert_array_equal(registration.to_rest(there.tolist()), registration.to_rest(there))
-    assert registration.query([[0, 0, 100]]).label.shape == (1,)
-    np.testing.assert_array_equal(registration.to_camera(rest[0]), registration.to_camera(rest[:1]))
-
-
 MOTION = "the pose is .* must be 4 x 4 finite numbers: a rotation and a translation"
 REFUSED: dict[str, tuple[Callable[[Registration], object], str]] = {
     "pairs": (lambda r: r.to_camera([[0.0, 1.0]]), r"have the shape \(1, 2\); they must be rows of x, y, z"),

@@ -116,13 +116,11 @@ def test_draws_need_their_scene_to_be_written(model: StatisticalModel) -> None:
 WRONG: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "key": (lambda facts: {**facts, "extra": 1}, "'extra'"),
     "missing": (lambda facts: {k: v for k, v in facts.items() if k != "z"}, "'z'"),
-    "text": (lambda facts: {**facts, "z": ["1.0"]}, "'z.0'"),
     "large": (lambda facts: {**facts, "z": [1e9]}, "'z.0'"),
     "format": (lambda facts: {**facts, "format": 2}, "its format is 2; this mereo reads format 1"),
     "method": (lambda facts: {**facts, "method": "draws"}, "the block `draws` belongs to the method 'draws' alone"),
     "unit": (lambda facts: {**facts, "scene_unit": 0.0}, "'scene_unit'"),
     "mirror": (lambda facts: {**facts, "T_camera_input": np.diag([1, 1, -1, 1]).tolist()}, "must be a rigid transform"),
-    "list": (lambda facts: [facts], "an object"),
     "lengths": (
         lambda facts: {**facts, "method": "draws", "draws": {"seed": 1, "sizes": [1], "names": ["a"]}},
         "must be of one length",

@@ -108,27 +108,20 @@ def test_ros(run: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 
     class Node:
         def __init__(self, name: str) -> None:
-            self.name = name
-
-        def create_publisher(self, kind: type, topic: str, depth: int) -> SimpleNamespace:
-            return SimpleNamespace(publish=sent.append)
+            self.create_publisher = lambda *_: SimpleNamespace(publish=sent.append)
 
         def create_subscription(self, kind: type, topic: str, callback: Callable[[Any], None], depth: int) -> None:
             cloud = message(seen())
             cloud.header = SimpleNamespace(stamp=SimpleNamespace(sec=5, nanosec=500_000_000))
-            self.calls = [lambda: callback(cloud)] * 2
+            self.spin = lambda: [callback(cloud) for _ in answers.copy()]
 
     def pose_stamped() -> SimpleNamespace:
         return SimpleNamespace(pose=SimpleNamespace(position=SimpleNamespace(), orientation=SimpleNamespace()))
 
-    def spin(node: Any) -> None:
-        for call in node.calls:
-            call()
-
     monkeypatch.setattr(mereo, "Tracker", Tracker, raising=False)
     run(
         "import rclpy",
-        rclpy={"init": lambda: None, "spin": spin},
+        rclpy={"init": lambda: None, "spin": lambda node: node.spin()},
         rclpy__node={"Node": Node},
         geometry_msgs={},
         geometry_msgs__msg={"PoseStamped": pose_stamped},

@@ -111,6 +111,14 @@ def test_a_segment_that_fills_the_box_is_closed_half_a_voxel_outside() -> None:
     assert 0.99 * 2.1**3 < segment.volume < 2.1**3
 
 
+def test_voxels_are_cubes_and_the_resolution_is_that_of_the_longest_side() -> None:
+    box = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 0.55]])
+    grid = run(logits_of(ball((0.5, 1.0, 0.3), 0.2)), resolution=20, box=box).grid
+    assert grid.labels.shape == (11, 21, 7)
+    np.testing.assert_allclose(grid.spacing, 0.1)
+    np.testing.assert_allclose(grid.positions(np.array([[10, 20, 0]])), [[1.0, 2.0, 0.0]])
+
+
 def test_locate_grows_until_the_object_is_inside() -> None:
     field = logits_of(ball((2.5, 0.0, 0.0), 2.0))
     box = locate(field, BOX)
