@@ -247,9 +247,7 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
         unchecked(mereo.Object.registrar)(mereo.Object(MODEL), "fulll")
     with pytest.raises(ValueError, match="the unit is -1 m; it must be positive"):
         mereo.reconstruct(seen(), MODEL, unit_m=-1)
-    with pytest.raises(
-        FileNotFoundError, match="there is no frame 'bunnny'; give a file or one of the shipped: bun000, bunny,"
-    ):
+    with pytest.raises(FileNotFoundError, match="there is no frame 'bunnny'; give a file or one of the shipped: bun"):
         mereo.load_frame("bunnny")
     with pytest.raises(ValueError, match="the shipped frame 'rope' is in metres and needs no options"):
         mereo.load_frame("rope", unit_m=0.001)
@@ -445,9 +443,7 @@ def test_learn_and_export_return_what_they_leave(tmp_path: Path, monkeypatch: py
     scores |= {"trained": False, "method": "search"}
     learned = mereo.learn("rope", tmp_path, train="never")
     assert learned.weights is learned.report is None and learned.method == "search" and learned.folder == tmp_path
-    with pytest.raises(
-        ValueError, match="train is 'once'; it must be one of auto, always, never: correct the spelling"
-    ):
+    with pytest.raises(ValueError, match="train is 'once'; it must be one of auto, always, never: correct"):
         inspect.unwrap(mereo.learn)("rope", tmp_path, train="once")
     monkeypatch.setattr(steps, "export_weights", lambda *given: calls.append(given))
     assert mereo.export("rope", tmp_path / "graphs", "torch") == tmp_path / "graphs"

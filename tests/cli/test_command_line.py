@@ -80,18 +80,6 @@ def test_version(option: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out == f"mereo {version('mereo')}\n"
 
 
-def test_train_options_override_the_preset() -> None:
-    text = (
-        "train data --epochs 2 --preset paper --network.width 64 --loss ce --network.no-encode-positions --output run"
-    )
-    command = command_line.parse(text.split())
-    assert isinstance(command, training.Train)
-    assert (command.config.epochs, command.config.loss, command.config.network.decoder.width) == (2, "ce", 64)
-    assert not command.config.network.decoder.encode_positions
-    assert command.config.learning_rate == PRESETS["paper"].learning_rate
-    assert command_line.parse(["train", "data", "--output", "run"]).config == PRESETS["base"]  # type: ignore[union-attr]
-
-
 @pytest.mark.parametrize("shard", ["4/4", "1", "-1/2", "1/2/3", ""])
 def test_wrong_shard_is_explained(shard: str) -> None:
     assert training.part_of("3/12") == (3, 12)
@@ -179,9 +167,9 @@ CALLS = {
         "mereo_learning.shards.generate",
         {"config": DatasetConfig(GenerateConfig(), 7, 3), "workers": 2, "shard": (1, 4), "resume": True} | OUT,
     ),
-    "train data --output out --preset tiny": (
+    "train data --output out": (
         "mereo.api.steps.train",
-        {"dataset": Path("data"), "config": PRESETS["tiny"]} | OUT,
+        {"dataset": Path("data"), "config": PRESETS["base"]} | OUT,
     ),
     "evaluate bunny --output out --examples 4 --seed 1000001": (
         "mereo_learning.evaluation_report.evaluate_weights",
@@ -254,11 +242,6 @@ def test_probes_that_this_torch_lacks_are_unknown(monkeypatch: pytest.MonkeyPatc
 
 
 QUICKSTART = Path(__file__).parents[2] / "docs/quickstart.md"
-METAVARS = ("SCENE", "OBJECT", "DATASET", "WEIGHTS", "INPUT", "SCAN", "ASSET")
-"""Words for positionals: see ``cli.options``."""
-
-FREE = ("{encoder-loss,",)
-"""Beginning of positionals that are chosen from a list, which is shown instead of a word."""
 
 
 ADDED = re.compile(r"\((default|required|repeatable)[^()]*(\([^()]*\))?[^()]*\)")
@@ -311,13 +294,6 @@ def test_every_option_is_explained(command: str) -> None:
     assert "-h, --help" in found
     for name, text in found.items():
         assert len(text.split()) >= 2, f"mereo {command} {name}: {text!r}"
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_positionals_have_the_words_of_all_commands(command: str) -> None:
-    box = help_of(command).partition("positional arguments")[2].partition("╰")[0]
-    for name in re.findall(r"^│ ([^ │].*?)(?:  |$)", box, re.MULTILINE):
-        assert name.startswith(FREE) or set(re.findall(r"[A-Z]+", name)) <= set(METAVARS), name
 
 
 def test_long_work_takes_threads_and_options_from_a_file() -> None:

@@ -69,12 +69,8 @@ def test_the_command_line_wins_over_the_file_and_the_file_over_the_preset(tmp_pa
 def test_a_sensor_is_a_word_or_its_terms(tmp_path: Path) -> None:
     path = written(tmp_path, {"sensor": "time-of-flight"})
     assert parsed(f"evaluate bunny --output out --config {path}")["terms"] == SENSORS["time-of-flight"]
-    field = next(iter(vars(SENSORS["paper"])))
-    value = vars(SENSORS["time-of-flight"])[field]
-    path = written(tmp_path, {"sensor": {field: value}})
-    assert parsed(f"evaluate bunny --output out --config {path}")["terms"] == replace(
-        SENSORS["paper"], **{field: value}
-    )
+    path = written(tmp_path, {"sensor": {"holes": 2.0}})
+    assert parsed(f"evaluate bunny --output out --config {path}")["terms"] == replace(SENSORS["paper"], holes=2.0)
 
 
 def test_yaml_and_names_with_hyphens(tmp_path: Path) -> None:
@@ -94,19 +90,10 @@ def test_a_runs_own_settings_are_such_a_file(tmp_path: Path) -> None:
     [
         ({"wieghts": "bunny"}, "has 'wieghts', which is no option of this command: correct it, perhaps to 'weights'"),
         ({"config": "other.json"}, "has 'config', which is no option of this command: "),
-        (
-            {"resolution": "many"},
-            "options.json: resolution is 'many', which cannot be (Input should be a valid integer",
-        ),
-        (
-            {"resolution": 1},
-            "options.json: resolution is 1; it must be a whole number, from 4 to 4096: give for example 128",
-        ),
+        ({"resolution": "many"}, "options.json: resolution is 'many', which cannot be (Input should be a valid int"),
+        ({"resolution": 1}, "options.json: resolution is 1; it must be a whole number, from 4 to 4096: give"),
         ({"method": "perhaps"}, "options.json: method is 'perhaps', which cannot be (Input should be 'auto'"),
-        (
-            {"weights": {"name": "bunny"}},
-            "has 'weights.name', which is no option of this command: correct it, perhaps to 'weights'",
-        ),
+        ({"weights": {"name": "bunny"}}, "has 'weights.name', which is no option of this command: correct it, perh"),
         ({"command": "train"}, "has options of `mereo train`, not of `mereo reconstruct`"),
         ([1, 2], "is no file of options; it must name each with its value"),
         ("{", "is no file of options (Expecting property name"),
@@ -115,11 +102,8 @@ def test_a_runs_own_settings_are_such_a_file(tmp_path: Path) -> None:
 def test_what_is_wrong_with_a_file_is_one_sentence(
     content: Any, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = written(tmp_path, content)
-    out = tmp_path / "out"
-    assert (
-        command_line.main(["reconstruct", "a.ply", "--weights", "w", "--output", str(out), "--config", str(path)]) == 2
-    )
+    path, out = str(written(tmp_path, content)), tmp_path / "out"
+    assert command_line.main(["reconstruct", "a", "--weights", "w", "--output", str(out), "--config", path]) == 2
     said = capsys.readouterr().err
     assert sentence in said and said.count("\n") == 1 and not out.exists(), said
 

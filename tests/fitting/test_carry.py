@@ -139,9 +139,7 @@ def test_a_surface_outside_does_not_tear(registrar: Registrar, bent: Registratio
 
 def test_far_away_things_are_refused(registrar: Registrar) -> None:
     points = np.random.default_rng(0).uniform(*SCENE.rest.bounds, size=(100, 3))
-    with pytest.raises(
-        ValueError, match="of 100 points of one are farther from the object than it is long .* bring it"
-    ):
+    with pytest.raises(ValueError, match="of 100 points of one are farther from the object than it is long"):
         placed_one(registrar, Positions(1000 * points))
     assert placed_one(registrar, Positions(points)).distance.max() < 20
 
@@ -359,9 +357,7 @@ def test_a_segmentation_of_slicer_keeps_its_segments(
 def test_a_volume_beside_the_object_is_refused(registrar: Registrar) -> None:
     moved = ramp().T_world_index.copy()
     moved[:3, 3] += 1000
-    with pytest.raises(
-        ValueError, match=r"far.nii holds nothing of the object: in RAS its voxels lie from \[.*\] to \[.*, and the obj"
-    ):
+    with pytest.raises(ValueError, match=r"far.nii holds nothing of the object: in RAS its voxels lie from \["):
         place([Attachment("far.nii", replace(ramp(), T_world_index=moved))], registrar, "scene")
     small = np.diag([0.1, 0.1, 0.1, 1.0])  # between all material points, and inside
     small[:3, 3] = (2.0, 1.0, 1.0)

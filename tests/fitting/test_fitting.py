@@ -7,15 +7,14 @@ import pytest
 from answers import fit_correspondences
 from fit_cases import IN_FRONT, SCENE, said, seen, shown
 from scipy.spatial.transform import Rotation
-from toy_scene import sample_deformations, toy_scene
+from toy_scene import toy_scene
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.draws.fit import DrawsProblem, Shape, approach, fit_draws, lay_on_shape, secant
 from mereo.fitting.draws.fit import narrowing as narrowing_of_draws
-from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
+from mereo.fitting.draws.playback import Drawn, DrawnStates
 from mereo.fitting.modes import narrowing, turns
 from mereo.fitting.problem.correspondences import Correspondences
-from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import POSE, Posed, along
 from mereo.fitting.registration.recognition import recognize
 from mereo.fitting.registration.register import CloudToFit, ModesFit, is_drawn
@@ -100,15 +99,6 @@ def test_derivatives_are_those_of_differences(model: StatisticalModel) -> None:
         there, back = posed.moved(step), posed.moved(-step)
         moved = there.place(model.material(there.z))[chosen] - back.place(model.material(back.z))[chosen]
         np.testing.assert_allclose(found[:, number], (moved * direction).sum(axis=1) / 2e-2, rtol=2e-3, atol=2e-2)
-
-
-def test_vertices_in_front_or_beside_are_pushed_back(view: View) -> None:
-    points = view.depth.to_points().points
-    evidence = Evidence.of(points)
-    middle = points[np.argmin(np.linalg.norm(points[:, :2] - points[:, :2].mean(axis=0), axis=1))]
-    direction, amount = evidence.violations(np.stack([middle * 0.9, middle + np.array([60.0, 0.0, 0.0])]), 0.5)
-    assert (amount > 1).all()
-    assert direction[0] @ middle > 0 and direction[1, 0] < 0
 
 
 def test_draws_find_a_state_of_the_scene(model: StatisticalModel) -> None:
@@ -222,15 +212,6 @@ def states(model: StatisticalModel) -> DrawnStates:
     return DrawnStates.of(SCENE, model, 30, 1000)
 
 
-def test_all_points_follow_the_played_ones(model: StatisticalModel, states: DrawnStates) -> None:
-    drawn = Drawn.of(SCENE, 1004)
-    deformations = drawn.deformations(SCENE, drawn.z)
-    assert deformations is not None
-    followed = states.played.spread @ states.played.moved(deformations).astype(np.float32)
-    error = np.linalg.norm(followed - material_moved(SCENE, model, deformations), axis=1)
-    assert np.quantile(error, 0.95) < 0.02 * model.half
-
-
 def test_a_secant_agrees_with_the_step_and_only_there() -> None:
     rng = np.random.default_rng(0)
     motion, step = rng.normal(size=(5, 3, 4)).astype(np.float32), rng.normal(size=4)
@@ -313,13 +294,3 @@ def test_one_state_is_no_model() -> None:
     nodes, labels = interior_nodes(scene.rest)
     with pytest.raises(ValueError, match="asked of 1 states; it needs 2 or more: record more states"):
         build_model(scene.rest, nodes, labels, sample_states(scene, nodes, labels, 1, 3))
-
-
-def test_inside_points_follow_the_scene(model: StatisticalModel) -> None:
-    scene = toy_scene()
-    deformations = sample_deformations(example_rng(7, 1))
-    points = np.random.default_rng(1).uniform([-17, -5, -4], [-7, 5, 4], size=(300, 3))
-    labels = np.ones(300, dtype=np.uint8)
-    material = state_points(scene.deform(deformations), model.nodes, model.node_labels)
-    error = np.linalg.norm(model.weights(points, labels)(material) - deformations[0](points), axis=1)
-    assert error.max() < 0.1

@@ -183,18 +183,13 @@ def test_other_methods_ask_nobody_else(liver: Model, cloud: PointCloud, monkeypa
 
 
 @pytest.fixture(scope="module")
-def model() -> Model:
-    return load_model("liver")
+def registrar() -> Registrar:
+    return Registrar.of(load_model("liver"), "modes")
 
 
 @pytest.fixture(scope="module")
-def registrar(model: Model) -> Registrar:
-    return Registrar.of(model, "modes")
-
-
-@pytest.fixture(scope="module")
-def points() -> np.ndarray:
-    return load_view("liver").depth.to_points().points
+def points(cloud: PointCloud) -> np.ndarray:
+    return cloud.points
 
 
 def with_rim(points: np.ndarray) -> np.ndarray:
@@ -211,29 +206,29 @@ def with_rim(points: np.ndarray) -> np.ndarray:
 
 
 def candidates(
-    model: Model, registrar: Registrar | None, points: np.ndarray, keep_all: bool = False, unit: float | None = 1.0
+    registrar: Registrar, points: np.ndarray, keep_all: bool = False, unit: float | None = 1.0
 ) -> tuple[Candidate, EncodedFrame]:
-    return fit_hypotheses(observe(PointCloud(points)), model, registrar, keep_all, unit)
+    return fit_hypotheses(observe(PointCloud(points)), registrar.network, registrar, keep_all, unit)
 
 
-def fitted(model: Model, registrar: Registrar, points: np.ndarray, **options: Any) -> Candidate:
-    return candidates(model, registrar, points, **options)[0]
+def fitted(registrar: Registrar, points: np.ndarray, **options: Any) -> Candidate:
+    return candidates(registrar, points, **options)[0]
 
 
 @pytest.mark.usefixtures("without_turns")
-def test_strays_are_left_out_and_all_else_is_kept(model: Model, registrar: Registrar, points: np.ndarray) -> None:
-    (clean, likelier), found = candidates(model, registrar, points), fitted(model, registrar, with_rim(points))
+def test_strays_are_left_out_and_all_else_is_kept(registrar: Registrar, points: np.ndarray) -> None:
+    (clean, likelier), found = candidates(registrar, points), fitted(registrar, with_rim(points))
     assert clean.hypothesis.dropped == 0 and clean.encoded is likelier
     assert not found.hypothesis.keep[len(points) :].any() and found.hypothesis.keep[: len(points)].mean() > 0.99
     assert found.modes is not None and clean.modes is not None
     moved = np.linalg.norm(found.modes.registration().material - clean.modes.registration().material, axis=1)
     assert np.median(moved) < 0.2
-    asked = fitted(model, registrar, with_rim(points), keep_all=True)
+    asked = fitted(registrar, with_rim(points), keep_all=True)
     assert asked.hypothesis.dropped == 0
 
 
 def test_points_that_a_fit_explains_are_given_back_beside_strays(
-    model: Model, registrar: Registrar, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
+    registrar: Registrar, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     contaminated = with_rim(points)
     lost = np.random.default_rng(0).choice(len(points), 10, replace=False)
@@ -244,12 +239,12 @@ def test_points_that_a_fit_explains_are_given_back_beside_strays(
         return Reading(cloud, keep), Reading.of_all(cloud)
 
     monkeypatch.setattr("mereo.fitting.registration.answer_frame.readings", hasty)
-    keep = fitted(model, registrar, contaminated).hypothesis.keep
+    keep = fitted(registrar, contaminated).hypothesis.keep
     assert keep[lost].all() and not keep[len(points) :].any()
 
 
-def test_an_answer_says_which_points_it_is_of(model: Model, registrar: Registrar, points: np.ndarray) -> None:
-    found = answer_to(with_rim(points), model, registrar, 24, label_points=True, scene_unit=1.0)
+def test_an_answer_says_which_points_it_is_of(registrar: Registrar, points: np.ndarray) -> None:
+    found = answer_to(with_rim(points), registrar.network, registrar, 24, label_points=True, scene_unit=1.0)
     assert found.taken and found.reconstruction.observed is not None
     assert len(found.reconstruction.observed.labels) == len(found.reconstruction.reading.cloud) < len(with_rim(points))
     assert found.seen.cloud is found.reconstruction.reading.cloud and found.seen.steps[-1].name == "strays"
@@ -261,15 +256,15 @@ def noisy(points: np.ndarray, std: float) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_a_noisy_frame_is_fitted_by_its_own_noise(model: Model, registrar: Registrar, points: np.ndarray) -> None:
-    clean, found = (fitted(model, registrar, cloud).modes for cloud in (points, noisy(points, 0.4)))
+def test_a_noisy_frame_is_fitted_by_its_own_noise(registrar: Registrar, points: np.ndarray) -> None:
+    clean, found = (fitted(registrar, cloud).modes for cloud in (points, noisy(points, 0.4)))
     assert clean is not None and found is not None
     assert clean.problem.config == FitConfig()
     config = found.problem.config
     assert 0.3 < config.cloud_sigma <= LARGEST and config.tolerance == pytest.approx(4.5 * config.cloud_sigma, rel=0.5)
     assert len(found.problem.evidence.observed_samples) > len(clean.problem.evidence.observed_samples)
     assert found.registration().accepted
-    metres = fitted(model, registrar, noisy(points, 0.4) * 0.005, unit=0.005).modes
+    metres = fitted(registrar, noisy(points, 0.4) * 0.005, unit=0.005).modes
     assert metres is not None and metres.problem.config.cloud_sigma == pytest.approx(config.cloud_sigma, rel=0.02)
 
 
@@ -293,10 +288,8 @@ def test_noise_that_neighbours_share_is_spread_evenly_and_a_wrong_state_is_not()
     assert not is_noise(np.where(rng.random(2700) < 0.1, 0.6, windows), around, is_shared=True)
 
 
-def test_a_noisy_cloud_is_explained_where_only_noise_is_left(
-    model: Model, registrar: Registrar, points: np.ndarray
-) -> None:
-    found = fitted(model, registrar, noisy(points, 0.4)).modes
+def test_a_noisy_cloud_is_explained_where_only_noise_is_left(registrar: Registrar, points: np.ndarray) -> None:
+    found = fitted(registrar, noisy(points, 0.4)).modes
     assert found is not None and found.problem.noisy
     problem, aside = found.problem, found.surface.material + np.array([0.0, 0.0, 1.0])
     assert problem.explained(9.0, found.surface, 0.1)

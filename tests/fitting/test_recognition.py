@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from answers import answer_to
 
 from mereo.fitting.registration.recognition import (
     CONSERVATIVE,
@@ -14,18 +13,11 @@ from mereo.fitting.registration.recognition import (
     recognize,
     strangeness,
 )
-from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
-from mereo.geometry.camera import PointCloud
 from mereo.models.calibration import Calibration, Recognizing, Usual
-from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import Scene, SourceFrame
-from mereo.scenes.seeds import example_rng
+from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel
-from mereo.synthesis.config import GenerateConfig
-from mereo.synthesis.examples import sample_view
-from mereo.synthesis.sample_views import load_view
 from mereo_learning.calibrate import (
     RecognitionSigns,
     other_objects,
@@ -150,24 +142,6 @@ def test_strangers_are_other_objects_planes_and_heaps(monkeypatch: pytest.Monkey
     low, high = rope.rest.bounds
     assert all(len(cloud) > 10 for _, cloud in frames)
     assert all(np.ptp(cloud.points, axis=0).max() < 2 * (high - low).max() for _, cloud in frames[1:])
-
-
-@pytest.mark.slow
-def test_shipped_weights_tell_their_object_from_another_and_from_a_wrong_unit() -> None:
-    rope = load_model("rope")
-    own = load_view("rope").depth.to_points()
-    other = sample_view(load_scene("robot"), GenerateConfig(), example_rng(5, 0)).depth.to_points()
-    assert rope.statistical_model is not None
-    sized = replace(rope.statistical_model, source_frame=SourceFrame(np.eye(4), 0.01))  # of a known true size
-    registrar = Registrar(rope, sized, "modes")
-    assert answer_to(own, rope, registrar, 24, unit_m=0.01).recognition.known is True
-    found = answer_to(other, rope, Registrar.of(rope), 24)
-    assert found.recognition.known is False and not found.taken
-    inches = answer_to(PointCloud(own.points / 25.4), rope, registrar, 24, unit_m=0.01).recognition
-    assert inches.known is False and inches.reason is not None and "a factor of" in inches.reason
-    unknown = answer_to(PointCloud(own.points / 25.4), rope, registrar, 24)
-    assert unknown.recognition.known is True
-    assert unknown.seen.frame.unit_m == pytest.approx(0.254, rel=0.05), "found by the object's true size"
 
 
 def test_limits_in_the_wrong_order_are_refused() -> None:

@@ -63,11 +63,7 @@ def test_the_radius_holds_95_percent_of_a_gaussian() -> None:
 
 
 def test_the_posterior_of_a_linear_problem_is_its_closed_form() -> None:
-    """Points with one coefficient, each measured in space: Bayes' rule for a Gaussian, by hand and by the factor.
-
-    The pose is held. With a prior N(0, 1) and measurements ``m_i z + noise``, the variance of z is
-    ``1 / (1 + sum |m_i|^2 / sigma^2)``.
-    """
+    """The pose is held; the prior is N(0, 1), measured is ``m_i z + noise``."""
     rng = np.random.default_rng(0)
     modes, sigma = rng.normal(size=(7, 3, 1)).astype(np.float32), 0.3
     held = NormalEquations.prior(np.zeros(1), np.zeros(1), np.eye(1), 0.0, 1e-6)

@@ -7,6 +7,8 @@ import pytest
 import trimesh
 from label_cases import CENTER, ORIGIN, RADIUS, SPACING, halves, nibabel, write_nifti
 from overlapping import check_overlap
+from shapes import ball, box
+from shapes import segment as segment_of
 
 from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
 from mereo.geometry.solids import Solids
@@ -105,24 +107,7 @@ def test_a_scene_from_a_label_volume(tmp_path: Path) -> None:
         load_scene(path)
 
 
-RED, BLUE = (213, 94, 0), (86, 180, 233)
-
-
-def segment_of(mesh: trimesh.Trimesh, name: str = "part", shift: float = 0.0) -> Segment:
-    vertices = np.array(mesh.vertices, dtype=np.float64) + np.array([shift, 0.0, 0.0])
-    return Segment(name, RED if name == "part" else BLUE, vertices, np.array(mesh.faces))
-
-
-def box() -> Segment:
-    return segment_of(trimesh.creation.box((1.0, 2.0, 3.0)))
-
-
-def ball() -> Segment:
-    return segment_of(trimesh.creation.icosphere(3), "ball", 4.0)
-
-
-def cylinder(sides: int) -> Segment:
-    return segment_of(trimesh.creation.cylinder(1.0, 2.0, sections=sides))
+BOX, BALL = box((-0.5, -1.0, -1.5), (0.5, 1.0, 1.5)), ball((4.0, 0.0, 0.0), 1.0, color=1, level=3)
 
 
 def check(segment: Segment) -> Segment:
@@ -136,7 +121,7 @@ def check(segment: Segment) -> Segment:
 
 
 def test_a_box_has_three_normals_at_each_corner() -> None:
-    split = check(box())
+    split = check(BOX)
     assert len(split.vertices) == 24
     normals = vertex_normals(split)
     np.testing.assert_allclose(np.abs(normals).max(axis=1), 1.0)
@@ -149,7 +134,7 @@ def test_a_box_has_three_normals_at_each_corner() -> None:
 @pytest.mark.parametrize("sides, times", [(12, 2), (24, 2), (8, 3)])
 def test_a_cylinder_is_smooth_around_and_has_rims(sides: int, times: int) -> None:
     """Twelve sides meet at exactly 30 degrees, which is no crease; eight at 45, which is one."""
-    split = check(cylinder(sides))
+    split = check(segment_of(trimesh.creation.cylinder(1.0, 2.0, sections=sides)))
     assert len(split.vertices) == times * 2 * sides + 2
     round_it = np.abs(vertex_normals(split)[:, 2]) < 0.5
     assert round_it.sum() == (times - 1) * 2 * sides
@@ -157,21 +142,20 @@ def test_a_cylinder_is_smooth_around_and_has_rims(sides: int, times: int) -> Non
 
 
 def test_faces_without_area_and_edges_of_many_faces_are_no_trouble() -> None:
-    one = box()
-    thin = np.concatenate([one.faces, [[0, 1, 1], [0, 0, 0]]])
-    assert len(split_at_creases(Segment("thin", RED, one.vertices, thin))[0].vertices) == 24
+    thin = np.concatenate([BOX.faces, [[0, 1, 1], [0, 0, 0]]])
+    assert len(split_at_creases(Segment("thin", BOX.color, BOX.vertices, thin))[0].vertices) == 24
     shared = np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4], [1, 0, 5]])
     fan = np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], dtype=float)
-    check(Segment("fan", RED, fan, shared))
-    none = Segment("none", RED, np.empty((0, 3)), np.empty((0, 3), dtype=np.int64))
+    check(Segment("fan", BOX.color, fan, shared))
+    none = Segment("none", BOX.color, np.empty((0, 3)), np.empty((0, 3), dtype=np.int64))
     assert split_at_creases(none)[0] is none
 
 
 def test_a_glb_has_creases_and_merges_to_the_same_surface(tmp_path: Path) -> None:
-    mesh = SegmentedMesh((box(), ball()))
+    mesh = SegmentedMesh((BOX, BALL))
     write_segments_glb(tmp_path / "s.glb", mesh, np.eye(3))
     read = trimesh.load_scene(tmp_path / "s.glb", process=False).geometry
-    assert [len(read[name].vertices) for name in mesh.names] == [24, len(ball().vertices)]
-    assert np.sort(np.abs(read["part"].vertex_normals), axis=1) == pytest.approx(np.tile([0, 0, 1], (24, 1)))
+    assert [len(read[name].vertices) for name in mesh.names] == [24, len(BALL.vertices)]
+    assert np.sort(np.abs(read["box"].vertex_normals), axis=1) == pytest.approx(np.tile([0, 0, 1], (24, 1)))
     for segment in read_segmented_mesh(tmp_path / "s.glb").segments:
         assert segment.edge_imbalance() == (0, 0)

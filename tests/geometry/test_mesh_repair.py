@@ -293,9 +293,7 @@ def test_a_scene_with_a_hole_warns_and_makes_examples(tmp_path: Path) -> None:
     path.write_text(
         "name: holed\nunits: m\nsegments:\n  - {name: ball, file: ball.ply}\n  - {name: box, file: box.ply}\n"
     )
-    with pytest.warns(
-        MeshWarning, match=r"'ball' has 7 open edges \(1 hole, near .*; the winding number .*--repair"
-    ) as caught:
+    with pytest.warns(MeshWarning, match=r"'ball' has 7 open edges \(1 hole, near .*; the winding number") as caught:
         scene = load_scene(path)
     assert len(caught) == 1
     assert [segment.solid for segment in scene.rest.segments] == [False, True] and len(set(scene.rest.colors)) == 2

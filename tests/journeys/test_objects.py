@@ -186,9 +186,7 @@ def test_a_mesh_without_volume_is_a_sentence(tmp_path: Path) -> None:
         mereo.load_object(tmp_path / "flat.stl")
     tilted = trimesh.Trimesh([[0, 0, 0], [90, 0, 10], [0, 60, 20]], [[0, 1, 2]], process=False)
     tilted.export(tmp_path / "tilted.stl")
-    with pytest.raises(
-        ValueError, match=r"tilted.stl is an open surface \(3 open edges\) that encloses no volume; .*or let"
-    ):
+    with pytest.raises(ValueError, match=r"tilted.stl is an open surface \(3 open edges\) that encloses no"):
         mereo.load_object(tmp_path / "tilted.stl")
 
 

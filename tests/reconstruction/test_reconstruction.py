@@ -3,9 +3,10 @@
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -99,24 +100,31 @@ def test_files(answer: Answer, tmp_path: Path) -> None:
     np.testing.assert_allclose(place[:3], np.array(BIG[0]) * ([1, -1, -1] if frame == "camera" else 1), atol=1e-6)
 
 
+@pytest.fixture
+def read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Reconstruction]:
+    """Answer to a cloud in metres, written into a folder, by a model of a known true size."""
+
+    def answered(folder: str, cloud: np.ndarray, visible_m: list[float], **isolation: Any) -> Reconstruction:
+        model = replace(scene("camera")[1], provenance={"visible_m": visible_m})
+        monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: model)
+        np.save(tmp_path / "cloud.npy", cloud)
+        command = ReconstructCommand((), weights="any", resolution=16, reading=InputConfig(unit_m=1.0))
+        job = FrameJob(replace(command, isolation=IsolationConfig(**isolation)))
+        return reconstruct_file(tmp_path / "cloud.npy", tmp_path / folder, job).reconstruction
+
+    return answered
+
+
 def test_what_is_read_and_left_out_is_printed_and_kept(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    read: Callable[..., Reconstruction], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    cloud, model = scene("camera")
-    np.save(tmp_path / "cloud.npy", np.concatenate([cloud, front((0.9, 0.0, 0.9), 0.03, -1.0)]))
-    monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: replace(model, provenance={"visible_m": [2, 3]}))
-    read = partial(reconstruct_file, tmp_path / "cloud.npy")
-    job = FrameJob(ReconstructCommand((), weights="any", resolution=16, reading=InputConfig(unit_m=1.0)))
+    cloud = scene("camera")[0]
+    crowded = np.concatenate([cloud, front((0.9, 0.0, 0.9), 0.03, -1.0)])
     with pytest.warns(SizeWarning, match="the visible part is 0.97 m long, but 2 to 3 m in training: other things"):
-        read(tmp_path / "crowded", job)
+        read("crowded", crowded, [2, 3])
     assert "strays:" not in capsys.readouterr().out, "it is a surface: nothing says that it is not the object"
     with pytest.warns(SizeWarning, match="the visible part is 0.1[0-9]* m long"):
-        read(
-            tmp_path / "alone",
-            replace(
-                job, command=replace(job.command, isolation=IsolationConfig(largest_cluster=True, cluster_gap=0.02))
-            ),
-        )
+        read("alone", crowded, [2, 3], largest_cluster=True, cluster_gap=0.02)
     assert "largest cluster: 1200 of 1800 points kept (1 of 2 clusters" in capsys.readouterr().out
     summary = json.loads((tmp_path / "alone/summary.json").read_text())
     assert summary["points"] == 1200 and summary["isolation"][-1]["name"] == "largest cluster"
@@ -124,24 +132,13 @@ def test_what_is_read_and_left_out_is_printed_and_kept(
     assert max(summary["visible_size_m"]) == pytest.approx(np.ptp(cloud[:, 1]), rel=1e-6)
 
 
-def with_strays() -> tuple[np.ndarray, np.ndarray, AnalyticModel]:
-    """The two balls with thirty single points far behind, the balls alone, and their model."""
-    own, model = scene("camera")
-    lone = np.random.default_rng(1).uniform((-0.3, -0.3, 0.9), (0.3, 0.3, 1.3), (30, 3))
-    return np.concatenate([own, lone]), own, model
-
-
 def test_strays_are_dropped_and_said_unless_all_are_to_be_kept(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    read: Callable[..., Reconstruction], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    cloud, own, model = with_strays()
-    np.save(tmp_path / "cloud.npy", cloud)
-    monkeypatch.setattr(
-        "mereo.models.weights.load_for", lambda *_: replace(model, provenance={"visible_m": [0.1, 0.2]})
-    )
-    read = partial(reconstruct_file, tmp_path / "cloud.npy")
-    job = FrameJob(ReconstructCommand((), weights="any", resolution=16, reading=InputConfig(unit_m=1.0)))
-    result = read(tmp_path / "out", job).reconstruction
+    own, model = scene("camera")
+    far_behind = np.random.default_rng(1).uniform((-0.3, -0.3, 0.9), (0.3, 0.3, 1.3), (30, 3))
+    cloud = np.concatenate([own, far_behind])
+    result = read("out", cloud, [0.1, 0.2])
     said = capsys.readouterr().out
     assert "strays: 30 of 1230 points dropped, the longest side was" in said and "(--keep-all keeps them)" in said
     summary = json.loads((tmp_path / "out/summary.json").read_text())
@@ -150,7 +147,7 @@ def test_strays_are_dropped_and_said_unless_all_are_to_be_kept(
     assert (step["name"], step["before"], step["kept"]) == ("strays", 1230, 1200)
     np.testing.assert_array_equal(result.labels.labels, reconstruct(own, model, resolution=16).labels.labels)
     with pytest.warns(SizeWarning, match="the visible part is 0.[5-9][0-9]* m long"):
-        read(tmp_path / "all", replace(job, command=replace(job.command, isolation=IsolationConfig(keep_all=True))))
+        read("all", cloud, [0.1, 0.2], keep_all=True)
     assert "strays:" not in capsys.readouterr().out
     assert json.loads((tmp_path / "all/summary.json").read_text())["points"] == 1230
 

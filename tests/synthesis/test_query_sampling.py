@@ -57,13 +57,6 @@ def shapes() -> dict[str, Shape]:
     }
 
 
-def halves(samples: Samples, keep: int) -> list[tuple[Samples, Samples]]:
-    """Per segment, the points inside and those outside."""
-    points, labels = (np.split(a, len(a) // keep) for a in samples)
-    sides = [Samples(p, q) for p, q in zip(points, labels, strict=True)]
-    return list(zip(sides[::2], sides[1::2], strict=True))
-
-
 def one_at_a_time(shape: Shape, keep: int, draw: int, seed: int, nested: bool) -> Samples:
     """The paper's loop, one draw after the other."""
     seeds = np.random.default_rng(seed).integers(0, 2**32, size=(shape.count, 4), dtype=np.uint32)
@@ -127,19 +120,6 @@ def test_the_nearest_surface_owns_nested_and_overlapping_solids() -> None:
     assert len(lens) > 100
     # equal radii: the first ball's surface is nearer where its centre is farther
     np.testing.assert_array_equal(owner_labels(overlapping, lens), np.where(lens[:, 0] > 0, 1, 2))
-
-
-def test_reach_around_balls_in_closed_form() -> None:
-    """Equal volumes on both sides: r * 2^(1/3) for n = k; half volumes r * 0.5^(1/3) and r * 1.5^(1/3) for n = 2k."""
-    balls = Balls(((0, 0, 0), 1.0), ((9, 0, 0), 2.0))
-    for factor, inner, outer in ((1, None, 2.0), (2, 0.5, 1.5)):
-        runs = [halves(sort_sample(balls, 256, 256 * factor, np.random.default_rng(s)), 256) for s in range(20)]
-        for index, r in enumerate(balls.radii):
-            outermost = np.mean([balls.radius(index, run[index][1].points).max() for run in runs])
-            assert outermost == pytest.approx(r * outer ** (1 / 3), rel=0.025)
-            if inner is not None:
-                innermost = np.mean([balls.radius(index, run[index][0].points).min() for run in runs])
-                assert innermost == pytest.approx(r * inner ** (1 / 3), rel=0.025)
 
 
 @pytest.mark.parametrize("sampler", ["volume-uniform", "label-uniform", "sort-sample", "nested-sort-sample"])

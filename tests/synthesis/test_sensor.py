@@ -236,6 +236,12 @@ def test_noise_has_the_asked_deviation_on_hits_only() -> None:
     assert abs((np.abs(hits) > 0.2).mean() - 0.0455) < 5 * np.sqrt(0.0455 / count)
 
 
+def test_strong_noise_neither_loses_nor_invents_hits() -> None:
+    image = render_depth(one(ball((0, 0, 150), 30.0)), NARROW)
+    noisy = add_depth_noise(image, 500.0, np.random.default_rng(0))
+    assert np.array_equal(noisy.valid, image.valid)
+
+
 @pytest.mark.parametrize("std", [-0.1, float("nan"), float("inf")])
 def test_a_deviation_must_be_finite_and_not_negative(std: float) -> None:
     image = render_depth(one(ball((0, 0, 150), 30.0)), NARROW)

@@ -101,6 +101,15 @@ def test_a_walk_goes_round_what_the_scene_refuses_and_tells_where_that_is_everyt
         walk(Scene("stubborn", rest_mesh(), draw), 0, np.arange(3) / 10, 1.0)
 
 
+def test_a_walk_does_not_jump_between_states_that_are_far_apart() -> None:
+    def draw(rng: np.random.Generator) -> tuple[Deformation, ...]:
+        return 4 * (Shear(90.0 * float(np.sign(rng.uniform(-1.0, 1.0))), 0.0, 0.0),)
+
+    states = walk(Scene("sides", rest_mesh(), draw), 0, np.arange(20) / 10, 1.0)
+    drawn = np.array([one.calls[0].shares[0] for one in states])
+    assert len(np.unique(drawn > 0.5)) == 1 and np.ptp(drawn) > 0.1
+
+
 @pytest.fixture(scope="module")
 def moments() -> list[Moment]:
     return list(sequence(toy_scene(), SHORT, SENSORS["paper"], 5))

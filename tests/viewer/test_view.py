@@ -562,11 +562,7 @@ def test_the_command_opens_the_page_of_a_folder(folder: Path, opened: list[Any])
         (b"glTF but not really", (), "s.glb cannot be read as a GLB file"),
         (b"", (), "s.glb is empty (0 bytes)"),
         (trimesh.Scene([trimesh.PointCloud(np.eye(3))]).export(file_type="glb"), (), "it has no faces"),
-        (
-            b"",
-            ("--weights", "rope"),
-            "is shown as it is, and no object is looked for: leave out --object and",
-        ),
+        (b"", ("--weights", "rope"), "is shown as it is, and no object is looked for: leave out --object and"),
     ],
 )
 def test_a_file_that_cannot_be_shown_is_said_in_one_sentence(
