@@ -167,10 +167,7 @@ CALLS = {
         "mereo_learning.shards.generate",
         {"config": DatasetConfig(GenerateConfig(), 7, 3), "workers": 2, "shard": (1, 4), "resume": True} | OUT,
     ),
-    "train data --output out": (
-        "mereo.api.steps.train",
-        {"dataset": Path("data"), "config": PRESETS["base"]} | OUT,
-    ),
+    "train data --output out": ("mereo.api.steps.train", {"dataset": Path("data"), "config": PRESETS["base"]} | OUT),
     "evaluate bunny --output out --examples 4 --seed 1000001": (
         "mereo_learning.evaluation_report.evaluate_weights",
         {"weights": "bunny", "config": EvaluationConfig(None, 4, 1_000_001), "workers": 1} | OUT,

@@ -11,16 +11,7 @@ from answers import answer_to
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem import correspondences
 from mereo.fitting.problem.evidence import Evidence
-from mereo.fitting.problem.problem import (
-    ACCEPTED,
-    CLEAN,
-    LARGEST,
-    SHARED,
-    constants_for,
-    is_noise,
-    noise_of,
-    shared,
-)
+from mereo.fitting.problem.problem import ACCEPTED, CLEAN, LARGEST, SHARED, constants_for, is_noise, noise_of, shared
 from mereo.fitting.problem.residuals import Surface
 from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.answer_frame import (

@@ -5,43 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mereo.fitting.registration.recognition import (
-    CONSERVATIVE,
-    MOST,
-    NOT_EVALUATED,
-    Signs,
-    recognize,
-    strangeness,
-)
+from mereo.fitting.registration.recognition import CONSERVATIVE, MOST, NOT_EVALUATED, Signs, recognize, strangeness
 from mereo.fitting.registration.registration import Registration
 from mereo.models.calibration import Calibration, Recognizing, Usual
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel
-from mereo_learning.calibrate import (
-    RecognitionSigns,
-    other_objects,
-    strange_frames,
-    usual_of,
-)
+from mereo_learning.calibrate import RecognitionSigns, other_objects, strange_frames, usual_of
 
 
 @pytest.fixture(scope="module")
 def registration(model: StatisticalModel) -> Registration:
     """A registration that nothing speaks against: the mean state."""
-    return Registration(
-        model=model,
-        material=model.mean + np.array([0.0, 0.0, 100.0]),
-        method="modes",
-        z=np.full(model.count, 0.5),
-        scene_unit=1.0,
-        unit_known=False,
-        explained=1.0,
-        accepted=True,
-        seconds=0.1,
-        residual=0.05,
-        ruled_out=0.0,
-    )
+    material, z = model.mean + np.array([0.0, 0.0, 100.0]), np.full(model.count, 0.5)
+    found = Registration(model, material, "modes", z, 1.0, unit_known=False, explained=1.0, accepted=True, seconds=0.1)
+    return replace(found, residual=0.05, ruled_out=0.0)
 
 
 @pytest.mark.parametrize(

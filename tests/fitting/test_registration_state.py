@@ -64,17 +64,6 @@ def test_a_state_gives_the_same_material_points_again(
     assert (tmp_path / STATE).stat().st_size < 5000
 
 
-def test_draws_come_back_with_their_seed_sizes_and_names(model: StatisticalModel) -> None:
-    before = by_draws(model)
-    state = state_of(before, SCENE)
-    assert state.draws is not None and before.drawn is not None
-    assert (state.draws.seed, state.draws.sizes) == (5, (3, 1))
-    assert state.draws.names == ("whole: shear x", "whole: shear y", "whole: shear z", "ball: lift")
-    drawn = restored(state, model, SCENE).drawn
-    assert drawn is not None and drawn.sizes == before.drawn.sizes
-    np.testing.assert_array_equal(drawn.smooth, before.drawn.smooth)
-
-
 def test_a_state_of_other_weights_is_refused(model: StatisticalModel) -> None:
     state = state_of(by_modes(model), "toy", weights="mine.safetensors")
     modes = model.modes.copy()

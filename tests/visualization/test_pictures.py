@@ -23,14 +23,7 @@ from mereo.models.weights import load_model
 from mereo.synthesis.examples import View
 from mereo.synthesis.sample_views import load_view
 from mereo.visualization import previews
-from mereo.visualization.color_scales import (
-    TABLE,
-    ColorScale,
-    confidence,
-    distance_scale,
-    observed_distance,
-    viridis,
-)
+from mereo.visualization.color_scales import TABLE, ColorScale, confidence, distance_scale, observed_distance, viridis
 from mereo.visualization.contact_sheets import contact_sheet, depth_to_rgb, legend
 from mereo.visualization.previews import preview_states
 from mereo.visualization.renderer import SUPERSAMPLE, Canvas, Triangles, Viewpoint, corner_normals, shade
@@ -51,7 +44,6 @@ from mereo_learning.error_maps import (
     offset_colors,
     offset_triangles,
     segmentation_error,
-    signed_distance,
     surface_offset,
     voxel_triangles,
 )
@@ -305,16 +297,6 @@ def test_what_is_missing_is_the_farther_off_the_longer_it_is() -> None:
     offset = surface_offset(truth, found, np.ones(3), places)
     np.testing.assert_allclose(offset, [0.0, -2.5, -6.5, -10.5], atol=0.3)
     np.testing.assert_array_equal(surface_offset(found, truth, np.ones(3), places), -offset)
-
-
-def test_equal_grids_have_no_offset_and_distances_vanish_on_faces() -> None:
-    occupied = np.random.default_rng(6).random((7, 8, 9)) > 0.5
-    places = np.random.default_rng(7).uniform(-0.5, 6.5, size=(90, 3))
-    assert not surface_offset(occupied, occupied, SPACING, places).any()
-    slab = np.zeros((9, 4, 4), dtype=bool)
-    slab[:4] = True
-    expected = (np.arange(9) - 3.5) * 0.5
-    np.testing.assert_allclose(signed_distance(slab, SPACING)[:, 1, 2], expected, rtol=1e-6)
 
 
 GREYS = ColorScale("grey", 1.0, 3.0, ((0, 0, 0), (100, 100, 100), (250, 250, 250)), ("low", "high"))

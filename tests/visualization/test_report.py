@@ -15,7 +15,7 @@ from reported_scenes import ball, example, page_data, positions, wall
 
 from mereo.fitting.registration.recognition import MOST, NOT_EVALUATED, Recognition, Signs
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
-from mereo.geometry.mesh import PALETTE, SegmentedMesh
+from mereo.geometry.mesh import SegmentedMesh
 from mereo.visualization.contact_sheets import MISSING, MOST_DEPTH_PX, depth_data
 from mereo.visualization.reconstruction_report import BUDGET_BYTES, VERDICTS, Report, trust
 from mereo.visualization.units import Unit
@@ -101,7 +101,7 @@ def test_large_and_empty_depth_images_are_small_pictures() -> None:
 
 def test_a_large_reconstruction_stays_under_the_budget_and_in_shape(tmp_path: Path) -> None:
     cloud, _, summary = example()
-    mesh = SegmentedMesh(tuple(ball(f"s{i}", 0.2 * i, PALETTE[i], level=6) for i in range(3)))
+    mesh = SegmentedMesh(tuple(ball(f"s{i}", 0.2 * i, i, level=6) for i in range(3)))
     Report(PointCloud(np.tile(cloud.points, (700, 1))), mesh, summary).write(tmp_path / "r.html")
     assert 1_000_000 < (tmp_path / "r.html").stat().st_size <= BUDGET_BYTES
     data = page_data(tmp_path / "r.html")
