@@ -8,7 +8,7 @@ import json
 import pickle
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -176,38 +176,30 @@ def test_other_names_are_refused(result: Result, tmp_path: Path) -> None:
 
 
 def test_values_tell_themselves_in_one_line(result: Result) -> None:
-    view = load_scene("rope")
-    camera = Camera.from_fov(4, 3, 0.5)
-    values: Sequence[object] = (
-        result,
-        result.reconstruction,
-        result.reconstruction.surfaces,
-        result.reconstruction.surfaces.segments[0],
-        result.reconstruction.labels,
-        result.reconstruction.segments,
-        result.reconstruction.code,
-        result.reconstruction.reading,
-        result.reconstruction.observed,
-        result.seen,
-        result.seen.frame,
-        result.seen.cloud,
+    rope, camera, found = load_scene("rope"), Camera.from_fov(4, 3, 0.5), result.reconstruction
+    parts = [found.surfaces, found.surfaces.segments[0], found.labels, found.segments, found.code, found.reading]
+    empty = [PointCloud(np.zeros((0, 3))), DepthImage(np.zeros((3, 4)), camera)]
+    frames = [result.seen, result.seen.frame, result.seen.cloud, *empty]
+    image, evaluation = DepthImage(np.full((3, 4), 2.0), camera), Evaluation(("a",), np.array([[5, 1], [1, 3]]), {})
+    located = Located(np.ones(1, np.uint8), np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))
+    asked = MODEL.query(found.code, seen()[:5])
+    known = [
         untrained(("a",)),
-        view,
+        rope,
         toy_scene(),
         DepthImage(np.zeros((3, 4)), camera),
-        DepthImage(np.full((3, 4), 2.0), camera),
-        PointCloud(np.zeros((0, 3))),
-        MODEL.query(result.reconstruction.code, seen()[:5]),
-        Located(np.ones(1, np.uint8), np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3))),
-        Evaluation(("a",), np.array([[5, 1], [1, 3]]), {}),
-    )
-    for value in values:
+        image,
+        asked,
+        located,
+        evaluation,
+    ]
+    for value in (result, found, found.observed, *parts, *frames, *known):
         assert "\n" not in repr(value) and "array(" not in repr(value) and len(repr(value)) < 250, repr(value)
     assert repr(result.seen.cloud) == "PointCloud(1,200 points, 0.12 x 0.18 x 0.06)"
-    assert repr(values[16]) == "DepthImage(4 x 3 pixels, 12 measured, depth 2 to 2)"
+    assert repr(image) == "DepthImage(4 x 3 pixels, 12 measured, depth 2 to 2)"
     assert repr(result).startswith("Result('cloud': 2 of 3 segments; network alone; ")
-    assert repr(values[-1]) == "Evaluation(0 examples: IoU 0.600, mIoU 0.600; a)"
-    assert "9 segments: base, segment_1, segment_2, segment_3, segment_4, ... (9)" in repr(view)
+    assert repr(evaluation) == "Evaluation(0 examples: IoU 0.600, mIoU 0.600; a)"
+    assert "9 segments: base, segment_1, segment_2, segment_3, segment_4, ... (9)" in repr(rope)
 
 
 def test_a_notebook_shows_pictures_and_figures(result: Result) -> None:

@@ -43,33 +43,9 @@ def direction(rng: np.random.Generator) -> np.ndarray:
     return vector / np.linalg.norm(vector)
 
 
-def make_rigid(rng: np.random.Generator) -> Deformation:
-    return Rigid(rng.uniform(-2, 2, 3), rng.uniform(-5, 5, 3), rng.uniform(-5, 5, 3))
-
-
 def make_bend(rng: np.random.Generator) -> Deformation:
     length = rng.uniform(5.0, 25.0)
     return Bend(np.zeros(3), direction(rng), direction(rng), length, rng.uniform(-0.9, 0.9) * length / REACH, REACH)
-
-
-def make_twist(rng: np.random.Generator) -> Deformation:
-    return Twist(rng.uniform(-3, 3, 3), direction(rng), rng.uniform(4, 20), rng.uniform(-2, 2))
-
-
-def make_taper(rng: np.random.Generator) -> Deformation:
-    return Taper(rng.uniform(-3, 3, 3), direction(rng), rng.uniform(4, 20), rng.uniform(0.4, 2.5))
-
-
-def make_squash(rng: np.random.Generator) -> Deformation:
-    return Squash(rng.uniform(-3, 3, 3), direction(rng), rng.uniform(0.4, 2.5))
-
-
-def make_field(rng: np.random.Generator) -> SmoothField:
-    return SmoothField.sample(rng, strength=0.9, wavelength=(8.0, 40.0))
-
-
-def make_lattice(rng: np.random.Generator) -> FreeFormLattice:
-    return FreeFormLattice.sample(rng, BOX, (4, 3, 2), strength=0.95)
 
 
 def make_window(rng: np.random.Generator) -> Deformation:
@@ -89,16 +65,16 @@ def make_sweep(rng: np.random.Generator) -> Deformation:
 
 MAKERS: dict[str, Callable[[np.random.Generator], Deformation]] = {
     "identity": lambda rng: Identity(),
-    "rigid": make_rigid,
+    "rigid": lambda rng: Rigid(rng.uniform(-2, 2, 3), rng.uniform(-5, 5, 3), rng.uniform(-5, 5, 3)),
     "bend": make_bend,
-    "twist": make_twist,
-    "taper": make_taper,
-    "squash": make_squash,
-    "field": make_field,
-    "lattice": make_lattice,
+    "twist": lambda rng: Twist(rng.uniform(-3, 3, 3), direction(rng), rng.uniform(4, 20), rng.uniform(-2, 2)),
+    "taper": lambda rng: Taper(rng.uniform(-3, 3, 3), direction(rng), rng.uniform(4, 20), rng.uniform(0.4, 2.5)),
+    "squash": lambda rng: Squash(rng.uniform(-3, 3, 3), direction(rng), rng.uniform(0.4, 2.5)),
+    "field": lambda rng: SmoothField.sample(rng, strength=0.9, wavelength=(8.0, 40.0)),
+    "lattice": lambda rng: FreeFormLattice.sample(rng, BOX, (4, 3, 2), strength=0.95),
     "window": make_window,
     "sweep": make_sweep,
-    "composition": lambda rng: Compose((make_field(rng), make_rigid(rng), make_squash(rng), make_taper(rng))),
+    "composition": lambda rng: Compose(tuple(MAKERS[name](rng) for name in ("field", "rigid", "squash", "taper"))),
 }
 
 
@@ -168,7 +144,7 @@ def test_jacobian_of_a_linear_map_is_its_matrix_at_any_scale() -> None:
 
 def test_composition_applies_the_first_part_first() -> None:
     rng = np.random.default_rng(3)
-    turn, twist, points = make_rigid(rng), make_twist(rng), cube(rng)
+    turn, twist, points = MAKERS["rigid"](rng), MAKERS["twist"](rng), cube(rng)
     assert np.array_equal(Compose((turn, twist))(points), twist(turn(points)))
     assert np.abs(Compose((turn, twist))(points) - Compose((twist, turn))(points)).max() > 0.1
     nested = Compose((Compose((turn, twist)), Compose(())))
@@ -179,7 +155,7 @@ def test_composition_applies_the_first_part_first() -> None:
 
 def test_rigid_preserves_distances_and_moves_its_center_by_the_translation() -> None:
     rng = np.random.default_rng(4)
-    motion, points = make_rigid(rng), cube(rng)
+    motion, points = MAKERS["rigid"](rng), cube(rng)
     moved = motion(points)
     assert np.allclose(np.linalg.norm(np.diff(moved, axis=0), axis=1), np.linalg.norm(np.diff(points, axis=0), axis=1))
     assert np.allclose(motion(motion.center[None])[0], motion.center + motion.translation)  # type: ignore[attr-defined]
@@ -211,7 +187,7 @@ def test_bend_is_a_circle_between_rigid_ends() -> None:
 def test_twist_and_squash_preserve_volume_and_taper_scales_by_the_square() -> None:
     rng = np.random.default_rng(6)
     points = cube(rng)
-    for make in (make_twist, make_squash):
+    for make in (MAKERS["twist"], MAKERS["squash"]):
         assert np.allclose(jacobian_determinant(make(rng), points), 1.0, atol=1e-4)
     taper = Taper(np.zeros(3), np.array([0.0, 1, 0]), 8.0, 0.5)
     factor = 1 - 0.5 * smooth_step(points[:, 1] / 8)
@@ -232,7 +208,7 @@ def test_smooth_field_changes_distances_within_its_bound(seed: int, strength: fl
 
 def test_lattice_equals_the_sum_of_b_splines() -> None:
     rng = np.random.default_rng(7)
-    lattice, points = make_lattice(rng), cube(rng, 40) * 1.6
+    lattice, points = MAKERS["lattice"](rng), cube(rng, 40) * 1.6
     at = (points - lattice.origin) / lattice.spacing
     basis = BSpline.basis_element(np.arange(-2.0, 3.0), extrapolate=False)
     expected = points.copy()

@@ -294,3 +294,16 @@ def test_one_state_is_no_model() -> None:
     nodes, labels = interior_nodes(scene.rest)
     with pytest.raises(ValueError, match="asked of 1 states; it needs 2 or more: record more states"):
         build_model(scene.rest, nodes, labels, sample_states(scene, nodes, labels, 1, 3))
+
+
+def test_draws_that_move_nothing_narrow_nothing(model: StatisticalModel, states: DrawnStates) -> None:
+    points, material = shown(model, 0.5)
+    fitted = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
+    problem = DrawsProblem.of(fitted.problem, states, fitted.correspondences)
+    drawn = fit_draws(problem, fitted.posed)
+    assert drawn is not None and drawn.motion is not None
+    one_moves, none_moves = drawn.motion.copy(), np.zeros_like(drawn.motion)
+    one_moves[:, :, 1:] = 0.0
+    narrowed = [narrowing_of_draws(problem, replace(drawn, motion=motion)) for motion in (one_moves, none_moves)]
+    assert narrowed[0] > 1.0
+    assert narrowed[1] == pytest.approx(0.0, abs=1e-6)

@@ -306,3 +306,14 @@ def test_doubtful_points_rule_nothing_out(points: np.ndarray) -> None:
     vertices = np.array([corner * 50.0, corner * 150.0])
     assert (Evidence.of(points).violations(vertices, 0.5)[1] > 0).all()
     assert (Evidence.of(points, corner[None] * 300.0).violations(vertices, 0.5)[1] == 0).all()
+
+
+def test_a_fit_that_alone_explains_the_frame_is_taken(liver: Model, cloud: PointCloud) -> None:
+    by_network = answer(liver, cloud).candidate
+    assert by_network is not None and by_network.modes is not None
+    strict = replace(by_network.modes.problem, config=replace(by_network.modes.problem.config, tolerance=1e-3))
+    refused = replace(by_network, modes=replace(by_network.modes, problem=strict))
+    astray = replace(by_network.modes.posed, translation=by_network.modes.posed.translation + 0.05)
+    searched = replace(by_network, modes=replace(by_network.modes, posed=astray), located_by="search")
+    assert searched.is_accepted and not refused.is_accepted
+    assert more_evident(refused, searched) is searched

@@ -131,3 +131,16 @@ def test_without_views_nothing_is_measured() -> None:
     assert RecognitionSigns().limits() is None
     few = RecognitionSigns([signs(np.random.default_rng(2)) for _ in range(8)]).limits()
     assert few is not None and few.noisy == dict(CONSERVATIVE.noisy)
+
+
+def test_a_noisy_frame_may_leave_more_unexplained(registration: Registration) -> None:
+    clean, noisy = (replace(registration, explained=0.88, needed=needed) for needed in (0.95, ACCEPTED))
+    assert recognize(noisy).strangeness < recognize(clean).strangeness
+    assert recognize(noisy).known is True
+
+
+def test_signs_add_up() -> None:
+    """Two signs of three standard deviations are stranger than one, by the root of two; what is usual adds none."""
+    usual = {name: Usual(mean=0.0, std=1.0) for name in ("unusual", "displaced", "beyond")}
+    one, two = (Signs(unusual=np.exp(3.0), displaced=d, beyond=0.01) for d in (0.01, np.exp(3.0)))
+    assert strangeness(two.strange(usual)) == pytest.approx(np.sqrt(2) * strangeness(one.strange(usual)), rel=1e-3)

@@ -1,6 +1,6 @@
 """Segments that look alike turned: found where states make turns, ruled out by what is seen, and turned together."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -39,42 +39,26 @@ from mereo.scenes.scene import Scene, Workspace
 from mereo.scenes.statistical_model import StatisticalModel
 
 
-@dataclass(frozen=True, eq=False)
-class Spun:
-    """Turned about z and leant about x, around the wheel's middle."""
-
-    spin: float
-    lean: float
-
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        middle = np.array([0.0, 0.0, 8.0])
-        return Rotation.from_euler("zx", [self.spin, self.lean]).apply(points - middle) + middle
-
-
-@dataclass(frozen=True, eq=False)
-class Slid:
-    """Moved along x."""
-
-    way: float
-
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        return points + np.array([self.way, 0.0, 0.0])
+def moves(way: float, spin: float, lean: float) -> tuple[Deformation, ...]:
+    """The block is moved along x, the wheel turned about z and leant about x around its middle."""
+    turn = Rotation.from_euler("zx", [spin, lean]).as_rotvec()
+    return Rigid(np.zeros(3), way * X, np.zeros(3)), Rigid(turn, np.zeros(3), np.array([0.0, 0.0, 8.0]))
 
 
 def free(rng: np.random.Generator) -> tuple[Deformation, ...]:
     """The wheel spins, whatever else."""
     spin, lean, way = (named(rng, name).uniform(-1, 1) for name in ("spin", "lean", "way"))
-    return Slid(0.5 * way), Spun(np.pi * spin, 0.05 * lean)
+    return moves(0.5 * way, np.pi * spin, 0.05 * lean)
 
 
 def coupled(rng: np.random.Generator) -> tuple[Deformation, ...]:
     """The wheel spins only as it leans."""
     spin = named(rng, "spin").uniform(-1, 1)
-    return Slid(0.0), Spun(np.pi * spin, 2.5 * spin)
+    return moves(0.0, np.pi * spin, 2.5 * spin)
 
 
 def held(rng: np.random.Generator) -> tuple[Deformation, ...]:
-    return Slid(0.0), Spun(0.0, 0.1 * named(rng, "lean").uniform(-1, 1))
+    return moves(0.0, 0.0, 0.1 * named(rng, "lean").uniform(-1, 1))
 
 
 def rest_mesh(sides: int, peg: float) -> SegmentedMesh:

@@ -6,7 +6,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from mereo.geometry.camera import Camera
-from mereo.geometry.downsampling import farthest_point_order, means_along_sight, random_subset
+from mereo.geometry.downsampling import MAX_POINTS, farthest_point_order, means_along_sight, random_subset
 from mereo.geometry.surface_patches import longest_side, smoothed, surface_points
 
 
@@ -55,6 +55,12 @@ def test_neither_unit_nor_turn_nor_order_matters(factor: float) -> None:
     order = np.random.default_rng(1).permutation(len(POINTS))
     turned = factor * POINTS[order] @ Rotation.from_rotvec([1.0, 0.5, -0.3]).as_matrix().T
     np.testing.assert_array_equal(surface_points(turned), PLATE[order])
+
+
+def test_many_points_are_decided_by_some_of_them() -> None:
+    points, genuine = plate(size=1050)
+    assert len(points) > 4 * MAX_POINTS
+    assert (surface_points(points) == genuine).mean() > 0.999
 
 
 def test_too_few_points_to_tell_are_all_kept() -> None:

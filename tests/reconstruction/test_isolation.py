@@ -239,3 +239,14 @@ def test_real_scans_lose_nothing(name: str, require_asset: Callable[[str], Path]
         scan = random_subset(points, limit)
         (only,) = readings(scan, "scanner")
         assert only.cloud.points is scan
+
+
+def test_a_scan_is_seen_along_its_estimated_lines_of_sight() -> None:
+    """Where it was taken from is not said; points that float about a plate are off it from anywhere in front."""
+    line = np.linspace(-0.1, 0.1, 40)
+    plate = np.stack(np.meshgrid(line, line, [5.0]), axis=-1).reshape(-1, 3)
+    floating = np.random.default_rng(0).uniform((-0.1, -0.1, 4.2), (0.1, 0.1, 4.8), (20, 3))
+    scan = np.concatenate([plate, floating])
+    taken, other = readings(PointCloud(scan), "scanner")
+    np.testing.assert_array_equal(taken.cloud.points, plate)
+    assert other.dropped == 0 and taken.stretch == pytest.approx(np.ptp(scan[:, 2]) / 0.2)

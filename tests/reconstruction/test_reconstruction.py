@@ -18,8 +18,9 @@ from two_balls import BIG, NAMES, SMALL, front, scene, two_balls
 
 import mereo
 from mereo.cli import reconstruct as many
-from mereo.cli.answers import ReconstructCommand
+from mereo.cli.answers import ReconstructCommand, StreamCommand
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
+from mereo.cli.stream import stream_reconstructions
 from mereo.fitting.registration.answer import Answer
 from mereo.io.atomic_files import MARKER
 from mereo.io.config import InputConfig
@@ -100,6 +101,9 @@ def test_files(answer: Answer, tmp_path: Path) -> None:
     np.testing.assert_allclose(place[:3], np.array(BIG[0]) * ([1, -1, -1] if frame == "camera" else 1), atol=1e-6)
 
 
+FAR_BEHIND = np.random.default_rng(1).uniform((-0.3, -0.3, 0.9), (0.3, 0.3, 1.3), (30, 3))
+
+
 @pytest.fixture
 def read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Reconstruction]:
     """Answer to a cloud in metres, written into a folder, by a model of a known true size."""
@@ -136,8 +140,7 @@ def test_strays_are_dropped_and_said_unless_all_are_to_be_kept(
     read: Callable[..., Reconstruction], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     own, model = scene("camera")
-    far_behind = np.random.default_rng(1).uniform((-0.3, -0.3, 0.9), (0.3, 0.3, 1.3), (30, 3))
-    cloud = np.concatenate([own, far_behind])
+    cloud = np.concatenate([own, FAR_BEHIND])
     result = read("out", cloud, [0.1, 0.2])
     said = capsys.readouterr().out
     assert "strays: 30 of 1230 points dropped, the longest side was" in said and "(--keep-all keeps them)" in said
@@ -150,6 +153,18 @@ def test_strays_are_dropped_and_said_unless_all_are_to_be_kept(
         read("all", cloud, [0.1, 0.2], keep_all=True)
     assert "strays:" not in capsys.readouterr().out
     assert json.loads((tmp_path / "all/summary.json").read_text())["points"] == 1230
+
+
+@pytest.mark.parametrize("keep_all, strays", [(False, 30), (True, 0)])
+def test_a_stream_drops_strays_and_counts_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, keep_all: bool, strays: int
+) -> None:
+    own, model = scene("camera")
+    np.save(tmp_path / "cloud.npy", np.concatenate([own, FAR_BEHIND]))
+    monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: model)
+    isolation = IsolationConfig(keep_all=keep_all)
+    stream_reconstructions(StreamCommand(str(tmp_path), weights="any", resolution=16, isolation=isolation))
+    assert json.loads(capsys.readouterr().out)["strays"] == strays
 
 
 def test_every_public_name_exists_and_importing_the_package_loads_nothing() -> None:

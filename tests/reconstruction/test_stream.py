@@ -314,3 +314,17 @@ def test_a_frame_replaces_its_own_file_and_no_other(
     first, again, other = (json.loads(line).get("error", "") for line in capsys.readouterr().out.splitlines())
     assert (first, again) == ("", "") and other.endswith("c_d.npy.glb holds the surfaces of c d.npy: rename c_d.npy")
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["c_d.npy.glb"]
+
+
+def test_a_sequence_that_breaks_off_is_told_after_its_frames_and_their_summary(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def frames(*_: object) -> Iterator[StreamFrame]:
+        yield StreamFrame("first", 0.0, lambda: PointCloud(np.ones((40, 3))))
+        raise ValueError("it is cut off")
+
+    monkeypatch.setattr("mereo.cli.stream.frames_of", frames)
+    with pytest.raises(ValueError, match="^it is cut off$"):
+        stream_reconstructions(StreamCommand(str(tmp_path), weights="rope"))
+    out, err = capsys.readouterr()
+    assert json.loads(out)["frame"] == "first" and "1 bad" in err

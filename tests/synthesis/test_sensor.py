@@ -335,3 +335,19 @@ def test_the_paper_makes_the_examples_it_always_made() -> None:
     assert example.normalizer.scale == pytest.approx(0.0489688726, rel=1e-6)
     assert np.allclose(example.cloud[1], [-0.9883676, -0.23809237, 0.19280505], atol=1e-5)
     assert np.allclose(example.queries.positions[0], [-0.70238803, 0.09261255, 0.62152631], atol=1e-5)
+
+
+def test_a_background_is_behind_everything_and_outside_a_true_mask() -> None:
+    vertices = PAIR.mesh.merged()[0]
+    clear = look(PAIR)
+    for seed in range(10):
+        seen = look(PAIR, seed, background=1.0)
+        assert (seen.source != NOTHING).all() and np.array_equal(seen.image.depth, clear.image.depth)
+        plane = seen.source == BACKGROUND
+        points = (seen.whole.depth[..., None] * CAMERA.directions())[plane]
+        center = points.mean(axis=0)
+        normal = np.linalg.svd(points - center, full_matrices=False)[2][2]
+        normal *= np.sign(normal[2])
+        assert normal[2] > np.cos(np.pi / 4) - 1e-9
+        gap = (center - vertices) @ normal
+        assert gap.min() > -1e-6 and gap.min() < 0.05 / OFF.metres_per_unit + 1e-6

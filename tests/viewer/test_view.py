@@ -9,11 +9,9 @@ import socket
 import subprocess
 import sys
 import urllib.request
-from collections.abc import Iterator
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -400,14 +398,6 @@ def folder(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.fixture
-def opened() -> Iterator[list[Any]]:
-    pages: list[Any] = []
-    yield pages
-    for page in pages:
-        page.close()
-
-
 def test_a_report_is_read_again(folder: Path) -> None:
     cloud, *_ = example()
     report = read_report(folder / "report.html")
@@ -549,9 +539,8 @@ def test_weights_without_a_model_are_asked_alone_and_it_is_said(rope: Model) -> 
 
 
 @needs_viser
-def test_the_command_opens_the_page_of_a_folder(folder: Path, opened: list[Any]) -> None:
-    opened.append(mereo.view(folder, port=0, block=False))
-    with urllib.request.urlopen(opened[-1].address, timeout=20) as answer:
+def test_the_command_opens_the_page_of_a_folder(folder: Path) -> None:
+    with mereo.view(folder, port=0, block=False) as page, urllib.request.urlopen(page.address, timeout=20) as answer:
         assert b"<html" in answer.read()
 
 
