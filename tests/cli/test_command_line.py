@@ -293,15 +293,6 @@ def test_every_option_is_explained(command: str) -> None:
         assert len(text.split()) >= 2, f"mereo {command} {name}: {text!r}"
 
 
-def test_long_work_takes_threads_and_options_from_a_file() -> None:
-    for command in ("generate", "train", "evaluate", "learn", "reconstruct"):
-        assert "--config" in help_of(command), command
-    for command in ("generate", "train", "evaluate", "learn", "reconstruct", "stream", "experiment"):
-        assert "--threads INT" in entries(command), command
-    for command in ("train", "evaluate", "reconstruct", "stream", "bench"):
-        assert "--device {auto,cpu,cuda}" in entries(command), command
-
-
 @pytest.mark.parametrize("shell", ["bash", "zsh"])
 def test_completion_prints_as_documented(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert f"mereo --tyro-print-completion {shell}" in QUICKSTART.read_text("utf-8")

@@ -153,14 +153,6 @@ def test_composition_applies_the_first_part_first() -> None:
     assert np.allclose(jacobian_determinant(nested, points), product, atol=1e-5)
 
 
-def test_rigid_preserves_distances_and_moves_its_center_by_the_translation() -> None:
-    rng = np.random.default_rng(4)
-    motion, points = MAKERS["rigid"](rng), cube(rng)
-    moved = motion(points)
-    assert np.allclose(np.linalg.norm(np.diff(moved, axis=0), axis=1), np.linalg.norm(np.diff(points, axis=0), axis=1))
-    assert np.allclose(motion(motion.center[None])[0], motion.center + motion.translation)  # type: ignore[attr-defined]
-
-
 def test_bend_preserves_arc_length_and_has_the_closed_form_jacobian() -> None:
     bend = Bend(np.zeros(3), np.array([0.0, 0, 2]), np.array([1.0, 0, 5]), length=12.0, angle_rad=1.5, radius=7.0)
     axis = np.linspace(-5, 20, 4001)[:, None] * np.array([0, 0, 1.0])

@@ -479,21 +479,6 @@ def test_a_lost_object_with_weights_is_searched_and_has_the_networks_surfaces(
     assert running[1].cancelled()
 
 
-def some_state(count: int, seed: int) -> Posed:
-    rng = np.random.default_rng(seed)
-    turn = Posed(np.eye(3), np.zeros(3), np.zeros(count)).moved(np.r_[rng.normal(size=3), np.zeros(4 + count)])
-    return Posed(turn.rotation, 50 * rng.normal(size=3), rng.normal(size=count), 0.1)
-
-
-def test_the_step_between_states_leads_from_one_to_the_other() -> None:
-    first, second = some_state(5, 0), some_state(5, 1)
-    led = first.moved(between(first, second))
-    np.testing.assert_allclose(led.rotation, second.rotation, atol=1e-12)
-    np.testing.assert_allclose(led.translation, second.translation)
-    np.testing.assert_allclose(led.z, second.z)
-    assert led.log_scale == pytest.approx(second.log_scale)
-
-
 def test_without_evidence_the_expected_state_is_the_answer(
     engine: Registrar, scene: Scene, first: SegmentedMesh
 ) -> None:
