@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mereo.fitting.problem.problem import ACCEPTED
 from mereo.fitting.registration.recognition import CONSERVATIVE, MOST, NOT_EVALUATED, Signs, recognize, strangeness
 from mereo.fitting.registration.registration import Registration
 from mereo.models.calibration import Calibration, Recognizing, Usual

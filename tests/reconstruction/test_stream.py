@@ -30,6 +30,7 @@ from mereo.cli.stream import (
     stream_reconstructions,
     watched_frames,
 )
+from mereo.geometry.camera import PointCloud
 from mereo.io.config import InputConfig
 from mereo.reconstruction.config import IsolationConfig
 from mereo.scenes.registry import load_scene

@@ -13,7 +13,7 @@ from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.scenes.seeds import example_rng
-from mereo.synthesis.clutter import BACKGROUND, OBJECT, OCCLUDER, Capsule
+from mereo.synthesis.clutter import BACKGROUND, NOTHING, OBJECT, OCCLUDER, Capsule
 from mereo.synthesis.config import SENSOR_TERMS, SENSORS, GenerateConfig, SamplingConfig, SensorConfig, SensorModel
 from mereo.synthesis.depth_sensor import (
     SimulatedView,
