@@ -8,7 +8,7 @@ import json
 import pickle
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,22 +18,34 @@ import jaxtyping
 import numpy as np
 import pytest
 from analytic import untrained
+from answers import answer_to
 from PIL import Image
-from toy_frames import MODEL, seen
+from toy_frames import CENTERS, MODEL, NAMES, RADII, seen
 from toy_scene import toy_scene
 
 import mereo
-from mereo.api import reconstruct, view
+from mereo.api import reconstruct, steps, view
 from mereo.api.result import SINGLE, Result
 from mereo.cli.answers import ReconstructCommand
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
+from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Located
-from mereo.geometry.camera import Camera, DepthImage, PointCloud
+from mereo.geometry.camera import SCANNER_TO_CAMERA, Camera, DepthImage, PointCloud
+from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.transforms import transform_points
 from mereo.io.atomic_files import MARKER
+from mereo.io.config import InputConfig
+from mereo.models.model import Model
 from mereo.reconstruction.observation import SizeWarning
 from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import SourceFrame
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.sample_views import load_view
 from mereo.visualization.units import Unit
+from mereo_learning import shards
 from mereo_learning.cases import Evaluation
+from mereo_learning.config import PRESETS, TrainConfig
+from mereo_learning.learn import LearnConfig
 from mereo_viewer import result_page
 from mereo_viewer.server import OpenPage
 
@@ -49,8 +61,6 @@ def unchecked(function: Callable[..., Any]) -> Callable[..., Any]:
 def result() -> Result:
     return mereo.reconstruct(seen(), MODEL, resolution=24, unit_m=1.0, label_points=True)
 
-
-# --- arguments --------------------------------------------------------------------------------------------------------
 
 LINE = np.linspace(0.1, 1.0, 99)[:, None] * [1.0, 0.5, 2.0]
 CAMERA = Camera(32, 32, 40.0, 40.0, 16.0, 16.0)
@@ -95,9 +105,6 @@ def test_a_result_says_that_it_cannot_be_sent(result: Result) -> None:
     assert pickle.loads(pickle.dumps(list(result)))[0].name == result.names[0]
 
 
-# --- saving -----------------------------------------------------------------------------------------------------------
-
-
 def contents(folder: Path) -> dict[str, Any]:
     """Files of a folder by name; of figures what does not differ from run to run."""
     found: dict[str, Any] = {}
@@ -112,16 +119,19 @@ def contents(folder: Path) -> dict[str, Any]:
     return found
 
 
-def test_a_result_is_saved_as_the_command_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("unit_m", [None, 0.5])
+def test_a_result_is_saved_as_the_command_does(
+    unit_m: float | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     np.save(tmp_path / "cloud.npy", seen())
     monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: MODEL)
-    reconstruct_file(
-        tmp_path / "cloud.npy", tmp_path / "command", FrameJob(ReconstructCommand((), weights="any", resolution=24))
-    )
-    found = mereo.reconstruct(tmp_path / "cloud.npy", MODEL, resolution=24)
+    command = ReconstructCommand((), weights="any", resolution=24, reading=InputConfig(unit_m=unit_m))
+    reconstruct_file(tmp_path / "cloud.npy", tmp_path / "command", FrameJob(command))
+    found = mereo.reconstruct(tmp_path / "cloud.npy", MODEL, resolution=24, unit_m=unit_m)
     assert found.save(tmp_path / "python") == tmp_path / "python"
     ours, theirs = contents(tmp_path / "python"), contents(tmp_path / "command")
     assert ours == theirs and len(ours) == 5 and (tmp_path / "python" / MARKER).is_file()
+    assert ours["summary.json"]["unit_m"] == unit_m and found.unit_m == unit_m
 
 
 def test_one_file_is_that_of_the_folder(result: Result, tmp_path: Path) -> None:
@@ -165,42 +175,31 @@ def test_other_names_are_refused(result: Result, tmp_path: Path) -> None:
     assert result.save(tmp_path / "take-1.2", formats=("npz",)).is_dir()
 
 
-# --- told -------------------------------------------------------------------------------------------------------------
-
-
 def test_values_tell_themselves_in_one_line(result: Result) -> None:
-    view = load_scene("rope")
-    camera = Camera.from_fov(4, 3, 0.5)
-    values: Sequence[object] = (
-        result,
-        result.reconstruction,
-        result.reconstruction.surfaces,
-        result.reconstruction.surfaces.segments[0],
-        result.reconstruction.labels,
-        result.reconstruction.segments,
-        result.reconstruction.code,
-        result.reconstruction.reading,
-        result.reconstruction.observed,
-        result.seen,
-        result.seen.frame,
-        result.seen.cloud,
+    rope, camera, found = load_scene("rope"), Camera.from_fov(4, 3, 0.5), result.reconstruction
+    parts = [found.surfaces, found.surfaces.segments[0], found.labels, found.segments, found.code, found.reading]
+    empty = [PointCloud(np.zeros((0, 3))), DepthImage(np.zeros((3, 4)), camera)]
+    frames = [result.seen, result.seen.frame, result.seen.cloud, *empty]
+    image, evaluation = DepthImage(np.full((3, 4), 2.0), camera), Evaluation(("a",), np.array([[5, 1], [1, 3]]), {})
+    located = Located(np.ones(1, np.uint8), np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))
+    asked = MODEL.query(found.code, seen()[:5])
+    known = [
         untrained(("a",)),
-        view,
+        rope,
         toy_scene(),
         DepthImage(np.zeros((3, 4)), camera),
-        DepthImage(np.full((3, 4), 2.0), camera),
-        PointCloud(np.zeros((0, 3))),
-        MODEL.query(result.reconstruction.code, seen()[:5]),
-        Located(np.ones(1, np.uint8), np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3))),
-        Evaluation(("a",), np.array([[5, 1], [1, 3]]), {}),
-    )
-    for value in values:
+        image,
+        asked,
+        located,
+        evaluation,
+    ]
+    for value in (result, found, found.observed, *parts, *frames, *known):
         assert "\n" not in repr(value) and "array(" not in repr(value) and len(repr(value)) < 250, repr(value)
     assert repr(result.seen.cloud) == "PointCloud(1,200 points, 0.12 x 0.18 x 0.06)"
-    assert repr(values[16]) == "DepthImage(4 x 3 pixels, 12 measured, depth 2 to 2)"
+    assert repr(image) == "DepthImage(4 x 3 pixels, 12 measured, depth 2 to 2)"
     assert repr(result).startswith("Result('cloud': 2 of 3 segments; network alone; ")
-    assert repr(values[-1]) == "Evaluation(0 examples: IoU 0.600, mIoU 0.600; a)"
-    assert "9 segments: base, segment_1, segment_2, segment_3, segment_4, ... (9)" in repr(view)
+    assert repr(evaluation) == "Evaluation(0 examples: IoU 0.600, mIoU 0.600; a)"
+    assert "9 segments: base, segment_1, segment_2, segment_3, segment_4, ... (9)" in repr(rope)
 
 
 def test_a_notebook_shows_pictures_and_figures(result: Result) -> None:
@@ -217,36 +216,15 @@ def test_a_notebook_shows_pictures_and_figures(result: Result) -> None:
     np.testing.assert_allclose([float(value) for value in place.split()], [20, -30, 600], atol=2)
 
 
-def test_a_cloud_has_metres_only_where_somebody_says_so(tmp_path: Path) -> None:
-    np.save(tmp_path / "cloud.npy", seen())
-    assumed = mereo.reconstruct(mereo.load_frame(tmp_path / "cloud.npy"), MODEL, resolution=16)
-    assert assumed.seen.frame.unit_m is None and assumed.unit_m is None
-    told = mereo.reconstruct(mereo.load_frame(tmp_path / "cloud.npy", unit_m=1.0), MODEL, resolution=16)
-    assert told.unit_m == 1.0
-    assumed.save(tmp_path / "assumed.html")
-    told.save(tmp_path / "told.html")
-    assert "volume (units³)" in (tmp_path / "assumed.html").read_text(encoding="utf-8")
-    assert "volume (cm³)" in (tmp_path / "told.html").read_text(encoding="utf-8")
-
-
 def images(page: str) -> list[str]:
     return re.findall(r'base64,([^"]+)"', page)
 
 
-# --- frames -----------------------------------------------------------------------------------------------------------
-
-
-def test_a_frame_may_be_many_things(result: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_size_of_none_is_warned_of_at_the_call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     np.save(tmp_path / "cloud.npy", seen())
-    frame = mereo.load_frame(tmp_path / "cloud.npy", unit_m=0.5)
-    assert frame.unit_m == 0.5 and result.seen.frame.unit_m == 1.0
-    grid = result.reconstruction.labels.labels
-    for one in (tmp_path / "cloud.npy", frame, result.seen, PointCloud(seen()), seen().tolist()):
-        found = mereo.reconstruct(one, MODEL, "network", resolution=24)
-        np.testing.assert_array_equal(found.reconstruction.labels.labels, grid)
     known = replace(MODEL, provenance={"visible_m": [2, 3]})
     monkeypatch.setattr(reconstruct, "reconstruct_observation", unchecked(reconstruct.reconstruct_observation))
-    for one in (tmp_path / "cloud.npy", seen(), [seen()]):
+    for one in (tmp_path / "cloud.npy", [seen()]):
         with pytest.warns(SizeWarning, match="the visible part is 0.18 m long, but 2 to 3 m in training") as warned:
             unchecked(mereo.reconstruct)(one, known, resolution=8, unit_m=1.0)
         assert warned[0].filename == __file__ and "--" not in str(warned[0].message)
@@ -261,9 +239,7 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
         unchecked(mereo.Object.registrar)(mereo.Object(MODEL), "fulll")
     with pytest.raises(ValueError, match="the unit is -1 m; it must be positive"):
         mereo.reconstruct(seen(), MODEL, unit_m=-1)
-    with pytest.raises(
-        FileNotFoundError, match="there is no frame 'bunnny'; give a file or one of the shipped: bun000, bunny,"
-    ):
+    with pytest.raises(FileNotFoundError, match="there is no frame 'bunnny'; give a file or one of the shipped: bun"):
         mereo.load_frame("bunnny")
     with pytest.raises(ValueError, match="the shipped frame 'rope' is in metres and needs no options"):
         mereo.load_frame("rope", unit_m=0.001)
@@ -271,9 +247,6 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
         mereo.load_frame(seen(), mask=tmp_path / "mask.png")
     with pytest.raises(TypeError, match="unit"):
         mereo.load_frame(tmp_path / "x.ply", unit=1.0)
-
-
-# --- the viewer -------------------------------------------------------------------------------------------------------
 
 
 class Server:
@@ -310,7 +283,6 @@ def test_a_page_stays_open_where_somebody_goes_on(
 
 
 def test_a_result_is_viewed_as_it_is(result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is computed again: the page's surfaces are the result's."""
     shown: list[Any] = []
     for module in (result_page, view):
         monkeypatch.setattr(module, "import_viser", lambda: None)
@@ -325,3 +297,162 @@ def test_a_result_is_viewed_as_it_is(result: Result, monkeypatch: pytest.MonkeyP
     assert content.facts.startswith("1,200 points")
     with pytest.raises(ValueError, match="frame.ply is given without its object: name the object's meshes"):
         mereo.view("frame.ply", block=False)
+
+
+UNIT_M, SCALE = 0.01, 4.0
+"""Metres per scene unit of the sized rope, and scene units per unit of its files."""
+
+
+def test_segments_are_had_by_their_names(result: Result) -> None:
+    assert result.names == NAMES and len(result) == 3
+    for name, center, radius in zip(NAMES, CENTERS, RADII, strict=False):
+        found = result[name]
+        np.testing.assert_allclose(found.centroid, center, atol=0.003)
+        assert found.volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.05)
+        assert found.name == name and found.label == NAMES.index(name) + 1 and found.is_present
+        assert 0.5 < found.confidence <= 1 and found.error_radius is None and found.pose is None
+        assert found.mesh is result.surfaces.segments[found.label - 1]
+    assert result["big"] is result["big"]
+
+
+def test_an_absent_segment_is_there_and_says_so(result: Result) -> None:
+    absent = result["absent"]
+    assert not absent.is_present and absent.volume == 0 and np.isnan(absent.confidence) and len(absent.mesh.faces) == 0
+    with pytest.raises(KeyError, match="there is no segment 'bigg'; the segments are big, <small>, absent"):
+        result["bigg"]
+    assert repr(absent) == "SegmentResult('absent', not found)" and "volume" in repr(result["big"])
+
+
+@pytest.fixture(scope="module")
+def registrar(rope: Model) -> Registrar:
+    """That of a rope of a known true size, whose files are in another frame and unit than its scene."""
+    T_scene_source = np.array([[0.0, -SCALE, 0, 1], [SCALE, 0, 0, 2], [0, 0, SCALE, 3], [0, 0, 0, 1]])
+    assert rope.statistical_model is not None
+    own = replace(rope.statistical_model, source_frame=SourceFrame(T_scene_source, UNIT_M))
+    return Registrar(rope, own, "modes")
+
+
+@pytest.mark.parametrize("unit, axes", [(UNIT_M, "camera"), (0.001, "scanner")])
+def test_the_pose_brings_the_objects_files_to_the_frame(
+    unit: float, axes: CloudAxes, rope: Model, registrar: Registrar
+) -> None:
+    points = load_view("rope").depth.to_points().points * (UNIT_M / unit)
+    points = points if axes == "camera" else points @ SCANNER_TO_CAMERA[:3, :3]
+    answer = answer_to(points, rope, registrar, 16, axes, unit)
+    result = Result.of(answer)
+    registered = result.registered
+    assert registered is not None and result.pose is not None and result.unit_m == unit
+    assert result.model_scale == pytest.approx(SCALE * UNIT_M / unit, rel=0.1)
+    np.testing.assert_allclose(result.pose[:3, :3] @ result.pose[:3, :3].T, np.eye(3), atol=1e-9)
+    assert np.linalg.det(result.pose[:3, :3]) == pytest.approx(1.0)
+    source = registered.model.source_frame
+    assert source is not None
+    rest = transform_points(np.linalg.inv(source.T_scene_source), registered.model.rest_points)
+    placed = transform_points(result.pose, result.model_scale * rest)
+    away = np.linalg.norm(placed - registered.material, axis=1)
+    length = float(np.ptp(registered.material, axis=0).max())
+    assert np.median(away) < 0.5 * length, "rigidly placed, a bent rope lies about where it is"
+    np.testing.assert_allclose(placed.mean(axis=0), registered.material.mean(axis=0), atol=1e-6 * length)
+
+
+def test_each_segment_has_its_own_pose_and_radius(rope: Model, registrar: Registrar) -> None:
+    result = Result.of(answer_to(load_view("rope").depth.to_points(), rope, registrar, 16, unit_m=UNIT_M))
+    registered, whole = result.registered, result.pose
+    assert registered is not None and whole is not None and result.model_scale is not None
+    source = registered.model.source_frame
+    assert source is not None
+    rest = transform_points(np.linalg.inv(source.T_scene_source), registered.model.rest_points)
+    for one in result:
+        rows = registered.model.labels == one.label
+        assert one.pose is not None and one.error_radius is not None and one.error_radius > 0
+        own, common = (
+            np.linalg.norm(transform_points(T, result.model_scale * rest[rows]) - registered.material[rows], axis=1)
+            for T in (one.pose, whole)
+        )
+        assert np.sqrt((own**2).mean()) < np.sqrt((common**2).mean()), one.name
+
+
+def test_a_unit_that_nobody_states_is_found_by_the_true_size(rope: Model, registrar: Registrar) -> None:
+    cloud = load_view("rope").depth.to_points()
+    result = Result.of(answer_to(cloud, rope, registrar, 16))
+    assert result.unit_m == pytest.approx(UNIT_M, rel=0.05) and result.seen.facts()["unit_m"] == result.unit_m
+    unsized = Registrar(rope, replace(registrar.model, source_frame=None), "modes")
+    free = Result.of(answer_to(cloud, rope, unsized, 16))
+    assert free.taken and free.unit_m is None and free.pose is not None
+    assert free.registered is not None and free.model_scale == free.registered.scene_unit
+
+
+def test_without_a_name_it_is_saved_beside_the_last(
+    result: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert [result.save(formats=("json",)) for _ in range(3)] == [Path("result"), Path("result2"), Path("result3")]
+    assert {path.name for path in tmp_path.iterdir()} == {"result", "result2", "result3"}
+    (tmp_path / "result2").rename(tmp_path / "other")
+    (tmp_path / "result2").symlink_to(tmp_path / "nowhere")
+    assert result.save(formats=("json",)) == Path("result4"), "a link that leads nowhere is somebody's"
+
+
+def test_generate_and_train_are_the_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(shards, "generate", lambda *given, **named: calls.append((*given, named)))
+    assert mereo.generate(tmp_path / "mine.yaml", str(tmp_path / "data"), examples=3, workers=2) == tmp_path / "data"
+    ((scene, output, config, named),) = calls
+    assert (scene, output) == (str(tmp_path / "mine.yaml"), tmp_path / "data")
+    assert config == shards.DatasetConfig(GenerateConfig(), 3, 0)
+    assert named == {"workers": 2, "shard": (0, 1), "resume": False}
+    trained: list[TrainConfig] = []
+    monkeypatch.setattr(steps.trainer, "train", lambda data, run, recipe, device: trained.append(recipe) or run / "w")
+    assert mereo.train("data", tmp_path, "tiny", init="rope") == tmp_path / "w"
+    assert trained == [replace(PRESETS["tiny"], init="rope")]
+    with pytest.raises(ValueError, match="the preset is 'tinny'; it must be one of paper, .*: correct the spelling"):
+        inspect.unwrap(mereo.train)("data", tmp_path, "tinny")
+    with pytest.raises(TypeError, match="epoch"):
+        mereo.train("data", tmp_path, epoch=3)
+
+
+def test_evaluate_scores_with_and_without_a_folder(tmp_path: Path) -> None:
+    model = untrained(load_scene("rope").rest.names)
+    alone = mereo.evaluate(model, examples=1, cells=8, method="network", progress=False)
+    written = mereo.evaluate(
+        model, scene=load_scene("rope"), output=tmp_path / "out", examples=1, cells=8, method="network"
+    )
+    np.testing.assert_array_equal(alone.confusion, written.confusion)
+    assert len(alone.seconds) == 1
+    assert json.loads((tmp_path / "out/metrics.json").read_text())["scene"] == "rope"
+    with pytest.raises(ValueError, match="scans are real and take no simulated camera"):
+        mereo.evaluate(model, scans=(), settings=GenerateConfig(image_size=48))
+
+
+def test_learn_and_export_return_what_they_leave(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[Any] = []
+    scores = {"iou": 0.9, "miou": 0.8, "trained": True, "method": "auto"}
+    monkeypatch.setattr(steps.learning, "learn", lambda files, output, config: calls.append((files, config)) or scores)
+    learned = mereo.learn("rope", tmp_path, minutes=3)
+    assert calls == [([Path("rope")], LearnConfig(minutes=3))]
+    assert learned.weights == tmp_path / "weights.safetensors" and learned.scene == "rope" and learned.miou == 0.8
+    assert repr(learned) == f"Learned({str(tmp_path)!r}: trained, method auto, IoU 0.900, mIoU 0.800)"
+    scores |= {"trained": False, "method": "search"}
+    learned = mereo.learn("rope", tmp_path, train="never")
+    assert learned.weights is learned.report is None and learned.method == "search" and learned.folder == tmp_path
+    with pytest.raises(ValueError, match="train is 'once'; it must be one of auto, always, never: correct"):
+        inspect.unwrap(mereo.learn)("rope", tmp_path, train="once")
+    monkeypatch.setattr(steps, "export_weights", lambda *given: calls.append(given))
+    assert mereo.export("rope", tmp_path / "graphs", "torch") == tmp_path / "graphs"
+    assert calls[-1] == ("rope", tmp_path / "graphs", "torch", False)
+
+
+@pytest.mark.slow
+def test_the_lines_of_the_readme_run_as_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (Path(__file__).parents[2] / "README.md").read_text("utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(compile(code, "README.md", "exec"), names)
+    result = names["result"]
+    assert result.taken and result.known is True and result["head"].error_radius > 0
+    here = result.registered.to_camera([[0.0, 1.0, 2.0]])
+    np.testing.assert_allclose(result.registered.to_rest(here), [[0, 1, 2]], atol=0.01)
+    assert sorted(path.name for path in (tmp_path / "result").glob("[!.]*")) == [
+        *("labels.npz", "preview.png", "radius95.glb", "report.html", "segments.glb", "state.json", "summary.json")
+    ]

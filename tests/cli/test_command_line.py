@@ -1,18 +1,38 @@
 """The command line as a user meets it: help at once, one line for every error, the exit codes of a good citizen."""
 
+import inspect
+import io
 import os
+import re
 import signal
 import subprocess
 import sys
+import tomllib
+from collections.abc import Iterator
+from contextlib import redirect_stdout
+from functools import lru_cache
+from importlib import import_module
 from importlib.metadata import version
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import torch
 
 import mereo.__main__ as command_line
+from mereo.cli import tools as doctor
 from mereo.cli import training
+from mereo.cli.answers import ReconstructCommand
+from mereo.cli.options import Outcome
+from mereo.cli.reconstruct import FrameJob
+from mereo.io.config import InputConfig
+from mereo.models import device
+from mereo.models.config import InferenceConfig
 from mereo.scenes.scene import SCENES
+from mereo.synthesis.config import GenerateConfig
 from mereo_learning.config import PRESETS
+from mereo_learning.scoring import EvaluationConfig
+from mereo_learning.shards import DatasetConfig
 
 
 def mereo(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -31,15 +51,10 @@ def assert_one_line_error(result: subprocess.CompletedProcess[str], *parts: str)
 
 
 def raising(error: BaseException) -> SimpleNamespace:
-    """A command whose work raises ``error``."""
-
     def run() -> None:
         raise error
 
     return SimpleNamespace(run=run)
-
-
-# --- help and version -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("command", ["", "evaluate", "reconstruct", "scene"])
@@ -65,29 +80,11 @@ def test_version(option: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out == f"mereo {version('mereo')}\n"
 
 
-# --- what the options mean --------------------------------------------------------------------------------------------
-
-
-def test_train_options_override_the_preset() -> None:
-    text = (
-        "train data --epochs 2 --preset paper --network.width 64 --loss ce --network.no-encode-positions --output run"
-    )
-    command = command_line.parse(text.split())
-    assert isinstance(command, training.Train)
-    assert (command.config.epochs, command.config.loss, command.config.network.decoder.width) == (2, "ce", 64)
-    assert not command.config.network.decoder.encode_positions
-    assert command.config.learning_rate == PRESETS["paper"].learning_rate
-    assert command_line.parse(["train", "data", "--output", "run"]).config == PRESETS["base"]  # type: ignore[union-attr]
-
-
 @pytest.mark.parametrize("shard", ["4/4", "1", "-1/2", "1/2/3", ""])
 def test_wrong_shard_is_explained(shard: str) -> None:
     assert training.part_of("3/12") == (3, 12)
     with pytest.raises(ValueError, match="it must be i/n with i from 0 to n - 1"):
         training.part_of(shard)
-
-
-# --- errors -----------------------------------------------------------------------------------------------------------
 
 
 def test_library_errors_are_one_line() -> None:
@@ -162,4 +159,146 @@ def test_arguments_that_mean_no_command_are_explained_in_a_box(
     assert not printed.out and all(part in printed.err for part in parts), printed.err
 
 
-# --- commands that need no weights ------------------------------------------------------------------------------------
+OUT = {"output": Path("out")}
+READING = InputConfig(Path("k.json"), 5000.0, Path("m.png"))
+COMMAND = ReconstructCommand((Path("a.png"),), weights="rope", output=Path("out"), reading=READING, force=True)
+CALLS = {
+    "generate rope --examples 7 --seed 3 --output out --workers 2 --shard 1/4 --resume": (
+        "mereo_learning.shards.generate",
+        {"config": DatasetConfig(GenerateConfig(), 7, 3), "workers": 2, "shard": (1, 4), "resume": True} | OUT,
+    ),
+    "train data --output out": ("mereo.api.steps.train", {"dataset": Path("data"), "config": PRESETS["base"]} | OUT),
+    "evaluate bunny --output out --examples 4 --seed 1000001": (
+        "mereo_learning.evaluation_report.evaluate_weights",
+        {"weights": "bunny", "config": EvaluationConfig(None, 4, 1_000_001), "workers": 1} | OUT,
+    ),
+    "reconstruct a.png --weights rope --output out --intrinsics k.json --depth-scale 5000 --mask m.png --force": (
+        "mereo.cli.reconstruct.reconstruct_inputs",
+        {"inputs": (Path("a.png"),), "job": FrameJob(COMMAND, InferenceConfig())} | OUT,
+    ),
+}
+
+
+@pytest.mark.parametrize("line", CALLS)
+def test_command_calls_the_library_with_its_options(line: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    place, expected = CALLS[line]
+    module, _, function = place.rpartition(".")
+    library, calls = import_module(module), list[dict[str, object]]()
+    signature = inspect.signature(getattr(library, function))
+
+    def called(*given: object, **named: object) -> Outcome:
+        calls.append(signature.bind(*given, **named).arguments)
+        return Outcome({})
+
+    monkeypatch.setattr(library, function, called)
+    assert command_line.main(line.split()) == 0
+    assert {name: calls[0][name] for name in expected} == expected
+
+
+def test_report_names_versions_device_and_threads(capsys: pytest.CaptureFixture[str]) -> None:
+    doctor.Doctor().run()
+    report = capsys.readouterr().out
+    facts = dict(line.split(maxsplit=1) for line in report.splitlines() if line)
+    assert facts["python"].startswith(f"{sys.version_info.major}.{sys.version_info.minor}.")
+    assert facts["threads"].startswith(f"{torch.get_num_threads()} of ")
+    assert {"device", "numpy", *doctor.PURPOSES} <= set(facts)
+
+
+def test_every_extra_is_explained_and_every_explanation_has_one() -> None:
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text("utf-8"))["project"]
+    assert set(project["optional-dependencies"]) == set(doctor.PURPOSES)
+    assert all(doctor.requirements(extra) for extra in doctor.PURPOSES)
+    assert any(requirement.startswith("torch") for requirement in doctor.requirements("network"))
+    assert not any(requirement.startswith("torch") for requirement in doctor.requirements(""))
+    assert not any("tensorboard" in requirement for requirement in doctor.requirements(""))
+
+
+def test_missing_extra_comes_with_the_command(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    version = doctor._version
+    monkeypatch.setattr(doctor, "_version", lambda name: None if name == "tensorboard" else version(name))
+    doctor.Doctor().run()
+    line = next(row for row in capsys.readouterr().out.splitlines() if row.startswith("track"))
+    (requirement,) = doctor.requirements("track")
+    assert "missing, for training curves" in line
+    assert line.endswith(f"-m pip install '{requirement}'")
+
+
+def test_probes_that_this_torch_lacks_are_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(torch.cpu, "_is_amx_tile_supported", raising=False)
+
+    def refuse() -> bool:
+        raise RuntimeError
+
+    monkeypatch.setattr(torch.cpu, "_is_avx2_supported", refuse, raising=False)
+    features = device.cpu_features()
+    assert features["amx"] is None
+    assert features["avx2"] is None
+
+
+QUICKSTART = Path(__file__).parents[2] / "docs/quickstart.md"
+
+
+ADDED = re.compile(r"\((default|required|repeatable)[^()]*(\([^()]*\))?[^()]*\)")
+"""What is said of an option without being an explanation."""
+
+
+@lru_cache
+def help_of(command: str) -> str:
+    """Text of ``mereo COMMAND --help`` as a terminal shows it."""
+    text = io.TextIOWrapper(io.BytesIO(), "utf-8")  # without an encoding, boxes are drawn otherwise
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(text):
+        patch.setenv("COLUMNS", "120")  # wider ones show two boxes side by side
+        with pytest.raises(SystemExit):
+            command_line.main([*command.split(), "--help"])
+    text.seek(0)
+    return text.read()
+
+
+def commands(group: str = "") -> Iterator[str]:
+    listed = re.findall(r"^│ +• ([a-z-]+)", help_of(group), re.MULTILINE)
+    for name in listed:
+        yield from commands(f"{group} {name}".strip())
+    if not listed:
+        yield group
+
+
+def entries(command: str) -> dict[str, str]:
+    """What a command takes, as its help shows it, each with its explanation but for defaults and rules."""
+    found: dict[str, str] = {}
+    for line in help_of(command).splitlines():
+        if re.match(r"│ (-|[A-Z{\[])", line):  # lower case begins what is said of a whole box
+            name, _, text = line.strip("│ ").partition("  ")
+            found[name] = text.strip()
+        elif line.startswith("│   ") and found:
+            found[next(reversed(found))] += f" {line.strip('│ ')}"
+    return {name: ADDED.sub("", text).strip() for name, text in found.items()}
+
+
+COMMANDS = tuple(commands())
+
+
+def test_all_commands_are_found() -> None:
+    assert {"generate", "scene new", "weights show", "assets get", "reconstruct", "learn"} <= set(COMMANDS)
+    assert len(COMMANDS) >= 22
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_option_is_explained(command: str) -> None:
+    found = entries(command)
+    assert "-h, --help" in found
+    for name, text in found.items():
+        assert len(text.split()) >= 2, f"mereo {command} {name}: {text!r}"
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+def test_completion_prints_as_documented(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert f"mereo --tyro-print-completion {shell}" in QUICKSTART.read_text("utf-8")
+    with pytest.raises(SystemExit) as end:
+        command_line.main(["--tyro-print-completion", shell])
+    script = capsys.readouterr().out
+    assert not end.value.code and "mereo" in script
+    for word in ("reconstruct", "weights", "--resolution", "--learning-rate"):
+        assert word in script, word

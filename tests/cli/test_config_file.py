@@ -1,17 +1,21 @@
 """A file of options says what the command line says, wins over defaults and presets, and loses to the command line."""
 
 import json
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from golden_objects import weights_of
 from two_balls import scene
 
 from mereo import __main__ as command_line
 from mereo.cli.options import options_of
+from mereo.io import progress
 from mereo.synthesis.config import SENSORS
+from mereo.synthesis.sample_views import load_view
 from mereo_learning.config import PRESETS
 
 pytestmark = pytest.mark.usefixtures("small_previews")
@@ -40,7 +44,6 @@ def written(folder: Path, content: Any, name: str = "options.json") -> Path:
 
 @pytest.mark.parametrize("command", LINES)
 def test_what_a_command_writes_says_the_same_as_its_line(command: str, tmp_path: Path) -> None:
-    """Through JSON and back, every option has its value; files are absolute then."""
     before = command_line.parse(LINES[command].split())
     content = json.loads(json.dumps(options_of(before, command)))
     assert content.pop("command") == command
@@ -66,12 +69,8 @@ def test_the_command_line_wins_over_the_file_and_the_file_over_the_preset(tmp_pa
 def test_a_sensor_is_a_word_or_its_terms(tmp_path: Path) -> None:
     path = written(tmp_path, {"sensor": "time-of-flight"})
     assert parsed(f"evaluate bunny --output out --config {path}")["terms"] == SENSORS["time-of-flight"]
-    field = next(iter(vars(SENSORS["paper"])))
-    value = vars(SENSORS["time-of-flight"])[field]
-    path = written(tmp_path, {"sensor": {field: value}})
-    assert parsed(f"evaluate bunny --output out --config {path}")["terms"] == replace(
-        SENSORS["paper"], **{field: value}
-    )
+    path = written(tmp_path, {"sensor": {"holes": 2.0}})
+    assert parsed(f"evaluate bunny --output out --config {path}")["terms"] == replace(SENSORS["paper"], holes=2.0)
 
 
 def test_yaml_and_names_with_hyphens(tmp_path: Path) -> None:
@@ -91,19 +90,10 @@ def test_a_runs_own_settings_are_such_a_file(tmp_path: Path) -> None:
     [
         ({"wieghts": "bunny"}, "has 'wieghts', which is no option of this command: correct it, perhaps to 'weights'"),
         ({"config": "other.json"}, "has 'config', which is no option of this command: "),
-        (
-            {"resolution": "many"},
-            "options.json: resolution is 'many', which cannot be (Input should be a valid integer",
-        ),
-        (
-            {"resolution": 1},
-            "options.json: resolution is 1; it must be a whole number, from 4 to 4096: give for example 128",
-        ),
+        ({"resolution": "many"}, "options.json: resolution is 'many', which cannot be (Input should be a valid int"),
+        ({"resolution": 1}, "options.json: resolution is 1; it must be a whole number, from 4 to 4096: give"),
         ({"method": "perhaps"}, "options.json: method is 'perhaps', which cannot be (Input should be 'auto'"),
-        (
-            {"weights": {"name": "bunny"}},
-            "has 'weights.name', which is no option of this command: correct it, perhaps to 'weights'",
-        ),
+        ({"weights": {"name": "bunny"}}, "has 'weights.name', which is no option of this command: correct it, perh"),
         ({"command": "train"}, "has options of `mereo train`, not of `mereo reconstruct`"),
         ([1, 2], "is no file of options; it must name each with its value"),
         ("{", "is no file of options (Expecting property name"),
@@ -112,11 +102,8 @@ def test_a_runs_own_settings_are_such_a_file(tmp_path: Path) -> None:
 def test_what_is_wrong_with_a_file_is_one_sentence(
     content: Any, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = written(tmp_path, content)
-    out = tmp_path / "out"
-    assert (
-        command_line.main(["reconstruct", "a.ply", "--weights", "w", "--output", str(out), "--config", str(path)]) == 2
-    )
+    path, out = str(written(tmp_path, content)), tmp_path / "out"
+    assert command_line.main(["reconstruct", "a", "--weights", "w", "--output", str(out), "--config", path]) == 2
     said = capsys.readouterr().err
     assert sentence in said and said.count("\n") == 1 and not out.exists(), said
 
@@ -141,3 +128,68 @@ def test_a_result_is_made_again_from_its_own_options(
     assert {path.name for path in first.iterdir()} == {path.name for path in second.iterdir()}
     assert (first / "config.json").read_text() == (second / "config.json").read_text()
     assert (first / "labels.npz").read_bytes() == (second / "labels.npz").read_bytes()
+
+
+PLIERS = str(weights_of("pliers"))
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_previews: None) -> Path:
+    """An empty folder that is the working one, with a frame of the rope, a plane, and what is no frame."""
+    monkeypatch.chdir(tmp_path)
+    np.save("rope.npy", load_view("rope").depth.to_points().points)
+    x, y = np.meshgrid(np.linspace(-0.05, 0.05, 20), np.linspace(-0.05, 0.05, 20))
+    np.save("plane.npy", np.stack([x, y, 0.5 + 0.1 * x * y], axis=2))
+    np.save("text.npy", np.array(["no frame"]))
+    return tmp_path
+
+
+def mereo(*arguments: str) -> int:
+    return command_line.main([*arguments, "--resolution", "12", "--formats", "glb"])
+
+
+def test_one_frame_is_one_object_and_the_rest_goes_elsewhere(here: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert mereo("reconstruct", "rope.npy", "--weights", "rope", "--method", "network", "--json") == 0
+    out, err = capfd.readouterr()
+    found = json.loads(out)
+    assert found["output"] == "result" and found["unit_m"] is None and found["recognition"]["known"] == "unsure"
+    assert [segment["name"] for segment in found["segments"]][:2] == ["base", "segment_1"]
+    assert "wrote result in" in err and not Path("result/summary.json").exists()
+
+
+def test_what_is_not_the_object_has_a_status_of_its_own(
+    here: Path, capfd: pytest.CaptureFixture[str], without_turns: None
+) -> None:
+    assert mereo("reconstruct", "plane.npy", "--weights", PLIERS, "--output", "one", "--json") == 3
+    found = json.loads(capfd.readouterr().out)
+    assert found["recognition"]["known"] is False and found["unit_m"] is None, "another object's size says nothing"
+    several = ("reconstruct", "plane.npy", "rope.npy", "--weights", PLIERS, "--output", "many", "--json")
+    assert mereo(*several) == 3
+    frames = json.loads(capfd.readouterr().out)["frames"]
+    assert [Path(frame["output"]).name for frame in frames] == ["plane", "rope"]
+    assert frames[0]["recognition"] == found["recognition"]
+
+
+def test_a_frame_that_cannot_be_answered_outweighs_it(
+    here: Path, capfd: pytest.CaptureFixture[str], without_turns: None
+) -> None:
+    assert mereo("reconstruct", "plane.npy", "text.npy", "--weights", PLIERS, "--output", "many", "--json") == 2
+    out, err = capfd.readouterr()
+    assert out == "" and "text.npy" in err
+
+
+def test_a_stage_is_shown_once_it_takes_long(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(progress, "STAGE_S", 0.05)
+    with progress.stage("nobody asks"):
+        time.sleep(0.2)
+    with progress.shown_stages(), progress.stage("short"):
+        pass
+    assert capfd.readouterr().err == ""
+    with progress.shown_stages(), progress.stage("long"):
+        for _ in range(200):
+            time.sleep(0.05)
+            if err := capfd.readouterr().err:
+                break
+    assert err == "long: 0 s so far\n"

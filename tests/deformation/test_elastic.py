@@ -55,9 +55,6 @@ def covariance(scale: float = 1.0, young: float = 1.0, power: float = 2.0) -> np
     return flat @ flat.T
 
 
-# --- the lattice ------------------------------------------------------------------------------------------------------
-
-
 def test_the_lattice_holds_the_mesh_and_its_volume() -> None:
     mesh, made = block(), solid()
     assert (made.mesh.locate(mesh.segments[0].vertices) >= 0).all()
@@ -72,9 +69,6 @@ def test_points_of_the_mesh_follow_affine_motions_of_the_nodes() -> None:
     outside = np.array([[-2.0, 0.4, 0.3], [9.0, 3.0, 1.0]])
     _, _, closest = solid().mesh.closest(outside)
     np.testing.assert_allclose(solid().mesh.embed(outside) @ solid().mesh.nodes, closest, atol=1e-12)
-
-
-# --- stiffness and modes ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("poisson", [-0.3, 0.0, 0.4])
@@ -132,18 +126,6 @@ def test_units_and_youngs_modulus_change_nothing() -> None:
     np.testing.assert_allclose(modes(young=3500.0)[0], 3500 * modes()[0], rtol=1e-8)
 
 
-def test_the_same_solid_gives_the_same_bits() -> None:
-    again = find_modes(build_lattice(block(), 8), COUNT, Material())
-    for before, after in zip(modes(), again, strict=True):
-        assert np.array_equal(before, after)
-    coefficients = np.random.default_rng(0).normal(size=COUNT)
-    first, second = (StateMap(solid(), modes()[1])(coefficients).nodes for _ in range(2))
-    assert np.array_equal(first, second)
-
-
-# --- states -----------------------------------------------------------------------------------------------------------
-
-
 def test_no_coefficients_are_the_rest_and_small_ones_are_linear() -> None:
     scaled = scale_modes(*modes(), motion=1e-4)
     state = StateMap(solid(), scaled)
@@ -153,7 +135,6 @@ def test_no_coefficients_are_the_rest_and_small_ones_are_linear() -> None:
 
 
 def test_drawn_states_keep_their_volume_and_centre() -> None:
-    """At a motion of .1 half longest sides, where linear modes alone change it by a tenth and more."""
     body, scaled = solid(), scale_modes(*modes(), motion=0.1 * 2.5)
     state, share = StateMap(body, scaled), body.volumes / body.volumes.sum()
     changes = []
@@ -186,9 +167,6 @@ def test_no_drawn_state_folds_or_swells_however_large_the_motion() -> None:
 
 def no_surface() -> tuple[np.ndarray, np.ndarray]:
     return np.empty((0, 3)), np.empty((0, 3))
-
-
-# --- parts that are stiffer, and parts that are held ------------------------------------------------------------------
 
 
 def test_a_stiffer_part_bends_less() -> None:
@@ -228,9 +206,6 @@ def test_what_is_held_does_not_move_and_nothing_is_rigid() -> None:
     hinge = np.isclose(solid().mesh.nodes[:, [0, 2]], solid().mesh.nodes[0, [0, 2]]).all(axis=1)
     with pytest.raises(ValueError, match="what is held leaves it free to turn: hold more of it"):
         find_modes(solid(), COUNT, Material(), hinge)
-
-
-# --- what is no solid -------------------------------------------------------------------------------------------------
 
 
 def test_bad_materials_are_refused() -> None:

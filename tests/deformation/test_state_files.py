@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +30,7 @@ def moved_vertices() -> dict[str, np.ndarray]:
 
 
 def soup() -> dict[str, np.ndarray]:
-    """For each segment the vertex of each corner of each face, as in an STL file."""
     return {part.name: part.faces.ravel() for part in boxes().segments}
-
-
-# --- formats ----------------------------------------------------------------------------------------------------------
 
 
 def nodes_npz(path: Path) -> Path:
@@ -69,11 +66,7 @@ def meshes(suffix: str, rest: bool) -> Callable[[Path], Path]:
     return write
 
 
-# --- other programs' files --------------------------------------------------------------------------------------------
-
-
 def grid(nodes: np.ndarray, **data: np.ndarray) -> Any:
-    """The lattice as pyvista has it, in the files' coordinates."""
     pyvista = pytest.importorskip("pyvista", reason="pyvista is not installed: pip install 'mereo[dev]'")
     made = pyvista.UnstructuredGrid({pyvista.CellType.TETRA: lattice().elements}, to_file(nodes))
     made.point_data.update(data)
@@ -99,17 +92,13 @@ def numpy_and_volume(path: Path) -> tuple[Path, Path]:
     return path / "run.npy", path / "volume.vtk"
 
 
-def numpy_and(suffix: str) -> Callable[[Path], tuple[Path, Path]]:
+def numpy_and(suffix: str, path: Path) -> tuple[Path, Path]:
     """Positions beside the simulated mesh as Gmsh or Abaqus writes it."""
-
-    def write(path: Path) -> tuple[Path, Path]:
-        meshio = pytest.importorskip("meshio", reason="meshio is not installed: pip install 'mereo[dev]'")
-        np.save(path / "run.npy", to_file(states()))
-        faces = ("triangle", lattice().surface)
-        meshio.Mesh(to_file(lattice().nodes), [faces, ("tetra", lattice().elements)]).write(path / f"volume{suffix}")
-        return path / "run.npy", path / f"volume{suffix}"
-
-    return write
+    meshio = pytest.importorskip("meshio", reason="meshio is not installed: pip install 'mereo[dev]'")
+    np.save(path / "run.npy", to_file(states()))
+    faces = ("triangle", lattice().surface)
+    meshio.Mesh(to_file(lattice().nodes), [faces, ("tetra", lattice().elements)]).write(path / f"volume{suffix}")
+    return path / "run.npy", path / f"volume{suffix}"
 
 
 def numpy_and_surface(path: Path) -> tuple[Path, Path]:
@@ -167,8 +156,8 @@ FORMATS: dict[str, Callable[[Path], Path | tuple[Path, Path]]] = {
     "obj": meshes("obj", rest=False),
     "stl": meshes("stl", rest=True),
     "NPY, VTK": numpy_and_volume,
-    "NPY, MSH": numpy_and(".msh"),
-    "NPY, INP": numpy_and(".inp"),
+    "NPY, MSH": partial(numpy_and, ".msh"),
+    "NPY, INP": partial(numpy_and, ".inp"),
     "NPY, PLY": numpy_and_surface,
     "VTU": folder_of_displacements,
     "VTK": pattern_of_both,
@@ -207,9 +196,6 @@ def test_a_sequence_of_positions_starts_at_rest_and_hexahedra_are_divided(tmp_pa
     record = read_states(tmp_path, ("left", "right"))
     assert isinstance(record, TetrahedralRecord) and np.abs(record.displacements[0]).max() == 0
     assert np.abs(Tetrahedra(record.rest_nodes, record.tetrahedra).volumes).sum() == pytest.approx(6 * 3 * 3)
-
-
-# --- what does not fit ------------------------------------------------------------------------------------------------
 
 
 def tetrahedral(**changes: np.ndarray) -> dict[str, np.ndarray]:

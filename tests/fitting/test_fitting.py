@@ -7,22 +7,20 @@ import pytest
 from answers import fit_correspondences
 from fit_cases import IN_FRONT, SCENE, said, seen, shown
 from scipy.spatial.transform import Rotation
+from toy_scene import toy_scene
 
 from mereo.fitting.config import FitConfig
-from mereo.fitting.draws.fit import DrawsProblem, Shape, approach, derivatives, fit_draws, lay_on_shape, secant
+from mereo.fitting.draws.fit import DrawsProblem, Shape, approach, fit_draws, lay_on_shape, secant
 from mereo.fitting.draws.fit import narrowing as narrowing_of_draws
-from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
+from mereo.fitting.draws.playback import Drawn, DrawnStates
 from mereo.fitting.modes import narrowing, turns
-from mereo.fitting.problem.correspondences import Correspondences, nothing
-from mereo.fitting.problem.evidence import Evidence
-from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, along
-from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
-from mereo.fitting.problem.residuals import NetworkTerm
+from mereo.fitting.problem.correspondences import Correspondences
+from mereo.fitting.problem.gauss_newton import POSE, Posed, along
 from mereo.fitting.registration.recognition import recognize
 from mereo.fitting.registration.register import CloudToFit, ModesFit, is_drawn
 from mereo.fitting.registration.registration import Registration
-from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
-from mereo.scenes.random_states import state_points
+from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.scenes.random_states import build_model, interior_nodes, sample_states, state_points
 from mereo.scenes.scene import State
 from mereo.scenes.seeds import example_rng
 from mereo.scenes.statistical_model import StatisticalModel
@@ -33,14 +31,12 @@ CLEAN = replace(GenerateConfig(), noise_std=0.0)
 
 
 def true_material(model: StatisticalModel, view: View) -> np.ndarray:
-    """Material points of the state that a view shows, camera frame."""
     state = State(view.mesh.transformed(view.T_world_camera), view.deformations)
     points = state_points(state, model.nodes, model.node_labels)
     return transform_points(inverse_rigid(view.T_world_camera), points)
 
 
 def told(model: StatisticalModel, view: View, error: float = 0.0) -> Correspondences:
-    """What a network might say: 200 material points, wrong by ``error`` units."""
     return said(model, true_material(model, view), max(error, 1e-12))
 
 
@@ -63,27 +59,7 @@ def test_a_known_state_is_found(model: StatisticalModel, index: int) -> None:
     assert found.accepted and found.explained > 0.99 and found.beyond_states < 0.05
 
 
-def test_the_fit_turns_with_the_frame(model: StatisticalModel, view: View, registration: Registration) -> None:
-    """Everything is turned about the camera: so is the answer."""
-    T = rigid(Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix(), np.zeros(3))
-    found = told(model, view, 1.0)
-    turned = replace(found, points=transform_points(T, found.points))
-    again = fit_correspondences(transform_points(T, view.depth.to_points().points), turned, model, 1.0)
-    np.testing.assert_allclose(again.material, registration.moved(T).material, atol=0.05)
-
-
-@pytest.mark.parametrize("known", [True, False])
-def test_the_unit_changes_nothing(model: StatisticalModel, view: View, registration: Registration, known: bool) -> None:
-    unit = 0.006
-    points, found = view.depth.to_points().points, told(model, view, 1.0)
-    scaled = fit_correspondences(points * unit, found.scaled(unit), model, unit if known else None)
-    assert scaled.scene_unit == pytest.approx(unit, rel=0.01)
-    free = registration if known else fit_correspondences(points, found, model)
-    np.testing.assert_allclose(scaled.material / unit, free.material, atol=0.05)
-
-
 def test_what_the_frame_rules_out_is_told(model: StatisticalModel, view: View, registration: Registration) -> None:
-    """Nothing of a right fit; half of a cloud leaves the model's other half where nothing of it was seen."""
     assert registration.ruled_out == 0.0 and recognize(registration).known is True
     points = view.depth.to_points().points
     half = fit_correspondences(points[points[:, 0] < np.median(points[:, 0])], told(model, view), model, 1.0)
@@ -125,18 +101,6 @@ def test_derivatives_are_those_of_differences(model: StatisticalModel) -> None:
         np.testing.assert_allclose(found[:, number], (moved * direction).sum(axis=1) / 2e-2, rtol=2e-3, atol=2e-2)
 
 
-def test_vertices_in_front_or_beside_are_pushed_back(view: View) -> None:
-    points = view.depth.to_points().points
-    evidence = Evidence.of(points)
-    middle = points[np.argmin(np.linalg.norm(points[:, :2] - points[:, :2].mean(axis=0), axis=1))]
-    direction, amount = evidence.violations(np.stack([middle * 0.9, middle + np.array([60.0, 0.0, 0.0])]), 0.5)
-    assert (amount > 1).all()
-    assert direction[0] @ middle > 0 and direction[1, 0] < 0
-
-
-# --- draws ------------------------------------------------------------------------------------------------------------
-
-
 def test_draws_find_a_state_of_the_scene(model: StatisticalModel) -> None:
     view = sample_view(SCENE, CLEAN, example_rng(5, 1))
     states = DrawnStates.of(SCENE, model, 100, 1000)
@@ -144,9 +108,6 @@ def test_draws_find_a_state_of_the_scene(model: StatisticalModel) -> None:
     assert found.method == "draws"
     error = np.linalg.norm(found.material - true_material(model, view), axis=1)
     assert np.median(error) < 0.05
-
-
-# --- the object at rest -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("noise", "unit"), [(0.0, 1.0), (0.1, 1.0), (0.1, 0.004)])
@@ -176,26 +137,6 @@ def test_under_noise_draws_are_asked_too_and_an_object_at_rest_stays_at_rest(mod
     assert noisy.may_take_draws and not clean.may_take_draws
     found = noisy.with_draws(DrawnStates.of(SCENE, model, 30))
     assert found.method == "rest" and found.seconds > clean.seconds
-
-
-def test_what_the_frame_does_not_show_narrows_nothing(model: StatisticalModel, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without evidence the coefficients' posterior is their prior; with more evidence it only narrows."""
-    points, material = shown(model, 0.5)
-    problem = Problem.of(model, said(model, material), Evidence.of(points), KNOWN_SCALE_STD, FitConfig())
-    posed = Posed(IN_FRONT[:3, :3], IN_FRONT[:3, 3], np.zeros(model.count))
-    assert narrowing(problem, posed) > 1.0
-
-    def nothing(self: Problem, normal: NormalEquations, *rest: object) -> NormalEquations:
-        return NormalEquations(normal.matrix + 1e-9 * np.eye(len(normal.matrix)), normal.gradient)
-
-    monkeypatch.setattr(Problem, "seen", nothing)
-    monkeypatch.setattr(
-        Problem, "known", lambda self, p, prior, slack: NormalEquations.prior(p.z, *vars(prior).values(), 0.0, 1.0)
-    )
-    assert narrowing(problem, posed) == pytest.approx(0.0, abs=1e-6)
-
-
-# --- the camera turned in place ---------------------------------------------------------------------------------------
 
 
 AXIS = np.array([0.3, -0.2, 2.0])
@@ -266,33 +207,9 @@ def test_noise_that_hides_how_wrong_a_fit_is_hides_it_from_a_last_try_no_more(mo
     assert last.registration().accepted and np.median(mended) < 0.5
 
 
-# --- draws: what is played, and the approach to a shape ---------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def states(model: StatisticalModel) -> DrawnStates:
     return DrawnStates.of(SCENE, model, 30, 1000)
-
-
-def test_all_points_follow_the_played_ones(model: StatisticalModel, states: DrawnStates) -> None:
-    drawn = Drawn.of(SCENE, 1004)
-    deformations = drawn.deformations(SCENE, drawn.z)
-    assert deformations is not None
-    followed = states.played.spread @ states.played.moved(deformations).astype(np.float32)
-    error = np.linalg.norm(followed - material_moved(SCENE, model, deformations), axis=1)
-    assert np.quantile(error, 0.95) < 0.02 * model.half
-
-
-def test_derivatives_predict_a_small_step(states: DrawnStates) -> None:
-    drawn = Drawn.of(SCENE, 1005)
-    here = drawn.deformations(SCENE, drawn.z)
-    step = np.where(drawn.smooth, 0.02 * np.cos(np.arange(len(drawn.z))), 0.0)
-    there = drawn.deformations(SCENE, drawn.z + step)
-    assert here is not None and there is not None
-    points = states.played.moved(here)
-    moved = states.played.moved(there) - points
-    predicted = derivatives(states, drawn, drawn.z, points) @ step
-    assert np.abs(predicted - moved).max() < 0.1 * np.abs(moved).max()
 
 
 def test_a_secant_agrees_with_the_step_and_only_there() -> None:
@@ -305,7 +222,6 @@ def test_a_secant_agrees_with_the_step_and_only_there() -> None:
 
 
 def test_the_approach_reaches_a_state_of_the_scene(model: StatisticalModel, states: DrawnStates) -> None:
-    """From another state, to the shape of one whose draws are known, in any pose."""
     points = states.material[7][states.played.index].astype(np.float64) @ np.diag([-1.0, -1.0, 1.0]) + 5.0
     shape = Shape.of(points, 0.04 * model.half, np.ones(len(points)))
     drawn = Drawn.of(SCENE, states.seeds[3])
@@ -331,19 +247,6 @@ def test_the_simpler_description_is_preferred_by_its_evidence(model: Statistical
         assert is_drawn(problem, replace(drawn, misfit=modes + gain), fitted.posed) == taken
 
 
-def test_draws_that_move_nothing_narrow_nothing(model: StatisticalModel, states: DrawnStates) -> None:
-    points, material = shown(model, 0.5)
-    fitted = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
-    problem = DrawsProblem.of(fitted.problem, states, fitted.correspondences)
-    drawn = fit_draws(problem, fitted.posed)
-    assert drawn is not None and drawn.motion is not None
-    one_moves, none_moves = drawn.motion.copy(), np.zeros_like(drawn.motion)
-    one_moves[:, :, 1:] = 0.0
-    narrowed = [narrowing_of_draws(problem, replace(drawn, motion=motion)) for motion in (one_moves, none_moves)]
-    assert narrowed[0] > 1.0
-    assert narrowed[1] == pytest.approx(0.0, abs=1e-6)
-
-
 def test_a_second_pass_follows_where_the_first_has_failed(
     model: StatisticalModel, states: DrawnStates, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -360,14 +263,47 @@ def test_a_second_pass_follows_where_the_first_has_failed(
     assert fit_draws(replace(problem, config=replace(problem.config, passes=1, hopeless=9.0)), fitted.posed) is not None
 
 
-def test_after_a_search_nobody_is_asked_about_a_frame_that_is_not_explained(
-    model: StatisticalModel, states: DrawnStates
-) -> None:
-    """A search has no correspondences, and draws are fitted all the same."""
+def test_modes_reproduce_states_they_were_not_built_from(model: StatisticalModel) -> None:
+    scene = toy_scene()
+    for index in range(5):
+        state = state_points(scene.sample_state(example_rng(7, index)), model.nodes, model.node_labels)
+        T, z = model.project(state)
+        found = model.material(z) @ T[:3, :3].T + T[:3, 3]
+        assert np.linalg.norm(found - state, axis=1).max() < 0.15
+        assert np.abs(z).max() < 5
+
+
+def test_the_residue_is_that_of_held_out_states(model: StatisticalModel) -> None:
+    assert 0 < model.residue < 0.01 * model.half
+
+
+def test_the_pose_of_the_states_does_not_matter() -> None:
+    scene, rng = toy_scene(), np.random.default_rng(0)
+    nodes, labels = interior_nodes(scene.rest)
+    states = sample_states(scene, nodes, labels, 60, 3)
+    turned = np.stack([s @ Rotation.random(rng=rng).as_matrix().T + rng.normal(size=3) * 50 for s in states])
+    plain = build_model(scene.rest, nodes, labels, states)
+    posed = build_model(scene.rest, nodes, labels, turned.astype(np.float32))
+    assert plain.count == posed.count
+    np.testing.assert_allclose(plain.mean, posed.mean, atol=0.02)
+    np.testing.assert_allclose(plain.motion, posed.motion, rtol=0.02)
+
+
+def test_one_state_is_no_model() -> None:
+    scene = toy_scene()
+    nodes, labels = interior_nodes(scene.rest)
+    with pytest.raises(ValueError, match="asked of 1 states; it needs 2 or more: record more states"):
+        build_model(scene.rest, nodes, labels, sample_states(scene, nodes, labels, 1, 3))
+
+
+def test_draws_that_move_nothing_narrow_nothing(model: StatisticalModel, states: DrawnStates) -> None:
     points, material = shown(model, 0.5)
     fitted = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
-    base = replace(fitted.problem, network=NetworkTerm.none(model))
-    problem = DrawsProblem.of(base, states, nothing())
-    strict = replace(problem, config=replace(problem.config, explained=0.0, jumps=0))
-    assert strict.config.network_start
-    assert fit_draws(strict, fitted.posed) is not None
+    problem = DrawsProblem.of(fitted.problem, states, fitted.correspondences)
+    drawn = fit_draws(problem, fitted.posed)
+    assert drawn is not None and drawn.motion is not None
+    one_moves, none_moves = drawn.motion.copy(), np.zeros_like(drawn.motion)
+    one_moves[:, :, 1:] = 0.0
+    narrowed = [narrowing_of_draws(problem, replace(drawn, motion=motion)) for motion in (one_moves, none_moves)]
+    assert narrowed[0] > 1.0
+    assert narrowed[1] == pytest.approx(0.0, abs=1e-6)

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from answers import answer_to
-from toy_scene import toy_scene
 
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.problem import ACCEPTED
@@ -22,45 +21,18 @@ from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.models.calibration import Calibration, Recognizing, Usual
-from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import Scene, SourceFrame
-from mereo.scenes.seeds import example_rng
+from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel
-from mereo.synthesis.config import GenerateConfig
-from mereo.synthesis.examples import sample_view
-from mereo.synthesis.sample_views import load_view
-from mereo_learning.calibrate import (
-    CalibrationView,
-    RecognitionSigns,
-    object_views,
-    other_objects,
-    strange_frames,
-    usual_of,
-)
-
-SCENE = toy_scene()
+from mereo_learning.calibrate import RecognitionSigns, other_objects, strange_frames, usual_of
 
 
 @pytest.fixture(scope="module")
 def registration(model: StatisticalModel) -> Registration:
     """A registration that nothing speaks against: the mean state."""
-    return Registration(
-        model=model,
-        material=model.mean + np.array([0.0, 0.0, 100.0]),
-        method="modes",
-        z=np.full(model.count, 0.5),
-        scene_unit=1.0,
-        unit_known=False,
-        explained=1.0,
-        accepted=True,
-        seconds=0.1,
-        residual=0.05,
-        ruled_out=0.0,
-    )
-
-
-# --- what is said -----------------------------------------------------------------------------------------------------
+    material, z = model.mean + np.array([0.0, 0.0, 100.0]), np.full(model.count, 0.5)
+    found = Registration(model, material, "modes", z, 1.0, unit_known=False, explained=1.0, accepted=True, seconds=0.1)
+    return replace(found, residual=0.05, ruled_out=0.0)
 
 
 @pytest.mark.parametrize(
@@ -87,19 +59,12 @@ def test_each_sign_has_its_say(
 
 
 def test_the_more_is_wrong_the_less_is_known(registration: Registration) -> None:
-    """Known, unsure, refused; and strangeness never falls."""
     said = [recognize(replace(registration, explained=share)) for share in (1.0, 0.98, 0.9, 0.8, 0.5, 0.1, 0.0)]
     each = [one.strangeness for one in said]
     assert each == sorted(each) and [said[0].known, said[-1].known] == [True, False]
     assert "unsure" in [one.known for one in said]
     order = [{True: 0, "unsure": 1, False: 2}[one.known] for one in said]
     assert order == sorted(order)
-
-
-def test_a_noisy_frame_may_leave_more_unexplained(registration: Registration) -> None:
-    clean, noisy = (replace(registration, explained=0.88, needed=needed) for needed in (0.95, ACCEPTED))
-    assert recognize(noisy).strangeness < recognize(clean).strangeness
-    assert recognize(noisy).known is True
 
 
 def test_the_object_at_rest_is_known_whatever_was_learned(registration: Registration) -> None:
@@ -114,7 +79,6 @@ def test_what_was_not_found_is_not_the_object_and_what_was_not_asked_is_unsure()
 
 
 def test_calibrated_weights_have_their_own_limits(registration: Registration) -> None:
-    """The same signs, twice as usual: nothing to say. And of weights that never saw such: refused."""
     odd = replace(registration, explained=0.8)
     usual = {"unexplained": Usual(mean=np.log(4.1), std=0.3)}
     lenient = Recognizing(clean=usual, noisy=usual, unsure=3.0, refused=6.0)
@@ -132,16 +96,6 @@ def test_a_size_off_by_a_factor_of_two_is_never_the_objects(
     wide = Calibration(seed=1, views=8, recognizing=CONSERVATIVE.model_copy(update={"unsure": 90.0, "refused": 99.0}))
     said = recognize(registration, wide, stated_scene_unit=unit)
     assert said.known is known and (known or "its size differs by a factor of" in str(said.reason))
-
-
-def test_signs_add_up() -> None:
-    """Two signs of three standard deviations are stranger than one, by the root of two; what is usual adds none."""
-    usual = {name: Usual(mean=0.0, std=1.0) for name in ("unusual", "displaced", "beyond")}
-    one, two = (Signs(unusual=np.exp(3.0), displaced=d, beyond=0.01) for d in (0.01, np.exp(3.0)))
-    assert strangeness(two.strange(usual)) == pytest.approx(np.sqrt(2) * strangeness(one.strange(usual)), rel=1e-3)
-
-
-# --- how limits are measured ------------------------------------------------------------------------------------------
 
 
 def signs(rng: np.random.Generator, factor: float = 1.0) -> Signs:
@@ -165,17 +119,6 @@ def test_a_view_that_was_not_understood_moves_no_limit() -> None:
     views = [signs(rng) for _ in range(24)]
     usual, spoiled = usual_of(views), usual_of([*views, signs(rng, 1e4)])
     assert all(abs(usual[name].mean - spoiled[name].mean) < 0.15 for name in usual)
-
-
-# --- what is seen -----------------------------------------------------------------------------------------------------
-
-
-def test_views_are_clean_and_noisy_in_turn_and_the_same_every_time() -> None:
-    views: list[CalibrationView] = list(object_views(SCENE, 5, 710_000))
-    assert [view.camera for view in views[:4]] == ["paper", "structured-light", "paper", "time-of-flight"]
-    assert [view.scene_unit for view in views] == [1.0] * 4 + [None]
-    again = next(object_views(SCENE, 1, 710_000))
-    np.testing.assert_array_equal(views[0].seen.points, again.seen.points)
 
 
 def test_strangers_are_other_objects_planes_and_heaps(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -214,24 +157,6 @@ def test_only_a_patch_is_explained_by_a_patch() -> None:
     assert Evidence.of(rough).patch_share(0.1) < 0.8
 
 
-@pytest.mark.slow
-def test_shipped_weights_tell_their_object_from_another_and_from_a_wrong_unit() -> None:
-    rope = load_model("rope")
-    own = load_view("rope").depth.to_points()
-    other = sample_view(load_scene("robot"), GenerateConfig(), example_rng(5, 0)).depth.to_points()
-    assert rope.statistical_model is not None
-    sized = replace(rope.statistical_model, source_frame=SourceFrame(np.eye(4), 0.01))  # of a known true size
-    registrar = Registrar(rope, sized, "modes")
-    assert answer_to(own, rope, registrar, 24, unit_m=0.01).recognition.known is True
-    found = answer_to(other, rope, Registrar.of(rope), 24)
-    assert found.recognition.known is False and not found.taken
-    inches = answer_to(PointCloud(own.points / 25.4), rope, registrar, 24, unit_m=0.01).recognition
-    assert inches.known is False and inches.reason is not None and "a factor of" in inches.reason
-    unknown = answer_to(PointCloud(own.points / 25.4), rope, registrar, 24)
-    assert unknown.recognition.known is True
-    assert unknown.seen.frame.unit_m == pytest.approx(0.254, rel=0.05), "found by the object's true size"
-
-
 def test_limits_in_the_wrong_order_are_refused() -> None:
     with pytest.raises(ValueError, match="the limits are 5 and 4; the first must be the smaller"):
         Recognizing(clean={}, noisy={}, unsure=5.0, refused=4.0)
@@ -241,3 +166,16 @@ def test_without_views_nothing_is_measured() -> None:
     assert RecognitionSigns().limits() is None
     few = RecognitionSigns([signs(np.random.default_rng(2)) for _ in range(8)]).limits()
     assert few is not None and few.noisy == dict(CONSERVATIVE.noisy)
+
+
+def test_a_noisy_frame_may_leave_more_unexplained(registration: Registration) -> None:
+    clean, noisy = (replace(registration, explained=0.88, needed=needed) for needed in (0.95, ACCEPTED))
+    assert recognize(noisy).strangeness < recognize(clean).strangeness
+    assert recognize(noisy).known is True
+
+
+def test_signs_add_up() -> None:
+    """Two signs of three standard deviations are stranger than one, by the root of two; what is usual adds none."""
+    usual = {name: Usual(mean=0.0, std=1.0) for name in ("unusual", "displaced", "beyond")}
+    one, two = (Signs(unusual=np.exp(3.0), displaced=d, beyond=0.01) for d in (0.01, np.exp(3.0)))
+    assert strangeness(two.strange(usual)) == pytest.approx(np.sqrt(2) * strangeness(one.strange(usual)), rel=1e-3)

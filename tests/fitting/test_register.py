@@ -1,7 +1,9 @@
 """The registered model as a reconstruction: the rest mesh's own segments, in the input's frame."""
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import jaxtyping
 import numpy as np
@@ -28,15 +30,24 @@ from mereo.fitting.registration.registration import Registration
 from mereo.fitting.tracking import Tracker
 from mereo.geometry.camera import SCANNER_TO_CAMERA, PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.metrics import confusion_matrix, intersection_over_union
+from mereo.geometry.metrics import Scores, confusion_matrix, intersection_over_union
 from mereo.geometry.solids import Solids
+from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.io.atomic_files import write_json
 from mereo.models.model import Model
+from mereo.models.weights import load_model
 from mereo.reconstruction.observation import observe
 from mereo.reconstruction.pipeline import Reconstruction
+from mereo.scenes.random_states import state_points
 from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import AssetUnavailable, Scene
+from mereo.scenes.scene import AssetUnavailable, Scene, State
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.examples import View, sample_view
 from mereo.synthesis.sample_views import SampleView, load_view
+from mereo_learning.cases import Evaluation, RegistrationErrors, seen_points
 from mereo_learning.scoring import EvaluationConfig, evaluate
+from mereo_learning.tables import markdown_table, metrics
 
 
 @pytest.fixture(scope="module")
@@ -184,17 +195,6 @@ def test_where_no_registration_is_found_auto_says_why(model: Model, view: Sample
         mereo.reconstruct(view.depth.to_points(), known, "modes", resolution=32)
 
 
-def test_points_may_be_plain_lists(found: Answer) -> None:
-    registration = found.registration
-    assert registration is not None
-    rest = registration.model.rest_points[:3]
-    np.testing.assert_array_equal(registration.to_camera(rest.tolist()), registration.to_camera(rest))
-    there = registration.to_camera(rest)
-    np.testing.assert_array_equal(registration.to_rest(there.tolist()), registration.to_rest(there))
-    assert registration.query([[0, 0, 100]]).label.shape == (1,)
-    np.testing.assert_array_equal(registration.to_camera(rest[0]), registration.to_camera(rest[:1]))
-
-
 MOTION = "the pose is .* must be 4 x 4 finite numbers: a rotation and a translation"
 REFUSED: dict[str, tuple[Callable[[Registration], object], str]] = {
     "pairs": (lambda r: r.to_camera([[0.0, 1.0]]), r"have the shape \(1, 2\); they must be rows of x, y, z"),
@@ -236,3 +236,68 @@ def test_weights_without_states_say_what_to_do() -> None:
 def test_without_a_model_in_the_weights_auto_asks_the_network(model: Model) -> None:
     assert registrar_for(replace(model, statistical_model=None), "auto") is None
     assert registrar_for(model, "network") is None and registrar_for(model, "auto") is not None
+
+
+SEED = 1_000_021
+
+
+@pytest.fixture(scope="module")
+def engine() -> Model:
+    return load_model("engine")
+
+
+@pytest.fixture(scope="module")
+def engine_view() -> View:
+    return sample_view(load_scene("engine").for_seed(SEED), GenerateConfig(), example_rng(SEED, 0))
+
+
+def test_a_registration_is_as_far_off_as_its_points_are(engine: Model, engine_view: View) -> None:
+    statistical = engine.statistical_model
+    assert statistical is not None
+    state = State(engine_view.mesh.transformed(engine_view.T_world_camera), engine_view.deformations)
+    truth = state_points(state, statistical.nodes, statistical.node_labels)
+    truth = transform_points(inverse_rigid(engine_view.T_world_camera), truth)
+    cloud = engine_view.depth.to_points()
+    found = Registrar.of(engine, "modes").fit_modes(CloudToFit(cloud.points, scene_unit=1.0)).registration()
+    shown = seen_points(truth, cloud, 1.0)
+    exact = RegistrationErrors.of(replace(found, material=truth), truth, shown, 1.0)
+    assert exact.distances.max() == 0.0 and len(exact.distances) == len(truth) and 0 < exact.seen.sum() < len(truth)
+    shifted = RegistrationErrors.of(replace(found, material=truth + np.array([0.0, 3.0, 0.0])), truth, shown, 1.0)
+    parts = shifted.summary(unit_mm=2.0)
+    for part in ("seen", "hidden"):
+        assert parts[part] == pytest.approx({"median": 3.0, "p95": 3.0, "median_mm": 6.0, "p95_mm": 6.0})
+    # the same in another unit of length
+    large_shown = seen_points(5 * truth, PointCloud(5 * cloud.points), 5.0)
+    moved = replace(found, material=5 * truth + np.array([0.0, 15.0, 0.0]))
+    large = RegistrationErrors.of(moved, 5 * truth, large_shown, 5.0)
+    np.testing.assert_allclose(large.distances, shifted.distances)
+
+
+@pytest.mark.slow
+def test_an_evaluation_compares_all_who_could_answer(engine: Model, tmp_path: Path) -> None:
+    found = evaluate(engine, EvaluationConfig("engine", 2, SEED, cells=24))
+    values = metrics(found, {})
+    assert sum(values["chosen"].values()) == pytest.approx(1.0)
+    only = {name for name, share in values["chosen"].items() if share == 1.0}
+    if only:  # then the scored answer is one of the three
+        same = values["network" if only == {"network"} else "modes" if only == {"modes"} else "full"]
+        assert (values["iou"], values["miou"]) == (same["iou"], same["miou"])
+    assert values["modes"]["miou"] > values["network"]["miou"] and values["full"]["seconds"] > 0
+    assert 0 <= values["registration_error"]["hidden"]["median"] <= values["registration_error"]["hidden"]["p95"]
+    assert values["registration_error"]["seen"]["median_mm"] is None  # the engine has no true size
+    write_json(tmp_path / "metrics.json", values)
+    assert json.loads((tmp_path / "metrics.json").read_text())["chosen"] == values["chosen"]
+    assert "modes alone" in markdown_table(found)
+    off = evaluate(engine, EvaluationConfig("engine", 2, SEED, cells=24, method="network"))
+    assert (off.scores.iou, off.scores.miou) == (values["network"]["iou"], values["network"]["miou"])
+    assert "alone" not in markdown_table(off) and metrics(off, {})["registration_error"] is None
+    assert found.known == (True, True) and off.known == ()
+
+
+def test_frames_are_counted_by_whether_they_are_said_to_show_the_object() -> None:
+    scores = Scores(0.9, 0.8, np.array([0.8]))
+    one = Evaluation(("a",), np.array([[9, 1], [1, 9]]), {str(number): scores for number in range(4)})
+    assert metrics(one, {})["known"] is None and "Said to show" not in markdown_table(one)
+    said = replace(one, known=(True, "unsure", True, False))
+    assert metrics(said, {})["known"] == {"true": 0.5, "unsure": 0.25, "false": 0.25}
+    assert "Said to show the object: 50.0%; unsure 25.0%, not 25.0%." in markdown_table(said)

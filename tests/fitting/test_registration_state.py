@@ -64,17 +64,6 @@ def test_a_state_gives_the_same_material_points_again(
     assert (tmp_path / STATE).stat().st_size < 5000
 
 
-def test_draws_come_back_with_their_seed_sizes_and_names(model: StatisticalModel) -> None:
-    before = by_draws(model)
-    state = state_of(before, SCENE)
-    assert state.draws is not None and before.drawn is not None
-    assert (state.draws.seed, state.draws.sizes) == (5, (3, 1))
-    assert state.draws.names == ("whole: shear x", "whole: shear y", "whole: shear z", "ball: lift")
-    drawn = restored(state, model, SCENE).drawn
-    assert drawn is not None and drawn.sizes == before.drawn.sizes
-    np.testing.assert_array_equal(drawn.smooth, before.drawn.smooth)
-
-
 def test_a_state_of_other_weights_is_refused(model: StatisticalModel) -> None:
     state = state_of(by_modes(model), "toy", weights="mine.safetensors")
     modes = model.modes.copy()
@@ -116,13 +105,11 @@ def test_draws_need_their_scene_to_be_written(model: StatisticalModel) -> None:
 WRONG: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "key": (lambda facts: {**facts, "extra": 1}, "'extra'"),
     "missing": (lambda facts: {k: v for k, v in facts.items() if k != "z"}, "'z'"),
-    "text": (lambda facts: {**facts, "z": ["1.0"]}, "'z.0'"),
     "large": (lambda facts: {**facts, "z": [1e9]}, "'z.0'"),
     "format": (lambda facts: {**facts, "format": 2}, "its format is 2; this mereo reads format 1"),
     "method": (lambda facts: {**facts, "method": "draws"}, "the block `draws` belongs to the method 'draws' alone"),
     "unit": (lambda facts: {**facts, "scene_unit": 0.0}, "'scene_unit'"),
     "mirror": (lambda facts: {**facts, "T_camera_input": np.diag([1, 1, -1, 1]).tolist()}, "must be a rigid transform"),
-    "list": (lambda facts: [facts], "an object"),
     "lengths": (
         lambda facts: {**facts, "method": "draws", "draws": {"seed": 1, "sizes": [1], "names": ["a"]}},
         "must be of one length",

@@ -11,7 +11,7 @@ from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.registration.answer_frame import search_modes
 from mereo.fitting.registration.register import CloudToFit
-from mereo.fitting.search import Poses, Screen, SightTable, medoids, rotations, tables_of
+from mereo.fitting.search import SightTable, medoids, rotations
 from mereo.geometry.camera import SightLines
 from mereo.models.weights import load_model
 from mereo.scenes.statistical_model import StatisticalModel
@@ -28,13 +28,11 @@ def model() -> StatisticalModel:
 
 
 def state(model: StatisticalModel, index: int) -> Posed:
-    """A state of the library, turned at random, before the camera."""
     turn = rotations(97)[(31 * index + 7) % 97]
     return Posed(turn, FAR - turn @ model.mean.mean(axis=0), model.library[index].astype(np.float64))
 
 
 def view(model: StatisticalModel, posed: Posed) -> np.ndarray:
-    """Cloud that the camera sees of a state."""
     return seen(model.mesh(posed.place(model.material(posed.z))))
 
 
@@ -47,7 +45,6 @@ def cut(points: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def off(model: StatisticalModel, material: np.ndarray, posed: Posed) -> float:
-    """Root mean square distance of the found places from the true ones, in half lengths."""
     true = posed.place(model.material(posed.z))
     return float(np.sqrt(((material - true) ** 2).sum(axis=1).mean()) / model.half)
 
@@ -82,26 +79,6 @@ def test_a_table_of_sight_rules_out_what_the_evidence_does(model: StatisticalMod
     # up to a cell's width, which is a few pixels here
     assert np.mean((exact > 0) == (looked_up[0] > 0)) > 0.85
     np.testing.assert_allclose(np.median(np.abs(exact - looked_up[0])), 0.0, atol=0.1)
-
-
-def test_a_rigid_step_draws_a_pose_to_the_frame(model: StatisticalModel) -> None:
-    posed = Posed(rotations(97)[5], FAR, np.zeros(model.count))
-    screen = Screen.of(tables_of(model, 0), Evidence.of(view(model, posed)), model.half)
-    turn = rotations(20_000)
-    near = turn[np.argsort(-np.einsum("nij,ij->n", turn, posed.rotation))[:30]]  # up to 10 degrees away
-    size = len(near)
-    poses = Poses(
-        np.zeros(size, dtype=np.int64),
-        near.astype(np.float32),
-        np.tile(FAR + 3.0, (size, 1)).astype(np.float32),
-        np.zeros(size, dtype=np.float32),
-        np.zeros(size, dtype=np.float32),
-    )
-    before = screen.scored(poses, 0.05).cost
-    for sigma in (0.15, 0.1, 0.1, 0.05, 0.05, 0.05):
-        poses = screen.scored(poses, sigma, moves=True)
-    assert (screen.scored(poses, 0.05).cost < before).all()
-    assert np.linalg.norm(poses.translation - FAR, axis=1).max() < 0.1 * model.half  # from 0.16
 
 
 @pytest.mark.parametrize("index", [0, 5])

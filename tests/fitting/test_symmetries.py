@@ -1,6 +1,6 @@
 """Segments that look alike turned: found where states make turns, ruled out by what is seen, and turned together."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -39,42 +39,26 @@ from mereo.scenes.scene import Scene, Workspace
 from mereo.scenes.statistical_model import StatisticalModel
 
 
-@dataclass(frozen=True, eq=False)
-class Spun:
-    """Turned about z and leant about x, around the wheel's middle."""
-
-    spin: float
-    lean: float
-
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        middle = np.array([0.0, 0.0, 8.0])
-        return Rotation.from_euler("zx", [self.spin, self.lean]).apply(points - middle) + middle
-
-
-@dataclass(frozen=True, eq=False)
-class Slid:
-    """Moved along x."""
-
-    way: float
-
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        return points + np.array([self.way, 0.0, 0.0])
+def moves(way: float, spin: float, lean: float) -> tuple[Deformation, ...]:
+    """The block is moved along x, the wheel turned about z and leant about x around its middle."""
+    turn = Rotation.from_euler("zx", [spin, lean]).as_rotvec()
+    return Rigid(np.zeros(3), way * X, np.zeros(3)), Rigid(turn, np.zeros(3), np.array([0.0, 0.0, 8.0]))
 
 
 def free(rng: np.random.Generator) -> tuple[Deformation, ...]:
     """The wheel spins, whatever else."""
     spin, lean, way = (named(rng, name).uniform(-1, 1) for name in ("spin", "lean", "way"))
-    return Slid(0.5 * way), Spun(np.pi * spin, 0.05 * lean)
+    return moves(0.5 * way, np.pi * spin, 0.05 * lean)
 
 
 def coupled(rng: np.random.Generator) -> tuple[Deformation, ...]:
     """The wheel spins only as it leans."""
     spin = named(rng, "spin").uniform(-1, 1)
-    return Slid(0.0), Spun(np.pi * spin, 2.5 * spin)
+    return moves(0.0, np.pi * spin, 2.5 * spin)
 
 
 def held(rng: np.random.Generator) -> tuple[Deformation, ...]:
-    return Slid(0.0), Spun(0.0, 0.1 * named(rng, "lean").uniform(-1, 1))
+    return moves(0.0, 0.0, 0.1 * named(rng, "lean").uniform(-1, 1))
 
 
 def rest_mesh(sides: int, peg: float) -> SegmentedMesh:
@@ -130,7 +114,6 @@ def test_what_is_left_open_has_the_second_moments_of_the_turns() -> None:
 
 
 def test_a_peg_that_is_seen_leaves_no_turn_open() -> None:
-    """One so small that the shapes are alike; where it is hidden, some turns stay open."""
     model = model_of(free, sides=6, peg=0.6)
     assert len(find_segment_turns(model)) == 1
     material = transform_points(IN_FRONT, model.rest_points)
@@ -144,7 +127,6 @@ def test_a_peg_that_is_seen_leaves_no_turn_open() -> None:
 
 
 def test_radii_hold_what_is_left_open() -> None:
-    """Beside what the Gaussian says, and for points that follow the material points too."""
     model = model_of(free, sides=6)
     material = transform_points(IN_FRONT, model.rest_points)
     turns = left_open(model, material, material[model.rest_points[:, 2] < 0.0], 0.2, 1500.0)
@@ -206,9 +188,6 @@ def test_an_object_without_states_is_at_rest() -> None:
 
 def test_a_wheel_with_a_long_peg_is_not_like_itself() -> None:
     assert find_segment_turns(model_of(free, peg=6.0)) == ()
-
-
-# --- segments turned together -----------------------------------------------------------------------------------------
 
 
 X, Y, WRIST = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), np.array([6.0, 0.0, 0.0])
@@ -281,7 +260,6 @@ def test_an_arm_has_one_group_of_forearm_and_wrist() -> None:
 
 
 def test_the_turned_shape_is_that_of_other_draws() -> None:
-    """Exactly, as the segments lie on the axis of the roll; and twice turned is the same."""
     (together,) = symmetric_groups(model())
     there = turn_segments(model(), moved(TRUTH), together)
     assert np.abs(there - moved(TRUTH)).max() > 4.0
@@ -290,7 +268,6 @@ def test_the_turned_shape_is_that_of_other_draws() -> None:
 
 
 def test_a_state_that_is_turned_so_is_found() -> None:
-    """What it is told from is the correspondences alone; a right state stays what it is."""
     problem = problem_of(TRUTH)
     right, wrong = state(problem, TRUTH), descend(problem, state(problem, flipped(TRUTH)), 1)
     assert np.abs(wrong.surface.material - right.surface.material).max() > 4.0

@@ -1,22 +1,41 @@
 """Uncertainty of registrations: theorems on the posterior, and what users are told in units."""
 
+import base64
+import copy
+import json
+import re
+import zlib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from answers import fit_correspondences
+import trimesh
+from answers import answer_to, fit_correspondences
 from fit_cases import SCENE, said, seen, shown
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from mereo.cli.stream import FrameAnswer, Outcome, line
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed
+from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.register import CloudToFit, Registrar
 from mereo.fitting.registration.registration import Registration
+from mereo.fitting.tracking import Tracker
 from mereo.fitting.uncertainty import NOISY_FACTOR, ModesOptimum, Posterior, radius95
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import owned_centroids, owned_gradients
-from mereo.geometry.transforms import rigid, transform_points
+from mereo.io.config import FilesConfig
+from mereo.models.calibration import Calibration
+from mereo.models.model import Model
+from mereo.models.weights import load_model
+from mereo.reconstruction.observation import observe
 from mereo.scenes.statistical_model import StatisticalModel
+from mereo.synthesis.sample_views import load_view
+from mereo.visualization.reconstruction_report import UNEXPLAINED, explain_centroids, point_marks
+from mereo.visualization.result_files import write_answer
 from mereo_learning.cases import RegistrationErrors, seen_points
 
 
@@ -33,7 +52,6 @@ def found(model: StatisticalModel, material: np.ndarray) -> Registration:
 
 
 def test_the_radius_holds_95_percent_of_a_gaussian() -> None:
-    """Exact for one direction and for three alike; between, by draws."""
     one, three = np.diag([4.0, 0.0, 0.0]), 4.0 * np.eye(3)
     np.testing.assert_allclose(radius95(np.stack([one, three])), 2.0 * np.sqrt(chi2.ppf(0.95, [1, 3])), rtol=1e-9)
     rng = np.random.default_rng(0)
@@ -45,11 +63,7 @@ def test_the_radius_holds_95_percent_of_a_gaussian() -> None:
 
 
 def test_the_posterior_of_a_linear_problem_is_its_closed_form() -> None:
-    """Points with one coefficient, each measured in space: Bayes' rule for a Gaussian, by hand and by the factor.
-
-    The pose is held. With a prior N(0, 1) and measurements ``m_i z + noise``, the variance of z is
-    ``1 / (1 + sum |m_i|^2 / sigma^2)``.
-    """
+    """The pose is held; the prior is N(0, 1), measured is ``m_i z + noise``."""
     rng = np.random.default_rng(0)
     modes, sigma = rng.normal(size=(7, 3, 1)).astype(np.float32), 0.3
     held = NormalEquations.prior(np.zeros(1), np.zeros(1), np.eye(1), 0.0, 1e-6)
@@ -66,7 +80,6 @@ def test_the_posterior_of_a_linear_problem_is_its_closed_form() -> None:
 
 
 def test_the_gradients_of_volumes_and_centroids_are_their_differences() -> None:
-    """Of a box with a ball in it, which takes its volume away."""
     mesh = SCENE.rest
     nested = SegmentedMesh((mesh.segments[3], replace(mesh.segments[0], name="around")), (("ball", "around"),))
     rng = np.random.default_rng(0)
@@ -87,16 +100,7 @@ def test_the_gradients_of_volumes_and_centroids_are_their_differences() -> None:
         np.testing.assert_allclose(said[:, 1:], (center - other) / 2e-5, rtol=1e-3, atol=1e-5)
 
 
-def test_hidden_points_have_larger_radii_than_seen_ones(found: Registration, material: np.ndarray) -> None:
-    assert found.uncertainty is not None
-    radii = found.uncertainty.material
-    shown = seen_points(material, PointCloud(seen(found.model.mesh(material))), 1.0)
-    assert np.median(radii[~shown]) > 1.2 * np.median(radii[shown])
-    assert (radii > 0).all()
-
-
 def test_radii_are_in_the_unit_of_the_input(model: StatisticalModel, material: np.ndarray, found: Registration) -> None:
-    """The same frame in millimetres and in metres, and turned about the camera."""
     assert found.uncertainty is not None
     turn = Rotation.from_euler("z", 40, degrees=True).as_matrix()
     points, network = seen(model.mesh(material)), said(model, material)
@@ -143,7 +147,6 @@ def test_the_interval_of_a_volume_is_around_it_and_not_far_from_the_true_one(
 
 
 def test_the_scale_is_that_which_holds_95_percent(found: Registration, material: np.ndarray) -> None:
-    """Ratios of radii that are too small by a known factor, and what is said of them with it."""
     shown = seen_points(material, PointCloud(seen(found.model.mesh(material))), 1.0)
     one = RegistrationErrors.of(found, material, shown, 1.0)
     np.testing.assert_array_equal(one.seen, shown)
@@ -184,7 +187,6 @@ def test_the_shares_of_all_evidence_sum_to_one(found: Registration) -> None:
 
 
 def test_an_influence_is_how_far_a_moved_point_moves_the_place(found: Registration) -> None:
-    """By the normal equations: one point's residual changed, and their step from there."""
     optimum = found.optimum
     assert optimum is not None
     row = 40
@@ -214,27 +216,144 @@ def test_segments_are_explained_by_name(found: Registration) -> None:
     assert replace(found, optimum=None).explain(name) is None
 
 
-def test_what_is_near_a_seen_point_decides_it(found: Registration) -> None:
-    """More than what is far; and of a frame that is turned the same is said, turned."""
-    row = int(np.flatnonzero(seen_points(found.material, PointCloud(seen(found.model.mesh(found.material))), 1.0))[20])
-    one = found.explain(found.material[row])
-    assert one is not None and len(one.unexplained) == 0
-    away = np.linalg.norm(one.points - one.place, axis=1)
-    assert one.weights[away < 4].mean() > 2 * one.weights[away > 12].mean()
-    T = rigid(Rotation.from_euler("xyz", [40, 10, 80], degrees=True).as_matrix(), np.array([5.0, 1.0, -3.0]))
-    turned = found.moved(T).explain(transform_points(T, found.material[[row]])[0])
-    assert turned is not None
-    np.testing.assert_allclose(turned.points, transform_points(T, one.points), atol=1e-6)
-    np.testing.assert_allclose(turned.influence, one.influence @ T[:3, :3].T, atol=1e-4)
+@pytest.fixture(scope="module")
+def liver() -> Model:
+    return replace(load_model("liver"), calibration=None)
 
 
-def test_points_are_as_sure_as_the_vertices_that_they_are(found: Registration) -> None:
-    """A vertex asked as a point follows its neighbours, which move much as it does."""
-    assert found.uncertainty is not None
-    rows = np.arange(0, sum(found.model.vertex_counts), 7)
-    labels = found.model.labels[rows]
-    for place, points in (("rest", found.model.rest_points), ("camera", found.material)):
-        asked = found.radius95(points[rows], labels, at=place)  # type: ignore[arg-type]
-        assert asked is not None
-        np.testing.assert_allclose(asked, found.uncertainty.material[rows], rtol=0.1)
-    assert [len(part) for part in found.uncertainty.vertices] == list(found.model.vertex_counts)
+@pytest.fixture(scope="module")
+def cloud() -> PointCloud:
+    return load_view("liver").depth.to_points()
+
+
+@pytest.fixture(scope="module")
+def answer(liver: Model, cloud: PointCloud) -> Answer:
+    result = answer_to(cloud, liver, Registrar.of(liver, "modes"), 24)
+    assert result.registered is not None and result.registered.uncertainty is not None
+    return result
+
+
+@pytest.fixture(scope="module")
+def folder(answer: Answer, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("sure")
+    files = FilesConfig(("glb", "ply", "npz", "vti", "json"), millimetres=True)
+    said = replace(answer.seen, frame=replace(answer.seen.frame, unit_m=0.5))
+    write_answer(path, replace(answer, seen=said), files)
+    return path
+
+
+def radii_of(answer: Answer) -> np.ndarray:
+    assert answer.registered is not None and answer.registered.uncertainty is not None
+    return np.concatenate(answer.registered.uncertainty.vertices)
+
+
+def test_a_registration_says_that_it_cannot_be_sent(answer: Answer) -> None:
+    with pytest.raises(TypeError, match="a registration cannot be pickled or copied.*save_state"):
+        copy.copy(answer.registered)
+
+
+def test_a_ply_has_the_radius_of_each_vertex_in_its_unit(answer: Answer, folder: Path) -> None:
+    """With --millimetres, of a frame whose unit is half a metre."""
+    data = (folder / "segments.ply").read_bytes()
+    head, body = data.split(b"end_header\n", 1)
+    assert b"property uchar label\nproperty float radius95\n" in head
+    assert b"comment radius95 is in the unit of x, y, z; it is not calibrated\n" in head
+    kinds = [*((axis, "<f4") for axis in "xyz"), ("color", "u1", 3), ("label", "u1"), ("radius95", "<f4")]
+    vertices = np.frombuffer(body, np.dtype(kinds), count=len(radii_of(answer)))
+    np.testing.assert_allclose(vertices["radius95"], 500.0 * radii_of(answer), rtol=1e-5)
+    assert answer.registered is not None
+    np.testing.assert_allclose(vertices["x"], 500.0 * answer.registered.material[: len(vertices), 0], rtol=1e-4)
+
+
+def test_a_glb_has_the_radius_of_each_vertex_and_says_its_unit(answer: Answer, folder: Path) -> None:
+    assert answer.registered is not None and answer.registered.uncertainty is not None
+    scene = trimesh.load_scene(folder / "segments.glb", process=False)
+    rows = np.split(np.arange(len(radii_of(answer))), np.cumsum(answer.registered.model.vertex_counts)[:-1])
+    for mesh, part in zip(scene.geometry.values(), rows, strict=True):
+        assert mesh.metadata["radius95"] == {"unit_m": 0.5, "calibrated": False} and mesh.visual.kind != "vertex"
+        told, place = mesh.vertex_attributes["_RADIUS95"], mesh.vertices
+        # vertices that are one place are written once
+        away, same = cKDTree(answer.registered.material[part]).query(place)
+        assert away.max() < 1e-4 and len(place) > 0.99 * len(part)
+        np.testing.assert_allclose(told[:, 0], radii_of(answer)[part][same], rtol=1e-3)
+
+
+def test_label_volumes_have_the_radius_of_each_voxel(answer: Answer, folder: Path) -> None:
+    with np.load(folder / "labels.npz") as values:
+        labels, radii = values["labels"], values["radius95"]
+    assert radii.shape == labels.shape and radii.dtype == np.float32
+    np.testing.assert_array_equal(np.isfinite(radii), labels > 0)
+    everywhere = radii_of(answer)
+    assert everywhere.min() * 0.9 < np.nanmedian(radii) < everywhere.max()
+    text = (folder / "labels.vti").read_text()
+    array = re.search(r'Name="radius95" format="binary">([^<]+)<', text)
+    assert array is not None and 'type="Float32"' in text
+    packed = base64.b64decode(array[1][44:])  # after the head of 32 bytes
+    told = np.frombuffer(zlib.decompress(packed), "<f4").reshape(labels.shape, order="F")
+    np.testing.assert_allclose(told, 500.0 * radii, rtol=1e-5)
+
+
+def test_the_summary_tells_centroids_volumes_and_the_whole(answer: Answer, folder: Path) -> None:
+    assert answer.registered is not None and answer.registered.uncertainty is not None
+    summary = json.loads((folder / "summary.json").read_text())
+    told = summary["radius95"]
+    assert told == {
+        "median": pytest.approx(np.median(radii_of(answer))),
+        "max": pytest.approx(radii_of(answer).max()),
+        "calibrated": False,
+        "unit_m": 0.5,
+    }
+    for row, one in zip(summary["segments"], answer.registered.uncertainty.segments, strict=True):
+        assert row["centroid_radius95"] == pytest.approx(one.centroid_radius95)
+        assert row["volume95"] == pytest.approx(list(one.volume95))
+        assert row["volume95"][0] < row["volume"] < row["volume95"][1]
+
+
+@pytest.mark.usefixtures("without_turns")
+def test_points_that_the_model_does_not_explain_are_red(liver: Model, cloud: PointCloud) -> None:
+    lump = cloud.points[:40] - [0.0, 0.0, 0.12 * np.ptp(cloud.points, axis=0).max()]
+    points = np.concatenate([cloud.points, lump])
+    registration = answer_to(points, liver, Registrar.of(liver, "modes"), 16, keep_all=True).registered
+    assert registration is not None
+    one = registration.explain("liver")
+    assert one is not None and len(one.unexplained)
+    marks = point_marks(one, points)
+    assert (marks[-40:] == UNEXPLAINED).mean() > 0.8 and (marks[:-40] == UNEXPLAINED).mean() < 0.1
+    assert tuple(explain_centroids(registration)) == liver.names
+
+
+def test_a_stream_says_it_where_it_is_asked_to(liver: Model, cloud: PointCloud) -> None:
+    tracker = Tracker(Registrar.of(liver, "modes"))
+    followed = [tracker.follow(observe(cloud), 0.05 * number) for number in range(2)]
+    assert followed[1].tracked
+    silent, told = FrameAnswer.of(followed[1]), FrameAnswer.of(followed[1], True)
+    words = line(Outcome("frame", 0.0, told, "", 0.0, 0.0, 0))
+    assert "radius95" not in line(Outcome("frame", 0.0, silent, "", 0.0, 0.0, 0))
+    assert set(words["radius95"]) == {"median", "max", "calibrated"} and words["radius95"]["median"] > 0
+    for name in liver.names:
+        assert "volume95" not in silent.facts["segments"][name]
+        low, high = words["segments"][name]["volume95"]
+        assert low < words["segments"][name]["volume"] < high and words["segments"][name]["centroid_radius95"] > 0
+
+
+def test_a_calibration_comes_from_the_weights(liver: Model, cloud: PointCloud) -> None:
+    known = replace(liver, calibration=Calibration(seed=1, views=2, radius_scale=2.5))
+    registrar = Registrar.of(known, "modes")
+    registration = registrar.fit_modes(CloudToFit(cloud.points)).registration()
+    assert registration.uncertainty is not None and registration.uncertainty.scale == 2.5
+    tracker = Tracker(registrar)
+    followed = [tracker.follow(observe(cloud), 0.05 * number).registration for number in range(2)]
+    assert all(one is not None and one.radius_scale == 2.5 for one in followed)
+
+
+def test_the_viewer_colours_it_and_says_it_of_a_place(answer: Answer, server: object) -> None:
+    pytest.importorskip("viser", reason="viser (extra `view`) is not installed")
+    from mereo_viewer.result_page import SURE, ResultPage, content_of_answer
+
+    page = ResultPage(server, content_of_answer(replace(answer, seen=observe(answer.seen.cloud, unit_m=1.0))))
+    colors, scale = page.content.colorings[SURE]()
+    mesh = page.content.mesh
+    assert [len(part) for part in colors] == [len(s.vertices) for s in mesh.segments]
+    assert scale is not None and "mm" in scale.words[1]
+    page.probe(mesh.segments[0].vertices[0])
+    assert re.search(r"± [\d.]+ mm \(95\s%\)", page.facts.content)

@@ -4,12 +4,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from label_cases import CENTER, ORIGIN, RADIUS, SPACING, halves, nibabel, write_nifti
 from overlapping import check_overlap
+from shapes import ball, box
+from shapes import segment as segment_of
 
-from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
 from mereo.geometry.solids import Solids
+from mereo.geometry.subdivision import split_at_creases
+from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.volume_files import is_volume, read_label_volume, segment_surfaces
+from mereo.io.writers.glb import write_segments_glb
 from mereo.scenes.registry import load_scene
 
 nrrd = pytest.importorskip("nrrd")
@@ -99,3 +105,57 @@ def test_a_scene_from_a_label_volume(tmp_path: Path) -> None:
     path.write_text("name: organs\nunits: mm\nlabels: ct.nii.gz\nnames: {1: liver, 5: spleen}\n")
     with pytest.raises(ValueError, match=r"organs.yaml:3: the volume has no voxel of 'spleen'"):
         load_scene(path)
+
+
+BOX, BALL = box((-0.5, -1.0, -1.5), (0.5, 1.0, 1.5)), ball((4.0, 0.0, 0.0), 1.0, color=1, level=3)
+
+
+def check(segment: Segment) -> Segment:
+    """Split segment, after a check that it is the same surface, with old vertices first."""
+    split, source = split_at_creases(segment)
+    np.testing.assert_array_equal(split.vertices, segment.vertices[source])
+    np.testing.assert_array_equal(source[split.faces], segment.faces)
+    np.testing.assert_array_equal(source[: len(segment.vertices)], np.arange(len(segment.vertices)))
+    assert set(source[split.faces].ravel()) == set(np.unique(split.faces)) & set(range(len(segment.vertices)))
+    return split
+
+
+def test_a_box_has_three_normals_at_each_corner() -> None:
+    split = check(BOX)
+    assert len(split.vertices) == 24
+    normals = vertex_normals(split)
+    np.testing.assert_allclose(np.abs(normals).max(axis=1), 1.0)
+    faces = split.vertices[split.faces]
+    own = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
+    own /= np.linalg.norm(own, axis=1, keepdims=True)
+    np.testing.assert_allclose(normals[split.faces], np.repeat(own[:, None], 3, axis=1), atol=1e-12)
+
+
+@pytest.mark.parametrize("sides, times", [(12, 2), (24, 2), (8, 3)])
+def test_a_cylinder_is_smooth_around_and_has_rims(sides: int, times: int) -> None:
+    """Twelve sides meet at exactly 30 degrees, which is no crease; eight at 45, which is one."""
+    split = check(segment_of(trimesh.creation.cylinder(1.0, 2.0, sections=sides)))
+    assert len(split.vertices) == times * 2 * sides + 2
+    round_it = np.abs(vertex_normals(split)[:, 2]) < 0.5
+    assert round_it.sum() == (times - 1) * 2 * sides
+    np.testing.assert_allclose(vertex_normals(split)[~round_it, 2], np.sign(split.vertices[~round_it, 2]), atol=1e-9)
+
+
+def test_faces_without_area_and_edges_of_many_faces_are_no_trouble() -> None:
+    thin = np.concatenate([BOX.faces, [[0, 1, 1], [0, 0, 0]]])
+    assert len(split_at_creases(Segment("thin", BOX.color, BOX.vertices, thin))[0].vertices) == 24
+    shared = np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4], [1, 0, 5]])
+    fan = np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], dtype=float)
+    check(Segment("fan", BOX.color, fan, shared))
+    none = Segment("none", BOX.color, np.empty((0, 3)), np.empty((0, 3), dtype=np.int64))
+    assert split_at_creases(none)[0] is none
+
+
+def test_a_glb_has_creases_and_merges_to_the_same_surface(tmp_path: Path) -> None:
+    mesh = SegmentedMesh((BOX, BALL))
+    write_segments_glb(tmp_path / "s.glb", mesh, np.eye(3))
+    read = trimesh.load_scene(tmp_path / "s.glb", process=False).geometry
+    assert [len(read[name].vertices) for name in mesh.names] == [24, len(BALL.vertices)]
+    assert np.sort(np.abs(read["box"].vertex_normals), axis=1) == pytest.approx(np.tile([0, 0, 1], (24, 1)))
+    for segment in read_segmented_mesh(tmp_path / "s.glb").segments:
+        assert segment.edge_imbalance() == (0, 0)

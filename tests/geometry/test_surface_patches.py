@@ -5,14 +5,12 @@ import pytest
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from mereo.geometry import surface_patches as module
 from mereo.geometry.camera import Camera
-from mereo.geometry.downsampling import MAX_POINTS
-from mereo.geometry.surface_patches import longest_side, smoothed, surface_patches, surface_points
+from mereo.geometry.downsampling import MAX_POINTS, farthest_point_order, means_along_sight, random_subset
+from mereo.geometry.surface_patches import longest_side, smoothed, surface_points
 
 
 def rays(size: int = 96) -> np.ndarray:
-    """Lines of sight through the pixels of an image, scaled to z = 1."""
     return Camera.from_fov(size, size, 0.5).directions()
 
 
@@ -45,14 +43,6 @@ def test_a_rim_of_background_is_no_surface(rim: int) -> None:
     assert longest_side(points) > 1.5 * longest_side(points[genuine])
 
 
-def test_what_is_wide_is_a_surface_wherever_it_lies() -> None:
-    """Six pixels of the wall are as good as the plate: nothing says which of them is the object."""
-    points, genuine = plate(rim=6)
-    patch, surface = surface_patches(points)
-    assert surface.all() and len(np.unique(patch[genuine])) == len(np.unique(patch[~genuine])) == 1
-    assert patch[genuine][0] != patch[~genuine][0]
-
-
 def test_parts_of_different_density_lose_nothing() -> None:
     """A ball of 1,800 random points beside a plate of 600, which are farther apart."""
     rng = np.random.default_rng(4)
@@ -65,6 +55,12 @@ def test_neither_unit_nor_turn_nor_order_matters(factor: float) -> None:
     order = np.random.default_rng(1).permutation(len(POINTS))
     turned = factor * POINTS[order] @ Rotation.from_rotvec([1.0, 0.5, -0.3]).as_matrix().T
     np.testing.assert_array_equal(surface_points(turned), PLATE[order])
+
+
+def test_many_points_are_decided_by_some_of_them() -> None:
+    points, genuine = plate(size=1050)
+    assert len(points) > 4 * MAX_POINTS
+    assert (surface_points(points) == genuine).mean() > 0.999
 
 
 def test_too_few_points_to_tell_are_all_kept() -> None:
@@ -82,24 +78,10 @@ def test_points_closer_than_their_noise_are_a_surface() -> None:
     assert surface_points(points * (1 + rng.normal(0, 0.05, (len(points), 1)))).mean() > 0.99
 
 
-def test_many_points_are_decided_by_some_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    looked_at, find = [], module._patches
-    monkeypatch.setattr(module, "_patches", lambda points: (looked_at.append(len(points)), find(points))[1])
-    points, genuine = plate(size=1050)
-    assert len(points) > 4 * MAX_POINTS
-    keep = surface_points(points)
-    assert looked_at[0] <= MAX_POINTS
-    assert (keep == genuine).mean() > 0.999
-
-
-# --- smoothing --------------------------------------------------------------------------------------------------------
-
-
 SIGHT = Camera.from_fov(48, 48, 0.5).directions().reshape(-1, 3)
 
 
 def plane(tilt: float) -> Float[np.ndarray, "n 3"]:
-    """A plane through (0, 0, 50), tilted about x."""
     normal = np.array([0.0, np.sin(tilt), -np.cos(tilt)])
     return SIGHT * (normal[2] * 50.0 / (SIGHT @ normal))[:, None]
 
@@ -117,7 +99,6 @@ def test_planes_stay_and_their_noise_falls(tilt: float) -> None:
 
 
 def test_points_stay_on_their_lines_of_sight_in_any_frame_and_unit() -> None:
-    """Turned about the camera and in other units, all is the same."""
     points = noisy(plane(0.4), 0.3)
     moved = smoothed(points)
     along = np.einsum("ij,ij->i", moved, points) / (np.linalg.norm(moved, axis=1) * np.linalg.norm(points, axis=1))
@@ -129,7 +110,6 @@ def test_points_stay_on_their_lines_of_sight_in_any_frame_and_unit() -> None:
 
 
 def test_an_edge_stays_sharp() -> None:
-    """Nothing lies between a near wall and a far one."""
     points = plane(0.0)
     points[SIGHT[:, 0] > 0.02] *= 0.8
     depth = smoothed(points)[:, 2]
@@ -142,3 +122,97 @@ def test_a_handful_of_points_is_as_good_as_it_is(count: int) -> None:
     np.testing.assert_allclose(smoothed(points), points, rtol=2e-2)
     same = np.repeat(points[:1], 8, axis=0)
     np.testing.assert_allclose(smoothed(same), same)
+
+
+@pytest.mark.parametrize("limit", [1, 7, 49, 50, 51])
+def test_a_random_subset_is_the_same_every_time(limit: int) -> None:
+    points = np.random.default_rng(3).normal(size=(50, 3))
+    chosen = random_subset(points, limit)
+    assert len(chosen) == min(limit, 50) == len(np.unique(chosen, axis=0))
+    assert set(map(tuple, chosen)) <= set(map(tuple, points))
+    assert np.array_equal(chosen, random_subset(points.copy(), limit))
+    assert np.array_equal(chosen, points[random_subset(np.arange(50), limit)])
+    assert limit < 50 or chosen is points
+
+
+def wall(pixels: int, depth: float, noise: float) -> Float[np.ndarray, "n 3"]:
+    directions = Camera.from_fov(pixels, pixels, 0.6).directions().reshape(-1, 3)
+    return directions * (depth + noise * np.random.default_rng(5).normal(size=(len(directions), 1)))
+
+
+def test_means_of_neighbours_average_the_noise() -> None:
+    points = wall(200, 50.0, 0.2)
+    means = means_along_sight(points, 2500)
+    assert 1800 < len(means) <= 2500
+    assert means[:, 2].std() == pytest.approx(0.2 * np.sqrt(len(means) / len(points)), rel=0.1)
+    assert means[:, 2].mean() == pytest.approx(50.0, abs=0.01)
+    assert means_along_sight(points, len(points)) is points
+
+
+def test_no_mean_lies_between_two_surfaces() -> None:
+    points = wall(200, 50.0, 0.05)
+    near = points[:, 0] > 0.013 * points[:, 2]
+    points[near] *= 0.8
+    means = means_along_sight(points, 2500)
+    assert np.minimum(np.abs(means[:, 2] - 50.0), np.abs(means[:, 2] - 40.0)).max() < 0.1
+    assert np.allclose(means_along_sight(points * 1024.0, 2500), means * 1024.0)
+
+
+@pytest.mark.parametrize("count", [2, 3, 300])
+def test_points_on_one_line_of_sight_are_few_already_or_parted(count: int) -> None:
+    """Without any extent across the lines of sight nothing divides by zero."""
+    points = np.array([[0.0, 0.0, 1.0]]) * np.linspace(1.0, 2.0, count)[:, None]
+    assert 1 <= len(means_along_sight(points, 1)) <= count
+
+
+def lattice(side: int) -> np.ndarray:
+    return np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1).reshape(-1, 3).astype(float)
+
+
+def gap_to_chosen(points: np.ndarray, order: np.ndarray) -> np.ndarray:
+    """[m - 1, n]: each point's distance to the nearest of the first 1, 2, ... chosen ones, in double precision."""
+    distances = np.linalg.norm(points[:, None] - points[order[:-1]][None], axis=-1)
+    return np.minimum.accumulate(distances, axis=1).T
+
+
+def test_on_a_lattice_the_choice_is_exact_and_ties_go_to_smaller_coordinates() -> None:
+    points = lattice(5)
+    order = farthest_point_order(points, 60)
+    gaps = gap_to_chosen(points, order)
+    # rows of the lattice are sorted by x, y, z, and argmax takes the first: the rule in one line
+    assert np.array_equal(order[1:], gaps.argmax(axis=1))
+
+
+@pytest.mark.parametrize("points", [lattice(4), np.random.default_rng(2).normal(size=(200, 3))], ids=["ties", "random"])
+def test_the_points_chosen_do_not_depend_on_their_order(points: np.ndarray) -> None:
+    expected = points[farthest_point_order(points, 50)]
+    for seed in range(4):
+        shuffled = np.random.default_rng(seed).permutation(points)
+        assert np.array_equal(shuffled[farthest_point_order(shuffled, 50)], expected)
+
+
+def test_it_starts_at_the_point_farthest_from_the_middle_of_the_box() -> None:
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [4, 3, 2], [2, 1, 0], [0, 3, 0]])
+    assert farthest_point_order(points, 1).tolist() == [0]  # as far as [4, 3, 2], and smaller in x
+    assert farthest_point_order(points[1:], 1).tolist() == [3]  # [0, 3, 0] and [4, 3, 2] again tie
+
+
+def test_a_given_start_comes_first() -> None:
+    points = np.random.default_rng(3).normal(size=(100, 3))
+    for start in (0, 57, 99):
+        order = farthest_point_order(points, 100, start)
+        assert order[0] == start and len(set(order.tolist())) == 100
+
+
+def test_coinciding_points_come_last_and_no_row_twice() -> None:
+    distinct = np.random.default_rng(4).normal(size=(30, 3))
+    points = np.random.default_rng(5).permutation(np.concatenate([distinct, distinct[:12], distinct[:5]]))
+    order = farthest_point_order(points, 100)
+    assert sorted(order) == list(range(47))
+    assert len(np.unique(points[order[:30]], axis=0)) == 30
+
+
+def test_where_a_small_cloud_lies_does_not_matter() -> None:
+    points = np.round(np.random.default_rng(6).normal(size=(300, 3)), 3)
+    far = points + 4096.0
+    assert np.array_equal(farthest_point_order(points, 300)[:100], farthest_point_order(far, 300)[:100])

@@ -1,22 +1,32 @@
 """One frame has one answer, whatever holds it and through whichever door it comes."""
 
 import json
+import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from camera_files import write_camera
-from toy_frames import MODEL, seen
+from memory_frames import message
+from page_blocks import ROOT, blocks
+from PIL import Image
+from scipy.spatial.transform import Rotation
+from toy_frames import MODEL, NAMES, seen
 from two_balls import scene
 
 import mereo
-from mereo.__main__ import main
 from mereo.fitting.registration.answer import Answer
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import CloudAxes
 from mereo.io.atomic_files import to_json
+from mereo.io.readers import read_mask
+from mereo.io.writers.meshes import write_positions_ply
+from mereo.synthesis.config import SensorModel
+from mereo.synthesis.depth_sensor import KINECT_DISPARITY_M, axial_std_m, quantize
 from mereo.visualization.result_files import summary_of
 
 pytestmark = pytest.mark.usefixtures("small_previews")
@@ -35,7 +45,6 @@ def asked(frame: Any, **reading: Any) -> mereo.Result:
 
 
 def same(found: Answer, wanted: Answer) -> None:
-    """The answers are one, in all that programs read."""
     np.testing.assert_array_equal(found.seen.cloud.points, wanted.seen.cloud.points)
     np.testing.assert_array_equal(found.reconstruction.labels.labels, wanted.reconstruction.labels.labels)
     np.testing.assert_array_equal(found.surfaces.merged()[0], wanted.surfaces.merged()[0])
@@ -63,14 +72,11 @@ def npy(path: Path) -> Path:
 CLOUDS: dict[str, Callable[[Path], Any]] = {
     "array": lambda _: seen(),
     "list": lambda _: seen().tolist(),
-    "tuple of rows": lambda _: tuple(map(tuple, seen().tolist())),
     "PointCloud": lambda _: PointCloud(seen()),
-    "npy": lambda folder: npy(folder / "cloud.npy"),
     "npy, a string": lambda folder: str(npy(folder / "cloud.npy")),
     "ply": lambda folder: ply(folder / "cloud.ply"),
     "load_frame of an array": lambda _: mereo.load_frame(seen()),
     "load_frame of a file": lambda folder: mereo.load_frame(npy(folder / "cloud.npy")),
-    "what a result was made from": lambda _: asked(seen()).seen,
 }
 
 
@@ -134,15 +140,138 @@ def test_a_depth_image_has_one_answer(tmp_path: Path) -> None:
     assert wanted.unit_m == 1.0 and asked(image).unit_m is None, "an image of any unit, unless it is said"
 
 
-@pytest.mark.parametrize("unit_m", [None, 0.5])
-def test_the_command_writes_what_python_finds(
-    unit_m: float | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: MODEL)
-    unit = [] if unit_m is None else ["--unit-m", str(unit_m)]
-    arguments = ["reconstruct", str(npy(tmp_path / "cloud.npy")), "--weights", "any", "--method", "network"]
-    assert main([*arguments, "--resolution", str(RESOLUTION), "--output", str(tmp_path / "out"), *unit]) == 0
-    written = json.loads((tmp_path / "out/summary.json").read_text())
-    for frame in (seen(), tmp_path / "cloud.npy"):
-        assert figures(written) == figures(asked(frame, unit_m=unit_m))
-    assert written["unit_m"] == unit_m and (written["visible_size_m"] is None) == (unit_m is None)
+FRAMES, TOOLS = ROOT / "docs" / "frames.md", ROOT / "docs" / "from-other-tools.md"
+MODELS: tuple[SensorModel, ...] = ("structured-light", "time-of-flight")
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[str, Any]]:
+    """Run the only block that has a word, next to frame.ply; stand-ins are modules by their names."""
+
+    def run_block(word: str, **modules: Any) -> dict[str, Any]:
+        for name, content in modules.items():
+            module = ModuleType(name)
+            vars(module).update(content)
+            monkeypatch.setitem(sys.modules, name.replace("__", "."), module)
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(mereo, "load_object", lambda _: MODEL, raising=False)
+        (code,) = (code for page in (FRAMES, TOOLS) for code in blocks(page, "python") if word in code)
+        names: dict[str, Any] = {}
+        exec(compile(code, word, "exec"), names)
+        return names
+
+    write_positions_ply(tmp_path / "frame.ply", seen())
+    return run_block
+
+
+class Mesh(SimpleNamespace):
+    """Stand-in of Open3D's TriangleMesh."""
+
+    def __init__(self, vertices: np.ndarray, triangles: np.ndarray) -> None:
+        super().__init__(vertices=vertices, triangles=triangles, paint_uniform_color=len, compute_vertex_normals=list)
+
+
+def test_open3d(run: Callable[..., dict[str, Any]]) -> None:
+    drawn: list[Any] = []
+    cloud = SimpleNamespace(points=np.concatenate([seen(), [[0, 0, 0], [np.nan, 1, 1]]]))
+    names = run(
+        "import open3d",
+        open3d={
+            "io": SimpleNamespace(read_point_cloud=lambda _: cloud),
+            "utility": SimpleNamespace(Vector3dVector=np.asarray, Vector3iVector=np.asarray),
+            "geometry": SimpleNamespace(TriangleMesh=Mesh),
+            "visualization": SimpleNamespace(draw_geometries=drawn.extend),
+        },
+    )
+    assert np.array_equal(names["without_nan"](cloud.points), seen())
+    assert drawn[0] is cloud and set(names["meshes"]) == set(NAMES[:2]) and len(drawn) == 3
+
+
+def test_slicer(run: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
+    loaded, placed = [], []
+    names = run(
+        "import slicer",
+        slicer={
+            "util": SimpleNamespace(
+                loadSegmentation=loaded.append,
+                updateMarkupsControlPointsFromArray=lambda node, points: placed.append((node, points)),
+            ),
+            "mrmlScene": SimpleNamespace(AddNewNodeByClass=lambda kind, name: (kind, name)),
+        },
+    )
+    assert loaded == [str(Path("result/labels.seg.nrrd"))] and (tmp_path / loaded[0]).is_file()
+    ((node, points),) = placed
+    assert node[1] == "centroids"
+    np.testing.assert_allclose(points[0], [-20, 30, 600], atol=8)
+    np.testing.assert_allclose(names["from_ras_mm"](names["to_ras_mm"](seen(), 0.5), 0.5), seen())
+    assert names["to_ras_mm"]([[1, 2, 3]], 0.001).tolist() == [[-1, -2, 3]]
+
+
+def test_ros(run: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix(), (1, 2, 3)
+    sent, answers, times = [], [("found", T), ("lost", None)], []
+
+    class Tracker:
+        def __init__(self, name: str) -> None:
+            assert name == "bunny"
+
+        def follow(self, cloud: Any, time_s: float, **reading: Any) -> SimpleNamespace:
+            frame = mereo.load_frame(cloud, **reading)
+            np.testing.assert_allclose(frame.cloud.points, seen(), atol=1e-6)
+            times.append(time_s)
+            tracking, pose = answers.pop(0)
+            return SimpleNamespace(tracking=tracking, pose=pose)
+
+    class Node:
+        def __init__(self, name: str) -> None:
+            self.create_publisher = lambda *_: SimpleNamespace(publish=sent.append)
+
+        def create_subscription(self, kind: type, topic: str, callback: Callable[[Any], None], depth: int) -> None:
+            cloud = message(seen())
+            cloud.header = SimpleNamespace(stamp=SimpleNamespace(sec=5, nanosec=500_000_000))
+            self.spin = lambda: [callback(cloud) for _ in answers.copy()]
+
+    def pose_stamped() -> SimpleNamespace:
+        return SimpleNamespace(pose=SimpleNamespace(position=SimpleNamespace(), orientation=SimpleNamespace()))
+
+    monkeypatch.setattr(mereo, "Tracker", Tracker, raising=False)
+    run(
+        "import rclpy",
+        rclpy={"init": lambda: None, "spin": lambda node: node.spin()},
+        rclpy__node={"Node": Node},
+        geometry_msgs={},
+        geometry_msgs__msg={"PoseStamped": pose_stamped},
+        sensor_msgs={},
+        sensor_msgs__msg={"PointCloud2": object},
+    )
+    (pose,) = (one.pose for one in sent)
+    assert times == [5.5, 5.5] and vars(pose.position) == {"x": 1.0, "y": 2.0, "z": 3.0}
+    np.testing.assert_allclose(list(vars(pose.orientation).values()), [0, 0, 0.5**0.5, 0.5**0.5], atol=1e-12)
+
+
+def axial_mm(z_m: float, degrees: float, model: SensorModel) -> float:
+    return 1e3 * float(axial_std_m(np.array([z_m]), np.deg2rad([degrees]), model)[0])
+
+
+def test_the_table_of_distances_follows_the_formulas() -> None:
+    row = r"^\| ([\d.]+) \| ([\d.]+), ([\d.]+) \| ([\d.]+) \| ([\d.]+), ([\d.]+) \| (\d+) \| (\d+) \|$"
+    rows = re.findall(row, FRAMES.read_text(), re.M)
+    assert len(rows) == 6
+    for z, *stated in np.array(rows, dtype=float).tolist():
+        light, flight = ([axial_mm(z, degrees, model) for degrees in (0, 60)] for model in MODELS)
+        assert stated[:5] == pytest.approx((*light, 1e3 * z**2 / KINECT_DISPARITY_M, *flight), abs=0.0051)
+        assert stated[5:] == [round(0.1 * focal / z) for focal in (420, 525)]
+    depths = np.unique(quantize(np.linspace(0.99, 1.01, 10_000), 1.0))
+    assert 1e3 * np.median(np.diff(depths)) == pytest.approx(2.85, abs=0.02), "the step as it is simulated"
+
+
+def test_the_colour_threshold_finds_the_orange_ball(run: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
+    row, column = np.mgrid[:120, :160]
+    ball = (row - 60) ** 2 + (column - 70) ** 2 < 30**2
+    picture = np.full((120, 160, 3), (60, 90, 200), np.uint8)
+    picture[ball] = picture[10:30, 130:150] = picture[100, 5] = (250, 110, 20)
+    Image.fromarray(picture).save(tmp_path / "color.png")
+    run("ndimage")
+    mask = read_mask(tmp_path / "mask.png")
+    assert not (mask & ~ball).any() and mask.sum() > 0.9 * ball.sum()

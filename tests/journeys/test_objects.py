@@ -156,25 +156,17 @@ def test_it_is_served_without_weights(folder: Path, meshes: list[str], points: n
     assert reply.status == 200 and json.loads(reply.body)["registration"]["located_by"] == "search"
 
 
-def test_its_page_opens(folder: Path, meshes: list[str], points: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
-    opened: list[OpenPage] = []
-    monkeypatch.setattr(OpenPage, "stay", lambda page, _: opened.append(page) or page)  # type: ignore[func-returns-value]
-    frame = [str(folder / "frame.npy"), "--unit-m", "1", "--port", "0", "--resolution", "24"]
-    assert command_line.main(["view", *frame, "--object", *meshes, "--units", "mm"]) == 0
-    opened[0].close()
-
-
-def test_its_result_shows_itself(
-    found: mereo.Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_its_frame_and_its_result_are_shown(
+    found: mereo.Result, folder: Path, meshes: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened: list[OpenPage] = []
     monkeypatch.setattr(OpenPage, "stay", lambda page, _: opened.append(page) or page)  # type: ignore[func-returns-value]
     found.save(tmp_path / "out")
     assert (tmp_path / "out/state.json").is_file()
-    assert command_line.main(["view", str(tmp_path / "out"), "--port", "0"]) == 0
-    opened[0].close()
-    assert command_line.main(["view", str(tmp_path / "out"), "--object", "rope"]) == 2
-    assert "is shown as it is, and no object is looked for: leave out --object and --weights" in capsys.readouterr().err
+    frame = [str(folder / "frame.npy"), "--unit-m", "1", "--resolution", "24", "--object", *meshes, "--units", "mm"]
+    for shown in (frame, [str(tmp_path / "out")]):
+        assert command_line.main(["view", *shown, "--port", "0"]) == 0
+        opened.pop().close()
 
 
 def test_without_a_frame_its_laboratory_opens(meshes: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -187,9 +179,6 @@ def test_without_a_frame_its_laboratory_opens(meshes: list[str], monkeypatch: py
     assert scene.rest.names == registrar.model.rest.names and network is None and registrar.network is None
 
 
-# --- what cannot be found ---------------------------------------------------------------------------------------------
-
-
 def test_a_mesh_without_volume_is_a_sentence(tmp_path: Path) -> None:
     flat = trimesh.Trimesh([[0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
     flat.export(tmp_path / "flat.stl")
@@ -197,9 +186,7 @@ def test_a_mesh_without_volume_is_a_sentence(tmp_path: Path) -> None:
         mereo.load_object(tmp_path / "flat.stl")
     tilted = trimesh.Trimesh([[0, 0, 0], [90, 0, 10], [0, 60, 20]], [[0, 1, 2]], process=False)
     tilted.export(tmp_path / "tilted.stl")
-    with pytest.raises(
-        ValueError, match=r"tilted.stl is an open surface \(3 open edges\) that encloses no volume; .*or let"
-    ):
+    with pytest.raises(ValueError, match=r"tilted.stl is an open surface \(3 open edges\) that encloses no"):
         mereo.load_object(tmp_path / "tilted.stl")
 
 
@@ -216,7 +203,6 @@ def test_two_objects_in_a_cloud_are_warned_of(angle: mereo.Object, points: np.nd
         ("mm.npy", ("long.stl", "short.stl"), "1", "correct the unit of the frame (--unit-m 0.001 for millimetres"),
         ("frame.npy", ("long.stl", "none.stl"), "1", "none.stl does not exist; a mesh is needed: check the path"),
         ("frame.npy", ("long.stl", "short.stl"), "0.001", "the object 120, a factor of 9"),
-        ("frame.npy", ("one.stl",), "1", "is flat, without any volume; an object's parts are solids: name a file"),
     ],
 )
 def test_bad_input_ends_a_command_with_a_sentence_and_nothing_written(
@@ -235,7 +221,6 @@ def test_bad_input_ends_a_command_with_a_sentence_and_nothing_written(
         np.save(f"{name}.npy", cloud)
     for name in ("long.stl", "short.stl"):
         Path(name).write_bytes((folder / name).read_bytes())
-    trimesh.Trimesh([[0, 0, 0], [9, 0, 0], [9, 9, 0]], [[0, 1, 2]], process=False).export("one.stl")
     before = set(Path().iterdir())
     given = ["reconstruct", frame, "--object", *object, "--units", "mm", "--unit-m", unit_m, "--output", "out"]
     assert command_line.main(given) == 2

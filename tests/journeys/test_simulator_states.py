@@ -2,11 +2,14 @@
 
 import json
 import shlex
+import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from page_blocks import ROOT, blocks
 
 import mereo
@@ -15,6 +18,7 @@ from mereo.geometry.metrics import grid_confusion, intersection_over_union, labe
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.writers.meshes import write_positions_ply
 from mereo.scenes.random_states import CACHE_VARIABLE
+from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import View, sample_view
@@ -99,3 +103,35 @@ def test_a_state_that_was_held_out_is_found(folder: Path) -> None:
 def test_it_is_learnt(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command(folder, "learn", "--train", "never") == 0
     assert json.loads((folder / "learned/metrics.json").read_text())
+
+
+def run_mereo(*arguments: object) -> str:
+    done = subprocess.run(
+        [sys.executable, "-m", "mereo", *map(str, arguments)], capture_output=True, text=True, timeout=1200
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_a_tiny_network_finds_the_rope(tmp_path: Path) -> None:
+    """About two CPU minutes of training suffice to see the object; more examples are what the presets are for."""
+    data, run, test, result = (tmp_path / name for name in ("data", "run", "test", "result"))
+    run_mereo("generate", "rope", "--examples", 1536, "--seed", 7, "--workers", 2, "--output", data)
+    run_mereo("train", data, "--output", run, "--preset", "tiny", "--epochs", 12)
+    weights = run / "weights.safetensors"
+    run_mereo("evaluate", weights, "--examples", 6, "--seed", TEST_SEED_START, "--output", test)
+    scores = json.loads((test / "metrics.json").read_text())
+    assert scores["iou"] > 0.45 and scores["miou"] > 0.15
+    view = sample_view(load_scene("rope"), GenerateConfig(), example_rng(TEST_SEED_START, 0))
+    np.save(tmp_path / "cloud.npy", view.depth.to_points().points)
+    run_mereo("reconstruct", tmp_path / "cloud.npy", "--weights", weights, "--resolution", 64, "--output", result)
+    assert {path.name for path in result.glob("[!.]*")} == {
+        "config.json", "segments.glb", "labels.npz", "summary.json", "state.json", "preview.png", "radius95.glb",
+        "report.html"
+    }  # fmt: skip
+    nodes = trimesh.load(result / "segments.glb").graph.nodes_geometry
+    assert "base" in nodes
+    base = next(s for s in view.mesh.segments if s.name == "base")
+    found = next(s for s in json.loads((result / "summary.json").read_text())["segments"] if s["name"] == "base")
+    assert np.linalg.norm(np.array(found["centroid"]) - base.vertices.mean(axis=0)) < 4.0

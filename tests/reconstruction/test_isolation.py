@@ -1,18 +1,27 @@
 """Each step leaves out what it is for and keeps the object, whatever the unit; the real scan survives its clutter."""
 
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
 import numpy as np
 import pytest
 from two_balls import front
 
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
-from mereo.geometry.downsampling import spacing, thin_to_grid
+from mereo.geometry.downsampling import random_subset, thin_to_grid
+from mereo.geometry.solids import Solids
+from mereo.geometry.surface_patches import longest_side
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.isolation import IsolationStep, clusters, largest_plane
+from mereo.reconstruction.isolation import IsolationStep, Reading, clusters, largest_plane, readings
 from mereo.reconstruction.observation import find_object, observe
+from mereo.scenes.registry import load_scene
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor
+from mereo.synthesis.examples import sample_view
+from mereo_learning.scans import SCANS, bunny_scan
 
 
 def half_ball(count: int = 3000, center: tuple[float, float, float] = (0.0, 0.0, 0.8)) -> np.ndarray:
-    """The near side of a ball of 10 cm."""
     return front(center, 0.1, -1.0, count)
 
 
@@ -29,7 +38,6 @@ EVERYTHING = np.concatenate([BALL, WALL, STRAYS])
 def isolate(
     seen: PointCloud | DepthImage, config: IsolationConfig, unit_m: float = 1.0
 ) -> tuple[PointCloud, tuple[IsolationStep, ...]]:
-    """Points of the object, and what each step left out."""
     cloud = seen.to_points() if isinstance(seen, DepthImage) else seen
     found = find_object(observe(cloud, unit_m=unit_m).frame, config)
     return found.cloud, found.steps
@@ -48,7 +56,6 @@ def test_nothing_happens_by_default_and_a_depth_image_is_taken_as_its_points() -
 
 
 def test_crops_are_in_metres_whatever_the_unit() -> None:
-    """Millimetres are 0.001 m a unit; both limits belong to the range."""
     for unit_m in (1.0, 0.001):
         crop = IsolationConfig(depth_range=(0.7, 0.8), box=(-0.1, -0.1, 0.0, 0.0, 0.1, 2.0))
         corners = np.array([[-0.05, 0, 0.7], [0.05, 0, 0.7], [-0.05, 0, 0.69], [-0.05, 0.2, 0.75]])
@@ -79,17 +86,6 @@ def test_the_plane_is_the_one_of_least_squares() -> None:
     assert largest_plane(line, np.full(50, 0.1), np.random.default_rng(5)) is None
 
 
-def test_far_planes_are_as_rough_as_depth_cameras_make_them() -> None:
-    """A floor from 0.5 to 2.5 m with noise that grows with distance squared goes as a whole, a box on it stays."""
-    rng = np.random.default_rng(7)
-    z = rng.uniform(0.5, 2.5, 20000)
-    floor = np.column_stack([rng.uniform(-0.5, 0.5, 20000), np.full(20000, 0.3), z])
-    floor[:, 1] += rng.normal(0, 0.002, 20000) * z**2
-    box = rng.uniform((-0.05, 0.1, 1.0), (0.05, 0.2, 1.05), (1000, 3))
-    left = kept(np.concatenate([floor, box]), IsolationConfig(remove_plane=True))
-    assert (left[:, 1] <= 0.2).sum() >= 1000 and len(left) < 1000 + 0.01 * len(floor)
-
-
 def test_outliers_go_and_the_object_stays() -> None:
     left = kept(np.concatenate([BALL, STRAYS]), IsolationConfig(remove_outliers=True))
     off = np.linalg.norm(left - [0, 0, 0.8], axis=1) - 0.1
@@ -114,7 +110,6 @@ def test_clusters_follow_neighbours_not_distance() -> None:
 
 
 def test_groups_within_the_gap_are_kept_with_those_behind_them() -> None:
-    """A few floating points are no group, however near."""
     row = [half_ball(n, (x, 0.0, 0.8)) for n, x in ((3000, 0.0), (800, 0.25), (500, 0.5), (700, -0.5))]
     row.append(np.array([0.0, 0.0, 0.66]) + np.zeros((5, 1)))
     gap = IsolationConfig(largest_cluster=True, cluster_gap=0.06)
@@ -162,8 +157,96 @@ def test_thinning_is_even_and_keeps_measurements() -> None:
     assert len(thin_to_grid(np.ones((100, 3)), 10)) == 10
 
 
-def test_spacing_is_that_of_the_pixels() -> None:
-    grid = np.stack(np.meshgrid(np.arange(50.0), np.arange(40.0), [7.0]), axis=-1).reshape(-1, 3)
-    assert spacing(0.25 * grid) == pytest.approx(0.25)
-    assert spacing(np.repeat(grid, 2, axis=0)) == pytest.approx(1.0), "the same place twice is no distance"
-    assert spacing(np.ones((9, 3))) == 0.0
+SEED, OFF = 700_000, 3.0
+"""Training draws, and the distance in scene units from which on a point is a stray: six times the noise."""
+
+
+def views(name: str, sensor: Sensor, which: Iterable[int]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Points of views, and whether each is on the object."""
+    scene, settings = load_scene(name).for_seed(SEED), GenerateConfig(sensor=SENSORS[sensor])
+    seen = [sample_view(scene, settings, example_rng(SEED, index)) for index in which]
+    clouds = [(view, view.depth.to_points().points) for view in seen]
+    return [(points, np.asarray(Solids(view.mesh).nearest(points).distance) < OFF) for view, points in clouds]
+
+
+def strays_left(reading: Reading, points: np.ndarray, genuine: np.ndarray) -> int:
+    return len(set(map(tuple, points[~genuine])) & set(map(tuple, reading.cloud.points)))
+
+
+def lengthened(reading: Reading, points: np.ndarray, genuine: np.ndarray) -> float:
+    return longest_side(reading.cloud.points) / longest_side(points[genuine])
+
+
+def wall_behind_plate(rim: int = 2, fragments: int = 8) -> tuple[np.ndarray, np.ndarray]:
+    """A plate of 30 x 30 pixels and pieces of a rim of the wall, in metres; whether each point is of the plate."""
+    u, v = (axis.ravel() for axis in np.meshgrid(np.arange(30 + rim) - 15.0, np.arange(30) - 15.0))
+    genuine = u < 15
+    whole = genuine | (v % (30 // fragments) > 0)
+    depth = np.where(genuine, 0.5, 1.5)
+    return (np.column_stack([u, v, np.full(len(u), 100.0)]) * depth[:, None] / 100)[whole], genuine[whole]
+
+
+def test_scattered_strays_are_dropped_and_said() -> None:
+    points, genuine = wall_behind_plate()
+    taken, other = readings(PointCloud(points))
+    np.testing.assert_array_equal(taken.cloud.points, points[genuine])
+    assert other.cloud.points is points and (other.dropped, other.step, str(other)) == (0, None, "")
+    assert taken.dropped == (~genuine).sum() and taken.step is not None
+    assert (taken.step.name, taken.step.before, taken.step.kept) == ("strays", len(points), genuine.sum())
+    assert str(taken) == (
+        f"strays: {taken.dropped} of {len(points)} points dropped, the longest side was {taken.stretch:.3g} times as "
+        "long with them (--keep-all keeps them)"
+    )
+    assert taken.stretch == pytest.approx(longest_side(points) / longest_side(points[genuine]))
+    assert taken.step.detail == f"the longest side was {taken.stretch:.3g} times as long with the others"
+
+
+def test_one_piece_that_lies_apart_stays_and_is_left_open() -> None:
+    """It may be a part whose root is hidden: the head behind the body."""
+    points, genuine = wall_behind_plate(fragments=1)
+    taken, other = readings(points)
+    assert taken.dropped == 0 and taken.cloud.points is points
+    np.testing.assert_array_equal(other.cloud.points, points[genuine])
+
+
+def test_everything_is_kept_where_asked_or_where_nothing_can_be_told() -> None:
+    points, _ = wall_behind_plate()
+    (everything,) = readings(points, keep_all=True)
+    assert everything.cloud.points is points
+    rng = np.random.default_rng(0)
+    for cloud in (points[:31], rng.uniform((-1, -1, 4), (1, 1, 6), (3000, 3)), np.ones((50, 3)), np.zeros((0, 3))):
+        assert [reading.dropped for reading in readings(cloud)] == [0]
+
+
+@pytest.mark.parametrize("name", ["shapes", "lizard"])
+def test_clean_views_lose_nothing(name: str) -> None:
+    for points, genuine in views(name, "paper", range(6)):
+        assert genuine.all() and readings(points)[0].cloud.points is points
+
+
+def test_views_of_a_sensor_come_back_to_the_objects_size() -> None:
+    for points, genuine in views("shapes", "structured-light", (2, 3, 4)):
+        taken, other = readings(points)
+        assert lengthened(other, points, genuine) > 1.08 and strays_left(other, points, genuine) >= 5
+        assert 0.96 < lengthened(taken, points, genuine) < 1.01 and strays_left(taken, points, genuine) == 0
+
+
+@pytest.mark.parametrize("name", SCANS)
+def test_real_scans_lose_nothing(name: str, require_asset: Callable[[str], Path]) -> None:
+    require_asset(f"bunny/{name}.ply")
+    points = bunny_scan(name)[0].points
+    for limit in (2000, 10_000, 10**6):
+        scan = random_subset(points, limit)
+        (only,) = readings(scan, "scanner")
+        assert only.cloud.points is scan
+
+
+def test_a_scan_is_seen_along_its_estimated_lines_of_sight() -> None:
+    """Where it was taken from is not said; points that float about a plate are off it from anywhere in front."""
+    line = np.linspace(-0.1, 0.1, 40)
+    plate = np.stack(np.meshgrid(line, line, [5.0]), axis=-1).reshape(-1, 3)
+    floating = np.random.default_rng(0).uniform((-0.1, -0.1, 4.2), (0.1, 0.1, 4.8), (20, 3))
+    scan = np.concatenate([plate, floating])
+    taken, other = readings(PointCloud(scan), "scanner")
+    np.testing.assert_array_equal(taken.cloud.points, plate)
+    assert other.dropped == 0 and taken.stretch == pytest.approx(np.ptp(scan[:, 2]) / 0.2)

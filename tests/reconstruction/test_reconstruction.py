@@ -3,22 +3,26 @@
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 from analytic import AnalyticModel, ball, logits_of, union
 from answers import answer_to, reconstruct
+from many_frames import content, frames, loads, run
 from two_balls import BIG, NAMES, SMALL, front, scene, two_balls
 
 import mereo
+from mereo.cli import reconstruct as many
 from mereo.cli.answers import ReconstructCommand, StreamCommand
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.cli.stream import stream_reconstructions
 from mereo.fitting.registration.answer import Answer
+from mereo.io.atomic_files import MARKER
 from mereo.io.config import InputConfig
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import SizeWarning
@@ -40,7 +44,6 @@ def found(answer: Answer) -> Reconstruction:
 
 
 def test_labels_are_the_fields_at_their_positions(found: Reconstruction) -> None:
-    """Grid, origin and spacing are in the input's frame: every voxel has the label of its own place."""
     grid = found.labels
     index = np.indices(grid.labels.shape).reshape(3, -1).T
     expected = two_balls(grid.positions(index)).argmax(axis=1)
@@ -71,17 +74,6 @@ def test_components_are_counted_and_nothing_is_removed() -> None:
     assert segment.volume == pytest.approx(4 / 3 * np.pi * (0.5**3 + 0.1**3 + 0.04**3), rel=0.02)
 
 
-def test_the_unit_of_the_cloud_does_not_matter() -> None:
-    """A factor of two to the ten is exact in floating point, so labels agree bit by bit."""
-    field = logits_of(ball((0.1, 0.2, 0.3), 0.9), ball((0.1, 0.2, 1.5), 0.4), ball((-0.9, -0.4, 0.0), 0.1))
-    cloud, model = scene("camera")[0], AnalyticModel.of(field, NAMES, normalized=True)
-    small, large = (reconstruct(factor * cloud, model, resolution=40) for factor in (1.0, 1024.0))
-    np.testing.assert_array_equal(small.labels.labels, large.labels.labels)
-    np.testing.assert_array_equal(1024.0 * small.labels.spacing, large.labels.spacing)
-    for a, b in zip(small.segments, large.segments, strict=True):
-        assert 1024.0**3 * a.volume == pytest.approx(b.volume, rel=1e-9)
-
-
 def test_files(answer: Answer, tmp_path: Path) -> None:
     frame, result = answer.seen.frame.axes, answer.reconstruction
     (tmp_path / "out").mkdir()
@@ -109,25 +101,34 @@ def test_files(answer: Answer, tmp_path: Path) -> None:
     np.testing.assert_allclose(place[:3], np.array(BIG[0]) * ([1, -1, -1] if frame == "camera" else 1), atol=1e-6)
 
 
+FAR_BEHIND = np.random.default_rng(1).uniform((-0.3, -0.3, 0.9), (0.3, 0.3, 1.3), (30, 3))
+
+
+@pytest.fixture
+def read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Reconstruction]:
+    """Answer to a cloud in metres, written into a folder, by a model of a known true size."""
+
+    def answered(folder: str, cloud: np.ndarray, visible_m: list[float], **isolation: Any) -> Reconstruction:
+        model = replace(scene("camera")[1], provenance={"visible_m": visible_m})
+        monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: model)
+        np.save(tmp_path / "cloud.npy", cloud)
+        command = ReconstructCommand((), weights="any", resolution=16, reading=InputConfig(unit_m=1.0))
+        job = FrameJob(replace(command, isolation=IsolationConfig(**isolation)))
+        return reconstruct_file(tmp_path / "cloud.npy", tmp_path / folder, job).reconstruction
+
+    return answered
+
+
 def test_what_is_read_and_left_out_is_printed_and_kept(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    read: Callable[..., Reconstruction], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Something else beside the object is left out when asked; the summary says so."""
-    cloud, model = scene("camera")
-    np.save(tmp_path / "cloud.npy", np.concatenate([cloud, front((0.9, 0.0, 0.9), 0.03, -1.0)]))
-    monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: replace(model, provenance={"visible_m": [2, 3]}))
-    read = partial(reconstruct_file, tmp_path / "cloud.npy")
-    job = FrameJob(ReconstructCommand((), weights="any", resolution=16, reading=InputConfig(unit_m=1.0)))
+    cloud = scene("camera")[0]
+    crowded = np.concatenate([cloud, front((0.9, 0.0, 0.9), 0.03, -1.0)])
     with pytest.warns(SizeWarning, match="the visible part is 0.97 m long, but 2 to 3 m in training: other things"):
-        read(tmp_path / "crowded", job)
+        read("crowded", crowded, [2, 3])
     assert "strays:" not in capsys.readouterr().out, "it is a surface: nothing says that it is not the object"
     with pytest.warns(SizeWarning, match="the visible part is 0.1[0-9]* m long"):
-        read(
-            tmp_path / "alone",
-            replace(
-                job, command=replace(job.command, isolation=IsolationConfig(largest_cluster=True, cluster_gap=0.02))
-            ),
-        )
+        read("alone", crowded, [2, 3], largest_cluster=True, cluster_gap=0.02)
     assert "largest cluster: 1200 of 1800 points kept (1 of 2 clusters" in capsys.readouterr().out
     summary = json.loads((tmp_path / "alone/summary.json").read_text())
     assert summary["points"] == 1200 and summary["isolation"][-1]["name"] == "largest cluster"
@@ -135,25 +136,12 @@ def test_what_is_read_and_left_out_is_printed_and_kept(
     assert max(summary["visible_size_m"]) == pytest.approx(np.ptp(cloud[:, 1]), rel=1e-6)
 
 
-def with_strays() -> tuple[np.ndarray, np.ndarray, AnalyticModel]:
-    """The two balls with thirty single points far behind, the balls alone, and their model."""
-    own, model = scene("camera")
-    lone = np.random.default_rng(1).uniform((-0.3, -0.3, 0.9), (0.3, 0.3, 1.3), (30, 3))
-    return np.concatenate([own, lone]), own, model
-
-
 def test_strays_are_dropped_and_said_unless_all_are_to_be_kept(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    read: Callable[..., Reconstruction], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The answer is that to the object's own points, bit for bit."""
-    cloud, own, model = with_strays()
-    np.save(tmp_path / "cloud.npy", cloud)
-    monkeypatch.setattr(
-        "mereo.models.weights.load_for", lambda *_: replace(model, provenance={"visible_m": [0.1, 0.2]})
-    )
-    read = partial(reconstruct_file, tmp_path / "cloud.npy")
-    job = FrameJob(ReconstructCommand((), weights="any", resolution=16, reading=InputConfig(unit_m=1.0)))
-    result = read(tmp_path / "out", job).reconstruction
+    own, model = scene("camera")
+    cloud = np.concatenate([own, FAR_BEHIND])
+    result = read("out", cloud, [0.1, 0.2])
     said = capsys.readouterr().out
     assert "strays: 30 of 1230 points dropped, the longest side was" in said and "(--keep-all keeps them)" in said
     summary = json.loads((tmp_path / "out/summary.json").read_text())
@@ -162,7 +150,7 @@ def test_strays_are_dropped_and_said_unless_all_are_to_be_kept(
     assert (step["name"], step["before"], step["kept"]) == ("strays", 1230, 1200)
     np.testing.assert_array_equal(result.labels.labels, reconstruct(own, model, resolution=16).labels.labels)
     with pytest.warns(SizeWarning, match="the visible part is 0.[5-9][0-9]* m long"):
-        read(tmp_path / "all", replace(job, command=replace(job.command, isolation=IsolationConfig(keep_all=True))))
+        read("all", cloud, [0.1, 0.2], keep_all=True)
     assert "strays:" not in capsys.readouterr().out
     assert json.loads((tmp_path / "all/summary.json").read_text())["points"] == 1230
 
@@ -171,13 +159,11 @@ def test_strays_are_dropped_and_said_unless_all_are_to_be_kept(
 def test_a_stream_drops_strays_and_counts_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, keep_all: bool, strays: int
 ) -> None:
-    cloud, _, model = with_strays()
-    np.save(tmp_path / "cloud.npy", cloud)
+    own, model = scene("camera")
+    np.save(tmp_path / "cloud.npy", np.concatenate([own, FAR_BEHIND]))
     monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: model)
     isolation = IsolationConfig(keep_all=keep_all)
-    stream_reconstructions(
-        StreamCommand(str(tmp_path), weights="any", resolution=16, every_frame=True, isolation=isolation)
-    )
+    stream_reconstructions(StreamCommand(str(tmp_path), weights="any", resolution=16, isolation=isolation))
     assert json.loads(capsys.readouterr().out)["strays"] == strays
 
 
@@ -189,3 +175,84 @@ def test_every_public_name_exists_and_importing_the_package_loads_nothing() -> N
         mereo.reconstrukt  # noqa: B018
     code = "import sys, mereo; print(sorted({'torch', 'numpy', 'scipy'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
+
+
+__all__ = ["loads"]  # a fixture
+
+
+def test_each_frame_of_a_folder_gets_what_it_gets_alone(
+    tmp_path: Path, loads: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = frames(tmp_path / "frames", "a.npy", "b.npy")
+    (folder / "notes.md").write_text("no frame")
+    (folder / ".hidden.npy").touch()
+    assert run(folder, "--output", tmp_path / "all") == 0
+    assert loads == ["any"]
+    assert sorted(path.name for path in (tmp_path / "all").iterdir()) == ["a", "b"]
+    said = capsys.readouterr().out
+    assert f"[1/2] {folder / 'a.npy'}\n" in said and f"[2/2] {folder / 'b.npy'}, " in said and "2 frames" in said
+    assert run(folder / "b.npy", "--output", tmp_path / "one") == 0
+    assert content(tmp_path / "one") == content(tmp_path / "all/b")
+
+
+def test_a_bad_frame_is_its_own(tmp_path: Path, loads: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    folder = frames(tmp_path / "frames", "good.npy")
+    (folder / "bad.ply").write_text("nonsense")
+    assert run(folder, tmp_path / "missing.npy", "--output", tmp_path / "out") == 2
+    printed = capsys.readouterr()
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["good"]
+    first, second, last = (line for line in printed.err.splitlines() if line.startswith("mereo: error: "))
+    assert "bad.ply cannot be read as a point cloud" in first and "missing.npy" in second
+    assert "2 of 3 frames could not be reconstructed" in last
+    rows = [line for line in printed.out.splitlines() if "bad.ply" in line or "missing.npy" in line]
+    assert all("none" in row for row in rows[2:]) and len(rows) == 4, "a heading and a row of the table each"
+
+
+def test_results_that_are_there_are_kept_without_force(
+    tmp_path: Path, loads: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, out = frames(tmp_path / "frames", "a.npy"), tmp_path / "out"
+    (out / "a").mkdir(parents=True)
+    (out / "a/mine.txt").write_text("keep")
+    assert run(folder, "--output", out) == 2
+    assert "exists and is not empty" in capsys.readouterr().err
+    assert run(folder, "--output", out, "--force") == 2
+    assert "not written by this version of mereo" in capsys.readouterr().err
+    assert [path.name for path in (out / "a").iterdir()] == ["mine.txt"]
+
+
+def test_what_is_no_frames_fault_stops_before_the_work(
+    tmp_path: Path, loads: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = frames(tmp_path / "frames", "a.npy", "b.npy")
+    out = tmp_path / "out"
+    for options, sentence in (
+        (("--carry-frame", "scene"), "nothing is carried"),
+        (("--carry", tmp_path / "no.stl"), "no.stl"),
+        (("--scene", tmp_path / "no.yaml", "--method", "modes"), "no.yaml"),
+    ):
+        assert run(folder, "--output", out, *options) == 2
+        printed = capsys.readouterr()
+        assert sentence in printed.err and printed.err.count("\n") == 1 and not out.exists(), printed.err
+    out.mkdir()
+    (out / MARKER).write_text("{}")
+    assert run(folder, "--output", out) == 2
+    assert "is a folder of results; each frame gets a folder of its own" in capsys.readouterr().err
+    assert run("--output", tmp_path / "out") == 2
+    assert "no input is given; name a frame" in capsys.readouterr().err
+    (tmp_path / "empty").mkdir()
+    assert run(tmp_path / "empty", "--output", tmp_path / "out") == 2
+    assert "has no depth images or point clouds" in capsys.readouterr().err
+
+
+def test_folders_are_called_by_as_much_of_the_name_as_tells_frames_apart(tmp_path: Path) -> None:
+    names = lambda *files: many.folder_names([tmp_path / file for file in files])  # noqa: E731
+    assert names("one/a.ply", "one/b.ply") == ["a", "b"]
+    assert names("one/a.ply", "one/a.npy") == ["a.ply", "a.npy"]
+    assert names("one/a.ply", "two/a.ply") == ["one-a.ply", "two-a.ply"]
+    with pytest.raises(ValueError, match=r"would both be written to 'one-a.ply': reconstruct them one at a time"):
+        names("x/one/a.ply", "y/one/a.ply")
+    with pytest.raises(ValueError, match="would both"):
+        names("one/a.ply", "one/A.ply")
+    folder = frames(tmp_path / "frames", "a.npy", "b.npy")
+    assert many.list_frames([folder / "b.npy", folder], InputConfig()) == [folder / "b.npy", folder / "a.npy"]

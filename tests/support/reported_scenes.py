@@ -6,20 +6,19 @@ import re
 from pathlib import Path
 
 import numpy as np
-import trimesh
+import shapes
 
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
-from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.mesh import Segment, SegmentedMesh
 
 
-def ball(name: str, shift: float, color: tuple[int, int, int], level: int = 3) -> Segment:
-    mesh = trimesh.creation.icosphere(level, radius=0.1)
-    return Segment(name, color, mesh.vertices + np.array([shift, 0, 0.5]), np.array(mesh.faces))
+def ball(name: str, shift: float, color: int, level: int = 3) -> Segment:
+    return shapes.ball((shift, 0.0, 0.5), 0.1, name, color, level)
 
 
 def example() -> tuple[PointCloud, SegmentedMesh, dict[str, object]]:
     lost = Segment("lost", (0, 158, 115), np.empty((0, 3)), np.empty((0, 3), dtype=np.int64))
-    mesh = SegmentedMesh((ball("head", -0.1, PALETTE[0]), ball("tail </script><b>", 0.1, PALETTE[1]), lost))
+    mesh = SegmentedMesh((ball("head", -0.1, 0), ball("tail </script><b>", 0.1, 1), lost))
     summary = {
         "title": "A <b>bold</b> </script> title",
         "points": 104,

@@ -3,8 +3,9 @@
 import json
 import os
 import re
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -14,15 +15,29 @@ from scene_code import CODE
 from scene_files import write_bar, write_mesh
 from shapes import ball
 from toy_data import SMALL
-from toy_scene import toy_scene
+from toy_scene import rest_mesh, sample_deformations, toy_scene
 
+import mereo.__main__ as command_line
 from mereo.api.generate import generate
-from mereo.scenes.scene import Scene
-from mereo.scenes.seeds import TEST_SEED_START
-from mereo.synthesis.config import GenerateConfig
-from mereo.synthesis.examples import Example, synthesize
+from mereo.cli import training
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.conventions import MIN_POINTS
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.solids import Solids
+from mereo.geometry.transforms import transform_points
+from mereo.models.model import Model
+from mereo.models.trained import EncodedCloud
+from mereo.models.weights import load_model
+from mereo.scenes.scene import PAPER_APERTURE_RAD, WHOLE_SPHERE_RAD, Scene, Workspace
+from mereo.scenes.seeds import TEST_SEED_START, example_rng
+from mereo.synthesis.config import SENSOR_TERMS, SENSORS, GenerateConfig, SamplingConfig, Sensor, SensorConfig
+from mereo.synthesis.examples import Example, View, sample_view, synthesize
 from mereo_learning import shards
+from mereo_learning.evaluation_report import evaluate_weights
+from mereo_learning.model_card import card
+from mereo_learning.scoring import EvaluationConfig
 from mereo_learning.shards import example_bytes
+from mereo_learning.tables import read_metrics
 
 TOY = toy_scene()
 
@@ -66,7 +81,6 @@ def test_killed_and_resumed_equals_uninterrupted(
 
 
 def test_tensors_are_as_documented_and_a_paper_size_dataset_fits_in_2_5_gigabytes(whole: Path) -> None:
-    """28,800 examples of a five-segment scene, on disk and in memory."""
     shard = load_file(whole / "shard-00000.safetensors")
     queries = SMALL.sampling.total(4)
     assert {key: (value.dtype.name, value.shape) for key, value in shard.items()} == {
@@ -192,3 +206,180 @@ def test_two_workers_make_the_same_files_as_one(kind: str, tmp_path: Path) -> No
         scene.write_text(CODE.format(name="mine", file=str(file)))
     one = made(scene, tmp_path / "one", 1, examples=70)
     assert made(scene, tmp_path / "two", 2, examples=70) == one
+
+
+NARROW = Workspace(axis=(0.0, 1.0, 0.0), aperture_rad=0.5)
+ALL_AROUND = Workspace(axis=(1.0, 0.0, 0.0), aperture_rad=WHOLE_SPHERE_RAD, any_roll=True, distance=(90.0, 95.0))
+
+
+def parsed(text: str) -> training.Generate | training.Evaluate:
+    command = command_line.parse(text.split())
+    assert isinstance(command, training.Generate | training.Evaluate)
+    return command
+
+
+def generate_options(text: str) -> GenerateConfig:
+    command = parsed(f"generate rope --examples 7 --output out {text}")
+    assert isinstance(command, training.Generate)
+    return command.settings
+
+
+@pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.parametrize("form", ["--sensor {}", "--sensor={}"])
+def test_an_option_chooses_a_sensor(name: Sensor, form: str) -> None:
+    assert generate_options(form.format(name)) == GenerateConfig(sensor=SENSORS[name])
+    command = parsed(f"evaluate rope --output out {form.format(name)}")
+    assert isinstance(command, training.Evaluate) and command.terms == SENSORS[name]
+    assert SENSORS[name].on == (name != "paper")
+
+
+def test_terms_are_added_to_a_sensor_and_all_are_off_by_default() -> None:
+    chosen = generate_options("--sensor structured-light --sensor.tool 0.3 --sensor.holes 0 --sampler label-uniform")
+    assert chosen.sensor == replace(SENSORS["structured-light"], tool=0.3, holes=0.0)
+    assert chosen.sampling.sampler == "label-uniform"
+    assert generate_options("--sensor.axial 1").sensor == SensorConfig(axial=1.0)
+    lengths = {"metres_per_unit", "model", "hole_radius_m"}
+    assert set(SENSOR_TERMS) | lengths == set(SensorConfig.__dataclass_fields__)
+    assert not SensorConfig().on and set(get_args(Sensor)) == set(SENSORS)
+    assert all(replace(SensorConfig(), **{name: 0.1}).on for name in SENSOR_TERMS)
+
+
+@pytest.mark.parametrize(
+    "options, sentences",
+    [
+        ("generate rope --examples 7 --sensor lidar", ("invalid choice 'lidar'", "'time-of-flight'")),
+        ("evaluate rope --workspace dome", ("invalid choice 'dome' for argument '--workspace'",)),
+        (
+            "generate rope --examples 1 --sensor.flying 2",
+            ("mereo: error: sensor.flying is 2.0; it must be from 0 to 1: give for example 0.0\n",),
+        ),
+        ("evaluate bunny --scans --sensor time-of-flight", ("are real and take no simulated camera: leave out --sen",)),
+        ("evaluate bunny --scans --workspace cone", ("--noise-std and --workspace",)),
+    ],
+)
+def test_unknown_and_contradictory_options_are_refused_before_anything_is_written(
+    options: str, sentences: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    try:
+        code = command_line.main([*options.split(), "--output", str(tmp_path / "out")])
+    except SystemExit as leaving:
+        code = leaving.code
+    printed = capsys.readouterr().err
+    assert code == 2 and all(sentence in printed for sentence in sentences), printed
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_scene_has_its_own_workspace_a_cone_and_the_sphere() -> None:
+    scene = replace(toy_scene(), workspace=NARROW)
+    assert scene.workspace_named("own") is scene.workspace_named("cone") is NARROW
+    assert scene.workspace_named("sphere") is not NARROW
+    assert asdict(scene.workspace_named("sphere")) == asdict(NARROW) | {"aperture_rad": 2 * np.pi, "any_roll": True}
+    scene = replace(toy_scene(), workspace=ALL_AROUND)
+    assert scene.workspace_named("own") is scene.workspace_named("sphere") is ALL_AROUND
+    expected = asdict(ALL_AROUND) | {"aperture_rad": PAPER_APERTURE_RAD, "any_roll": False}
+    assert asdict(scene.workspace_named("cone")) == expected
+    assert replace(scene, cone=NARROW).workspace_named("cone") is NARROW
+
+
+def test_evaluation_looks_through_the_sensor_from_the_workspace_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clouds: list[PointCloud] = []
+    encode = Model.encode
+
+    def watch(model: Model, cloud: PointCloud) -> EncodedCloud:
+        clouds.append(cloud)
+        return encode(model, cloud)
+
+    monkeypatch.setattr(Model, "encode", watch)
+    spoilt = GenerateConfig(128, 0.5, sensor=SENSORS["structured-light"])
+    found = []
+    for number, settings in enumerate((GenerateConfig(), spoilt, GenerateConfig(workspace="sphere"))):
+        config = EvaluationConfig(examples=1, cells=12, settings=settings, method="network")
+        evaluate_weights("rope", tmp_path / str(number), config)
+        found.append(read_metrics(tmp_path / str(number) / "metrics.json"))
+    own, through, around = found
+    assert [(fact["image_size"], fact["noise_std"]) for fact in found] == [(96, 0.1), (128, 0.5), (96, 0.1)]
+    assert [SensorConfig(**fact["sensor"]) for fact in (own, through)] == [SENSORS["paper"], spoilt.sensor]
+    assert len(clouds) == 3 and not np.array_equal(clouds[0].points[:20], clouds[1].points[:20])
+    assert (own["workspace"], around["workspace"]) == ("own", "sphere") and own["iou"] != around["iou"]
+    assert ", workspace sphere, noise 0.1 units" in card("rope", load_model("rope"), [around], b"")
+    assert "workspace sphere" not in card("rope", load_model("rope"), [own], b"").split("## Results")[-1]
+
+
+SETTINGS = GenerateConfig(sampling=SamplingConfig(per_segment=128))
+SCENE = toy_scene()
+
+
+def example_and_view(index: int, settings: GenerateConfig = SETTINGS) -> tuple[Example, View]:
+    """An example and the view it was made from: the view is drawn first, from the same generator."""
+    return synthesize(SCENE, settings, example_rng(1, index)), sample_view(SCENE, settings, example_rng(1, index))
+
+
+@pytest.fixture(scope="module", params=range(3))
+def case(request: pytest.FixtureRequest) -> tuple[Example, View]:
+    return example_and_view(request.param)
+
+
+Case = tuple[Example, View]
+
+
+def test_the_cloud_is_the_depth_image_unprojected_and_normalized(case: Case) -> None:
+    example, view = case
+    seen = view.depth.to_points().points
+    kept = example.normalizer.invert(example.cloud)
+    gaps = np.linalg.norm(kept[:, None] - seen[None], axis=-1)
+    assert gaps.min(axis=1).max() < 1e-6
+    assert len(np.unique(gaps.argmin(axis=1))) == len(kept) == min(len(seen), SETTINGS.points)
+    low, high = example.normalizer.apply(seen).min(axis=0), example.normalizer.apply(seen).max(axis=0)
+    assert np.isclose((high - low).max(), 2) and np.allclose(low + high, 0)
+    distance = Solids(view.mesh).nearest(view.depth.to_points().points).distance
+    # noise is along the ray: never farther from the surface than that, 0.1 in standard deviation
+    assert distance.max() < 0.6 and 0.02 < distance.mean() < 0.1
+
+
+def test_labels_distances_and_directions_are_those_of_the_deformed_segments(case: Case) -> None:
+    example, view = case
+    queries, solids = example.queries, Solids(view.mesh)
+    points = example.normalizer.invert(queries.positions)
+    clear = solids.nearest(points).distance > 1e-6
+    assert np.array_equal(solids.label(points[clear]), queries.labels[clear])
+    assert np.array_equal(queries.distances < 0, queries.labels > 0)
+    assert len(queries.labels) == SETTINGS.sampling.total(4)
+    foot = queries.positions + np.abs(queries.distances)[:, None] * queries.directions
+    assert Solids(view.mesh).nearest(example.normalizer.invert(foot)).distance.max() < 1e-6
+    assert np.allclose(np.linalg.norm(queries.directions, axis=1), 1)
+
+
+def test_rest_coordinates_lead_back_to_the_query_and_lie_in_the_same_segment_at_rest(case: Case) -> None:
+    """The theorem: deform(rest) is the query's place in the scene; outside there is no rest."""
+    example, view = case
+    queries = example.queries
+    low, high = SCENE.rest.bounds
+    rest = queries.rest * (high - low).max() / 2 + (low + high) / 2
+    world = transform_points(view.T_world_camera, example.normalizer.invert(queries.positions))
+    assert np.array_equal(np.isnan(queries.rest).any(axis=1), queries.labels == 0)
+    for index, deformation in enumerate(view.deformations):
+        members = queries.labels == index + 1
+        assert members.sum() >= 64
+        assert np.abs(deformation(rest[members]) - world[members]).max() < 1e-3
+        assert (np.abs(queries.rest[members]) <= 1 + 1e-4).all()
+    inside, solids = queries.labels > 0, Solids(SCENE.rest)
+    rest = rest[inside]
+    # faces are flat before and after, the map between them is not: only points beside a face may change sides
+    clear = solids.nearest(rest).distance > 0.1
+    assert np.array_equal(solids.label(rest[clear]), queries.labels[inside][clear])
+
+
+def test_views_that_see_too_little_are_drawn_again_and_a_scene_out_of_sight_is_named() -> None:
+    far = toy_scene(distance=(20_000.0, 20_001.0))
+    with pytest.raises(ValueError, match=rf"'toy' showed fewer than {MIN_POINTS} points in 100 random views"):
+        sample_view(far, SETTINGS, example_rng(0, 0))
+
+    def sometimes_tiny(rng: np.random.Generator) -> tuple:
+        tiny = bool(rng.random() < 0.5)
+        return tuple((lambda p, d=d: 1e-3 * p) if tiny else d for d in sample_deformations(rng))
+
+    scene = Scene("blinking", SegmentedMesh(rest_mesh().segments), sometimes_tiny, Workspace())
+    counts = [sample_view(scene, SETTINGS, example_rng(4, index)).depth.valid.sum() for index in range(12)]
+    assert min(counts) >= MIN_POINTS

@@ -5,12 +5,16 @@ from statistics import NormalDist
 
 import numpy as np
 import pytest
-from shapes import ball, box, one
+import trimesh
+from shapes import ball, box, one, segment
+from toy_scene import toy_scene
 
 from mereo.geometry.camera import Camera
-from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.synthesis.config import SENSOR_TERMS, SENSORS, SensorConfig, SensorModel
+from mereo.scenes.seeds import example_rng
+from mereo.synthesis.clutter import BACKGROUND, NOTHING, OBJECT, OCCLUDER, Capsule
+from mereo.synthesis.config import SENSOR_TERMS, SENSORS, GenerateConfig, SamplingConfig, SensorConfig, SensorModel
 from mereo.synthesis.depth_sensor import (
     SimulatedView,
     add_depth_noise,
@@ -23,6 +27,7 @@ from mereo.synthesis.depth_sensor import (
     render_depth,
     sample_mask,
 )
+from mereo.synthesis.examples import sample_view, synthesize
 
 CAMERA = Camera.from_fov(96, 96, np.deg2rad(35))
 RAYS = CAMERA.directions()
@@ -32,7 +37,6 @@ MODELS: tuple[SensorModel, ...] = ("structured-light", "time-of-flight")
 
 
 def wall(z: float, tilt_deg: float = 0.0) -> Solids:
-    """A plane through (0, 0, z), turned about the y axis; it fills the image."""
     part = box((-9000, -9000, 0), (9000, 9000, 5))
     cosine, sine = np.cos(np.deg2rad(tilt_deg)), np.sin(np.deg2rad(tilt_deg))
     turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
@@ -49,7 +53,7 @@ def look(solids: Solids, seed: int = 0, noise_std: float = 0.0, **terms: object)
     return observe(solids, CAMERA, noise_std, replace(OFF, **terms), np.random.default_rng(seed))  # type: ignore[arg-type]
 
 
-def test_published_values_which_grow_with_distance_and_slant() -> None:
+def test_published_values() -> None:
     """By hand from the papers' formulas: Kinect at 1 m and at 0.4 m and 45 degrees, Kinect v2 at 2 m; pixels."""
     z, flat = np.array([1.0]), np.zeros(1)
     assert axial_std_m(z, flat) == pytest.approx(0.001884)
@@ -58,11 +62,7 @@ def test_published_values_which_grow_with_distance_and_slant() -> None:
     assert lateral_std(z, flat) * 585 == pytest.approx(0.8)
     assert lateral_std(z, np.array([np.pi / 4])) * 585 == pytest.approx(0.835)
     assert lateral_std(np.array([2.0]), flat, "time-of-flight") == pytest.approx(0.0008)
-    z, angle = np.linspace(0.5, 4, 50), np.linspace(0, np.pi / 2, 91)
-    for model in MODELS:
-        assert (np.diff(axial_std_m(np.linspace(1, 4, 50), np.zeros(50), model)) > 0).all()
-        assert (np.diff(axial_std_m(np.ones(91), angle, model)) >= 0).all()
-    assert np.isfinite(axial_std_m(z, np.full(50, np.pi / 2))).all()
+    assert np.isfinite(axial_std_m(np.linspace(0.5, 4, 50), np.full(50, np.pi / 2))).all()
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -194,14 +194,10 @@ def test_any_sensor_leaves_later_draws_as_they_were(name: str) -> None:
 
 
 def test_a_term_does_not_change_what_others_draw() -> None:
-    """The same pixels drop out, the same noise is drawn, with and without the rest."""
     alone = look(wall(150.0, 70.0), dropout=0.9).image.valid
     assert np.array_equal(look(wall(150.0, 70.0), dropout=0.9, axial=1.0, flying=0.5).image.valid, alone)
     noise = look(wall(150.0), axial=1.0).whole.depth
     assert np.array_equal(look(wall(150.0), axial=1.0, background=1.0, tool=0.0).whole.depth, noise)
-
-
-# --- the depth camera -------------------------------------------------------------------------------------------------
 
 
 NARROW = Camera.from_fov(96, 96, float(np.deg2rad(30)))
@@ -221,13 +217,6 @@ def test_depth_of_a_sphere_is_the_smaller_root_of_the_ray_equation() -> None:
     # a face of this sphere is up to radius * 5e-4 below the sphere, seen at a slant of at most 1 / 0.3
     error = depth[well_inside] - expected[well_inside]
     assert error.min() > -1e-3 and error.max() < 0.05
-
-
-def test_the_nearer_surface_hides_the_other() -> None:
-    mesh = SegmentedMesh((box((-50, -50, 130), (50, 50, 140), "wall"), box((-5, -5, 100), (5, 5, 110), "block", 1)))
-    depth = render_depth(mesh, NARROW).depth
-    block = np.abs(NARROW.directions()[..., :2] * 100).max(axis=-1) < 5
-    assert np.allclose(depth[block], 100, rtol=1e-6) and np.allclose(depth[~block], 130, rtol=1e-6)
 
 
 def test_noise_has_the_asked_deviation_on_hits_only() -> None:
@@ -254,3 +243,111 @@ def test_a_deviation_must_be_finite_and_not_negative(std: float) -> None:
     image = render_depth(one(ball((0, 0, 150), 30.0)), NARROW)
     with pytest.raises(ValueError, match=r"the depth noise is .*; it is a standard deviation, finite and at least 0"):
         add_depth_noise(image, std, np.random.default_rng(0))
+
+
+SIGHT = RAYS.reshape(-1, 3)
+SCENE = toy_scene()
+PAIR = Solids(SegmentedMesh((ball((-5, 0, 150), 15.0), box((12, -15, 140), (30, 15, 165), color=1))))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_rays_hit_a_capsule_where_they_hit_its_triangles(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    low, high = (-30, -30, 100), (30, 30, 160)
+    start, end, radius = rng.uniform(low, high), rng.uniform(low, high), rng.uniform(3, 10)
+    rows, hits = Capsule(start, end, radius).first_hit(SIGHT)
+    length = float(np.linalg.norm(end - start))
+    mesh = trimesh.creation.capsule(length, radius, count=[128, 128], transform=np.eye(4))
+    mesh.apply_translation([0, 0, -mesh.bounds.mean(axis=0)[2]])
+    mesh.apply_transform(trimesh.geometry.align_vectors([0, 0, 1], (end - start) / length))
+    mesh.apply_translation((start + end) / 2)
+    expected = Solids(one(segment(mesh))).first_hit(SIGHT)
+    distance = np.full(len(SIGHT), np.inf)
+    distance[rows] = hits.distance
+    both = np.isfinite(distance) & np.isfinite(expected.distance)
+    assert both.sum() > 100 and (np.isfinite(distance) != np.isfinite(expected.distance)).sum() < 0.03 * both.sum()
+    assert np.median(np.abs(distance[both] - expected.distance[both])) < 0.01
+    normal = hits.normal / np.linalg.norm(hits.normal, axis=1, keepdims=True)
+    assert np.allclose(np.linalg.norm(hits.normal, axis=1), radius)
+    assert (np.einsum("ij,ij->i", normal, SIGHT[rows]) < 1e-9).all()
+
+
+def test_a_capsule_without_length_is_a_ball_and_behind_the_camera_nothing() -> None:
+    center = np.array([3.0, -4.0, 120.0])
+    rows, hits = Capsule(center, center, 10.0).first_hit(SIGHT)
+    places = SIGHT[rows] * hits.distance[:, None]
+    assert len(rows) > 100 and np.allclose(np.linalg.norm(places - center, axis=1), 10.0)
+    assert len(Capsule(-center, np.array([40.0, 0, -100]), 10.0).first_hit(SIGHT)[0]) == 0
+
+
+BOXES = [
+    box(low, low + np.array([20, 12, 15]))
+    for low in np.random.default_rng(0).uniform((-40, -40, 90), (20, 20, 190), (8, 3))
+]
+
+
+@pytest.mark.parametrize("part", [ball((-38, 30, 130), 14.0), ball((0, 0, 10), 14.0), *BOXES])
+def test_rays_that_are_left_out_would_have_missed(part: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    culled = Solids(one(part)).first_hit(SIGHT).distance
+    monkeypatch.setattr("mereo.geometry.solids.toward", lambda directions, low, high: np.arange(len(directions)))
+    found = Solids(one(part)).first_hit(SIGHT).distance
+    assert np.isfinite(found).sum() > 50 and np.array_equal(found, culled)
+
+
+@pytest.mark.parametrize("term", ["tool", "hand"])
+def test_occluders_are_in_front_hide_the_object_and_come_from_outside(term: str) -> None:
+    clear = look(PAIR, 0)
+    depth, hidden, borders = clear.whole.depth, [], 0
+    for seed in range(40):
+        seen = look(PAIR, seed, **{term: 1.0})
+        occluder = seen.source == OCCLUDER
+        over = occluder & (clear.source == OBJECT)
+        assert (seen.whole.depth[over] < depth[over]).all() and not seen.mask[occluder].any()
+        assert np.array_equal(seen.image.depth, np.where(occluder, 0, depth))
+        hidden.append(over.sum())
+        edge = np.concatenate([occluder[0], occluder[-1], occluder[:, 0], occluder[:, -1]])
+        borders += bool(edge.any())
+    assert np.mean(np.array(hidden) > 0) > 0.9 and np.mean(hidden) > 10 and borders >= 38
+
+
+def test_a_wrong_mask_lets_background_and_tools_in_and_loses_the_object() -> None:
+    """As many pixels on both sides of the outline, on average; without a background only losses remain."""
+    truth = (look(PAIR, 0).source == OBJECT).sum()
+    leaked, lost = [], []
+    for seed in range(60):
+        seen = look(PAIR, seed, background=1.0, mask_offset_px=1.0)
+        leaked.append((seen.image.valid & (seen.source == BACKGROUND)).sum())
+        lost.append(truth - seen.object_points)
+    outline = 2 * np.pi * 15 + 96
+    assert 0.5 < np.mean(leaked) / np.mean(lost) < 2
+    assert 0.1 * outline < np.mean(leaked) < outline
+    alone = look(PAIR, 0, mask_offset_px=1.0)
+    assert alone.image.valid.sum() == alone.object_points
+    stray = [look(PAIR, seed, tool=1.0, mask_offset_px=1.5) for seed in range(20)]
+    assert sum(bool((seen.image.valid & (seen.source == OCCLUDER)).any()) for seen in stray) > 10
+
+
+def test_the_paper_makes_the_examples_it_always_made() -> None:
+    """Values from before there were other sensors, within the single precision of rays: 4e-7 of an image's sum."""
+    config = GenerateConfig(image_size=48, points=128, sampling=SamplingConfig(per_segment=16))
+    example, view = (make(SCENE, config, example_rng(3, 5)) for make in (synthesize, sample_view))
+    assert view.depth.valid.sum() == 243 and view.depth.depth.sum() == pytest.approx(31193.8164, rel=1e-6)
+    assert example.normalizer.scale == pytest.approx(0.0489688726, rel=1e-6)
+    assert np.allclose(example.cloud[1], [-0.9883676, -0.23809237, 0.19280505], atol=1e-5)
+    assert np.allclose(example.queries.positions[0], [-0.70238803, 0.09261255, 0.62152631], atol=1e-5)
+
+
+def test_a_background_is_behind_everything_and_outside_a_true_mask() -> None:
+    vertices = PAIR.mesh.merged()[0]
+    clear = look(PAIR)
+    for seed in range(10):
+        seen = look(PAIR, seed, background=1.0)
+        assert (seen.source != NOTHING).all() and np.array_equal(seen.image.depth, clear.image.depth)
+        plane = seen.source == BACKGROUND
+        points = (seen.whole.depth[..., None] * CAMERA.directions())[plane]
+        center = points.mean(axis=0)
+        normal = np.linalg.svd(points - center, full_matrices=False)[2][2]
+        normal *= np.sign(normal[2])
+        assert normal[2] > np.cos(np.pi / 4) - 1e-9
+        gap = (center - vertices) @ normal
+        assert gap.min() > -1e-6 and gap.min() < 0.05 / OFF.metres_per_unit + 1e-6

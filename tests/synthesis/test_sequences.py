@@ -105,9 +105,8 @@ def test_a_walk_does_not_jump_between_states_that_are_far_apart() -> None:
     def draw(rng: np.random.Generator) -> tuple[Deformation, ...]:
         return 4 * (Shear(90.0 * float(np.sign(rng.uniform(-1.0, 1.0))), 0.0, 0.0),)
 
-    drawn = np.array(
-        [one.calls[0].shares[0] for one in walk(Scene("sides", rest_mesh(), draw), 0, np.arange(20) / 10, 1.0)]
-    )
+    states = walk(Scene("sides", rest_mesh(), draw), 0, np.arange(20) / 10, 1.0)
+    drawn = np.array([one.calls[0].shares[0] for one in states])
     assert len(np.unique(drawn > 0.5)) == 1 and np.ptp(drawn) > 0.1
 
 

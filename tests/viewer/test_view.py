@@ -1,6 +1,7 @@
 """`mereo view`: its pages in a real browser, and its command."""
 
 import contextlib
+import json
 import os
 import re
 import signal
@@ -8,22 +9,49 @@ import socket
 import subprocess
 import sys
 import urllib.request
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
+from answers import answer_to
 from browser import BROWSER, Page, pixels_of, until
 from PIL import Image
-from toy_scene import rest_mesh
+from reported_scenes import ball, example, wall
+from toy_scene import rest_mesh, toy_scene
 
+import mereo
+from mereo.__main__ import main
+from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.state import STATE
 from mereo.geometry.camera import PointCloud
-from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
+from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.metrics import Scores
+from mereo.geometry.radii import Radii
+from mereo.geometry.transforms import transform_points
+from mereo.io.mesh_formats import read_glb
+from mereo.io.writers.glb import GLTF_CAMERA_ROTATION, write_segments_glb
+from mereo.models.model import Model
+from mereo.scenes.parameters import parameters, random_state, set_value
+from mereo.synthesis.sample_views import load_view
 from mereo.visualization.color_scales import ColorScale
-from mereo.visualization.units import Unit
+from mereo.visualization.reconstruction_report import Report, read_report
+from mereo.visualization.units import UNKNOWN, Unit
 from mereo_viewer import server as viewer_server
 from mereo_viewer.display import chips, heading, message
-from mereo_viewer.result_page import Content, Probed, ResultPage, probe_html
+from mereo_viewer.laboratory import CameraPlace, Laboratory, LabPage, Trial, slider_range
+from mereo_viewer.result_page import (
+    SURE,
+    VERTEX,
+    Content,
+    Probed,
+    ResultPage,
+    content_of_answer,
+    content_of_files,
+    probe_html,
+)
 
 needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
 needs_browser = pytest.mark.skipif(
@@ -91,9 +119,6 @@ def test_points_give_way_to_colours_and_a_probe_is_shown(server: object) -> None
     page.move_probe(np.array([0.0, 0.0, 148.0]))
     assert "box_1" in page.facts.content and "2 mm inside the nearest surface" in page.facts.content
     assert nodes["/probe"].visible and nodes["/arrow"].visible
-
-
-# --- server -----------------------------------------------------------------------------------------------------------
 
 
 def first_message(port: int, host: str, origin: str | None) -> bytes:
@@ -226,3 +251,321 @@ def test_names_cannot_break_the_panels() -> None:
     ):
         assert told in shown
     assert shown.index("0.75") < shown.index("0.25")  # the likeliest first
+
+
+def test_the_camera_stands_where_its_place_says_and_sees_the_state() -> None:
+    laboratory = Laboratory(toy_scene(axis=(0.0, 0.0, 1.0)), None, None)
+    played = random_state(laboratory.scene, 2)
+    place = CameraPlace(tilt_rad=0.5, azimuth_rad=1.2, distance=140.0)
+    view = laboratory.look(played, place)
+    world = view.mesh.transformed(view.T_world_camera)
+    offset = view.T_world_camera[:3, 3] - world.bounds.mean(axis=0)
+    assert np.linalg.norm(offset) == pytest.approx(140.0)
+    assert np.arccos(offset[2] / 140.0) == pytest.approx(0.5)
+    expected = laboratory.scene.deform(played.deformations).mesh
+    for shown, wanted in zip(world.segments, expected.segments, strict=True):
+        np.testing.assert_allclose(shown.vertices, wanted.vertices, atol=1e-9)
+    # what was measured lies on the object, within the sensor's noise
+    points = transform_points(view.T_world_camera, view.depth.to_points().points)
+    low, high = expected.bounds
+    assert ((points > low - 1.0) & (points < high + 1.0)).all()
+
+
+def test_pictures_do_not_flicker_and_follow_a_slider() -> None:
+    laboratory = Laboratory(toy_scene(), None, None)
+    played, place = random_state(laboratory.scene, 2), laboratory.first_place
+    first, again = (laboratory.look(played, place).depth.depth for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+    moved = set_value(laboratory.scene, played, parameters(played)[-1], 0.5)
+    assert (laboratory.look(moved, place).depth.depth != first).any()
+
+
+def test_what_the_laboratory_cannot_show_is_said_in_one_sentence(rope: Model) -> None:
+    laboratory = Laboratory(toy_scene(), None, None)
+    with pytest.raises(ValueError, match="the camera sees 0 points of the object; at least .* move the camera"):
+        laboratory.look(random_state(laboratory.scene, 0), CameraPlace(0.1, 0.0, 90_000.0))
+    with pytest.raises(ValueError, match="the weights know .* the object has .*: name the weights of this object"):
+        Laboratory(toy_scene(), rope, None)
+
+
+@pytest.mark.parametrize(
+    "low, high, value, ends",
+    [(0.0, 1.0, 0.5, (0.0, 1.0, 0.01)), (-3.14, 31.4, 0.0, (-3.2, 31.4, 0.1)), (-180.0, 180.0, 0.0, (-180, 180, 1.0))],
+)
+def test_a_slider_has_few_digits_and_a_hundred_steps(
+    low: float, high: float, value: float, ends: tuple[float, float, float]
+) -> None:
+    slider = replace(parameters(random_state(toy_scene(), 0))[0], low=low, high=high, value=value)
+    assert slider_range(slider) == pytest.approx(ends)
+    assert slider_range(replace(slider, low=2.0, high=5.0, whole=True)) == (2.0, 5.0, 1.0)
+
+
+@needs_viser
+def test_sliders_and_buttons_change_what_is_shown(server: object) -> None:
+    page = LabPage(server, Laboratory(toy_scene(), None, None))
+    page.update()
+    assert page.view is not None and page.trial is None and "points seen" in page.status.content
+    first = page.shape
+    slider = parameters(first)[1]
+    page.move((slider.key, slider.index), 0.25)
+    assert parameters(page.shape)[1].value == pytest.approx(0.25)
+    assert page.sliders._handles[slider.key, slider.index].value == pytest.approx(0.25)
+    page.move(((slider.key[0], 99), 0), 0.5)  # of a state that has just gone
+    before = page.view.depth.depth
+    page._tilt.value = 3.0
+    page.update()
+    assert (page.view.depth.depth != before).any()
+    page.randomize()
+    assert page.shape is not first and page.sliders._handles.keys() == {(p.key, p.index) for p in parameters(first)}
+
+
+@needs_viser
+def test_of_many_changes_the_newest_of_each_control_counts(server: object) -> None:
+    page = LabPage(server, Laboratory(toy_scene(), None, None))
+    asked: list[int] = []
+    with page._working:  # changes come while the page is at work
+        for number in range(5):
+            page._changes["x"] = lambda shape, number=number: asked.append(number) or shape  # type: ignore[func-returns-value]
+    page.update()
+    assert asked == [4] and not page._changes
+
+
+@needs_viser
+def test_what_is_found_stands_beside_the_truth_until_something_changes(
+    server: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = LabPage(server, Laboratory(toy_scene(), None, None))
+    page.update()
+    view = page.view
+    assert view is not None
+    scores = Scores(0.875, 0.75, np.array([0.5, 1.0, 0.75, 0.75]))
+    monkeypatch.setattr(Laboratory, "answer", lambda _, seen: Trial(seen.mesh, "found <by> test", scores, 1.5))
+    page.reconstruct()
+    assert "0.875" in page.scores.content and "0.750" in page.scores.content
+    assert "found &lt;by&gt; test; 1.5 s" in page.status.content
+    nodes = server.scene._handle_from_node_name  # type: ignore[attr-defined]
+    found, true = (np.array(nodes[f"/names/{name}"].position) for name in ("reconstruction", "truth"))
+    right = view.T_world_camera[:3, 0]
+    assert (true - found) @ right > 1.0 and len(page.answer.handles) == 4
+    page.update()
+    assert page.trial is None and not page.answer.handles and page.scores.content == ""
+
+    def nothing(_: Laboratory, __: object) -> Trial:
+        raise ValueError("nothing is found: move the camera")
+
+    monkeypatch.setattr(Laboratory, "answer", nothing)
+    page.reconstruct()
+    assert "nothing is found: move the camera" in page.status.content and page.trial is None
+
+
+@pytest.mark.slow
+@needs_viser
+@needs_browser
+def test_the_laboratory_follows_its_buttons_in_a_browser(tmp_path: Path, server: object) -> None:
+    page = LabPage(server, Laboratory(toy_scene(), None, None))
+    page.update()
+    with Page(tmp_path, f"http://127.0.0.1:{server.get_port()}", (1200, 760)) as browser:  # type: ignore[attr-defined]
+        until(lambda: "points seen" in browser.text())
+        browser.still()
+        words = set(browser.text().split("\n"))
+        assert {"Camera", "Deformation", "tilt (°)", "shear x", "ball", "Random state"} <= words  # "ball" is a folder
+        before = page.view
+        browser.evaluate("[...document.querySelectorAll('button')].find(b => b.innerText == 'Random state').click()")
+        until(lambda: page.view is not before)
+        until(lambda: all(pixels_of(browser.screenshot(), segment.color) > 150 for segment in rest_mesh().segments))
+
+
+def radii_of(mesh: SegmentedMesh) -> Radii:
+    points = np.concatenate([segment.vertices for segment in mesh.segments])
+    counts = tuple(len(segment.vertices) for segment in mesh.segments)
+    labels = np.repeat(np.arange(1, len(counts) + 1), counts).astype(np.uint8)
+    return Radii(points, labels, np.linspace(0.001, 0.004, len(points)), counts, True)
+
+
+def found() -> SegmentedMesh:
+    return SegmentedMesh((ball("head", -0.1, 0), ball("tail", 0.1, 1)))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Result of the network alone, in metres: surfaces, a report with a depth image, no state."""
+    cloud, _, summary = example()
+    folder = tmp_path / "result"
+    folder.mkdir()
+    write_segments_glb(folder / "segments.glb", found(), GLTF_CAMERA_ROTATION, 0.001, radii_of(found()))
+    told = {**summary, "title": "frame <7>"}
+    Report(cloud, found(), told, unit=Unit(0.001), depth=wall(80, 60, 1000.0)).write(folder / "report.html")
+    return folder
+
+
+def test_a_report_is_read_again(folder: Path) -> None:
+    cloud, *_ = example()
+    report = read_report(folder / "report.html")
+    assert report is not None and report.cloud is not None and report.depth is not None
+    np.testing.assert_allclose(report.cloud.points, cloud.points, atol=1e-5)
+    assert (report.title, report.level, report.count, report.unit_known) == ("frame <7>", "alone", len(cloud), True)
+    assert report.verdict.startswith("Network alone: nothing says whether this is the object. The object reaches")
+    assert report.depth.shape == (19, 24, 3) and report.ends == ("500 mm", "700 mm")
+
+
+@pytest.mark.parametrize(
+    "old, new",
+    [
+        ("const DATA = {", "const DATA = ["),
+        ('"low": [', '"low": [0, '),
+        ('"positions": "', '"positions": "AAA'),
+        ("data:image/png;base64,", "https://example.org/"),
+        ("data:image/png;base64,iVBOR", "data:image/png;base64,AAAAA"),
+        ('"alone"', '"certainly"'),
+        ("const DATA", "const NONE"),
+    ],
+)
+def test_a_page_that_is_damaged_or_another_one_is_none(folder: Path, old: str, new: str) -> None:
+    page = (folder / "report.html").read_text("utf-8")
+    assert old in page
+    (folder / "report.html").write_text(page.replace(old, new, 1), "utf-8")
+    assert read_report(folder / "report.html") is None
+    assert read_report(folder / "gone.html") is None
+
+
+def test_our_own_glb_is_in_the_frame_of_the_input(folder: Path) -> None:
+    scene = read_glb(folder / "segments.glb")
+    assert scene.is_ours and scene.unit_m == pytest.approx(0.001) and scene.colors == (None, None)
+    np.testing.assert_allclose(scene.rotation, GLTF_CAMERA_ROTATION, atol=1e-12)
+    assert scene.mesh.names == ("head", "tail") and scene.mesh.colors == found().colors
+    for shown, segment in zip(scene.mesh.segments, found().segments, strict=True):
+        np.testing.assert_allclose(shown.vertices, segment.vertices, atol=1e-6)
+    assert scene.radii is not None and scene.radii.calibrated
+    np.testing.assert_allclose(scene.radii.values, radii_of(found()).values, rtol=1e-5)
+
+
+def write_strange(path: Path) -> None:
+    """GLB file of somebody else: a moved and mirrored box of vertex colours, a plain one twice, a texture, points."""
+    scene = trimesh.Scene()
+    painted = trimesh.creation.box((1, 1, 1))
+    painted.visual.vertex_colors = np.array([[255, 0, 0, 255]] * 4 + [[0, 0, 255, 255]] * 4, dtype=np.uint8)
+    mirrored = np.diag([-1.0, 1.0, 1.0, 1.0])
+    mirrored[0, 3] = 5.0
+    scene.add_geometry(painted, node_name="painted", geom_name="painted", transform=mirrored)
+    plain = trimesh.creation.box((1, 1, 1))
+    material = trimesh.visual.material.PBRMaterial(baseColorFactor=[255, 0, 0, 255])
+    plain.visual = trimesh.visual.TextureVisuals(material=material)
+    scene.add_geometry(plain, node_name="plain", geom_name="plain")
+    round_one = trimesh.creation.icosphere(1)
+    picture = Image.fromarray(np.full((4, 4, 3), (0, 128, 255), dtype=np.uint8))
+    round_one.visual = trimesh.visual.TextureVisuals(uv=np.full((len(round_one.vertices), 2), 0.5), image=picture)
+    scene.add_geometry(round_one, node_name="round", geom_name="round")
+    scene.add_geometry(trimesh.PointCloud(np.eye(3)), node_name="points", geom_name="points")
+    path.write_bytes(scene.export(file_type="glb"))
+
+
+def test_any_glb_is_read_with_its_places_and_colours(tmp_path: Path) -> None:
+    write_strange(tmp_path / "s.glb")
+    scene = read_glb(tmp_path / "s.glb")
+    assert not scene.is_ours and scene.radii is None and scene.unit_m == 1.0
+    parts = {segment.name: (segment, colors) for segment, colors in zip(scene.mesh.segments, scene.colors, strict=True)}
+    assert set(parts) == {"painted", "plain", "round"}
+    painted, colors = parts["painted"]
+    assert painted.bounds[:, 0].tolist() == [4.5, 5.5] and painted.volume == pytest.approx(1.0)
+    assert colors is not None and {tuple(color) for color in colors.tolist()} == {(255, 0, 0), (0, 0, 255)}
+    assert parts["plain"][0].color == (255, 0, 0) and parts["plain"][1] is None
+    assert len(parts["plain"][0].vertices) == 8 and parts["round"][0].color == (0, 128, 255)
+
+
+def test_a_folder_is_shown_with_all_that_its_files_keep(folder: Path) -> None:
+    content = content_of_files(folder)
+    assert content.title == "frame <7>" and "2 segments" in content.facts and not content.is_doubtful
+    assert content.verdict.startswith("Network alone") and content.unit.metres == pytest.approx(0.001)
+    assert content.cloud is not None and content.depth is not None and content.depth[1] == ("500 mm", "700 mm")
+    assert tuple(content.colorings) == ("distance", SURE)
+    colors, scale = content.colorings[SURE]()
+    assert [len(part) for part in colors] == [len(s.vertices) for s in content.mesh.segments] and scale is not None
+    cloud, mesh, summary = example()
+    Report(cloud, mesh, summary).write(folder / "report.html")
+    assert content_of_files(folder).unit == UNKNOWN
+    (folder / "report.html").unlink()
+    plain = content_of_files(folder)
+    assert plain.title == "result" and plain.cloud is None and plain.verdict == ""
+    (folder / STATE).write_text("{}")
+    assert content_of_files(folder / STATE).facts == plain.facts
+
+
+def test_an_inner_segment_is_seen_through_the_outer_one(folder: Path) -> None:
+    assert content_of_files(folder).mesh.opaque == (True, True)
+    (folder / "summary.json").write_text(json.dumps({"nested": [["head", "tail"]]}))
+    assert content_of_files(folder).mesh.opaque == (True, False)
+    for damaged in ('{"nested": [["head", "nose"]]}', '{"nested": 3}', "{}", "[]", "{", '{"nested": [[[], {}]]}'):
+        (folder / "summary.json").write_text(damaged)
+        assert content_of_files(folder).mesh.nested == ()
+
+
+def test_places_are_asked_of_a_results_surfaces(folder: Path) -> None:
+    content, head = content_of_files(folder), found().segments[0]
+    assert content.ask is not None
+    middle, rim = head.vertices.mean(axis=0), head.vertices[0]
+    inside, outside, on_it = (content.ask(point[None]) for point in (middle, middle + 5.0, rim))
+    assert inside.label == 1 and outside.label == 0 and on_it.label == 1
+    size = np.linalg.norm(rim - middle)
+    assert inside.distance[0] == pytest.approx(-size, rel=0.1) and outside.distance[0] > 4
+    assert outside.radius95 is None and on_it.radius95 is not None
+    assert on_it.radius95[0] == pytest.approx(0.001, rel=0.01)
+    np.testing.assert_allclose(rim, middle + inside.direction[0] * size, atol=3 * size)
+
+
+def test_any_glb_has_its_own_colours_and_no_probe(tmp_path: Path) -> None:
+    write_strange(tmp_path / "s.GLB")
+    content = content_of_files(tmp_path / "s.GLB")
+    assert content.ask is None and content.first_view == "front" and content.facts.startswith("3 parts")
+    colors, scale = content.colorings[VERTEX]()
+    assert scale is None and [len(part) for part in colors] == [len(s.vertices) for s in content.mesh.segments]
+
+
+def seen_as(answer: Answer, points: np.ndarray) -> Probed:
+    content = content_of_answer(answer)
+    assert content.ask is not None
+    return content.ask(points)
+
+
+def test_weights_without_a_model_are_asked_alone_and_it_is_said(rope: Model) -> None:
+    cloud = load_view("rope").depth.to_points()
+    answer = answer_to(cloud, replace(rope, statistical_model=None), None, 24)
+    content, shown = content_of_answer(answer), seen_as(answer, cloud.points[:4])
+    assert content.verdict == "network alone: the weights carry no statistical model"
+    assert shown.rest is None and shown.probability is not None
+    assert tuple(content.colorings) == ("confidence", "distance")
+    colors, scale = content.colorings["confidence"]()
+    assert [len(part) for part in colors] == [len(s.vertices) for s in content.mesh.segments]
+    assert scale is not None and scale.title == "confidence of the surface"
+
+
+@needs_viser
+def test_the_command_opens_the_page_of_a_folder(folder: Path) -> None:
+    with mereo.view(folder, port=0, block=False) as page, urllib.request.urlopen(page.address, timeout=20) as answer:
+        assert b"<html" in answer.read()
+
+
+@pytest.mark.parametrize(
+    "content, options, sentence",
+    [
+        (None, (), "s.glb does not exist; a GLB file is needed: check the path"),
+        (b"glTF but not really", (), "s.glb cannot be read as a GLB file"),
+        (b"", (), "s.glb is empty (0 bytes)"),
+        (trimesh.Scene([trimesh.PointCloud(np.eye(3))]).export(file_type="glb"), (), "it has no faces"),
+        (b"", ("--weights", "rope"), "is shown as it is, and no object is looked for: leave out --object and"),
+    ],
+)
+def test_a_file_that_cannot_be_shown_is_said_in_one_sentence(
+    content: bytes | None,
+    options: tuple[str, ...],
+    sentence: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for module in ("mereo_viewer.result_page", "mereo.api.view"):
+        monkeypatch.setattr(f"{module}.import_viser", lambda: None)
+    if content is not None:
+        (tmp_path / "s.glb").write_bytes(content)
+    assert main(["view", str(tmp_path / "s.glb"), *options]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("mereo: error: ") and error.count("\n") == 1 and sentence in error

@@ -1,19 +1,31 @@
 """The renderer agrees with closed forms, and the pictures show what they claim to show."""
 
+import sys
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from answers import answer_to
 from PIL import Image
+from shapes import ball as round_ball
 
+import mereo
+from mereo import __main__ as command_line
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
-from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
+from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh, vertex_normals
 from mereo.geometry.transforms import rigid
+from mereo.models.model import Model
+from mereo.models.trained import Answer, EncodedCloud
+from mereo.models.weights import load_model
 from mereo.synthesis.examples import View
+from mereo.synthesis.sample_views import load_view
 from mereo.visualization import previews
+from mereo.visualization.color_scales import TABLE, ColorScale, confidence, distance_scale, observed_distance, viridis
 from mereo.visualization.contact_sheets import contact_sheet, depth_to_rgb, legend
-from mereo.visualization.previews import preview_states, render_cloud_and_segments
+from mereo.visualization.previews import preview_states
 from mereo.visualization.renderer import SUPERSAMPLE, Canvas, Triangles, Viewpoint, corner_normals, shade
 from mereo_learning.cases import EvaluatedView
 from mereo_learning.error_maps import (
@@ -32,10 +44,11 @@ from mereo_learning.error_maps import (
     offset_colors,
     offset_triangles,
     segmentation_error,
-    signed_distance,
     surface_offset,
     voxel_triangles,
 )
+from mereo_learning.metrics_log import MetricsLog
+from mereo_viewer.result_page import ask_network, first_point, probe_answer
 
 FRONT = ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
 
@@ -80,15 +93,6 @@ def test_a_pinhole_picture_is_the_camera_depth_image_in_colour() -> None:
     pixel = np.column_stack([column + 0.5, row + 0.5]) / SUPERSAMPLE
     points = camera.unproject(pixel, canvas.depth[row, column])
     np.testing.assert_allclose(np.linalg.norm(points - [0.1, -0.2, 3], axis=1), 0.7, atol=4e-3)
-
-
-def test_the_picture_moves_with_the_world() -> None:
-    mesh = SegmentedMesh((ball((0, 0, 0), 1.0), ball((1.2, 0.3, 0), 0.5, PALETTE[1], "nose")))
-    turn = trimesh.transformations.random_rotation_matrix(np.array([0.1, 0.5, 0.9]))
-    move = rigid(turn[:3, :3], np.array([5.0, -3.0, 2.0]))
-    still = shade(mesh, Viewpoint(np.eye(4), 2.0), (60, 60))
-    moved = shade(mesh.transformed(move), Viewpoint(np.linalg.inv(move), 2.0), (60, 60))
-    assert np.mean(np.abs(still.astype(int) - moved.astype(int)).max(axis=-1) > 8) < 0.01
 
 
 def test_nearer_things_hide_farther_ones() -> None:
@@ -243,17 +247,6 @@ def test_an_error_on_the_far_side_is_seen_from_behind_only_and_an_empty_predicti
     assert hue_is(picture[: -strips(picture)], UNDER).any()  # all of it is missing
 
 
-def test_the_preview_shows_cloud_and_segments(tmp_path: Path) -> None:
-    mesh = SegmentedMesh((ball((0, 0, 2), 0.3, (255, 0, 0)), ball((0.5, 0, 2), 0.2, (0, 0, 255), "nose")))
-    lost = Segment("lost", (0, 255, 0), np.empty((0, 3)), np.empty((0, 3), dtype=np.int64))
-    mesh = SegmentedMesh((*mesh.segments, lost))
-    cloud = PointCloud(mesh.segments[0].vertices[mesh.segments[0].vertices[:, 2] < 2])
-    render_cloud_and_segments(tmp_path / "camera.png", cloud, mesh, "title", size=90)
-    picture = np.asarray(Image.open(tmp_path / "camera.png"))
-    assert hue_is(picture, (255, 0, 0)).sum() > 300
-    assert hue_is(picture, (0, 0, 255)).sum() > 100
-
-
 def test_a_preview_of_states_has_three_pictures_for_each_state(tmp_path: Path) -> None:
     camera = Camera.from_fov(24, 24, 0.6)
     mesh = SegmentedMesh((ball((0, 0, 3), 0.5, (255, 0, 0)),))
@@ -304,17 +297,141 @@ def test_what_is_missing_is_the_farther_off_the_longer_it_is() -> None:
     offset = surface_offset(truth, found, np.ones(3), places)
     np.testing.assert_allclose(offset, [0.0, -2.5, -6.5, -10.5], atol=0.3)
     np.testing.assert_array_equal(surface_offset(found, truth, np.ones(3), places), -offset)
-    occupied = np.zeros((6, 6, 6), dtype=bool)
-    occupied[2:4, 2:4, 2:4] = True
-    places = np.array([[1.5, 2.0, 3.0], [2.0, 3.0, 3.5]])
-    assert surface_offset(occupied, np.zeros_like(occupied), np.ones(3), places).max() < -10
 
 
-def test_equal_grids_have_no_offset_and_distances_vanish_on_faces() -> None:
-    occupied = np.random.default_rng(6).random((7, 8, 9)) > 0.5
-    places = np.random.default_rng(7).uniform(-0.5, 6.5, size=(90, 3))
-    assert not surface_offset(occupied, occupied, SPACING, places).any()
-    slab = np.zeros((9, 4, 4), dtype=bool)
-    slab[:4] = True
-    expected = (np.arange(9) - 3.5) * 0.5
-    np.testing.assert_allclose(signed_distance(slab, SPACING)[:, 1, 2], expected, rtol=1e-6)
+GREYS = ColorScale("grey", 1.0, 3.0, ((0, 0, 0), (100, 100, 100), (250, 250, 250)), ("low", "high"))
+
+
+def two_balls(radius: float = 2.0) -> SegmentedMesh:
+    return SegmentedMesh(
+        (round_ball((0, 0, 0), radius, "one", 0, level=3), round_ball((6, 0, 0), radius, "two", 1, level=3))
+    )
+
+
+def test_a_scale_is_linear_between_its_stops_and_vertex_normals_of_a_ball_point_outward() -> None:
+    values = np.array([-5.0, 1.0, 1.5, 2.0, 2.5, 3.0, 9.0, np.nan])
+    assert GREYS.colors(values)[:, 0].tolist() == [0, 0, 50, 100, 175, 250, 250, 128]
+    segment = round_ball((1, 2, 3), 2.0, "one", 0, level=3)
+    np.testing.assert_allclose(vertex_normals(segment), (segment.vertices - [1, 2, 3]) / 2.0, atol=0.02)
+
+
+def test_confidence_is_the_drop_of_probability_across_the_surface() -> None:
+    """A model that is certain of one ball's border, and says one half everywhere near the other's."""
+
+    def ask(points: np.ndarray) -> Answer:
+        inside = (np.linalg.norm(points, axis=1) < 2.0).astype(float)
+        unsure = 0.5 * (np.linalg.norm(points - [6, 0, 0], axis=1) < 3.0)
+        probability = np.stack([1 - inside - unsure, inside, unsure], axis=1)
+        nothing = np.zeros(len(points))
+        return Answer(probability.argmax(axis=1).astype(np.uint8), probability, nothing, np.zeros_like(points))
+
+    sure, guessed = confidence(two_balls(), ask)
+    np.testing.assert_array_equal(sure, 1.0)
+    np.testing.assert_array_equal(guessed, 0.0)
+
+
+def test_distance_to_what_was_observed_tells_seen_from_guessed() -> None:
+    mesh = two_balls()
+    one, two = observed_distance(mesh, mesh.segments[0].vertices)
+    np.testing.assert_array_equal(one, 0.0)
+    assert two.min() == pytest.approx(2.0, abs=0.05)
+    assert two.max() == pytest.approx(6.0, abs=0.05)
+    scale = distance_scale([one, two], " mm")
+    assert 0 < scale.high <= 6 and scale.words[1].endswith(" mm, guessed")
+    lost = replace(mesh.segments[1], vertices=np.zeros((0, 3)), faces=np.zeros((0, 3), dtype=np.int64))
+    mesh = SegmentedMesh((mesh.segments[0], lost))
+    assert [len(v) for v in observed_distance(mesh, np.zeros((1, 3)))] == [len(mesh.segments[0].vertices), 0]
+    assert distance_scale([np.zeros(0)], "").high > 0
+
+
+def test_a_ray_meets_the_nearest_surface_that_is_shown() -> None:
+    mesh, origin, along = two_balls(), np.array([-9.0, 0.01, 0.02]), np.array([2.0, 0.0, 0.0])
+    np.testing.assert_allclose(first_point(mesh, origin, along, [True, True]), [-2.0, 0.01, 0.02], atol=0.05)
+    np.testing.assert_allclose(first_point(mesh, origin, along, [False, True]), [4.0, 0.01, 0.02], atol=0.05)
+    assert first_point(mesh, origin, along, [False, False]) is None
+    assert first_point(mesh, origin, -along, [True, True]) is None
+
+
+@pytest.fixture
+def encoded(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
+    """The points of every cloud that a model encodes."""
+    clouds: list[np.ndarray] = []
+    encode = Model.encode
+
+    def counted(model: Model, cloud: PointCloud) -> EncodedCloud:
+        clouds.append(np.asarray(cloud.points))
+        return encode(model, cloud)
+
+    monkeypatch.setattr(Model, "encode", counted)
+    return clouds
+
+
+def test_no_cloud_is_encoded_twice(encoded: list[np.ndarray], tmp_path: Path) -> None:
+    cloud = load_view("rope").depth.to_points()
+    mereo.reconstruct(cloud, load_model("rope"), "network", resolution=16).save(tmp_path / "result")
+    assert len(encoded) == 1
+    model = load_model("rope")
+    answer = answer_to(cloud, model, None, 16)
+    probe_answer(answer, cloud.points[:5])
+    confidence(answer.reconstruction.surfaces, partial(ask_network, answer))
+    assert len(encoded) == 2, "once for each"
+
+
+ROWS = [{"step": float(step), "loss": 2.0 / step, "val_iou": 0.1 * step} for step in (1, 2, 3)]
+
+
+@pytest.fixture
+def no_matplotlib(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a machine without the extra: it is not found, and importing it fails."""
+    for name in [name for name in sys.modules if name.split(".")[0] == "matplotlib"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+
+
+def test_the_colours_are_matplotlibs() -> None:
+    import matplotlib
+
+    values = np.concatenate([np.linspace(-0.2, 1.2, 5000), np.arange(257) / 256, [0.0, 1.0]])
+    theirs = matplotlib.colormaps["viridis"](values, bytes=True)[:, :3]
+    np.testing.assert_array_equal(viridis(values), theirs)
+    assert viridis(np.full((2, 3), np.nan)).tolist() == [[TABLE[0].tolist()] * 3] * 2
+
+
+def picture(path: Path) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def record(run: Path) -> MetricsLog:
+    log = MetricsLog(run)
+    log.rows = list(ROWS)
+    log.write()
+    return log
+
+
+@pytest.mark.usefixtures("no_matplotlib")
+def test_a_run_without_curves_is_whole_and_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = record(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["metrics.csv"]
+    assert log.is_written(3)
+    assert capsys.readouterr().out == (
+        "curves.png is left out, for matplotlib, which draws it, is not installed: pip install 'mereo[plots]'\n"
+    )
+
+
+def test_a_run_with_curves_says_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = record(tmp_path)
+    assert picture(tmp_path / "curves.png").shape == (440, 1210, 3)
+    assert log.is_written(3)
+    (tmp_path / "curves.png").unlink()
+    assert not log.is_written(3)
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.usefixtures("no_matplotlib")
+def test_an_experiment_asks_for_the_extra_before_it_starts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command_line.main(["experiment", "sampling", "--output", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err == (
+        "mereo: error: matplotlib, which draws charts, is not installed: pip install 'mereo[plots]'\n"
+    )
+    assert not (tmp_path / "out").exists()

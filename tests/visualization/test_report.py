@@ -3,21 +3,21 @@
 import base64
 import io
 import re
-import subprocess
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from browser import BROWSER
+from browser import BROWSER, Page, pixels_of, until
 from PIL import Image
 from reported_scenes import ball, example, page_data, positions, wall
-from scipy.spatial import cKDTree
 
+from mereo.fitting.registration.recognition import MOST, NOT_EVALUATED, Recognition, Signs
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
-from mereo.geometry.mesh import PALETTE, SegmentedMesh
+from mereo.geometry.mesh import SegmentedMesh
 from mereo.visualization.contact_sheets import MISSING, MOST_DEPTH_PX, depth_data
-from mereo.visualization.reconstruction_report import BUDGET_BYTES, Report, cluster
+from mereo.visualization.reconstruction_report import BUDGET_BYTES, VERDICTS, Report, trust
 from mereo.visualization.units import Unit
 from mereo_learning.evaluation_report import write_evaluation_report
 
@@ -101,7 +101,7 @@ def test_large_and_empty_depth_images_are_small_pictures() -> None:
 
 def test_a_large_reconstruction_stays_under_the_budget_and_in_shape(tmp_path: Path) -> None:
     cloud, _, summary = example()
-    mesh = SegmentedMesh(tuple(ball(f"s{i}", 0.2 * i, PALETTE[i], level=6) for i in range(3)))
+    mesh = SegmentedMesh(tuple(ball(f"s{i}", 0.2 * i, i, level=6) for i in range(3)))
     Report(PointCloud(np.tile(cloud.points, (700, 1))), mesh, summary).write(tmp_path / "r.html")
     assert 1_000_000 < (tmp_path / "r.html").stat().st_size <= BUDGET_BYTES
     data = page_data(tmp_path / "r.html")
@@ -114,28 +114,9 @@ def test_a_large_reconstruction_stays_under_the_budget_and_in_shape(tmp_path: Pa
     assert not (tmp_path / "r2.html").exists()
 
 
-def test_clustering_keeps_the_shape_and_moves_no_vertex_beyond_its_cell() -> None:
-    fine = ball("ball", 0.0, PALETTE[0], level=5)
-    coarse = cluster(fine, 0.02)
-    assert len(coarse.faces) < len(fine.faces) / 5
-    assert coarse.volume == pytest.approx(fine.volume, rel=0.05)
-    gaps, _ = cKDTree(fine.vertices).query(coarse.vertices)
-    assert gaps.max() < 0.02 * np.sqrt(3)
-    assert len(np.unique(np.sort(coarse.faces, axis=1), axis=0)) == len(coarse.faces)
-
-
 in_browser = pytest.mark.skipif(
     BROWSER is None, reason="no chromium or chrome in PATH: install one (Debian: apt-get install chromium)"
 )
-
-
-def browse(page: str, tmp_path: Path, *options: str) -> str:
-    assert BROWSER
-    command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader"]
-    command += ["--enable-unsafe-swiftshader", "--disable-background-networking", "--disable-component-update"]
-    command += ["--disable-sync", "--no-first-run", "--hide-scrollbars", "--window-size=1000,800"]
-    command += [f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=4000", *options, page]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
 
 
 @pytest.mark.slow
@@ -144,21 +125,17 @@ def browse(page: str, tmp_path: Path, *options: str) -> str:
 def test_a_browser_draws_every_segment(tmp_path: Path, mode: str) -> None:
     cloud, mesh, summary = example()
     Report(cloud, mesh, summary).write(tmp_path / "r.html")
-    address = (tmp_path / "r.html").as_uri() + mode
-    text = browse(address, tmp_path, "--dump-dom")
-    drawing = re.search(r'data-drawing="(\w+)"', text)
-    assert drawing
+    with Page(tmp_path, (tmp_path / "r.html").as_uri() + mode, (1000, 800)) as page:
+        drawing = until(lambda: re.search(r'data-drawing="(\w+)"', page.evaluate("document.documentElement.outerHTML")))
+        text, picture = drawing.string, page.screenshot()
     assert drawing[1] == "canvas" or not mode
     table = re.search(r'<table id="table">(.*?)</table>', text, re.DOTALL)
     assert table
     assert "tail &lt;/script&gt;&lt;b&gt;" in table[1]
     assert "0.1&nbsp;&nbsp;&nbsp;0.2&nbsp;&nbsp;&nbsp;0.3" in table[1]
-    browse(address, tmp_path, f"--screenshot={tmp_path / 's.png'}")
-    stage = np.asarray(Image.open(tmp_path / "s.png").convert("RGB"))[150:500, 40:680].astype(float)
+    stage = picture[150:500, 40:680].astype(float)
     for segment in mesh.segments[:2]:
-        wanted = np.asarray(segment.color, dtype=float)
-        cosine = stage @ wanted / (np.linalg.norm(stage, axis=-1) * np.linalg.norm(wanted))
-        assert (cosine > 0.99).sum() > 1000, f"{segment.name} is not to be seen"
+        assert pixels_of(stage, segment.color) > 1000, f"{segment.name} is not to be seen"
     drawn = np.flatnonzero((np.ptp(stage, axis=-1) > 60).any(axis=0))
     assert np.ptp(drawn) > 0.8 * stage.shape[1], "the object does not fill the canvas"
 
@@ -171,6 +148,48 @@ def test_places_and_volumes_are_told_as_exactly_as_they_are_known() -> None:
     assert Unit(None).place(place, 0.0) == "-0.0247 -1e-06 1.59 ± 0", "without an error as without a radius"
     assert Unit(0.01).volume(648.0, (633.2, 663.1)) == "648 (633 to 663)"
     assert Unit(None).volume(4.9012, (4.889, 4.9204)) == "4.901 (4.889 to 4.920)"
+
+
+TAKEN = {"answer": "registration", "explained": 0.989, "accepted": True}
+KEPT = {"answer": "network", "explained": 0.668, "accepted": False}
+FLAT = {"answer": "network", "refusal": "the cloud is flat"}
+NOTHING = "Network alone: nothing says whether this is the object."
+LITTLE = "Doubtful: the model explains only 66.8 % of the points, so this is"
+UNCHECKED = "Not checked: nothing says whether this is the object; the model explains 98.9"
+
+
+def recognized(known: bool | str, reason: str | None = None) -> Recognition:
+    return Recognition(known, reason, 5.0, Signs(size=0.01, unexplained=0.2))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "recognition, registration, level, line, cure",
+    [
+        (recognized(True), TAKEN, "yes", "Trust it: the frame shows the object; the model explains 98.9 %", None),
+        (recognized("unsure", "3% are not: look, or crop"), TAKEN, "doubt", "Doubtful: 3% are not.", "look, or crop"),
+        (recognized(False, "size: unit (-u: m)"), TAKEN, "no", "Do not trust it: size.", "unit (-u: m)"),
+        (recognized(False, "off: look"), KEPT, "no", "Do not trust it: off; the model explains only 66.8 %", "look"),
+        (recognized(False, "only 3% of the points: turn"), KEPT, "no", "Do not trust it: only 3% of the p", "turn"),
+        (Recognition(False, "the cloud is flat", MOST), FLAT, "no", "Do not trust it: the cloud is flat.", None),
+        (recognized(True), KEPT, "doubt", LITTLE, None),
+        (recognized(True), {**TAKEN, "explained": 0.7, "accepted": False}, "doubt", "Doubtful: the model ex", None),
+        (NOT_EVALUATED, None, "alone", NOTHING, None),
+        (None, None, "alone", NOTHING, None),
+        (None, TAKEN, "unchecked", UNCHECKED, None),
+    ],
+)
+def test_a_verdict_is_one_line_with_its_reason(
+    recognition: Recognition | None, registration: dict[str, Any] | None, level: str, line: str, cure: str | None
+) -> None:
+    summary: dict[str, Any] = {} if recognition is None else {"recognition": recognition.facts()}
+    found = trust(summary if registration is None else {**summary, "registration": registration})
+    verdict = f"{VERDICTS[found.level]}: {found.why}.".replace("\N{NO-BREAK SPACE}", " ")
+    assert (found.level, found.cure) == (level, cure) and verdict.startswith(line)
+
+
+@pytest.mark.parametrize("junk", [None, 3, [], {"known": None, "explained": float("nan"), "answer": 7}])
+def test_a_damaged_summary_is_not_trusted(junk: object) -> None:
+    assert trust({"recognition": junk, "registration": junk}).level not in ("yes", "doubt")
 
 
 METRICS = {
