@@ -166,6 +166,18 @@ def test_a_depth_as_far_as_the_object_is_unknown() -> None:
     assert 1.02 not in by_cloud.past[:, 2] and (np.isclose(by_cloud.unknown[:, 2], 1.02)).sum() > 500
 
 
+def test_a_tool_that_hides_the_object_is_unknown_where_it_is_farther_away_too() -> None:
+    """It comes from behind the object's near side, and passes before it."""
+    column = np.ones((50, 1)) * np.arange(60)
+    tool = np.zeros(SHOWN.shape, dtype=bool)
+    tool[18:32, :20] = True
+    depth = np.where(SHOWN, 1.0 + 0.025 * (column - 20), np.where(tool, 0.8 + 0.026 * (19 - column), 2.0))
+    past = np.zeros(SHOWN.shape, dtype=bool)
+    lines = lines_of_image(DepthImage(depth, WIDE), SHOWN).past
+    past[pixels(lines[WIDE.project(lines).min(axis=1) >= 0], WIDE)] = True
+    assert past[:10].sum() > 100 and not past[tool].any()
+
+
 def test_many_lines_are_thinned_far_from_the_object_only() -> None:
     camera = Camera(600, 500, 800.0, 800.0, 300.0, 250.0)
     shown, depth = np.kron(SHOWN, np.ones((10, 10), dtype=bool)), np.kron(scene(), np.ones((10, 10)))
