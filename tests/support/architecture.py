@@ -129,7 +129,7 @@ BUDGET = {
     "src/mereo_serving": (1_770, 13),
     "src/mereo_viewer": (1_380, 5),
     "src/mereo_experiments": (1_610, 17),
-    "tests": (28_950, 203),
+    "tests": (26_250, 135),
 }
 """Lines and files that a folder may have at most; they only fall, those of tests to 25,000."""
 
