@@ -519,13 +519,14 @@ def search(whole: Problem, partial: Problem | None = None, start: Posed | None =
         heavier = chosen.with_heavier_cloud()
         if heavier is not None and heavier.is_explained:
             return heavier.outcome()
-        cloud = chosen.best.misfit.cloud
-        if chosen.is_explained or (number > 0 and not whole.config.unexplained <= cloud <= HOPELESS):
+        if chosen.is_explained or (number > 0 and chosen.best.misfit.cloud < whole.config.unexplained):
             break
         if number > 0:
             better = heavier or chosen.as_noisy()
             if better is not None:
                 return better.outcome()
+            if chosen.best.misfit.cloud > HOPELESS:
+                break
             trails = [chosen]
     return (heavier or chosen).outcome()
 

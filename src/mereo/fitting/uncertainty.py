@@ -45,8 +45,8 @@ WITHIN = float(norm.ppf(0.5 + LEVEL / 2))
 NOISY_FACTOR = 1.5
 """Factor of the posterior's radii in a noisy frame, of an object that was not calibrated.
 
-Of 24 training views by simulated cameras, radii of fits of the modes hold 96 % with it and 85 % without; those of clean
-views need none (docs/experiments/071.md)."""
+On 12 training views of two objects by simulated cameras, radii of fits of the modes hold 96 % with it and 84 % without;
+those of clean views need none (docs/experiments/071.md)."""
 
 _FREEDOM = np.linspace(1.0, 3.0, 201)
 _QUANTILE = chdtri(_FREEDOM, 1.0 - LEVEL)
@@ -412,8 +412,8 @@ class Uncertainty:
     """How far the true positions may be from where a registration has them; lengths in the input's unit.
 
     A ``radius95`` is that of the ball around a point that holds its true position with probability 0.95: by the
-    posterior of the fit, times ``factor``. It does not cover another object, nor a fit
-    that ended in a wrong state (``fitting.registration.recognition`` detects both).
+    posterior of the fit, times ``factor``. It does not cover another object, nor a fit that ended in a wrong state
+    (``fitting.registration.recognition`` detects both).
 
     Attributes:
         optimum: where the fit has ended.

@@ -83,9 +83,10 @@ class Candidate:
     def is_featureless(self) -> bool:
         """Whether the frame shows neither outline nor relief, so that any smooth surface explains it as well.
 
-        Parts of planes show neither, and many objects with an unknown unit, or with a flat side, explain them.
+        Parts of planes show neither, and many objects with an unknown unit, or with a flat side, explain them. Where a
+        pose is given, its giver knows the object.
         """
-        if self.modes is None:
+        if self.modes is None or self.located_by == "pose":
             return False
         evidence, fit = self.modes.problem.evidence, self.modes.registration()
         return evidence.hidden_edge > NO_OUTLINE and evidence.patch_share(self.modes.tolerance) > fit.explained - PATCH
