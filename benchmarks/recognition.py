@@ -271,7 +271,8 @@ def measured(name: str, arguments: argparse.Namespace) -> Measured:
     assert model is None or isinstance(model, Model)
     if model is None:
         assert thing.scene is not None and thing.model is not None
-        scene, unsized = thing.scene, Registrar(None, thing.model, given=thing.scene)
+        scene, unsized = thing.scene, thing.registrar()
+        assert unsized is not None
     else:
         scene = load_scene(arguments.scene or trained_scene(model))
         if model.calibration is None:
@@ -281,8 +282,8 @@ def measured(name: str, arguments: argparse.Namespace) -> Measured:
     result, seed, clean = Measured(), arguments.seed, []
     for kind, view, seen in own_views(scene, arguments.views, seed):
         result.add(kind, answered(seen, model, registrar), view, seen.cloud)
-        clean += [view] if kind == "clean" else []
-    clouds = [view.depth.to_points() for view in clean]
+        clean += [(view, seen.cloud)] if kind == "clean" else []
+    clouds = [cloud for _, cloud in clean]
     for index, cloud in enumerate(clouds):
         wrong = PointCloud(cloud.points * FACTORS[index % len(FACTORS)])
         result.strange["wrong unit"].append(recognized(wrong, model, registrar))
@@ -302,12 +303,12 @@ def measured(name: str, arguments: argparse.Namespace) -> Measured:
     return result
 
 
-def calibration_error(model: Model, views: Sequence[View]) -> tuple[float, float]:
+def calibration_error(model: Model, views: Sequence[tuple[View, PointCloud]]) -> tuple[float, float]:
     """Expected calibration error of the probabilities as they are and calibrated, over cells of the paper's metric."""
     logits, truth = [], []
-    for view in views:
+    for view, cloud in views:
         points, labels = sample_cells(truth_grid(view.mesh, CELLS))
-        logits.append(model.logits(model.encode(view.depth.to_points()), points))
+        logits.append(model.logits(model.encode(cloud), points))
         truth.append(labels)
     calibration = model.calibration
     assert calibration is not None and calibration.temperature is not None

@@ -225,8 +225,7 @@ class Screen:
     def of(cls, tables: ShapeTables, evidence: Evidence, half: float, scaled: bool = False) -> "Screen":
         """Screen of a frame."""
         points, sight = evidence.observed_samples[:POINTS].astype(np.float32), SightTable.of(evidence)
-        in_part = evidence.other_lines == "unknown" or len(evidence.sight.data) > len(evidence.points)
-        return cls(tables, points, sight, half, scaled, in_part)
+        return cls(tables, points, sight, half, scaled, evidence.is_open)
 
     def starts(self, rotations: Float[np.ndarray, "r 3 3"]) -> Poses:
         """Every state at every rotation, its visible side on the cloud; where ``scaled``, as large as the cloud.
@@ -402,9 +401,7 @@ HEAVY, HEAVIER_STEPS, HELPS = 3000.0, (0.04, 12), 0.65
 the share of the misfit that may be left: bends of a bunny's ears leave .45 to .54, states of livers .77 up."""
 
 HOPELESS = 4.0
-"""Misfit of the cloud after two rounds from which on a third, which takes as long as both, is not made.
-
-After two rounds training views of six objects, cameras' too, have at most 2.6, most other things 4.3 to 6."""
+"""Misfit of the cloud after two rounds from which on no third is made: own views have up to 2.6, most else 4.3 to 6."""
 
 WHOLE = 150.0
 """Misfit by which an object that is seen whole may be explained worse than one that something hides in part: it is on

@@ -43,10 +43,8 @@ WITHIN = float(norm.ppf(0.5 + LEVEL / 2))
 """Standard deviations of one Gaussian number on either side that hold it with this probability: 1.96."""
 
 NOISY_FACTOR = 1.5
-"""Factor of the posterior's radii in a noisy frame, of an object that was not calibrated.
-
-On 12 training views of two objects by simulated cameras, radii of fits of the modes hold 96 % with it and 84 % without;
-those of clean views need none (docs/experiments/071.md)."""
+"""Factor of the posterior's radii in a noisy frame, of an object that was not calibrated: on training views fits of the
+modes hold 96 % with it and 84 % without; clean views need none (docs/experiments/071.md)."""
 
 _FREEDOM = np.linspace(1.0, 3.0, 201)
 _QUANTILE = chdtri(_FREEDOM, 1.0 - LEVEL)

@@ -144,8 +144,15 @@ class Evidence:
         return np.where(away[:, None], -normals, normals)
 
     @property
+    def is_open(self) -> bool:
+        """Whether there are lines of sight on which nothing is known."""
+        return self.other_lines == "unknown" or len(self.sight.data) > len(self.points)
+
+    @property
     def hidden_edge(self) -> float:
-        """Share of the silhouette beside which nothing is known, as where an occluder or the picture's edge cuts it."""
+        """Share of the silhouette next to which nothing is known: where an occluder or the picture's edge cuts it."""
+        if not self.is_open:
+            return 0.0
         toward = self.points / self.ranges[:, None]
         across = rotation_along(toward.mean(axis=0))[:, :2].T
         turns = np.arange(EDGE_DIRECTIONS) * (2 * np.pi / EDGE_DIRECTIONS)

@@ -32,10 +32,7 @@ from mereo.reconstruction.pipeline import (
 )
 
 NO_OUTLINE = 0.9
-"""Share of the silhouette beside which nothing is known from which on a frame shows no outline.
-
-Planes of which a model explains a part have 1, training views of seven objects of which 0 to 75 % are hidden at most
-.58."""
+"""``Evidence.hidden_edge`` from which on a frame shows no outline: planes have 1, views that are 75 % hidden .58."""
 
 PATCH = 0.02
 """Share of the points by which a smooth patch may explain fewer than the object, and still explains as many."""
@@ -88,8 +85,10 @@ class Candidate:
         """
         if self.modes is None or self.located_by == "pose":
             return False
-        evidence, fit = self.modes.problem.evidence, self.modes.registration()
-        return evidence.hidden_edge > NO_OUTLINE and evidence.patch_share(self.modes.tolerance) > fit.explained - PATCH
+        evidence = self.modes.problem.evidence
+        if evidence.hidden_edge <= NO_OUTLINE:
+            return False
+        return evidence.patch_share(self.modes.tolerance) > self.modes.registration().explained - PATCH
 
     def explained(self, tolerance: float) -> float:
         """Share of all points, outliers included, that lie on the facing surface up to a tolerance in scene units."""
