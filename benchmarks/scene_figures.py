@@ -1,10 +1,12 @@
 """Figures that scenes' docstrings state: what tells the robot's fingers apart, what half a cell costs the sheet.
 
     python benchmarks/scene_figures.py [--views 200]
+    python benchmarks/scene_figures.py --picture docs/images/scenes.png
 
 Robot: in how many pixels of a noise-free depth image a random state differs, by more than five times the camera's
 noise, from the same with the hand turned by half and its fingers exchanged; views in which the hand shows. Sheet:
-scores of the truth against itself, moved by half a cell of its own grid along each axis.
+scores of the truth against itself, moved by half a cell of its own grid along each axis. The picture shows each
+built-in scene at rest, in two random states, these three overlaid, and a depth image of the second.
 """
 
 import argparse
@@ -23,6 +25,8 @@ from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.depth_sensor import render_depth
 from mereo.synthesis.examples import sample_view
+from mereo.visualization.contact_sheets import contact_sheet, depth_to_rgb, enlarge, save_png
+from mereo.visualization.renderer import Vector, Viewpoint, shade
 from mereo_objects import _robot_parts as parts
 
 TELLING = 0.5
@@ -30,6 +34,42 @@ TELLING = 0.5
 
 SHOWN = 10
 """Pixels of hand and fingers, at least; a hand that is hidden is no question."""
+
+SIDE = 192
+"""Width and height of a picture: two pixels for each of the depth image."""
+
+VIEWPOINTS: dict[str, tuple[Vector, Vector]] = {
+    "human": ((0.3, -0.3, -1.0), (0.0, 1.0, 0.0)),
+    "robot": ((0.9, 0.8, -0.45), (0.0, 0.0, 1.0)),
+    "bunny": ((0.3, -0.3, -1.0), (0.0, 1.0, 0.0)),
+    "lizard": ((0.3, 0.5, -1.0), (0.0, 0.0, 1.0)),
+    "rope": ((-0.3, 0.4, -1.0), (-1.0, 0.0, 0.0)),
+    "skull": ((0.35, 0.8, -0.6), (1.0, 0.0, 0.0)),
+    "engine": ((0.35, 1.0, -0.35), (0.0, 0.0, 1.0)),
+    "liver": ((0.25, 0.6, 0.6), (0.0, 1.0, 0.0)),
+    "shapes": ((0.5, 1.0, -0.6), (0.0, 0.0, 1.0)),
+    "sheet": ((0.3, 0.8, -0.75), (0.0, 0.0, 1.0)),
+    "tumor": ((0.25, 0.6, 0.6), (0.0, 1.0, 0.0)),
+    "liver-simulated": ((0.25, 0.6, 0.6), (0.0, 1.0, 0.0)),
+}
+"""Viewing direction and up of each scene's pictures, in the scene's frame."""
+
+
+def draw_scenes(path: str) -> None:
+    """Write the picture of all built-in scenes; states are those of seed 0."""
+    images, captions = [], []
+    for name, (direction, up) in VIEWPOINTS.items():
+        scene = load_scene(name)
+        views = [sample_view(scene, GenerateConfig(), example_rng(0, index)) for index in (0, 1)]
+        meshes = [scene.rest, *(view.mesh.transformed(view.T_world_camera) for view in views)]
+        bounds = np.array([each.bounds for each in meshes])
+        viewpoint = Viewpoint.along(np.stack([bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)]), direction, up)
+        states = [shade(mesh, viewpoint, (SIDE, SIDE)) for mesh in meshes]
+        overlaid = np.rint(np.mean(np.array(states, dtype=float), axis=0)).astype(np.uint8)
+        images += [*states, overlaid, enlarge(depth_to_rgb(views[1].depth), SIDE)]
+        words = ("random state", "another", "overlaid", "depth image of the other")
+        captions += [f"{name}, {len(scene.rest.segments)} segments", *words]
+    save_png(path, contact_sheet(images, captions, 10))
 
 
 def telling_pixels(views: int) -> Float[np.ndarray, " n"]:
@@ -71,7 +111,12 @@ def moved_by_half_a_cell(views: int) -> tuple[float, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Measure what scenes' docstrings state.")
     parser.add_argument("--views", type=int, default=200)
-    views = parser.parse_args().views
+    parser.add_argument("--picture", help="write this picture of all scenes instead")
+    options = parser.parse_args()
+    if options.picture:
+        draw_scenes(options.picture)
+        return
+    views = options.views
     counts = telling_pixels(views)
     low, median = np.quantile(counts, [0.05, 0.5])
     print(
