@@ -1,4 +1,4 @@
-"""What the model of a default deformation answers of states that are not its own: elastic solid beside box of rubber.
+"""What the model of a default deformation answers of states that are not its own: elastic solid against box of rubber.
 
     python benchmarks/elastic_states.py [SCENES ...] [--views N] [--seed S]
 

@@ -67,7 +67,7 @@ class OccludedView:
         whole: all that was measured, with occluder and wall.
         mask: pixels of the object, as the sensor's segmentation has them.
         source: what each pixel's ray met first, ``clutter.OBJECT`` and so on.
-        alone: depth of the object alone without noise, 0 beside it.
+        alone: depth of the object alone without noise, 0 around it.
         hidden: share of the object's pixels that are hidden or outside the picture.
     """
 
@@ -106,7 +106,7 @@ def occlude(
         share: of the object's pixels, 0 to 1 (without 1).
         rng: decides where, and on the noise.
         settings: noise and sensor. What the sensor puts around the object at random is left out.
-        wall: whether a wall is far behind the object; without it nothing is measured beside object and occluder.
+        wall: whether a wall is far behind the object; without it nothing is measured around object and occluder.
 
     Raises ``ValueError`` where no object pixel, or no share from 0 to 1, is there.
     """

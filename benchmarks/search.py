@@ -7,10 +7,10 @@ Conditions: `whole`, `screen30` and `screen50` (an occluder with a straight edge
 pixels), `picture50` (the picture's edge cuts off half), `tool30`, `hand30`, and views by simulated cameras,
 `structured-light` and `time-of-flight` at 96 x 96 pixels, `structured-light-192` and `time-of-flight-192` at 192 x 192.
 Frames of the first kinds are whole depth images with a mask before a far wall; `whole` and those of cameras are cut
-out, so that they do not say what is beside the object.
+out, so that they do not say what is around the object.
 
 Finders: `search` (no network), `network` (both fit modes and, where there are few, scene parameters), `both` (`--method
-auto`), and `before`, the network's fit that takes all beside the object for empty and asks no search.
+auto`), and `before`, the network's fit that takes all around the object for empty and makes no search.
 
 A row: mean IoU / mIoU of the views on a grid of 60 cells, median and greatest seconds, share of views that the fit
 explains, and how many of those have an IoU below .8. With `--output` each row is kept in FOLDER/OBJECT-CONDITION.json

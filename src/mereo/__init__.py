@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from mereo_learning.config import TrainConfig as TrainConfig
 
 # Here and not where torch is used, because this runs before every import of torch that mereo makes. A thread that spins
-# at a barrier holds the core that the thread it waits for needs: beside other work each barrier may cost a time slice.
+# at a barrier holds the core that the thread it waits for needs: next to other work each barrier may cost a time slice.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 _HOME = {

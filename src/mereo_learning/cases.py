@@ -218,7 +218,7 @@ class Reliability:
 
     @classmethod
     def of_view(cls, model: Trained, code: EncodedCloud, truth: TruthGrid) -> "Reliability":
-        """Answers of a network about a view; one that tells no segments apart is asked for the whole."""
+        """Answers of a network about a view; one that tells no segments apart is scored for the whole."""
         points, labels = sample_cells(truth)
         answer, result = model.query(code, points), cls()
         right = answer.label == np.minimum(labels, answer.probability.shape[1] - 1)

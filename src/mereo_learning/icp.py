@@ -9,7 +9,7 @@ scan points a segment may answer for. A scan shows one side of an object and eve
    shrinks from round to round;
 3. moves each body (all segments at first, then each by itself) onto its own points.
 
-Where asked, a body is held in the directions in which its points do not constrain it (a ball turns freely, a rod
+On request, a body is held in the directions in which its points do not constrain it (a ball turns freely, a rod
 slides), after Zhang, Kaess and Singh, "On degeneracy of optimization-based state estimation problems" (ICRA 2016).
 
 Notation: ``T_scan_segment`` maps rest coordinates (scene units) to the scan's frame and unit: a similarity. Motions are

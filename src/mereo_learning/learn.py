@@ -471,7 +471,7 @@ def timed(data: Dataset, recipe: TrainConfig, folder: Path, shown: Progress) -> 
 
 
 class Trial(Trainer):
-    """Training of ``STEPS`` steps on all of its data, of which only losses and speed are asked."""
+    """Training of ``STEPS`` steps on all of its data, of which only losses and speed count."""
 
     @classmethod
     def of(cls, data: Dataset, recipe: TrainConfig, folder: Path) -> "Trial":
@@ -700,7 +700,7 @@ def scene_for(files: Sequence[Path], folder: Path, units: str | None, quiet: boo
         if not quiet:
             print(
                 f"wrote {path}; where the object moves in other ways, stop with Ctrl-C, say so in that file "
-                "(docs/own-object.md), and learn it anew: mereo learn FILE --output ANOTHER"
+                "(docs/own-object.md), and learn it again: mereo learn FILE --output ANOTHER"
             )
     return str(path)
 

@@ -199,7 +199,7 @@ def _metrics(folder: Path, model: Model) -> dict[str, Any]:
 
 
 def _with_statistical_model(model: Model) -> Model:
-    """The weights with as many modes of the object's states as fit into ``MOST_BYTES`` beside the network."""
+    """The weights with as many modes of the object's states as fit into ``MOST_BYTES`` next to the network."""
     states = model.statistical_model
     if states is None:
         return model

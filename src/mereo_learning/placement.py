@@ -131,7 +131,7 @@ def place(
         is_rigid: whether the object is rigid; then only the first stage is done.
         hold: names of segments that are placed as if the scan did not show them.
 
-    Raises ``ValueError`` when the result cannot be right: most of the scan lies elsewhere, or a segment ran away.
+    Raises ``ValueError`` when the result cannot be right: most of the scan lies far away, or a segment ran away.
     """
     if unknown := sorted(set(hold) - set(rest.names)):
         raise ValueError(

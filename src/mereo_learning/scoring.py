@@ -52,7 +52,7 @@ class EvaluationConfig:
         scans: truth files, or their folders, of ``mereo align``; none of them means the four range scans of the bunny;
             None scores views.
         settings: the camera of the views (image size, noise, sensor); by default the paper's.
-        method: which answer is scored: by default what a user gets, and beside it all others that can be had.
+        method: which answer is scored: by default the answer that a user gets, and all others too.
         cells: cells of the grid along each axis.
     """
 

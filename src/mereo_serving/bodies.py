@@ -40,7 +40,7 @@ MASKS, YAML = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"), (".yaml", ".ym
 
 PARTS = ("frame", "mask", "intrinsics")
 
-logging.getLogger("python_multipart").setLevel(logging.CRITICAL + 1)  # it tells the log what the client is told
+logging.getLogger("python_multipart").setLevel(logging.CRITICAL + 1)  # it writes to the log what the client reads
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
     admit -Place-> (the body comes) -submit-> Waiting -take-> FrameRequest -> Reply
 
-All is done in the thread of the event loop, so nothing here is locked; only processes are asked in threads, one each.
+All is done in the thread of the event loop, so nothing here is locked; only processes have a thread each.
 """
 
 import asyncio

@@ -148,7 +148,7 @@ class _Body:
 
     def __init__(self, scope: Any, receive: Any) -> None:
         self._receive, self._whole = receive, False
-        # who waits for leave to send a body is told the answer instead
+        # a client that waits for leave to send a body gets the answer instead
         self._expects_continue = any(name.lower() == b"expect" for name, _ in scope["headers"])
 
     async def receive(self) -> Any:

@@ -132,14 +132,14 @@ CRASHED = (
 )
 
 FAULT = "the frame cannot be answered for a fault of the server, which has logged it: try another frame, or report it"
-"""What a client is told of an error that is not its own; the log has the rest."""
+"""Message to a client about an error that is not its own; the log has the rest."""
 
 
 class Refused(Exception):
     """Request that is not answered.
 
     Attributes:
-        reply: what its client is told.
+        reply: answer to its client.
     """
 
     def __init__(self, status: int, sentence: str, headers: Mapping[str, str] | None = None) -> None:

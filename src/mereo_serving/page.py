@@ -1,4 +1,4 @@
-"""The page ``/docs``: what can be asked, written out of the OpenAPI description, without anything from another host."""
+"""The page ``/docs``: the requests, written out of the OpenAPI description, without anything from another host."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape

@@ -80,7 +80,7 @@ def serve(
 
 
 class GracefulServer(uvicorn.Server):
-    """Server that refuses what waits as soon as it is asked to end, and answers what is begun."""
+    """Server that refuses what waits as soon as it has to end, and answers what is begun."""
 
     def __init__(self, config: uvicorn.Config, dispatcher: Dispatcher, greeting: str) -> None:
         super().__init__(config)

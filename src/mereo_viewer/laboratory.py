@@ -50,7 +50,7 @@ CELLS = 64
 """Cells a side on which an answer is scored; the paper takes 100, fewer are faster and a little off."""
 
 GAP = 0.15
-"""Room beside and below truth and reconstruction, side by side, in stage units."""
+"""Room next to and below truth and reconstruction, side by side, in stage units."""
 
 
 # --- without a page ---------------------------------------------------------------------------------------------------
@@ -299,7 +299,7 @@ class LabPage:
     # --- changes ------------------------------------------------------------------------------------------------------
 
     def update(self) -> None:
-        """See the state anew, after the camera has moved."""
+        """Render the state again, after the camera has moved."""
         self._change("camera", lambda shape: shape)
 
     def randomize(self) -> None:

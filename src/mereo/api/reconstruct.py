@@ -245,7 +245,7 @@ class Tracker:
       which it waits some seconds; or it was found again by a search in the background.
     - "followed": the last frame's state led to it.
     - "lost": the object has left the view, is covered, or has moved too far; ``known`` is False and
-      ``recognition.reason`` says why. No registration is the answer: ``surfaces`` are a network's, which was asked at
+      ``recognition.reason`` says why. No registration is the answer: ``surfaces`` are a network's, which answered at
       once but does not explain the frame; without weights they raise ``ValueError``. A search goes on in a thread of
       its own, while frames are answered in milliseconds, until the object is found.
 
@@ -283,7 +283,7 @@ class Tracker:
             reading: arguments of ``load_frame``.
 
         Raises ``ValueError`` for unusable frames, after which the sequence may go on. Surfaces, labels and figures are
-        made when they are asked for.
+        made on first use.
         """
         isolation = isolation or IsolationConfig()
         with python_words():

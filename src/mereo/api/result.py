@@ -242,7 +242,7 @@ class Result(Answer):
             path: a folder to create, by default result, result2, ...; or a file whose suffix says what it is: .glb,
                 .ply (surfaces), .npz, .vti, .nii.gz, .seg.nrrd (labels), .json (the figures), .html (the report), .png
                 (the preview).
-            formats: files of a folder beside report and preview, as ``--formats``; "points" needs
+            formats: files of a folder besides report and preview, as ``--formats``; "points" needs
                 ``reconstruct(..., label_points=True)``.
             millimetres: write .ply, .vti and other files that have no unit in millimetres, not in the frame's unit.
             overwrite: replace a folder that mereo wrote, and nothing else is in, or a file that no input is.

@@ -114,7 +114,7 @@ class ViewCommand:
             without it (and --object) a shipped frame.
         object: what is looked for in the frame, as for `mereo reconstruct`: its meshes or its scene. Without a frame
             the laboratory of this object is opened: states of its are shown to a simulated camera, and what is found in
-            its image beside the truth.
+            its image next to the truth.
         weights: a shipped name or a file; by default those of the shipped frame, or none.
         units: of the object's meshes; guessed where not given.
         port: where the page is; 0 takes any that is free.
@@ -170,7 +170,7 @@ class StreamCommand:
 
     Each answer is one line of JSON on standard output, in the input's frame and units; rate and latency come at the
     end, on standard error. Where the object's own deformation model is known, it is followed: each frame's fit starts
-    from the last one's state, and network or search are asked at first and where the object is lost. The exit status is
+    from the last one's state, and network or search answer at first and where the object is lost. The exit status is
     0 where any frame was answered and the sequence was whole, else 2.
 
     Attributes:
@@ -180,8 +180,7 @@ class StreamCommand:
         units: of the object's meshes; guessed where not given.
         resolution: grid cells along the longest side of the network's surfaces: fewer are faster.
         method: auto follows the registered model where it explains the frame, if the weights carry one, and else asks
-            the network; network asks it alone, for each frame anew; search leaves it out; modes takes the model in any
-            case.
+            the network; network uses it alone, frame by frame; search leaves it out; modes takes the model in any case.
         uncertainty: say how sure the registered model is: radii, in the input's unit, that hold the true places of the
             surface and of each segment's centroid with probability 0.95, and intervals of its volume; takes some 30 ms.
         rate: frames per second at which a folder was recorded.

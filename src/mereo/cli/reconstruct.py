@@ -86,7 +86,7 @@ class FrameJob:
 
     @property
     def read(self) -> tuple[str | Path, ...]:
-        """Files that are read beside the frames."""
+        """Files that are read besides the frames."""
         command = self.command
         scene = () if command.scene is None else files_of(command.scene)
         given = (command.reading.intrinsics, command.reading.mask, command.initial_pose, *command.carry)

@@ -79,7 +79,7 @@ class SceneCheck:
 
     Attributes:
         scene: a name from `mereo scene list`, or a scene file of your own (.yaml, .py).
-        repair: write repaired copies of faulty meshes, and a scene file that names them, beside a YAML scene file.
+        repair: write repaired copies of faulty meshes, and a scene file that names them, next to a YAML scene file.
     """
 
     scene: SceneName

@@ -131,7 +131,7 @@ class CalibrateCommand:
     threads: Threads = 0
 
     def run(self) -> None:
-        """Measure, write the weights anew, and print what was found."""
+        """Measure, write the weights again, and print the result."""
         from mereo.io.atomic_files import atomic_file
         from mereo.models.calibration import calibration_rows
         from mereo.models.weights import load_model, with_calibration

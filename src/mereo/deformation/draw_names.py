@@ -4,7 +4,7 @@
         angle_rad = named(rng, "bend", "rad").uniform(0.0, 0.7)
 
 Only a ``NamedGenerator`` keeps them, such as the laboratory's (``mereo.scenes.draw_recorder``). Any other generator
-draws as if it had not been told, and names change no number with either.
+draws as without names, and names change no number with either.
 """
 
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ class DrawName:
 
 
 class NamedGenerator(np.random.Generator):
-    """Generator that is told what its next draw is called, and of which parts, the outermost first.
+    """Generator that knows the name of its next draw, and its parts, the outermost first.
 
     ``checked`` is whether states that the scene would refuse are to be refused, see ``unchecked``.
     """
@@ -40,13 +40,13 @@ class NamedGenerator(np.random.Generator):
     checked: bool = True
 
     def take_name(self) -> DrawName:
-        """Name of the draw that is being made; the one after it has none until it is told."""
+        """Name of the draw that is being made; the one after it has none until it is named."""
         (name, unit), self.next_name = self.next_name, ("", "")
         return DrawName(self.parts, name, unit)
 
 
 def named(rng: np.random.Generator, name: str | tuple[str, ...], unit: str = "") -> np.random.Generator:
-    """Generator ``rng`` itself, told what the numbers of its next draw are called.
+    """Generator ``rng`` itself, with a name for the numbers of its next draw.
 
     ``name`` is that of all numbers, or of each of them in C order; ``unit`` as they are drawn is "rad", "°", "mm",
     "log" for a factor's logarithm, "" for shares.
@@ -59,8 +59,8 @@ def named(rng: np.random.Generator, name: str | tuple[str, ...], unit: str = "")
 def unchecked(rng: np.random.Generator) -> bool:
     """Whether a scene may leave out its test of a state, as the state itself is not wanted.
 
-    A fit plays states a small step beside a tested one for what each draw moves. A test such as for parts that meet may
-    take longer than the rest of a state, and refused neighbours would tell nothing.
+    A fit simulates states a small step from a tested one for what each draw moves. A test such as for parts that meet
+    may take longer than the rest of a state, and refused neighbours would tell nothing.
     """
     return isinstance(rng, NamedGenerator) and not rng.checked
 

@@ -186,7 +186,7 @@ def invert(
     """Rest points whose image is ``points``: by the deformation itself where it is ``Invertible``, else by ``newton``.
 
     It starts at ``guess``, for example the rest positions of the nearest deformed vertices. Returns also for each
-    whether its image lies within ``TOLERANCE`` of the coordinates' magnitude; elsewhere it is the best position found.
+    whether its image lies within ``TOLERANCE`` of the coordinates' magnitude; else it is the best position reached.
     """
     if isinstance(deformation, Invertible):
         return deformation.rest_points(points, guess)
@@ -198,7 +198,7 @@ def newton(
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
     """Rest points found by damped Newton's method with finite differences, all points at once; see ``invert``.
 
-    A step is kept where the distance to the target falls by at least half of what the linear model promises; elsewhere
+    A step is kept where the distance to the target falls by at least half of what the linear model promises; else
     half of the step is tried, and so on, so that guesses from which the plain method overshoots still converge.
     (Any decrease would not do: a point can run away along one axis while it gains along another.)
     """

@@ -170,7 +170,7 @@ BLOCK = 150
 """Poses in one array operation: their arrays fit a core's cache, where 3,600 at once take seven times as long each."""
 
 OUTSIDE = SILHOUETTE_WEIGHT * SILHOUETTE_VERTICES / 3000.0
-"""Weight of what the frame rules out beside that of the cloud: as in the fit."""
+"""Weight of what the frame rules out relative to that of the cloud: as in the fit."""
 
 FARTHEST = 0.5
 """Largest turn of one step, rad, and largest change of the scale's logarithm."""
@@ -211,7 +211,7 @@ class Screen:
     Attributes:
         half: half the object's length.
         scaled: whether the scale is unknown.
-        in_part: whether something may hide a part of the object, or nothing is known beside it.
+        in_part: whether something may hide a part of the object, or nothing is known around it.
     """
 
     tables: ShapeTables
@@ -431,7 +431,7 @@ def rotations(count: int) -> Float[np.ndarray, "n 3 3"]:
 
 @dataclass(eq=False)
 class _Trail:
-    """Search under one hypothesis on the lines of sight beside the cloud."""
+    """Search under one hypothesis on the lines of sight around the cloud."""
 
     problem: Problem
     handicap: float = 0.0
@@ -498,7 +498,7 @@ class _Trail:
 def search(whole: Problem, partial: Problem | None = None, start: Posed | None = None) -> SearchOutcome:
     """Search for the state that explains a frame without correspondences, or fit it from ``start``.
 
-    ``partial`` is the same where it is open whether the object is seen whole: with nothing known beside the cloud. It
+    ``partial`` is the same where it is open whether the object is seen whole: with nothing known around the cloud. It
     is taken where it explains the frame better by more than ``WHOLE``.
     """
     trails = [_Trail(whole)] if partial is None else [_Trail(whole), _Trail(partial, WHOLE)]

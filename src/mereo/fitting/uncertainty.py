@@ -77,7 +77,7 @@ class RadiusParts:
     open: Float[np.ndarray, " n"]
 
     def radii(self, scale: float = 1.0, extra_radius: float = 0.0) -> Float[np.ndarray, " n"]:
-        """Radii with a scale of the Gaussian, and a radius that all points have beside; in the parts' unit."""
+        """Radii with a scale of the Gaussian, and a radius that all points have in addition; in the parts' unit."""
         result: np.ndarray = np.sqrt((scale * self.gaussian) ** 2 + self.open**2 + extra_radius**2)
         return result
 
@@ -93,7 +93,7 @@ class Posterior:
         factor: p x p, ``factor factor^T`` is the covariance of the parameters.
         residue: root mean square distance of the object's states from what the coefficients can express.
         open: motion of the material points with further standard normal numbers, by the second moments of what is far
-            from Gaussian (``find_segment_turns``, a state beside rest), in the camera's axes; None without.
+            from Gaussian (``find_segment_turns``, a state near rest), in the camera's axes; None without.
     """
 
     posed: Posed
@@ -190,7 +190,7 @@ class Posterior:
 def covariance_factor(precision: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
     """Factor F of an inverse, ``F F^T = precision^-1``; unlike units of the parameters do no harm.
 
-    Precisions are sums of products in single precision: what these leave open (a scale that nobody knows, beside
+    Precisions are sums of products in single precision: what these leave open (a scale that nobody knows, next to
     states that grow) is as unsure as their rounding can tell, and may come out below zero.
     """
     unit = 1.0 / np.sqrt(np.diag(precision))

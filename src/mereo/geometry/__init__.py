@@ -1,1 +1,1 @@
-"""Cameras, meshes, clouds, label grids, and what can be asked of them."""
+"""Cameras, meshes, clouds, label grids, and queries on them."""

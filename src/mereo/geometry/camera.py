@@ -143,7 +143,7 @@ SightKind = Literal["past", "unknown"]
 
 @dataclass(frozen=True, eq=False)
 class SightLines:
-    """Lines of sight beside the object, in the frame, axes and unit of its points.
+    """Lines of sight around the object, in the frame, axes and unit of its points.
 
     Attributes:
         past: points that were measured behind the object; the space between the camera and each is empty.
@@ -158,7 +158,7 @@ class SightLines:
 
     @classmethod
     def of_cloud(cls, other_lines: SightKind | None = None) -> "SightLines":
-        """Lines of sight beside a bare cloud, all of one kind, or of an undecided one."""
+        """Lines of sight around a bare cloud, all of one kind, or of an undecided one."""
         return cls(np.empty((0, 3)), np.empty((0, 3)), other_lines)
 
     def transformed(self, T_new_old: Float[np.ndarray, "4 4"]) -> "SightLines":

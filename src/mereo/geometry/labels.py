@@ -71,7 +71,7 @@ class SegmentedCloud:
 
     @property
     def chances(self) -> dict[str, Float[np.ndarray, " n"]]:
-        """``confidence`` and ``occupancy`` by their names; none where no network was asked."""
+        """``confidence`` and ``occupancy`` by their names; none without a network's answer."""
         if len(self.points) and np.isnan(self.confidence).all():
             return {}
         return {"confidence": self.confidence, "occupancy": self.occupancy}

@@ -180,7 +180,7 @@ class SegmentedMesh:
     def check(self) -> None:
         """Raise ``ValueError`` unless every segment is finite, closed, outward oriented and of positive volume.
 
-        Of a segment that is marked as no solid, only finite vertices and existing indices are asked.
+        Of a segment that is marked as no solid, only finite vertices and existing indices are required.
         """
         for segment in self.segments:
             check_segment(segment)

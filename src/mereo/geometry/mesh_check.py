@@ -192,7 +192,7 @@ FRAGMENT = 0.02
 
 
 def fragments(vertices: Vertices, faces: Faces, unit: str = "") -> tuple[Bool[np.ndarray, " f"], str]:
-    """Faces of pieces that are tiny beside the whole, and a phrase with their number, size and place."""
+    """Faces of pieces that are tiny compared with the whole, and a phrase with their number, size and place."""
     piece = pieces(faces, len(vertices))
     corners = vertices[faces]
     low, high = (np.full((piece.max() + 1, 3), end) for end in (np.inf, -np.inf))

@@ -210,7 +210,7 @@ class Solids:
 
         Rays are cast in single precision, so nearer to a surface than two millionths of its segment's longest side the
         label may be that of the other side, on some processors and not on others (0.4 millionths were the most with
-        AVX-512 and AVX2, 1.6 with SSE). Beyond that it is right where no surface folds over itself. Beside such a fold
+        AVX-512 and AVX2, 1.6 with SSE). Beyond that it is right where no surface folds over itself. Next to such a fold
         both rays may meet the wall of a pocket of winding number -1 from behind, and a point outside then counts as
         inside: of the built-in scenes six in 10,000 within 0.1 units of the skull's cranium.
         """

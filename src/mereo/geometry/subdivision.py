@@ -40,7 +40,7 @@ class TooManyFaces(ValueError):
 def split_edges(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], too_long: TooLong, most: int
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
-    """The same surface with all edges halved, and their halves again, that are ``too_long``; each is asked once.
+    """The same surface with all edges halved, and their halves again, that are ``too_long``; each is tested once.
 
     The given vertices come first. Both triangles at an edge are split there, so that closed meshes stay closed. Raises
     ``TooManyFaces`` where that takes more than ``most``.

@@ -18,10 +18,10 @@ NEIGHBORS = 24
 """Neighbours that are looked at: in an image, the 5 x 5 pixels around one."""
 
 ADJACENT, AROUND = 1.6, 3.0
-"""Angles in pitches within which points are beside each other (diagonals are), and within which neighbours count."""
+"""Angles in pitches within which points are adjacent (diagonals are), and within which neighbours count."""
 
 JUMP = 4.0
-"""Largest step in range between points beside each other, in widths of a pixel there: a surface seen at 76 degrees."""
+"""Largest step in range between adjacent points, in widths of a pixel there: a surface seen at 76 degrees."""
 
 NOISE = 2.5
 """The same in median steps between nearest neighbours, where that is more: closer points differ by noise alone."""

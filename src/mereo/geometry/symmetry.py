@@ -61,7 +61,7 @@ class Symmetry:
 
     @property
     def keeps_segments(self) -> bool:
-        """Whether each segment comes to lie on itself, so that the pose alone cannot be told."""
+        """Whether each segment comes to lie on itself, so that the pose alone is not determined."""
         return self.lands_on == tuple(range(len(self.lands_on)))
 
     def describe(self, names: tuple[str, ...]) -> str:

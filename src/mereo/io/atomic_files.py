@@ -1,6 +1,6 @@
 """Files and folders of results: they appear whole or not at all, and replace only what mereo itself wrote.
 
-An output is made in a scratch folder beside its destination (``.NAME.1a2b3c4d.mereo``) and renamed at the end. The
+An output is made in a scratch folder next to its destination (``.NAME.1a2b3c4d.mereo``) and renamed at the end. The
 scratch folder is locked by its process; the system frees locks when a process dies, so the next one that writes there
 can tell what a killed one left from work in progress.
 
@@ -67,7 +67,7 @@ def check_place(path: Path, may_be_link: bool = False) -> None:
 
 @contextmanager
 def scratch_folder(path: Path) -> Iterator[Path]:
-    """Yield a fresh folder beside ``path``, and remove it at the end, whatever happens; missing parents are made.
+    """Yield a fresh folder next to ``path``, and remove it at the end, whatever happens; missing parents are made.
 
     Where the block fails (Ctrl-C too) the parents are removed again. What killed processes left here for ``path`` goes.
     Raises ``OSError`` where the disk is full, and ``PermissionError``.

@@ -68,7 +68,7 @@ def is_foreseen(error: Exception) -> bool:
 def words_of(error: Exception) -> str:
     """Words of an error in one line: the sentence of a foreseen one, else its type and text.
 
-    An error of the operating system is told by its file and reason, the lack of torch by the extra that brings it.
+    An error of the operating system is described by its file and reason, the lack of torch by the extra that brings it.
     """
     if is_torch(error):
         return NEEDED

@@ -2,7 +2,7 @@
 
     train    ━━━━━━━━━━━━╸━━━━━━━━━━  step 120 of 300, 24.0 examples/s, 90 s left, loss 1.234
 
-is a bar on a terminal, and elsewhere the same as a plain line now and then. What others print meanwhile stays above it.
+is a bar on a terminal, else the same as a plain line now and then. What others print meanwhile stays above it.
 """
 
 import sys

@@ -37,7 +37,7 @@ class Document:
             count = _count(root, {})
             self.data: Any = yaml.safe_load(self.text) if count <= MOST_VALUES else None
         except RecursionError:  # also of what contains itself by an alias
-            raise ValueError(f"{path} is nested too deeply; a scene file has lists in blocks: write it anew") from None
+            raise ValueError(f"{path} is nested too deeply; a scene file has lists in blocks: write it again") from None
         except (yaml.YAMLError, ValueError, KeyError) as error:  # the last two of dates, numbers and truth values
             mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
             place, why = f"{path}:{mark.line + 1}" if mark else path, getattr(error, "problem", None) or reason(error)
@@ -45,7 +45,7 @@ class Document:
         if count > MOST_VALUES:
             raise ValueError(f"{path} holds {count} values; at most {MOST_VALUES} can be read: use fewer aliases")
         if not isinstance(root, yaml.MappingNode):
-            raise ValueError(f"{path} holds no `key: value` lines; a scene file starts with `name:`: write one anew")
+            raise ValueError(f"{path} holds no `key: value` lines; a scene file starts with `name:`: write one")
         self._root: yaml.Node = root
         self._refuse_repeated(root)
 

@@ -74,7 +74,7 @@ class RadiusFactors:
         return None if self.scale is None else self.scale * self.widening(misfit)
 
     def extra_radius(self, displaced: float | None) -> float:
-        """Radius that every place has beside, where network and model are so far apart; in half lengths."""
+        """Radius that every position has in addition, where network and model are so far apart; in half lengths."""
         if self.displaced is None or displaced is None:
             return 0.0
         return float(np.sqrt(max(displaced**2 - self.displaced**2, 0.0)))

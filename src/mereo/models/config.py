@@ -65,7 +65,7 @@ EXACT = InferenceConfig(precision="float32")
 
 @dataclass(frozen=True)
 class Supervision:
-    """Kinds of truth that a loss has taught a network, and so what it can be asked.
+    """Kinds of truth that a loss has taught a network, and so what it can answer.
 
     Attributes:
         labels: by cross-entropy ("ce"); a network trained without it only knows inside from outside.
@@ -136,7 +136,7 @@ class AutodecoderConfig(_Part):
     Attributes:
         search_steps: steps of the autodecoder's search for a cloud's code.
         search_rate: learning rate of that search.
-        code_penalty: weight of a code's squared length in it, beside L1.
+        code_penalty: weight of a code's squared length in it, added to L1.
         spread_penalty: in its place where above 0: the search is then in units of the trained codes' spread, and so is
             its rate.
     """

@@ -173,7 +173,7 @@ def line_of_sight(
 
 
 class ConditionedMLP(nn.Module):
-    """Layers of the decoder, from code and query points to features, whatever is asked of them.
+    """Layers of the decoder, from code and query points to features, whatever is read from them.
 
     Queries are in the camera frame; the levels of the code may be in an aligned one.
     """

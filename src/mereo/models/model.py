@@ -51,7 +51,7 @@ class Model:
     """Trained network with everything needed to use it.
 
     Attributes:
-        network: in evaluation mode, not to be changed once the model has been asked.
+        network: in evaluation mode, not to be changed once the model has been used.
         names, colors: of the segments; label i + 1 is names[i].
         provenance: how it was trained: scene, seeds, dataset, recipe, versions.
         loss: the terms it was trained with; what none of them taught is not answered.
@@ -225,7 +225,7 @@ class Model:
         points: Float[np.ndarray, "n 3"],
         answer: Callable[[Prediction, Tensor], tuple[Tensor, ...]],
     ) -> list[np.ndarray]:
-        """Parts of the answers at all points, asked chunk by chunk."""
+        """Parts of the answers at all points, computed chunk by chunk."""
         normalized = code.normalizer.apply(np.asarray(points, dtype=np.float64)).astype(np.float32)
         size, most = (CUDA_QUERY_CHUNK, 1) if self.device.type == "cuda" else (CPU_QUERY_CHUNK, MOST)
         network = self.inference  # made by one thread, this one

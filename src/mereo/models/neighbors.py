@@ -115,7 +115,7 @@ def _by_tree(queries: Float[np.ndarray, "q d"], points: Float[np.ndarray, "n d"]
 
 @lru_cache(maxsize=16)
 def _tree(data: bytes, dtype: str, axes: int) -> KDTree:
-    """Tree of points; the latest are kept, as a cloud's is asked again for every chunk of its queries."""
+    """Tree of points; the latest are kept, as a cloud's is used again for every chunk of its queries."""
     return KDTree(np.frombuffer(data, dtype).reshape(-1, axes))
 
 

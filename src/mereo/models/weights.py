@@ -33,7 +33,7 @@ from mereo.workers.spread import Cluster
 FORMAT_VERSION = 3
 """Version of the files."""
 
-CURE = "the file is damaged or was changed: take it anew, or train again"
+CURE = "the file is damaged or was changed: copy it again, or train again"
 
 Checked = TypeVar("Checked", bound=BaseModel)
 

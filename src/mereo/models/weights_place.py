@@ -66,7 +66,7 @@ def is_weights(name: str | Path) -> bool:
     try:
         return find_weights(name).suffix == ".safetensors"
     except FileNotFoundError:
-        return Path(name).suffix == ".safetensors"  # a file that is missing is told as such where it is loaded
+        return Path(name).suffix == ".safetensors"  # a missing file is reported where it is loaded
 
 
 def load_weights(given: Trained | str | Path, inference: InferenceConfig) -> Trained:

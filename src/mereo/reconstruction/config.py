@@ -25,8 +25,8 @@ class IsolationConfig:
         keep_all: drop no strays, the points off all surfaces (a rim of background, flying pixels) that would stretch
             the cloud.
         extent: how much of the object's outline the frame shows. whole: nothing hides or cuts the object, so that it
-            ends where its points end. partial: something may hide or cut it anywhere, so that nothing is known beside
-            its points. auto: as the depths measured beside the object say; where the frame does not say it, the fit
+            ends where its points end. partial: something may hide or cut it anywhere, so that nothing is known around
+            its points. auto: as the depths measured around the object say; where the frame does not say it, the fit
             decides.
     """
 

@@ -4,7 +4,7 @@
 
 Every step is off by default, works on single points (no step moves one), and reports how many points it took away. The
 steps that compare neighbours measure lengths in the cloud's own spacing, so they need no unit and no setting. What is
-dropped without being asked for is in ``strays``.
+dropped unless kept on request is in ``strays``.
 """
 
 from collections.abc import Callable, Iterator
@@ -34,7 +34,7 @@ PLANE_SHARE = 0.1
 OUTLIER_NEIGHBORS, OUTLIER_STD = 16, 6.0
 """Neighbours whose mean distance makes an outlier, and standard deviations by which it must exceed the cloud's mean.
 
-Rusu et al., RAS 2008; PCL's StatisticalOutlierRemoval. The 1 or 2 standard deviations that are common elsewhere take
+Rusu et al., RAS 2008; PCL's StatisticalOutlierRemoval. The 1 or 2 standard deviations that are usual take
 surfaces that are seen edge-on, and with them the outline that the network's frame is made from."""
 
 CLUSTER_NEIGHBORS, CLUSTER_GAP = 12, 10.0

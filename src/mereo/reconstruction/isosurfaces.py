@@ -24,8 +24,8 @@ from mereo.geometry.mesh import Color, Segment, SegmentedMesh
 #
 # - Those whose corners differ (``changing_cells``), and at the first level all cells around them.
 # - Those where the lead of the winning class falls so steeply that it may vanish inside (``_sloping_cells``), except
-#   beside a surface that is already known.
-# - Then no evaluated node may contradict the label assumed beside it; where one does, that neighbour is evaluated too,
+#   next to a surface that is already known.
+# - Then no evaluated node may contradict the label assumed next to it; where one does, that neighbour is evaluated too,
 #   and so on (``_halve``). So a surface that is met anywhere is followed to its end.
 #
 # What can be missed is a part that lies between the nodes of the coarse lattice, touches no evaluated node, and casts
@@ -103,7 +103,7 @@ def sample_coarse_to_fine(
         changing, sloping = changing_cells(labels), _sloping_cells(rows, evaluate.logits())
         if step == COARSE:
             active = _over_neighbors(changing | sloping, np.logical_or)
-        else:  # beside a surface that is known the lead is small because of it, and `_halve` watches there
+        else:  # next to a surface that is known the lead is small because of it, and `_halve` watches there
             active = changing | (sloping & ~_over_neighbors(changing, np.logical_or))
         step //= 2
         labels, rows = _halve(labels, rows, active, step, evaluate)
@@ -158,8 +158,8 @@ def _halve(
 ) -> tuple[UInt8[np.ndarray, "u v w"], Int[np.ndarray, "u v w"]]:
     """Labels and rows of the next lattice, ``step`` fine nodes apart.
 
-    Active cells are evaluated, others filled with their corners' label. Then every skipped node beside one of another
-    label is evaluated, until none is left: so no evaluated node contradicts the label assumed beside it, and a surface
+    Active cells are evaluated, others filled with their corners' label. Then every skipped node next to one of another
+    label is evaluated, until none is left: so no evaluated node contradicts the label assumed next to it, and a surface
     once met is followed to its end.
     """
     shape = tuple(2 * n - 1 for n in labels.shape)
@@ -236,7 +236,7 @@ class Extraction:
     Attributes:
         surfaces: every segment as a closed mesh, in the order of the names; without faces where it does not occur.
         grid: the labels.
-        evaluated: number of points at which the field was asked.
+        evaluated: number of points at which the field was evaluated.
     """
 
     surfaces: SegmentedMesh

@@ -74,7 +74,7 @@ class Observation:
 
     @cached_property
     def lines(self) -> SightLines:
-        """Lines of sight beside the object, in the frame's axes and unit; strays count as the object's points."""
+        """Lines of sight around the object, in the frame's axes and unit; strays count as the object's points."""
         return lines_of_frame(self.frame, self.selection, self.extent)
 
     def read_as(self, reading: Reading) -> "Observation":
@@ -228,7 +228,7 @@ def clusters_warning(observation: Observation) -> str | None:
 
 # --- lines of sight ---------------------------------------------------------------------------------------------------
 
-# Which of them went past the object, and along which nothing is known: depths beside it are compared with those of its
+# Which of them went past the object, and along which nothing is known: depths around it are compared with those of its
 # pixels nearest in the picture (docs/registration.md). A depth image states a line of sight for each pixel, a point
 # cloud for each point that isolation left out.
 
@@ -248,7 +248,7 @@ ALIKE, AGREEING = 0.25, 3
 this share. A pixel at an edge that mixes two depths has neighbours at either."""
 
 SILENT = 0.02
-"""Share of the pixels beside the object below which those that went past are too few: then a depth of zero may as well
+"""Share of the pixels around the object below which those that went past are too few: then a depth of zero may as well
 mean that the image was cut out or rendered."""
 
 DENSE = 3.0
@@ -256,7 +256,7 @@ DENSE = 3.0
 
 
 def lines_of_frame(frame: SensorFrame, selection: Selection | None, extent: Extent = "auto") -> SightLines:
-    """Lines of sight beside the object of a frame, in the frame's axes and unit.
+    """Lines of sight around the object of a frame, in the frame's axes and unit.
 
     Args:
         frame: everything that was measured.
@@ -282,10 +282,10 @@ def lines_of_frame(frame: SensorFrame, selection: Selection | None, extent: Exte
 
 
 def lines_of_image(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SightLines:
-    """Lines of sight beside the object in a depth image, in the camera frame and the image's unit.
+    """Lines of sight around the object in a depth image, in the camera frame and the image's unit.
 
     They are those of pixels within one size of the object around its box. Where hardly any of them went past, zeros do
-    not say that nothing was measured, and what is elsewhere is left open.
+    not say that nothing was measured, and the rest is left open.
 
     Args:
         whole: the depth image with all that was measured.
@@ -398,7 +398,7 @@ def _on_grids(
 
 
 def lines_of_points(points: Float[np.ndarray, "n 3"], is_object: Bool[np.ndarray, " n"]) -> SightLines:
-    """Lines of sight to the points of a cloud that are not the object's; what is elsewhere is left open.
+    """Lines of sight to the points of a cloud that are not the object's; the rest is left open.
 
     Args:
         points: camera frame.

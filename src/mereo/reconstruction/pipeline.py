@@ -77,7 +77,7 @@ class Reconstruction:
         labels: the label grid.
         segments: each segment in numbers, in the same order.
         timings_s: seconds of each stage.
-        evaluated: points at which the network was asked for surfaces.
+        evaluated: points at which the network was evaluated for surfaces.
         clipped: whether a segment still reached the largest box and was closed there.
         code: what the network made of the cloud; ask it for more with ``Model.query``, in the camera frame. None
             without a network.

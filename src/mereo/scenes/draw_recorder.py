@@ -2,7 +2,7 @@
 
 A scene says how it deforms by drawing from a generator. ``Recorder`` is a generator that writes down every draw as
 *shares*: where each number lies in its distribution, uniform in 0..1. Played back with other shares, the same scene
-gives the state that lies there, within its own bounds. docs/design/0013-viewer.md tells how draws are told apart and
+gives the state that lies there, within its own bounds. docs/design/0013-viewer.md says how draws are distinguished and
 what happens in loops that draw again.
 """
 

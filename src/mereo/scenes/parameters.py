@@ -128,7 +128,7 @@ def _played(
 
 
 def _renumbered(calls: Sequence[Call]) -> tuple[Call, ...]:
-    """Calls with keys counted anew where calls were left out."""
+    """Calls with keys counted again where calls were left out."""
     seen: Counter[Place] = Counter()
     result = []
     for call in calls:

@@ -185,7 +185,7 @@ def build_model(
     """
     if len(states) < 2:
         raise ValueError(
-            f"a statistical model is asked of {len(states)} states; it needs 2 or more: record more states"
+            f"a statistical model cannot be made of {len(states)} states; it needs 2 or more: record more states"
         )
     held_out = max(1, round(HELD_OUT * len(states)))
     mean, aligned = _aligned(material_points(rest, nodes), states)
@@ -258,7 +258,7 @@ VERSION = 1
 def kept_model(scene: Scene, count: int = OBJECT_STATES) -> StatisticalModel:
     """Statistical model of a scene: read where it was made before, else made, and kept where that can be written."""
     path = cache_folder() / "models" / f"{model_key(scene, count)}.safetensors"
-    with suppress(OSError, ValueError):  # not there, or damaged: it is made anew
+    with suppress(OSError, ValueError):  # not there, or damaged: it is made again
         return read_statistical_model(path.read_bytes())
     with stage("make the object's statistical model, once"):
         made = scene_model(scene, count)

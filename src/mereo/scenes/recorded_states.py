@@ -140,7 +140,7 @@ def tetrahedra_around(
 ) -> Tetrahedra:
     """Tetrahedra of a file around an object, both in scene units.
 
-    Raises ``ValueError`` naming the file for tetrahedra that are none, and for a mesh elsewhere than ``rest``.
+    Raises ``ValueError`` naming the file for tetrahedra that are none, and for a mesh far from ``rest``.
     """
     try:
         mesh = Tetrahedra(nodes, elements)
@@ -161,7 +161,7 @@ def tetrahedra_around(
 def _tetrahedral_frames(
     path: Path, record: TetrahedralRecord, rest: SegmentedMesh, scale: float, shift: Float[np.ndarray, "3"]
 ) -> TetrahedralFrames:
-    """Frames; ``ValueError`` for a mesh elsewhere than ``rest`` and for the first frame that inverts a tetrahedron."""
+    """Frames; ``ValueError`` for a mesh far from ``rest`` and for the first frame that inverts a tetrahedron."""
     mesh = tetrahedra_around(path, record.rest_nodes * scale + shift, record.tetrahedra, rest)
     frames = TetrahedralFrames(mesh, record.displacements, scale, len(rest.segments))
     for frame in range(frames.count):

@@ -26,7 +26,7 @@ SensorModel = Literal["structured-light", "time-of-flight"]
 
 @dataclass(frozen=True)
 class SensorConfig:
-    """Strengths of real depth cameras' errors beside the paper's noise, each off at 0 (docs/design/0006-sensors.md).
+    """Strengths of real depth cameras' errors besides the paper's noise, each off at 0 (docs/design/0006-sensors.md).
 
     A strength of 1 is as published. The formulas are in metres, scenes in their own units.
 

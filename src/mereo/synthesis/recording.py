@@ -169,7 +169,7 @@ class _Path:
         return result
 
     def redraw(self, i: int, shrink: bool) -> int:
-        """Draw the nodes anew that count most at time i and after; returns how many first states stay as they were."""
+        """Draw the nodes again that count most at time i and after; returns how many first states stay as they were."""
         if shrink:
             self.reach *= SHRINK
             return 0

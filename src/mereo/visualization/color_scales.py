@@ -15,7 +15,7 @@ Ask = Callable[[Float[np.ndarray, "n 3"]], Answer]
 """Function that answers as a model does at points in the frame of the surfaces."""
 
 CONFIDENCE_STEP = 0.02
-"""Distance to either side of a surface at which the model is asked, as a share of the object's longest side."""
+"""Distance to either side of a surface at which the model is evaluated, as a share of the object's longest side."""
 
 
 # The map viridis, from dark violet to yellow, by Nathaniel Smith, Stéfan van der Walt and Eric Firing, in the public

@@ -4,7 +4,7 @@
     summary of a result -trust-> Trust (a verdict, why, and what to do)
                         -page_words-> all text of the page, in known units
 
-The page is ``report.html`` beside this module with its data, one line of JSON, in place of one marker. Positions are
+The page is ``report.html`` next to this module with its data, one line of JSON, in place of one marker. Positions are
 16-bit steps of the joint box and travel as base64, so that the page stays under ``BUDGET_BYTES``; surfaces over the
 budget are coarsened for the page only (``segments.glb`` keeps all). A folder of results has its surfaces in files of
 their own; what was observed is in the page alone, and is read from it as data; no script is run.
@@ -456,7 +456,7 @@ def _radius_bytes(radii: Radii, names: tuple[str, ...], part: Segment) -> str | 
 
 @dataclass(frozen=True, eq=False)
 class WrittenReport:
-    """What a page shows beside the surfaces.
+    """What a page shows besides the surfaces.
 
     Attributes:
         title: of the page.

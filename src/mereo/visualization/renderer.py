@@ -163,7 +163,7 @@ class Canvas:
         self._outline(part)
 
     def _outline(self, part: Int[np.ndarray, "h w"]) -> None:
-        """Darken pixels beside another part or beside the background."""
+        """Darken pixels next to another part or next to the background."""
         edge = np.zeros(part.shape, dtype=bool)
         for axis in (0, 1):
             for step in (1, -1):
@@ -203,7 +203,7 @@ class Canvas:
         self.rgb[hidden] = (1 - SEE_THROUGH) * self.rgb[hidden] + SEE_THROUGH * inner.rgb[hidden]
 
     def picture(self) -> UInt8[np.ndarray, "h w 3"]:
-        """Finished picture, averaged down to the asked size."""
+        """Finished picture, averaged down to the requested size."""
         height, width = (side // SUPERSAMPLE for side in self.depth.shape)
         blocks = self.rgb.reshape(height, SUPERSAMPLE, width, SUPERSAMPLE, 3)
         return np.rint(255 * blocks.mean(axis=(1, 3))).astype(np.uint8)

@@ -55,7 +55,7 @@ def lacks(scale: ExperimentScale, encoder: Encoder, loss: Loss) -> str:
     """Words for what an encoder's recipe lacks of those that another encoder's has; empty where all are alike."""
     each = {name: recipe(scale, name, loss) for name in ENCODERS}
     chosen, others = each[encoder], [result for name, result in each.items() if result is not None and name != encoder]
-    assert chosen is not None, "nothing is asked of encoder and loss that do not go together"
+    assert chosen is not None, "encoder and loss always go together here"
     everything = dict.fromkeys(name for config in others for name in features(config))
     return ", ".join(name for name in everything if name not in features(chosen))
 

@@ -1,4 +1,4 @@
-"""Costs of experiments, told by running them on a store that only counts.
+"""Costs of experiments: they are run on a store that only counts.
 
 So the figures of `mereo experiment list` follow what the experiments do, and cannot differ from it.
 """

@@ -17,7 +17,7 @@ NOTES = ("The paper's figures are those of its printed lizard (15 scans), ours o
 
 
 def run(store: Store, scale: ExperimentScale) -> Result:
-    """Result of one training: the synthetic score beside the real one."""
+    """Result of one training: the synthetic score and the real one."""
     weights = store.run(store.dataset("bunny", GenerateConfig(), scale.examples), scale.recipe)
     synthetic = store.score(weights, GenerateConfig(), scale.test_examples, scale.cells)
     real, views = store.scans(weights, scale.cells)

@@ -69,5 +69,5 @@ def _check_results(directory: Path) -> None:
         folder = str(error).rpartition(": ")[0]
         raise FileExistsError(
             f"{folder}: move it away or delete it, and run the same command again, which keeps the datasets, runs and "
-            "scores and writes these results anew"
+            "scores and writes these results again"
         ) from None

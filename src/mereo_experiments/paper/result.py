@@ -1,4 +1,4 @@
-"""Result of an experiment, beside what the paper says: as Markdown, JSON and a bar chart."""
+"""Result of an experiment, compared with what the paper says: as Markdown, JSON and a bar chart."""
 
 import json
 from collections.abc import Mapping, Sequence

@@ -22,7 +22,7 @@ class ExperimentScale:
         name: name of the budget.
         recipe: training settings, from which an experiment changes what it compares.
         autodecoder: those of the autodecoder, which has a recipe of its own in the paper too.
-        rival: a second recipe to report beside it where an experiment compares whole recipes; None for one only.
+        rival: a second recipe to report too where an experiment compares whole recipes; None for one only.
         examples: number of examples of each dataset.
         test_examples: number of test views of each evaluation.
         cells: cells of the evaluation's grid along each axis; the paper's is 100.

@@ -199,7 +199,7 @@ def fitted_model(preset: str, view: SampleView) -> Model:
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    # so few steps leave the running statistics behind: take them anew
+    # so few steps leave the running statistics behind: compute them again
     for norm in network.modules():
         if isinstance(norm, nn.BatchNorm1d) and norm.training:
             norm.reset_running_stats()

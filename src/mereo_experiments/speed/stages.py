@@ -82,7 +82,7 @@ ONEDNN = {torch.ops.mkldnn._linear_pointwise: _operations_of_linear}
 
 
 def timed(work: Callable[[], Any], device: torch.device) -> tuple[float, Any]:
-    """Seconds that ``work`` takes, until the device has done what it was asked, and what it gives."""
+    """Seconds that ``work`` takes, until the device is done, and its result."""
     start = time.perf_counter()
     result = work()
     if device.type == "cuda":
@@ -236,7 +236,7 @@ class Bench:
 
     Attributes:
         model: the model.
-        view: what it is asked about.
+        view: where it is queried.
         machine: measured rates, from which floors follow.
         repeats: repetitions of each stage; the rival's grids run once.
         rival: whether to time the straightforward implementation too, and to compare its labels.

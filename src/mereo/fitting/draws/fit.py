@@ -41,7 +41,7 @@ from mereo.scenes.parameters import play, played_back
 from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel
 
-# --- a frame, and states beside it ------------------------------------------------------------------------------------
+# --- a frame, and states compared with it -----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ class DrawsProblem:
 
 @dataclass(frozen=True, eq=False)
 class DrawsFit:
-    """A played state, by its draws, beside the frame.
+    """A played state, by its draws, compared with the frame.
 
     Attributes:
         posed: rigid pose; its ``z`` is empty.
@@ -297,7 +297,7 @@ class Shape:
 
 @dataclass(frozen=True, eq=False)
 class StateOnShape:
-    """A state of a scene, by its draws, beside a shape.
+    """A state of a scene, by its draws, compared with a shape.
 
     Attributes:
         points: its played points.

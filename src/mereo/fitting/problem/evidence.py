@@ -29,7 +29,7 @@ MORE_SAMPLES = 4000
 """The same of a noisy frame, whose noise averages out over more of them."""
 
 SILHOUETTE_PITCHES = 1.2
-"""Beside the nearest line of sight by more than this many pixels is outside."""
+"""Farther from the nearest line of sight than this many pixels is outside."""
 
 AROUND_PITCHES = 1.6
 """Lines of sight nearer than this are a pixel's 3 x 3 neighbours: the nearest depth among them bounds free space.
@@ -42,7 +42,7 @@ NORMAL_POINTS = 12
 """Points by which the surface's direction at an observed one is estimated."""
 
 RIM_PITCHES, EDGE_PITCHES, EDGE_DIRECTIONS = 2.5, 3.5, 8
-"""Angles from the observed points, in pixels, between which lines of sight beside the object are sampled, and in how
+"""Angles from the observed points, in pixels, between which lines of sight around the object are sampled, and in how
 many directions: nearer lies the rim, of which nothing is known in any case (``lines_of_sight.RIM``)."""
 
 
@@ -107,8 +107,8 @@ class Evidence:
     ) -> "Evidence":
         """Prepare a cloud, with so many ``observed_samples`` at most; its lines of sight start at the origin.
 
-        Those of ``outliers`` rule nothing out. ``lines`` says what is known beside the cloud; without it, and where it
-        leaves that open, all lines of sight beside the cloud went past the object.
+        Those of ``outliers`` rule nothing out. ``lines`` says what is known around the cloud; without it, and where it
+        leaves that open, all lines of sight around the cloud went past the object.
         """
         points = means_along_sight(points, MOST_POINTS)
         ranges = np.linalg.norm(points, axis=1)
@@ -208,7 +208,7 @@ class Evidence:
         """Look up lines of sight, as ``violations`` takes them.
 
         Returns the unit vector of the nearest one that met the object or of which nothing is known, the distance before
-        which that is free, and the distance up to which a line of sight beside it is free; -1 where it is not beside.
+        which that is free, and the distance up to which a line of sight around it is free; -1 where it is not around.
         """
         angle, near = self.sight.query(toward)
         nearest = np.where(near < len(self.points), np.inf, angle)
@@ -216,7 +216,7 @@ class Evidence:
         return self.sight.data[near], self.front[near], free
 
     def _free(self, toward: Float[np.ndarray, "n 3"], unknown: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Distance up to which lines of sight beside the object are free: infinite where nothing ends them.
+        """Distance up to which lines of sight around the object are free: infinite where nothing ends them.
 
         ``unknown`` is the angle to the nearest line of sight on which nothing is known, infinite where one that met the
         object is nearer; one that went past the object counts where it is nearer than that.

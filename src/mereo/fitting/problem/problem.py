@@ -216,7 +216,7 @@ class Problem:
         offset = self.evidence.observed_samples - position
         across = np.einsum("pi,pi->p", offset, normal)
         tangential = np.sqrt(np.maximum((offset**2).sum(axis=1) - across**2, 0.0))
-        # an observed sample up to one spacing beside a sample is still on its plane
+        # an observed sample up to one spacing from a sample is still on its plane
         distance = np.hypot(across, np.maximum(tangential - self.samples.spacing, 0.0))
         few = samples.few(self.config.silhouette_vertices).position
         return self.total(
@@ -342,7 +342,7 @@ def is_noise(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"], is
     """Whether what a fit leaves over is noise, and not its own error.
 
     Where ``is_shared``, noise that neighbours may share, as stereo cameras match windows of pixels: constants reach to
-    it, and it is spread as normal numbers are, while a wrong fit is right in most of the frame and far off elsewhere.
+    it, and it is spread as normal numbers are, while a wrong fit is right in most of the frame and far off in the rest.
     """
     if not is_shared:
         return noise_of(offset) <= COHERENT * noise_of(offset, around)

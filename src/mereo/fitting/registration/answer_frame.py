@@ -46,7 +46,7 @@ Of 48 clean training views of six shipped objects none has more than .1, under a
 after 40 seconds of training have .3 to .5 in each view, where their fits explain the points by chance at most."""
 
 HIDDEN = 0.12
-"""Share of the silhouette beside which nothing is known from which a search follows, as a part is hidden.
+"""Share of the silhouette next to which nothing is known from which a search follows, as a part is hidden.
 
 Whole clean views have at most .03, those of which a tool hides 30 % .01 to .32, others that are cut .15 to .57."""
 
@@ -54,7 +54,7 @@ Whole clean views have at most .03, those of which a tool hides 30 % .01 to .32,
 AS_GOOD = 1.25
 """Misfit of a second fit, in that of the first, up to which it explains a noisy frame as well.
 
-Of second fits that lie apart, those beside two wrong answers had 1.15 and 1.17, those beside right ones up to 2.5."""
+Of second fits that lie apart, those of two wrong answers had 1.15 and 1.17, those of right ones up to 2.5."""
 
 
 def answer_frame(
@@ -362,7 +362,7 @@ def initial_state(T_camera_model: Float[np.ndarray, "4 4"], model: StatisticalMo
 def cloud_to_fit(
     frame: EncodedFrame, lines: SightLines, scene_unit: float | None, is_unit_certain: bool = True
 ) -> CloudToFit:
-    """Cloud that one hypothesis takes for the object's; ``lines`` are those beside it, in the frame's axes."""
+    """Cloud that one hypothesis takes for the object's; ``lines`` are those around it, in the frame's axes."""
     dropped = frame.reading.whole.points[~frame.reading.keep]
     outliers = transform_points(frame.T_camera_input, dropped) if len(dropped) else None
     return CloudToFit(frame.seen.points, scene_unit, is_unit_certain, outliers, lines.transformed(frame.T_camera_input))
@@ -430,7 +430,7 @@ def search_modes(
     config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
     start: Posed | None = None,
 ) -> ModesFit:
-    """Fit the modes to a cloud by search; where it leaves open what lies beside it, the fits decide.
+    """Fit the modes to a cloud by search; where it leaves open what lies around it, the fits decide.
 
     With a ``start`` that is known roughly, the fit begins there, and keeps its pose where the object is held.
     """

@@ -222,7 +222,7 @@ FEATURELESS = (
 """Reason of ``Candidate.is_featureless``."""
 
 LOOK = "look at the result before you rely on it"
-WIDEN = f"{LOOK}, or name the weights of what it is; if it is this object, widen the scene's ranges and learn it anew"
+WIDEN = f"{LOOK}, or name the weights of what it is; if it is this object, widen the scene's ranges and learn it again"
 
 
 def _reason(sign: SignName, registration: Registration, signs: Signs) -> str:
@@ -245,7 +245,7 @@ def _reason(sign: SignName, registration: Registration, signs: Signs) -> str:
         )
     if sign == "ruled_out":
         return (
-            f"{registration.ruled_out:.0%} of the model's surface lies where the frame shows none of it, beside or in "
+            f"{registration.ruled_out:.0%} of the model's surface lies where the frame shows none of it, next to or in "
             f"front of what was seen: {LOOK}, or take the frame from nearer"
         )
     if sign == "beyond" or (sign == "unusual" and registration.beyond_states > 0.5):

@@ -58,7 +58,7 @@ class CloudToFit:
         is_unit_certain: whether that is known for certain; else it is believed where the network's correspondences
             agree with it.
         outliers: points that were left out: along their lines of sight nothing is known.
-        lines: what is known of the lines of sight beside the cloud; None of a bare cloud.
+        lines: what is known of the lines of sight around the cloud; None of a bare cloud.
     """
 
     points: Float[np.ndarray, "n 3"]
@@ -145,7 +145,7 @@ class ModesFit:
 
     @property
     def may_take_draws(self) -> bool:
-        """Whether draws may be the answer: beside the rest model only under noise, where modes may miss what moved."""
+        """Whether draws may be the answer: besides the rest model only under noise, where modes may miss what moved."""
         return self.rest is None or self.problem.noisy
 
     @property

@@ -68,13 +68,13 @@ class Registration:
         residual: root mean square distance of the observed points from the model's facing surface, input unit; None
             where the registration was read from a file.
         drawn: the scene's draws where ``method`` is "draws", with their seed: what plays the state again.
-        ruled_out: share of the surface's vertices that the frame rules out, by more than a scene unit: they lie beside
+        ruled_out: share of the surface's vertices that the frame rules out, by more than a scene unit: they lie next to
             all that was seen of the object or in front of it; None where the registration was read from a file.
         needed: least ``explained`` of a frame of this noise to be believed.
         optimum: where the fit ended, from which uncertainty and explanations are made on first use; None
             where the registration was read from a file.
         radius_scale: factor of the radii by the weights' calibration of such fits to such frames; None without one.
-        extra_radius: radius that every position has beside that, as ``Uncertainty.extra_radius``; scene units.
+        extra_radius: radius that every position has in addition, as ``Uncertainty.extra_radius``; scene units.
         alike: number of different states that a search found to explain the frame alike, this one included.
     """
 

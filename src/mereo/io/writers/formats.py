@@ -27,7 +27,7 @@ from mereo.io.writers.volumes import (
 )
 
 SURE = "radius95.glb"
-"""Name of the file beside the segments' GLB whose colours say how sure each place of the surfaces is."""
+"""Name of the file next to the segments' GLB whose colours say how sure each place of the surfaces is."""
 
 
 @dataclass(frozen=True, eq=False)

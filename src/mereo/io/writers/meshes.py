@@ -165,7 +165,7 @@ def _write(path: str | Path, comments: list[str], elements: dict[str, np.ndarray
 
 
 def write_segments_obj(path: str | Path, surfaces: SegmentedMesh) -> None:
-    """Write one OBJ object (``o``) per segment with a material of its colour; the materials go beside it, as STEM.mtl.
+    """Write one OBJ object (``o``) per segment with a material of its colour; the materials go next to it, as STEM.mtl.
 
     Materials have the segments' names, too, as many programs name what they read after its material (trimesh, VTK).
     Segments without faces are left out. Raises ``ValueError`` where no segment has faces.

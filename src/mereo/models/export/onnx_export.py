@@ -6,7 +6,7 @@ Two graphs, because a cloud is encoded once and queried often:
     query     points [1, q, 3], code tensors, and with free-space evidence cloud and viewpoint [1, 3]
                                                          -> logits [1, q, c], distance [1, q], direction [1, q, 3]
 
-All coordinates are normalized, the cloud in farthest-point order; ``mereo_onnx.py``, which goes beside ONNX graphs,
+All coordinates are normalized, the cloud in farthest-point order; ``mereo_onnx.py``, which goes with ONNX graphs,
 does both in numpy. n and q are open: n from the network's own number of points up. See docs/architecture.md.
 """
 

@@ -31,7 +31,7 @@ from mereo.scenes.seeds import example_rng
 def check_scene(name: str, repair: bool = False) -> None:
     """Print what each segment, the overlaps, the unit and random states of a built-in scene or a file are like.
 
-    With ``repair`` repaired copies of faulty meshes are written beside a YAML file, as ``SEGMENT-repaired.ply``, and a
+    With ``repair`` repaired copies of faulty meshes are written next to a YAML file, as ``SEGMENT-repaired.ply``, and a
     scene file ``NAME-repaired.yaml`` that names them. No existing file is changed.
 
     Raises ``ValueError`` that counts the faults left, ``FileExistsError`` where a repaired file is there already.
@@ -156,7 +156,7 @@ def _moved(before: Segment, kept: Segment, after: Segment, unit: str) -> str:
 
 
 def _write(document: Document, mesh: SegmentedMesh, changed: set[str]) -> Path:
-    """The repaired meshes and a scene file that names them, beside the original."""
+    """The repaired meshes and a scene file that names them, next to the original."""
     path = document.path.with_name(f"{document.path.stem}-repaired{document.path.suffix}")
     text, files = _with_segment_files(document, mesh, changed)
     meshes = dict[Path, bytes]()

@@ -247,7 +247,7 @@ def _held(contact: Contact, joints: Sequence[Joint]) -> bool:
 def _joint(
     test: "_CollisionTest", touching: Sequence[Contact], contact: Contact, joints: Sequence[Joint]
 ) -> Joint | None:
-    """The joint of a contact; None where its sides hang together elsewhere, look alike in it, or collide at once."""
+    """The joint of a contact; None where its sides are joined apart from it, look alike in it, or collide at once."""
     mesh, reach = test.mesh, test.reach
     hinge = contact.kind == "cylinder"
     axis = contact.axis if hinge else contact.along

@@ -586,7 +586,7 @@ def quoted(text: str) -> str:
 
 
 def _numbers(values: Float[np.ndarray, "3"]) -> str:
-    largest = max(float(np.abs(values).max()), 1e-12)  # what is nothing beside it is rounding
+    largest = max(float(np.abs(values).max()), 1e-12)  # what is nothing compared with it is rounding
     return "[" + ", ".join(f"{value if abs(value) > 1e-4 * largest else 0.0:.4g}" for value in values) + "]"
 
 
