@@ -292,7 +292,7 @@ def test_the_pose_of_the_states_does_not_matter() -> None:
 def test_one_state_is_no_model() -> None:
     scene = toy_scene()
     nodes, labels = interior_nodes(scene.rest)
-    with pytest.raises(ValueError, match="asked of 1 states; it needs 2 or more: record more states"):
+    with pytest.raises(ValueError, match="cannot be made of 1 states; it needs 2 or more: record more states"):
         build_model(scene.rest, nodes, labels, sample_states(scene, nodes, labels, 1, 3))
 
 

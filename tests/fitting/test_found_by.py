@@ -259,6 +259,19 @@ def test_a_noisy_frame_is_fitted_by_its_own_noise(registrar: Registrar, points: 
     assert metres is not None and metres.problem.config.cloud_sigma == pytest.approx(config.cloud_sigma, rel=0.02)
 
 
+def test_what_a_calm_frame_cannot_have_is_no_noise(
+    registrar: Registrar, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    modes = fitted(registrar, points).modes
+    assert modes is not None
+    problem, surface = modes.problem, Surface.through(modes.problem.model, modes.registration().material)
+    offset = np.random.default_rng(1).normal(scale=0.4, size=len(points))
+    monkeypatch.setattr(Surface, "offsets", lambda _, given: offset[: len(given)])
+    calm, rough = (replace(problem, evidence=Evidence.of(cloud)) for cloud in (points, noisy(points, 0.4)))
+    assert rough.leaves_noise(surface), "every neighbour differs, and so do the points"
+    assert not calm.leaves_noise(surface), "as a state that wriggles through a smooth surface does"
+
+
 def test_what_neighbours_share_is_no_noise(points: np.ndarray) -> None:
     """An offset of all points, or of half of them, is the fit's; what each has for itself is the camera's."""
     around, rng = Evidence.of(points).around, np.random.default_rng(0)

@@ -94,8 +94,15 @@ def test_a_size_off_by_a_factor_of_two_is_never_the_objects(
 ) -> None:
     """Not even by weights whose other signs vary so much that their limits are wide."""
     wide = Calibration(seed=1, views=8, recognizing=CONSERVATIVE.model_copy(update={"unsure": 90.0, "refused": 99.0}))
-    said = recognize(registration, wide, stated_scene_unit=unit)
+    said = recognize(replace(registration, needed=0.75), wide, stated_scene_unit=unit)
     assert said.known is known and (known or "its size differs by a factor of" in str(said.reason))
+
+
+def test_noisy_frames_do_not_make_clean_ones_lenient(registration: Registration) -> None:
+    usual = {"unexplained": Usual(mean=np.log(4.1) - 4.0, std=1.0)}
+    limits = Calibration(seed=1, views=8, recognizing=Recognizing(clean=usual, noisy=usual, unsure=4.5, refused=8.0))
+    clean, noisy = (replace(registration, explained=1 - 4 * (1 - needed), needed=needed) for needed in (0.95, 0.75))
+    assert recognize(noisy, limits).known is True and recognize(clean, limits).known == "unsure"
 
 
 def signs(rng: np.random.Generator, factor: float = 1.0) -> Signs:

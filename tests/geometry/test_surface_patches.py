@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from mereo.geometry.camera import Camera
 from mereo.geometry.downsampling import MAX_POINTS, farthest_point_order, means_along_sight, random_subset
-from mereo.geometry.surface_patches import longest_side, smoothed, surface_points
+from mereo.geometry.surface_patches import longest_side, roughness, smoothed, surface_points
 
 
 def rays(size: int = 96) -> np.ndarray:
@@ -114,6 +114,16 @@ def test_an_edge_stays_sharp() -> None:
     points[SIGHT[:, 0] > 0.02] *= 0.8
     depth = smoothed(points)[:, 2]
     assert np.minimum(np.abs(depth - 50.0), np.abs(depth - 40.0)).max() < 0.1
+
+
+@pytest.mark.parametrize("std", [0.05, 0.4])
+def test_the_calmest_part_of_a_cloud_bounds_its_noise(std: float) -> None:
+    points = noisy(plane(0.6), std)
+    assert 0.5 * std < roughness(points) < 0.8 * std, "a tenth of all patches is that calm by chance"
+    crumpled = np.where(SIGHT[:, :1] > 0, 1.0, 1.0 + np.random.default_rng(3).uniform(-0.1, 0.1, (len(SIGHT), 1)))
+    assert 0.5 * std < roughness(points * crumpled) < std, "however rough the rest is"
+    assert roughness(1024.0 * points) == pytest.approx(1024.0 * roughness(points), rel=1e-6)
+    assert roughness(points[:6]) == np.inf
 
 
 @pytest.mark.parametrize("count", [1, 3, 5])

@@ -30,12 +30,12 @@ def test_lines_say_stage_rate_and_time_left(wait: Callable[[float], None], capsy
         wait(2.0)
         shown.advance(10)
         wait(2.0)
-        shown.advance(10, "loss 1.5", tail_s=100.0)
+        shown.advance(10, "loss 1.5")
     printed = capsys.readouterr()
     assert printed.out == "", "results alone are on standard output"
     assert printed.err.splitlines() == [
         "generate: 10 of 30 examples, 5.0 examples/s, 4 s left",
-        "generate: 20 of 30 examples, 5.0 examples/s, 2 min left, loss 1.5",
+        "generate: 20 of 30 examples, 5.0 examples/s, 2 s left, loss 1.5",
         "generate: 20 examples in 4 s",
     ]
 

@@ -139,6 +139,31 @@ def smoothed(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     return sight * moved[:, None]
 
 
+ROUGH_NEIGHBORS, CALM = 12, 0.1
+"""Points of each local patch, itself among them, and the share of a cloud that is its calmest part."""
+
+
+def roughness(points: Float[np.ndarray, "n 3"]) -> float:
+    """Noise along the lines of sight that a cloud has at most, in its unit: what its calmest part is rough by.
+
+    The standard deviation from a quadratic patch of each point and its neighbours, which edges and fine relief raise:
+    the ``CALM`` quantile of it. Infinite for fewer points than say anything.
+    """
+    count = min(ROUGH_NEIGHBORS, len(points))
+    free = count - len(RIDGE)
+    if free < 1:
+        return float("inf")
+    distance = np.linalg.norm(points, axis=1)
+    sight = points / distance[:, None]
+    angle, neighbor = cKDTree(sight).query(sight, k=count)
+    radius = max(float(np.median(angle[:, -1])), np.finfo(float).tiny)
+    terms, inverse = _quadratic(sight, neighbor, radius), 1.0 / distance[neighbor]
+    normal = np.einsum("nki,nkj->nij", terms, terms) + 1e-6 * np.eye(len(RIDGE))
+    patch = np.linalg.solve(normal, np.einsum("nki,nk->ni", terms, inverse)[..., None])
+    away = np.linalg.norm(inverse - (terms @ patch)[..., 0], axis=1) * distance**2
+    return float(np.quantile(away, CALM)) / float(np.sqrt(free))
+
+
 def _on_same_surface(
     distance: Float[np.ndarray, " n"], angle: Float[np.ndarray, "n k"], neighbor: Int[np.ndarray, "n k"]
 ) -> Bool[np.ndarray, "n k"]:

@@ -41,12 +41,12 @@ class Progress:
         self._started = self._shown = time.monotonic()
         self._paused_s = 0.0
 
-    def advance(self, count: int = 1, note: str = "", tail_s: float = 0.0) -> None:
-        """Count ``count`` more units as done; ``note`` is shown behind the time left, which includes ``tail_s``."""
+    def advance(self, count: int = 1, note: str = "") -> None:
+        """Count ``count`` more units as done; ``note`` is shown behind the time left."""
         now = time.monotonic()
         self.done += count
         rate = self.done / max(now - self._started - self._paused_s, 1e-9)
-        left_s = (self.total - self.done) / max(rate, 1e-9) + tail_s
+        left_s = (self.total - self.done) / max(rate, 1e-9)
         speed = f"{rate:.{1 if rate >= 0.1 else 3}f} {self.unit}/s"
         if self.each:
             speed = f"{rate * self.each:.1f} examples/s"

@@ -1,6 +1,7 @@
 """Sample views: a depth image with the truth behind it, in one small file, to try a model on.
 
-A few views, rendered from test seeds, come with the package, so that a fresh clone can be tried without any download.
+A few views of test seeds (benchmarks/shipped_frames.py) come with the package, so that a fresh clone can be tried
+without any download.
 """
 
 from dataclasses import dataclass
@@ -10,15 +11,10 @@ import numpy as np
 
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.labels import LabelGrid
-from mereo.geometry.metrics import TruthGrid, truth_grid
-from mereo.io.atomic_files import atomic_file
+from mereo.geometry.metrics import TruthGrid
 from mereo.io.errors import SizeError, quiet, reason
 from mereo.io.readers import read_arrays, read_point_cloud
 from mereo.io.sensor_frame import SensorFrame
-from mereo.scenes.registry import load_scene
-from mereo.scenes.seeds import TEST_SEED_START, example_rng
-from mereo.synthesis.config import GenerateConfig
-from mereo.synthesis.examples import sample_view
 
 SHIPPED = Path(__file__).parents[1] / "frames"
 
@@ -28,9 +24,6 @@ SHIPPED_SCAN = "bun000"
 
 GUESSED_UNIT_M = 0.01
 """Metres per scene unit of shipped frames of objects whose true size is not known."""
-
-DEPTH_STEP = 0.005
-"""Step of the stored depth in scene units, a twentieth of the sensor's noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,45 +48,6 @@ class SampleView:
     def metres(self) -> float:
         """Metres per scene unit; ``GUESSED_UNIT_M`` where the object's true size is not known."""
         return self.unit_m or GUESSED_UNIT_M
-
-
-def make_view(scene: str, seed: int = TEST_SEED_START, cells: int = 100) -> SampleView:
-    """Example 0 of a test seed as a sample view, its depth rounded as ``save_view`` stores it.
-
-    Raises ``ValueError`` where the depth is too large for the file.
-    """
-    loaded = load_scene(scene)
-    view = sample_view(loaded.for_seed(seed), GenerateConfig(), example_rng(seed, 0))
-    rounded = np.rint(view.depth.depth / DEPTH_STEP)
-    if rounded.max() > 65535:
-        raise ValueError(
-            f"scene {scene!r} is {view.depth.depth.max():.4g} units away; a sample view stores up to "
-            f"{65535 * DEPTH_STEP:g}: move its camera workspace closer"
-        )
-    depth = DepthImage(rounded * DEPTH_STEP, view.depth.camera)
-    return SampleView(scene, seed, depth, truth_grid(view.mesh, cells), loaded.unit_m)
-
-
-def save_view(path: str | Path, view: SampleView) -> None:
-    """Write a sample view as a compressed .npz (about 50 kB): 16-bit depth, intrinsics, true labels."""
-    camera, grid = view.depth.camera, view.truth.grid
-    with atomic_file(path) as partial:
-        np.savez_compressed(
-            partial,
-            scene=np.array(view.scene),
-            seed=np.array(view.seed),
-            depth=np.rint(view.depth.depth / DEPTH_STEP).astype(np.uint16),
-            depth_step=np.array(DEPTH_STEP),
-            intrinsics=np.array(
-                [camera.focal_x_px, camera.focal_y_px, camera.center_x_px, camera.center_y_px], dtype=np.float64
-            ),
-            labels=grid.labels,
-            kept=view.truth.kept,
-            origin=grid.origin,
-            spacing=grid.spacing,
-            names=np.asarray(grid.names),
-            unit_m=np.array(np.nan if view.unit_m is None else view.unit_m),
-        )
 
 
 def shipped_views() -> tuple[str, ...]:
@@ -122,7 +76,9 @@ def load_view(name: str | Path) -> SampleView:
     except SizeError:
         raise
     except Exception as error:  # whatever a damaged archive makes of zlib, tokenize and numpy
-        raise ValueError(f"{path} is not a sample view of mereo ({reason(error)}); write it with `save_view`") from None
+        raise ValueError(
+            f"{path} is not a sample view of mereo ({reason(error)}); benchmarks/shipped_frames.py makes them"
+        ) from None
 
 
 def shipped_frame(name: str) -> SensorFrame:

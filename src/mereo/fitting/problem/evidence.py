@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from mereo.deformation.moving_least_squares import spread
 from mereo.geometry.camera import SightKind, SightLines
 from mereo.geometry.downsampling import means_along_sight
+from mereo.geometry.surface_patches import roughness
 from mereo.geometry.transforms import rotation_along
 
 MOST_POINTS = 6000
@@ -142,6 +143,11 @@ class Evidence:
         normals = np.linalg.eigh(np.einsum("pki,pkj->pij", patches, patches))[1][:, :, 0]
         away = np.einsum("pi,pi->p", normals, self.observed_samples) > 0
         return np.where(away[:, None], -normals, normals)
+
+    @cached_property
+    def roughness(self) -> float:
+        """Noise that the cloud has at most (``surface_patches.roughness``)."""
+        return roughness(self.points)
 
     @property
     def is_open(self) -> bool:

@@ -164,7 +164,9 @@ class Problem:
 
     def leaves_noise(self, surface: Surface, is_shared: bool = False) -> bool:
         """Whether what a fit leaves over is noise, and not its own error; ``is_shared`` as in ``as_noisy_as``."""
-        return is_noise(surface.offsets(self.evidence.points), self.evidence.around, is_shared)
+        offset = surface.offsets(self.evidence.points)
+        is_possible = is_shared or noise_of(offset) <= ROUGHER * self.evidence.roughness
+        return is_possible and is_noise(offset, self.evidence.around, is_shared)
 
     def explained(self, cloud: float, surface: Surface, most: float) -> bool:
         """Whether a surface explains the cloud: by a misfit below ``most``, or of a noisy one all but the noise."""
@@ -290,9 +292,9 @@ class Problem:
 
 # --- noise of a frame -------------------------------------------------------------------------------------------------
 
-# Differences between neighbouring pixels do not show a camera's noise, as edges and curvature look like noise too; a
-# fitted model takes these away. What it leaves over is noise where every pixel differs; where neighbours share it, the
-# model is wrong.
+# Differences between neighbouring pixels only bound a camera's noise, as edges and curvature look like noise too; a
+# fitted model takes these away. What it leaves over is noise where every pixel differs; where neighbours share it, or
+# it is more than the calmest part of the cloud has, the model is wrong.
 
 TO_STD = 1.4826
 """Standard deviation of normal numbers over the median of their absolute values."""
@@ -302,6 +304,10 @@ CLEAN = 0.1
 
 COHERENT = 1.3
 """What a fit leaves over, in noises, from which on it is wrong; right ones have 0.8 to 1.1."""
+
+ROUGHER = 1.8
+"""The same, in the roughness of the cloud's calmest part; right fits of noisy frames have 0.6 to 1.5, and a fit to
+another object up to 4.6 (docs/experiments/072.md)."""
 
 NORMAL = 4.3
 """The 95 % quantile of what a fit leaves over, in its median, up to which it looks like normal numbers, with 2.9."""
