@@ -306,7 +306,7 @@ COHERENT = 1.3
 """What a fit leaves over, in noises, from which on it is wrong; right ones have 0.8 to 1.1."""
 
 ROUGHER = 1.8
-"""The same, in the roughness of the cloud's calmest part; right fits of noisy frames have 0.6 to 1.5, and a fit to
+"""The same, in the roughness of the cloud's calmest part; right fits of noisy frames have 0.6 to 1.4, and a fit to
 another object up to 4.6 (docs/experiments/072.md)."""
 
 NORMAL = 4.3
