@@ -24,8 +24,10 @@ from toy_frames import CENTERS, MODEL, NAMES, RADII, seen
 from toy_scene import toy_scene
 
 import mereo
+from mereo.__main__ import main
 from mereo.api import reconstruct, steps, view
 from mereo.api.result import SINGLE, Result
+from mereo.api.words import SPEAKS_OPTIONS, in_python, option_words, python_words
 from mereo.cli.answers import ReconstructCommand
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.fitting.registration.register import Registrar
@@ -152,7 +154,7 @@ def test_nobodys_files_are_replaced(result: Result, tmp_path: Path) -> None:
     (tmp_path / "out/mine.txt").write_text("keep")
     for place in ("out", "one.glb"):
         (tmp_path / "one.glb").write_text("keep")
-        with pytest.raises(FileExistsError, match="not overwritten"):
+        with pytest.raises(FileExistsError, match="not overwritten: .* overwrite=True$"):
             result.save(tmp_path / place)
     with pytest.raises(FileExistsError, match="not written by this version of mereo"):
         result.save(tmp_path / "out", overwrite=True)
@@ -456,3 +458,56 @@ def test_the_lines_of_the_readme_run_as_printed(tmp_path: Path, monkeypatch: pyt
     assert sorted(path.name for path in (tmp_path / "result").glob("[!.]*")) == [
         *("labels.npz", "preview.png", "radius95.glb", "report.html", "segments.glb", "state.json", "summary.json")
     ]
+
+
+# --- sentences name options on the command line and arguments in Python -----------------------------------------------
+
+
+OUT = "choose another --output or pass --force"
+
+
+@pytest.mark.parametrize(
+    ("option", "argument"),
+    [
+        (OUT, "choose another output or pass overwrite=True"),
+        ("(--keep-all keeps them)", "(isolation=IsolationConfig(keep_all=True) keeps them)"),
+        (
+            "the unit (--unit-m 0.001 for millimetres, --depth-scale)",
+            "the unit (unit_m=0.001 for millimetres, depth_scale)",
+        ),
+        ("turn the cloud (--frame), or give --frame-index 0", "turn the cloud (axes), or give frame_index=0"),
+        ("needed: give --intrinsics FILE", "needed: give intrinsics=file"),
+        ("ask again with --method network.", 'ask again with method="network".'),
+        ("two - or three -- of them, well-known", "two - or three -- of them, well-known"),
+    ],
+)
+def test_options_are_arguments_in_python(option: str, argument: str) -> None:
+    assert in_python(option) == argument
+    assert in_python(argument) == argument, "said once"
+
+
+def test_an_error_is_told_in_the_words_of_who_asks() -> None:
+    with pytest.raises(FileExistsError) as caught, python_words():
+        raise FileExistsError(OUT)
+    assert str(caught.value) == in_python(OUT)
+    with option_words(), pytest.raises(FileExistsError) as caught, python_words():
+        raise FileExistsError(OUT)
+    assert str(caught.value) == OUT and not SPEAKS_OPTIONS.get()
+    with pytest.raises(KeyError, match="--force"), python_words():
+        raise KeyError("--force")
+    with pytest.raises(OSError) as system, python_words():
+        raise OSError(2, "--force")
+    assert system.value.errno == 2 and system.value.strerror == "--force"
+
+
+def test_one_frame_is_refused_in_two_languages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The command's words are options, also after somebody has asked in Python."""
+    cloud = seen()
+    cloud[3] = np.nan
+    np.save(tmp_path / "cloud.npy", cloud)
+    for ask in (mereo.load_frame, lambda path: mereo.reconstruct(path, MODEL)):
+        with pytest.raises(ValueError, match="drop_invalid=True$"):
+            ask(tmp_path / "cloud.npy")
+        arguments = ["reconstruct", str(tmp_path / "cloud.npy"), "--weights", "rope", "--output", str(tmp_path / "out")]
+        assert main(arguments) == 2 and "--drop-invalid" in capsys.readouterr().err
+        assert not SPEAKS_OPTIONS.get()

@@ -1,5 +1,6 @@
 """The package keeps the order of its rooms; every rule of ``architecture`` is shown to fail on a small tree."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -65,6 +66,28 @@ def test_the_house_keeps_its_budget(tmp_path: Path) -> None:
     too_many = ["src has 5 lines, more than 4: cut as much as you add", "src has 2 files, more than 1: cut as much"]
     faults = rules.over_budget(tmp_path, {"src": (4, 1)})
     assert [fault[: len(start)] for fault, start in zip(faults, too_many, strict=True)] == too_many
+
+
+CLOCK = re.compile(
+    r"\b(?:(?:time|monotonic|perf_counter|process_time|thread_time)(?:_ns)?\(\)|(?:times|getrusage|now)\()"
+)
+DEADLINE = re.compile(r"^\s*(while|if) |\(\) \+ ")
+"""A loop may wait for a deadline, and a process may have a timeout: they end what hangs, and assert nothing."""
+
+
+def clocks(source: str) -> list[str]:
+    """Lines that read a clock for something else than a deadline."""
+    return [line for line in source.splitlines() if CLOCK.search(line) and not DEADLINE.search(line)]
+
+
+def test_no_test_compares_a_clock_with_a_number() -> None:
+    """How long work takes depends on the machine: count operations, or measure in ``benchmarks/``."""
+    waiting = "end = time.monotonic() + 5\nwhile time.monotonic() < end:\n    pass"
+    assert clocks(waiting) == []
+    for line in ("start = time.monotonic()", "seconds.append(process_time_ns())", "return os.times().user"):
+        assert clocks(f"{waiting}\n{line}") == [line]
+    for path in set((TOP / "tests").rglob("*.py")) - {Path(__file__)}:
+        assert clocks(path.read_text("utf-8")) == [], path
 
 
 # --- that the rules can fail ------------------------------------------------------------------------------------------
