@@ -61,13 +61,6 @@ def require_asset() -> Callable[[str], Path]:
 
 
 @pytest.fixture(scope="session")
-def assets_dir() -> Path:
-    """A folder that holds the Stanford bunny and its scans under their asset names, or the test is skipped."""
-    found = [find_asset(name) for name in assets.ASSETS if name.startswith("bunny/")]
-    return found[0].parent.parent
-
-
-@pytest.fixture(scope="session")
 def rope() -> "Model":
     """The shipped weights of the rope, for all who do not change them."""
     from mereo.models.weights import load_model
