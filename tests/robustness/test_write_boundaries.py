@@ -114,17 +114,16 @@ def prepare(case: Case, inputs: Path, place: Path) -> str:
     return case.arguments.replace("INPUTS", str(inputs))
 
 
-def boundaries(calls: list[str]) -> Iterator[tuple[int, bool]]:
-    """Moments at which to kill: the number of a call, and whether just after it; of each kind of call the first."""
-    kinds, functions = set[str](), set[str]()
-    for number, (function, place) in enumerate(call.split(" ", 1) for call in calls):
-        name = re.sub("[0-9a-f]{8}|[0-9]+", "0", Path(place).name) if function in MOVES else Path(place).suffix
-        if f"{function} {name}" not in kinds:
-            yield number, True
-        if function in MOVES and function not in functions:
-            yield number, False
-        kinds.add(f"{function} {name}")
-        functions.add(function)
+def boundaries(changes: list[str], dear: bool) -> list[int]:
+    """Changes before which to kill: those that follow the first of a kind, and the first moves themselves."""
+    numbers, seen = set[int](), set[str]()
+    for number, (event, place) in enumerate(change.split(" ", 1) for change in changes):
+        name = re.sub("[0-9a-f]{8}|[0-9]+", "0", Path(place).name) if event in MOVES else Path(place).suffix
+        if event in MOVES or (event != "open" and not dear):
+            numbers |= {number + 1} if f"{event} {name}" not in seen else set()
+            numbers |= {number} if event in MOVES and event not in seen else set()
+            seen |= {event, f"{event} {name}"}
+    return sorted(numbers - {len(changes)})
 
 
 @pytest.mark.parametrize("name", ["scene export", *SLOW])
@@ -134,12 +133,12 @@ def test_a_killed_command_is_finished_by_the_next(name: str, inputs: Path, tmp_p
     fresh, whole, place = (tmp_path / folder for folder in ("fresh", "whole", "place"))
     arguments = prepare(case, inputs, fresh)
     shutil.copytree(fresh, whole)
-    undisturbed = run_command(whole, arguments, every_call=not case.dear)
-    assert undisturbed.code == 0 and undisturbed.calls, undisturbed.said
-    for number, after in boundaries(undisturbed.calls):
+    undisturbed = run_command(whole, arguments)
+    assert undisturbed.code == 0 and undisturbed.changes, undisturbed.said
+    for number in boundaries(undisturbed.changes, case.dear):
         shutil.copytree(fresh, place)
-        killed = run_command(place, arguments, at=number, after=after, every_call=not case.dear)
-        where = f"killed {'after' if after else 'before'} call {number}: {killed.calls[-1]}"
+        killed = run_command(place, arguments, at=number)
+        where = f"killed before change {number}: {killed.changes[-1]}"
         assert killed.code == -9, f"{where}\n{killed.said}"
         go_on(case, arguments, place, where)
         assert names(place) == names(whole) and content(place) == content(whole), where
