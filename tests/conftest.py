@@ -108,7 +108,7 @@ def without_curves(monkeypatch: pytest.MonkeyPatch) -> None:
 def without_turns(monkeypatch: pytest.MonkeyPatch) -> None:
     """Skip the search over turned cameras, which takes most of the time of a frame that no fit explains.
 
-    For tests of what happens to such a frame afterwards; ``test_turned_camera.py`` tests the search.
+    For tests of what happens to such a frame afterwards.
     """
     monkeypatch.setattr("mereo.fitting.registration.register.with_turned_camera", lambda start, predict: start)
 
