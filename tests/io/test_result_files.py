@@ -3,7 +3,6 @@
 import base64
 import json
 import re
-import sys
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
@@ -278,15 +277,6 @@ def test_the_same_result_gives_the_same_bytes(tmp_path: Path) -> None:
         volumes.write_labels_nifti(tmp_path / f"{number}.nii.gz", grid(), COLORS)
     for end in ("seg.nrrd", "nii.gz"):
         assert (tmp_path / f"0.{end}").read_bytes() == (tmp_path / f"1.{end}").read_bytes()
-
-
-def test_a_missing_library_is_named_with_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "nibabel", None)
-    with pytest.raises(
-        ImportError, match=r"NIfTI needs nibabel, which is not installed: pip install 'mereo\[medical\]'"
-    ):
-        volumes.write_labels_nifti(tmp_path / "l.nii.gz", grid(), COLORS)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_labels_have_names(tmp_path: Path) -> None:

@@ -15,7 +15,6 @@ import sys
 import threading
 import time
 import urllib.request
-import zipfile
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import replace
@@ -38,7 +37,7 @@ import serving as bench
 import uvicorn
 from analytic import AnalyticModel
 from camera_files import write_camera
-from fuzz import damaged
+from fuzz import damaged, zipped
 from PIL import Image
 from two_balls import BIG, NAMES, SMALL, front, two_balls
 
@@ -46,7 +45,6 @@ import mereo
 from mereo.cli.answers import ReconstructCommand, ServeCommand
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.io.config import InputConfig
-from mereo.io.errors import LIMIT_VARIABLE
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.sensor_frame import read_frame
 from mereo.models.config import InferenceConfig
@@ -656,16 +654,12 @@ async def test_a_body_that_does_not_come_is_not_waited_for(root: Path) -> None:
         assert server.dispatcher.held == 0 and not list(root.iterdir())
 
 
-async def test_what_unpacks_to_too_much_is_refused(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(LIMIT_VARIABLE, "0.5")
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("points.npy", bytes(1_000_000_000))
-    assert len(packed.getvalue()) < 1_100_000
-
+async def test_what_unpacks_to_too_much_is_refused(root: Path) -> None:
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f4", "fortran_order": False, "shape": (10**15, 3)})
     async with running(root) as server:
-        found = await server.post(packed.getvalue(), f"{ADDRESS}?format=npz")
-        assert found.status_code == 413 and "frame.npz takes more than 0.5 GB" in found.json()["error"]
+        found = await server.post(zipped({"points.npy": header.getvalue()}), f"{ADDRESS}?format=npz")
+        assert found.status_code == 413 and "frame.npz takes more than 8 GB" in found.json()["error"]
 
 
 async def test_a_fault_of_the_server_is_logged_and_not_told(
