@@ -14,7 +14,6 @@ from functools import lru_cache
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -33,13 +32,6 @@ from mereo.synthesis.config import GenerateConfig
 from mereo_learning.config import PRESETS
 from mereo_learning.scoring import EvaluationConfig
 from mereo_learning.shards import DatasetConfig
-
-
-def raising(error: BaseException) -> SimpleNamespace:
-    def run() -> None:
-        raise error
-
-    return SimpleNamespace(run=run)
 
 
 @pytest.mark.parametrize("command", ["", "evaluate", "reconstruct", "scene"])
@@ -79,35 +71,6 @@ def test_an_error_of_a_process_is_one_line_with_its_code() -> None:
     assert (ran.returncode, ran.stdout, ran.stderr.count("\n")) == (2, "", 1)
     assert ran.stderr.startswith("mereo: error: ") and ran.stderr.count("'cube' is unknown") == 1
     assert ", ".join(SCENES) in ran.stderr
-
-
-@pytest.mark.parametrize(
-    ("error", "line"),
-    [
-        (ValueError("the scale is -1;\n it must be positive"), "the scale is -1; it must be positive"),
-        (FileNotFoundError("there is no file 'a.ply'"), "there is no file 'a.ply'"),
-        (FileNotFoundError(2, "No such file or directory", "a.ply"), "a.ply: no such file or directory: correct that"),
-        (OSError(28, "No space left on device"), "no space left on device: correct that"),
-        (ImportError("pyvista is missing: pip install pyvista"), "pyvista is missing: pip install pyvista"),
-        (ValueError(), "ValueError"),
-    ],
-)
-def test_each_kind_of_error(
-    error: Exception, line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.delenv(command_line.TRACEBACK_VARIABLE, raising=False)
-    monkeypatch.setattr(command_line, "parse", lambda arguments: raising(error))
-    assert command_line.main([]) == 2
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    assert printed.err.startswith(f"mereo: error: {line}")
-    assert printed.err.count("\n") == 1
-
-
-def test_interruption(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(command_line, "parse", lambda arguments: raising(KeyboardInterrupt()))
-    assert command_line.main([]) == 128 + signal.SIGINT
-    assert capsys.readouterr().err == "mereo: interrupted\n"
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGPIPE"), reason="this system has no SIGPIPE")

@@ -437,6 +437,10 @@ def test_any_glb_is_read_with_its_places_and_colours(tmp_path: Path) -> None:
     assert colors is not None and {tuple(color) for color in colors.tolist()} == {(255, 0, 0), (0, 0, 255)}
     assert parts["plain"][0].color == (255, 0, 0) and parts["plain"][1] is None
     assert len(parts["plain"][0].vertices) == 8 and parts["round"][0].color == (0, 128, 255)
+    content = content_of_files((tmp_path / "s.glb").rename(tmp_path / "s.GLB"))
+    assert content.ask is None and content.first_view == "front" and content.facts.startswith("3 parts")
+    shown, scale = content.colorings[VERTEX]()
+    assert scale is None and [len(part) for part in shown] == [len(s.vertices) for s in content.mesh.segments]
 
 
 def test_a_folder_is_shown_with_all_that_its_files_keep(folder: Path) -> None:
@@ -479,14 +483,6 @@ def test_places_are_asked_of_a_results_surfaces(folder: Path) -> None:
     assert outside.radius95 is None and on_it.radius95 is not None
     assert on_it.radius95[0] == pytest.approx(0.001, rel=0.01)
     np.testing.assert_allclose(rim, middle + inside.direction[0] * size, atol=3 * size)
-
-
-def test_any_glb_has_its_own_colours_and_no_probe(tmp_path: Path) -> None:
-    write_strange(tmp_path / "s.GLB")
-    content = content_of_files(tmp_path / "s.GLB")
-    assert content.ask is None and content.first_view == "front" and content.facts.startswith("3 parts")
-    colors, scale = content.colorings[VERTEX]()
-    assert scale is None and [len(part) for part in colors] == [len(s.vertices) for s in content.mesh.segments]
 
 
 def test_weights_without_a_model_are_asked_alone_and_it_is_said(rope: Model) -> None:
