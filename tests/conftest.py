@@ -37,27 +37,22 @@ FEW_STATES = 60
 """Random states of a scene, among which a fit of its draws starts in the tests: a tenth of what users have."""
 
 
-def find_asset(name: str) -> Path:
-    """A downloadable mesh or scan; skips the test, with the reason, where neither mirror nor network has it."""
-    try:
-        return assets.get(name)
-    except assets.AssetUnavailable as error:
-        pytest.skip(str(error))
-
-
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call() -> Iterator[None]:
-    """Skip a test whose scene needs a mesh that neither mirror nor network has."""
+    """Skip a test whose scene needs a mesh or scan that neither mirror nor network has; so where its fixtures do."""
     try:
         return (yield)
     except assets.AssetUnavailable as error:
         pytest.skip(str(error))
 
 
+pytest_runtest_setup = pytest_runtest_call
+
+
 @pytest.fixture(scope="session")
 def require_asset() -> Callable[[str], Path]:
     """``require_asset("bunny/bunny.off")`` is the file's path, or the test is skipped."""
-    return find_asset
+    return lambda name: assets.get(name)
 
 
 @pytest.fixture(scope="session")

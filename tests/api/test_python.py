@@ -11,8 +11,8 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import jaxtyping
 import numpy as np
@@ -242,49 +242,33 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
         mereo.load_frame(tmp_path / "x.ply", unit=1.0)
 
 
-class Server:
-    """As much of viser's as a page needs."""
-
-    stopped = 0
-
-    def get_port(self) -> int:
-        return 1234
-
-    def stop(self) -> None:
-        self.stopped += 1
-
-
 def test_a_page_stays_open_where_somebody_goes_on(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    server = Server()
-    page = OpenPage(server)
-    monkeypatch.setattr(
-        "mereo_viewer.server.threading", SimpleNamespace(Event=lambda: SimpleNamespace(wait=lambda: None))
-    )
+    page = OpenPage(server := MagicMock(**{"get_port.return_value": 1234}))
+    monkeypatch.setattr("mereo_viewer.server.threading", MagicMock())
     monkeypatch.setattr(sys, "ps1", ">>> ", raising=False)
-    assert page.stay() is page and server.stopped == 0
+    assert page.stay() is page and not server.stop.called
     assert capsys.readouterr().out == "open http://127.0.0.1:1234 in a browser; close() ends\n"
-    assert (
-        'iframe src="http://127.0.0.1:1234"' in page._repr_html_() and repr(page) == "OpenPage('http://127.0.0.1:1234')"
-    )
+    assert 'iframe src="http://127.0.0.1:1234"' in page._repr_html_()
+    assert repr(page) == "OpenPage('http://127.0.0.1:1234')"
     monkeypatch.delattr(sys, "ps1")
     page.stay()
     page.close()
-    assert server.stopped == 1 and "Ctrl-C ends" in capsys.readouterr().out
+    assert server.stop.call_count == 1 and "Ctrl-C ends" in capsys.readouterr().out
     assert "iframe" not in page._repr_html_()
 
 
 def test_a_result_is_viewed_as_it_is(result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
-    shown: list[Any] = []
     for module in (result_page, view):
         monkeypatch.setattr(module, "import_viser", lambda: None)
-    monkeypatch.setattr(result_page, "start_server", lambda port: shown.append(port) or Server())
-    monkeypatch.setattr(result_page, "ResultPage", lambda _, content: shown.append(content))
+    start, show = MagicMock(**{"return_value.get_port.return_value": 1234}), MagicMock()
+    monkeypatch.setattr(result_page, "start_server", start)
+    monkeypatch.setattr(result_page, "ResultPage", show)
     with result.show(block=False) as page, mereo.view(result, block=False, port=8081):
         assert page.address == "http://127.0.0.1:1234"
-    assert shown[0] == 0 and shown[2] == 8081
-    content = shown[1]
+    assert [given.args for given in start.call_args_list] == [(0,), (8081,)]
+    content = show.call_args[0][1]
     assert content.mesh is result.reconstruction.surfaces
     assert (content.title, content.unit, content.depth) == ("cloud", Unit(1.0), None)
     assert content.facts.startswith("1,200 points")

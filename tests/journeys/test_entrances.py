@@ -188,16 +188,13 @@ def test_ros(run: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
     np.testing.assert_allclose([turn.x, turn.y, turn.z, turn.w], [0, 0, 0.5**0.5, 0.5**0.5], atol=1e-12)
 
 
-def axial_mm(z_m: float, degrees: float, model: SensorModel) -> float:
-    return 1e3 * float(axial_std_m(np.array([z_m]), np.deg2rad([degrees]), model)[0])
-
-
 def test_the_table_of_distances_follows_the_formulas() -> None:
     row = r"^\| ([\d.]+) \| ([\d.]+), ([\d.]+) \| ([\d.]+) \| ([\d.]+), ([\d.]+) \| (\d+) \| (\d+) \|$"
     rows = re.findall(row, FRAMES.read_text(), re.M)
     assert len(rows) == 6
     for z, *stated in np.array(rows, dtype=float).tolist():
-        light, flight = ([axial_mm(z, degrees, model) for degrees in (0, 60)] for model in MODELS)
+        at, angles = np.full(2, z), np.deg2rad([0.0, 60.0])
+        light, flight = (1e3 * axial_std_m(at, angles, model) for model in MODELS)
         assert stated[:5] == pytest.approx((*light, 1e3 * z**2 / KINECT_DISPARITY_M, *flight), abs=0.0051)
         assert stated[5:] == [round(0.1 * focal / z) for focal in (420, 525)]
     depths = np.unique(quantize(np.linspace(0.99, 1.01, 10_000), 1.0))

@@ -59,11 +59,6 @@ def found(answer: Answer) -> Reconstruction:
     return answer.reconstruction
 
 
-def results(found: Reconstruction, files: FilesConfig, unit_m: float = 1.0) -> Results:
-    parts = found.surfaces, found.labels, found.observed
-    return Results(*parts, GLTF_CAMERA_ROTATION, unit_m, files.millimetres)
-
-
 def test_every_format_is_written_where_the_table_says(answer: Answer, tmp_path: Path) -> None:
     pytest.importorskip("nibabel", reason="nibabel is not installed: pip install 'mereo[medical]'")
     (tmp_path / "all").mkdir()
@@ -80,7 +75,8 @@ def test_units(found: Reconstruction, tmp_path: Path, millimetres: bool, factor:
     """The cloud is in centimetres: GLB is in metres, volumes in millimetres, the others as asked for."""
     out, center = tmp_path, np.array(BIG[0])
     formats = chosen_formats(["glb", "ply", "stl", "obj", "vti", "points", "seg.nrrd"])
-    write_formats(out, formats, results(found, FilesConfig(formats, millimetres), 0.01))
+    parts = found.surfaces, found.labels, found.observed
+    write_formats(out, formats, Results(*parts, GLTF_CAMERA_ROTATION, 0.01, millimetres))
     glb = trimesh.load_scene(out / "segments.glb")
     place = trimesh.transform_points(glb.geometry["big"].vertices, glb.graph["big"][0]).mean(axis=0)
     np.testing.assert_allclose(place, 0.01 * center * [1, -1, -1], atol=1e-5)
