@@ -54,11 +54,6 @@ from mereo_viewer.server import OpenPage
 pytestmark = pytest.mark.usefixtures("small_previews")
 
 
-def unchecked(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function as users have it: without the check of types that tests put before it."""
-    return inspect.unwrap(function)
-
-
 @pytest.fixture(scope="module")
 def result() -> Result:
     return mereo.reconstruct(seen(), MODEL, resolution=24, unit_m=1.0, label_points=True)
@@ -172,7 +167,7 @@ def test_other_names_are_refused(result: Result, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="one file, whose suffix says its format"):
         result.save(tmp_path / "x.glb", formats=("ply",))
     with pytest.raises(ValueError, match="there is no format 'plx'"):
-        unchecked(Result.save)(result, tmp_path / "x", formats=("plx",))
+        inspect.unwrap(Result.save)(result, tmp_path / "x", formats=("plx",))
     assert list(tmp_path.iterdir()) == []
     assert result.save(tmp_path / "take-1.2", formats=("npz",)).is_dir()
 
@@ -197,7 +192,8 @@ def test_values_tell_themselves_in_one_line(result: Result) -> None:
 
 def test_a_notebook_shows_pictures_and_figures(result: Result) -> None:
     page = result._repr_html_()
-    pictures = [np.asarray(Image.open(io.BytesIO(base64.b64decode(code))).convert("RGB")) for code in images(page)]
+    contents = (io.BytesIO(base64.b64decode(code)) for code in re.findall(r'base64,([^"]+)"', page))
+    pictures = [np.asarray(Image.open(content).convert("RGB")) for content in contents]
     assert [picture.shape[1] for picture in pictures] == [300, 300] and len(page) < 60_000
     dots = [int((picture.max(axis=2) < 60).sum()) for picture in pictures]
     assert dots[0] > 1.5 * dots[1] > 0, "the camera sees all that it has measured, its right half of it"
@@ -209,17 +205,13 @@ def test_a_notebook_shows_pictures_and_figures(result: Result) -> None:
     np.testing.assert_allclose([float(value) for value in place.split()], [20, -30, 600], atol=2)
 
 
-def images(page: str) -> list[str]:
-    return re.findall(r'base64,([^"]+)"', page)
-
-
 def test_a_size_of_none_is_warned_of_at_the_call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     np.save(tmp_path / "cloud.npy", seen())
     known = replace(MODEL, provenance={"visible_m": [2, 3]})
-    monkeypatch.setattr(reconstruct, "reconstruct_observation", unchecked(reconstruct.reconstruct_observation))
+    monkeypatch.setattr(reconstruct, "reconstruct_observation", inspect.unwrap(reconstruct.reconstruct_observation))
     for one in (tmp_path / "cloud.npy", [seen()]):
         with pytest.warns(SizeWarning, match="the visible part is 0.18 m long, but 2 to 3 m in training") as warned:
-            unchecked(mereo.reconstruct)(one, known, resolution=8, unit_m=1.0)
+            inspect.unwrap(mereo.reconstruct)(one, known, resolution=8, unit_m=1.0)
         assert warned[0].filename == __file__ and "--" not in str(warned[0].message)
         mereo.reconstruct(one, known, resolution=8)  # of no stated unit, so that there is nothing to warn of
 
@@ -229,7 +221,7 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="axes is given for a frame that is read already: give it where"):
         mereo.reconstruct(frame, MODEL, axes="scanner")
     with pytest.raises(ValueError, match="the method is 'fulll'; it must be one of .*: correct the spelling"):
-        unchecked(mereo.Object.registrar)(mereo.Object(MODEL), "fulll")
+        inspect.unwrap(mereo.Object.registrar)(mereo.Object(MODEL), "fulll")
     with pytest.raises(ValueError, match="the unit is -1 m; it must be positive"):
         mereo.reconstruct(seen(), MODEL, unit_m=-1)
     with pytest.raises(FileNotFoundError, match="there is no frame 'bunnny'; give a file or one of the shipped: bun"):

@@ -1,6 +1,7 @@
 """Objects without weights: meshes and a frame are enough, and bad input is one sentence."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -40,16 +41,16 @@ def meshes(folder: Path) -> list[str]:
     return [str(folder / "long.stl"), str(folder / "short.stl")]
 
 
-@pytest.fixture(autouse=True)
-def _own_cache(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(CACHE_VARIABLE, str(folder / "cache"))
+@pytest.fixture(scope="module", autouse=True)
+def _own_cache(folder: Path) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv(CACHE_VARIABLE, str(folder / "cache"))
+        yield
 
 
 @pytest.fixture(scope="module")
-def angle(folder: Path, meshes: list[str]) -> mereo.Object:
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setenv(CACHE_VARIABLE, str(folder / "cache"))
-        return mereo.load_object(meshes, units="mm")
+def angle(meshes: list[str]) -> mereo.Object:
+    return mereo.load_object(meshes, units="mm")
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +106,6 @@ def test_the_model_is_made_once_and_read_again(folder: Path, scene: Scene, monke
     again = kept_model(scene)
     np.testing.assert_array_equal(first.modes, again.modes)
     monkeypatch.undo()
-    monkeypatch.setenv(CACHE_VARIABLE, str(folder / "cache"))
     path.write_bytes(path.read_bytes()[:100])  # damaged: made anew, with the same bits
     np.testing.assert_array_equal(kept_model(scene).modes, first.modes)
 

@@ -24,9 +24,6 @@ from mereo.io.atomic_files import atomic_file
 @pytest.fixture(autouse=True)
 def hang_ups_count() -> Iterator[None]:
     """As in a terminal, also where the tests themselves were started to outlive one (nohup)."""
-    if not hasattr(signal, "SIGHUP"):
-        yield
-        return
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
     signal.signal(signal.SIGHUP, before)

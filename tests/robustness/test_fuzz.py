@@ -131,7 +131,14 @@ def labels_of_infinity(content: bytes) -> bytes:
     return bytes(nibabel.Nifti1Image(np.full((4, 4, 4), np.inf, "f4"), np.eye(4)).to_bytes())
 
 
-CASES: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
+def signalling_depth(content: bytes) -> bytes:
+    values = np.full((12, 16), 0.7, "<f4")
+    values.view("<u4")[0, 0] = 0x7F800001
+    Image.fromarray(values).save(file := io.BytesIO(), "TIFF")
+    return file.getvalue()
+
+
+CASES: dict[str, tuple[str, Callable[[bytes], bytes], str | None]] = {
     "pixels that OpenEXR prints about": ("depth.exr", chunk_size, "cannot be read as a depth image"),
     "a header of 4 GB": ("cloud.npy", at(6, b"\2\0" + b"\xff" * 4), "expected 4294967295 bytes"),
     "no array": ("surfaces.npz", lambda c: zipped({"a": b"text"}), "its entry 'a' is no array"),
@@ -148,7 +155,12 @@ CASES: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
     "labels beyond all numbers": ("labels.nii", labels_of_infinity, "holds values that are no labels"),
     "a scan of two lines": ("truth.json", json_with(scan="\u2028"), r"the name of its scan is '.u2028'"),
     "an extension of 2 GB": ("labels.nii", at(352, struct.pack("<i", 2**31 - 16)), "labels.nii cannot be read"),
+    "pixels that Pillow warned of": ("depth.tif", lambda c: c[:-7], "depth.tif cannot be read"),
+    "a depth that signals": ("depth.tif", signalling_depth, None),
+    "a normal that trimesh logged": ("text.stl", lambda c: c.replace(b"normal ", b"normal x", 1), None),
+    "a header that nibabel changed": ("labels.nii", at(0, b"\0"), None),
 }
+"""Kind of file, its change, and the words of the refusal; None where it is taken, in silence."""
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -159,24 +171,11 @@ def test_it_is_one_sentence_now(case: str, tmp_path: Path, capfd: pytest.Capture
     target, path = TARGETS[name], tmp_path / name
     target.write(path)
     path.write_bytes(change(path.read_bytes()))
-    with pytest.raises(ValueError, match=expected):
-        target.read(path)
-    assert fault_of(target.read, path) == (False, "")
+    assert fault_of(target.read, path) == (expected is None, "")
     assert capfd.readouterr() == ("", "")
-
-
-@pytest.mark.parametrize("name", ["depth.tif", "text.stl", "labels.nii"])
-def test_libraries_say_nothing_of_their_own(name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    """Pillow warned, trimesh logged a traceback and nibabel what it had changed in the header."""
-    changes: dict[str, Callable[[bytes], bytes]] = {
-        "depth.tif": lambda c: c[:-7],
-        "text.stl": lambda c: c.replace(b"normal ", b"normal x", 1),
-        "labels.nii": at(0, b"\0"),
-    }
-    target, path = TARGETS[name], tmp_path / name
-    target.write(path)
-    path.write_bytes(changes[name](path.read_bytes()))
-    assert fault_of(target.read, path)[1] == "" and capfd.readouterr() == ("", "")
+    if expected is not None:
+        with pytest.raises(ValueError, match=expected):
+            target.read(path)
 
 
 def test_a_checkpoint_of_another_run_is_refused_before_training_begins(tmp_path: Path) -> None:
@@ -199,15 +198,6 @@ def test_a_librarys_text_is_short_and_its_output_is_dropped(capfd: pytest.Captur
     assert capfd.readouterr() == ("", "")
     with quiet():
         assert np.float64(1e308) * 10 == np.inf
-
-
-def test_a_depth_that_signals_is_no_measurement(tmp_path: Path) -> None:
-    path = tmp_path / "depth.tif"
-    TARGETS["depth.tif"].write(path)
-    values = np.full((12, 16), 0.7, "<f4")
-    values.view("<u4")[0, 0] = 0x7F800001
-    Image.fromarray(values).save(path)
-    assert fault_of(TARGETS["depth.tif"].read, path) == (True, "")
 
 
 # --- headers that lie, and files that unpack to far more than they are ------------------------------------------------

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import trimesh
 from answers import answer_to
-from browser import BROWSER, Page, pixels_of, until
+from browser import Page, needs_browser, pixels_of, until
 from PIL import Image
 from reported_scenes import ball, example, wall
 from toy_scene import rest_mesh, toy_scene
@@ -52,9 +52,6 @@ from mereo_viewer.result_page import (
 )
 
 needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
-needs_browser = pytest.mark.skipif(
-    BROWSER is None, reason="no chromium or chrome in PATH: install one (Debian: apt-get install chromium)"
-)
 
 
 def toy_content() -> Content:
