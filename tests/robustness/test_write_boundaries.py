@@ -61,8 +61,9 @@ CASES = {
 }
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in CASES if name != "scene export"]
 
-FOREIGN = ("thesis.tex", ".out.mine.mereo/mine.txt", ".out.00000000.partial/mine.txt")
-"""Files of somebody else beside an output, two in folders that look like mereo's own."""
+ALIKE = (".out.mine.mereo", ".out.ply.mine.mereo", ".other.00000000.mereo", ".out.00000000.partial")
+FOREIGN = ("thesis.tex", *(f"{name}/mine.txt" for name in ALIKE))
+"""Files of somebody else beside an output, most in folders that look like mereo's own."""
 
 TIMES = re.compile(rb'"timings_s": {[^}]*}|"seconds": [0-9.e+-]+')
 """Durations in JSON, and in pages that hold it: all that differs between two runs of a command."""
@@ -135,6 +136,7 @@ def test_a_killed_command_is_finished_by_the_next(name: str, inputs: Path, tmp_p
     shutil.copytree(fresh, whole)
     undisturbed = run_command(whole, arguments)
     assert undisturbed.code == 0 and undisturbed.changes, undisturbed.said
+    assert all((whole / name).is_file() for name in FOREIGN)
     for number in boundaries(undisturbed.changes, case.dear):
         shutil.copytree(fresh, place)
         killed = run_command(place, arguments, at=number)
@@ -182,4 +184,4 @@ def test_a_full_disk_is_said_and_leaves_nothing(name: str, room: int, inputs: Pa
         after = {file: after[file] for file in before}
     assert after == before
     go_on(case, arguments, place, "after a full disk")
-    assert {str(path) for path in place.rglob(".*.mereo")} == {str(place / ".out.mine.mereo")}
+    assert {path.name for path in place.rglob(".*.mereo")} == set(ALIKE[:3])
