@@ -37,34 +37,22 @@ FEW_STATES = 60
 """Random states of a scene, among which a fit of its draws starts in the tests: a tenth of what users have."""
 
 
-def find_asset(name: str) -> Path:
-    """A downloadable mesh or scan; skips the test, with the reason, where neither mirror nor network has it."""
-    try:
-        return assets.get(name)
-    except assets.AssetUnavailable as error:
-        pytest.skip(str(error))
-
-
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call() -> Iterator[None]:
-    """Skip a test whose scene needs a mesh that neither mirror nor network has."""
+    """Skip a test whose scene needs a mesh or scan that neither mirror nor network has; so where its fixtures do."""
     try:
         return (yield)
     except assets.AssetUnavailable as error:
         pytest.skip(str(error))
 
 
+pytest_runtest_setup = pytest_runtest_call
+
+
 @pytest.fixture(scope="session")
 def require_asset() -> Callable[[str], Path]:
     """``require_asset("bunny/bunny.off")`` is the file's path, or the test is skipped."""
-    return find_asset
-
-
-@pytest.fixture(scope="session")
-def assets_dir() -> Path:
-    """A folder that holds the Stanford bunny and its scans under their asset names, or the test is skipped."""
-    found = [find_asset(name) for name in assets.ASSETS if name.startswith("bunny/")]
-    return found[0].parent.parent
+    return lambda name: assets.get(name)
 
 
 @pytest.fixture(scope="session")
@@ -115,7 +103,7 @@ def without_curves(monkeypatch: pytest.MonkeyPatch) -> None:
 def without_turns(monkeypatch: pytest.MonkeyPatch) -> None:
     """Skip the search over turned cameras, which takes most of the time of a frame that no fit explains.
 
-    For tests of what happens to such a frame afterwards; ``test_turned_camera.py`` tests the search.
+    For tests of what happens to such a frame afterwards.
     """
     monkeypatch.setattr("mereo.fitting.registration.register.with_turned_camera", lambda start, predict: start)
 

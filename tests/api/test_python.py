@@ -11,8 +11,8 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import jaxtyping
 import numpy as np
@@ -24,8 +24,10 @@ from toy_frames import CENTERS, MODEL, NAMES, RADII, seen
 from toy_scene import toy_scene
 
 import mereo
+from mereo.__main__ import main
 from mereo.api import reconstruct, steps, view
 from mereo.api.result import SINGLE, Result
+from mereo.api.words import SPEAKS_OPTIONS, in_python, option_words, python_words
 from mereo.cli.answers import ReconstructCommand
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.fitting.registration.register import Registrar
@@ -50,11 +52,6 @@ from mereo_viewer import result_page
 from mereo_viewer.server import OpenPage
 
 pytestmark = pytest.mark.usefixtures("small_previews")
-
-
-def unchecked(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function as users have it: without the check of types that tests put before it."""
-    return inspect.unwrap(function)
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +149,7 @@ def test_nobodys_files_are_replaced(result: Result, tmp_path: Path) -> None:
     (tmp_path / "out/mine.txt").write_text("keep")
     for place in ("out", "one.glb"):
         (tmp_path / "one.glb").write_text("keep")
-        with pytest.raises(FileExistsError, match="not overwritten"):
+        with pytest.raises(FileExistsError, match="not overwritten: .* overwrite=True$"):
             result.save(tmp_path / place)
     with pytest.raises(FileExistsError, match="not written by this version of mereo"):
         result.save(tmp_path / "out", overwrite=True)
@@ -170,7 +167,7 @@ def test_other_names_are_refused(result: Result, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="one file, whose suffix says its format"):
         result.save(tmp_path / "x.glb", formats=("ply",))
     with pytest.raises(ValueError, match="there is no format 'plx'"):
-        unchecked(Result.save)(result, tmp_path / "x", formats=("plx",))
+        inspect.unwrap(Result.save)(result, tmp_path / "x", formats=("plx",))
     assert list(tmp_path.iterdir()) == []
     assert result.save(tmp_path / "take-1.2", formats=("npz",)).is_dir()
 
@@ -183,16 +180,7 @@ def test_values_tell_themselves_in_one_line(result: Result) -> None:
     image, evaluation = DepthImage(np.full((3, 4), 2.0), camera), Evaluation(("a",), np.array([[5, 1], [1, 3]]), {})
     located = Located(np.ones(1, np.uint8), np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))
     asked = MODEL.query(found.code, seen()[:5])
-    known = [
-        untrained(("a",)),
-        rope,
-        toy_scene(),
-        DepthImage(np.zeros((3, 4)), camera),
-        image,
-        asked,
-        located,
-        evaluation,
-    ]
+    known = [untrained(("a",)), rope, toy_scene(), image, asked, located, evaluation]
     for value in (result, found, found.observed, *parts, *frames, *known):
         assert "\n" not in repr(value) and "array(" not in repr(value) and len(repr(value)) < 250, repr(value)
     assert repr(result.seen.cloud) == "PointCloud(1,200 points, 0.12 x 0.18 x 0.06)"
@@ -204,7 +192,8 @@ def test_values_tell_themselves_in_one_line(result: Result) -> None:
 
 def test_a_notebook_shows_pictures_and_figures(result: Result) -> None:
     page = result._repr_html_()
-    pictures = [np.asarray(Image.open(io.BytesIO(base64.b64decode(code))).convert("RGB")) for code in images(page)]
+    contents = (io.BytesIO(base64.b64decode(code)) for code in re.findall(r'base64,([^"]+)"', page))
+    pictures = [np.asarray(Image.open(content).convert("RGB")) for content in contents]
     assert [picture.shape[1] for picture in pictures] == [300, 300] and len(page) < 60_000
     dots = [int((picture.max(axis=2) < 60).sum()) for picture in pictures]
     assert dots[0] > 1.5 * dots[1] > 0, "the camera sees all that it has measured, its right half of it"
@@ -216,17 +205,13 @@ def test_a_notebook_shows_pictures_and_figures(result: Result) -> None:
     np.testing.assert_allclose([float(value) for value in place.split()], [20, -30, 600], atol=2)
 
 
-def images(page: str) -> list[str]:
-    return re.findall(r'base64,([^"]+)"', page)
-
-
 def test_a_size_of_none_is_warned_of_at_the_call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     np.save(tmp_path / "cloud.npy", seen())
     known = replace(MODEL, provenance={"visible_m": [2, 3]})
-    monkeypatch.setattr(reconstruct, "reconstruct_observation", unchecked(reconstruct.reconstruct_observation))
+    monkeypatch.setattr(reconstruct, "reconstruct_observation", inspect.unwrap(reconstruct.reconstruct_observation))
     for one in (tmp_path / "cloud.npy", [seen()]):
         with pytest.warns(SizeWarning, match="the visible part is 0.18 m long, but 2 to 3 m in training") as warned:
-            unchecked(mereo.reconstruct)(one, known, resolution=8, unit_m=1.0)
+            inspect.unwrap(mereo.reconstruct)(one, known, resolution=8, unit_m=1.0)
         assert warned[0].filename == __file__ and "--" not in str(warned[0].message)
         mereo.reconstruct(one, known, resolution=8)  # of no stated unit, so that there is nothing to warn of
 
@@ -236,7 +221,7 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="axes is given for a frame that is read already: give it where"):
         mereo.reconstruct(frame, MODEL, axes="scanner")
     with pytest.raises(ValueError, match="the method is 'fulll'; it must be one of .*: correct the spelling"):
-        unchecked(mereo.Object.registrar)(mereo.Object(MODEL), "fulll")
+        inspect.unwrap(mereo.Object.registrar)(mereo.Object(MODEL), "fulll")
     with pytest.raises(ValueError, match="the unit is -1 m; it must be positive"):
         mereo.reconstruct(seen(), MODEL, unit_m=-1)
     with pytest.raises(FileNotFoundError, match="there is no frame 'bunnny'; give a file or one of the shipped: bun"):
@@ -249,49 +234,33 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
         mereo.load_frame(tmp_path / "x.ply", unit=1.0)
 
 
-class Server:
-    """As much of viser's as a page needs."""
-
-    stopped = 0
-
-    def get_port(self) -> int:
-        return 1234
-
-    def stop(self) -> None:
-        self.stopped += 1
-
-
 def test_a_page_stays_open_where_somebody_goes_on(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    server = Server()
-    page = OpenPage(server)
-    monkeypatch.setattr(
-        "mereo_viewer.server.threading", SimpleNamespace(Event=lambda: SimpleNamespace(wait=lambda: None))
-    )
+    page = OpenPage(server := MagicMock(**{"get_port.return_value": 1234}))
+    monkeypatch.setattr("mereo_viewer.server.threading", MagicMock())
     monkeypatch.setattr(sys, "ps1", ">>> ", raising=False)
-    assert page.stay() is page and server.stopped == 0
+    assert page.stay() is page and not server.stop.called
     assert capsys.readouterr().out == "open http://127.0.0.1:1234 in a browser; close() ends\n"
-    assert (
-        'iframe src="http://127.0.0.1:1234"' in page._repr_html_() and repr(page) == "OpenPage('http://127.0.0.1:1234')"
-    )
+    assert 'iframe src="http://127.0.0.1:1234"' in page._repr_html_()
+    assert repr(page) == "OpenPage('http://127.0.0.1:1234')"
     monkeypatch.delattr(sys, "ps1")
     page.stay()
     page.close()
-    assert server.stopped == 1 and "Ctrl-C ends" in capsys.readouterr().out
+    assert server.stop.call_count == 1 and "Ctrl-C ends" in capsys.readouterr().out
     assert "iframe" not in page._repr_html_()
 
 
 def test_a_result_is_viewed_as_it_is(result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
-    shown: list[Any] = []
     for module in (result_page, view):
         monkeypatch.setattr(module, "import_viser", lambda: None)
-    monkeypatch.setattr(result_page, "start_server", lambda port: shown.append(port) or Server())
-    monkeypatch.setattr(result_page, "ResultPage", lambda _, content: shown.append(content))
+    start, show = MagicMock(**{"return_value.get_port.return_value": 1234}), MagicMock()
+    monkeypatch.setattr(result_page, "start_server", start)
+    monkeypatch.setattr(result_page, "ResultPage", show)
     with result.show(block=False) as page, mereo.view(result, block=False, port=8081):
         assert page.address == "http://127.0.0.1:1234"
-    assert shown[0] == 0 and shown[2] == 8081
-    content = shown[1]
+    assert [given.args for given in start.call_args_list] == [(0,), (8081,)]
+    content = show.call_args[0][1]
     assert content.mesh is result.reconstruction.surfaces
     assert (content.title, content.unit, content.depth) == ("cloud", Unit(1.0), None)
     assert content.facts.startswith("1,200 points")
@@ -456,3 +425,56 @@ def test_the_lines_of_the_readme_run_as_printed(tmp_path: Path, monkeypatch: pyt
     assert sorted(path.name for path in (tmp_path / "result").glob("[!.]*")) == [
         *("labels.npz", "preview.png", "radius95.glb", "report.html", "segments.glb", "state.json", "summary.json")
     ]
+
+
+# --- sentences name options on the command line and arguments in Python -----------------------------------------------
+
+
+OUT = "choose another --output or pass --force"
+
+
+@pytest.mark.parametrize(
+    ("option", "argument"),
+    [
+        (OUT, "choose another output or pass overwrite=True"),
+        ("(--keep-all keeps them)", "(isolation=IsolationConfig(keep_all=True) keeps them)"),
+        (
+            "the unit (--unit-m 0.001 for millimetres, --depth-scale)",
+            "the unit (unit_m=0.001 for millimetres, depth_scale)",
+        ),
+        ("turn the cloud (--frame), or give --frame-index 0", "turn the cloud (axes), or give frame_index=0"),
+        ("needed: give --intrinsics FILE", "needed: give intrinsics=file"),
+        ("ask again with --method network.", 'ask again with method="network".'),
+        ("two - or three -- of them, well-known", "two - or three -- of them, well-known"),
+    ],
+)
+def test_options_are_arguments_in_python(option: str, argument: str) -> None:
+    assert in_python(option) == argument
+    assert in_python(argument) == argument, "said once"
+
+
+def test_an_error_is_told_in_the_words_of_who_asks() -> None:
+    with pytest.raises(FileExistsError) as caught, python_words():
+        raise FileExistsError(OUT)
+    assert str(caught.value) == in_python(OUT)
+    with option_words(), pytest.raises(FileExistsError) as caught, python_words():
+        raise FileExistsError(OUT)
+    assert str(caught.value) == OUT and not SPEAKS_OPTIONS.get()
+    with pytest.raises(KeyError, match="--force"), python_words():
+        raise KeyError("--force")
+    with pytest.raises(OSError) as system, python_words():
+        raise OSError(2, "--force")
+    assert system.value.errno == 2 and system.value.strerror == "--force"
+
+
+def test_one_frame_is_refused_in_two_languages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The command's words are options, also after somebody has asked in Python."""
+    cloud = seen()
+    cloud[3] = np.nan
+    np.save(tmp_path / "cloud.npy", cloud)
+    for ask in (mereo.load_frame, lambda path: mereo.reconstruct(path, MODEL)):
+        with pytest.raises(ValueError, match="drop_invalid=True$"):
+            ask(tmp_path / "cloud.npy")
+        arguments = ["reconstruct", str(tmp_path / "cloud.npy"), "--weights", "rope", "--output", str(tmp_path / "out")]
+        assert main(arguments) == 2 and "--drop-invalid" in capsys.readouterr().err
+        assert not SPEAKS_OPTIONS.get()

@@ -91,10 +91,6 @@ def test_every_entry_that_is_mentioned_exists() -> None:
         assert set(mentioned) <= entries, page
 
 
-def test_readme_is_one_screen() -> None:
-    assert len((ROOT / "README.md").read_text().splitlines()) <= 80
-
-
 @pytest.mark.parametrize("page", [p for p in RELEASED if any(commands(p))], ids=lambda page: page.name)
 def test_commands_parse(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
@@ -159,7 +155,8 @@ def test_the_glossary_names_what_exists_and_each_term_once() -> None:
     assert {name for name in named if name.removeprefix("--").replace("-", "_") not in known} == set()
 
 
-def test_decisions_are_short() -> None:
+def test_readme_is_one_screen_and_decisions_are_short() -> None:
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 80
     for page in ROOT.glob("docs/design/*.md"):
         assert len(page.read_text().splitlines()) <= 40, page
 

@@ -10,7 +10,6 @@ import pytest
 
 import mereo.__main__ as command_line
 from mereo.cli import answers, scenes, tools, training
-from mereo.cli.training import Train
 from mereo.io.bounds import Bounds, check_values
 from mereo.io.config import InputConfig
 from mereo.models.config import PARTS, Encoder, NetworkConfig
@@ -129,18 +128,6 @@ def another(name: str, value: Any) -> Any:
     return (*value, 7) if isinstance(value, tuple) else OTHERS[type(value)](value)
 
 
-def options(settings: dict[str, Any]) -> list[str]:
-    """As a command line has them, where a switch that is on is switched off by ``no-``."""
-    found = []
-    for name, value in settings.items():
-        option = name.replace("_", "-")
-        if isinstance(value, bool):
-            found += [f"--network.{option}" if value else f"--network.no-{option}"]
-        else:
-            found += [f"--network.{option}", *map(str, value if isinstance(value, tuple) else (value,))]
-    return found
-
-
 ALL_OTHERS = {name: another(name, value) for name, value in NetworkConfig().to_dict().items()} | {"spread_penalty": 0.5}
 
 
@@ -164,12 +151,6 @@ def test_every_setting_has_one_name_and_comes_back_as_it_was_written() -> None:
 def test_unknown_settings_are_named(name: str) -> None:
     with pytest.raises(ValueError, match=f"the network settings differ in '{name}' from this version of mereo"):
         NetworkConfig.from_dict({"width": 64, name: 3})
-
-
-def test_every_setting_is_an_option_without_its_part() -> None:
-    command = command_line.parse(["train", "data", "--output", "run", "--preset", "paper", *options(ALL_OTHERS)])
-    assert isinstance(command, Train)
-    assert command.config.network.to_dict() == ALL_OTHERS
 
 
 def test_a_recipe_is_written_flat() -> None:

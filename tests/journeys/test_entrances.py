@@ -5,8 +5,9 @@ import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ import mereo
 from mereo.fitting.registration.answer import Answer
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.transforms import rigid
 from mereo.io.atomic_files import to_json
 from mereo.io.readers import read_mask
 from mereo.io.writers.meshes import write_positions_ply
@@ -56,35 +58,9 @@ def result() -> mereo.Result:
     return asked(seen())
 
 
-def ply(path: Path) -> Path:
-    """The points as doubles, so that none is rounded."""
-    rows = "\n".join(" ".join(repr(float(value)) for value in point) for point in seen())
-    head = "\n".join(f"property double {axis}" for axis in "xyz")
-    path.write_text(f"ply\nformat ascii 1.0\nelement vertex {len(seen())}\n{head}\nend_header\n{rows}\n")
-    return path
-
-
 def npy(path: Path) -> Path:
     np.save(path, seen())
     return path
-
-
-CLOUDS: dict[str, Callable[[Path], Any]] = {
-    "array": lambda _: seen(),
-    "list": lambda _: seen().tolist(),
-    "PointCloud": lambda _: PointCloud(seen()),
-    "npy, a string": lambda folder: str(npy(folder / "cloud.npy")),
-    "ply": lambda folder: ply(folder / "cloud.ply"),
-    "load_frame of an array": lambda _: mereo.load_frame(seen()),
-    "load_frame of a file": lambda folder: mereo.load_frame(npy(folder / "cloud.npy")),
-}
-
-
-@pytest.mark.parametrize("kind", CLOUDS)
-def test_points_have_one_answer(kind: str, result: mereo.Result, tmp_path: Path) -> None:
-    found = asked(CLOUDS[kind](tmp_path))
-    same(found, result)
-    assert found.unit_m is None and found.seen.frame.axes == "camera"
 
 
 @pytest.mark.parametrize("axes", ["camera", "scanner"])
@@ -98,7 +74,7 @@ def test_axes_and_unit_are_the_same_beside_the_frame_and_before_it(axes: CloudAx
 
     wanted = found(points, **reading)
     assert wanted.unit_m == 0.5 and wanted.seen.frame.axes == axes
-    for frame in (points.tolist(), PointCloud(points), tmp_path / "cloud.npy"):
+    for frame in (points.tolist(), PointCloud(points), tmp_path / "cloud.npy", str(tmp_path / "cloud.npy")):
         same(found(frame, **reading), wanted)
         same(found(mereo.load_frame(frame, **reading)), wanted)
 
@@ -106,7 +82,7 @@ def test_axes_and_unit_are_the_same_beside_the_frame_and_before_it(axes: CloudAx
 def test_a_list_of_frames_is_a_list_of_answers(result: mereo.Result, tmp_path: Path) -> None:
     frames: list[Any] = [seen(), PointCloud(seen()), npy(tmp_path / "cloud.npy"), mereo.load_frame(seen())]
     found = mereo.reconstruct(frames, MODEL, "network", resolution=RESOLUTION)
-    assert len(found) == len(frames)
+    assert len(found) == len(frames) and result.unit_m is None and result.seen.frame.axes == "camera"
     for one in found:
         same(one, result)
     read = [mereo.load_frame(seen()), found[0].seen]
@@ -148,11 +124,9 @@ MODELS: tuple[SensorModel, ...] = ("structured-light", "time-of-flight")
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[str, Any]]:
     """Run the only block that has a word, next to frame.ply; stand-ins are modules by their names."""
 
-    def run_block(word: str, **modules: Any) -> dict[str, Any]:
-        for name, content in modules.items():
-            module = ModuleType(name)
-            vars(module).update(content)
-            monkeypatch.setitem(sys.modules, name.replace("__", "."), module)
+    def run_block(word: str, modules: dict[str, Any]) -> dict[str, Any]:
+        for name, module in modules.items():
+            monkeypatch.setitem(sys.modules, name, module)
         monkeypatch.chdir(tmp_path)
         monkeypatch.setattr(mereo, "load_object", lambda _: MODEL, raising=False)
         (code,) = (code for page in (FRAMES, TOOLS) for code in blocks(page, "python") if word in code)
@@ -164,94 +138,54 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[s
     return run_block
 
 
-class Mesh(SimpleNamespace):
-    """Stand-in of Open3D's TriangleMesh."""
-
-    def __init__(self, vertices: np.ndarray, triangles: np.ndarray) -> None:
-        super().__init__(vertices=vertices, triangles=triangles, paint_uniform_color=len, compute_vertex_normals=list)
-
-
 def test_open3d(run: Callable[..., dict[str, Any]]) -> None:
-    drawn: list[Any] = []
     cloud = SimpleNamespace(points=np.concatenate([seen(), [[0, 0, 0], [np.nan, 1, 1]]]))
-    names = run(
-        "import open3d",
-        open3d={
-            "io": SimpleNamespace(read_point_cloud=lambda _: cloud),
-            "utility": SimpleNamespace(Vector3dVector=np.asarray, Vector3iVector=np.asarray),
-            "geometry": SimpleNamespace(TriangleMesh=Mesh),
-            "visualization": SimpleNamespace(draw_geometries=drawn.extend),
-        },
-    )
+    open3d = MagicMock(**{"io.read_point_cloud.return_value": cloud})
+    names = run("import open3d", {"open3d": open3d})
     assert np.array_equal(names["without_nan"](cloud.points), seen())
+    ((drawn,),) = open3d.visualization.draw_geometries.call_args_list[0][:1]
     assert drawn[0] is cloud and set(names["meshes"]) == set(NAMES[:2]) and len(drawn) == 3
 
 
 def test_slicer(run: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
-    loaded, placed = [], []
-    names = run(
-        "import slicer",
-        slicer={
-            "util": SimpleNamespace(
-                loadSegmentation=loaded.append,
-                updateMarkupsControlPointsFromArray=lambda node, points: placed.append((node, points)),
-            ),
-            "mrmlScene": SimpleNamespace(AddNewNodeByClass=lambda kind, name: (kind, name)),
-        },
-    )
-    assert loaded == [str(Path("result/labels.seg.nrrd"))] and (tmp_path / loaded[0]).is_file()
-    ((node, points),) = placed
-    assert node[1] == "centroids"
+    slicer = MagicMock()
+    names = run("import slicer", {"slicer": slicer})
+    slicer.util.loadSegmentation.assert_called_once_with(str(Path("result/labels.seg.nrrd")))
+    assert (tmp_path / "result/labels.seg.nrrd").is_file()
+    made = slicer.mrmlScene.AddNewNodeByClass
+    node, points = slicer.util.updateMarkupsControlPointsFromArray.call_args[0]
+    assert made.call_args[0][1] == "centroids" and node is made.return_value
     np.testing.assert_allclose(points[0], [-20, 30, 600], atol=8)
     np.testing.assert_allclose(names["from_ras_mm"](names["to_ras_mm"](seen(), 0.5), 0.5), seen())
     assert names["to_ras_mm"]([[1, 2, 3]], 0.001).tolist() == [[-1, -2, 3]]
 
 
 def test_ros(run: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix(), (1, 2, 3)
-    sent, answers, times = [], [("found", T), ("lost", None)], []
-
-    class Tracker:
-        def __init__(self, name: str) -> None:
-            assert name == "bunny"
-
-        def follow(self, cloud: Any, time_s: float, **reading: Any) -> SimpleNamespace:
-            frame = mereo.load_frame(cloud, **reading)
-            np.testing.assert_allclose(frame.cloud.points, seen(), atol=1e-6)
-            times.append(time_s)
-            tracking, pose = answers.pop(0)
-            return SimpleNamespace(tracking=tracking, pose=pose)
+    T = rigid(Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix(), np.array([1.0, 2, 3]))
+    answers = [SimpleNamespace(tracking="found", pose=T), SimpleNamespace(tracking="lost", pose=None)]
+    tracker, cloud = MagicMock(**{"follow.side_effect": answers}), message(seen())
+    cloud.header = SimpleNamespace(stamp=SimpleNamespace(sec=5, nanosec=500_000_000))
 
     class Node:
+        create_publisher, create_subscription = MagicMock(), MagicMock()
+
         def __init__(self, name: str) -> None:
-            self.create_publisher = lambda *_: SimpleNamespace(publish=sent.append)
+            pass
 
-        def create_subscription(self, kind: type, topic: str, callback: Callable[[Any], None], depth: int) -> None:
-            cloud = message(seen())
-            cloud.header = SimpleNamespace(stamp=SimpleNamespace(sec=5, nanosec=500_000_000))
-            self.spin = lambda: [callback(cloud) for _ in answers.copy()]
-
-    def pose_stamped() -> SimpleNamespace:
-        return SimpleNamespace(pose=SimpleNamespace(position=SimpleNamespace(), orientation=SimpleNamespace()))
-
-    monkeypatch.setattr(mereo, "Tracker", Tracker, raising=False)
-    run(
-        "import rclpy",
-        rclpy={"init": lambda: None, "spin": lambda node: node.spin()},
-        rclpy__node={"Node": Node},
-        geometry_msgs={},
-        geometry_msgs__msg={"PoseStamped": pose_stamped},
-        sensor_msgs={},
-        sensor_msgs__msg={"PointCloud2": object},
-    )
-    (pose,) = (one.pose for one in sent)
-    assert times == [5.5, 5.5] and vars(pose.position) == {"x": 1.0, "y": 2.0, "z": 3.0}
-    np.testing.assert_allclose(list(vars(pose.orientation).values()), [0, 0, 0.5**0.5, 0.5**0.5], atol=1e-12)
-
-
-def axial_mm(z_m: float, degrees: float, model: SensorModel) -> float:
-    return 1e3 * float(axial_std_m(np.array([z_m]), np.deg2rad([degrees]), model)[0])
+    modules = ("rclpy", "geometry_msgs", "geometry_msgs.msg", "sensor_msgs", "sensor_msgs.msg")
+    stand_ins = {**{name: MagicMock() for name in modules}, "rclpy.node": SimpleNamespace(Node=Node)}
+    monkeypatch.setattr(mereo, "Tracker", {"bunny": tracker}.get, raising=False)
+    run("import rclpy", stand_ins)
+    for _ in answers:
+        Node.create_subscription.call_args[0][2](cloud)
+        (given, time_s), reading = tracker.follow.call_args
+        np.testing.assert_allclose(mereo.load_frame(given, **reading).cloud.points, seen(), atol=1e-6)
+        assert time_s == 5.5
+    pose = stand_ins["geometry_msgs.msg"].PoseStamped().pose
+    (sent,) = Node.create_publisher.return_value.publish.call_args_list
+    assert sent.args[0].pose is pose and (pose.position.x, pose.position.y, pose.position.z) == (1.0, 2.0, 3.0)
+    turn = pose.orientation
+    np.testing.assert_allclose([turn.x, turn.y, turn.z, turn.w], [0, 0, 0.5**0.5, 0.5**0.5], atol=1e-12)
 
 
 def test_the_table_of_distances_follows_the_formulas() -> None:
@@ -259,7 +193,8 @@ def test_the_table_of_distances_follows_the_formulas() -> None:
     rows = re.findall(row, FRAMES.read_text(), re.M)
     assert len(rows) == 6
     for z, *stated in np.array(rows, dtype=float).tolist():
-        light, flight = ([axial_mm(z, degrees, model) for degrees in (0, 60)] for model in MODELS)
+        at, angles = np.full(2, z), np.deg2rad([0.0, 60.0])
+        light, flight = (1e3 * axial_std_m(at, angles, model) for model in MODELS)
         assert stated[:5] == pytest.approx((*light, 1e3 * z**2 / KINECT_DISPARITY_M, *flight), abs=0.0051)
         assert stated[5:] == [round(0.1 * focal / z) for focal in (420, 525)]
     depths = np.unique(quantize(np.linspace(0.99, 1.01, 10_000), 1.0))
@@ -272,6 +207,6 @@ def test_the_colour_threshold_finds_the_orange_ball(run: Callable[..., dict[str,
     picture = np.full((120, 160, 3), (60, 90, 200), np.uint8)
     picture[ball] = picture[10:30, 130:150] = picture[100, 5] = (250, 110, 20)
     Image.fromarray(picture).save(tmp_path / "color.png")
-    run("ndimage")
+    run("ndimage", {})
     mask = read_mask(tmp_path / "mask.png")
     assert not (mask & ~ball).any() and mask.sum() > 0.9 * ball.sum()

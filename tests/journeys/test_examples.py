@@ -3,10 +3,8 @@
 import os
 import re
 import shlex
-import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,37 +27,21 @@ EXPECTED = {
     "simulate_liver.py": "3 states of 98 nodes",
     "wrong_answers.py": "wrote wrong_answers.png",
 }
-ASSETS = {
-    "isolate_object.py": ("bunny/bunny.off", "bunny/bun000.ply"),
-    "loop.py": ("bunny/bunny.off",),
-    "simulate_liver.py": ("liver/lapgym_liver_volumetric.vtk",),
-    "wrong_answers.py": ("bunny/bunny.off", "human/makehuman_base.obj", "liver/lapgym_liver_visual.stl"),
-}
-"""Downloads that they need."""
-
 OPTIONS = {"loop.py": ("--fps", "1"), "shipped_weights.py": ("--weights", "rope", "--cells", "24")}
 """What keeps an example short."""
 
-LONG = (
-    *("isolate_object.py", "loop.py", "reconstruct_cloud.py", "shipped_weights.py", "simulate_liver.py"),
-    "wrong_answers.py",
-)
-"""Those that take longer; what they call has tests of its own."""
-
-EXTRAS = {"simulate_liver.py": "mujoco"}
-"""Modules that come with an extra of the package."""
+SHORT = ("desk_lamp.py", "query_points.py", "sensors.py")
+"""The others take longer; what they call has tests of its own."""
 
 
 def test_every_example_is_run() -> None:
     assert {path.name for path in EXAMPLES.glob("*.py")} == set(EXPECTED)
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if n in LONG else ()) for n in EXPECTED])
-def test_example_runs(name: str, tmp_path: Path, require_asset: Callable[[str], Path]) -> None:
-    for asset in ASSETS.get(name, ()):
-        require_asset(asset)
-    if name in EXTRAS:
-        pytest.importorskip(EXTRAS[name], reason=f"{EXTRAS[name]} is not installed: pip install 'mereo[simulation]'")
+@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in SHORT else pytest.mark.slow) for n in EXPECTED])
+def test_example_runs(name: str, tmp_path: Path) -> None:
+    if name == "simulate_liver.py":
+        pytest.importorskip("mujoco", reason="mujoco is not installed: pip install 'mereo[simulation]'")
     done = subprocess.run(
         [sys.executable, str(EXAMPLES / name), *OPTIONS.get(name, ())],
         cwd=tmp_path,
@@ -68,32 +50,20 @@ def test_example_runs(name: str, tmp_path: Path, require_asset: Callable[[str], 
         text=True,
         timeout=300,
     )
+    if "AssetUnavailable" in done.stderr:
+        pytest.skip(done.stderr.splitlines()[-1])
     assert done.returncode == 0, done.stderr[-2000:]
     assert EXPECTED[name] in done.stdout
 
 
-FOLDER = Path(__file__).parents[2] / "examples" / "cluster"
-SCRIPTS, FILES = sorted(FOLDER.glob("*.sbatch")), sorted(FOLDER.glob("*.yaml"))
-FILLED = {
-    "$data": "data/bunny",
-    "$run": "runs/bunny",
-    "$scene": "bunny",
-    "$first": "node1",
-    "$SLURM_JOB_NUM_NODES": "2",
-    "$SLURM_JOB_ID": "17",
-    "$SLURM_CPUS_PER_TASK": "32",
-    "$SLURM_ARRAY_TASK_ID": "3",
-}
-"""What the variables of scripts stand for."""
-
+FOLDER = EXAMPLES / "cluster"
 SEPARATE = "TORCH_DISABLE_SHARE_RDZV_TCP_STORE"
 """Without it nodes do not find each other after a restart."""
 
 
 def commands(script: Path) -> list[list[str]]:
     text = re.sub(r"\\\n\s*", " ", script.read_text())
-    for name, value in FILLED.items():
-        text = re.sub(rf"{re.escape(name)}\b", value, text)
+    text = re.sub(r"\$\w+", lambda name: "bunny" if name[0] == "$scene" else "2", text)
     lines = [shlex.split(line) for line in text.splitlines() if re.match(r"(srun |mereo )", line)]
     assert lines and not any("$" in word for words in lines for word in words), script
     return [words[1:] if words[0] == "srun" else words for words in lines]
@@ -116,19 +86,10 @@ def assert_started_well(options: Any, command: Train) -> None:
     assert re.fullmatch(r"[a-z0-9.-]+:29400", options.rdzv_endpoint)
 
 
-def objects() -> Iterator[tuple[Path, dict[str, Any]]]:
-    for file in FILES:
-        for item in yaml.safe_load_all(file.read_text()):
-            yield file, item
-
-
-@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.name)
+@pytest.mark.parametrize("script", sorted(FOLDER.glob("*.sbatch")), ids=lambda path: path.name)
 def test_scripts_are_shell(script: Path) -> None:
-    bash = shutil.which("bash")
-    if bash is None:
-        pytest.skip("there is no bash")
     lines = script.read_text().splitlines()
-    assert subprocess.run([bash, "-n", script], capture_output=True, text=True).stderr == ""
+    assert subprocess.run(["bash", "-n", script], capture_output=True, text=True).stderr == ""
     assert lines[0] == "#!/bin/bash" and "set -euo pipefail" in lines
     last = max(number for number, line in enumerate(lines) if line.startswith("#SBATCH"))
     assert all(line.startswith("#") for line in lines[:last]), "sbatch reads its options up to the first command"
@@ -153,14 +114,12 @@ def test_the_generating_script_makes_all_parts() -> None:
 
 
 def test_kubernetes_starts_what_it_should() -> None:
-    (_, service), (_, job) = (item for item in objects() if item[0].name == "train-kubernetes.yaml")
-    assert (service["apiVersion"], service["kind"]) == ("v1", "Service") and service["spec"]["clusterIP"] == "None"
-    assert (job["apiVersion"], job["kind"]) == ("batch/v1", "Job")
+    service, job = yaml.safe_load_all((FOLDER / "train-kubernetes.yaml").read_text())
     spec, template = job["spec"], job["spec"]["template"]
     pod = template["spec"]
     assert spec["completionMode"] == "Indexed" and spec["completions"] == spec["parallelism"]
     assert service["spec"]["selector"].items() <= template["metadata"]["labels"].items()
-    assert pod["subdomain"] == service["metadata"]["name"] and pod["restartPolicy"] in ("Never", "OnFailure")
+    assert pod["subdomain"] == service["metadata"]["name"]
     (container,) = pod["containers"]
     options, command = ran_by_torchrun([*container["command"], *container["args"]])
     assert_started_well(options, command)
@@ -169,14 +128,12 @@ def test_kubernetes_starts_what_it_should() -> None:
     first, port = options.rdzv_endpoint.split(":")
     assert first == f"{job['metadata']['name']}-0.{service['metadata']['name']}", "an indexed pod's name"
     assert int(port) == service["spec"]["ports"][0]["port"]
-    assert all(isinstance(item["value"], str) for item in container["env"])
     assert {"name": SEPARATE, "value": "1"} in container["env"]
     assert_on_the_volume(pod, command.dataset, command.output)
 
 
 def test_kuberay_starts_what_it_should() -> None:
-    ((_, job),) = (item for item in objects() if item[0].name == "generate-kuberay.yaml")
-    assert (job["apiVersion"], job["kind"]) == ("ray.io/v1", "RayJob")
+    job = yaml.safe_load((FOLDER / "generate-kuberay.yaml").read_text())
     words = shlex.split(job["spec"]["entrypoint"])
     at = words.index("--ray")
     assert words[at + 1] == "auto"
@@ -184,10 +141,7 @@ def test_kuberay_starts_what_it_should() -> None:
     assert isinstance(command, Generate) and command.resume
     cluster = job["spec"]["rayClusterSpec"]
     for group in (cluster["headGroupSpec"], *cluster["workerGroupSpecs"]):
-        assert all(isinstance(value, str) for value in group["rayStartParams"].values())
         assert_on_the_volume(group["template"]["spec"], command.output)
-    (workers,) = cluster["workerGroupSpecs"]
-    assert workers["minReplicas"] <= workers["replicas"] <= workers["maxReplicas"]
 
 
 def assert_on_the_volume(pod: dict[str, Any], *folders: Path) -> None:

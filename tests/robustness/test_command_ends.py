@@ -24,9 +24,6 @@ from mereo.io.atomic_files import atomic_file
 @pytest.fixture(autouse=True)
 def hang_ups_count() -> Iterator[None]:
     """As in a terminal, also where the tests themselves were started to outlive one (nohup)."""
-    if not hasattr(signal, "SIGHUP"):
-        yield
-        return
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
     signal.signal(signal.SIGHUP, before)
@@ -38,7 +35,7 @@ def run(work: Callable[[], object], monkeypatch: pytest.MonkeyPatch, *arguments:
     return command_line.main(list(arguments))
 
 
-@pytest.mark.parametrize("number", STOPPING)
+@pytest.mark.parametrize("number", [signal.SIGINT, *STOPPING])
 def test_a_signal_leaves_nothing_half_written(
     number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -49,9 +46,10 @@ def test_a_signal_leaves_nothing_half_written(
             threading.Event().wait(20)
 
     assert run(write, monkeypatch) == 128 + number
-    assert capsys.readouterr().err == f"mereo: stopped by {number.name}\n"
+    words = "interrupted" if number == signal.SIGINT else f"stopped by {number.name}"
+    assert capsys.readouterr().err == f"mereo: {words}\n"
     assert not list(tmp_path.iterdir())
-    assert signal.getsignal(number) == signal.SIG_DFL
+    assert signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler)
 
 
 @pytest.mark.parametrize("number", STOPPING)
@@ -131,25 +129,36 @@ def test_a_real_signal_leaves_complete_shards_only(tmp_path: Path, number: signa
 
 
 @pytest.mark.parametrize(
-    ("error", "end"),
+    ("error", "code", "end"),
     [
-        (TypeError("a\nbug"), "TypeError: a bug; this is a fault of mereo: run it again with MEREO_TRACEBACK=1, and "),
-        (MemoryError(), "MemoryError; the memory does not suffice: ask for less"),
-        (RuntimeError("CUDA out of memory. " + 99 * "Tried. "), "...; the memory does not suffice: ask for less"),
-        (RecursionError("too deep"), "RecursionError: too deep; something is nested too deeply, or in itself: look"),
+        (ValueError("the scale is -1;\n it must be positive"), 2, "the scale is -1; it must be positive"),
+        (FileNotFoundError("there is no file 'a.ply'"), 2, "there is no file 'a.ply'"),
+        (FileNotFoundError(2, "No such file", "a.ply"), 2, "a.ply: no such file: correct that"),
+        (OSError(28, "No space left on device"), 2, "no space left on device: correct that"),
+        (ImportError("pyvista is missing: pip install pyvista"), 2, "pyvista is missing: pip install pyvista"),
+        (ValueError(), 2, "ValueError"),
+        (TypeError("a\nbug"), 70, "a bug; this is a fault of mereo: run it again with MEREO_TRACEBACK=1, and "),
+        (MemoryError(), 70, "; the memory does not suffice: ask for less"),
+        (RuntimeError("CUDA out of memory. " + 99 * "Tried. "), 70, "...; the memory does not suffice: ask for less"),
+        (RecursionError("too deep"), 70, ": too deep; something is nested too deeply, or in itself: look"),
     ],
 )
-def test_whatever_else_happens_is_one_line_that_names_command_and_files(
-    error: Exception, end: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+def test_every_error_is_one_line_which_names_command_and_files_where_it_is_not_foreseen(
+    error: Exception,
+    code: int,
+    end: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
 ) -> None:
     def fail() -> None:
         raise error
 
     monkeypatch.delenv(command_line.TRACEBACK_VARIABLE, raising=False)
-    assert run(fail, monkeypatch, "scene", "check", "cube", "--output", str(tmp_path), "\0") == command_line.FAULT == 70
-    printed = capsys.readouterr().err
-    assert printed.startswith(f"mereo: error: mereo scene check on {tmp_path}: {type(error).__name__}")
-    assert end in printed and printed.count("\n") == 1
+    assert run(fail, monkeypatch, "scene", "check", "cube", "--output", str(tmp_path), "\0") == code
+    out, err = capsys.readouterr()
+    start = end if code == 2 else f"mereo scene check on {tmp_path}: {type(error).__name__}"
+    assert err.startswith(f"mereo: error: {start}") and end in err and err.count("\n") == 1 and out == ""
     monkeypatch.setenv(command_line.TRACEBACK_VARIABLE, "1")
     with pytest.raises(type(error)):
         command_line.main([])

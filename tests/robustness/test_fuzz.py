@@ -19,7 +19,6 @@ import pytest
 import torch
 from fuzz import TARGETS, fault_of, inputs, limits, listing, zipped
 from PIL import Image
-from point_files import save_pcd, save_ply
 from safetensors import numpy as arrays
 from safetensors.torch import load_file, save_file
 
@@ -28,7 +27,6 @@ from mereo.io.errors import LIMIT_VARIABLE, PAGES, max_bytes, quiet, reason, wit
 from mereo.io.intrinsics import read_intrinsics
 from mereo.io.mesh_formats import read_glb, read_segmented_mesh
 from mereo.io.readers import read_point_cloud, read_raw_depth
-from mereo.io.ros_recordings import recorded_frames
 from mereo.io.sensor_frame import read_frame
 from mereo.io.simulation_states import read_states
 from mereo.io.volume_files import read_label_volume
@@ -133,7 +131,14 @@ def labels_of_infinity(content: bytes) -> bytes:
     return bytes(nibabel.Nifti1Image(np.full((4, 4, 4), np.inf, "f4"), np.eye(4)).to_bytes())
 
 
-CASES: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
+def signalling_depth(content: bytes) -> bytes:
+    values = np.full((12, 16), 0.7, "<f4")
+    values.view("<u4")[0, 0] = 0x7F800001
+    Image.fromarray(values).save(file := io.BytesIO(), "TIFF")
+    return file.getvalue()
+
+
+CASES: dict[str, tuple[str, Callable[[bytes], bytes], str | None]] = {
     "pixels that OpenEXR prints about": ("depth.exr", chunk_size, "cannot be read as a depth image"),
     "a header of 4 GB": ("cloud.npy", at(6, b"\2\0" + b"\xff" * 4), "expected 4294967295 bytes"),
     "no array": ("surfaces.npz", lambda c: zipped({"a": b"text"}), "its entry 'a' is no array"),
@@ -150,7 +155,12 @@ CASES: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
     "labels beyond all numbers": ("labels.nii", labels_of_infinity, "holds values that are no labels"),
     "a scan of two lines": ("truth.json", json_with(scan="\u2028"), r"the name of its scan is '.u2028'"),
     "an extension of 2 GB": ("labels.nii", at(352, struct.pack("<i", 2**31 - 16)), "labels.nii cannot be read"),
+    "pixels that Pillow warned of": ("depth.tif", lambda c: c[:-7], "depth.tif cannot be read"),
+    "a depth that signals": ("depth.tif", signalling_depth, None),
+    "a normal that trimesh logged": ("text.stl", lambda c: c.replace(b"normal ", b"normal x", 1), None),
+    "a header that nibabel changed": ("labels.nii", at(0, b"\0"), None),
 }
+"""Kind of file, its change, and the words of the refusal; None where it is taken, in silence."""
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -161,24 +171,11 @@ def test_it_is_one_sentence_now(case: str, tmp_path: Path, capfd: pytest.Capture
     target, path = TARGETS[name], tmp_path / name
     target.write(path)
     path.write_bytes(change(path.read_bytes()))
-    with pytest.raises(ValueError, match=expected):
-        target.read(path)
-    assert fault_of(target.read, path) == (False, "")
+    assert fault_of(target.read, path) == (expected is None, "")
     assert capfd.readouterr() == ("", "")
-
-
-@pytest.mark.parametrize("name", ["depth.tif", "text.stl", "labels.nii"])
-def test_libraries_say_nothing_of_their_own(name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    """Pillow warned, trimesh logged a traceback and nibabel what it had changed in the header."""
-    changes: dict[str, Callable[[bytes], bytes]] = {
-        "depth.tif": lambda c: c[:-7],
-        "text.stl": lambda c: c.replace(b"normal ", b"normal x", 1),
-        "labels.nii": at(0, b"\0"),
-    }
-    target, path = TARGETS[name], tmp_path / name
-    target.write(path)
-    path.write_bytes(changes[name](path.read_bytes()))
-    assert fault_of(target.read, path)[1] == "" and capfd.readouterr() == ("", "")
+    if expected is not None:
+        with pytest.raises(ValueError, match=expected):
+            target.read(path)
 
 
 def test_a_checkpoint_of_another_run_is_refused_before_training_begins(tmp_path: Path) -> None:
@@ -203,84 +200,18 @@ def test_a_librarys_text_is_short_and_its_output_is_dropped(capfd: pytest.Captur
         assert np.float64(1e308) * 10 == np.inf
 
 
-def test_a_depth_that_signals_is_no_measurement(tmp_path: Path) -> None:
-    path = tmp_path / "depth.tif"
-    TARGETS["depth.tif"].write(path)
-    values = np.full((12, 16), 0.7, "<f4")
-    values.view("<u4")[0, 0] = 0x7F800001
-    Image.fromarray(values).save(path)
-    assert fault_of(TARGETS["depth.tif"].read, path) == (True, "")
-
-
 # --- headers that lie, and files that unpack to far more than they are ------------------------------------------------
 
 
 POINTS = np.random.default_rng(0).normal(size=(57, 3)).astype(np.float32)
-TEXT = "".join(f"{x} {y} {z}\n" for x, y, z in POINTS.tolist()).encode()
-PLY, PCD = save_ply(POINTS, "binary_little_endian"), save_pcd(POINTS, "binary")
-TRIANGLE = b"3 0 1 2\n"
-
-
-def npy(*shape: int) -> bytes:
-    file = io.BytesIO()
-    np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": shape})
-    return file.getvalue()
-
-
-def one_sentence(read: Callable[[Path], object], path: Path, content: bytes, expected: str) -> None:
-    path.write_bytes(content)
-    with pytest.raises(ValueError, match=expected) as caught:
-        read(path)
-    assert "\n" not in str(caught.value) and str(path) in str(caught.value)
-
-
-LYING_CLOUDS = {
-    "fewer than none.ply": (PLY.replace(b"vertex 57", b"vertex -5"), "its header states -5 of element 'vertex'"),
-    "no such format.ply": (PLY.replace(b"little", b"middle"), "its format is 'binary_middle_endian'"),
-    "more than there are.ply": (PLY.replace(b"57", b"1000000000000"), "PLY is unexpected length"),
-    "fewer than none.pcd": (PCD.replace(b"POINTS 57", b"POINTS -5"), "its header states -5 points"),
-    "two counts.pcd": (PCD.replace(b"POINTS 57", b"POINTS 20"), "its header states 20 points and 57 x 1"),
-    "too far back.pcd": (
-        PCD.partition(b"DATA")[0].replace(b"57", b"4")
-        + b"DATA binary_compressed\n"
-        + struct.pack("<II", 5, 80)
-        + bytes([1, 65, 66, 32, 10]),
-        "its compressed data are damaged",
-    ),
-    "cut short.pts": (b"58\n" + TEXT, "truncated: 57 of 58 points"),
-    "huge.npz": (zipped({"points.npy": npy(10**15, 3) + PLY}), "takes more than 8 GB of memory to read"),
-}
-
-
-@pytest.mark.parametrize("name", LYING_CLOUDS)
-def test_a_cloud_whose_header_lies_is_refused(tmp_path: Path, name: str) -> None:
-    one_sentence(read_point_cloud, tmp_path / name, *LYING_CLOUDS[name])
-
-
-LYING_MESHES = {
-    "fewer faces.ply": (
-        save_ply(POINTS, "ascii").replace(b"end_header", b"element face 5\nproperty list uchar int i\nend_header"),
-        "truncated: 57 of 62 rows",
-    ),
-    "fewer faces.off": (b"OFF\n3 5 0\n0 0 0\n1 0 0\n0 1 0\n" + TRIANGLE, "truncated: 1 of 5 faces"),
-    "fewer than none.off": (b"OFF\n-3 1 0\n0 0 0\n" + TRIANGLE, "its header states -3 vertices"),
-    "huge.stl": (bytes(80) + b"\xff" * 4 + bytes(100), "cannot be read as a mesh"),
-}
-
-
-@pytest.mark.parametrize("name", LYING_MESHES)
-def test_a_mesh_whose_header_lies_is_refused(tmp_path: Path, name: str) -> None:
-    one_sentence(read_segmented_mesh, tmp_path / name, *LYING_MESHES[name])
 
 
 def nifti(*sizes: int) -> bytes:
     nibabel = pytest.importorskip("nibabel", reason="nibabel is not installed: pip install 'mereo[medical]'")
     header = nibabel.Nifti1Header()
     header.set_data_dtype(np.uint8)
-    block = bytearray(header.binaryblock)
-    block[40:56] = struct.pack("<8h", 3, *sizes, 1, 1, 1, 1)
-    block[108:112], block[344:348] = struct.pack("<f", 352), b"n+1\0"
-    return bytes(block) + bytes(214)
+    header["dim"], header["vox_offset"], header["magic"] = (3, *sizes, 1, 1, 1, 1), 352, b"n+1"
+    return bytes(header.binaryblock) + bytes(214)
 
 
 def nrrd(sizes: str, encoding: str, data: bytes) -> bytes:
@@ -290,10 +221,16 @@ def nrrd(sizes: str, encoding: str, data: bytes) -> bytes:
 
 def test_a_volume_whose_header_lies_is_refused(tmp_path: Path) -> None:
     huge = "takes more than 8 GB of memory to read|cannot be read as a label volume"
-    one_sentence(read_label_volume, tmp_path / "a.nii.gz", gzip.compress(nifti(32000, 32000, 30)), huge)
-    one_sentence(read_label_volume, tmp_path / "b.nii", nifti(-5, 6, 7), "its header states the size -5 x 6 x 7")
-    one_sentence(read_label_volume, tmp_path / "a.nrrd", nrrd("32000 32000 30", "raw", bytes(210)), huge)
-    one_sentence(read_label_volume, tmp_path / "b.nrrd", nrrd("-5 -6 7", "raw", bytes(210)), "the size -5 x -6 x 7")
+    for name, content, sentence in (
+        ("a.nii.gz", gzip.compress(nifti(32000, 32000, 30)), huge),
+        ("b.nii", nifti(-5, 6, 7), "its header states the size -5 x 6 x 7"),
+        ("a.nrrd", nrrd("32000 32000 30", "raw", bytes(210)), huge),
+        ("b.nrrd", nrrd("-5 -6 7", "raw", bytes(210)), "the size -5 x -6 x 7"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ValueError, match=f"{name}.*({sentence})") as caught:
+            read_label_volume(tmp_path / name)
+        assert "\n" not in str(caught.value)
 
 
 BOMBS: dict[str, Callable[[Path], object]] = {"a.npz": read_point_cloud, "a.nrrd": read_label_volume}
@@ -303,34 +240,17 @@ BOMBS: dict[str, Callable[[Path], object]] = {"a.npz": read_point_cloud, "a.nrrd
 @pytest.mark.skipif(not PAGES.exists(), reason="only Linux holds a process to a limit")
 @pytest.mark.parametrize("name", BOMBS)
 def test_what_takes_too_much_memory_is_refused(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path, zeros = tmp_path / name, bytes(1_000_000_000)
+    path = tmp_path / name
     if name == "a.npz":
-        path.write_bytes(zipped({"points.npy": npy(len(zeros) // 12, 3) + zeros}))
+        np.savez_compressed(path, points=np.zeros((83_333_333, 3), "f4"))
     else:
-        path.write_bytes(nrrd("1000 1000 1000", "gzip", gzip.compress(zeros, 1)))
+        path.write_bytes(nrrd("1000 1000 1000", "gzip", gzip.compress(bytes(1_000_000_000), 1)))
     before = resource.getrlimit(resource.RLIMIT_AS)
     monkeypatch.setenv(LIMIT_VARIABLE, "0.7")
     with pytest.raises(ValueError, match=r"takes more than 0\.7 GB of memory to read") as caught:
         BOMBS[name](path)
     assert "\n" not in str(caught.value) and str(path) in str(caught.value)
     assert resource.getrlimit(resource.RLIMIT_AS) == before
-
-
-def test_a_recording_is_unpacked_in_limited_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One chunk, without an index, as a bomb would come."""
-    mcap = pytest.importorskip("rosbags.rosbag2.storage_mcap", reason="rosbags is missing: mereo[sensors]")
-
-    def sized(content: bytes) -> bytes:
-        return len(content).to_bytes(8, "little") + content
-
-    size = 1_000_000_000
-    chunk = bytes(16) + size.to_bytes(8, "little") + bytes(4) + (4).to_bytes(4, "little") + b"zstd"
-    content = b"\x89MCAP0\r\n\x01" + sized((4).to_bytes(4, "little") + b"ros2" + bytes(4))
-    content += b"\x06" + sized(chunk + sized(mcap.zstd.compress(bytes(size))))
-    (tmp_path / "a.mcap").write_bytes(content + b"\x02" + sized(bytes(20)) + b"\x89MCAP0\r\n")
-    monkeypatch.setenv(LIMIT_VARIABLE, "0.7")
-    with pytest.raises(ValueError, match=r"a\.mcap (takes more than 0\.7 GB of memory|cannot be read)"):
-        next(recorded_frames(tmp_path / "a.mcap"))
 
 
 def test_a_pipe_or_device_that_is_named_like_a_file_is_refused_at_once(tmp_path: Path) -> None:

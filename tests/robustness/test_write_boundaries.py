@@ -61,8 +61,9 @@ CASES = {
 }
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in CASES if name != "scene export"]
 
-FOREIGN = ("thesis.tex", ".out.mine.mereo/mine.txt", ".out.00000000.partial/mine.txt")
-"""Files of somebody else beside an output, two in folders that look like mereo's own."""
+ALIKE = (".out.mine.mereo", ".out.ply.mine.mereo", ".other.00000000.mereo", ".out.00000000.partial")
+FOREIGN = ("thesis.tex", *(f"{name}/mine.txt" for name in ALIKE))
+"""Files of somebody else beside an output, most in folders that look like mereo's own."""
 
 TIMES = re.compile(rb'"timings_s": {[^}]*}|"seconds": [0-9.e+-]+')
 """Durations in JSON, and in pages that hold it: all that differs between two runs of a command."""
@@ -114,17 +115,16 @@ def prepare(case: Case, inputs: Path, place: Path) -> str:
     return case.arguments.replace("INPUTS", str(inputs))
 
 
-def boundaries(calls: list[str]) -> Iterator[tuple[int, bool]]:
-    """Moments at which to kill: the number of a call, and whether just after it; of each kind of call the first."""
-    kinds, functions = set[str](), set[str]()
-    for number, (function, place) in enumerate(call.split(" ", 1) for call in calls):
-        name = re.sub("[0-9a-f]{8}|[0-9]+", "0", Path(place).name) if function in MOVES else Path(place).suffix
-        if f"{function} {name}" not in kinds:
-            yield number, True
-        if function in MOVES and function not in functions:
-            yield number, False
-        kinds.add(f"{function} {name}")
-        functions.add(function)
+def boundaries(changes: list[str], dear: bool) -> list[int]:
+    """Changes before which to kill: those that follow the first of a kind, and the first moves themselves."""
+    numbers, seen = set[int](), set[str]()
+    for number, (event, place) in enumerate(change.split(" ", 1) for change in changes):
+        name = re.sub("[0-9a-f]{8}|[0-9]+", "0", Path(place).name) if event in MOVES else Path(place).suffix
+        if event in MOVES or (event != "open" and not dear):
+            numbers |= {number + 1} if f"{event} {name}" not in seen else set()
+            numbers |= {number} if event in MOVES and event not in seen else set()
+            seen |= {event, f"{event} {name}"}
+    return sorted(numbers - {len(changes)})
 
 
 @pytest.mark.parametrize("name", ["scene export", *SLOW])
@@ -134,12 +134,13 @@ def test_a_killed_command_is_finished_by_the_next(name: str, inputs: Path, tmp_p
     fresh, whole, place = (tmp_path / folder for folder in ("fresh", "whole", "place"))
     arguments = prepare(case, inputs, fresh)
     shutil.copytree(fresh, whole)
-    undisturbed = run_command(whole, arguments, every_call=not case.dear)
-    assert undisturbed.code == 0 and undisturbed.calls, undisturbed.said
-    for number, after in boundaries(undisturbed.calls):
+    undisturbed = run_command(whole, arguments)
+    assert undisturbed.code == 0 and undisturbed.changes, undisturbed.said
+    assert all((whole / name).is_file() for name in FOREIGN)
+    for number in boundaries(undisturbed.changes, case.dear):
         shutil.copytree(fresh, place)
-        killed = run_command(place, arguments, at=number, after=after, every_call=not case.dear)
-        where = f"killed {'after' if after else 'before'} call {number}: {killed.calls[-1]}"
+        killed = run_command(place, arguments, at=number)
+        where = f"killed before change {number}: {killed.changes[-1]}"
         assert killed.code == -9, f"{where}\n{killed.said}"
         go_on(case, arguments, place, where)
         assert names(place) == names(whole) and content(place) == content(whole), where
@@ -183,4 +184,4 @@ def test_a_full_disk_is_said_and_leaves_nothing(name: str, room: int, inputs: Pa
         after = {file: after[file] for file in before}
     assert after == before
     go_on(case, arguments, place, "after a full disk")
-    assert {str(path) for path in place.rglob(".*.mereo")} == {str(place / ".out.mine.mereo")}
+    assert {path.name for path in place.rglob(".*.mereo")} == set(ALIKE[:3])

@@ -108,8 +108,6 @@ SUBROOMS = {"fitting": ("config", "problem", "modes", "search", "draws", "uncert
 ROOT_MODULES = ("__init__", "__main__")
 """The public names and the entry point, which may import every room."""
 
-MAY_IMPORT_TORCH = ("models/", "cli/tools.py")
-
 HEAVY = ("numpy", "torch", "scipy", "trimesh", "matplotlib")
 """What settings must not load, so that ``--help`` is instant: the two, and libraries that bring them."""
 
@@ -121,6 +119,9 @@ SATELLITES = {
     "mereo_experiments": ("cli/",),
 }
 """Packages beside mereo, in the same wheel, and the modules of mereo that may import each."""
+
+MAY_IMPORT = {"torch": ("models/", "cli/tools.py"), "matplotlib": ("io/extras.py",), **SATELLITES}
+"""The same of libraries that most installations lack: asked for where they are used, with the extra's name."""
 
 BUDGET = {
     "src/mereo": (34_000, 152),
@@ -169,21 +170,12 @@ def _place(name: str, order: tuple[str, ...]) -> int:
     return order.index(name) if name in order else len(order)
 
 
-def torch_imports(package: Package) -> list[str]:
-    """Imports of torch, lazy ones included, in rooms that do without."""
+def guarded_imports(package: Package) -> list[str]:
+    """Imports of what only some may import, lazy ones included, by modules that do without."""
     return [
-        f"{i.place} imports torch, which only {', '.join(MAY_IMPORT_TORCH)} may"
+        f"{i.place} imports {i.target}, which only {', '.join(MAY_IMPORT[i.target])} may"
         for i in package
-        if i.target == "torch" and not f"{i.source}.py".startswith(MAY_IMPORT_TORCH)
-    ]
-
-
-def satellite_imports(package: Package) -> list[str]:
-    """Imports of a package beside mereo, lazy ones included, by modules that do without."""
-    return [
-        f"{i.place} imports {i.target}, which only {', '.join(SATELLITES[i.target])} may"
-        for i in package
-        if i.target in SATELLITES and not f"{i.source}.py".startswith(SATELLITES[i.target])
+        if i.target in MAY_IMPORT and not f"{i.source}.py".startswith(MAY_IMPORT[i.target])
     ]
 
 

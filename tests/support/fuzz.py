@@ -434,12 +434,8 @@ def every_frame(path: Path) -> None:
         read()
 
 
-def exactly_read(path: Path) -> object:
-    return read_point_cloud(path, drop_invalid=True)
-
-
-def of_segment(path: Path) -> object:
-    return read_states(path, ("a",))
+exactly_read = partial(read_point_cloud, drop_invalid=True)
+of_segment = partial(read_states, names=("a",))
 
 
 class Target(NamedTuple):

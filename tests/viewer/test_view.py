@@ -17,14 +17,12 @@ import numpy as np
 import pytest
 import trimesh
 from answers import answer_to
-from browser import BROWSER, Page, pixels_of, until
+from browser import Page, needs_browser, pixels_of, until
 from PIL import Image
 from reported_scenes import ball, example, wall
 from toy_scene import rest_mesh, toy_scene
 
-import mereo
 from mereo.__main__ import main
-from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.state import STATE
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
@@ -54,9 +52,6 @@ from mereo_viewer.result_page import (
 )
 
 needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
-needs_browser = pytest.mark.skipif(
-    BROWSER is None, reason="no chromium or chrome in PATH: install one (Debian: apt-get install chromium)"
-)
 
 
 def toy_content() -> Content:
@@ -200,30 +195,9 @@ def test_the_command_prints_where_the_page_is_and_ends_cleanly(tmp_path: Path) -
             process.kill()
 
 
-@pytest.mark.parametrize(
-    "arguments, sentence",
-    [
-        (("--weights", "lizard"), "none is shipped for 'lizard'; name a depth image or a point cloud"),
-        (("cloud.ply",), "cloud.ply is given without its object: name the object's meshes or scene with --object"),
-    ],
-)
-def test_what_cannot_be_shown_is_said_in_one_sentence(
-    arguments: tuple[str, ...], sentence: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from mereo.__main__ import main
-
-    monkeypatch.setattr("mereo.api.view.import_viser", lambda: None)
-    assert main(["view", *arguments]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("mereo: error: ") and error.count("\n") == 1
-    assert sentence in error
-
-
 def test_without_viser_one_sentence_names_the_extra(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from mereo.__main__ import main
-
     monkeypatch.setitem(sys.modules, "viser", None)
     assert main(["view"]) == 2
     assert "`mereo view` needs it: run pip install 'mereo[view]'" in capsys.readouterr().err
@@ -398,16 +372,6 @@ def folder(tmp_path: Path) -> Path:
     return folder
 
 
-def test_a_report_is_read_again(folder: Path) -> None:
-    cloud, *_ = example()
-    report = read_report(folder / "report.html")
-    assert report is not None and report.cloud is not None and report.depth is not None
-    np.testing.assert_allclose(report.cloud.points, cloud.points, atol=1e-5)
-    assert (report.title, report.level, report.count, report.unit_known) == ("frame <7>", "alone", len(cloud), True)
-    assert report.verdict.startswith("Network alone: nothing says whether this is the object. The object reaches")
-    assert report.depth.shape == (19, 24, 3) and report.ends == ("500 mm", "700 mm")
-
-
 @pytest.mark.parametrize(
     "old, new",
     [
@@ -470,6 +434,10 @@ def test_any_glb_is_read_with_its_places_and_colours(tmp_path: Path) -> None:
     assert colors is not None and {tuple(color) for color in colors.tolist()} == {(255, 0, 0), (0, 0, 255)}
     assert parts["plain"][0].color == (255, 0, 0) and parts["plain"][1] is None
     assert len(parts["plain"][0].vertices) == 8 and parts["round"][0].color == (0, 128, 255)
+    content = content_of_files((tmp_path / "s.glb").rename(tmp_path / "s.GLB"))
+    assert content.ask is None and content.first_view == "front" and content.facts.startswith("3 parts")
+    shown, scale = content.colorings[VERTEX]()
+    assert scale is None and [len(part) for part in shown] == [len(s.vertices) for s in content.mesh.segments]
 
 
 def test_a_folder_is_shown_with_all_that_its_files_keep(folder: Path) -> None:
@@ -477,6 +445,8 @@ def test_a_folder_is_shown_with_all_that_its_files_keep(folder: Path) -> None:
     assert content.title == "frame <7>" and "2 segments" in content.facts and not content.is_doubtful
     assert content.verdict.startswith("Network alone") and content.unit.metres == pytest.approx(0.001)
     assert content.cloud is not None and content.depth is not None and content.depth[1] == ("500 mm", "700 mm")
+    np.testing.assert_allclose(content.cloud.points, example()[0].points, atol=1e-5)
+    assert content.depth[0].shape == (19, 24, 3) and content.verdict.endswith("may be cut off there.")
     assert tuple(content.colorings) == ("distance", SURE)
     colors, scale = content.colorings[SURE]()
     assert [len(part) for part in colors] == [len(s.vertices) for s in content.mesh.segments] and scale is not None
@@ -512,24 +482,12 @@ def test_places_are_asked_of_a_results_surfaces(folder: Path) -> None:
     np.testing.assert_allclose(rim, middle + inside.direction[0] * size, atol=3 * size)
 
 
-def test_any_glb_has_its_own_colours_and_no_probe(tmp_path: Path) -> None:
-    write_strange(tmp_path / "s.GLB")
-    content = content_of_files(tmp_path / "s.GLB")
-    assert content.ask is None and content.first_view == "front" and content.facts.startswith("3 parts")
-    colors, scale = content.colorings[VERTEX]()
-    assert scale is None and [len(part) for part in colors] == [len(s.vertices) for s in content.mesh.segments]
-
-
-def seen_as(answer: Answer, points: np.ndarray) -> Probed:
-    content = content_of_answer(answer)
-    assert content.ask is not None
-    return content.ask(points)
-
-
 def test_weights_without_a_model_are_asked_alone_and_it_is_said(rope: Model) -> None:
     cloud = load_view("rope").depth.to_points()
     answer = answer_to(cloud, replace(rope, statistical_model=None), None, 24)
-    content, shown = content_of_answer(answer), seen_as(answer, cloud.points[:4])
+    content = content_of_answer(answer)
+    assert content.ask is not None
+    shown = content.ask(cloud.points[:4])
     assert content.verdict == "network alone: the weights carry no statistical model"
     assert shown.rest is None and shown.probability is not None
     assert tuple(content.colorings) == ("confidence", "distance")
@@ -538,34 +496,35 @@ def test_weights_without_a_model_are_asked_alone_and_it_is_said(rope: Model) -> 
     assert scale is not None and scale.title == "confidence of the surface"
 
 
-@needs_viser
-def test_the_command_opens_the_page_of_a_folder(folder: Path) -> None:
-    with mereo.view(folder, port=0, block=False) as page, urllib.request.urlopen(page.address, timeout=20) as answer:
-        assert b"<html" in answer.read()
-
-
 @pytest.mark.parametrize(
-    "content, options, sentence",
+    "content, arguments, sentence",
     [
-        (None, (), "s.glb does not exist; a GLB file is needed: check the path"),
-        (b"glTF but not really", (), "s.glb cannot be read as a GLB file"),
-        (b"", (), "s.glb is empty (0 bytes)"),
-        (trimesh.Scene([trimesh.PointCloud(np.eye(3))]).export(file_type="glb"), (), "it has no faces"),
-        (b"", ("--weights", "rope"), "is shown as it is, and no object is looked for: leave out --object and"),
+        (None, ("--weights", "lizard"), "none is shipped for 'lizard'; name a depth image or a point cloud"),
+        (
+            None,
+            ("cloud.ply",),
+            "cloud.ply is given without its object: name the object's meshes or scene with --object",
+        ),
+        (None, ("s.glb",), "s.glb does not exist; a GLB file is needed: check the path"),
+        (b"glTF but not really", ("s.glb",), "s.glb cannot be read as a GLB file"),
+        (b"", ("s.glb",), "s.glb is empty (0 bytes)"),
+        (trimesh.Scene([trimesh.PointCloud(np.eye(3))]).export(file_type="glb"), ("s.glb",), "it has no faces"),
+        (b"", ("s.glb", "--weights", "rope"), "is shown as it is, and no object is looked for: leave out --object and"),
     ],
 )
-def test_a_file_that_cannot_be_shown_is_said_in_one_sentence(
+def test_what_cannot_be_shown_is_said_in_one_sentence(
     content: bytes | None,
-    options: tuple[str, ...],
+    arguments: tuple[str, ...],
     sentence: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     for module in ("mereo_viewer.result_page", "mereo.api.view"):
         monkeypatch.setattr(f"{module}.import_viser", lambda: None)
     if content is not None:
-        (tmp_path / "s.glb").write_bytes(content)
-    assert main(["view", str(tmp_path / "s.glb"), *options]) == 2
+        Path("s.glb").write_bytes(content)
+    assert main(["view", *arguments]) == 2
     error = capsys.readouterr().err
     assert error.startswith("mereo: error: ") and error.count("\n") == 1 and sentence in error

@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from browser import BROWSER, Page, pixels_of, until
+from browser import Page, needs_browser, pixels_of, until
 from PIL import Image
 from reported_scenes import ball, example, page_data, positions, wall
 
@@ -114,13 +114,8 @@ def test_a_large_reconstruction_stays_under_the_budget_and_in_shape(tmp_path: Pa
     assert not (tmp_path / "r2.html").exists()
 
 
-in_browser = pytest.mark.skipif(
-    BROWSER is None, reason="no chromium or chrome in PATH: install one (Debian: apt-get install chromium)"
-)
-
-
 @pytest.mark.slow
-@in_browser
+@needs_browser
 @pytest.mark.parametrize("mode", ["", "#2d"])
 def test_a_browser_draws_every_segment(tmp_path: Path, mode: str) -> None:
     cloud, mesh, summary = example()

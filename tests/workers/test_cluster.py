@@ -242,13 +242,10 @@ def test_a_failed_object_stops_no_other_and_the_same_call_continues(
 # --- processes of this machine ----------------------------------------------------------------------------------------
 
 
-def test_one_worker_works_here_and_in_order() -> None:
+def test_one_worker_works_here_and_in_order_and_its_errors_arrive_or_are_replaced() -> None:
     assert list(spread(square, [3, 1, 2])) == [(3, 9), (1, 1), (2, 4)]
     assert next(spread(report, [0], 8))[1][0] == os.getpid()
     assert list(spread(square, [], 4)) == []
-
-
-def test_an_error_arrives_as_it_was_raised_or_is_replaced() -> None:
     with pytest.raises(ValueError, match="three is bad"):
         list(spread(fail_on_three, range(5)))
     assert dict(spread(fail_on_three, range(5), 1, lambda item, error: -item))[3] == -3

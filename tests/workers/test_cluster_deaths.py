@@ -10,13 +10,16 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
+from glob import glob
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 from angle import write_angle
+from browser import until
 from folder_contents import contents
 from many_frames import content, frames, loads, run
 from toy_data import SMALL
@@ -73,26 +76,15 @@ def nodes() -> Iterator[Any]:
         made.shutdown()
 
 
-def processes(*words: str) -> list[int]:
-    found = []
-    for place in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):
-            line = (place / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
-            found += [int(place.name)] if all(word in line for word in words) else []
-    return sorted(found)
-
-
-def parent(process: int) -> int:
-    try:
-        return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
-    except OSError:
-        return 0
+def processes(*words: str) -> list[psutil.Process]:
+    lines = ((process, " ".join(process.info["cmdline"] or ())) for process in psutil.process_iter(["cmdline", "ppid"]))
+    return [process for process, line in lines if all(word in line for word in words)]
 
 
 def working(place: str) -> list[int]:
     """Workers at a task, of the cluster whose files lie in a folder."""
-    nodes = processes("raylet", place)
-    return [process for process in processes("ray::_apply") if parent(process) in nodes]
+    nodes = [node.pid for node in processes("raylet", place)]
+    return sorted(process.pid for process in processes("ray::_apply") if process.info["ppid"] in nodes)
 
 
 def folder_of_ray(process: int) -> str:
@@ -102,19 +94,15 @@ def folder_of_ray(process: int) -> str:
 
 def has_left(process: int) -> bool:
     """Whether processes or files of Ray stay for long when a process has ended."""
-    until = time.monotonic() + 15
-    while processes(folder_of_ray(process)) and time.monotonic() < until:
-        time.sleep(0.2)
-    files = [str(place) for place in Path("/tmp").iterdir() if str(place).startswith(folder_of_ray(process))]
-    return bool(processes(folder_of_ray(process)) or files)
+    with suppress(TimeoutError):
+        until(lambda: not processes(folder_of_ray(process)), 15)
+    return bool(processes(folder_of_ray(process)) or glob(f"{folder_of_ray(process)}*"))
 
 
-def started(line: str, **options: Any) -> "tuple[subprocess.Popen[str], list[int]]":
+def started(line: str, **options: Any) -> "tuple[subprocess.Popen[str], Any]":
     """A command, as soon as workers of its own cluster are at a task, and these: they may be done a moment later."""
     command = subprocess.Popen([sys.executable, "-m", "mereo", *line.split()], text=True, stderr=-1, **options)
-    until = time.monotonic() + 300
-    while not (busy := working(folder_of_ray(command.pid))) and time.monotonic() < until and command.poll() is None:
-        time.sleep(0.1)
+    busy = until(lambda: working(folder_of_ray(command.pid)) or command.poll() is not None, 300)
     return command, busy
 
 
