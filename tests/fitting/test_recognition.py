@@ -99,7 +99,7 @@ def test_a_size_off_by_a_factor_of_two_is_never_the_objects(
 
 
 def test_noisy_frames_do_not_make_clean_ones_lenient(registration: Registration) -> None:
-    usual = {"unexplained": Usual(mean=np.log(4.1) - 4.0, std=1.0)}
+    usual = {"unexplained": Usual(mean=np.log(4.1) - 4.2, std=1.0)}
     limits = Calibration(seed=1, views=8, recognizing=Recognizing(clean=usual, noisy=usual, unsure=4.5, refused=8.0))
     clean, noisy = (replace(registration, explained=1 - 4 * (1 - needed), needed=needed) for needed in (0.95, 0.75))
     assert recognize(noisy, limits).known is True and recognize(clean, limits).known == "unsure"

@@ -52,10 +52,6 @@ CONSERVATIVE = Recognizing(
 )
 """For weights that were not calibrated."""
 
-CLEAN_UNSURE = 3.3
-"""Strangeness above which any clean frame is unsure, as noisy frames raise the limits of calibrations: of 130
-clean training views of 13 objects, half of them in part behind a tool, none has more than 2.9."""
-
 
 @dataclass(frozen=True)
 class Signs:
@@ -203,7 +199,7 @@ def recognize(
     signs = Signs.of(registration, displaced, stated_scene_unit)
     usual, unsure = limits.noisy, limits.unsure
     if not is_noisy(registration):
-        usual, unsure = limits.clean, min(limits.unsure, CLEAN_UNSURE)
+        usual, unsure = limits.clean, min(limits.unsure, CONSERVATIVE.unsure)  # only noise has made it wider
     each = signs.strange(usual)
     total = strangeness(each)
     is_unit_wrong = signs.size is not None and signs.size > float(np.log(2.0))  # a factor of two
