@@ -196,7 +196,6 @@ def test_the_frame_survives_weights_and_older_ones_have_none(tmp_path: Path) -> 
     model = scene_model(replace(load_scene("rope"), unit_m=0.25, T_scene_source=np.diag([2.0, 2.0, 2.0, 1.0])), 10)
     save_model(replace(untrained(model.rest.names), statistical_model=model), tmp_path / "w.safetensors")
     read = load_model(tmp_path / "w.safetensors").statistical_model
-    assert read is not None and read.source_frame is not None and model.source_frame is not None
     np.testing.assert_array_equal(read.source_frame.T_scene_source, model.source_frame.T_scene_source)
     assert read.source_frame.unit_m == 0.25 and read.source_frame.scale == pytest.approx(2.0)
     tensors, facts = pack_model(model)

@@ -57,7 +57,6 @@ def confused(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def lying(*given: Any) -> Any:
         found = honest(*given)
-        assert found is not None
         return replace(found, rest=np.random.default_rng(0).permutation(found.rest))
 
     monkeypatch.setattr("mereo.fitting.registration.register.find_correspondences", lying)
@@ -119,7 +118,7 @@ def test_the_state_with_the_greater_evidence_is_taken_whatever_its_unit(by_netwo
 
 def test_a_network_far_from_what_it_starts_is_no_start(by_network: Candidate) -> None:
     """Weights after a minute of training explain a frame by chance, with the object turned end for end."""
-    assert not is_astray(by_network)
+    assert by_network.modes is not None and not is_astray(by_network)
     found = by_network.modes.correspondences
     guessed = replace(found, rest=np.random.default_rng(0).permutation(found.rest))
     lucky = replace(by_network, modes=replace(by_network.modes, correspondences=guessed))
@@ -200,7 +199,6 @@ def test_strays_are_left_out_and_all_else_is_kept(registrar: Registrar, points: 
     found = fitted(registrar, with_rim(points))
     assert clean.hypothesis.dropped == 0 and clean.encoded is likelier
     assert not found.hypothesis.keep[len(points) :].any() and found.hypothesis.keep[: len(points)].mean() > 0.99
-    assert found.modes is not None and clean.modes is not None
     moved = np.linalg.norm(found.modes.registration().material - clean.modes.registration().material, axis=1)
     assert np.median(moved) < 0.2
     assert fitted(registrar, with_rim(points), keep_all=True).hypothesis.dropped == 0
@@ -237,7 +235,6 @@ def noisy(points: np.ndarray, std: float) -> np.ndarray:
 @pytest.mark.slow
 def test_a_noisy_frame_is_fitted_by_its_own_noise(registrar: Registrar, points: np.ndarray) -> None:
     clean, found = (fitted(registrar, cloud).modes for cloud in (points, noisy(points, 0.4)))
-    assert clean is not None and found is not None
     assert clean.problem.config == FitConfig()
     config = found.problem.config
     assert 0.3 < config.cloud_sigma <= LARGEST and config.tolerance == pytest.approx(4.5 * config.cloud_sigma, rel=0.5)
@@ -251,7 +248,6 @@ def test_what_a_calm_frame_cannot_have_is_no_noise(
     registrar: Registrar, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     modes = fitted(registrar, points).modes
-    assert modes is not None
     problem, surface = modes.problem, Surface.through(modes.problem.model, modes.registration().material)
     offset = np.random.default_rng(1).normal(scale=0.4, size=len(points))
     monkeypatch.setattr(Surface, "offsets", lambda _, given: offset[: len(given)])

@@ -478,7 +478,6 @@ def test_frames_that_become_noisier_are_met_with_their_own_constants(
 ) -> None:
     tracker = Tracker(engine)
     tracker.follow(observe(seen(scene, first, 0.02)), 0.0, scene_unit=1.0)
-    assert tracker._track is not None
     quiet = tracker._track.problem.config
     for number in range(1, 11):
         found = tracker.follow(observe(seen(scene, first, 0.5, number)), number / RATE_HZ, scene_unit=1.0)

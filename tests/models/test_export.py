@@ -50,7 +50,6 @@ def model_of(config: NetworkConfig, loss: str) -> Model:
     network = Network(config, len(NAMES))
     if config.additions.rest_template:
         lookup = network.decoder.lookup
-        assert lookup is not None
         axis = torch.linspace(-TEMPLATE_REACH, TEMPLATE_REACH, TEMPLATE_NODES)
         places = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
         centers = torch.tensor([[0.3, 0.0, 0.1], [-0.2, 0.5, 0.0], [0.0, -0.4, -0.6]])
