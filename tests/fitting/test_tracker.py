@@ -87,9 +87,7 @@ def rms(answer: Answer, mesh: SegmentedMesh) -> float:
 @pytest.fixture(scope="module")
 def registrar() -> Registrar:
     """Registrar of a lobe with a core inside and a tip that lies on it, which bends."""
-    model = load_model("tests/golden/lump.safetensors").statistical_model
-    assert model is not None
-    return Registrar(None, model)
+    return Registrar(None, load_model("tests/golden/lump.safetensors").statistical_model)
 
 
 class HeldExecutor(Executor):

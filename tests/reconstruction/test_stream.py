@@ -85,10 +85,14 @@ def test_a_slow_answer_gets_the_latest_frame_and_dropped_ones_are_not_decoded() 
     assert "10 dropped for newer ones, 0 bad" in str(summary)
 
 
+def damaged() -> None:
+    raise ValueError("the file\nis damaged")
+
+
 @pytest.mark.parametrize(
     "load, sentence",
     [
-        (Mock(side_effect=ValueError("the file\nis damaged")), "the file is damaged"),
+        (damaged, "the file is damaged"),
         (Mock(side_effect=OSError()), "OSError"),
         (lambda: [][1], "bad cannot be answered (IndexError: list index out of range)"),
         (Mock(side_effect=EOFError()), "bad cannot be answered (EOFError): record or write it again"),
