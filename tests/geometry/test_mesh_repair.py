@@ -188,7 +188,7 @@ def test_check_counts_faults_and_repair_leaves_the_users_files(
     part.apply_translation((3, 0, 0))
     write_mesh(Segment("left", (0, 0, 0), np.array(part.vertices), np.array(part.faces)[2:]), tmp_path / "left.stl")
     before = {file: file.read_bytes() for file in tmp_path.iterdir()}
-    with pytest.raises(ValueError, match=r"bar.yaml has 3 faults, listed above: repair the meshes with --repair"):
+    with pytest.raises(ValueError, match=r"bar.yaml has 2 faults, listed above: repair the meshes with --repair"):
         check_scene(str(path))
     printed = capsys.readouterr().out
     assert "fault: it has 6 open edges (1 hole, near [103, 2.08, 9.17] mm)" in printed
