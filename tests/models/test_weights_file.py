@@ -37,7 +37,9 @@ WRONG: dict[str, Callable[[Any, dict[str, torch.Tensor]], Any]] = {
     "and nested segments disagree": lambda h, t: h.update(nested=[["a", "c"]]),
     "1 colours": lambda h, t: h.update(colors=[[1, 2, 3]]),
     "a header with a wrong 'provenance.visible_m": lambda h, t: h.update(provenance={"visible_m": [1]}),
-    "a header with a wrong 'calibration.radius_scale'": lambda h, t: h.update(calibration={"radius_scale": -1.0}),
+    "a header with a wrong 'calibration.radius_scale'": lambda h, t: h.update(
+        calibration={"seed": 3, "views": 8, "radius_scale": -1.0}
+    ),
     "network.width is '64'; it must be a whole number": lambda h, t: h["network"].update(width="64"),
     "network.skip_after is 4000, of": lambda h, t: h["network"].update(skip_after=4000),
     "the network settings differ in 'heads'": lambda h, t: h["network"].update(heads=3),
