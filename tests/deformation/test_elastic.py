@@ -1,6 +1,7 @@
 """Elastic modes: theorems of the free solid, whatever its shape; and what is no solid is refused in a sentence."""
 
 import pickle
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -176,14 +177,10 @@ def test_a_stiffer_part_bends_less() -> None:
     def energies(body: ElasticSolid) -> np.ndarray:
         """Strain energy of each half in the softest modes, under the same stiffness."""
         _, vectors = find_modes(body, 4, Material())
-        center = body.mesh.nodes[body.mesh.elements].mean(axis=1)[:, 0]
-        halves = []
-        for side in (center < 3, center > 3):
-            part = ElasticSolid(body.mesh, body.filled, np.where(side, 1.0, 1e-9))
-            stiffness = assemble_stiffness(part, Material())
-            flat = vectors.reshape(-1, 4)
-            halves.append(np.einsum("ik,ik->", flat, stiffness @ flat))
-        return np.array(halves)
+        center, flat = body.mesh.nodes[body.mesh.elements].mean(axis=1)[:, 0], vectors.reshape(-1, 4)
+        sides = (np.where(side, 1.0, 1e-9) for side in (center < 3, center > 3))
+        halves = (assemble_stiffness(ElasticSolid(body.mesh, body.filled, side), Material()) for side in sides)
+        return np.array([np.einsum("ik,ik->", flat, stiffness @ flat) for stiffness in halves])
 
     soft, stiff = energies(even), energies(uneven)
     assert soft[0] == pytest.approx(soft[1], rel=0.2)
@@ -208,36 +205,28 @@ def test_what_is_held_does_not_move_and_nothing_is_rigid() -> None:
         find_modes(solid(), COUNT, Material(), hinge)
 
 
-def test_bad_materials_are_refused() -> None:
-    for poisson in (0.5, -1.0, np.nan):
+def test_bad_materials_lattices_and_modes_are_refused() -> None:
+    for value in (0.5, -1.0, np.nan):
         with pytest.raises(ValueError, match="must lie between -1 and 0.5: take 0.4 for tissue"):
-            Material(poisson)
-    for young in (0.0, -1.0, np.inf, np.nan):
-        with pytest.raises(ValueError, match="must be above 0: take 1, which changes no mode"):
-            Material(young=young)
-
-
-def test_bad_lattices_are_refused() -> None:
+            Material(value)
     with pytest.raises(ValueError, match="a lattice of 1 cells cannot bend; 2 or more are needed: take 16"):
         build_lattice(block(), 1)
-    part = block().segments[0]
-    inverted = SegmentedMesh((Segment("block", part.color, part.vertices, part.faces[:, ::-1].copy()),))
+    (part,) = block().segments
     with pytest.raises(ValueError, match="has no inside: turn its faces outward"):
-        build_lattice(inverted, 8)
+        build_lattice(SegmentedMesh((replace(part, faces=part.faces[:, ::-1].copy()),)), 8)
     for share in (0.0, 1.5, np.nan):
         with pytest.raises(ValueError, match="must be above 0 and at most 1: leave empty ones out"):
             ElasticSolid(lattice(), np.full(len(lattice().elements), share))
-
-
-def test_bad_modes_are_refused() -> None:
     small = build_lattice(block(), 2)
     most = 3 * len(small.mesh.nodes) - 7
     for count in (0, most + 1):
         with pytest.raises(ValueError, match=f"{count} modes of .* nodes; from 1 to {most} exist: take more cells"):
             find_modes(small, count, Material())
-    for motion in (0.0, -1.0, np.nan):
+    for value in (0.0, np.inf, np.nan):
+        with pytest.raises(ValueError, match="must be above 0: take 1, which changes no mode"):
+            Material(young=value)
         with pytest.raises(ValueError, match="it must be above 0: a tenth of half the longest side is moderate"):
-            scale_modes(*modes(), motion=motion)
+            scale_modes(*modes(), motion=value)
 
 
 def test_a_solid_in_pieces_is_refused() -> None:

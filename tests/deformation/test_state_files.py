@@ -13,7 +13,7 @@ from lattice import boxes, lattice, pvd_text, states, xdmf_text
 
 from mereo.deformation.tetrahedral import Tetrahedra, TetrahedralMap
 from mereo.io.simulation_states import TetrahedralRecord, read_states
-from mereo.scenes.recorded_states import load_states
+from mereo.scenes.recorded_states import SplitStates, load_states
 
 SCALE, SHIFT = 0.5, (1.0, -2.0, 3.0)
 """From the files' coordinates to those of the scene, in which ``boxes`` are."""
@@ -80,8 +80,7 @@ def surface(vertices: np.ndarray) -> Any:
     return pyvista.PolyData.from_regular_faces(to_file(vertices[::-1]), faces)
 
 
-def displacements() -> np.ndarray:
-    return (states() - lattice().nodes) / SCALE
+DISPLACEMENTS = (states() - lattice().nodes) / SCALE
 
 
 def numpy_and_volume(path: Path) -> tuple[Path, Path]:
@@ -109,14 +108,14 @@ def numpy_and_surface(path: Path) -> tuple[Path, Path]:
 
 
 def folder_of_displacements(path: Path) -> Path:
-    for frame, moved in enumerate(displacements()):
+    for frame, moved in enumerate(DISPLACEMENTS):
         grid(lattice().nodes, U=moved, velocity=10 * moved).save(path / f"{frame}.vtu")
     return path
 
 
 def pattern_of_both(path: Path) -> Path:
     """Points that have moved, by displacements that are stored too; other files lie in the folder."""
-    for frame, (nodes, moved) in enumerate(zip(states(), displacements(), strict=True)):
+    for frame, (nodes, moved) in enumerate(zip(states(), DISPLACEMENTS, strict=True)):
         grid(nodes, Displacement=moved).save(path / f"run_{frame}.vtk")
     grid(lattice().nodes).save(path / "other.vtk")
     return path / "run_*.vtk"
@@ -143,7 +142,7 @@ def collection(path: Path) -> tuple[Path, Path]:
 
 
 def fenics(path: Path) -> Path:
-    text = xdmf_text(to_file(lattice().nodes), lattice().elements, displacements())
+    text = xdmf_text(to_file(lattice().nodes), lattice().elements, DISPLACEMENTS)
     (path / "run.xdmf").write_text(text, encoding="utf-8")
     return path / "run.xdmf"
 
@@ -170,11 +169,15 @@ ROUNDED = ("ply", "stl", "obj", "NPY, VTK", "NPY, PLY")
 """Those in single precision or of eight digits."""
 
 
+def load_written(written: Path | tuple[Path, Path]) -> SplitStates:
+    """States from a path, or a path and a mesh beside it."""
+    path, mesh = written if isinstance(written, tuple) else (written, None)
+    return load_states(path, boxes(), mesh=mesh, scale=SCALE, shift=SHIFT)
+
+
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_gives_the_same_states(name: str, tmp_path: Path) -> None:
-    written = FORMATS[name](tmp_path)
-    path, mesh = written if isinstance(written, tuple) else (written, None)
-    split = load_states(path, boxes(), mesh=mesh, scale=SCALE, shift=SHIFT)
+    split = load_written(FORMATS[name](tmp_path))
     frames, truth = split.training.frames, moved_vertices()
     assert frames.count == 10 and (split.training.end, split.testing.first) == (9, 9)
     for frame in range(10):
@@ -199,8 +202,7 @@ def test_a_sequence_of_positions_starts_at_rest_and_hexahedra_are_divided(tmp_pa
 
 
 def tetrahedral(**changes: np.ndarray) -> dict[str, np.ndarray]:
-    mesh = lattice()
-    return {"rest_nodes": mesh.nodes, "tetrahedra": mesh.elements, "nodes": states()} | changes
+    return {"rest_nodes": lattice().nodes, "tetrahedra": lattice().elements, "nodes": states()} | changes
 
 
 def surfaces(**changes: np.ndarray) -> dict[str, np.ndarray]:
@@ -249,7 +251,7 @@ def test_states_that_do_not_fit_are_named(case: str, tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_directories_that_are_not_states_are_explained(tmp_path: Path) -> None:
+def test_paths_that_are_no_states_are_explained(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"one folder of mesh files for each segment \(left, right\), or a mesh for"):
         load_states(tmp_path, boxes())
     meshes("ply", rest=False)(tmp_path)
@@ -259,9 +261,6 @@ def test_directories_that_are_not_states_are_explained(tmp_path: Path) -> None:
     trimesh.creation.box().export(tmp_path / "right/10.ply")
     with pytest.raises(ValueError, match="right: frame 10.ply has 8 vertices but frame 1.ply has 98; the topology"):
         load_states(tmp_path, boxes())
-
-
-def test_paths_that_are_no_states_are_explained(tmp_path: Path) -> None:
     (tmp_path / "s.npz").write_bytes(b"no archive")
     with pytest.raises(ValueError, match="cannot be read as a NPZ file"):
         load_states(tmp_path / "s.npz", boxes())
@@ -270,15 +269,15 @@ def test_paths_that_are_no_states_are_explained(tmp_path: Path) -> None:
         load_states(tmp_path / "s.csv", boxes())
 
 
-def remeshed(path: Path) -> tuple[Path, None]:
+def remeshed(path: Path) -> Path:
     grid(states()[0]).save(path / "0.vtu")
     grid(states()[1]).extract_cells(range(40)).save(path / "1.vtu")
-    return path, None
+    return path
 
 
-def single_surface(path: Path) -> tuple[Path, None]:
+def single_surface(path: Path) -> Path:
     surface(boxes().merged()[0]).save(path / "0.vtp")
-    return path / "*.vtp", None
+    return path / "*.vtp"
 
 
 def other_surface(path: Path) -> tuple[Path, Path]:
@@ -287,31 +286,29 @@ def other_surface(path: Path) -> tuple[Path, Path]:
     return run, mesh
 
 
-def cut_short(path: Path) -> tuple[Path, None]:
-    folder_of_displacements(path)
-    (path / "3.vtu").write_bytes((path / "3.vtu").read_bytes()[:600])
-    return path, None
+def cut_short(path: Path) -> Path:
+    file = folder_of_displacements(path) / "3.vtu"
+    file.write_bytes(file.read_bytes()[:600])
+    return path
 
 
-def archive_with_mesh(path: Path) -> tuple[Path, Path]:
-    return nodes_npz(path), path / "volume.vtk"
-
-
-UNUSABLE: dict[str, tuple[Callable[[Path], tuple[Path, Path | None]], str]] = {
+UNUSABLE: dict[str, tuple[Callable[[Path], Path | tuple[Path, Path]], str]] = {
     "remeshed": (remeshed, r"frame 1.vtu has \d+ nodes but frame 0.vtu has 96; the topology must stay the same"),
     "no tetrahedra": (single_surface, r"no tetrahedra and one surface for 2 segments; .* `states: \{positions: "),
     "other surface": (other_surface, r"miss a vertex of its mesh by .*; without tetrahedra .* or name a mesh with tet"),
     "cut short": (cut_short, r"3.vtu cannot be read as a mesh \(.*\): export or download it again"),
-    "mesh of an archive": (archive_with_mesh, r"an NPZ file, which holds its own rest; `mesh` is not for it: leave it"),
+    "mesh of an archive": (
+        lambda path: (nodes_npz(path), path / "volume.vtk"),
+        r"an NPZ file, which holds its own rest; `mesh` is not for it: leave it",
+    ),
 }
 
 
 @pytest.mark.parametrize("case", UNUSABLE)
 def test_other_programs_files_that_do_not_fit_are_named(case: str, tmp_path: Path) -> None:
     write, text = UNUSABLE[case]
-    path, mesh = write(tmp_path)
     with pytest.raises(ValueError, match=text) as caught:
-        load_states(path, boxes(), mesh=mesh, scale=SCALE, shift=SHIFT)
+        load_written(write(tmp_path))
     assert "\n" not in str(caught.value)
 
 

@@ -40,7 +40,7 @@ from mereo.scenes.random_states import scene_model, state_points
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import State
 from mereo.scenes.statistical_model import StatisticalModel, pack_model, unpack_model
-from mereo.synthesis.sample_views import SampleView, load_view
+from mereo.synthesis.sample_views import load_view
 
 SCENE = toy_scene()
 T = rigid(Rotation.from_rotvec([0.4, -1.0, 0.3]).as_matrix(), np.array([5.0, -3.0, 90.0]))
@@ -82,7 +82,6 @@ def test_a_rigid_pose_carries_everything_rigidly(model: StatisticalModel, regist
     here = registered(model, transform_points(T, model.rest_points), 0.001)
     found = carry(placed_one(registrar, table(points, turns)), here)
     np.testing.assert_allclose(found.content.points, 0.001 * transform_points(T, points), atol=1.5e-5)
-    assert found.content.rotations is not None
     np.testing.assert_allclose(found.content.rotations, T[:3, :3] @ turns, atol=5e-3)
     labels = Solids(model.rest).label(points)
     distance = Solids(model.rest).nearest(points).distance * (labels == 0)
@@ -196,7 +195,6 @@ def test_the_frame_survives_weights_and_older_ones_have_none(tmp_path: Path) -> 
     model = scene_model(replace(load_scene("rope"), unit_m=0.25, T_scene_source=np.diag([2.0, 2.0, 2.0, 1.0])), 10)
     save_model(replace(untrained(model.rest.names), statistical_model=model), tmp_path / "w.safetensors")
     read = load_model(tmp_path / "w.safetensors").statistical_model
-    assert read is not None and read.source_frame is not None and model.source_frame is not None
     np.testing.assert_array_equal(read.source_frame.T_scene_source, model.source_frame.T_scene_source)
     assert read.source_frame.unit_m == 0.25 and read.source_frame.scale == pytest.approx(2.0)
     tensors, facts = pack_model(model)
@@ -217,8 +215,7 @@ RAMP = np.array([3.0, -2.0, 5.0])
 @pytest.fixture(scope="module")
 def resized(model: StatisticalModel) -> Registration:
     """Bent, turned, and in a unit of which ten are one of the scene's."""
-    shear = Shear(2.0, 0.2, 0.1)
-    state = SCENE.deform((shear,) * 4)
+    state = SCENE.deform((Shear(2.0, 0.2, 0.1),) * 4)
     return registered(model, transform_points(T, state_points(state, model.nodes, model.node_labels)), 10.0)
 
 
@@ -327,15 +324,16 @@ def test_a_file_comes_back_in_its_format_and_overlays_the_labels(
     assert isinstance(found, CarriedVolume) and isinstance(found.content, Volume)
     direct = resampled(ramp("int16"), resized).content
     np.testing.assert_array_equal(found.content.values, direct.values)
-    write_attachment(tmp_path / "out" / name, found.content, 1000.0, np.eye(3), 0.01)
-    again = read_volume(tmp_path / "out" / name)
+    out = tmp_path / "out" / name
+    write_attachment(out, found.content, 1000.0, np.eye(3), 0.01)
+    again = read_volume(out)
     assert again.values.dtype == np.int16
     np.testing.assert_array_equal(again.values, direct.values)
     in_mm = np.diag([10.0, 10, 10, 1]) @ direct.T_world_index
     np.testing.assert_allclose(RAS_OF_LPS @ again.T_world_index, in_mm, rtol=1e-5, atol=1e-3)
-    first = (tmp_path / "out" / name).read_bytes()
-    write_attachment(tmp_path / "out" / name, found.content, 1000.0, np.eye(3), 0.01)
-    assert (tmp_path / "out" / name).read_bytes() == first
+    first = out.read_bytes()
+    write_attachment(out, found.content, 1000.0, np.eye(3), 0.01)
+    assert out.read_bytes() == first
 
 
 def test_a_segmentation_of_slicer_keeps_its_segments(
@@ -411,26 +409,20 @@ pytestmark = pytest.mark.usefixtures("small_previews")
 @pytest.fixture(scope="module")
 def weights(rope: Model) -> Model:
     """Those of the rope, whose own files are in centimetres."""
-    assert rope.statistical_model is not None
     frame = replace(load_scene("rope"), unit_m=0.01).source_frame
     return replace(rope, statistical_model=replace(rope.statistical_model, source_frame=frame))
 
 
 @pytest.fixture(scope="module")
-def view() -> SampleView:
-    return load_view("rope")
-
-
-@pytest.fixture(scope="module")
-def folder(weights: Model, view: SampleView, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(weights: Model, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Weights, a cloud in centimetres that is said to be so, and four files to carry."""
     folder = tmp_path_factory.mktemp("carry")
     save_model(weights, folder / "rope.safetensors")
-    np.save(folder / "cloud.npy", view.depth.to_points().points)
+    np.save(folder / "cloud.npy", load_view("rope").depth.to_points().points)
     rest = load_scene("rope").rest
     part = rest.segments[1]
-    trimesh.Trimesh(part.vertices, part.faces, process=False).export(folder / "own.ply")
-    trimesh.Trimesh(part.vertices, part.faces, process=False).export(folder / "own.glb")
+    for suffix in ("ply", "glb"):
+        trimesh.Trimesh(part.vertices, part.faces, process=False).export(folder / f"own.{suffix}")
     x, y, z = part.vertices.mean(axis=0)
     volume = Volume(np.arange(8, dtype=np.int16).reshape(2, 2, 2), np.diag([*np.ptp(rest.bounds, axis=0), 1.0]))
     volume.T_world_index[:3, 3] = rest.bounds[0]  # a voxel at each corner of the rest box
@@ -440,21 +432,18 @@ def folder(weights: Model, view: SampleView, tmp_path_factory: pytest.TempPathFa
     return folder
 
 
-def run(folder: Path, *options: str, cloud: str = "cloud.npy", output: str = "out") -> int:
+def run(folder: Path, files: tuple[str, ...], *options: str, cloud: str = "cloud.npy", output: str = "out") -> int:
     arguments = ["reconstruct", str(folder / cloud), "--weights", str(folder / "rope.safetensors")]
-    return command_line.main([*arguments, "--output", str(folder / output), "--resolution", "32", *options])
-
-
-def to_carry(folder: Path, *names: str) -> list[str]:
-    return [word for name in names for word in ("--carry", str(folder / name))]
+    carried = [word for name in files for word in ("--carry", str(folder / name))]
+    return command_line.main([*arguments, "--output", str(folder / output), "--resolution", "32", *carried, *options])
 
 
 def test_the_command_carries_in_the_frame_and_unit_of_its_other_files(folder: Path) -> None:
     options = ["--method", "modes", "--unit-m", "0.01", "--millimetres", "--formats", "ply", "glb", "json"]
-    assert run(folder, *options, *to_carry(folder, "own.ply", "own.glb", "grasp.csv", "ct.nrrd")) == 0
-    out = folder / "out"
+    files, out = ("own.ply", "own.glb", "grasp.csv", "ct.nrrd"), folder / "out"
+    assert run(folder, files, *options) == 0
     summary = json.loads((out / "summary.json").read_text())
-    assert [one["file"] for one in summary["carried"]] == ["own.ply", "own.glb", "grasp.csv", "ct.nrrd"]
+    assert tuple(one["file"] for one in summary["carried"]) == files
     assert all(one["farthest"] < 0.01 for one in summary["carried"][:3]) and summary["registration"]["unit"] == "known"
     own = read_segmented_mesh(out / "segments.glb").segments[1].vertices
     carried = read_segmented_mesh(out / "carried/own.glb").segments[0].vertices
@@ -466,16 +455,15 @@ def test_the_command_carries_in_the_frame_and_unit_of_its_other_files(folder: Pa
     assert grasp.rows[0][-1] == "0.02" and grasp.rotations is not None
     volume = read_volume(out / "carried/ct.nrrd")  # millimetres: ten of the input's unit
     low, high = (np.diag([-1.0, -1.0, 1.0]) @ bound for bound in read_segmented_mesh(out / "segments.glb").bounds)
-    assert (volume.bounds[0] < 10 * np.minimum(low, high)).all() and (
-        volume.bounds[1] > 10 * np.maximum(low, high)
-    ).all()
+    assert (volume.bounds[0] < 10 * np.minimum(low, high)).all()
+    assert (volume.bounds[1] > 10 * np.maximum(low, high)).all()
     assert list(volume.values.shape) == summary["carried"][3]["voxels"] and volume.values.dtype == np.int16
     together = read_segmented_mesh(out / "carried.glb")
     assert together.names[:2] == ("own.ply", "own.glb") and len(together.names) == 2 + len(summary["segments"])
 
 
-def test_a_wrong_unit_is_not_believed(weights: Model, view: SampleView) -> None:
-    registrar, cloud = Registrar.of(weights, "modes"), view.depth.to_points()
+def test_a_wrong_unit_is_not_believed(weights: Model) -> None:
+    registrar, cloud = Registrar.of(weights, "modes"), load_view("rope").depth.to_points()
     free = registrar.fit_modes(CloudToFit(cloud.points)).registration()
     metres, true = (registrar.stated_scene_unit(unit_m) for unit_m in (1.0, 0.01))
     # the cloud is said to be in metres
@@ -484,10 +472,8 @@ def test_a_wrong_unit_is_not_believed(weights: Model, view: SampleView) -> None:
     np.testing.assert_array_equal(wrong.material, free.material)
     assert not wrong.unit_known and not free.unit_known
     assert right.unit_known and right.scene_unit == pytest.approx(1.0, rel=1e-4)
-    assert weights.statistical_model is not None
-    near = fit_frame(
-        CloudToFit(cloud.points, scene_unit=0.95, is_unit_certain=False), weights, weights.statistical_model
-    )
+    stated = CloudToFit(cloud.points, scene_unit=0.95, is_unit_certain=False)
+    near = fit_frame(stated, weights, weights.statistical_model)
     assert near.unit == 0.95  # within what the network's own estimate leaves open
 
 
@@ -502,7 +488,7 @@ def test_a_wrong_unit_is_not_believed(weights: Model, view: SampleView) -> None:
 def test_the_command_refuses_before_any_work(
     folder: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
 ) -> None:
-    assert run(folder, *to_carry(folder, "grasp.csv"), *options, cloud="no-such-cloud.npy", output="refused") != 0
+    assert run(folder, ("grasp.csv",), *options, cloud="no-such-cloud.npy", output="refused") != 0
     assert message in " ".join(capsys.readouterr().err.split()) and not (folder / "refused").exists()
 
 
@@ -511,6 +497,6 @@ def test_without_a_registration_nothing_is_written(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Registrar, "takes", lambda *_: False)  # as of a frame that no state explains
-    assert run(folder, *to_carry(folder, "grasp.csv"), output="none") != 0
+    assert run(folder, ("grasp.csv",), output="none") != 0
     assert "the network's answer is kept, but --carry needs a registration" in capsys.readouterr().err
     assert not (folder / "none").exists()

@@ -7,10 +7,9 @@ import pytest
 from answers import fit_correspondences
 from fit_cases import IN_FRONT, SCENE, said, seen, shown
 from scipy.spatial.transform import Rotation
-from toy_scene import toy_scene
 
 from mereo.fitting.config import FitConfig
-from mereo.fitting.draws.fit import DrawsProblem, Shape, approach, fit_draws, lay_on_shape, secant
+from mereo.fitting.draws.fit import DrawsFit, DrawsProblem, Shape, approach, fit_draws, lay_on_shape, secant
 from mereo.fitting.draws.fit import narrowing as narrowing_of_draws
 from mereo.fitting.draws.playback import Drawn, DrawnStates
 from mereo.fitting.modes import narrowing, turns
@@ -50,12 +49,13 @@ def registration(model: StatisticalModel, view: View) -> Registration:
     return fit_correspondences(view.depth.to_points().points, told(model, view, 1.0), model, 1.0)
 
 
-@pytest.mark.parametrize("index", range(4))
-def test_a_known_state_is_found(model: StatisticalModel, index: int) -> None:
+@pytest.mark.parametrize(("index", "method"), [*((index, "modes") for index in range(4)), (1, "draws")])
+def test_a_known_state_is_found(model: StatisticalModel, index: int, method: str) -> None:
     view = sample_view(SCENE, CLEAN, example_rng(5, index))
-    found = fit_correspondences(view.depth.to_points().points, told(model, view), model, 1.0)
-    error = np.linalg.norm(found.material - true_material(model, view), axis=1)
-    assert np.median(error) < 0.05
+    error, states = (0.0, None) if method == "modes" else (0.5, DrawnStates.of(SCENE, model, 100, 1000))
+    found = fit_correspondences(view.depth.to_points().points, told(model, view, error), model, 1.0, states)
+    assert found.method == method
+    assert np.median(np.linalg.norm(found.material - true_material(model, view), axis=1)) < 0.05
     assert found.accepted and found.explained > 0.99 and found.beyond_states < 0.05
 
 
@@ -99,15 +99,6 @@ def test_derivatives_are_those_of_differences(model: StatisticalModel) -> None:
         there, back = posed.moved(step), posed.moved(-step)
         moved = there.place(model.material(there.z))[chosen] - back.place(model.material(back.z))[chosen]
         np.testing.assert_allclose(found[:, number], (moved * direction).sum(axis=1) / 2e-2, rtol=2e-3, atol=2e-2)
-
-
-def test_draws_find_a_state_of_the_scene(model: StatisticalModel) -> None:
-    view = sample_view(SCENE, CLEAN, example_rng(5, 1))
-    states = DrawnStates.of(SCENE, model, 100, 1000)
-    found = fit_correspondences(view.depth.to_points().points, told(model, view, 0.5), model, 1.0, states)
-    assert found.method == "draws"
-    error = np.linalg.norm(found.material - true_material(model, view), axis=1)
-    assert np.median(error) < 0.05
 
 
 @pytest.mark.parametrize(("noise", "unit"), [(0.0, 1.0), (0.1, 1.0), (0.1, 0.004)])
@@ -212,6 +203,22 @@ def states(model: StatisticalModel) -> DrawnStates:
     return DrawnStates.of(SCENE, model, 30, 1000)
 
 
+@pytest.fixture(scope="module")
+def fitted(model: StatisticalModel) -> ModesFit:
+    points, material = shown(model, 0.5)
+    return ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
+
+
+@pytest.fixture(scope="module")
+def problem(fitted: ModesFit, states: DrawnStates) -> DrawsProblem:
+    return DrawsProblem.of(fitted.problem, states, fitted.correspondences)
+
+
+@pytest.fixture(scope="module")
+def drawn(problem: DrawsProblem, fitted: ModesFit) -> DrawsFit:
+    return fit_draws(problem, fitted.posed)
+
+
 def test_a_secant_agrees_with_the_step_and_only_there() -> None:
     rng = np.random.default_rng(0)
     motion, step = rng.normal(size=(5, 3, 4)).astype(np.float32), rng.normal(size=4)
@@ -226,20 +233,16 @@ def test_the_approach_reaches_a_state_of_the_scene(model: StatisticalModel, stat
     shape = Shape.of(points, 0.04 * model.half, np.ones(len(points)))
     drawn = Drawn.of(SCENE, states.seeds[3])
     start = lay_on_shape(states, shape, drawn, drawn.z)
-    assert start is not None
     found = approach(states, shape, start, 3)
     apart = [np.linalg.norm(n.points @ n.rotation.T + n.translation - points, axis=1) for n in (start, found)]
     assert found.misfit < start.misfit
     assert np.median(apart[1]) < 0.3 * np.median(apart[0])
 
 
-def test_the_simpler_description_is_preferred_by_its_evidence(model: StatisticalModel, states: DrawnStates) -> None:
+def test_the_simpler_description_is_preferred_by_its_evidence(
+    problem: DrawsProblem, fitted: ModesFit, drawn: DrawsFit
+) -> None:
     """Draws are taken where their misfit is lower, or higher by less than what the modes' more free numbers buy."""
-    points, material = shown(model, 0.5)
-    fitted = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
-    problem = DrawsProblem.of(fitted.problem, states, fitted.correspondences)
-    drawn = fit_draws(problem, fitted.posed)
-    assert drawn is not None
     modes = problem.last.misfit(fitted.posed).total
     bought = narrowing(problem.base, fitted.posed) - narrowing_of_draws(problem, drawn)
     assert bought > 1.0
@@ -248,13 +251,10 @@ def test_the_simpler_description_is_preferred_by_its_evidence(model: Statistical
 
 
 def test_a_second_pass_follows_where_the_first_has_failed(
-    model: StatisticalModel, states: DrawnStates, monkeypatch: pytest.MonkeyPatch
+    problem: DrawsProblem, fitted: ModesFit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Modes that are wrong and a single step leave the cloud unexplained; a pass from there comes nearer."""
-    points, material = shown(model, 0.5)
-    fitted = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
-    problem = DrawsProblem.of(fitted.problem, states, fitted.correspondences)
-    wrong = replace(fitted.posed, z=np.full(model.count, 2.0))
+    wrong = replace(fitted.posed, z=np.full_like(fitted.posed.z, 2.0))
     poor = replace(problem.config, starts=1, sieve=((1, 1),), kept=1, last_rounds=0, steps=1, hopeless=0.0)
     poor = replace(poor, jumps=0, network_start=False)
     once, twice = (fit_draws(replace(problem, config=replace(poor, passes=n)), wrong) for n in (0, 1))
@@ -264,44 +264,30 @@ def test_a_second_pass_follows_where_the_first_has_failed(
 
 
 def test_modes_reproduce_states_they_were_not_built_from(model: StatisticalModel) -> None:
-    scene = toy_scene()
     for index in range(5):
-        state = state_points(scene.sample_state(example_rng(7, index)), model.nodes, model.node_labels)
+        state = state_points(SCENE.sample_state(example_rng(7, index)), model.nodes, model.node_labels)
         T, z = model.project(state)
         found = model.material(z) @ T[:3, :3].T + T[:3, 3]
         assert np.linalg.norm(found - state, axis=1).max() < 0.15
         assert np.abs(z).max() < 5
+    assert 0 < model.residue < 0.01 * model.half  # that of held-out states
 
 
-def test_the_residue_is_that_of_held_out_states(model: StatisticalModel) -> None:
-    assert 0 < model.residue < 0.01 * model.half
-
-
-def test_the_pose_of_the_states_does_not_matter() -> None:
-    scene, rng = toy_scene(), np.random.default_rng(0)
-    nodes, labels = interior_nodes(scene.rest)
-    states = sample_states(scene, nodes, labels, 60, 3)
+def test_a_model_needs_two_states_whose_poses_do_not_matter() -> None:
+    rng = np.random.default_rng(0)
+    nodes, labels = interior_nodes(SCENE.rest)
+    states = sample_states(SCENE, nodes, labels, 60, 3)
     turned = np.stack([s @ Rotation.random(rng=rng).as_matrix().T + rng.normal(size=3) * 50 for s in states])
-    plain = build_model(scene.rest, nodes, labels, states)
-    posed = build_model(scene.rest, nodes, labels, turned.astype(np.float32))
+    plain = build_model(SCENE.rest, nodes, labels, states)
+    posed = build_model(SCENE.rest, nodes, labels, turned.astype(np.float32))
     assert plain.count == posed.count
     np.testing.assert_allclose(plain.mean, posed.mean, atol=0.02)
     np.testing.assert_allclose(plain.motion, posed.motion, rtol=0.02)
-
-
-def test_one_state_is_no_model() -> None:
-    scene = toy_scene()
-    nodes, labels = interior_nodes(scene.rest)
     with pytest.raises(ValueError, match="cannot be made of 1 states; it needs 2 or more: record more states"):
-        build_model(scene.rest, nodes, labels, sample_states(scene, nodes, labels, 1, 3))
+        build_model(SCENE.rest, nodes, labels, states[:1])
 
 
-def test_draws_that_move_nothing_narrow_nothing(model: StatisticalModel, states: DrawnStates) -> None:
-    points, material = shown(model, 0.5)
-    fitted = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
-    problem = DrawsProblem.of(fitted.problem, states, fitted.correspondences)
-    drawn = fit_draws(problem, fitted.posed)
-    assert drawn is not None and drawn.motion is not None
+def test_draws_that_move_nothing_narrow_nothing(problem: DrawsProblem, drawn: DrawsFit) -> None:
     one_moves, none_moves = drawn.motion.copy(), np.zeros_like(drawn.motion)
     one_moves[:, :, 1:] = 0.0
     narrowed = [narrowing_of_draws(problem, replace(drawn, motion=motion)) for motion in (one_moves, none_moves)]

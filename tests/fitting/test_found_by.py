@@ -3,6 +3,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -30,7 +31,6 @@ from mereo.models.model import Model
 from mereo.models.weights import load_model
 from mereo.reconstruction.isolation import Reading
 from mereo.reconstruction.observation import observe
-from mereo.reconstruction.pipeline import EncodedFrame
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import SENSORS, GenerateConfig
@@ -57,7 +57,6 @@ def confused(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def lying(*given: Any) -> Any:
         found = honest(*given)
-        assert found is not None
         return replace(found, rest=np.random.default_rng(0).permutation(found.rest))
 
     monkeypatch.setattr("mereo.fitting.registration.register.find_correspondences", lying)
@@ -67,11 +66,21 @@ def answer(liver: Model, cloud: PointCloud, method: Any = "auto") -> Answer:
     return answer_to(cloud, liver, Registrar.of(liver, method), 24)
 
 
-def test_a_network_that_understands_is_not_doubted(
-    liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch
+@pytest.fixture(scope="module")
+def by_network(liver: Model, cloud: PointCloud) -> Candidate:
+    found = answer(liver, cloud).candidate
+    assert found is not None and found.modes is not None
+    return found
+
+
+@pytest.mark.usefixtures("without_turns")
+def test_a_network_that_understands_is_not_doubted_and_other_methods_ask_nobody_else(
+    liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
     monkeypatch.setattr(f"{HYPOTHESES}.search_modes", None)
     assert answer(liver, cloud).located_by == "network"
+    request.getfixturevalue("confused")
+    assert answer(liver, cloud, "modes").located_by == "network"
 
 
 @pytest.mark.usefixtures("confused", "without_turns")
@@ -88,29 +97,28 @@ def test_the_network_is_left_out_on_request(liver: Model, cloud: PointCloud, mon
     assert found.located_by == "search" and found.taken
 
 
-def test_the_state_with_the_greater_evidence_is_taken_whatever_its_unit(liver: Model, cloud: PointCloud) -> None:
-    model = liver.statistical_model
-    assert model is not None
-    by_network = answer(liver, cloud).candidate
-    assert by_network is not None and by_network.modes is not None
+def test_the_state_with_the_greater_evidence_is_taken_whatever_its_unit(by_network: Candidate) -> None:
     right = by_network.modes
     astray = replace(right, posed=replace(right.posed, translation=right.posed.translation + 3.0))
     wrong = replace(by_network, modes=astray, located_by="search")
     assert misfit_in(right, astray) > misfit_in(right, right)
     assert more_evident(by_network, wrong) is by_network and more_evident(wrong, by_network) is by_network
     assert more_evident(replace(by_network, modes=None), wrong) is wrong
-    halved = replace(
-        right, unit=2 * right.unit, posed=replace(right.posed, log_scale=right.posed.log_scale - np.log(2.0))
-    )
-    halved = replace(halved, posed=replace(halved.posed, translation=right.posed.translation / 2))
+    half = replace(right.posed, log_scale=right.posed.log_scale - np.log(2.0), translation=right.posed.translation / 2)
+    halved = replace(right, unit=2 * right.unit, posed=half)
     assert misfit_in(right, halved) == pytest.approx(misfit_in(right, right), rel=1e-6)
+    # one that alone explains the frame is taken, also with less evidence
+    strict = replace(right.problem, config=replace(right.problem.config, tolerance=1e-3))
+    refused = replace(by_network, modes=replace(right, problem=strict))
+    close = replace(right.posed, translation=right.posed.translation + 0.05)
+    searched = replace(by_network, modes=replace(right, posed=close), located_by="search")
+    assert searched.is_accepted and not refused.is_accepted
+    assert more_evident(refused, searched) is searched
 
 
-def test_a_network_far_from_what_it_starts_is_no_start(liver: Model, cloud: PointCloud) -> None:
+def test_a_network_far_from_what_it_starts_is_no_start(by_network: Candidate) -> None:
     """Weights after a minute of training explain a frame by chance, with the object turned end for end."""
-    by_network = answer(liver, cloud).candidate
-    assert by_network is not None and by_network.modes is not None
-    assert not is_astray(by_network)
+    assert by_network.modes is not None and not is_astray(by_network)
     found = by_network.modes.correspondences
     guessed = replace(found, rest=np.random.default_rng(0).permutation(found.rest))
     lucky = replace(by_network, modes=replace(by_network.modes, correspondences=guessed))
@@ -123,23 +131,14 @@ def test_a_search_is_asked_too_where_a_part_is_hidden(
     liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     across = cloud.points[:, 0] / cloud.points[:, 2]
-    kept = cloud.points[across > np.quantile(across, 0.2)]
-    asked = []
-    honest = search_modes
-
-    def searched(*given: Any) -> Any:
-        asked.append(given)
-        return honest(*given)
-
+    cut = across <= np.quantile(across, 0.2)
+    searched = Mock(wraps=search_modes)
     monkeypatch.setattr(f"{HYPOTHESES}.search_modes", searched)
-    registrar = Registrar.of(liver)
-    cut = cloud.points[across <= np.quantile(across, 0.2)]
-    lines = SightLines(np.empty((0, 3)), 0.5 * cut, "past")
-    seen = observe(PointCloud(kept))
-    vars(seen)["lines"] = lines
-    assert answer_frame(seen, liver, registrar, resolution=24).taken and asked
-    asked.clear()
-    assert answer_frame(observe(cloud), liver, registrar, resolution=24).taken and not asked
+    seen, registrar = observe(PointCloud(cloud.points[~cut])), Registrar.of(liver)
+    vars(seen)["lines"] = SightLines(np.empty((0, 3)), 0.5 * cloud.points[cut], "past")
+    assert answer_frame(seen, liver, registrar, resolution=24).taken and searched.called
+    searched.reset_mock()
+    assert answer_frame(observe(cloud), liver, registrar, resolution=24).taken and not searched.called
 
 
 def test_a_noisy_frame_that_two_fits_explain_apart_is_not_known(liver: Model, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -167,12 +166,6 @@ def test_a_noisy_frame_that_two_fits_explain_apart_is_not_known(liver: Model, mo
     assert "two fits explain this noisy frame, and the places of the object are 20% of" in str(doubted.reason)
 
 
-@pytest.mark.usefixtures("confused", "without_turns")
-def test_other_methods_ask_nobody_else(liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(f"{HYPOTHESES}.search_modes", None)
-    assert answer(liver, cloud, "modes").located_by == "network"
-
-
 @pytest.fixture(scope="module")
 def registrar() -> Registrar:
     return Registrar.of(load_model("liver"), "modes")
@@ -196,26 +189,19 @@ def with_rim(points: np.ndarray) -> np.ndarray:
     return np.concatenate([points, np.column_stack([rim, np.ones(len(rim))]) * (1.4 * points[:, 2].max())])
 
 
-def candidates(
-    registrar: Registrar, points: np.ndarray, keep_all: bool = False, unit: float | None = 1.0
-) -> tuple[Candidate, EncodedFrame]:
-    return fit_hypotheses(observe(PointCloud(points)), registrar.network, registrar, keep_all, unit)
-
-
-def fitted(registrar: Registrar, points: np.ndarray, **options: Any) -> Candidate:
-    return candidates(registrar, points, **options)[0]
+def fitted(registrar: Registrar, points: np.ndarray, keep_all: bool = False, unit: float = 1.0) -> Candidate:
+    return fit_hypotheses(observe(PointCloud(points)), registrar.network, registrar, keep_all, unit)[0]
 
 
 @pytest.mark.usefixtures("without_turns")
 def test_strays_are_left_out_and_all_else_is_kept(registrar: Registrar, points: np.ndarray) -> None:
-    (clean, likelier), found = candidates(registrar, points), fitted(registrar, with_rim(points))
+    clean, likelier = fit_hypotheses(observe(PointCloud(points)), registrar.network, registrar, False, 1.0)
+    found = fitted(registrar, with_rim(points))
     assert clean.hypothesis.dropped == 0 and clean.encoded is likelier
     assert not found.hypothesis.keep[len(points) :].any() and found.hypothesis.keep[: len(points)].mean() > 0.99
-    assert found.modes is not None and clean.modes is not None
     moved = np.linalg.norm(found.modes.registration().material - clean.modes.registration().material, axis=1)
     assert np.median(moved) < 0.2
-    asked = fitted(registrar, with_rim(points), keep_all=True)
-    assert asked.hypothesis.dropped == 0
+    assert fitted(registrar, with_rim(points), keep_all=True).hypothesis.dropped == 0
 
 
 def test_points_that_a_fit_explains_are_given_back_beside_strays(
@@ -249,7 +235,6 @@ def noisy(points: np.ndarray, std: float) -> np.ndarray:
 @pytest.mark.slow
 def test_a_noisy_frame_is_fitted_by_its_own_noise(registrar: Registrar, points: np.ndarray) -> None:
     clean, found = (fitted(registrar, cloud).modes for cloud in (points, noisy(points, 0.4)))
-    assert clean is not None and found is not None
     assert clean.problem.config == FitConfig()
     config = found.problem.config
     assert 0.3 < config.cloud_sigma <= LARGEST and config.tolerance == pytest.approx(4.5 * config.cloud_sigma, rel=0.5)
@@ -263,7 +248,6 @@ def test_what_a_calm_frame_cannot_have_is_no_noise(
     registrar: Registrar, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     modes = fitted(registrar, points).modes
-    assert modes is not None
     problem, surface = modes.problem, Surface.through(modes.problem.model, modes.registration().material)
     offset = np.random.default_rng(1).normal(scale=0.4, size=len(points))
     monkeypatch.setattr(Surface, "offsets", lambda _, given: offset[: len(given)])
@@ -319,14 +303,3 @@ def test_doubtful_points_rule_nothing_out(points: np.ndarray) -> None:
     vertices = np.array([corner * 50.0, corner * 150.0])
     assert (Evidence.of(points).violations(vertices, 0.5)[1] > 0).all()
     assert (Evidence.of(points, corner[None] * 300.0).violations(vertices, 0.5)[1] == 0).all()
-
-
-def test_a_fit_that_alone_explains_the_frame_is_taken(liver: Model, cloud: PointCloud) -> None:
-    by_network = answer(liver, cloud).candidate
-    assert by_network is not None and by_network.modes is not None
-    strict = replace(by_network.modes.problem, config=replace(by_network.modes.problem.config, tolerance=1e-3))
-    refused = replace(by_network, modes=replace(by_network.modes, problem=strict))
-    astray = replace(by_network.modes.posed, translation=by_network.modes.posed.translation + 0.05)
-    searched = replace(by_network, modes=replace(by_network.modes, posed=astray), located_by="search")
-    assert searched.is_accepted and not refused.is_accepted
-    assert more_evident(refused, searched) is searched

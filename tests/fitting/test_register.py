@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import jaxtyping
 import numpy as np
@@ -40,7 +41,7 @@ from mereo.reconstruction.observation import observe
 from mereo.reconstruction.pipeline import Reconstruction
 from mereo.scenes.random_states import state_points
 from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import AssetUnavailable, Scene, State
+from mereo.scenes.scene import AssetUnavailable, State
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import View, sample_view
@@ -87,13 +88,11 @@ def test_the_answer_is_the_model_itself(network: Reconstruction, found: Answer, 
 
 
 def test_labels_are_those_of_the_segments(network: Reconstruction, found: Answer) -> None:
-    result = found.reconstruction
-    grid = result.labels
+    result, grid = found.reconstruction, found.reconstruction.labels
     index = np.argwhere(np.ones(grid.labels.shape, dtype=bool))
     agree = Solids(result.surfaces).label(grid.positions(index)) == grid.labels.reshape(-1)
     assert agree.mean() > 0.999 and not grid.touched_sides().any()
     assert grid.spacing[0] == pytest.approx(np.ptp(result.surfaces.bounds, axis=0).max() / 48)
-    assert result.observed is not None and network.observed is not None
     assert result.observed.labels.min() >= 1 and len(result.observed.labels) == len(network.observed.labels)
 
 
@@ -122,9 +121,8 @@ def test_a_scene_that_has_changed_since_is_said_and_not_played(
     base, *pieces = scene.rest.segments
     finer = Segment(base.name, base.color, *subdivide(base.vertices, base.faces))
     changed = replace(scene, rest=SegmentedMesh((finer, *pieces)))
-    said = (
-        rf"'rope' has other .* \(its segment 'base' has {len(finer.vertices)} vertices, theirs {len(base.vertices)}\)"
-    )
+    counts = rf"has {len(finer.vertices)} vertices, theirs {len(base.vertices)}"
+    said = rf"'rope' has other .* \(its segment 'base' {counts}\)"
     fitted = Registrar.of(model, "modes").fit_modes(CloudToFit(view.depth.to_points().points))
     monkeypatch.setattr(register, "load_scene", lambda name: changed)
     for registrar in (Registrar.of(model), Registrar.of(model, scene=changed)):
@@ -152,24 +150,17 @@ def test_auto_plays_the_scene_where_it_is_at_hand(
     assert modes.finish(fitted).method == "modes" and "states_or_none" not in vars(modes)
     foreign = replace(registrar, network=replace(model, provenance={"scene": "mine"}))
     assert foreign.finish(fitted).method == "modes" and foreign.states_or_none is None
-    asked: list[DrawnStates] = []
-
-    def with_draws(self: ModesFit, states: DrawnStates) -> Registration:
-        asked.append(states)
-        return self.registration()
-
+    with_draws = Mock(return_value=fitted.registration())
     monkeypatch.setattr(ModesFit, "with_draws", with_draws)
     registrar.finish(fitted)
-    assert asked == [few_rope_states] and registrar.states_or_none is few_rope_states
+    with_draws.assert_called_once_with(few_rope_states)
+    assert registrar.states_or_none is few_rope_states
 
 
 def test_without_its_mesh_auto_fits_the_modes_and_full_says_what_is_missing(
-    model: Model, view: SampleView, monkeypatch: pytest.MonkeyPatch
+    model: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def missing(name: str) -> Scene:
-        raise AssetUnavailable("the mesh is not here")
-
-    monkeypatch.setattr(register, "load_scene", missing)
+    monkeypatch.setattr(register, "load_scene", Mock(side_effect=AssetUnavailable("the mesh is not here")))
     assert Registrar.of(model).states_or_none is None
     with pytest.raises(AssetUnavailable, match="the mesh is not here"):
         Registrar.of(model, "full")
@@ -209,7 +200,6 @@ REFUSED: dict[str, tuple[Callable[[Registration], object], str]] = {
 def test_what_is_no_place_or_motion_is_refused(case: str, found: Answer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # the check of types that tests put before it
     call, sentence = REFUSED[case]
-    assert found.registration is not None
     with pytest.raises(ValueError, match=sentence):
         call(found.registration)
 
@@ -227,13 +217,10 @@ def test_a_scene_unit_is_a_length(scene_unit: float, view: SampleView, model: Mo
             tracker.follow(seen, np.nan)
 
 
-def test_weights_without_states_say_what_to_do() -> None:
+def test_without_a_model_in_the_weights_auto_asks_the_network_and_others_say_what_to_do(model: Model) -> None:
     other = replace(untrained(("a", "b")), provenance={"scene": "mine"})
     with pytest.raises(ValueError, match="the weights of a, b carry no statistical model .* or use --method network"):
         statistical_model_of(other)
-
-
-def test_without_a_model_in_the_weights_auto_asks_the_network(model: Model) -> None:
     assert registrar_for(replace(model, statistical_model=None), "auto") is None
     assert registrar_for(model, "network") is None and registrar_for(model, "auto") is not None
 
@@ -253,7 +240,6 @@ def engine_view() -> View:
 
 def test_a_registration_is_as_far_off_as_its_points_are(engine: Model, engine_view: View) -> None:
     statistical = engine.statistical_model
-    assert statistical is not None
     state = State(engine_view.mesh.transformed(engine_view.T_world_camera), engine_view.deformations)
     truth = state_points(state, statistical.nodes, statistical.node_labels)
     truth = transform_points(inverse_rigid(engine_view.T_world_camera), truth)

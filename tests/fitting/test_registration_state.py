@@ -34,9 +34,7 @@ def by_draws(model: StatisticalModel, scene: Scene = SCENE, seed: int = 5) -> Re
     """Draws that a fit has moved away from those of their seed."""
     drawn = Drawn.of(scene, seed)
     z = np.where(drawn.smooth, 0.8 * drawn.z + 0.1, drawn.z)
-    deformations = drawn.deformations(scene, z)
-    assert deformations is not None
-    unposed = material_moved(scene, model, deformations)
+    unposed = material_moved(scene, model, drawn.deformations(scene, z))
     return placed(model, unposed, method="draws", z=z, drawn=replace(drawn, z=z))
 
 
@@ -85,6 +83,8 @@ def test_a_scene_that_has_changed_since_is_said(model: StatisticalModel) -> None
         restored(state, model, replace(SCENE, sample_deformations=lambda rng: (rng.random(), rng.random())))
     with pytest.raises(ValueError, match="the state is one of the scene 'toy', not of 'other'"):
         restored(state, model, replace(SCENE, name="other"))
+    with pytest.raises(ValueError, match="one of draws; the scene that is played is needed, not its name 'toy'"):
+        state_of(by_draws(model), "toy")
 
 
 def test_a_name_in_a_file_runs_no_code(model: StatisticalModel, tmp_path: Path) -> None:
@@ -96,15 +96,9 @@ def test_a_name_in_a_file_runs_no_code(model: StatisticalModel, tmp_path: Path) 
     assert not ran.exists()
 
 
-def test_draws_need_their_scene_to_be_written(model: StatisticalModel) -> None:
-    with pytest.raises(ValueError, match="one of draws; the scene that is played is needed, not its name 'toy'"):
-        state_of(by_draws(model), "toy")
-
-
 # what is wrong in a file, and where
 WRONG: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "key": (lambda facts: {**facts, "extra": 1}, "'extra'"),
-    "missing": (lambda facts: {k: v for k, v in facts.items() if k != "z"}, "'z'"),
     "large": (lambda facts: {**facts, "z": [1e9]}, "'z.0'"),
     "format": (lambda facts: {**facts, "format": 2}, "its format is 2; this mereo reads format 1"),
     "method": (lambda facts: {**facts, "method": "draws"}, "the block `draws` belongs to the method 'draws' alone"),
@@ -127,17 +121,14 @@ def test_a_wrong_value_is_refused_in_one_sentence(kind: str, model: StatisticalM
     assert where in str(error.value) and "\n" not in str(error.value) and len(str(error.value)) < 400
 
 
-@pytest.mark.parametrize("content", [b"", b"[" * 200_000, b'{"z": NaN}', b"{}" + b" " * 2**20])
-def test_hostile_files_are_refused(content: bytes, tmp_path: Path) -> None:
-    (tmp_path / STATE).write_bytes(content)
-    with pytest.raises(ValueError, match="is no state of a registration") as error:
-        read_state(tmp_path)
-    assert "\n" not in str(error.value) and len(str(error.value)) < 400
-
-
-def test_a_folder_without_a_state_is_refused(tmp_path: Path) -> None:
+def test_folders_without_a_state_and_with_a_hostile_file_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="`mereo reconstruct` writes it where the answer is a registered model"):
         read_state(tmp_path)
+    for content in (b"[" * 200_000, b'{"z": NaN}', b"{}" + b" " * 2**20):
+        (tmp_path / STATE).write_bytes(content)
+        with pytest.raises(ValueError, match="is no state of a registration") as error:
+            read_state(tmp_path)
+        assert "\n" not in str(error.value) and len(str(error.value)) < 400
 
 
 def test_a_damaged_number_of_coefficients_is_said(model: StatisticalModel) -> None:
@@ -162,7 +153,6 @@ def test_a_built_in_scene_is_found_by_its_name(tmp_path: Path) -> None:
 def test_weights_keep_the_digest_of_their_model(rope: Model, tmp_path: Path) -> None:
     save_model(rope, tmp_path / "r.safetensors")
     one, other = (load_model(tmp_path / "r.safetensors").statistical_model for _ in range(2))
-    assert one is not None and other is not None
     assert model_digest(one) == model_digest(other)
     state = state_of(by_modes(one), "rope")
     assert_same(restored(state, other), by_modes(one))

@@ -1,12 +1,9 @@
 """The search for pose and state without a network: what its tables hold, and what it finds."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from fit_cases import seen
 
-from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.registration.answer_frame import search_modes
@@ -22,9 +19,7 @@ FAR = np.array([12.0, -7.0, 150.0])
 @pytest.fixture(scope="module")
 def model() -> StatisticalModel:
     """Model of a lobe with a core inside and a tip that lies on it, which bends."""
-    found = load_model("tests/golden/lump.safetensors").statistical_model
-    assert found is not None
-    return found
+    return load_model("tests/golden/lump.safetensors").statistical_model
 
 
 def state(model: StatisticalModel, index: int) -> Posed:
@@ -104,24 +99,17 @@ def test_a_view_of_which_a_half_is_hidden_is_found_as_one(model: StatisticalMode
     assert open_.problem.evidence.other_lines == "unknown"
 
 
-def test_noise_is_told_from_a_wrong_state(model: StatisticalModel) -> None:
+@pytest.mark.parametrize("patched", [False, True])
+def test_noise_is_told_from_a_wrong_state(model: StatisticalModel, patched: bool) -> None:
+    """Also that of a stereo camera that matches windows: each patch of the frame is off by one amount."""
     posed = state(model, 1)
-    points = view(model, posed)
-    rng = np.random.default_rng(0)
-    noisy = points * (1 + rng.normal(scale=0.5, size=(len(points), 1)) / np.linalg.norm(points, axis=1, keepdims=True))
-    fitted = search_modes(CloudToFit(noisy, 1.0, lines=SightLines.of_cloud("past")), model)
-    assert fitted.problem.noisy and off(model, fitted.registration().material, posed) < 0.1
-    assert not search_modes(CloudToFit(points, 1.0), model, replace(FitConfig())).problem.noisy
-
-
-def test_errors_that_neighbours_share_are_noise_too(model: StatisticalModel) -> None:
-    """Of a stereo camera that matches windows: each patch of the frame is off by one amount."""
-    posed = state(model, 1)
-    points = view(model, posed)
-    across = points[:, :2] / points[:, 2:]
-    patch = np.unique((across // 0.012).astype(int), axis=0, return_inverse=True)[1].ravel()
-    off_by = np.random.default_rng(0).normal(scale=0.5, size=patch.max() + 1)[patch]
+    points, rows = view(model, posed), slice(None)
+    if patched:
+        cells = (points[:, :2] / points[:, 2:] // 0.012).astype(int)
+        rows = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
+    off_by = np.random.default_rng(0).normal(scale=0.5, size=len(points))[rows]
     noisy = points * (1 + off_by / np.linalg.norm(points, axis=1))[:, None]
     fitted = search_modes(CloudToFit(noisy, 1.0, lines=SightLines.of_cloud("past")), model)
     assert fitted.problem.noisy and fitted.registration().accepted
     assert off(model, fitted.registration().material, posed) < 0.1
+    assert patched or not search_modes(CloudToFit(points, 1.0), model).problem.noisy

@@ -92,8 +92,11 @@ def test_of_a_wheel_of_six_sides_only_sixths_look_alike() -> None:
     assert np.isin([60, 120, 180, 240, 300], degrees).all() and not np.isin([30, 90, 150, 210, 270, 330], degrees).any()
 
 
-def test_turns_that_no_state_makes_by_themselves_do_not_count() -> None:
-    assert find_segment_turns(model_of(held)) == ()
+def test_turns_that_no_state_makes_by_themselves_or_after_which_nothing_is_alike_do_not_count() -> None:
+    spinning = model_of(free)
+    without_states = spinning.around(spinning.mean, np.zeros((len(spinning.mean), 3, 0), dtype=np.float32))
+    for model in (model_of(held), without_states, model_of(free, peg=6.0)):
+        assert find_segment_turns(model) == ()
     for turn in find_segment_turns(model_of(coupled)):  # it may stand on its head
         assert abs(turn.axis[2]) < 0.01
 
@@ -117,8 +120,8 @@ def test_a_peg_that_is_seen_leaves_no_turn_open() -> None:
     model = model_of(free, sides=6, peg=0.6)
     assert len(find_segment_turns(model)) == 1
     material = transform_points(IN_FRONT, model.rest_points)
-    vertices = material[: sum(model.vertex_counts)][model.labels[: sum(model.vertex_counts)] == 2]
-    rest = model.rest_points[: sum(model.vertex_counts)][model.labels[: sum(model.vertex_counts)] == 2]
+    wheel = np.flatnonzero(model.labels[: sum(model.vertex_counts)] == 2)
+    vertices, rest = material[wheel], model.rest_points[wheel]
     on_peg = rest[:, 0] > 6.1
     assert on_peg.sum() > 3
     shown, hidden = (left_open(model, material, vertices[rows], 0.2, 1500.0) for rows in (on_peg, rest[:, 0] < 0.0))
@@ -162,32 +165,18 @@ def test_of_many_draws_those_jump_that_slide_along_the_surface() -> None:
     states = DrawnStates.of(scene, model, 30, 1000)
     drawn = Drawn.of(scene, 1006)
     truth = drawn.z.copy()
-    deformations = drawn.deformations(scene, truth)
-    assert deformations is not None
-    material = transform_points(IN_FRONT, material_moved(scene, model, deformations))
+    material = transform_points(IN_FRONT, material_moved(scene, model, drawn.deformations(scene, truth)))
     fitted = ModesFit.of(CloudToFit(seen(model.mesh(material)), 1.0), said(model, material), model)
     config = replace(MANY_DRAWS, explained=0.01)
     problem = DrawsProblem.of(fitted.problem, states, fitted.correspondences, config)
     wrong = truth.copy()
     wrong[0] = ndtri((ndtr(truth[0]) + 1 / 6) % 1.0)
-    pose = Posed(IN_FRONT[:3, :3], IN_FRONT[:3, 3], np.empty(0))
-    start = simulate(problem, drawn, wrong, pose)
-    assert start is not None
-    start = descend(problem, start, 1)
+    start = descend(problem, simulate(problem, drawn, wrong, POSE), 1)
     np.testing.assert_array_equal(draws_that_may_jump(problem, start), [0])
     found = try_jumps(problem, start)
     assert abs(ndtr(start.z[0]) - ndtr(truth[0])) > 0.1 and abs(ndtr(found.z[0]) - ndtr(truth[0])) < 0.01
     assert found.misfit < start.misfit
     assert try_jumps(replace(problem, config=replace(config, jumps=0)), start) is start
-
-
-def test_an_object_without_states_is_at_rest() -> None:
-    model = model_of(free)
-    assert find_segment_turns(model.around(model.mean, np.zeros((len(model.mean), 3, 0), dtype=np.float32))) == ()
-
-
-def test_a_wheel_with_a_long_peg_is_not_like_itself() -> None:
-    assert find_segment_turns(model_of(free, peg=6.0)) == ()
 
 
 X, Y, WRIST = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), np.array([6.0, 0.0, 0.0])
@@ -231,10 +220,7 @@ def flipped(z: np.ndarray) -> np.ndarray:
 
 
 def moved(z: np.ndarray) -> np.ndarray:
-    drawn = Drawn.of(scene(), 1000)
-    deformations = drawn.deformations(scene(), z)
-    assert deformations is not None
-    return material_moved(scene(), model(), deformations)
+    return material_moved(scene(), model(), Drawn.of(scene(), 1000).deformations(scene(), z))
 
 
 def problem_of(z: np.ndarray, points: int = 4000) -> DrawsProblem:
@@ -245,22 +231,16 @@ def problem_of(z: np.ndarray, points: int = 4000) -> DrawsProblem:
 
 
 def state(problem: DrawsProblem, z: np.ndarray) -> DrawsFit:
-    fit = simulate(problem, Drawn.of(scene(), 1000), z, POSE)
-    assert fit is not None
-    return fit
+    return simulate(problem, Drawn.of(scene(), 1000), z, POSE)
 
 
 TRUTH = np.array([0.3, 0.9, -0.5])
 
 
-def test_an_arm_has_one_group_of_forearm_and_wrist() -> None:
+def test_forearm_and_wrist_are_turned_together_to_the_shape_of_other_draws() -> None:
     (together,) = symmetric_groups(model())
     assert [turn.label for turn, _ in together] == [2, 3]
     assert all(angle == pytest.approx(np.pi) and abs(turn.axis[0]) > 0.999 for turn, angle in together)
-
-
-def test_the_turned_shape_is_that_of_other_draws() -> None:
-    (together,) = symmetric_groups(model())
     there = turn_segments(model(), moved(TRUTH), together)
     assert np.abs(there - moved(TRUTH)).max() > 4.0
     np.testing.assert_allclose(there, moved(flipped(TRUTH)), atol=0.02)

@@ -20,10 +20,10 @@ from scipy.stats import chi2
 from mereo.cli.stream import FrameAnswer, Outcome, line
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed
 from mereo.fitting.registration.answer import Answer
-from mereo.fitting.registration.register import CloudToFit, Registrar
+from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.tracking import Tracker
-from mereo.fitting.uncertainty import NOISY_FACTOR, ModesOptimum, Posterior, radius95
+from mereo.fitting.uncertainty import NOISY_FACTOR, ModesOptimum, Posterior, Uncertainty, radius95
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import owned_centroids, owned_gradients
@@ -49,6 +49,11 @@ def found(model: StatisticalModel, material: np.ndarray) -> Registration:
     registration = fit_correspondences(seen(model.mesh(material)), said(model, material), model, 1.0)
     assert registration.method == "modes" and registration.explained > 0.95
     return registration
+
+
+@pytest.fixture(scope="module")
+def sure(found: Registration) -> Uncertainty:
+    return found.uncertainty
 
 
 def test_the_radius_holds_95_percent_of_a_gaussian() -> None:
@@ -100,53 +105,48 @@ def test_the_gradients_of_volumes_and_centroids_are_their_differences() -> None:
         np.testing.assert_allclose(said[:, 1:], (center - other) / 2e-5, rtol=1e-3, atol=1e-5)
 
 
-def test_radii_are_in_the_unit_of_the_input(model: StatisticalModel, material: np.ndarray, found: Registration) -> None:
-    assert found.uncertainty is not None
+def test_radii_are_in_the_unit_of_the_input(model: StatisticalModel, material: np.ndarray, sure: Uncertainty) -> None:
     turn = Rotation.from_euler("z", 40, degrees=True).as_matrix()
     points, network = seen(model.mesh(material)), said(model, material)
     for unit in (0.001, 25.0):
         other = replace(network, points=unit * network.points @ turn.T)
         again = fit_correspondences(unit * points @ turn.T, other, model, unit)
-        assert again.uncertainty is not None
-        np.testing.assert_allclose(again.uncertainty.material, unit * found.uncertainty.material, rtol=0.02)
-        for one, first in zip(again.uncertainty.segments, found.uncertainty.segments, strict=True):
+        np.testing.assert_allclose(again.uncertainty.material, unit * sure.material, rtol=0.02)
+        for one, first in zip(again.uncertainty.segments, sure.segments, strict=True):
             assert one.centroid_radius95 == pytest.approx(unit * first.centroid_radius95, rel=0.02)
             assert one.volume95 == pytest.approx([unit**3 * value for value in first.volume95], rel=0.02)
 
 
-def test_a_calibration_scales_radii_and_intervals(found: Registration) -> None:
-    assert found.uncertainty is not None and not found.uncertainty.calibrated
+def test_a_calibration_scales_radii_and_intervals(found: Registration, sure: Uncertainty) -> None:
     wide = replace(found, radius_scale=3.0).uncertainty
-    assert wide is not None and wide.calibrated
-    np.testing.assert_allclose(wide.material, 3.0 * found.uncertainty.material)
-    for one, other in zip(wide.segments, found.uncertainty.segments, strict=True):
+    assert wide is not None and wide.calibrated and not sure.calibrated
+    np.testing.assert_allclose(wide.material, 3.0 * sure.material)
+    for one, other in zip(wide.segments, sure.segments, strict=True):
         assert one.centroid_radius95 == pytest.approx(3.0 * other.centroid_radius95)
         assert np.ptp(one.volume95) == pytest.approx(3.0 * np.ptp(other.volume95), rel=1e-6)
-    assert wide.summary()["calibrated"] and wide.summary()["median"] == pytest.approx(
-        3 * found.uncertainty.summary()["median"]
-    )
+    assert wide.summary()["calibrated"]
+    assert wide.summary()["median"] == pytest.approx(3 * sure.summary()["median"])
 
 
-def test_radii_of_noisy_frames_are_wider_where_nothing_is_calibrated(found: Registration) -> None:
-    optimum, sure = found.optimum, found.uncertainty
-    assert isinstance(optimum, ModesOptimum) and sure is not None
+def test_radii_of_noisy_frames_are_wider_where_nothing_is_calibrated(sure: Uncertainty) -> None:
+    optimum = sure.optimum
+    assert isinstance(optimum, ModesOptimum)
     noisy = replace(sure, optimum=replace(optimum, problem=replace(optimum.problem, noisy=True)))
     assert noisy.factor == NOISY_FACTOR > 1.0 == sure.factor and replace(noisy, scale=0.7).factor == 0.7
 
 
 def test_the_interval_of_a_volume_is_around_it_and_not_far_from_the_true_one(
-    found: Registration, material: np.ndarray
+    found: Registration, sure: Uncertainty, material: np.ndarray
 ) -> None:
     """The true one may be outside once in twenty times, but not by as much again."""
-    assert found.uncertainty is not None
     here, truth = found.mesh.owned_volumes, found.model.mesh(material).owned_volumes
-    for told, volume, true in zip(found.uncertainty.segments, here, truth, strict=True):
+    for told, volume, true in zip(sure.segments, here, truth, strict=True):
         low, high = told.volume95
         assert (low + high) / 2 == pytest.approx(volume, rel=1e-5)
         assert 0 < high - low < 0.2 * true and abs(true - volume) < high - low
 
 
-def test_the_scale_is_that_which_holds_95_percent(found: Registration, material: np.ndarray) -> None:
+def test_the_scale_is_that_which_holds_95_percent(found: Registration, sure: Uncertainty, material: np.ndarray) -> None:
     shown = seen_points(material, PointCloud(seen(found.model.mesh(material))), 1.0)
     one = RegistrationErrors.of(found, material, shown, 1.0)
     np.testing.assert_array_equal(one.seen, shown)
@@ -154,9 +154,8 @@ def test_the_scale_is_that_which_holds_95_percent(found: Registration, material:
     np.testing.assert_allclose(calibrated.radii, one.scaled(7.0).with_extra_radius(0.05).radii)
     np.testing.assert_allclose(calibrated.ratios, one.scaled(7.0).with_extra_radius(0.05).ratios, atol=1e-12)
     off = np.linalg.norm(found.material - material, axis=1)
-    assert found.uncertainty is not None
-    np.testing.assert_array_equal(one.ratios <= 1.0, off <= found.uncertainty.material)
-    both = RegistrationErrors.together([one, RegistrationErrors.of(found, material, shown, 1.0)])
+    np.testing.assert_array_equal(one.ratios <= 1.0, off <= sure.material)
+    both = RegistrationErrors.together([one, one])
     scale = both.scale()
     said = both.scaled(scale).coverage(unit_mm=2.0)
     assert said["all"] == pytest.approx(0.95, abs=1e-3)
@@ -179,7 +178,6 @@ def test_the_shares_of_all_evidence_sum_to_one(found: Registration) -> None:
     for part in (shown, ~shown):
         each = [found.explain(place, at="rest") for place in found.model.rest_points[part][::60]]
         for one in each:
-            assert one is not None
             assert sum(one.shares.values()) == pytest.approx(1.0, abs=1e-3) and min(one.shares.values()) > -1e-6
             assert one.weights.sum() == pytest.approx(1.0) and (one.weights >= 0).all()
         shares.append(np.mean([one.shares["states"] for one in each if one is not None]))
@@ -188,10 +186,8 @@ def test_the_shares_of_all_evidence_sum_to_one(found: Registration) -> None:
 
 def test_an_influence_is_how_far_a_moved_point_moves_the_place(found: Registration) -> None:
     optimum = found.optimum
-    assert optimum is not None
     row = 40
     one = found.explain(found.material[row])
-    assert one is not None
     best = int(one.weights.argmax())
     jacobian, residual, weight = optimum.terms.cloud
     change = np.zeros(len(residual))
@@ -199,15 +195,13 @@ def test_an_influence_is_how_far_a_moved_point_moves_the_place(found: Registrati
     total = optimum.terms.total
     step = np.linalg.solve(total.matrix, -(jacobian * weight[:, None]).T.astype(float) @ change)
     moved = optimum.posed.moved(step)
-    posterior = optimum.posterior
-    before, after = posterior.material[row], moved.place(found.model.material(moved.z))[row]
+    before, after = optimum.posterior.material[row], moved.place(found.model.material(moved.z))[row]
     np.testing.assert_allclose((after - before) / 1e-3, one.influence[best], rtol=0.05, atol=1e-3)
 
 
 def test_segments_are_explained_by_name(found: Registration) -> None:
     name = found.model.rest.names[0]
     one = found.explain(name)
-    assert one is not None
     np.testing.assert_allclose(one.place, owned_centroids(found.mesh)[0])
     with pytest.raises(ValueError, match=r"there is no segment 'nose'; the segments are box_0, .*: name one of them"):
         found.explain("nose")
@@ -228,9 +222,7 @@ def cloud() -> PointCloud:
 
 @pytest.fixture(scope="module")
 def answer(liver: Model, cloud: PointCloud) -> Answer:
-    result = answer_to(cloud, liver, Registrar.of(liver, "modes"), 24)
-    assert result.registered is not None and result.registered.uncertainty is not None
-    return result
+    return answer_to(cloud, liver, Registrar.of(liver, "modes"), 24)
 
 
 @pytest.fixture(scope="module")
@@ -242,68 +234,63 @@ def folder(answer: Answer, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def radii_of(answer: Answer) -> np.ndarray:
-    assert answer.registered is not None and answer.registered.uncertainty is not None
-    return np.concatenate(answer.registered.uncertainty.vertices)
+@pytest.fixture(scope="module")
+def told(answer: Answer) -> Uncertainty:
+    return answer.registered.uncertainty
 
 
-def test_a_registration_says_that_it_cannot_be_sent(answer: Answer) -> None:
+@pytest.fixture(scope="module")
+def radii(told: Uncertainty) -> np.ndarray:
+    return np.concatenate(told.vertices)
+
+
+def test_a_registration_says_that_it_cannot_be_sent(found: Registration) -> None:
     with pytest.raises(TypeError, match="a registration cannot be pickled or copied.*save_state"):
-        copy.copy(answer.registered)
+        copy.copy(found)
 
 
-def test_a_ply_has_the_radius_of_each_vertex_in_its_unit(answer: Answer, folder: Path) -> None:
+def test_a_ply_has_the_radius_of_each_vertex_in_its_unit(answer: Answer, radii: np.ndarray, folder: Path) -> None:
     """With --millimetres, of a frame whose unit is half a metre."""
     data = (folder / "segments.ply").read_bytes()
     head, body = data.split(b"end_header\n", 1)
     assert b"property uchar label\nproperty float radius95\n" in head
     assert b"comment radius95 is in the unit of x, y, z; it is not calibrated\n" in head
     kinds = [*((axis, "<f4") for axis in "xyz"), ("color", "u1", 3), ("label", "u1"), ("radius95", "<f4")]
-    vertices = np.frombuffer(body, np.dtype(kinds), count=len(radii_of(answer)))
-    np.testing.assert_allclose(vertices["radius95"], 500.0 * radii_of(answer), rtol=1e-5)
-    assert answer.registered is not None
+    vertices = np.frombuffer(body, np.dtype(kinds), count=len(radii))
+    np.testing.assert_allclose(vertices["radius95"], 500.0 * radii, rtol=1e-5)
     np.testing.assert_allclose(vertices["x"], 500.0 * answer.registered.material[: len(vertices), 0], rtol=1e-4)
 
 
-def test_a_glb_has_the_radius_of_each_vertex_and_says_its_unit(answer: Answer, folder: Path) -> None:
-    assert answer.registered is not None and answer.registered.uncertainty is not None
+def test_a_glb_has_the_radius_of_each_vertex_and_says_its_unit(answer: Answer, radii: np.ndarray, folder: Path) -> None:
     scene = trimesh.load_scene(folder / "segments.glb", process=False)
-    rows = np.split(np.arange(len(radii_of(answer))), np.cumsum(answer.registered.model.vertex_counts)[:-1])
+    rows = np.split(np.arange(len(radii)), np.cumsum(answer.registered.model.vertex_counts)[:-1])
     for mesh, part in zip(scene.geometry.values(), rows, strict=True):
         assert mesh.metadata["radius95"] == {"unit_m": 0.5, "calibrated": False} and mesh.visual.kind != "vertex"
-        told, place = mesh.vertex_attributes["_RADIUS95"], mesh.vertices
         # vertices that are one place are written once
-        away, same = cKDTree(answer.registered.material[part]).query(place)
-        assert away.max() < 1e-4 and len(place) > 0.99 * len(part)
-        np.testing.assert_allclose(told[:, 0], radii_of(answer)[part][same], rtol=1e-3)
+        away, same = cKDTree(answer.registered.material[part]).query(mesh.vertices)
+        assert away.max() < 1e-4 and len(mesh.vertices) > 0.99 * len(part)
+        np.testing.assert_allclose(mesh.vertex_attributes["_RADIUS95"][:, 0], radii[part][same], rtol=1e-3)
 
 
-def test_label_volumes_have_the_radius_of_each_voxel(answer: Answer, folder: Path) -> None:
+def test_label_volumes_have_the_radius_of_each_voxel(radii: np.ndarray, folder: Path) -> None:
     with np.load(folder / "labels.npz") as values:
-        labels, radii = values["labels"], values["radius95"]
-    assert radii.shape == labels.shape and radii.dtype == np.float32
-    np.testing.assert_array_equal(np.isfinite(radii), labels > 0)
-    everywhere = radii_of(answer)
-    assert everywhere.min() * 0.9 < np.nanmedian(radii) < everywhere.max()
+        labels, found = values["labels"], values["radius95"]
+    assert found.shape == labels.shape and found.dtype == np.float32
+    np.testing.assert_array_equal(np.isfinite(found), labels > 0)
+    assert radii.min() * 0.9 < np.nanmedian(found) < radii.max()
     text = (folder / "labels.vti").read_text()
     array = re.search(r'Name="radius95" format="binary">([^<]+)<', text)
     assert array is not None and 'type="Float32"' in text
     packed = base64.b64decode(array[1][44:])  # after the head of 32 bytes
     told = np.frombuffer(zlib.decompress(packed), "<f4").reshape(labels.shape, order="F")
-    np.testing.assert_allclose(told, 500.0 * radii, rtol=1e-5)
+    np.testing.assert_allclose(told, 500.0 * found, rtol=1e-5)
 
 
-def test_the_summary_tells_centroids_volumes_and_the_whole(answer: Answer, folder: Path) -> None:
-    assert answer.registered is not None and answer.registered.uncertainty is not None
+def test_the_summary_tells_centroids_volumes_and_the_whole(told: Uncertainty, radii: np.ndarray, folder: Path) -> None:
     summary = json.loads((folder / "summary.json").read_text())
-    told = summary["radius95"]
-    assert told == {
-        "median": pytest.approx(np.median(radii_of(answer))),
-        "max": pytest.approx(radii_of(answer).max()),
-        "calibrated": False,
-        "unit_m": 0.5,
-    }
-    for row, one in zip(summary["segments"], answer.registered.uncertainty.segments, strict=True):
+    lengths = {"median": pytest.approx(np.median(radii)), "max": pytest.approx(radii.max())}
+    assert summary["radius95"] == {**lengths, "calibrated": False, "unit_m": 0.5}
+    for row, one in zip(summary["segments"], told.segments, strict=True):
         assert row["centroid_radius95"] == pytest.approx(one.centroid_radius95)
         assert row["volume95"] == pytest.approx(list(one.volume95))
         assert row["volume95"][0] < row["volume"] < row["volume95"][1]
@@ -314,7 +301,6 @@ def test_points_that_the_model_does_not_explain_are_red(liver: Model, cloud: Poi
     lump = cloud.points[:40] - [0.0, 0.0, 0.12 * np.ptp(cloud.points, axis=0).max()]
     points = np.concatenate([cloud.points, lump])
     registration = answer_to(points, liver, Registrar.of(liver, "modes"), 16, keep_all=True).registered
-    assert registration is not None
     one = registration.explain("liver")
     assert one is not None and len(one.unexplained)
     marks = point_marks(one, points)
@@ -338,12 +324,10 @@ def test_a_stream_says_it_where_it_is_asked_to(liver: Model, cloud: PointCloud) 
 
 def test_a_calibration_comes_from_the_weights(liver: Model, cloud: PointCloud) -> None:
     known = replace(liver, calibration=Calibration(seed=1, views=2, radius_scale=2.5))
-    registrar = Registrar.of(known, "modes")
-    registration = registrar.fit_modes(CloudToFit(cloud.points)).registration()
-    assert registration.uncertainty is not None and registration.uncertainty.scale == 2.5
-    tracker = Tracker(registrar)
-    followed = [tracker.follow(observe(cloud), 0.05 * number).registration for number in range(2)]
-    assert all(one is not None and one.radius_scale == 2.5 for one in followed)
+    tracker = Tracker(Registrar.of(known, "modes"))
+    for number in range(2):
+        found = tracker.follow(observe(cloud), 0.05 * number).registration
+        assert found is not None and found.uncertainty is not None and found.uncertainty.scale == 2.5
 
 
 def test_the_viewer_colours_it_and_says_it_of_a_place(answer: Answer, server: object) -> None:

@@ -1,11 +1,14 @@
 """Symmetries of segmented objects, against solids whose symmetries are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
+from shapes import segment
 
-from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.metrics import with_segments_exchanged
 from mereo.geometry.symmetry import describe_symmetries, find_symmetries
 from mereo.geometry.transforms import fit_rigid, rigid, transform_points
@@ -14,17 +17,12 @@ POSE = rigid(Rotation.from_euler("xyz", [20, 30, 40], degrees=True).as_matrix(),
 
 
 def posed(*parts: trimesh.Trimesh, pose: np.ndarray = POSE, nested: tuple[tuple[str, str], ...] = ()) -> SegmentedMesh:
-    segments = [
-        Segment("abc"[i], (1, 2, 3), transform_points(pose, np.asarray(part.vertices)), np.asarray(part.faces))
-        for i, part in enumerate(parts)
-    ]
-    return SegmentedMesh(tuple(segments), nested)
+    segments = (replace(segment(part), name="abc"[i]) for i, part in enumerate(parts))
+    return SegmentedMesh(tuple(segments), nested).transformed(pose)
 
 
 def moved(part: trimesh.Trimesh, x: float, y: float = 0.0, z: float = 0.0) -> trimesh.Trimesh:
-    part = part.copy()
-    part.apply_translation((x, y, z))
-    return part
+    return part.copy().apply_translation((x, y, z))
 
 
 CUBOID, BALL = trimesh.creation.box((20, 30, 50)), trimesh.creation.icosphere(radius=20, subdivisions=4)
@@ -56,25 +54,19 @@ def test_an_axis_is_named_in_the_frame_of_the_object() -> None:
     (sentence,) = describe_symmetries(find_symmetries(posed(moved(BALL, 1), pose=np.eye(4)), 0.3), ("ball",))
     assert sentence == "the object looks the same turned in any way, each segment on itself"
     halves = posed(moved(CUBOID, -10), moved(CUBOID, 10), pose=np.eye(4))
-    assert (
-        "the object looks the same turned by 180 degrees about z: no frame tells left and right apart"
-        in describe_symmetries(find_symmetries(halves, 0.3), ("left", "right"))
-    )
+    sentence = "the object looks the same turned by 180 degrees about z: no frame tells left and right apart"
+    assert sentence in describe_symmetries(find_symmetries(halves, 0.3), ("left", "right"))
 
 
 def test_segments_that_change_places_are_told_from_those_that_land_on_none() -> None:
     halves = find_symmetries(posed(moved(CUBOID, -10), moved(CUBOID, 10)), 0.3)
-    assert {symmetry.lands_on for symmetry in halves} == {(0, 1), (1, 0)}
-    assert {symmetry.swaps for symmetry in halves if symmetry.lands_on == (1, 0)} == {True}
+    assert {(symmetry.lands_on, symmetry.swaps) for symmetry in halves} == {((0, 1), False), ((1, 0), True)}
     core = trimesh.creation.icosphere(radius=5)
     beam = trimesh.creation.box((20, 4, 4))  # it would survive a half turn
-    (bottle,) = find_symmetries(
-        posed(beam, trimesh.creation.cone(15, 60, sections=64).apply_translation((0, 0, -20))), 0.3
-    )
+    (bottle,) = find_symmetries(posed(beam, moved(trimesh.creation.cone(15, 60, sections=64), 0, 0, -20)), 0.3)
     assert bottle.angle is None and bottle.lands_on == (None, 1)
     (hidden,) = find_symmetries(posed(moved(core, 8), BALL, nested=(("a", "b"),)), 0.3)
-    assert hidden.lands_on == (None, 1)
-    assert not hidden.swaps
+    assert hidden.lands_on == (None, 1) and not hidden.swaps
     assert hidden.describe(("tumour", "ball")).endswith("in any way: no frame tells where tumour is")
 
 
@@ -94,12 +86,8 @@ def test_scores_up_to_symmetry_take_the_exchange_that_fits_best() -> None:
     np.testing.assert_array_equal(with_segments_exchanged(exchanged, []), exchanged)
 
 
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(3)
-
-
-def test_a_fit_of_moved_points_is_the_motion(rng: np.random.Generator) -> None:
+def test_a_fit_of_moved_points_is_the_motion() -> None:
+    rng = np.random.default_rng(3)
     for count in (3, 4, 50):
         motion = rigid(Rotation.from_rotvec(rng.normal(size=3)).as_matrix(), rng.normal(size=3) * 100)
         source = rng.normal(size=(count, 3)) * [1, 5, 0.0 if count == 4 else 0.1]  # four of them in a plane
@@ -107,7 +95,8 @@ def test_a_fit_of_moved_points_is_the_motion(rng: np.random.Generator) -> None:
         np.testing.assert_allclose(found, motion, atol=1e-9)
 
 
-def test_a_fit_of_noisy_pairs_is_the_one_of_scipy_and_nothing_near_it_is_better(rng: np.random.Generator) -> None:
+def test_a_fit_of_noisy_pairs_is_the_one_of_scipy_and_nothing_near_it_is_better() -> None:
+    rng = np.random.default_rng(3)
     source, target, weights = rng.normal(size=(20, 3)), rng.normal(size=(20, 3)), rng.random(20)
     found = fit_rigid(source, target, weights)
     middle, aim = (np.average(points, axis=0, weights=weights) for points in (source, target))
@@ -128,8 +117,8 @@ def test_a_fit_of_points_whose_products_are_infinite_ends() -> None:
         fit_rigid(points, points)
 
 
-def test_mirrored_points_are_turned_not_mirrored(rng: np.random.Generator) -> None:
-    source = rng.normal(size=(30, 3))
+def test_mirrored_points_are_turned_not_mirrored() -> None:
+    source = np.random.default_rng(3).normal(size=(30, 3))
     rotation = fit_rigid(source, source * [-1, 1, 1])[:3, :3]
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(rotation) == pytest.approx(1.0)

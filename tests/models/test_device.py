@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -82,18 +83,11 @@ def test_cuda_where_there_is_none_is_refused(tmp_path: Path, capsys: pytest.Capt
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """How many rows oneDNN was asked for, as if it were faster here."""
-    rows_of_each: list[int] = []
-    onednn = device._by_onednn
-
-    def by_onednn(rows: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None) -> torch.Tensor:
-        rows_of_each.append(rows.numel() // rows.shape[-1])
-        return onednn(rows, weight, bias)
-
-    monkeypatch.setattr(device, "_by_onednn", by_onednn)
+def by_onednn(monkeypatch: pytest.MonkeyPatch) -> Mock:
+    """The product by oneDNN, as if it were faster here."""
     monkeypatch.setattr(device, "onednn_pays", lambda: True)
-    return rows_of_each
+    monkeypatch.setattr(device, "_by_onednn", Mock(wraps=device._by_onednn))
+    return device._by_onednn
 
 
 def layer(inputs: int = 70, outputs: int = 40) -> tuple[torch.Tensor, torch.Tensor]:
@@ -106,18 +100,18 @@ def rows(count: int, inputs: int = 70) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("biased", [True, False])
-def test_products_are_torchs_own(asked: list[int], biased: bool) -> None:
+def test_products_are_torchs_own(by_onednn: Mock, biased: bool) -> None:
     weight, bias = layer()
     with torch.inference_mode():
-        for count in (ROWS, 2 * ROWS):
+        for calls, count in enumerate((ROWS, 2 * ROWS), start=1):
             found = linear(rows(count), weight, bias if biased else None)
             exact = F.linear(rows(count).double(), weight.double(), bias.double() if biased else None)
             torch.testing.assert_close(found.double(), exact, rtol=0, atol=1e-4)
-        assert asked == [ROWS, 2 * ROWS]
+            assert by_onednn.call_count == calls
         assert count_operations(lambda: linear(rows(ROWS), weight)) == 2 * ROWS * 70 * 40
 
 
-def test_other_sizes_precisions_and_trainings_are_torchs(asked: list[int]) -> None:
+def test_other_sizes_precisions_and_trainings_are_torchs(by_onednn: Mock) -> None:
     weight, bias = layer()
     with torch.inference_mode():
         assert torch.equal(linear(rows(ROWS + 1), weight, bias), F.linear(rows(ROWS + 1), weight, bias))
@@ -127,7 +121,7 @@ def test_other_sizes_precisions_and_trainings_are_torchs(asked: list[int]) -> No
             assert linear(rows(ROWS), weight).dtype == torch.bfloat16
     weight.requires_grad_()
     linear(rows(ROWS), weight, bias).sum().backward()
-    assert weight.grad is not None and not asked
+    assert weight.grad is not None and not by_onednn.called
 
 
 @pytest.mark.usefixtures("fresh_decisions")

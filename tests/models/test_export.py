@@ -5,6 +5,7 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +51,6 @@ def model_of(config: NetworkConfig, loss: str) -> Model:
     network = Network(config, len(NAMES))
     if config.additions.rest_template:
         lookup = network.decoder.lookup
-        assert lookup is not None
         axis = torch.linspace(-TEMPLATE_REACH, TEMPLATE_REACH, TEMPLATE_NODES)
         places = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
         centers = torch.tensor([[0.3, 0.0, 0.1], [-0.2, 0.5, 0.0], [0.0, -0.4, -0.6]])
@@ -77,13 +77,12 @@ def seen(count: int, seed: int) -> np.ndarray:
 SHIPPED = "bunny"
 
 
-def ordered(count: int) -> torch.Tensor:
-    points = seen(count, 5)
-    return torch.from_numpy(points[farthest_point_order(points, count)])[None]
-
-
-def asked(count: int) -> torch.Tensor:
-    return 3.0 * torch.rand(1, count, 3, generator=torch.Generator().manual_seed(1)) - 1.5
+def inputs_of(model: Model) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+    """Clouds in the order of the model, and points to query: one, then more of both than the model's own number."""
+    for extra, queries in ((0, 1), (31, 100)):
+        points = seen(model.network.config.points + extra, 5)
+        cloud = torch.from_numpy(points[farthest_point_order(points, len(points))])[None]
+        yield cloud, 3.0 * torch.rand(1, queries, 3, generator=torch.Generator().manual_seed(1)) - 1.5
 
 
 def answers_of(model: Model, cloud: torch.Tensor, points: torch.Tensor) -> tuple[np.ndarray, ...]:
@@ -120,8 +119,7 @@ def test_a_reloaded_torch_program_answers_as_the_network(tmp_path: Path, case: s
     assert sorted(path.name for path in folder.glob("[!.]*")) == ["encoder.pt2", "model.json", "query.pt2"]
     encoder, query = (torch.export.load(folder / f"{name}.pt2").module() for name in ("encoder", "query"))
     wanted = json.loads((folder / "model.json").read_text())["query_inputs"]
-    for points, queries in ((model.network.config.points, 1), (model.network.config.points + 31, 50)):
-        cloud, places = ordered(points), asked(queries)
+    for cloud, places in inputs_of(model):
         given = {**encoder(cloud), "cloud": cloud, "viewpoint": torch.tensor([[0.1, -0.2, -8.0]])}
         found = query(places, {name: given[name] for name in wanted})
         agree(found, answers_of(model, cloud, places))
@@ -130,17 +128,13 @@ def test_a_reloaded_torch_program_answers_as_the_network(tmp_path: Path, case: s
 def test_an_autodecoder_is_refused(tmp_path: Path) -> None:
     config = PRESETS["tiny"].network.changed(encoder="autodecoder", local_neighbors=0)
     save_model(Model(Network(config, 3).eval(), NAMES, PALETTE[:3]), tmp_path / "w.safetensors")
-    with pytest.raises(
-        ValueError, match=r"an autodecoder's, which finds the code .* by gradient steps; .*: train with"
-    ):
+    with pytest.raises(ValueError, match=r"an autodecoder's, which finds .* by gradient steps; .*: train with"):
         export_weights(tmp_path / "w.safetensors", tmp_path / "out", "torch")
     assert [path.name for path in tmp_path.iterdir()] == ["w.safetensors"]
 
 
 def test_missing_packages_are_named_with_their_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "mereo.models.export.onnx_export.find_spec", lambda name: None if name == "onnxscript" else object()
-    )
+    monkeypatch.setattr("mereo.models.export.onnx_export.find_spec", lambda name: name != "onnxscript" or None)
     with pytest.raises(ImportError, match=r"onnxscript is needed to export to ONNX: pip install 'mereo\[onnx\]'"):
         export_weights(SHIPPED, tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
@@ -221,8 +215,7 @@ def test_onnx_graphs_answer_as_the_network_and_the_folder_says_what_it_holds(exp
     model, folder = exported
     encoder, query = (onnxruntime.InferenceSession(folder / f"{name}.onnx") for name in ("encoder", "query"))
     names = [output.name for output in encoder.get_outputs()]
-    for points, queries in ((model.network.config.points, 1), (model.network.config.points + 31, 300)):
-        cloud, places = ordered(points), asked(queries)
+    for cloud, places in inputs_of(model):
         given = dict(zip(names, encoder.run(names, {"cloud": cloud.numpy()}), strict=True))
         with torch.inference_mode():
             code = code_tensors(model.network.encode(cloud, torch.zeros(1, 3)))
@@ -251,8 +244,7 @@ runpy.run_path("mereo_onnx.py", run_name="__main__")
 def test_the_runner_answers_as_the_model_without_torch(exported: tuple[Model, Path]) -> None:
     model, folder = exported
     cloud = raw_cloud(3000)
-    low, high = cloud.min(axis=0), cloud.max(axis=0)
-    size = float((high - low).max())
+    low, high, size = cloud.min(axis=0), cloud.max(axis=0), np.ptp(cloud, axis=0).max()
     queries = np.random.default_rng(2).uniform(low - 0.3 * size, high + 0.3 * size, (20_000, 3))
     np.save(folder / "frame.npy", cloud)
     np.save(folder / "queries.npy", queries)

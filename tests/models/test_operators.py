@@ -6,7 +6,6 @@ import sys
 import pytest
 import torch
 import torch.nn.functional as F
-from torch import Tensor
 
 from mereo.models.export.onnx_export import trilinear
 from mereo.models.neighbors import _by_rank, ball_query, gather, nearest, squared_distances
@@ -108,8 +107,8 @@ def test_rigid_fits_are_those_of_torchs_svd(monkeypatch: pytest.MonkeyPatch) -> 
     expected = fit_rigid(source, target + 3 * source)
     monkeypatch.setattr(torch.linalg, "svd", svd3)
     found = fit_rigid(source, target + 3 * source)
-    torch.testing.assert_close(found.rotation, expected.rotation, atol=2e-5, rtol=0)
-    torch.testing.assert_close(found.shift, expected.shift, atol=2e-5, rtol=0)
+    for name in ("rotation", "shift"):
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name), atol=2e-5, rtol=0)
     flat = source * torch.tensor([1.0, 1.0, 0.0])
     mirrored = fit_rigid(flat, flat * torch.tensor([1.0, -1.0, 1.0]))
     torch.testing.assert_close(torch.linalg.det(mirrored.rotation), torch.ones(50), atol=1e-5, rtol=0)
@@ -132,14 +131,10 @@ def random_motion(batch: int, seed: int = 0) -> Alignment:
     return Alignment(q, torch.randn(batch, 3, generator=generator))
 
 
-def cloud_of(batch: int = 2, points: int = TINY.points) -> Tensor:
-    return torch.rand(batch, points, 3, generator=torch.Generator().manual_seed(1)) * 2 - 1
-
-
 @pytest.mark.parametrize("flatten", [1.0, 0.0])
 def test_fit_finds_the_motion_that_was_made(flatten: float) -> None:
     """Also of flat clouds, whose mirror image is as near; in bfloat16 coordinates stay what they are."""
-    motion, cloud = random_motion(8), cloud_of(8, 50) * torch.tensor([1.0, 1.0, flatten])
+    motion, cloud = random_motion(8), random_points(8, 50, 1) * torch.tensor([1.0, 1.0, flatten])
     moved = motion.apply(cloud)
     found = fit_rigid(cloud, moved)
     assert torch.allclose(found.rotation, motion.rotation, atol=1e-5)
@@ -151,10 +146,11 @@ def test_fit_finds_the_motion_that_was_made(flatten: float) -> None:
         assert torch.allclose(fit_rigid(cloud, moved).apply(cloud), moved, atol=1e-5)
 
 
-def test_a_moved_object_gets_the_same_answers_turned_along(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_moved_object_gets_the_same_answers_turned_along() -> None:
     torch.manual_seed(0)
     network = Network(TINY.changed(sight_neighbors=0), segments=3).train()
-    cloud, queries, viewpoint = cloud_of(), cloud_of(points=30), torch.tensor([[0.0, 0.0, -8.0]] * 2)
+    cloud, queries = random_points(2, TINY.points, 1), random_points(2, 30, 1)
+    viewpoint = torch.tensor([[0.0, 0.0, -8.0]] * 2)
     network(cloud, viewpoint, queries)
     network.eval()
     motion = random_motion(2)
@@ -175,9 +171,8 @@ def test_loss_is_the_mean_distance_inside() -> None:
     loss = rest_loss(predicted, rest)
     loss.backward()  # type: ignore[no-untyped-call]
     assert torch.isclose(loss, torch.tensor(3.0), atol=1e-3)
-    assert predicted.grad is not None and torch.isfinite(predicted.grad).all()
-    assert (predicted.grad[0, 2:] == 0).all()
+    assert torch.isfinite(predicted.grad).all() and (predicted.grad[0, 2:] == 0).all()
     predicted = torch.randn(2, 5, 3, requires_grad=True)
     loss = rest_loss(predicted, torch.full((2, 5, 3), torch.nan))
     loss.backward()  # type: ignore[no-untyped-call]
-    assert loss.item() == 0 and predicted.grad is not None and torch.isfinite(predicted.grad).all()
+    assert loss.item() == 0 and torch.isfinite(predicted.grad).all()

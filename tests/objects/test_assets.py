@@ -28,18 +28,11 @@ def empty_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, request: pytest
     return tmp_path / "cache"
 
 
-class QuietHandler(http.server.SimpleHTTPRequestHandler):
-    """Serves files without a line per request in the test output."""
-
-    def log_message(self, format: str, *args: object) -> None:
-        pass
-
-
 @pytest.fixture
 def server(tmp_path: Path) -> Iterator[str]:
     """A web server on this machine that serves ``tmp_path / "web"``; yields its address."""
     (tmp_path / "web").mkdir()
-    handler = functools.partial(QuietHandler, directory=tmp_path / "web")
+    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=tmp_path / "web")
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as web:
         thread = threading.Thread(target=web.serve_forever, args=(0.01,))
         thread.start()
@@ -66,8 +59,7 @@ def test_mirror_comes_first_and_is_checked(monkeypatch: pytest.MonkeyPatch, tmp_
     path = tmp_path / "mirror" / asset.name
     path.parent.mkdir(parents=True)
     path.write_bytes(CONTENT)
-    assert assets.get(asset.name) == path
-    assert assets.location(asset.name) == path
+    assert assets.get(asset.name) == path == assets.location(asset.name)
     path.write_bytes(CONTENT + b"changed")
     found = hashlib.sha256(CONTENT + b"changed").hexdigest()
     with pytest.raises(ValueError, match="delete it to download the right one") as caught:
@@ -80,8 +72,7 @@ def test_one_download_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, s
     (tmp_path / "web" / "toy.off").write_bytes(CONTENT)
     assert assets.location(asset.name) is None
     path = assets.get(asset.name)
-    assert path == empty_cache / asset.name
-    assert path.read_bytes() == CONTENT
+    assert path == empty_cache / asset.name and path.read_bytes() == CONTENT
     (tmp_path / "web" / "toy.off").unlink()
     assert assets.get(asset.name) == path == assets.location(asset.name)
 
@@ -100,9 +91,7 @@ def test_a_wrong_download_leaves_nothing(
 
 def test_no_network_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     asset = register(monkeypatch, "http://127.0.0.1:9/toy.off")  # the discard port: refused
-    with pytest.raises(
-        AssetUnavailable, match="cannot be reached: put the file from .* and set MEREO_ASSETS"
-    ) as caught:
+    with pytest.raises(AssetUnavailable, match="cannot be reached: put the file from .* set MEREO_ASSETS") as caught:
         assets.get(asset.name)
     assert "\n" not in str(caught.value)
 
@@ -112,13 +101,8 @@ def test_a_silent_network_is_given_up_while_it_is_silent(monkeypatch: pytest.Mon
     asset = register(monkeypatch, "http://127.0.0.1:9/toy.off")
     release, ended = threading.Event(), threading.Event()
 
-    def hang(*_: object, **__: object) -> None:
-        release.wait(60)
-        ended.set()
-        raise ConnectionError
-
     monkeypatch.setattr(assets, "ANSWER_SECONDS", 0.2)
-    monkeypatch.setattr(pooch.HTTPDownloader, "__call__", hang)
+    monkeypatch.setattr(pooch.HTTPDownloader, "__call__", lambda *_, **__: release.wait(60) and ended.set())
     with pytest.raises(AssetUnavailable, match="cannot be reached"):
         assets.get(asset.name)
     assert not ended.is_set()

@@ -47,14 +47,11 @@ def test_rods_join_crank_pins_and_piston_pins() -> None:
 
 
 def test_pistons_are_on_top_when_their_cylinder_fires_in_the_order_1_3_4_2() -> None:
-    order = np.argsort(engine.FIRING_RAD) + 1
-    assert order.tolist() == [1, 3, 4, 2]
+    assert np.argsort(engine.FIRING_RAD).tolist() == [0, 2, 3, 1]
     for number, firing in enumerate(engine.FIRING_RAD, start=1):
-        index = NAMES.index(f"piston_{number}")
-        top = [engine.rest_mesh().segments[index].vertices]
-        heights = [
-            engine.deformations_at(firing + offset)[index](top[0])[:, 2].max() for offset in (-0.3, 0.0, 0.3, np.pi)
-        ]
+        piston = engine.rest_mesh().segments[NAMES.index(f"piston_{number}")]
+        moves = (motions(firing + offset)[piston.name] for offset in (-0.3, 0.0, 0.3, np.pi))
+        heights = [move(piston.vertices)[:, 2].max() for move in moves]
         assert np.argmax(heights) == 1 and np.isclose(heights[1] - heights[3], 2 * parts.CRANK_RADIUS)
         valves = slice(2 * number - 2, 2 * number)
         assert (engine.valve_lifts(firing)[valves] == 0).all()  # closed while it burns
@@ -103,10 +100,8 @@ def pose(*angles_deg: float) -> SegmentedMesh:
 
 
 def test_neighbours_have_a_clearance() -> None:
-    mesh = robot.rest_mesh()
-    pairs = [*pairwise(LINKS), ("hand", "finger_left"), ("hand", "finger_right")]
-    for pair in pairs:
-        assert 0.1 < gap(mesh, *pair) < 0.3, pair
+    for pair in (*pairwise(LINKS), ("hand", "finger_left"), ("hand", "finger_right")):
+        assert 0.1 < gap(robot.rest_mesh(), *pair) < 0.3, pair
 
 
 @pytest.mark.parametrize("index", range(6))
@@ -159,10 +154,6 @@ def test_poses_in_which_parts_meet_are_refused(angles_deg: tuple[float, ...], pa
 # --- lizard -----------------------------------------------------------------------------------------------------------
 
 
-def vertices(solid: Manifold) -> np.ndarray:
-    return np.array(solid.to_mesh().vert_properties[:, :3], dtype=float)
-
-
 def extreme_pose(rng: np.random.Generator) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     limits = np.column_stack([np.full((len(SPINE), 2), lizard.SPINE_PLAY_RAD), lizard.SPINE_LIMIT_RAD])
     swing = np.array([[lizard.LEG_PLAY_RAD] * 2 + [limit] for limit in (lizard.SWING_RAD, lizard.FOOT_RAD)])
@@ -197,7 +188,7 @@ def test_a_chain_of_knuckles_moves_every_link_rigidly() -> None:
     for number, link in enumerate(spine_links()):
         if number > 0:
             motion = follow(motion, SPINE[number - 1], vectors[number - 1])
-        points = vertices(link)
+        points = np.array(link.to_mesh().vert_properties[:, :3], dtype=float)
         assert np.allclose(chain(points), points @ motion[:3, :3].T + motion[:3, 3], atol=1e-9)
 
 

@@ -10,11 +10,8 @@ from mereo.reconstruction.isosurfaces import Extraction, Field, _grid, extract, 
 BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 
 
-def run(
-    field: Field, segments: int = 1, resolution: int = 40, box: np.ndarray = BOX, dense: bool = False
-) -> Extraction:
-    names = tuple(f"part {i}" for i in range(segments))
-    return extract(field, box, resolution, names, PALETTE[:segments], dense=dense)
+def run(field: Field, segments: int = 1, resolution: int = 40, box: np.ndarray = BOX, **options: bool) -> Extraction:
+    return extract(field, box, resolution, ("left", "right")[:segments], PALETTE[:segments], **options)
 
 
 def euler_number(segment: Segment) -> int:
@@ -72,8 +69,7 @@ def test_a_ball_is_a_closed_surface_of_euler_number_2_for_which_few_points_are_a
     assert segment.volume == pytest.approx(4 / 3 * np.pi * 0.7**3, rel=2e-3)
     radius = np.linalg.norm(segment.vertices - [0.03, -0.02, 0.05], axis=1)
     assert np.abs(radius - 0.7).max() < 0.05 * 2 / 64, "a twentieth of a voxel"
-    field = logits_of(ball((0.0, 0.0, 0.0), 0.6))
-    assert run(field, resolution=128).evaluated < 0.08 * 129**3
+    assert run(logits_of(ball((0.0, 0.0, 0.0), 0.6)), resolution=128).evaluated < 0.08 * 129**3
 
 
 def test_neighbours_share_their_interface_and_volumes_add_up() -> None:
@@ -90,9 +86,7 @@ def test_neighbours_share_their_interface_and_volumes_add_up() -> None:
         walls.append(np.unique(segment.vertices[on_wall].round(5), axis=0))
     assert len(walls[0]) > 200
     np.testing.assert_allclose(walls[0], walls[1], atol=2e-5 * voxel + 1e-9)
-    assert left.volume + right.volume == pytest.approx(together.volume, rel=3e-3), (
-        "but for gaps below a voxel along the rim"
-    )
+    assert left.volume + right.volume == pytest.approx(together.volume, rel=3e-3)  # gaps below a voxel along the rim
 
 
 def test_a_segment_that_fills_the_box_is_closed_half_a_voxel_outside() -> None:

@@ -38,12 +38,8 @@ def answer(request: pytest.FixtureRequest) -> Answer:
     return answer_to(cloud, model, resolution=48, axes=request.param)
 
 
-@pytest.fixture(scope="module")
-def found(answer: Answer) -> Reconstruction:
-    return answer.reconstruction
-
-
-def test_labels_are_the_fields_at_their_positions(found: Reconstruction) -> None:
+def test_labels_are_the_fields_at_their_positions(answer: Answer) -> None:
+    found = answer.reconstruction
     grid = found.labels
     index = np.indices(grid.labels.shape).reshape(3, -1).T
     expected = two_balls(grid.positions(index)).argmax(axis=1)
@@ -51,7 +47,8 @@ def test_labels_are_the_fields_at_their_positions(found: Reconstruction) -> None
     assert grid.names == NAMES and not found.clipped
 
 
-def test_segments_are_where_they_are_and_an_absent_one_is_listed(found: Reconstruction) -> None:
+def test_segments_are_where_they_are_and_an_absent_one_is_listed(answer: Answer) -> None:
+    found = answer.reconstruction
     absent = found.segments[2]
     assert (absent.name, absent.volume, absent.voxels, absent.components) == ("absent", 0.0, 0, 0)
     assert np.isnan(absent.confidence) and np.isnan(absent.box).all()
@@ -78,13 +75,8 @@ def test_files(answer: Answer, tmp_path: Path) -> None:
     frame, result = answer.seen.frame.axes, answer.reconstruction
     (tmp_path / "out").mkdir()
     write_answer(tmp_path / "out", answer)
-    assert sorted(p.name for p in (tmp_path / "out").glob("[!.]*")) == [
-        "labels.npz",
-        "preview.png",
-        "report.html",
-        "segments.glb",
-        "summary.json",
-    ]
+    files = {"labels.npz", "preview.png", "report.html", "segments.glb", "summary.json"}
+    assert {path.name for path in (tmp_path / "out").glob("[!.]*")} == files
     with np.load(tmp_path / "out/labels.npz") as stored:
         np.testing.assert_array_equal(stored["labels"], result.labels.labels)
         np.testing.assert_array_equal(stored["origin"], result.labels.origin)
@@ -153,18 +145,10 @@ def test_strays_are_dropped_and_said_unless_all_are_to_be_kept(
         read("all", cloud, [0.1, 0.2], keep_all=True)
     assert "strays:" not in capsys.readouterr().out
     assert json.loads((tmp_path / "all/summary.json").read_text())["points"] == 1230
-
-
-@pytest.mark.parametrize("keep_all, strays", [(False, 30), (True, 0)])
-def test_a_stream_drops_strays_and_counts_them(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, keep_all: bool, strays: int
-) -> None:
-    own, model = scene("camera")
-    np.save(tmp_path / "cloud.npy", np.concatenate([own, FAR_BEHIND]))
-    monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: model)
-    isolation = IsolationConfig(keep_all=keep_all)
-    stream_reconstructions(StreamCommand(str(tmp_path), weights="any", resolution=16, isolation=isolation))
-    assert json.loads(capsys.readouterr().out)["strays"] == strays
+    for keep_all, strays in ((False, 30), (True, 0)):  # a stream counts them
+        isolation = IsolationConfig(keep_all=keep_all)
+        stream_reconstructions(StreamCommand(str(tmp_path), weights="any", resolution=16, isolation=isolation))
+        assert json.loads(capsys.readouterr().out)["strays"] == strays
 
 
 def test_every_public_name_exists_and_importing_the_package_loads_nothing() -> None:
@@ -214,10 +198,8 @@ def test_results_that_are_there_are_kept_without_force(
     folder, out = frames(tmp_path / "frames", "a.npy"), tmp_path / "out"
     (out / "a").mkdir(parents=True)
     (out / "a/mine.txt").write_text("keep")
-    assert run(folder, "--output", out) == 2
-    assert "exists and is not empty" in capsys.readouterr().err
-    assert run(folder, "--output", out, "--force") == 2
-    assert "not written by this version of mereo" in capsys.readouterr().err
+    for options, sentence in (((), "exists and is not empty"), (("--force",), "not written by this version of mereo")):
+        assert run(folder, "--output", out, *options) == 2 and sentence in capsys.readouterr().err
     assert [path.name for path in (out / "a").iterdir()] == ["mine.txt"]
 
 
@@ -236,13 +218,13 @@ def test_what_is_no_frames_fault_stops_before_the_work(
         assert sentence in printed.err and printed.err.count("\n") == 1 and not out.exists(), printed.err
     out.mkdir()
     (out / MARKER).write_text("{}")
-    assert run(folder, "--output", out) == 2
-    assert "is a folder of results; each frame gets a folder of its own" in capsys.readouterr().err
-    assert run("--output", tmp_path / "out") == 2
-    assert "no input is given; name a frame" in capsys.readouterr().err
     (tmp_path / "empty").mkdir()
-    assert run(tmp_path / "empty", "--output", tmp_path / "out") == 2
-    assert "has no depth images or point clouds" in capsys.readouterr().err
+    for inputs, sentence in (
+        ((folder,), "is a folder of results; each frame gets a folder of its own"),
+        ((), "no input is given; name a frame"),
+        ((tmp_path / "empty",), "has no depth images or point clouds"),
+    ):
+        assert run(*inputs, "--output", out) == 2 and sentence in capsys.readouterr().err
 
 
 def test_folders_are_called_by_as_much_of_the_name_as_tells_frames_apart(tmp_path: Path) -> None:

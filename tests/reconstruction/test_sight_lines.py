@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from camera_files import write_camera
 from PIL import Image
+from scipy.ndimage import distance_transform_edt
 
 from mereo.fitting.problem.evidence import Evidence
 from mereo.geometry.camera import SCANNER_TO_CAMERA, Camera, DepthImage, PointCloud, SightLines
@@ -64,19 +65,22 @@ class Occluded:
 
     @property
     def found(self) -> Observation:
-        image = self.seen.image
-        frame = SensorFrame(Path("simulated"), image.to_points(), None, "camera", image, whole=self.seen.whole)
-        return find_object(frame)
+        return find_object(frame_of(self.seen.image, self.seen.whole))
 
-    def kinds(self, lines: SightLines) -> np.ndarray:
-        """Image of "p" and "u" where a line of sight is kept, "" elsewhere; each line is in one pixel of its own."""
-        image = np.full(self.seen.mask.shape, "", dtype="U1")
-        for points, kind in ((lines.past, "p"), (lines.unknown, "u")):
-            rows, columns = pixels(points, self.seen.whole.camera)
-            inside = (rows >= 0) & (rows < image.shape[0]) & (columns >= 0) & (columns < image.shape[1])
-            assert (image[rows[inside], columns[inside]] == "").all()
-            image[rows[inside], columns[inside]] = kind
-        return image
+
+def frame_of(image: DepthImage, whole: DepthImage | None = None) -> SensorFrame:
+    return SensorFrame(Path("simulated"), image.to_points(), None, "camera", image, whole=whole)
+
+
+def kinds(lines: SightLines, camera: Camera) -> np.ndarray:
+    """Image of "p" and "u" where a line of sight is kept, "" elsewhere; each line is in one pixel of its own."""
+    image = np.full((camera.height, camera.width), "", dtype="U1")
+    for points, kind in ((lines.past, "p"), (lines.unknown, "u")):
+        rows, columns = pixels(points, camera)
+        inside = (rows >= 0) & (rows < camera.height) & (columns >= 0) & (columns < camera.width)
+        assert (image[rows[inside], columns[inside]] == "").all()
+        image[rows[inside], columns[inside]] = kind
+    return image
 
 
 def occlude(view: View, kind: Cut, sensor: SensorConfig = SENSORS["paper"], wall: bool = True) -> Occluded:
@@ -110,7 +114,7 @@ def test_past_is_empty_and_nothing_is_known_where_the_object_is_hidden(views: li
         np.testing.assert_allclose(lines.past[:, 2], seen.whole.depth[rows, columns])
         alone = cut.alone.depth[rows, columns]
         assert ((alone == 0) | (alone >= lines.past[:, 2])).all()
-        labels = cut.kinds(lines)
+        labels = kinds(lines, seen.whole.camera)
         assert (labels[seen.mask] == "").all()
         hidden = (cut.alone.depth > 0) & (seen.source == OCCLUDER)
         assert (labels[hidden] != "p").all() and hidden.any() == (kind != "none")
@@ -134,7 +138,9 @@ def test_under_sensors_and_wrong_masks_few_lines_are_wrong(views: list[View], se
             alone = cut.alone.depth[pixels(lines.past, seen.whole.camera)]
             wrong += int(((alone > 0) & (alone < lines.past[:, 2] - 1)).sum())
             total += len(lines.past)
-            labels = cut.kinds(lines)[surrounded((seen.source == BACKGROUND) & seen.whole.valid & ~seen.mask)]
+            labels = kinds(lines, seen.whole.camera)[
+                surrounded((seen.source == BACKGROUND) & seen.whole.valid & ~seen.mask)
+            ]
             known += (labels == "p").sum() / ((labels == "p") | (labels == "u")).sum()
     assert wrong < 0.002 * total
     assert known > 0.97 * len(views) * len(CUTS)
@@ -146,7 +152,7 @@ def test_a_rendered_image_leaves_open_what_is_beside_the_object(views: list[View
         assert lines.other_lines is None and len(lines.past) == len(lines.unknown) == 0
         # an occluder before nothing is unknown, and the zeros around it remain open
         cut = occlude(view, "hand", wall=False)
-        labels = cut.kinds(cut.found.lines)
+        labels = kinds(cut.found.lines, cut.seen.whole.camera)
         assert cut.found.lines.other_lines is None and (labels[cut.seen.source == NOTHING] == "").all()
         hidden = (cut.alone.depth > 0) & (cut.seen.source == OCCLUDER)
         assert hidden.any() and (labels[hidden] == "u").all()
@@ -173,6 +179,10 @@ def scene() -> np.ndarray:
     return depth
 
 
+WHOLE = DepthImage(scene(), WIDE)
+CUT = frame_of(DepthImage(np.where(SHOWN, WHOLE.depth, 0.0), WIDE), WHOLE)
+
+
 def pixels(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns of the pixels that points are seen in."""
     columns, rows = np.floor(camera.project(points)).astype(int).T
@@ -184,10 +194,7 @@ def test_each_pixel_has_its_kind_and_a_lone_depth_between_object_and_wall_is_no_
     expected = np.where(scene() == 2.0, "p", "u")
     expected[14:36, 19:41] = "u"  # the rim, which the object's own pixels cover but for one all around
     expected[SHOWN] = ""
-    image = np.full((50, 60), "", dtype="U1")
-    for points, kind in ((lines.past, "p"), (lines.unknown, "u")):
-        image[pixels(points, WIDE)] = kind
-    wrong = image != expected
+    wrong = kinds(lines, WIDE) != expected
     # at the ends of the wall, at other depths beside it, a pixel may have too few that agree
     assert wrong.sum() <= 4 and not wrong[12:38, 17:43].any()
     assert lines.other_lines == "unknown"
@@ -212,35 +219,23 @@ def test_a_tool_that_hides_the_object_is_unknown_where_it_is_farther_away_too() 
     tool = np.zeros(SHOWN.shape, dtype=bool)
     tool[18:32, :20] = True
     depth = np.where(SHOWN, 1.0 + 0.025 * (column - 20), np.where(tool, 0.8 + 0.026 * (19 - column), 2.0))
-    past = np.zeros(SHOWN.shape, dtype=bool)
-    lines = lines_of_image(DepthImage(depth, WIDE), SHOWN).past
-    past[pixels(lines[WIDE.project(lines).min(axis=1) >= 0], WIDE)] = True
+    past = kinds(lines_of_image(DepthImage(depth, WIDE), SHOWN), WIDE) == "p"
     assert past[:10].sum() > 100 and not past[tool].any()
 
 
 def test_many_lines_are_thinned_far_from_the_object_only() -> None:
     camera = Camera(600, 500, 800.0, 800.0, 300.0, 250.0)
     shown, depth = np.kron(SHOWN, np.ones((10, 10), dtype=bool)), np.kron(scene(), np.ones((10, 10)))
-    lines = lines_of_image(DepthImage(depth, camera), shown)
-    kept = np.zeros(shown.shape, dtype=bool)
-    for points in (lines.past, lines.unknown):
-        kept[pixels(points, camera)] = True
+    kept = kinds(lines_of_image(DepthImage(depth, camera), shown), camera) != ""
     assert 0.5 * MOST_LINES < kept.sum() <= MOST_LINES
-    rows, columns = np.mgrid[:500, :600]
-    distance = np.hypot(
-        np.maximum(np.maximum(150 - rows, rows - 349), 0), np.maximum(np.maximum(200 - columns, columns - 399), 0)
-    )
+    distance = distance_transform_edt(~shown)
     assert kept[(distance > 0) & (distance <= DENSE)].all()
 
 
 def test_a_cloud_has_the_kinds_of_its_image() -> None:
-    whole = DepthImage(scene(), WIDE)
-    cut = DepthImage(np.where(SHOWN, whole.depth, 0.0), WIDE)
-    frame = SensorFrame(Path("x"), cut.to_points(), 1.0, "camera", cut, whole=whole)
-    by_image = find_object(frame).lines
-    by_cloud = find_object(
-        SensorFrame(Path("x"), whole.to_points(), 1.0, "camera"), IsolationConfig(depth_range=(0.9, 1.1))
-    ).lines
+    by_image = find_object(CUT).lines
+    frame = SensorFrame(Path("x"), WHOLE.to_points(), 1.0, "camera")
+    by_cloud = find_object(frame, IsolationConfig(depth_range=(0.9, 1.1))).lines
     assert by_cloud.other_lines is None
     past, unknown = (
         {place for place in zip(*pixels(points, WIDE), strict=True) if 5 <= place[0] < 45 and 5 <= place[1] < 55}
@@ -277,30 +272,21 @@ def test_points_that_were_only_thinned_out_are_the_objects() -> None:
     ball = x**2 + y**2 < 0.2**2
     depth = np.where(ball, 1.0 - np.sqrt(np.maximum(0.2**2 - x**2 - y**2, 0.0)), 3.0)
     whole = DepthImage(depth, camera)
-    seen = find_object(
-        SensorFrame(Path("x"), whole.to_points(), 1.0, "camera", whole, whole=whole),
-        IsolationConfig(largest_cluster=True),
-    )
+    seen = find_object(replace(frame_of(whole, whole), unit_m=1.0), IsolationConfig(largest_cluster=True))
     # the wall is larger: so the ball is what is left out, behind nothing, and the wall is the object
     assert seen.selection is not None and seen.selection.thinned.any()
     rest = seen.selection.of_object(seen.frame.cloud.points)
     assert rest.sum() > len(seen.cloud) and not rest[ball.ravel()].any()
     assert rest[~ball.ravel()].mean() > 0.999
-    rows, columns = pixels(seen.lines.unknown, camera)
-    inside = (rows >= 0) & (rows < 300) & (columns >= 0) & (columns < 400)
-    assert ball[rows[inside], columns[inside]].mean() > 0.9 and len(seen.lines.past) == 0
+    assert ball[kinds(seen.lines, camera) == "u"].mean() > 0.9 and len(seen.lines.past) == 0
 
 
 @pytest.mark.parametrize(("extent", "other_lines"), [("whole", "past"), ("partial", "unknown"), ("auto", None)])
 def test_the_extent_can_be_stated(extent: Extent, other_lines: str | None) -> None:
-    lines = observation.observe(
-        PointCloud(np.random.default_rng(0).normal((0, 0, 10), size=(50, 3))), extent=extent
-    ).lines
+    cloud = PointCloud(np.random.default_rng(0).normal((0, 0, 10), size=(50, 3)))
+    lines = observation.observe(cloud, extent=extent).lines
     assert lines.other_lines == other_lines and len(lines.past) == len(lines.unknown) == 0
-    whole = DepthImage(scene(), WIDE)
-    cut = DepthImage(np.where(SHOWN, whole.depth, 0.0), WIDE)
-    frame = SensorFrame(Path("x"), cut.to_points(), 1.0, "camera", cut, whole=whole)
-    lines = find_object(frame, IsolationConfig(extent=extent)).lines
+    lines = find_object(CUT, IsolationConfig(extent=extent)).lines
     assert lines.other_lines == (other_lines or "unknown")
     assert (len(lines.past) > 0) == (extent != "partial") and (len(lines.unknown) > 0) == (extent == "auto")
     assert not IsolationConfig(extent=extent).on and FrameOptions(extent=extent).isolation().extent == extent

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -44,10 +45,6 @@ def frame(number: int, time_s: float = 0.0) -> StreamFrame:
 
 def content(frame: StreamFrame) -> int:
     return frame.load()
-
-
-def raise_(problem: Exception) -> None:
-    raise problem
 
 
 def test_every_frame_is_answered_in_order_when_asked_at_the_recorded_pace(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -88,14 +85,17 @@ def test_a_slow_answer_gets_the_latest_frame_and_dropped_ones_are_not_decoded() 
     assert "10 dropped for newer ones, 0 bad" in str(summary)
 
 
+def damaged() -> None:
+    raise ValueError("the file\nis damaged")
+
+
 @pytest.mark.parametrize(
     "load, sentence",
     [
-        (lambda: raise_(ValueError("the file\nis damaged")), "the file is damaged"),
-        (lambda: raise_(OSError()), "OSError"),
+        (damaged, "the file is damaged"),
+        (Mock(side_effect=OSError()), "OSError"),
         (lambda: [][1], "bad cannot be answered (IndexError: list index out of range)"),
-        (lambda: raise_(EOFError()), "bad cannot be answered (EOFError): record or write it again"),
-        (lambda: json.loads("{"), "bad cannot be answered (JSONDecodeError: Expecting property name"),
+        (Mock(side_effect=EOFError()), "bad cannot be answered (EOFError): record or write it again"),
         (lambda: Path("no/such.ply").read_bytes(), "no/such.ply: no such file or directory: correct that and try"),
     ],
 )
@@ -113,11 +113,10 @@ def test_a_broken_sequence_is_raised_after_its_frames(every_frame: bool) -> None
         yield frame(0)
         raise OSError("the recording is cut off")
 
-    found = []
+    outcomes = stream(frames(), content, every_frame=every_frame)
+    assert next(outcomes).result == 0
     with pytest.raises(OSError, match="cut off"):
-        for outcome in stream(frames(), content, every_frame=every_frame):
-            found.append(outcome.result)
-    assert found == [0]
+        next(outcomes)
 
 
 @pytest.mark.parametrize("comes", [True, False])
@@ -134,10 +133,9 @@ def test_leaving_early_ends_the_reading_thread(comes: bool) -> None:
     assert next(outcomes).result == 0
     outcomes.close()  # type: ignore[attr-defined]
     asked.release(3)
-    for thread in threading.enumerate():
-        if thread.name == "frames":
-            thread.join(5)
-            assert not thread.is_alive()
+    for thread in [thread for thread in threading.enumerate() if thread.name == "frames"]:
+        thread.join(5)
+        assert not thread.is_alive()
 
 
 def write(path: Path, content: bytes, changed_s: int) -> Path:
@@ -156,9 +154,7 @@ def test_a_file_is_taken_once_when_it_has_come_to_rest_and_forgotten_when_it_goe
     write(watched.folder / "notes.doc", b"not wanted", 1)
     assert watched.look(0.0) == []
     write(file, b"ply, longer", 1)
-    assert watched.look(0.1) == []
-    assert watched.look(0.2) == [file]
-    assert watched.look(0.3) == []
+    assert [watched.look(time_s) for time_s in (0.1, 0.2, 0.3)] == [[], [file], []]
     file.unlink()
     assert watched.look(0.4) == []
     write(file, b"ply, longer", 1)
@@ -184,24 +180,11 @@ def test_an_empty_or_restless_file_is_waited_for_within_bounds(watched: WatchedF
 def test_watching_ends_with_ctrl_c(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def interrupted(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
     np.save(tmp_path / "a.npy", np.random.default_rng(0).uniform(1, 2, (500, 3)))
-    monkeypatch.setattr("mereo.cli.stream.answer_frame", interrupted)
+    monkeypatch.setattr("mereo.cli.stream.answer_frame", Mock(side_effect=KeyboardInterrupt))
     command = StreamCommand(str(tmp_path), weights="rope", watch=True, method="network")
     assert stream_reconstructions(command).answered == 0
     assert capsys.readouterr().err.startswith("stopped\n0 frames answered")
-
-
-def test_what_cannot_be_watched_is_refused(tmp_path: Path) -> None:
-    reading, isolation = InputConfig(), IsolationConfig()
-    with pytest.raises(FileNotFoundError, match="does not exist; a folder that can be watched is needed: make it"):
-        watched_frames(str(tmp_path / "nowhere"), reading, isolation)
-    (tmp_path / "a.ply").touch()
-    for source in ("-", str(tmp_path / "a.ply")):
-        with pytest.raises(ValueError, match=f"{source} is no folder of frames; only such a folder can be watched"):
-            watched_frames(source, reading, isolation)
 
 
 @pytest.mark.parametrize("given, taken", [(None, "4"), ("1024", "1024")])
@@ -267,6 +250,8 @@ def test_names_on_standard_input_are_frames(
 
 def test_sources_that_are_none_are_refused(tmp_path: Path) -> None:
     reading, isolation = InputConfig(), IsolationConfig()
+    with pytest.raises(FileNotFoundError, match="does not exist; a folder that can be watched is needed: make it"):
+        watched_frames(str(tmp_path / "nowhere"), reading, isolation)
     with pytest.raises(FileNotFoundError, match="does not exist; a folder of frames"):
         frames_of(str(tmp_path / "nowhere"), reading, isolation)
     with pytest.raises(ValueError, match="has no depth images or point clouds"):
@@ -274,6 +259,9 @@ def test_sources_that_are_none_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.ply").write_text("ply")
     with pytest.raises(ValueError, match="is a single file"):
         frames_of(str(tmp_path / "a.ply"), reading, isolation)
+    for source in ("-", str(tmp_path / "a.ply")):
+        with pytest.raises(ValueError, match=f"{source} is no folder of frames; only such a folder can be watched"):
+            watched_frames(source, reading, isolation)
     with pytest.raises(ValueError, match="none of the 1 frames could be answered"):
         stream_reconstructions(StreamCommand(str(tmp_path), weights="rope"))
     # before the weights are loaded and any frame is answered
@@ -297,8 +285,8 @@ def test_a_stream_replaces_no_surfaces_unless_forced(
 ) -> None:
     out = tmp_path / "out"
     out.mkdir()
-    (out / "a.npy.glb").write_text("precious")
-    (out / "thesis.tex").write_text("precious")
+    for name in ("a.npy.glb", "thesis.tex"):
+        (out / name).write_text("precious")
     assert run(monkeypatch, out, ("a.npy", "b.npy")) == 2
     said = capsys.readouterr()
     assert said.err.startswith(f"mereo: error: {out} exists and is not empty; nothing in it is overwritten")
