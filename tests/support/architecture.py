@@ -130,9 +130,9 @@ BUDGET = {
     "src/mereo_serving": (1_770, 13),
     "src/mereo_viewer": (1_380, 5),
     "src/mereo_experiments": (1_610, 17),
-    "tests": (26_250, 135),
+    "tests": (25_000, 131),
 }
-"""Lines and files that a folder may have at most; they only fall, those of tests to 25,000."""
+"""Lines and files that a folder may have at most; they only fall."""
 
 TEST_FOLDERS = ("theorems", "journeys", "robustness", "house", "support")
 """Folders of tests beside those of the rooms: see CONTRIBUTING.md."""
