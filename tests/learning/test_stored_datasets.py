@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from toy_data import SMALL, make_small_datasets, read_all, small_shards, whole
+from toy_data import SMALL, make_small_datasets, read_all, small_shards
 from toy_scene import toy_scene
 
 from mereo.__main__ import main, parse
@@ -19,7 +19,7 @@ from mereo.io.object_storage import ObjectPath, Place, StorageError, names_in, w
 from mereo.scenes.seeds import TEST_SEED_START
 from mereo_learning.dataset import Dataset
 
-__all__ = ["small_shards", "whole"]  # fixtures
+__all__ = ["small_shards"]  # a fixture
 
 TOY = toy_scene()
 NUMBERS = count()
@@ -35,11 +35,18 @@ def contents(folder: Place) -> dict[str, bytes]:
 
 
 @pytest.fixture(scope="module")
-def other(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Like ``whole``, with another seed."""
+def originals(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two datasets of the same scene with other seeds, each of four examples in two shards."""
     with pytest.MonkeyPatch.context() as patch:
         make_small_datasets(patch)
-        return Path(str(make(tmp_path_factory.mktemp("other") / "data", seed=4)))
+        folder = tmp_path_factory.mktemp("originals")
+        make(folder / "a"), make(folder / "b", seed=4)
+        return folder / "a", folder / "b"
+
+
+@pytest.fixture
+def whole(originals: tuple[Path, Path]) -> Path:
+    return originals[0]
 
 
 @pytest.fixture
@@ -118,16 +125,16 @@ DAMAGE: dict[str, Callable[[bytes, bytes], bytes]] = {
 @pytest.mark.parametrize("name", ["shard-00001.safetensors", "template.safetensors", "statistical_model.safetensors"])
 @pytest.mark.parametrize("reason", DAMAGE)
 def test_a_damaged_file_is_named_and_made_again(
-    stored: Place, whole: Path, other: Path, name: str, reason: str, capsys: pytest.CaptureFixture[str]
+    stored: Place, originals: tuple[Path, Path], name: str, reason: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_whole(stored / name, DAMAGE[reason](*((folder / name).read_bytes() for folder in (whole, other))))
+    write_whole(stored / name, DAMAGE[reason](*((folder / name).read_bytes() for folder in originals)))
     with pytest.raises(ValueError, match=rf"{name} .*\({reason}.*\); delete it and run .?mereo generate"):
         Dataset.load(stored)
     assert main(["dataset", "check", str(stored)]) == 2
     assert f"{name}: {reason}" in capsys.readouterr().out
     make(stored, resume=True)
     assert f"{name} is damaged and is made again" in capsys.readouterr().out
-    assert contents(stored) == contents(whole)
+    assert contents(stored) == contents(originals[0])
 
 
 def test_a_manifest_that_was_changed_does_not_fit_its_files(data: Path) -> None:
