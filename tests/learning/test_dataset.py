@@ -35,8 +35,8 @@ FULL = AugmentConfig(keep_points=(0.4, 0.9), hole_probability=1.0, jitter_std=0.
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return Dataset.load(write_toy_dataset(tmp_path_factory.mktemp("toy") / "data"))
+def data(pair: tuple[Dataset, Dataset]) -> Dataset:
+    return pair[0]
 
 
 def test_the_size_of_what_is_seen_is_known_where_the_unit_is(tmp_path: Path) -> None:
@@ -50,10 +50,6 @@ def test_the_size_of_what_is_seen_is_known_where_the_unit_is(tmp_path: Path) -> 
     assert visible_m == (pytest.approx(0.1, rel=0.1), pytest.approx(0.2, rel=0.1))
 
 
-def rng(seed: int = 0) -> Draws:
-    return Draws.of(seed)
-
-
 def observed(generator: np.random.Generator, points: int, queries: int) -> dict[str, np.ndarray]:
     """Half balls, and three halves of their cloud, of which the last has fewer points."""
     row = half_balls(generator, points, queries)
@@ -64,7 +60,7 @@ def observed(generator: np.random.Generator, points: int, queries: int) -> dict[
 
 
 def test_without_augmentation_a_batch_is_the_stored_data(data: Dataset) -> None:
-    batch, stored = data.batch(torch.arange(4), 96, 0, NONE, rng()), data.read(torch.arange(4))
+    batch, stored = data.batch(torch.arange(4), 96, 0, NONE, Draws.of(0)), data.read(torch.arange(4))
     assert torch.allclose(batch.cloud, stored["cloud"], atol=1e-5)
     assert torch.allclose(batch.positions, stored["positions"], atol=1e-5)
     viewpoint = -stored["center"] * stored["scale"][:, None]
@@ -98,28 +94,25 @@ def test_a_share_of_a_batch_meets_the_changes_of_the_whole(data: Dataset) -> Non
 
 def test_query_subset_keeps_labels_with_positions(data: Dataset) -> None:
     index = torch.tensor([2, 5])
-    batch, stored = data.batch(index, 96, 16, NONE, rng()), data.read(index)
+    batch, stored = data.batch(index, 96, 16, NONE, Draws.of(0)), data.read(index)
     assert batch.positions.shape == (2, 16, 3)
-    for row in range(2):
-        for position, label in zip(batch.positions[row], batch.labels[row], strict=True):
-            match = (stored["positions"][row] - position).norm(dim=-1).argmin()
-            assert stored["labels"][row, match] == label
+    match = torch.cdist(batch.positions, stored["positions"]).argmin(dim=2)
+    assert torch.equal(stored["labels"].long().gather(1, match), batch.labels)
 
 
 def test_augmented_cloud_fills_the_unit_box_and_camera_stays_in_front(data: Dataset) -> None:
-    batch = data.batch(torch.arange(16), 64, 0, FULL, rng())
+    batch = data.batch(torch.arange(16), 64, 0, FULL, Draws.of(0))
     extent = batch.cloud.amax(dim=1) - batch.cloud.amin(dim=1)
     assert torch.allclose(extent.amax(dim=1), torch.full((16,), 2.0), atol=1e-4)
     assert (batch.viewpoint[:, 2] < batch.cloud[..., 2].amin(dim=1)).all()
 
 
 def test_roll_is_a_rigid_motion_about_the_optical_axis(data: Dataset) -> None:
-    plain = data.batch(torch.arange(6), 96, 0, NONE, rng())
-    rolled = augment_batch(plain, AugmentConfig(roll=True), rng(1))
+    plain = data.batch(torch.arange(6), 96, 0, NONE, Draws.of(0))
+    rolled = augment_batch(plain, AugmentConfig(roll=True), Draws.of(1))
 
-    def gaps(batch: object) -> torch.Tensor:
-        positions, cloud, eye = batch.positions, batch.cloud, batch.viewpoint  # type: ignore[attr-defined]
-        everything = torch.cat([positions[:, :20], cloud[:, :20], eye[:, None]], dim=1).double()
+    def gaps(batch: Batch) -> torch.Tensor:
+        everything = torch.cat([batch.positions[:, :20], batch.cloud[:, :20], batch.viewpoint[:, None]], dim=1).double()
         distances = torch.cdist(everything, everything)
         return distances / distances.amax(dim=(1, 2), keepdim=True)
 
@@ -136,15 +129,15 @@ def test_roll_is_a_rigid_motion_about_the_optical_axis(data: Dataset) -> None:
 
 def test_padding_is_chosen_last_and_a_small_cloud_survives_any_hole() -> None:
     cloud = torch.arange(10.0)[None, :, None].repeat(1, 1, 3)
-    chosen = choose_points(cloud, torch.tensor([7]), 10, NONE, rng())
+    chosen = choose_points(cloud, torch.tensor([7]), 10, NONE, Draws.of(0))
     assert chosen[0, :, 0].tolist() == [0, 1, 2, 3, 4, 5, 6, 0, 1, 2]
     cloud = torch.arange(200.0)[None, :, None].repeat(1, 1, 3)
-    kept = choose_points(cloud, torch.tensor([200]), 200, AugmentConfig(keep_points=(0.5, 0.5)), rng())[0, :, 0]
+    kept = choose_points(cloud, torch.tensor([200]), 200, AugmentConfig(keep_points=(0.5, 0.5)), Draws.of(0))[0, :, 0]
     assert 70 < len(kept.unique()) < 130 and (kept[:70].diff() > 0).all(), "in order, and half of them dropped"
     assert kept.max() > 190, "anywhere, not at the end"
     cloud = torch.zeros(1, 40, 3)
     huge = AugmentConfig(hole_probability=1.0, hole_radius=1e6)
-    assert choose_points(cloud, torch.tensor([40]), 40, huge, rng()).shape == (1, 40, 3)
+    assert choose_points(cloud, torch.tensor([40]), 40, huge, Draws.of(0)).shape == (1, 40, 3)
 
 
 def test_domain_holds_every_segment_point_with_a_margin(data: Dataset) -> None:
@@ -178,28 +171,24 @@ def pair(folders: tuple[Path, Path]) -> tuple[Dataset, Dataset]:
 
 def batch_of(data: Dataset, probability: float, observation: torch.Tensor | None = None, seed: int = 0) -> Batch:
     augment = AugmentConfig(observations=probability, keep_points=(0.7, 1.0), jitter_std=0.003)
-    return data.batch(torch.arange(8), 48, 32, augment, rng(seed), observation)
-
-
-def assert_same(one: Batch, other: Batch) -> None:
-    for name in ("cloud", "viewpoint", "positions", "labels", "distances", "directions"):
-        assert torch.equal(getattr(one, name), getattr(other, name)), name
+    return data.batch(torch.arange(8), 48, 32, augment, Draws.of(seed), observation)
 
 
 def test_a_batch_depends_on_its_generator_and_at_probability_0_on_no_further_one(pair: tuple[Dataset, Dataset]) -> None:
     plain, seen = pair
     assert (plain.further, seen.further) == (0, KINDS)
-    for seed in range(3):
-        assert_same(batch_of(seen, 0.0, seed=seed), batch_of(plain, 0.5, seed=seed))
-    assert_same(batch_of(seen, 1.0, FIRST), batch_of(plain, 1.0))
-    assert_same(batch_of(pair[1], 0.5, seed=4), batch_of(pair[1], 0.5, seed=4))
-    assert not torch.equal(batch_of(pair[1], 0.5, seed=4).cloud, batch_of(pair[1], 0.5, seed=5).cloud)
+    same = [(batch_of(seen, 0.0, seed=seed), batch_of(plain, 0.5, seed=seed)) for seed in range(3)]
+    same.append((batch_of(seen, 1.0, FIRST), batch_of(plain, 1.0)))
+    for one, other in (*same, (batch_of(seen, 0.5, seed=4), batch_of(seen, 0.5, seed=4))):
+        for name in ("cloud", "viewpoint", "positions", "labels", "distances", "directions"):
+            assert torch.equal(getattr(one, name), getattr(other, name)), name
+    assert not torch.equal(batch_of(seen, 0.5, seed=4).cloud, batch_of(seen, 0.5, seed=5).cloud)
 
 
 def test_further_ones_are_seen_as_often_as_asked_and_by_default_in_half_of_the_draws() -> None:
-    drawn = draw_observations(300, KINDS, 1.0, rng())
+    drawn = draw_observations(300, KINDS, 1.0, Draws.of(0))
     assert set(drawn.tolist()) == {1, 2, 3} and torch.bincount(drawn)[1:].min() > 70
-    counts = torch.bincount(draw_observations(3000, KINDS, AugmentConfig().observations, rng()))
+    counts = torch.bincount(draw_observations(3000, KINDS, AugmentConfig().observations, Draws.of(0)))
     assert abs(counts[0] / 3000 - 0.5) < 0.05 and counts[1:].min() > 400
 
 
@@ -207,7 +196,7 @@ def test_further_ones_are_seen_as_often_as_asked_and_by_default_in_half_of_the_d
 def test_queries_and_cloud_stay_in_one_frame(pair: tuple[Dataset, Dataset], number: int) -> None:
     """The box is normalized anew, so distances between queries, cloud and camera keep their ratios to the stored."""
     seen = read_all(pair[1])
-    found = pair[1].batch(torch.arange(8), 96, 0, AugmentConfig(), rng(), FIRST + number)
+    found = pair[1].batch(torch.arange(8), 96, 0, AugmentConfig(), Draws.of(0), FIRST + number)
     assert torch.allclose((found.cloud.amax(dim=1) - found.cloud.amin(dim=1)).amax(dim=1), torch.full((8,), 2.0))
     count = int(seen.seen_count[0, number - 1])
     stored = seen.seen[:8, number - 1, :count].float()
@@ -253,6 +242,5 @@ def test_held_out_scores_and_offsets_are_of_the_first_cloud(pair: tuple[Dataset,
 
 def test_an_autodecoder_sees_every_example_as_it_is(pair: tuple[Dataset, Dataset]) -> None:
     """Its codes are of examples, not of clouds."""
-    assert fit_config(PRESETS["paper-autodecoder"], pair[1]).augment.observations == 0.0
-    assert fit_config(PRESETS["paper"], pair[1]).augment.observations == 0.5
-    assert fit_config(PRESETS["paper"], pair[0]).augment.observations == 0.0
+    for preset, data, share in (("paper-autodecoder", pair[1], 0.0), ("paper", pair[1], 0.5), ("paper", pair[0], 0.0)):
+        assert fit_config(PRESETS[preset], data).augment.observations == share

@@ -16,6 +16,7 @@ from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.metrics import format_score, grid_confusion, intersection_over_union, truth_grid
 from mereo.geometry.solids import Solids
+from mereo.geometry.transforms import rigid
 from mereo.models.weights import save_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import AssetUnavailable
@@ -51,12 +52,10 @@ def oracle(mesh: SegmentedMesh, shift: tuple[float, float, float] = (0.0, 0.0, 0
 
 def test_the_truth_scores_one_and_a_shifted_answer_its_closed_form() -> None:
     """A shift by 0.25 along x, on the joint box [0, 2]: what is predicted outside the true box is not counted."""
-    scores = grid_scores(oracle(two_cuboids()), cloud(), two_cuboids(), cells=40)
-    assert (scores.iou, scores.miou) == (1.0, 1.0)
-    scores = grid_scores(oracle(two_cuboids(), (0.25, 0.0, 0.0)), cloud(), two_cuboids(), cells=40)
-    np.testing.assert_allclose(scores.per_segment, [0.6, 0.75])
-    assert scores.miou == pytest.approx(0.675)
-    assert scores.iou == pytest.approx(1.75 / 2)
+    for shift, per_segment, iou in ((0.0, [1.0, 1.0], 1.0), (0.25, [0.6, 0.75], 1.75 / 2)):
+        scores = grid_scores(oracle(two_cuboids(), (shift, 0.0, 0.0)), cloud(), two_cuboids(), cells=40)
+        np.testing.assert_allclose(scores.per_segment, per_segment)
+        assert (scores.iou, scores.miou) == (pytest.approx(iou), pytest.approx(np.mean(per_segment)))
 
 
 def test_scores_have_three_decimals_and_the_table_agrees_with_the_matrix() -> None:
@@ -87,12 +86,12 @@ def test_truth_grid_against_point_by_point() -> None:
 
 def test_one_confusion_matrix_over_the_whole_set() -> None:
     """Not the mean over examples: a hard case weighs by its points."""
-    mesh = two_cuboids()
+    mesh, truth = two_cuboids(), truth_grid(two_cuboids(), 20)
     models = [oracle(mesh), oracle(mesh, (0.25, 0.0, 0.0))]
-    alone = [grid_confusion(truth_grid(mesh, 20), predict_grid(m, cloud(), truth_grid(mesh, 20)), 2) for m in models]
+    alone = [grid_confusion(truth, predict_grid(model, cloud(), truth), 2) for model in models]
 
     def case(index: int) -> TestCase:
-        shifted = mesh.transformed(np.array([[1, 0, 0, 0.25 * index], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]))
+        shifted = mesh.transformed(rigid(np.eye(3), np.array([0.25 * index, 0.0, 0.0])))
         return TestCase(str(index), cloud(), truth_grid(shifted, 20))
 
     # truth moved by 0.25 against the fixed oracle is the mirror image of the oracle moved

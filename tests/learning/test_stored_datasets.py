@@ -74,9 +74,7 @@ def test_a_storage_gets_the_bytes_that_a_folder_gets(whole: Path, empty: Place) 
     one, other = Dataset.load(empty), Dataset.load(whole)
     assert one.manifest == other.manifest and torch.equal(one.template, other.template)
     first, second = (vars(read_all(data)) for data in (one, other))
-    assert first.keys() == second.keys()
-    for name, values in first.items():
-        torch.testing.assert_close(values, second[name], rtol=0, atol=0, equal_nan=True, msg=name)
+    torch.testing.assert_close(first, second, rtol=0, atol=0, equal_nan=True)
 
 
 def test_machines_share_a_place(whole: Path, empty: Place) -> None:
@@ -91,8 +89,6 @@ def test_another_dataset_or_other_objects_are_left_alone(stored: Place) -> None:
     before = contents(stored)
     with pytest.raises(FileExistsError, match="holds a dataset; continue it with resume, or choose another output"):
         make(stored)
-    with pytest.raises(ValueError, match="was made with seed = 3, not 4; resuming needs equal settings"):
-        make(stored, seed=4, resume=True)
     above = stored.parent if isinstance(stored, Path) else ObjectPath("memory://datasets")
     with pytest.raises(FileExistsError, match=r"is not empty and holds no manifest.json; choose another output"):
         make(above)
@@ -114,12 +110,6 @@ def test_a_lost_network_is_no_damage(whole: Path, stored: Place, monkeypatch: py
             with pytest.raises(StorageError, match="shard-00000.safetensors cannot be read: the storage cannot be"):
                 fails()
     assert contents(stored) == contents(whole)
-
-
-def test_more_examples_than_the_disk_has_room_for_are_refused_at_once(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"examples=10000000000 needs .* GB and .* GB free: ask for fewer, or change"):
-        generate(TOY, tmp_path / "data", SMALL, examples=10**10, seed=3)
-    assert not (tmp_path / "data").exists()
 
 
 # --- changed files ----------------------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from folder_contents import contents
 from safetensors.numpy import load_file
 from toy_data import SMALL, make_small_datasets, small_shards
 from toy_scene import toy_scene
@@ -37,10 +38,6 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return folder / "plain", folder / "seen"
 
 
-def shards_of(directory: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in sorted(directory.glob("shard-*"))}
-
-
 def example(settings: GenerateConfig, index: int = 0) -> Example:
     return synthesize(TOY, settings, example_rng(SEED, index))
 
@@ -57,12 +54,9 @@ def test_all_are_those_that_differ_from_the_examples_own_sensor_and_an_unknown_o
         settings.__post_init__()
 
 
-# --- the same bits ----------------------------------------------------------------------------------------------------
-
-
 def test_state_first_cloud_and_queries_are_those_without_and_the_manifest_has_sensors(data: tuple[Path, Path]) -> None:
-    for name in shards_of(data[0]):
-        plain, seen = (load_file(directory / name) for directory in data)
+    for shard in data[0].glob("shard-*"):
+        plain, seen = (load_file(directory / shard.name) for directory in data)
         assert seen.keys() - plain.keys() == {"seen", "seen_count"}
         assert all(seen[key].tobytes() == value.tobytes() for key, value in plain.items())
     plain, seen = (json.loads((directory / "manifest.json").read_text())["settings"] for directory in data)
@@ -78,19 +72,13 @@ def test_an_observation_is_the_same_whichever_others_there_are_and_its_size_is_k
         assert size == example_bytes(settings, len(TOY.rest.segments))
 
 
-# --- datasets ---------------------------------------------------------------------------------------------------------
-
-
 def test_resuming_needs_the_same_observations(data: tuple[Path, Path]) -> None:
-    before = [shards_of(directory) for directory in data]
+    before = [contents(directory) for directory in data]
     for directory, right, wrong in zip(data, (SMALL, SEEN), (SEEN, SMALL), strict=True):
         generate(TOY, directory, right, examples=EXAMPLES, seed=SEED, resume=True)
         with pytest.raises(ValueError, match=r"was made with settings\.observations = \[.*resuming needs equal"):
             generate(TOY, directory, wrong, examples=EXAMPLES, seed=SEED, resume=True)
-    assert [shards_of(directory) for directory in data] == before
-
-
-# --- what they show ---------------------------------------------------------------------------------------------------
+    assert [contents(directory) for directory in data] == before
 
 
 def test_half_precision_moves_no_point_by_more_than_its_noise(data: tuple[Path, Path]) -> None:

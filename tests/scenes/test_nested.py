@@ -39,18 +39,14 @@ def radius(points: np.ndarray, part: tuple[tuple[float, float, float], float]) -
     return np.linalg.norm(points - part[0], axis=1)
 
 
-def draws(count: int, reach: float = 6.0, seed: int = 0) -> np.ndarray:
-    """Uniform points, clear of the surfaces by more than the balls' facets deviate."""
-    points = np.random.default_rng(seed).uniform(-reach, reach, size=(count, 3))
-    return points[(np.abs(radius(points, CORE) - CORE[1]) > 0.02) & (np.abs(radius(points, ORGAN) - ORGAN[1]) > 0.02)]
+def clear_of(points: np.ndarray, gap: float) -> np.ndarray:
+    """Which points are farther from both surfaces; facets deviate from balls by up to 0.01."""
+    return (np.abs(radius(points, CORE) - CORE[1]) > gap) & (np.abs(radius(points, ORGAN) - ORGAN[1]) > gap)
 
 
 def true_labels(points: np.ndarray) -> np.ndarray:
     """1 in the core, 2 in the rest of the organ."""
     return np.where(radius(points, CORE) < CORE[1], 1, np.where(radius(points, ORGAN) < ORGAN[1], 2, 0))
-
-
-# --- the declaration --------------------------------------------------------------------------------------------------
 
 
 def test_what_is_nested_in_a_nested_segment_is_nested_too_and_owns_its_shell() -> None:
@@ -73,19 +69,13 @@ def test_the_inner_segment_comes_first_and_both_exist(inner: str, outer: str, fa
         organ(((inner, outer),))
 
 
-# --- overlap ----------------------------------------------------------------------------------------------------------
-
-
-def test_declared_pairs_may_overlap_and_no_others() -> None:
+def test_declared_pairs_may_overlap_and_no_others_and_the_inner_segment_must_be_inside() -> None:
     assert overlaps(organ()) == overlaps(onion()) == ()
     (found,) = overlaps(organ(()))
     assert (found.small, found.large, found.nested) == ("core", "organ", False) and found.share > 0.99
     vein = SegmentedMesh((*organ().segments, box((-4, -1, -1), (-3, 1, 1), "vein")), organ().nested)
     (found,) = overlaps(vein)
     assert (found.small, found.large) == ("vein", "organ")
-
-
-def test_the_inner_segment_must_be_inside() -> None:
     half_out = SegmentedMesh(
         (box((4, -1, -1), (6, 1, 1), "core"), box((0, -5, -5), (5, 5, 5), "organ")), organ().nested
     )
@@ -96,11 +86,9 @@ def test_the_inner_segment_must_be_inside() -> None:
     assert found.nested and found.share == pytest.approx(0.86, abs=0.01)
 
 
-# --- distance ---------------------------------------------------------------------------------------------------------
-
-
 def test_distance_and_direction_lead_to_the_surface_of_what_the_owner_owns() -> None:
-    points, solids = draws(5000), Solids(organ())
+    points, solids = np.random.default_rng(0).uniform(-6, 6, size=(5000, 3)), Solids(organ())
+    points = points[clear_of(points, 0.02)]
     labels = solids.label(points)
     distance, direction = signed_distance_and_direction(solids, points, labels)
     to_core, to_organ = radius(points, CORE) - CORE[1], radius(points, ORGAN) - ORGAN[1]
@@ -126,9 +114,6 @@ def test_the_template_has_the_signed_distance_to_what_each_segment_owns() -> Non
     np.testing.assert_allclose(grid[1], np.maximum(to_organ, -to_core), atol=0.03)
 
 
-# --- samplers ---------------------------------------------------------------------------------------------------------
-
-
 def test_the_outside_of_a_nested_segment_is_the_segment_around_it() -> None:
     solids, keep = Solids(organ()), 200
     samples = sort_sample(solids, keep, 2 * keep, np.random.default_rng(0))
@@ -146,12 +131,9 @@ def test_every_sampler_gives_points_to_their_owner(sampler: str) -> None:
     settings = SamplingConfig(sampler=sampler, per_segment=128, uniform_fraction=1.0)  # type: ignore[arg-type]
     samples = sample_queries(Solids(organ()), settings, np.random.default_rng(2))
     assert len(samples.points) == settings.total(2)
-    clear = np.all([np.abs(radius(samples.points, part) - part[1]) > 0.02 for part in (CORE, ORGAN)], axis=0)
+    clear = clear_of(samples.points, 0.02)
     assert np.array_equal(samples.labels[clear], true_labels(samples.points[clear]))
     assert set(samples.labels.tolist()) == {0, 1, 2}
-
-
-# --- surfaces ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("nested", [(), (("core", "organ"),)])
@@ -169,8 +151,7 @@ def test_a_declared_outer_surface_leaves_out_the_wall_of_the_cavity(nested: tupl
     check_overlap(found.surfaces)
     inner, outer = found.surfaces.segments
     spheres = 1 if nested else 2  # that bound the organ's mesh
-    for segment, euler in ((inner, 2), (outer, 2 * spheres)):
-        assert len(segment.vertices) - len(segment.faces) // 2 == euler
+    assert [len(part.vertices) - len(part.faces) // 2 for part in (inner, outer)] == [2, 2 * spheres]
     volumes = found.surfaces.owned_volumes
     assert volumes[0] == pytest.approx(4 / 3 * np.pi * 0.45**3, rel=0.02)
     assert volumes.sum() == pytest.approx(4 / 3 * np.pi, rel=0.01)
@@ -178,14 +159,10 @@ def test_a_declared_outer_surface_leaves_out_the_wall_of_the_cavity(nested: tupl
     assert apart > 0.1 if nested else apart < 1e-5
 
 
-# --- a scene ----------------------------------------------------------------------------------------------------------
-
-
-def move_together(rng: np.random.Generator) -> tuple[Deformation, ...]:
-    return (Shear(*(rng.uniform(-1, 1, size=3) * [1.5, 0.2, 0.15])),) * 2
-
-
 def test_rest_coordinates_lie_in_the_owner_at_rest() -> None:
+    def move_together(rng: np.random.Generator) -> tuple[Deformation, ...]:
+        return (Shear(*(rng.uniform(-1, 1, size=3) * [1.5, 0.2, 0.15])),) * 2
+
     scene, settings = Scene("organ", organ(), move_together), GenerateConfig(sampling=SamplingConfig(per_segment=128))
     example, view = synthesize(scene, settings, example_rng(1, 0)), sample_view(scene, settings, example_rng(1, 0))
     queries, (center, half) = example.queries, rest_frame(scene.rest)
@@ -195,6 +172,6 @@ def test_rest_coordinates_lie_in_the_owner_at_rest() -> None:
     world = transform_points(view.T_world_camera, example.normalizer.invert(queries.positions))
     assert np.abs(view.deformations[0](rest[inside]) - world[inside]).max() < 1e-3
     # faces are flat before and after, the map between them is not: points beside a face may change sides
-    clear = inside & (np.abs(radius(rest, CORE) - CORE[1]) > 0.06) & (np.abs(radius(rest, ORGAN) - ORGAN[1]) > 0.06)
+    clear = inside & clear_of(rest, 0.06)
     assert np.array_equal(true_labels(rest[clear]), queries.labels[clear]) and clear.sum() > 150
     check_overlap(view.mesh, tolerance=0.02)

@@ -131,8 +131,9 @@ def test_attempts_that_the_scene_threw_away_have_no_sliders() -> None:
 
 def test_a_refused_value_is_said_and_an_allowed_one_taken() -> None:
     scene = scene_of(rejecting)
-    played = set_value(scene, random_state(scene, 1), slider(random_state(scene, 1), "one"), 0.99)
-    played = set_value(scene, played, slider(played, "other"), 0.6)
+    played = random_state(scene, 1)
+    for name, value in (("one", 0.99), ("other", 0.6)):
+        played = set_value(scene, played, slider(played, name), value)
     np.testing.assert_allclose(shift_of(played)[:2], [0.99, 0.6], atol=1e-8)
     with pytest.raises(Refused, match="the scene refuses this value of 'other'"):
         set_value(scene, played, slider(played, "other"), 0.4)
@@ -198,9 +199,6 @@ def test_a_choice_of_unequal_options_is_the_option_that_its_slider_shows() -> No
             assert shift_of(moved)[0] == parameters(moved)[0].value == wanted
 
 
-# --- names ------------------------------------------------------------------------------------------------------------
-
-
 def test_a_scene_names_its_draws_and_the_source_names_the_others() -> None:
     def sample(rng: np.random.Generator) -> tuple[Deformation, ...]:
         with part(rng, "arm"):
@@ -211,13 +209,8 @@ def test_a_scene_names_its_draws_and_the_source_names_the_others() -> None:
         return shifted(first, offset, rng.uniform(0.0, 1.0))
 
     found = parameters(random_state(scene_of(sample), 0))
-    assert [(f.group, f.name, f.unit) for f in found] == [
-        ("arm", "left bend", "°"),
-        ("arm", "swing", "°"),
-        ("arm", "play", "°"),
-        ("whole", "offset", ""),
-        ("whole", "sample", ""),
-    ]
+    names = ["arm/left bend/°", "arm/swing/°", "arm/play/°", "whole/offset/", "whole/sample/"]
+    assert ["/".join((f.group, f.name, f.unit)) for f in found] == names
     assert found[0].high == pytest.approx(180.0)
 
 
@@ -262,9 +255,6 @@ def test_draws_keep_their_values_with_their_names() -> None:
         np.testing.assert_array_equal(shift_of(played), before)
 
 
-# --- draws in the order of the calls ----------------------------------------------------------------------------------
-
-
 def places(scene: Scene, played: Played) -> np.ndarray:
     return scene.deform(played.deformations).mesh.merged()[0]
 
@@ -276,11 +266,9 @@ def test_the_same_draws_give_the_same_state_and_sliders_that_move_it(name: str) 
     again = played_back(scene, 7, [call.shares for call in before.calls])
     np.testing.assert_array_equal(places(scene, again), places(scene, before))
     assert again.keys == before.keys and parameters(again) == parameters(before)
-    slider = parameters(again)[0]
-    middle = (slider.low + slider.high) / 2
-    np.testing.assert_array_equal(
-        places(scene, set_value(scene, again, slider, middle)), places(scene, set_value(scene, before, slider, middle))
-    )
+    first = parameters(again)[0]
+    moved = [set_value(scene, played, first, (first.low + first.high) / 2) for played in (again, before)]
+    np.testing.assert_array_equal(*(places(scene, played) for played in moved))
 
 
 def test_every_number_has_the_name_of_its_slider_and_those_of_one_are_counted() -> None:

@@ -82,7 +82,7 @@ def assert_in_view(scene: Scene, mesh: SegmentedMesh, rng: np.random.Generator) 
     assert seen[:, 2].min() > 0 and pixels.min() > 0 and pixels.max() < size
 
 
-def test_rest_pose_is_sound(scene: Scene) -> None:
+def test_rest_pose_is_sound_and_of_true_size_where_it_is_known(scene: Scene) -> None:
     scene.rest.check()
     check_overlap(scene.rest)
     assert not crowded(scene.rest, NOISE / 2)
@@ -91,6 +91,8 @@ def test_rest_pose_is_sound(scene: Scene) -> None:
     # a sheet is flat at rest: its thickness, the shortest side, says nothing about its size
     shortest = extent[:2].min() / 2 if scene.name == "sheet" else extent.min()
     assert 5.0 < shortest < 30.0
+    length_m = None if scene.unit_m is None else pytest.approx(extent.max() * scene.unit_m, rel=0.02)
+    assert LENGTHS_M.get(scene.name) == length_m
 
 
 def test_deformations_can_be_undone(scene: Scene, states: list[State]) -> None:
@@ -149,15 +151,6 @@ def test_random_states_are_sound_apart_smooth_and_in_view(
             assert render_depth(mesh.transformed(T_camera_world), camera).valid.sum() >= MIN_POINTS
 
 
-def test_true_size_where_it_is_known(scene: Scene) -> None:
-    if scene.name not in LENGTHS_M:
-        assert scene.unit_m is None
-        return
-    assert scene.unit_m is not None
-    low, high = scene.rest.bounds
-    assert (high - low).max() * scene.unit_m == pytest.approx(LENGTHS_M[scene.name], rel=0.02)
-
-
 def test_workspace_is_a_cone_of_the_stated_aperture_and_distance() -> None:
     rng = np.random.default_rng(6)
     workspace, target = Workspace(axis=(0.0, 1.0, 0.0)), np.array([3.0, -2.0, 1.0])
@@ -182,14 +175,8 @@ def test_whole_sphere_with_any_roll_prefers_no_direction() -> None:
     for column in range(3):  # x, y and z axes of the camera are each uniform on the sphere
         assert np.abs(poses[:, :3, column].mean(axis=0)).max() < 0.06
     assert np.allclose(np.linalg.det(poses[:, :3, :3]), 1.0)
-
-
-def test_look_at_straight_along_up_is_still_a_rotation() -> None:
     pose = look_at(np.array([0.0, 0.0, 10.0]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
-    assert is_rigid(pose) and np.allclose(pose[:3, 2], [0, 0, -1])
-
-
-# --- sliders ----------------------------------------------------------------------------------------------------------
+    assert is_rigid(pose) and np.allclose(pose[:3, 2], [0, 0, -1]), "straight along up"
 
 
 @pytest.mark.parametrize("seed", [0, 3])
@@ -197,15 +184,12 @@ def test_every_number_that_a_scene_draws_has_a_name_of_its_own(scene: Scene, see
     played = random_state(scene, seed)
     assert [call.key for call in played.calls if not call.name.name] == [], "the scene does not say what it draws"
     found = parameters(played)
-    names = [(f.group, f.name, f.unit) for f in found]
-    assert found and len({(group, name) for group, name, _ in names}) == len(names)
-    assert all(re.fullmatch(r"[a-z0-9][\w ,/.]*[\w]", name) and "_" not in name for _, name, _ in names), names
+    names = [(f.group, f.name) for f in found]
+    assert found and len(set(names)) == len(names)
+    assert all(re.fullmatch(r"[a-z0-9][\w ,/.]*[\w]", name) and "_" not in name for _, name in names), names
     # the same sliders keep their names when one of them moves
     moved = {f.key: f.name for f in parameters(set_value(scene, played, found[0], found[0].value))}
     assert moved == {f.key: f.name for f in found}
-
-
-# --- shared arrays ----------------------------------------------------------------------------------------------------
 
 
 def test_nobody_changes_the_rest_pose_or_a_state_in_place(scene: Scene) -> None:

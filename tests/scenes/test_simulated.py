@@ -24,11 +24,6 @@ from mereo.synthesis.config import GenerateConfig, SamplingConfig
 from mereo_learning import shards
 from mereo_learning.scoring import EvaluationConfig, evaluate
 
-
-def inner_points(count: int = 500, margin: float = 0.0) -> np.ndarray:
-    return np.random.default_rng(1).uniform(margin, np.array(SIZE) - margin, size=(count, 3))
-
-
 # --- tetrahedra -------------------------------------------------------------------------------------------------------
 
 
@@ -59,7 +54,8 @@ def test_tetrahedra_have_the_jacobian_of_their_volumes() -> None:
 
 def test_inverse_is_exact_inside_and_found_outside() -> None:
     deformation = TetrahedralMap(lattice(), states()[-1])
-    points = np.concatenate([inner_points(), inner_points() * [1, 1, 0] + [0, 0, -0.1]])
+    inner = np.random.default_rng(1).uniform(0.0, SIZE, size=(500, 3))
+    points = np.concatenate([inner, inner * [1, 1, 0] + [0, 0, -0.1]])
     # a useless guess: where the point lies inside a tetrahedron none is needed
     guess = np.concatenate([np.full((500, 3), 40.0), points[500:] + 0.05])
     found, converged = invert(deformation, deformation(points), guess)
@@ -69,12 +65,13 @@ def test_inverse_is_exact_inside_and_found_outside() -> None:
 
 def test_bad_tetrahedra_are_named() -> None:
     nodes, elements = np.eye(4, 3), np.array([[0, 1, 2, 3]])
-    with pytest.raises(ValueError, match="tetrahedron 1 has no volume at rest; it must have some"):
-        Tetrahedra(nodes, np.array([[0, 1, 2, 3], [0, 1, 2, 2]]))
-    with pytest.raises(ValueError, match="refers to node 4, but there are 4; indices run from 0: subtract 1"):
-        Tetrahedra(nodes, elements + 1)
-    with pytest.raises(ValueError, match="rest node 2 is not finite"):
-        Tetrahedra(np.where(np.arange(4)[:, None] == 2, np.nan, nodes), elements)
+    for bad, of_them, message in (
+        (nodes, np.array([[0, 1, 2, 3], [0, 1, 2, 2]]), "tetrahedron 1 has no volume at rest; it must have some"),
+        (nodes, elements + 1, "refers to node 4, but there are 4; indices run from 0: subtract 1"),
+        (np.where(np.arange(4)[:, None] == 2, np.nan, nodes), elements, "rest node 2 is not finite"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Tetrahedra(bad, of_them)
 
 
 # --- surfaces ---------------------------------------------------------------------------------------------------------
@@ -107,7 +104,9 @@ def test_the_interior_estimate_is_near_the_solid_that_made_the_surface() -> None
 # --- training and testing ---------------------------------------------------------------------------------------------
 
 
-def test_only_test_seeds_take_held_out_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_test_seeds_take_held_out_states_which_are_of_the_same_object(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(shards, "rest_distances", lambda rest: np.zeros((4, 2, 2, 2), dtype=np.float16))  # slow
 
     def forbidden(rng: np.random.Generator) -> tuple:
@@ -123,10 +122,6 @@ def test_only_test_seeds_take_held_out_states(tmp_path: Path, monkeypatch: pytes
     for scene, seed in ((only_test, 0), (only_training, TEST_SEED_START)):
         with pytest.raises(AssertionError, match="wrong states"):
             generate(scene, tmp_path / f"{seed}", settings, examples=1, seed=seed, test=seed > 0)
-
-
-def test_held_out_states_are_of_the_same_object() -> None:
-    toy = toy_scene()
     with pytest.raises(ValueError, match="held-out states left, right; they must be one object"):
         replace(toy, held_out=Scene("b", boxes(), toy.sample_deformations))
 
@@ -210,6 +205,7 @@ def test_a_mesh_of_states_that_is_missing_or_misspelt_is_said_with_its_line(nump
         ("{positions: run.npy, nodes: rest.obj}", "the key `nodes` means nothing here: known are mesh"),
         ("{mesh: rest.obj}", "`positions` is missing; it must be given"),
         ("[run.npy]", "`states` is .*; it must be a path, or a block of the keys positions and mesh: correct it"),
+        ("s.npz\ndeformations: soft", "both states and deformations; recorded states say how the object moves"),
     ):
         numpy_bar.write_text(text.replace("{positions: run.npy, mesh: rest.obj}", wrong))
         with pytest.raises(ValueError, match=message):
@@ -227,9 +223,3 @@ def test_what_a_collection_names_is_read_and_kept(tmp_path: Path) -> None:
     assert files_of(path)[-3:] == [tmp_path / name for name in ("run.pvd", *names[:2])]
     assert files_of_states(tmp_path / "run.xdmf") == [tmp_path / "run.xdmf", tmp_path / "run.h5"]
     assert files_of_states(tmp_path / "*.vtu") == [tmp_path / "1.vtu"]
-
-
-def test_states_and_deformations_exclude_each_other(tmp_path: Path) -> None:
-    path = write_bar(tmp_path, "states: states.npz\ndeformations:\n  - {type: lattice}\n")
-    with pytest.raises(ValueError, match="both states and deformations; recorded states say how the object moves"):
-        load_scene(path)

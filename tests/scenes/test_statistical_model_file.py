@@ -50,6 +50,9 @@ def test_what_fewer_modes_leave_out_is_residue(rope: StatisticalModel) -> None:
     assert few.count == 5 and with_fewer_modes(rope, 1000) is rope
     lost = (rope.modes[..., 5:].astype(np.float64) ** 2).sum() / len(rope.mean)
     assert few.residue**2 == pytest.approx(rope.residue**2 + lost)
+    for count in (0, 1, rope.count // 2, rope.count):
+        assert rope.residues[count] == pytest.approx(with_fewer_modes(rope, count).residue, rel=1e-6)
+    assert (np.diff(rope.residues) < 0).all() and (np.diff(rope.explained) > 0).all()
 
 
 @pytest.mark.parametrize("spare", [0, 40_000, 10**9])
@@ -63,27 +66,15 @@ def test_as_many_modes_as_fit(rope: StatisticalModel, spare: int) -> None:
     assert most == rope.count or size(with_fewer_modes(rope, most + 1)) > limit
 
 
-def test_another_file_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "m.safetensors").write_bytes(b"nothing")
-    with pytest.raises(ValueError, match=r"m.safetensors is no statistical model of mereo \(.*\); delete it and run"):
-        load_statistical_model(tmp_path / "m.safetensors")
-
-
-def test_an_object_that_does_not_deform_has_no_modes(tmp_path: Path) -> None:
+def test_an_object_that_does_not_deform_has_no_modes_and_another_file_is_refused(tmp_path: Path) -> None:
     still = replace(load_scene("rope"), sample_deformations=lambda _: (Identity(),) * 9)
     save_statistical_model(scene_model(still, 20), tmp_path / "m.safetensors")
     read = load_statistical_model(tmp_path / "m.safetensors")
     assert read.count == 0 and read.residue < 1e-5
     np.testing.assert_allclose(read.material(np.zeros(0)), read.rest_points, atol=1e-4)
-
-
-# --- how many modes are needed ----------------------------------------------------------------------------------------
-
-
-def test_the_residue_of_fewer_modes_is_that_of_the_model_without_the_others(rope: StatisticalModel) -> None:
-    for count in (0, 1, rope.count // 2, rope.count):
-        assert rope.residues[count] == pytest.approx(with_fewer_modes(rope, count).residue, rel=1e-6)
-    assert (np.diff(rope.residues) < 0).all() and (np.diff(rope.explained) > 0).all()
+    (tmp_path / "m.safetensors").write_bytes(b"nothing")
+    with pytest.raises(ValueError, match=r"m.safetensors is no statistical model of mereo \(.*\); delete it and run"):
+        load_statistical_model(tmp_path / "m.safetensors")
 
 
 def test_the_number_of_modes_needed_is_the_smallest_that_is_enough(rope: StatisticalModel) -> None:
@@ -92,16 +83,13 @@ def test_the_number_of_modes_needed_is_the_smallest_that_is_enough(rope: Statist
     assert rope.modes_for(np.inf) == 0 and rope.modes_for(rope.residue / 2) is None
 
 
-def test_the_command_says_how_many(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_says_how_many_also_of_weights(
+    rope: StatisticalModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert command_line.main(["scene", "modes", "rope", "--states", "100"]) == 0
     assert "modes leave" in capsys.readouterr().out
     with pytest.raises(ValueError, match="fewer than 100 say little"):
         SceneModes("rope", states=5).run()
-
-
-def test_weights_show_the_model_in_them(
-    rope: StatisticalModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
     network = replace(untrained(rope.rest.names), provenance={"scene": "rope"})
     save_model(replace(network, statistical_model=rope), tmp_path / "with.safetensors")
     SceneModes(str(tmp_path / "with.safetensors"), states=100).run()

@@ -5,7 +5,7 @@ import os
 import re
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -95,7 +95,7 @@ def test_tensors_are_as_documented_and_a_paper_size_dataset_fits_in_2_5_gigabyte
         "rest": ("float16", (4, queries, 3)),
     }
     assert np.array_equal(np.isnan(shard["rest"]).any(axis=-1), shard["labels"] == 0)
-    stored = sum(value.nbytes for value in load_file(whole / "shard-00000.safetensors").values())
+    stored = sum(value.nbytes for value in shard.values())
     assert stored == 4 * example_bytes(SMALL, segments=4)
     file = (whole / "shard-00000.safetensors").stat().st_size
     assert file - stored < 2000  # the header, once per 64 examples
@@ -116,15 +116,6 @@ def test_manifest_tells_how_to_make_it_again_and_files_have_the_users_permission
     assert all(path.stat().st_mode & 0o777 == 0o666 & ~mask for path in whole.iterdir())
 
 
-def test_test_seeds_and_training_seeds_never_meet(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="seeds from 1000000 up are for testing and never for training"):
-        generate(TOY, tmp_path / "data", SMALL, examples=4, seed=TEST_SEED_START)
-    with pytest.raises(ValueError, match="a test set needs one from 1000000 up"):
-        generate(TOY, tmp_path / "data", SMALL, examples=4, seed=TEST_SEED_START - 1, test=True)
-    assert not (tmp_path / "data").exists()
-    generate(TOY, tmp_path / "data", SMALL, examples=1, seed=TEST_SEED_START, test=True)
-
-
 def test_resuming_names_the_setting_that_differs(whole: Path, tmp_path: Path) -> None:
     before = contents(whole)
     sampling = replace(SMALL.sampling, oversample=2)
@@ -143,43 +134,39 @@ def test_resuming_names_the_setting_that_differs(whole: Path, tmp_path: Path) ->
     assert contents(whole) == before
 
 
-def test_a_broken_manifest_cannot_be_resumed(tmp_path: Path) -> None:
-    for text in ("{", "[]"):
-        (tmp_path / "manifest.json").write_text(text)
-        with pytest.raises(ValueError, match="holds no settings; what it belongs to cannot be continued: choose"):
-            generate(TOY, tmp_path, SMALL, examples=4, seed=1, resume=True)
-
-
-@pytest.mark.parametrize("resume", [False, True])
-def test_an_existing_directory_is_left_alone(tmp_path: Path, resume: bool) -> None:
-    (tmp_path / "notes.txt").write_text("precious")
-    with pytest.raises(FileExistsError, match=r"is not empty and holds no manifest\.json; choose another output"):
-        generate(TOY, tmp_path, SMALL, examples=4, seed=1, resume=resume)
+@pytest.mark.parametrize("text", ["{", "[]"])
+def test_a_broken_manifest_cannot_be_resumed_nor_a_file_take_a_dataset(tmp_path: Path, text: str) -> None:
+    (tmp_path / "manifest.json").write_text(text)
+    with pytest.raises(ValueError, match="holds no settings; what it belongs to cannot be continued: choose"):
+        generate(TOY, tmp_path, SMALL, examples=4, seed=1, resume=True)
     with pytest.raises(FileExistsError, match="is a file; a dataset is a directory: choose another output"):
-        generate(TOY, tmp_path / "notes.txt", SMALL, examples=4, seed=1, resume=resume)
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+        generate(TOY, tmp_path / "manifest.json", SMALL, examples=4, seed=1)
+    assert [path.read_text() for path in tmp_path.iterdir()] == [text]
 
 
 @pytest.mark.parametrize(
-    "examples, seed, workers, shard, message",
+    "options, message",
     [
-        (0, 1, 1, (0, 1), "examples is 0; it must be at least 1"),
-        (4, -1, 1, (0, 1), "seed is -1; it must not be negative"),
-        (4, 1, -1, (0, 1), "the number of workers is -1; it must be at least 1"),
-        (4, 1, 1, (2, 2), "the shard is 2/2; i/n needs i from 0 to n - 1"),
+        ({"examples": 0}, "examples is 0; it must be at least 1"),
+        ({"seed": -1}, "seed is -1; it must not be negative"),
+        ({"workers": -1}, "the number of workers is -1; it must be at least 1"),
+        ({"shard": (2, 2)}, "the shard is 2/2; i/n needs i from 0 to n - 1"),
+        ({"seed": TEST_SEED_START}, "seeds from 1000000 up are for testing and never for training"),
+        ({"seed": TEST_SEED_START - 1, "test": True}, "a test set needs one from 1000000 up"),
+        ({"examples": 10**10}, r"examples=10000000000 needs .* GB and .* GB free: ask for fewer, or change"),
     ],
 )
-def test_wrong_numbers_are_named(
-    tmp_path: Path, examples: int, seed: int, workers: int, shard: tuple[int, int], message: str
+def test_wrong_numbers_are_named_before_anything_is_written(
+    tmp_path: Path, options: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
-        generate(TOY, tmp_path / "data", SMALL, examples=examples, seed=seed, workers=workers, shard=shard)
+        generate(TOY, tmp_path / "data", SMALL, **{"examples": 4, "seed": 1} | options)
     assert not (tmp_path / "data").exists()
 
 
 def made(scene: Path, output: Path, workers: int = 1, examples: int = 2, resume: bool = False) -> dict[str, bytes]:
     generate(str(scene), output, SMALL, examples=examples, seed=0, workers=workers, resume=resume)
-    return {file.name: file.read_bytes() for file in output.iterdir()}
+    return contents(output)
 
 
 def test_an_edited_scene_is_not_resumed_but_an_edited_comment_is(tmp_path: Path) -> None:
@@ -212,14 +199,8 @@ NARROW = Workspace(axis=(0.0, 1.0, 0.0), aperture_rad=0.5)
 ALL_AROUND = Workspace(axis=(1.0, 0.0, 0.0), aperture_rad=WHOLE_SPHERE_RAD, any_roll=True, distance=(90.0, 95.0))
 
 
-def parsed(text: str) -> training.Generate | training.Evaluate:
-    command = command_line.parse(text.split())
-    assert isinstance(command, training.Generate | training.Evaluate)
-    return command
-
-
 def generate_options(text: str) -> GenerateConfig:
-    command = parsed(f"generate rope --examples 7 --output out {text}")
+    command = command_line.parse(f"generate rope --examples 7 --output out {text}".split())
     assert isinstance(command, training.Generate)
     return command.settings
 
@@ -228,7 +209,7 @@ def generate_options(text: str) -> GenerateConfig:
 @pytest.mark.parametrize("form", ["--sensor {}", "--sensor={}"])
 def test_an_option_chooses_a_sensor(name: Sensor, form: str) -> None:
     assert generate_options(form.format(name)) == GenerateConfig(sensor=SENSORS[name])
-    command = parsed(f"evaluate rope --output out {form.format(name)}")
+    command = command_line.parse(f"evaluate rope --output out {form.format(name)}".split())
     assert isinstance(command, training.Evaluate) and command.terms == SENSORS[name]
     assert SENSORS[name].on == (name != "paper")
 
@@ -245,36 +226,33 @@ def test_terms_are_added_to_a_sensor_and_all_are_off_by_default() -> None:
 
 
 @pytest.mark.parametrize(
-    "options, sentences",
+    "options, sentence",
     [
-        ("generate rope --examples 7 --sensor lidar", ("invalid choice 'lidar'", "'time-of-flight'")),
-        ("evaluate rope --workspace dome", ("invalid choice 'dome' for argument '--workspace'",)),
-        (
-            "generate rope --examples 1 --sensor.flying 2",
-            ("mereo: error: sensor.flying is 2.0; it must be from 0 to 1: give for example 0.0\n",),
-        ),
-        ("evaluate bunny --scans --sensor time-of-flight", ("are real and take no simulated camera: leave out --sen",)),
-        ("evaluate bunny --scans --workspace cone", ("--noise-std and --workspace",)),
+        ("generate rope --examples 7 --sensor lidar", "invalid choice 'lidar'.*'time-of-flight'"),
+        ("evaluate rope --workspace dome", "invalid choice 'dome' for argument '--workspace'"),
+        ("generate rope --examples 1 --sensor.flying 2", "error: sensor.flying is 2.0; it must be from 0 to 1: give"),
+        ("evaluate bunny --scans --sensor time-of-flight", "are real and take no simulated camera: leave out --sen"),
+        ("evaluate bunny --scans --workspace cone", "--noise-std and --workspace"),
     ],
 )
 def test_unknown_and_contradictory_options_are_refused_before_anything_is_written(
-    options: str, sentences: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    options: str, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     try:
         code = command_line.main([*options.split(), "--output", str(tmp_path / "out")])
     except SystemExit as leaving:
         code = leaving.code
     printed = capsys.readouterr().err
-    assert code == 2 and all(sentence in printed for sentence in sentences), printed
+    assert code == 2 and re.search(sentence, printed, re.DOTALL), printed
     assert not list(tmp_path.iterdir())
 
 
 def test_a_scene_has_its_own_workspace_a_cone_and_the_sphere() -> None:
-    scene = replace(toy_scene(), workspace=NARROW)
+    scene = replace(TOY, workspace=NARROW)
     assert scene.workspace_named("own") is scene.workspace_named("cone") is NARROW
     assert scene.workspace_named("sphere") is not NARROW
     assert asdict(scene.workspace_named("sphere")) == asdict(NARROW) | {"aperture_rad": 2 * np.pi, "any_roll": True}
-    scene = replace(toy_scene(), workspace=ALL_AROUND)
+    scene = replace(TOY, workspace=ALL_AROUND)
     assert scene.workspace_named("own") is scene.workspace_named("sphere") is ALL_AROUND
     expected = asdict(ALL_AROUND) | {"aperture_rad": PAPER_APERTURE_RAD, "any_roll": False}
     assert asdict(scene.workspace_named("cone")) == expected
@@ -308,20 +286,14 @@ def test_evaluation_looks_through_the_sensor_from_the_workspace_and_says_so(
 
 
 SETTINGS = GenerateConfig(sampling=SamplingConfig(per_segment=128))
-SCENE = toy_scene()
-
-
-def example_and_view(index: int, settings: GenerateConfig = SETTINGS) -> tuple[Example, View]:
-    """An example and the view it was made from: the view is drawn first, from the same generator."""
-    return synthesize(SCENE, settings, example_rng(1, index)), sample_view(SCENE, settings, example_rng(1, index))
+Case = tuple[Example, View]
 
 
 @pytest.fixture(scope="module", params=range(3))
-def case(request: pytest.FixtureRequest) -> tuple[Example, View]:
-    return example_and_view(request.param)
-
-
-Case = tuple[Example, View]
+def case(request: pytest.FixtureRequest) -> Case:
+    """An example and the view it was made from: the view is drawn first, from the same generator."""
+    example, view = (make(TOY, SETTINGS, example_rng(1, request.param)) for make in (synthesize, sample_view))
+    return example, view  # type: ignore[return-value]
 
 
 def test_the_cloud_is_the_depth_image_unprojected_and_normalized(case: Case) -> None:
@@ -331,9 +303,10 @@ def test_the_cloud_is_the_depth_image_unprojected_and_normalized(case: Case) -> 
     gaps = np.linalg.norm(kept[:, None] - seen[None], axis=-1)
     assert gaps.min(axis=1).max() < 1e-6
     assert len(np.unique(gaps.argmin(axis=1))) == len(kept) == min(len(seen), SETTINGS.points)
-    low, high = example.normalizer.apply(seen).min(axis=0), example.normalizer.apply(seen).max(axis=0)
+    box = example.normalizer.apply(seen)
+    low, high = box.min(axis=0), box.max(axis=0)
     assert np.isclose((high - low).max(), 2) and np.allclose(low + high, 0)
-    distance = Solids(view.mesh).nearest(view.depth.to_points().points).distance
+    distance = Solids(view.mesh).nearest(seen).distance
     # noise is along the ray: never farther from the surface than that, 0.1 in standard deviation
     assert distance.max() < 0.6 and 0.02 < distance.mean() < 0.1
 
@@ -347,7 +320,7 @@ def test_labels_distances_and_directions_are_those_of_the_deformed_segments(case
     assert np.array_equal(queries.distances < 0, queries.labels > 0)
     assert len(queries.labels) == SETTINGS.sampling.total(4)
     foot = queries.positions + np.abs(queries.distances)[:, None] * queries.directions
-    assert Solids(view.mesh).nearest(example.normalizer.invert(foot)).distance.max() < 1e-6
+    assert solids.nearest(example.normalizer.invert(foot)).distance.max() < 1e-6
     assert np.allclose(np.linalg.norm(queries.directions, axis=1), 1)
 
 
@@ -355,7 +328,7 @@ def test_rest_coordinates_lead_back_to_the_query_and_lie_in_the_same_segment_at_
     """The theorem: deform(rest) is the query's place in the scene; outside there is no rest."""
     example, view = case
     queries = example.queries
-    low, high = SCENE.rest.bounds
+    low, high = TOY.rest.bounds
     rest = queries.rest * (high - low).max() / 2 + (low + high) / 2
     world = transform_points(view.T_world_camera, example.normalizer.invert(queries.positions))
     assert np.array_equal(np.isnan(queries.rest).any(axis=1), queries.labels == 0)
@@ -364,7 +337,7 @@ def test_rest_coordinates_lead_back_to_the_query_and_lie_in_the_same_segment_at_
         assert members.sum() >= 64
         assert np.abs(deformation(rest[members]) - world[members]).max() < 1e-3
         assert (np.abs(queries.rest[members]) <= 1 + 1e-4).all()
-    inside, solids = queries.labels > 0, Solids(SCENE.rest)
+    inside, solids = queries.labels > 0, Solids(TOY.rest)
     rest = rest[inside]
     # faces are flat before and after, the map between them is not: only points beside a face may change sides
     clear = solids.nearest(rest).distance > 0.1

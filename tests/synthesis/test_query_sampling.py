@@ -104,7 +104,7 @@ def test_batch_size_changes_no_bit_and_the_generator_advances_alike_whatever_is_
         np.testing.assert_array_equal(usual.points, other.points)
     rngs = [np.random.default_rng(3) for _ in range(2)]
     for rng, draw in zip(rngs, (20, 200), strict=True):
-        sort_sample(shapes()["balls"], 20, draw, rng)
+        sort_sample(shape, 20, draw, rng)
     assert rngs[0].random() == rngs[1].random()
 
 
@@ -135,8 +135,7 @@ def test_queries_of_an_example(sampler: str) -> None:
     low, high = joint_box(shape)
     np.testing.assert_array_equal([low, high], [[-1, -1, -1], [3.05, 1.75, 1]])
     unit = (samples.points[64 * 3 :] - low) / (high - low)
-    assert unit.min() > 0
-    assert unit.max() < 1
+    assert 0 < unit.min() < unit.max() < 1
     assert np.abs(unit.mean(axis=0) - 0.5).max() < 4 * np.sqrt(1 / 12 / 96)
 
 
@@ -151,35 +150,33 @@ def test_settings_reach_the_sampler_and_uniform_points_are_the_papers_share_of_a
     np.testing.assert_array_equal(queries.points, direct.points)
 
 
-@pytest.mark.parametrize(
-    "change, message",
-    [
-        ({"per_segment": 7}, "per_segment is 7; half the points go inside and half outside: pass an even number"),
-        ({"box_margin": 0.0}, "box_margin is 0.0; it must be greater than 0: give for example 0.5"),
-    ],
-)
-def test_bad_settings(change: dict[str, float], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        sample_queries(shapes()["balls"], replace(SamplingConfig(), **change), np.random.default_rng(0))
+def test_bad_settings() -> None:
+    with pytest.raises(ValueError, match="per_segment is 7; half the points go inside and half outside: pass an even"):
+        replace(SamplingConfig(), per_segment=7)
+    with pytest.raises(ValueError, match=r"box_margin is 0.0; it must be greater than 0: give for example 0.5"):
+        replace(SamplingConfig(), box_margin=0.0)
     with pytest.raises(ValueError, match="keep is 9 and draw is 8; .* pass keep <= draw"):
         sort_sample(shapes()["balls"], 9, 8, np.random.default_rng(0))
 
 
-def test_segments_that_are_never_hit_or_never_missed(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert query_sampling.MAX_DRAWS == 2_000_000
+@pytest.mark.parametrize(
+    ("radii", "message"),
+    [
+        (
+            (3.0, 1.0),
+            "segment 1 has 0 of 30,000 draws inside it; 128 are needed: check that it is closed and no earlier segment "
+            "covers it, or split it into shorter parts",
+        ),
+        (
+            (1.0, 3.0),
+            "segment 0 has 0 of 30,000 draws in the empty space around it; 128 are needed: widen box_margin, "
+            "or use nested-sort-sample for a segment enclosed by others",
+        ),
+    ],
+)
+def test_segments_that_are_never_hit_or_never_missed(
+    radii: tuple[float, float], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(query_sampling, "MAX_DRAWS", 30_000)
-    covered = Balls(((0, 0, 0), 3.0), ((0, 0, 0), 1.0))
-    with pytest.raises(ValueError) as caught:
-        sort_sample(covered, 128, 128, np.random.default_rng(0))
-    assert str(caught.value) == (
-        "segment 1 has 0 of 30,000 draws inside it; 128 are needed: check that it is closed and no earlier segment "
-        "covers it, or split it into shorter parts"
-    )
-    monkeypatch.setattr(query_sampling, "MAX_DRAWS", 30_000)
-    enclosed = Balls(((0, 0, 0), 1.0), ((0, 0, 0), 3.0))
-    with pytest.raises(ValueError) as caught:
-        sort_sample(enclosed, 128, 128, np.random.default_rng(0))
-    assert str(caught.value) == (
-        "segment 0 has 0 of 30,000 draws in the empty space around it; 128 are needed: widen box_margin, "
-        "or use nested-sort-sample for a segment enclosed by others"
-    )
+    with pytest.raises(ValueError, match=f"^{message}$"):
+        sort_sample(Balls(*(((0, 0, 0), radius) for radius in radii)), 128, 128, np.random.default_rng(0))
