@@ -106,16 +106,14 @@ def spacing(points: Float[np.ndarray, "n 3"]) -> float:
 # training.
 
 
-def farthest_point_order(
-    points: Real[np.ndarray, "n 3"], count: int, start: int | None = None
-) -> Int[np.ndarray, " m"]:
+def farthest_point_order(points: Real[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, " m"]:
     """Rows of ``points`` such that each next point is the farthest from all before it; ``m = min(n, count)`` of them.
 
     Deterministic: distances are computed in single precision with one fixed order of operations. Ties go to the point
     with the smaller x, then y, then z, so the sequence of points does not depend on the order in which they came.
     Points that coincide with an earlier one come last.
 
-    The rows are distinct; ``start`` is the first, by default the point farthest from the middle of the bounding box.
+    The rows are distinct; the first is the point farthest from the middle of the bounding box.
     """
     m = min(count, len(points))
     if m <= 0:
@@ -124,7 +122,7 @@ def farthest_point_order(
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     # about the middle, so that single precision is spent on the shape and not on where it is
     xyz = np.ascontiguousarray((points[rank] - middle).T, dtype=np.float32)
-    current = int(np.add.reduce(xyz * xyz, axis=0).argmax() if start is None else np.flatnonzero(rank == start)[0])
+    current = int(np.add.reduce(xyz * xyz, axis=0).argmax())
     # buffers are reused and every operation is one pass, because m passes over n points dominate
     order = np.empty(m, dtype=np.int64)
     difference, square = np.empty_like(xyz), np.empty_like(xyz[0])
