@@ -144,7 +144,7 @@ ROUGH_NEIGHBORS, CALM = 12, 0.1
 
 
 def roughness(points: Float[np.ndarray, "n 3"]) -> float:
-    """Noise along the lines of sight that a cloud has at most, in its unit: what its calmest part is rough by.
+    """Bound on the noise of a cloud along its lines of sight, in its unit: how rough its calmest part is.
 
     The standard deviation from a quadratic patch of each point and its neighbours, which edges and fine relief raise:
     the ``CALM`` quantile of it. Infinite for fewer points than say anything.
