@@ -62,8 +62,8 @@ def draw_scenes(path: str) -> None:
         scene = load_scene(name)
         views = [sample_view(scene, GenerateConfig(), example_rng(0, index)) for index in (0, 1)]
         meshes = [scene.rest, *(view.mesh.transformed(view.T_world_camera) for view in views)]
-        bounds = np.array([each.bounds for each in meshes])
-        viewpoint = Viewpoint.along(np.stack([bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)]), direction, up)
+        corners = np.concatenate([each.bounds for each in meshes])
+        viewpoint = Viewpoint.along(np.stack([corners.min(axis=0), corners.max(axis=0)]), direction, up)
         states = [shade(mesh, viewpoint, (SIDE, SIDE)) for mesh in meshes]
         overlaid = np.rint(np.mean(np.array(states, dtype=float), axis=0)).astype(np.uint8)
         images += [*states, overlaid, enlarge(depth_to_rgb(views[1].depth), SIDE)]

@@ -131,10 +131,7 @@ def smoothed(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         return points
     near = (angle <= radius) & _on_same_surface(distance, angle, neighbor)
     weight = near * np.exp(-0.5 * (angle / (WIDTH * radius)) ** 2)
-    terms = _quadratic(sight, neighbor, radius)
-    normal = np.einsum("nki,nk,nkj->nij", terms, weight, terms) + np.diag(RIDGE)
-    right = np.einsum("nki,nk->ni", terms, weight / distance[neighbor])
-    inverse = np.linalg.solve(normal, right[..., None])[:, 0, 0]
+    inverse = _fit_patches(_quadratic(sight, neighbor, radius), weight, weight / distance[neighbor], RIDGE)[:, 0]
     moved = np.where((near.sum(axis=1) >= FEWEST) & (inverse > 0), 1.0 / inverse, distance)
     return sight * moved[:, None]
 
@@ -158,9 +155,8 @@ def roughness(points: Float[np.ndarray, "n 3"]) -> float:
     angle, neighbor = cKDTree(sight).query(sight, k=count)
     radius = max(float(np.median(angle[:, -1])), np.finfo(float).tiny)
     terms, inverse = _quadratic(sight, neighbor, radius), 1.0 / distance[neighbor]
-    normal = np.einsum("nki,nkj->nij", terms, terms) + 1e-6 * np.eye(len(RIDGE))
-    patch = np.linalg.solve(normal, np.einsum("nki,nk->ni", terms, inverse)[..., None])
-    away = np.linalg.norm(inverse - (terms @ patch)[..., 0], axis=1) * distance**2
+    patch = _fit_patches(terms, np.ones_like(inverse), inverse, (1e-6,) * len(RIDGE))  # rows of points leave it open
+    away = np.linalg.norm(inverse - np.einsum("nki,ni->nk", terms, patch), axis=1) * distance**2
     return float(np.quantile(away, CALM)) / float(np.sqrt(free))
 
 
@@ -171,6 +167,18 @@ def _on_same_surface(
     step = np.abs(distance[neighbor] - distance[:, None])
     noise = NOISE * float(np.median(step[:, 1 : FEWEST + 1]))
     return step <= np.maximum(JUMP * angle * distance[:, None], noise)
+
+
+def _fit_patches(
+    terms: Float[np.ndarray, "n k 6"],
+    weight: Float[np.ndarray, "n k"],
+    weighted: Float[np.ndarray, "n k"],
+    ridge: tuple[float, ...],
+) -> Float[np.ndarray, "n 6"]:
+    """Coefficients of each point's patch by least squares; ``weighted`` are the neighbours' values times weights."""
+    normal = np.einsum("nki,nk,nkj->nij", terms, weight, terms) + np.diag(ridge)
+    fitted: np.ndarray = np.linalg.solve(normal, np.einsum("nki,nk->ni", terms, weighted)[..., None])[..., 0]
+    return fitted
 
 
 def _quadratic(

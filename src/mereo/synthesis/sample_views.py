@@ -18,7 +18,6 @@ from mereo.io.sensor_frame import SensorFrame
 
 SHIPPED = Path(__file__).parents[1] / "frames"
 
-
 SHIPPED_SCAN = "bun000"
 """Name of the shipped range scan of the Stanford bunny: 4,000 of its 40,256 points, evenly spread."""
 

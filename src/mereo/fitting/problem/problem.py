@@ -164,9 +164,8 @@ class Problem:
 
     def leaves_noise(self, surface: Surface, is_shared: bool = False) -> bool:
         """Whether what a fit leaves over is noise, and not its own error; ``is_shared`` as in ``as_noisy_as``."""
-        offset = surface.offsets(self.evidence.points)
-        is_possible = is_shared or noise_of(offset) <= ROUGHER * self.evidence.roughness
-        return is_possible and is_noise(offset, self.evidence.around, is_shared)
+        seen, offset = self.evidence, surface.offsets(self.evidence.points)
+        return is_noise(offset, seen.around, is_shared) and (is_shared or noise_of(offset) <= ROUGHER * seen.roughness)
 
     def explained(self, cloud: float, surface: Surface, most: float) -> bool:
         """Whether a surface explains the cloud: by a misfit below ``most``, or of a noisy one all but the noise."""

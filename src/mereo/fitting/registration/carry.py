@@ -266,7 +266,7 @@ CELLS = (4, 2)
 """Voxels along the sides of the cells in which rest positions are interpolated, one after the other."""
 
 TOLERANCE = 0.04
-"""Voxels of the source by which that may be off at a cell's centre. In its rest, where the nearest material points
+"""Voxels of the source by which that may be off at a cell's centre. Away from it, where the nearest material points
 change, it is up to twice as much: inside the object less than 0.1."""
 
 QUERIES_AT_ONCE = 2000
