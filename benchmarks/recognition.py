@@ -1,7 +1,7 @@
 """Can an answer be trusted: whether it is the object, how far off it may be, how reliable probabilities are.
 
-    python benchmarks/recognition.py [OBJECT ...] [--views N] [--strangers N] [--seed S] [--calibration-views N]
-                                     [--method modes|auto] [--output FOLDER]
+    python benchmarks/recognition.py [OBJECT ...] [--views N] [--strangers N] [--own] [--seed S]
+                                     [--calibration-views N] [--method modes|auto] [--output FOLDER]
 
 For each object, with its shipped weights, a file of weights, or none (a scene file, meshes): the area under the
 receiver operating characteristic (AUROC) by which ``Recognition.strangeness`` tells N clean views of the object from
@@ -10,7 +10,8 @@ of it side by side, from the half of its points on one side, from clouds in anot
 with all draws 1.5 times as far and, with weights, from its own views as a network of the preset `tiny` understands
 them after ten steps; the shares of clean views, of those of which a tool hides 30 %, and of simulated cameras' views
 that are "unsure" and refused; the shares of their true material points, seen and hidden, within the 95 % radii; and the
-expected calibration error of the network's probabilities as they are and calibrated. Weights without a calibration
+expected calibration error of the network's probabilities as they are and calibrated. With ``--own`` the object's own
+views are all. Weights without a calibration
 are calibrated here, on training seeds, and not written. Test seeds begin at 1,000,000: tune on others.
 
 With `--output` each object's row is kept in FOLDER/OBJECT.json as soon as it is measured and FOLDER/table.md has those
@@ -283,6 +284,8 @@ def measured(name: str, arguments: argparse.Namespace) -> Measured:
     for kind, view, seen in own_views(scene, arguments.views, seed):
         result.add(kind, answered(seen, model, registrar), view, seen.cloud)
         clean += [(view, seen.cloud)] if kind == "clean" else []
+    if arguments.own:
+        return result
     clouds = [cloud for _, cloud in clean]
     for index, cloud in enumerate(clouds):
         wrong = PointCloud(cloud.points * FACTORS[index % len(FACTORS)])
@@ -382,6 +385,7 @@ def main() -> None:
     parser.add_argument("objects", nargs="*", default=["bunny", "liver", "rope", "robot"])
     parser.add_argument("--views", type=int, default=8)
     parser.add_argument("--strangers", type=int, default=2)
+    parser.add_argument("--own", action="store_true", help="measure the object's own views alone")
     parser.add_argument("--seed", type=int, default=TEST_SEED_START)
     parser.add_argument("--calibration-views", type=int, default=VIEWS)
     parser.add_argument("--scene", default=None)

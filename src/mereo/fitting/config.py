@@ -34,7 +34,6 @@ class FitConfig:
         normal_length: distance, as a share of the same half, that a difference of unit normals by 1 is worth in the
             search for the sample of each observed point; 0 compares places alone.
         search_rounds: rounds of the search at most, while nothing explains the frame.
-        scale_std: standard deviation of the scale's logarithm where the unit is not known.
         accepted, tolerance: a fit is believed where this share of the observed points lies as near its facing surface.
             Where network and fit give .8 of the correspondences the same segment, a share of .85 is enough.
         turned: whether the network also predicts with the camera turned, where much is unexplained: seconds a frame.
@@ -52,7 +51,6 @@ class FitConfig:
     exact_steps: int = 3
     normal_length: float = 0.0
     search_rounds: int = 3
-    scale_std: float = 0.1
     accepted: float = 0.95
     tolerance: float = 0.45
     turned: bool = True
@@ -70,7 +68,7 @@ class DrawsConfig:
         choices: states with other discrete draws that are tried, where no start meets a shape.
         cloud_weight, network_weight: how many independent points cloud and correspondences are worth, from beginning
             to end, also where draws and modes are compared.
-        first_rounds, last_rounds: sets of differences in the fit to the frame, after a jump and else.
+        last_rounds: sets of differences in the fit to the frame; one after a jump.
         steps: at most with one set of differences.
         explained: the cloud's misfit above which the network's answer is a start too, and draws may jump.
         hopeless: the same, above which the next starts are tried, in at most ``batches`` of them.
@@ -92,7 +90,6 @@ class DrawsConfig:
     sieve: tuple[tuple[int, int], ...] = ((1, 10), (1, 3))
     cloud_weight: float = 1500.0
     network_weight: float = 30.0
-    first_rounds: int = 1
     last_rounds: int = 2
     steps: int = 6
     explained: float = 0.125

@@ -524,11 +524,11 @@ def try_jumps(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
             break
         each = [find_jumps(problem, fit, int(number), sigma) for number in draws_that_may_jump(problem, fit)]
         best_first = sorted((jump for jumps in each for jump in jumps), key=lambda jump: jump[0])
-        fits = [descend(problem, other, config.first_rounds) for _, other in best_first[: config.kept + 1]]
+        fits = [descend(problem, other, 1) for _, other in best_first[: config.kept + 1]]
         best = min(fits, key=by_misfit, default=fit)
         if best.misfit >= fit.misfit:
             break
-        fit = descend(problem, best, config.first_rounds)
+        fit = descend(problem, best, 1)
     return fit
 
 

@@ -33,8 +33,8 @@ COARSE = 3
 PAIR_WEIGHT = 100.0
 """How many independent points the distances that the states keep are worth."""
 
-KNOWN_SCALE_STD = 1e-6
-"""``Problem.scale_std`` of a frame whose unit is known."""
+KNOWN_SCALE_STD, OPEN_SCALE_STD = 1e-6, 0.1
+"""``Problem.scale_std`` of a frame whose unit is known, and of one whose unit is not."""
 
 
 @dataclass(frozen=True)

@@ -440,7 +440,7 @@ def search_modes(
         is_open = cloud.lines is None or cloud.lines.other_lines is None
         evidence = cloud.evidence(unit)
         given = None if start is None or not model.is_held else GivenPose(start, HELD_STD * model.half)
-        whole = Problem(model, NetworkTerm.none(model), evidence, cloud.scale_std(config), config, given=given)
+        whole = Problem(model, NetworkTerm.none(model), evidence, cloud.scale_std, config, given=given)
         partial = replace(whole, evidence=replace(evidence, other_lines="unknown")) if is_open else None
         outcome = search(whole, partial, start)
         problem, modes = outcome.problem, outcome.best

@@ -30,7 +30,7 @@ from mereo.fitting.modes import narrowing as modes_narrowing
 from mereo.fitting.problem.correspondences import Correspondences, agree, estimate_unit, find_correspondences
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import Posed
-from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
+from mereo.fitting.problem.problem import KNOWN_SCALE_STD, OPEN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import Surface
 from mereo.fitting.registration.registration import Method, Registration
 from mereo.fitting.uncertainty import DrawsOptimum, ModesOptimum, Optimum
@@ -73,9 +73,10 @@ class CloudToFit:
         lines = None if self.lines is None else self.lines.scaled(1 / unit)
         return Evidence.of(self.points / unit, outliers, lines=lines)
 
-    def scale_std(self, config: FitConfig) -> float:
+    @property
+    def scale_std(self) -> float:
         """``Problem.scale_std``."""
-        return config.scale_std if self.scene_unit is None else KNOWN_SCALE_STD
+        return OPEN_SCALE_STD if self.scene_unit is None else KNOWN_SCALE_STD
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +133,7 @@ class ModesFit:
             return predict(seen * unit).scaled(1 / unit)
 
         with limit_blas_threads():
-            problem = Problem.of(model, correspondences, cloud.evidence(unit), cloud.scale_std(config), config)
+            problem = Problem.of(model, correspondences, cloud.evidence(unit), cloud.scale_std, config)
             fit = problem, correspondences, fit_modes(problem)
             predict_scaled = None if predict is None else predict_in_scene_units
             fit = with_turned_camera(fit, predict_scaled)
