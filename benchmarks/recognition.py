@@ -10,9 +10,9 @@ of it side by side, from the half of its points on one side, from clouds in anot
 with all draws 1.5 times as far and, with weights, from its own views as a network of the preset `tiny` understands
 them after ten steps; the shares of clean views, of those of which a tool hides 30 %, and of simulated cameras' views
 that are "unsure" and refused; the shares of their true material points, seen and hidden, within the 95 % radii; and the
-expected calibration error of the network's probabilities as they are and calibrated. With ``--own`` the object's own
-views are all. Weights without a calibration
-are calibrated here, on training seeds, and not written. Test seeds begin at 1,000,000: tune on others.
+expected calibration error of the network's probabilities as they are and calibrated. ``--own`` measures the object's
+own views alone. Weights without a calibration are calibrated here, on training seeds, and not written. Test seeds begin
+at 1,000,000: tune on others.
 
 With `--output` each object's row is kept in FOLDER/OBJECT.json as soon as it is measured and FOLDER/table.md has those
 of the objects named, so that a run that was cut off goes on where it was: rows of the same settings are not measured
