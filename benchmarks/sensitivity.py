@@ -4,11 +4,11 @@
 
 Numbers are those of the constants and defaults of ``mereo.fitting`` and of what it reads of a frame (``FILES``). One is
 doubled, or, where it is a share between .5 and 1, its distance from 1 halved, in a copy of the source, in which N views
-of each object (training seeds) are answered: in turn by the paper's camera, by time of flight, by the paper's camera
-with a tool that hides 30 %, and by structured light; the second and third by a search without the network. With
-``--clean`` all are whole, by the paper's camera, and answered from the network where there is one. A number matters if
-the mean mIoU over the views changes by .002 or more. To save time, groups of numbers change together and are halved
-where the group matters, and a group is given up at the first view that alone would change the mean by that much.
+of each object (training seeds) are answered from the network, where there is one: whole ones by the paper's camera, and
+unless ``--clean`` is given, as many by simulated cameras, and as many of which a tool hides 30 %, by a search without
+the network (``recognition.own_views``). A number matters if the mean mIoU over the views changes by .002 or more. To
+save time, groups of numbers change together and are halved where the group matters, and a group is given up at the
+first view that alone would change the mean by that much.
 Objects are shipped ones, or files of scenes, which are always searched for.
 Rows are kept in FILE, so that a run that was cut off goes on where it was.
 """
@@ -28,19 +28,14 @@ from shutil import copytree, ignore_patterns
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from occluded_views import occlude
-from recognition import sized
+from recognition import own_views, sized
 
 import mereo
 from mereo.api.objects import load_object
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.geometry.metrics import TruthGrid, grid_confusion, intersection_over_union, labels_on, truth_grid
-from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.observation import Observation, find_object, observe
+from mereo.reconstruction.observation import Observation
 from mereo.scenes.registry import load_scene
-from mereo.scenes.seeds import example_rng
-from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor
-from mereo.synthesis.examples import sample_view
 
 SOURCE = Path(mereo.__file__).parent
 
@@ -58,9 +53,6 @@ LEAST_CHANGE = 0.002
 
 CELLS, TOGETHER = 50, 16
 """Cells of the truth along each axis; numbers of the first groups."""
-
-CAMERAS: tuple[Sensor, ...] = ("paper", "time-of-flight", "paper", "structured-light")
-"""Cameras of an object's views, in turn; of the third a tool hides a part."""
 
 
 @dataclass(frozen=True)
@@ -120,16 +112,10 @@ class Frame:
 def make_frames(objects: Sequence[str], views: int, seed: int, clean: bool) -> list[Frame]:
     frames = []
     for name in objects:
-        scene = load_scene(name).for_seed(seed)
-        for index in range(views):
-            kind = 0 if clean else index % len(CAMERAS)
-            view = sample_view(scene, GenerateConfig(sensor=SENSORS[CAMERAS[kind]]), example_rng(seed, index))
-            seen = observe(view.depth.to_points(), unit_m=1.0)
-            if kind == 2:
-                hidden = occlude(view, "tool", 0.3, np.random.default_rng([seed, index]))
-                seen = find_object(hidden.frame(1.0), IsolationConfig())
-            truth = truth_grid(view.mesh, CELLS)
-            frames.append(Frame(name, seen, truth, len(view.mesh.names), kind in (1, 2)))
+        for kind, view, seen in own_views(load_scene(name), views, seed):
+            if kind == "clean" or not clean:
+                truth = truth_grid(view.mesh, CELLS)
+                frames.append(Frame(name, seen, truth, len(view.mesh.names), kind == "occluded"))
     return frames
 
 

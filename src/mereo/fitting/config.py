@@ -65,7 +65,6 @@ class DrawsConfig:
         starts: random states, most like a shape, from which fits start.
         sieve: sets of differences spent on each start, and on how many of the best, one stage after the other.
         kept: how many of them are then fitted to the frame.
-        choices: states with other discrete draws that are tried, where no start meets a shape.
         cloud_weight, network_weight: how many independent points cloud and correspondences are worth, from beginning
             to end, also where draws and modes are compared.
         last_rounds: sets of differences in the fit to the frame; one after a jump.
@@ -86,7 +85,6 @@ class DrawsConfig:
 
     starts: int = 40
     kept: int = 2
-    choices: int = 100
     sieve: tuple[tuple[int, int], ...] = ((1, 10), (1, 3))
     cloud_weight: float = 1500.0
     network_weight: float = 30.0

@@ -476,10 +476,10 @@ def descend_best(problem: DrawsProblem, frame: Posed, shape: Shape, starts: list
 
 def find_other_choices(problem: DrawsProblem, shape: Shape, best: StateOnShape | None) -> list[StateOnShape]:
     """Find states near a shape that ``best`` does not meet, made from that one by other discrete draws."""
-    config, states = problem.config, problem.states
+    states = problem.states
     if best is None or best.misfit < 100.0:
         return []
-    others = redraw_choices(states.scene, replace(best.drawn, z=best.z), config.choices)
+    others = redraw_choices(states.scene, replace(best.drawn, z=best.z), 100)
     states_near = [lay_on_shape(states, shape, other, other.z) for other in others]
     # a choice may come out the same again
     new = [near for near in states_near if near is not None and np.abs(near.points - best.points).max() > shape.std]
