@@ -100,15 +100,6 @@ def without_curves(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def without_turns(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Skip the search over turned cameras, which takes most of the time of a frame that no fit explains.
-
-    For tests of what happens to such a frame afterwards.
-    """
-    monkeypatch.setattr("mereo.fitting.registration.register.with_turned_camera", lambda start, predict: start)
-
-
-@pytest.fixture
 def small_previews(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw small previews: the six large ones of a result take half a second."""
     from mereo.visualization import result_files

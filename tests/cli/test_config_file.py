@@ -159,7 +159,7 @@ def test_one_frame_is_one_object_and_the_rest_goes_elsewhere(here: Path, capfd: 
 
 
 def test_what_is_not_the_object_has_a_status_of_its_own_and_a_failure_outweighs_it(
-    here: Path, capfd: pytest.CaptureFixture[str], without_turns: None
+    here: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     asked = ("--weights", PLIERS, "--method", "modes", "--json", "--output")
     assert mereo("reconstruct", "plane.npy", *asked, "one") == 3

@@ -12,13 +12,18 @@ from mereo.fitting.config import FitConfig
 from mereo.fitting.draws.fit import DrawsFit, DrawsProblem, Shape, approach, fit_draws, lay_on_shape, secant
 from mereo.fitting.draws.fit import narrowing as narrowing_of_draws
 from mereo.fitting.draws.playback import Drawn, DrawnStates
-from mereo.fitting.modes import narrowing, turns
+from mereo.fitting.modes import ScoredFit, fit_wide, narrowing, refined, shaken
 from mereo.fitting.problem.correspondences import Correspondences
+from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import POSE, Posed, along
+from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
+from mereo.fitting.problem.residuals import NetworkTerm
 from mereo.fitting.registration.recognition import recognize
 from mereo.fitting.registration.register import CloudToFit, ModesFit, is_drawn
 from mereo.fitting.registration.registration import Registration
+from mereo.fitting.search import rotations
 from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.models.weights import load_model
 from mereo.scenes.random_states import build_model, interior_nodes, sample_states, state_points
 from mereo.scenes.scene import State
 from mereo.scenes.seeds import example_rng
@@ -130,74 +135,6 @@ def test_under_noise_draws_are_asked_too_and_an_object_at_rest_stays_at_rest(mod
     assert found.method == "rest" and found.seconds > clean.seconds
 
 
-AXIS = np.array([0.3, -0.2, 2.0])
-
-
-def confused(found: Correspondences) -> Correspondences:
-    """Correspondences as of an object turned by a third of a turn in itself, about an axis that is none of symmetry."""
-    center = found.rest.mean(axis=0)
-    cyclic = (found.rest - center)[:, [1, 2, 0]] + center
-    return Correspondences(found.points, cyclic, found.labels, found.confidence, found.observed)
-
-
-class Network:
-    """A network that understands a frame only when its camera is turned in one way."""
-
-    def __init__(self, points: np.ndarray, right: Correspondences, turn: np.ndarray | None) -> None:
-        self.points, self.right, self.turn, self.asked = points, right, turn, 0
-
-    def __call__(self, seen: np.ndarray) -> Correspondences:
-        self.asked += 1
-        rotation = np.linalg.lstsq(self.points, seen, rcond=None)[0].T  # from its frame to the one that is asked about
-        understood = self.turn is not None and np.allclose(rotation, self.turn, atol=1e-6)
-        return (self.right if understood else confused(self.right)).turned(rotation)
-
-
-def test_turns_are_different_rotations_that_keep_the_object_in_front_of_the_camera() -> None:
-    found = np.stack(list(turns(AXIS)))
-    np.testing.assert_allclose(found @ found.transpose(0, 2, 1), np.broadcast_to(np.eye(3), found.shape), atol=1e-12)
-    assert np.linalg.det(found) == pytest.approx(np.ones(len(found)))
-    away = found @ (AXIS / np.linalg.norm(AXIS)) @ (AXIS / np.linalg.norm(AXIS))
-    assert (away > np.cos(np.deg2rad(26.0))).all()
-    all_of_them = np.concatenate([np.eye(3)[None], found])
-    apart = np.abs(all_of_them[:, None] - all_of_them[None]).max(axis=(2, 3)) + np.eye(len(all_of_them))
-    assert apart.min() > 0.15
-
-
-@pytest.mark.parametrize("number", [2, 12])
-def test_a_frame_that_the_network_understands_only_when_it_is_turned_is_found(
-    model: StatisticalModel, number: int
-) -> None:
-    points, material = shown(model, 0.8)
-    right = said(model, material)
-    turn = list(turns(points.mean(axis=0)))[number]
-    network = Network(points, right, turn)
-    alone = ModesFit.of(CloudToFit(points, 1.0), confused(right), model)
-    turned = ModesFit.of(CloudToFit(points, 1.0), confused(right), model, predict=network)
-    off, mended = (np.linalg.norm(one.registration().material - material, axis=1) for one in (alone, turned))
-    assert np.median(off) > 3.0 and np.median(mended) < 0.3
-    assert number < network.asked <= 8 * (number // 8 + 1)  # no more than its round
-
-
-def test_a_frame_that_is_explained_is_asked_about_once(model: StatisticalModel) -> None:
-    points, material = shown(model, 0.5)
-    network = Network(points, said(model, material), None)
-    ModesFit.of(CloudToFit(points, 1.0), said(model, material), model, predict=network)
-    assert network.asked == 0
-
-
-def test_noise_that_hides_how_wrong_a_fit_is_hides_it_from_a_last_try_no_more(model: StatisticalModel) -> None:
-    points, material = shown(model, 0.8)
-    points = points * (1 + np.random.default_rng(0).normal(scale=0.4, size=(len(points), 1)) / IN_FRONT[2, 3])
-    right = said(model, material)
-    network = Network(points, right, list(turns(points.mean(axis=0)))[2])
-    first = ModesFit.of(CloudToFit(points, 1.0), confused(right), model, FitConfig(turned=False), predict=network)
-    last = ModesFit.of(CloudToFit(points, 1.0), confused(right), model, FitConfig(turned_anyway=True), predict=network)
-    off, mended = (np.linalg.norm(one.registration().material - material, axis=1) for one in (first, last))
-    assert not first.registration().accepted and np.median(off) > 3.0
-    assert last.registration().accepted and np.median(mended) < 0.5
-
-
 @pytest.fixture(scope="module")
 def states(model: StatisticalModel) -> DrawnStates:
     return DrawnStates.of(SCENE, model, 30, 1000)
@@ -293,3 +230,41 @@ def test_draws_that_move_nothing_narrow_nothing(problem: DrawsProblem, drawn: Dr
     narrowed = [narrowing_of_draws(problem, replace(drawn, motion=motion)) for motion in (one_moves, none_moves)]
     assert narrowed[0] > 1.0
     assert narrowed[1] == pytest.approx(0.0, abs=1e-6)
+
+
+# --- fits in a wrong optimum next to the right one ------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def robot() -> StatisticalModel:
+    """Model of a robot, whose joints make many optima."""
+    return load_model("robot").statistical_model
+
+
+def stuck(model: StatisticalModel, index: int, other: int, noise: float = 0.0) -> tuple[Problem, ScoredFit]:
+    """Frame of one state of the library, and the fit to it that starts from another."""
+    turn = rotations(97)[(31 * index + 7) % 97]
+    posed = Posed(
+        turn, np.array([12.0, -7.0, 150.0]) - turn @ model.mean.mean(axis=0), model.library[index].astype(float)
+    )
+    points = seen(model.mesh(posed.place(model.material(posed.z))))
+    points = points * (1 + np.random.default_rng(0).normal(scale=noise / 150.0, size=(len(points), 1)))
+    problem = Problem(model, NetworkTerm.none(model), Evidence.of(points), KNOWN_SCALE_STD, FitConfig())
+    return problem, refined(problem, fit_wide(problem, replace(posed, z=model.library[other].astype(float))))
+
+
+@pytest.mark.parametrize(("index", "other"), [(2, 19), (4, 5), (5, 22)])
+def test_a_fit_is_shaken_out_of_a_wrong_optimum(robot: StatisticalModel, index: int, other: int) -> None:
+    problem, wrong = stuck(robot, index, other)
+    assert not wrong.explains(problem)
+    assert shaken(problem, wrong).misfit.total < 0.2 * wrong.misfit.total
+
+
+def test_what_is_explained_hopeless_or_a_cameras_noise_is_left(robot: StatisticalModel) -> None:
+    problem, wrong = stuck(robot, 4, 5)
+    right = shaken(problem, wrong)
+    assert right.explains(problem) and shaken(problem, right) is right
+    other_thing = replace(wrong, misfit=replace(wrong.misfit, cloud=5.0))
+    assert shaken(problem, other_thing) is other_thing
+    noisy, fitted = stuck(robot, 4, 4, noise=0.5)
+    assert not fitted.explains(noisy) and shaken(noisy, fitted) is fitted

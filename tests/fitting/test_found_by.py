@@ -12,7 +12,17 @@ from answers import answer_to
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem import correspondences
 from mereo.fitting.problem.evidence import Evidence
-from mereo.fitting.problem.problem import ACCEPTED, CLEAN, LARGEST, SHARED, constants_for, is_noise, noise_of, shared
+from mereo.fitting.problem.problem import (
+    ACCEPTED,
+    CAMERA,
+    CLEAN,
+    LARGEST,
+    SHARED,
+    constants_for,
+    is_noise,
+    noise_of,
+    shared,
+)
 from mereo.fitting.problem.residuals import Surface
 from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.answer_frame import (
@@ -73,7 +83,6 @@ def by_network(liver: Model, cloud: PointCloud) -> Candidate:
     return found
 
 
-@pytest.mark.usefixtures("without_turns")
 def test_a_network_that_understands_is_not_doubted_and_other_methods_ask_nobody_else(
     liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
@@ -83,7 +92,7 @@ def test_a_network_that_understands_is_not_doubted_and_other_methods_ask_nobody_
     assert answer(liver, cloud, "modes").located_by == "network"
 
 
-@pytest.mark.usefixtures("confused", "without_turns")
+@pytest.mark.usefixtures("confused")
 def test_a_search_is_asked_too_where_the_network_is_lost(liver: Model, cloud: PointCloud) -> None:
     found = answer(liver, cloud)
     assert found.located_by == "search" and found.taken and found.registration is not None
@@ -193,7 +202,6 @@ def fitted(registrar: Registrar, points: np.ndarray, keep_all: bool = False, uni
     return fit_hypotheses(observe(PointCloud(points)), registrar.network, registrar, keep_all, unit)[0]
 
 
-@pytest.mark.usefixtures("without_turns")
 def test_strays_are_left_out_and_all_else_is_kept(registrar: Registrar, points: np.ndarray) -> None:
     clean, likelier = fit_hypotheses(observe(PointCloud(points)), registrar.network, registrar, False, 1.0)
     found = fitted(registrar, with_rim(points))
@@ -293,6 +301,9 @@ def test_constants_follow_the_noise_and_end() -> None:
     clean = replace(found, cloud_sigma=config.cloud_sigma, tolerance=config.tolerance, accepted=config.accepted)
     assert clean == config
     assert constants_for(0.2, replace(config, accepted=0.5)).accepted == 0.5
+    assert constants_for(0.9 * CAMERA, config).accepted == config.accepted, (
+        "a clean frame's fit that is not quite right"
+    )
     assert constants_for(9.0, config).cloud_sigma == LARGEST
 
 

@@ -296,7 +296,6 @@ def test_the_summary_tells_centroids_volumes_and_the_whole(told: Uncertainty, ra
         assert row["volume95"][0] < row["volume"] < row["volume95"][1]
 
 
-@pytest.mark.usefixtures("without_turns")
 def test_points_that_the_model_does_not_explain_are_red(liver: Model, cloud: PointCloud) -> None:
     lump = cloud.points[:40] - [0.0, 0.0, 0.12 * np.ptp(cloud.points, axis=0).max()]
     points = np.concatenate([cloud.points, lump])

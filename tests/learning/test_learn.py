@@ -161,7 +161,7 @@ def test_bad_scores_come_with_advice_and_good_ones_without_and_a_command_names_w
 
 
 @pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch, without_turns: None, tmp_path_factory: pytest.TempPathFactory) -> None:
+def small(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
     """So little of everything that a run takes seconds."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "models"))
     for module, name, value in (

@@ -33,11 +33,9 @@ class FitConfig:
         exact_steps: last steps, which use the faces themselves.
         normal_length: distance, as a share of the same half, that a difference of unit normals by 1 is worth in the
             search for the sample of each observed point; 0 compares places alone.
-        search_rounds: rounds of the search at most, while nothing explains the frame.
+        search_rounds: rounds of the search at most, while nothing explains the frame; 0 keeps a network's fit.
         accepted, tolerance: a fit is believed where this share of the observed points lies as near its facing surface.
             Where network and fit give .8 of the correspondences the same segment, a share of .85 is enough.
-        turned: whether the network also predicts with the camera turned, where much is unexplained: seconds a frame.
-        turned_anyway: whether it does, however much noise that may be: for frames that nothing else explains.
     """
 
     start_sigma: float = 0.06
@@ -53,8 +51,6 @@ class FitConfig:
     search_rounds: int = 3
     accepted: float = 0.95
     tolerance: float = 0.45
-    turned: bool = True
-    turned_anyway: bool = False
 
 
 @dataclass(frozen=True)

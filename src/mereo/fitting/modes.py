@@ -4,26 +4,31 @@
 2. Cloud, silhouette, free space, and less and less the correspondences.
 3. The same again under the Gaussian of the library's states near the answer: states lie on curved sets, of which it is
    the tangent.
-4. While the cloud is not explained, other states of the library, where the states lie on a curved set at all.
+4. While the cloud is not explained, other states of the library and around the best fit, where the states lie on a
+   curved set at all.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import islice
 
 import numpy as np
 from jaxtyping import Float, Float32
-from scipy.spatial.transform import Rotation
 
 from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.evidence import MOST_POINTS
 from mereo.fitting.problem.gauss_newton import DAMPING, Posed
 from mereo.fitting.problem.problem import Misfit, Problem
 from mereo.fitting.problem.residuals import NetworkTerm, Prior, Surface
-from mereo.fitting.problem.segments import corner_positions, different, diverse_rows, largest_distance
+from mereo.fitting.problem.segments import (
+    corner_positions,
+    different,
+    diverse_rows,
+    largest_distance,
+    rms_distance,
+)
 from mereo.geometry.downsampling import means_along_sight
 from mereo.geometry.surface_patches import smoothed
-from mereo.geometry.transforms import best_rotations, fit_rigid, robust_rigid, rotation_along
+from mereo.geometry.transforms import best_rotations, fit_rigid, robust_rigid
 
 REFINE_SIGMA = 0.02
 """The cloud's first standard deviation in a refinement, as all sigmas of this module a share of ``half``."""
@@ -34,7 +39,7 @@ PAIR_SLACK = 0.05
 
 def fit_modes(problem: Problem) -> "ScoredFit":
     """Fit from the correspondences, refine, and try other states while the frame is not explained."""
-    return explored(problem, refined(problem, fit_whole(problem)))
+    return shaken(problem, explored(problem, refined(problem, fit_whole(problem))))
 
 
 def refined(problem: Problem, posed: Posed) -> "ScoredFit":
@@ -42,12 +47,14 @@ def refined(problem: Problem, posed: Posed) -> "ScoredFit":
     return ScoredFit.of(problem, posed).better(problem, refine(problem, posed))
 
 
-def explored(problem: Problem, best: "ScoredFit") -> "ScoredFit":
-    """Try states that agree with a fit or the network, while the best does not explain the cloud.
+def has_many_optima(problem: Problem) -> bool:
+    """Whether many distances are kept, so that the states lie on a curved set; smooth bending has one optimum."""
+    return len(problem.model.pairs) >= 300
 
-    Only where many distances are kept: smooth bending has one optimum.
-    """
-    for number in range(2 if len(problem.model.pairs) >= 300 else 0):
+
+def explored(problem: Problem, best: "ScoredFit") -> "ScoredFit":
+    """Try states that agree with a fit or the network, while the best does not explain the cloud."""
+    for number in range(2 if has_many_optima(problem) else 0):
         if best.explains(problem):
             break
         before = best
@@ -56,6 +63,59 @@ def explored(problem: Problem, best: "ScoredFit") -> "ScoredFit":
         if best is before:
             break
     return best
+
+
+SHAKES, SHAKEN = 8, 12
+"""Rounds of shaking at most, and starts in each."""
+
+HOPELESS = 4.0
+"""Misfit of the cloud from which on a fit is of something else: own views have up to 2.6, most else 4.3 to 6."""
+
+
+def shaken(problem: Problem, best: "ScoredFit") -> "ScoredFit":
+    """Fit again from states around the best, drawn from the prior's spread, as long as one of them is better.
+
+    What folds or has joints has many optima next to each other, and the right one is rarely far from a wrong one.
+    """
+    rng = np.random.default_rng(0)
+    for _ in range(SHAKES if has_many_optima(problem) else 0):
+        if best.explains(problem) or best.misfit.cloud > HOPELESS or problem.wants_noise(best.surface):
+            break
+        before, z = best, best.posed.z
+        starts = [replace(best.posed, z=z + rng.standard_normal(len(z))) for _ in range(SHAKEN)]
+        for _, posed in bend_by_few(problem, starts, 3)[:3]:
+            best = min(best, refined(problem, fit_wide(problem, posed)), key=lambda scored: scored.misfit.total)
+        if best is before:
+            break
+    return best
+
+
+BENDING = ((0.12, 5, 0.05), (0.05, 8, 0.02))
+"""First sigma, steps, and the sigma of the choice, of the two stages in which few points bend a candidate."""
+
+BENT_APART = 0.05
+"""Distance between two candidates' material points, as a share of ``half``, up to which they are one."""
+
+
+def bend_by_few(problem: Problem, states: list[Posed], kept: int) -> list[tuple[float, Posed]]:
+    """Bend states towards the frame by few points, and return those that differ with their misfits, the lowest first.
+
+    Half of them after each stage, and ``kept`` at least.
+    """
+    coarse, whole, cost = problem.coarse, Prior.whole(problem.model), list[float]()
+    for start, steps, sigma in BENDING:
+        states = [fit_cloud(coarse, posed, whole, start, steps, PAIR_SLACK) for posed in states]
+        cost = [coarse.screen(posed, sigma * problem.model.half).without_network for posed in states]
+        order = np.argsort(cost)
+        states, cost = [states[index] for index in order], [cost[index] for index in order]
+        rows = differing(problem, states, BENT_APART)[: max(kept, len(states) // 2)]
+        states, cost = [states[row] for row in rows], [cost[row] for row in rows]
+    return list(zip(cost, states, strict=True))
+
+
+def differing(problem: Problem, states: list[Posed], apart: float) -> list[int]:
+    """Rows of the states of which each differs from all before it by ``apart`` half lengths in the mean."""
+    return diverse_rows(corner_positions(problem.model, states), apart * problem.model.half, rms_distance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,50 +321,3 @@ def as_noisy(start: NetworkFit, points: Float[np.ndarray, "n 3"], predict: Predi
     fits = [(*candidate, fit_modes(candidate[0])) for candidate in candidates]
     best = min(fits, key=lambda fit: fit[2].misfit.without_network)
     return best if best[0].leaves_noise(best[2].surface) else start
-
-
-# --- the camera turned ------------------------------------------------------------------------------------------------
-
-# Correspondences should turn along with a camera that turns about its centre. A network's do so where it recognizes
-# what it sees; where it does not, each turn gives another guess, and the fit decides which is right.
-
-ROLL = np.pi / 4
-"""Angle between two turns about the line of sight to the object, rad."""
-
-TILTS = np.deg2rad([0.0, 15.0, 15.0, 25.0])
-"""Angles by which the camera is tilted away from the object, each with all rolls, rad."""
-
-
-def turns(axis: Float[np.ndarray, "3"]) -> Iterator[Float[np.ndarray, "3 3"]]:
-    """Generate rotations of the camera frame: rolls about a line of sight, without and with tilts away from it."""
-    axis = axis / np.linalg.norm(axis)
-    across = rotation_along(axis)[:, :2]
-    count = round(2 * np.pi / ROLL)
-    for number in range(1, count * len(TILTS)):
-        toward = 2.0 * number  # rad: so far apart are the directions of two tilts in a row
-        tilt = across @ np.array([np.cos(toward), np.sin(toward)]) * TILTS[number // count]
-        yield (Rotation.from_rotvec(tilt) * Rotation.from_rotvec(number * ROLL * axis)).as_matrix()
-
-
-def with_turned_camera(start: NetworkFit, predict: PredictCorrespondences | None) -> NetworkFit:
-    """Return a fit, or where it leaves much unexplained the best of it and of fits with the camera turned."""
-    problem, _, modes = start
-    if predict is None or not problem.config.turned or not problem.wants_turns(modes.misfit.cloud, modes.surface):
-        return start
-    points, anyway = problem.evidence.points, problem.config.turned_anyway
-    best, waiting = start, turns(points.mean(axis=0))
-    while rotations := list(islice(waiting, 8)):
-        predicted = [predict(points @ turn.T).turned(turn.T) for turn in rotations]
-        frames = [(problem.with_network(correspondences), correspondences) for correspondences in predicted]
-        costs = list[float]()
-        for frame, _ in frames:
-            posed = refine(frame.coarse, fit_whole(frame.coarse), 2.0, 4)
-            costs.append(frame.screen(posed, frame.config.cloud_sigma).without_network)
-        for index in np.argsort(costs)[:2]:
-            frame, correspondences = frames[index]
-            modes = ScoredFit.of(frame, refine(frame, fit_whole(frame)))
-            if modes.misfit.without_network < best[2].misfit.without_network:
-                best = frame, correspondences, modes
-        if best[2].misfit.cloud < best[0].config.unexplained or (anyway and best[0].leaves_noise(best[2].surface)):
-            break
-    return best if best is start else (best[0], best[1], explored(best[0], best[2]))

@@ -20,12 +20,23 @@ from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from mereo.fitting.modes import PAIR_SLACK, ScoredFit, explored, fit_cloud, fit_wide, refined
+from mereo.fitting.modes import (
+    BENT_APART,
+    HOPELESS,
+    ScoredFit,
+    bend_by_few,
+    differing,
+    explored,
+    fit_cloud,
+    fit_wide,
+    refined,
+    shaken,
+)
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import DAMPING, Posed, cross
 from mereo.fitting.problem.problem import Problem
 from mereo.fitting.problem.residuals import ROBUST, SILHOUETTE_WEIGHT, Prior, SampledSurface
-from mereo.fitting.problem.segments import corner_positions, diverse_rows, rms_distance
+from mereo.fitting.problem.segments import diverse_rows, rms_distance
 from mereo.geometry.transforms import rotation_along
 from mereo.io.cores import cores
 from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
@@ -384,24 +395,18 @@ SIGMAS = (
 APART = 0.15
 """Distance between two poses' samples, as a share of the half length, up to which they are one."""
 
-BENT_APART = 0.05
-"""The same of candidates that are bent already."""
-
-BENDING = ((0.12, 5, 0.05), (0.05, 8, 0.02))
-"""First sigma, steps, and the sigma of the choice, of the two stages in which few points bend a candidate."""
-
 RIVAL = 1.5
 """Misfit by few points, in misfits of the best, up to which a candidate may still be as good."""
 
 ALIKE = 0.05
 """Difference of the cloud's misfit up to which two states explain a frame alike."""
 
+SHAKEN = 3
+"""Fits around which states are tried in each round."""
+
 HEAVY, HEAVIER_STEPS, HELPS = 3000.0, (0.04, 12), 0.65
 """Weight of a cloud that an elastic solid explains only under it, the first sigma and the steps of the fit with it, and
 the share of the misfit that may be left: bends of a bunny's ears leave .45 to .54, states of livers .77 up."""
-
-HOPELESS = 4.0
-"""Misfit of the cloud after two rounds from which on no third is made: own views have up to 2.6, most else 4.3 to 6."""
 
 WHOLE = 150.0
 """Misfit by which an object that is seen whole may be explained worse than one that something hides in part: it is on
@@ -456,6 +461,14 @@ class _Trail:
         if not self.is_explained:
             self.fitted.append(explored(self.problem, self.best))
 
+    def shake(self) -> None:
+        """Fit again from states around the best fits that differ: an object that looks alike turned is one of them."""
+        ranked = sorted(self.fitted, key=_total)
+        for row in differing(self.problem, [scored.posed for scored in ranked], APART)[:SHAKEN]:
+            if self.is_explained:
+                return
+            self.fitted.append(shaken(self.problem, ranked[row]))
+
     def with_heavier_cloud(self) -> "_Trail | None":
         """The same with a cloud that is worth more, where the prior of an elastic solid keeps it from being explained.
 
@@ -484,6 +497,7 @@ class _Trail:
                 continue
             rows = differing(noisy, states, BENT_APART)[:4]
             trail = _Trail(noisy, 0.0, [explored(noisy, refined(noisy, fit_wide(noisy, states[row]))) for row in rows])
+            trail.shake()
             if noisy.leaves_noise(trail.best.surface, is_shared):
                 return trail
         return None
@@ -513,6 +527,7 @@ def search(whole: Problem, partial: Problem | None = None, start: Posed | None =
         for trail, other in permutations(trails, 2):  # either may have found what the other has missed
             trail.fitted.append(refined(trail.problem, other.best.posed))
         chosen = min(trails, key=lambda trail: trail.best.misfit.total + trail.handicap)
+        chosen.shake()
         heavier = chosen.with_heavier_cloud()
         if heavier is not None and heavier.is_explained:
             return heavier.outcome()
@@ -520,10 +535,10 @@ def search(whole: Problem, partial: Problem | None = None, start: Posed | None =
             break
         if number > 0:
             better = heavier or chosen.as_noisy()
-            if better is not None:
-                return better.outcome()
-            if chosen.best.misfit.cloud > HOPELESS:
-                break
+            # less noise than a camera's may be the error of a wrong state: the last round decides
+            is_sure = better is not None and (better is heavier or better.problem.is_camera)
+            if is_sure or number + 1 == whole.config.search_rounds or chosen.best.misfit.cloud > HOPELESS:
+                return (better or chosen).outcome()
             trails = [chosen]
     return (heavier or chosen).outcome()
 
@@ -534,21 +549,7 @@ def _total(scored: ScoredFit) -> float:
 
 def candidates(problem: Problem, stage: SearchRound) -> list[tuple[float, Posed]]:
     """Find candidates in a round, with their misfits by few points, the lowest first."""
-    coarse, whole = problem.coarse, Prior.whole(problem.model)
-    bent, cost = screen_poses(problem, stage), list[float]()
-    for start, steps, sigma in BENDING:
-        bent = [fit_cloud(coarse, posed, whole, start, steps, PAIR_SLACK) for posed in bent]
-        cost = [coarse.screen(posed, sigma * problem.model.half).without_network for posed in bent]
-        order = np.argsort(cost)
-        bent, cost = [bent[index] for index in order], [cost[index] for index in order]
-        rows = differing(problem, bent, BENT_APART)[: max(stage.fitted, len(bent) // 2)]
-        bent, cost = [bent[row] for row in rows], [cost[row] for row in rows]
-    return list(zip(cost, bent, strict=True))
-
-
-def differing(problem: Problem, states: list[Posed], apart: float) -> list[int]:
-    """Rows of the states of which each differs from all before it by ``apart`` half lengths in the mean."""
-    return diverse_rows(corner_positions(problem.model, states), apart * problem.model.half, rms_distance)
+    return bend_by_few(problem, screen_poses(problem, stage), stage.fitted)
 
 
 def screen_poses(problem: Problem, stage: SearchRound) -> list[Posed]:

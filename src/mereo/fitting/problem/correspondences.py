@@ -51,10 +51,6 @@ class Correspondences:
         """Correspondences with the camera frame in another unit."""
         return replace(self, points=self.points * factor)
 
-    def turned(self, rotation: Float[np.ndarray, "3 3"]) -> "Correspondences":
-        """Correspondences in a camera frame that is turned about its origin."""
-        return replace(self, points=self.points @ rotation.T)
-
     def displaced(self, model: StatisticalModel, material: Float[np.ndarray, "m 3"]) -> float | None:
         """How far the places of the object are from where a model's state has them, as a share of half its length.
 

@@ -116,6 +116,11 @@ class Problem:
         return PairTerm.of(self.model)
 
     @property
+    def is_camera(self) -> bool:
+        """Whether the noise is a camera's."""
+        return self.noisy and self.config.cloud_sigma >= SIGMAS * CAMERA
+
+    @property
     def network_sigma(self) -> float:
         """Standard deviation of a correspondence, scene units."""
         return self.config.start_sigma * self.model.half
@@ -142,13 +147,9 @@ class Problem:
             return None
         return replace(self, config=config, evidence=self.evidence.with_more_samples, noisy=True)
 
-    def wants_turns(self, cloud: float, surface: Surface) -> bool:
-        """Whether a misfit of the cloud, much greater than its noise, shows that the fit is likely wrong."""
-        if cloud < self.config.unexplained:
-            return False
-        if self.config.turned_anyway:
-            return not self.leaves_noise(surface)
-        return cloud > 1.5 * (self.residual_noise(surface) / self.config.cloud_sigma) ** 2
+    def wants_noise(self, surface: Surface) -> bool:
+        """Whether a fit leaves a camera's noise over, for which the constants are not: it would be fitted, too."""
+        return not self.noisy and self.residual_noise(surface) >= CAMERA
 
     @property
     def by_every_point(self) -> "Problem":
@@ -323,8 +324,12 @@ LARGEST = 1.0
 SHARED = 1.05
 """Misfit of a noisy cloud, in misfits of what neighbours do not share, up to which nothing more is to be explained."""
 
+CAMERA = 0.15
+"""Noise, in scene units, from which on it is a camera's. Less is left over by a clean frame's fit that is not quite
+right, from which as much is asked as from any clean frame's."""
+
 ACCEPTED = 0.75
-"""Share of a noisy frame's points that a fit must explain to be believed: nothing reveals the outliers among them."""
+"""Share of a camera's points that a fit must explain to be believed: nothing reveals the outliers among them."""
 
 
 def unshared(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
@@ -367,4 +372,5 @@ def constants_for(noise: float, config: FitConfig) -> FitConfig:
         return config
     sigma = min(max(SIGMAS * noise, config.cloud_sigma), LARGEST)
     tolerance = config.tolerance * min(max(NOISES * noise, config.cloud_sigma), LARGEST) / config.cloud_sigma
-    return replace(config, cloud_sigma=sigma, tolerance=tolerance, accepted=min(config.accepted, ACCEPTED))
+    accepted = config.accepted if noise < CAMERA else min(config.accepted, ACCEPTED)
+    return replace(config, cloud_sigma=sigma, tolerance=tolerance, accepted=accepted)

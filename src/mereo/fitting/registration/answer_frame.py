@@ -206,19 +206,17 @@ def is_hidden_in_part(seen: Observation, candidate: Candidate) -> bool:
 def more_evident(first: Candidate, second: Candidate) -> Candidate:
     """The candidate whose state has the lower misfit in the problem of the first; the first where both do.
 
-    The second where it alone explains the frame: of a noisy one the first knows no noise. Where they differ in whether
-    the object is seen whole, each in its own, as two hypotheses of a search.
+    The second where it alone explains the frame: of a noisy one the first knows no noise. Where they differ in the
+    length of a scene unit, or in whether the object is seen whole, each in its own, as two hypotheses of a search.
     """
     if first.modes is None or second.modes is None:
         return first if second.modes is None else second
     if second.is_accepted and not first.is_accepted:
         return second
-    if first.modes.problem.evidence.other_lines == second.modes.problem.evidence.other_lines:
+    fits = first.modes, second.modes
+    if len({(each.unit, each.problem.evidence.other_lines) for each in fits}) == 1:
         return second if misfit_in(first.modes, second.modes) < misfit_in(first.modes, first.modes) else first
-    cost = [
-        misfit_in(each, each) + (WHOLE if each.problem.evidence.other_lines == "unknown" else 0.0)
-        for each in (first.modes, second.modes)
-    ]
+    cost = [misfit_in(each, each) + (WHOLE if each.problem.evidence.other_lines == "unknown" else 0.0) for each in fits]
     return second if cost[1] < cost[0] else first
 
 
@@ -287,28 +285,24 @@ def fit_hypotheses(
     if registrar is None:
         return Candidate(likelier), likelier
 
-    def fit(encoded: EncodedFrame, patience: Registrar) -> Candidate:
+    def fit(encoded: EncodedFrame) -> Candidate:
         try:
-            modes = patience.fit_modes(cloud_to_fit(encoded, seen.lines, scene_unit, is_certain), encoded.code)
+            modes = registrar.fit_modes(cloud_to_fit(encoded, seen.lines, scene_unit, is_certain), encoded.code)
         except ValueError as error:
             return Candidate(encoded, error=error)
         return Candidate(encoded, modes)
 
     if len(hypotheses) == 1:
-        return fit(likelier, registrar), likelier
-    # with outliers much stays unexplained in any case, which is no reason to turn the camera
-    quick = registrar.without_retries
-    pair = fit(likelier, quick), fit(encode_frame(hypotheses[1], model, axes), quick)
+        return fit(likelier), likelier
+    pair = fit(likelier), fit(encode_frame(hypotheses[1], model, axes))
     everything, surfaces = sorted(pair, key=lambda candidate: candidate.hypothesis.dropped)
     best = everything if surfaces.modes is None else surfaces
     if everything.modes is not None and surfaces.modes is not None:
         best = everything
         if not _are_object(everything, surfaces):
             given_back = _with_explained_given_back(surfaces)
-            again = surfaces if given_back is None else fit(encode_frame(given_back, model, axes), quick)
+            again = surfaces if given_back is None else fit(encode_frame(given_back, model, axes))
             best = _most_explained(everything, surfaces, surfaces if again.modes is None else again)
-    if best.modes is not None and not best.is_accepted:  # then it is not for outliers alone
-        best = better(best, fit(best.encoded, registrar.with_retries))
     if best.modes is not None:
         spent = time.perf_counter() - started - best.encoded.timings_s["encode"]
         best = replace(best, modes=replace(best.modes, seconds=spent))

@@ -48,7 +48,7 @@ def _usual(unexplained: float, ruled_out: float, beyond: float, displaced: float
 
 
 CONSERVATIVE = Recognizing(
-    clean=_usual(0.3, 0.015, 0.15, 0.06), noisy=_usual(0.6, 0.03, 0.2, 0.09), unsure=4.0, refused=8.0
+    clean=_usual(0.12, 0.015, 0.15, 0.06), noisy=_usual(0.6, 0.03, 0.2, 0.09), unsure=4.0, refused=8.0
 )
 """For weights that were not calibrated."""
 

@@ -24,7 +24,6 @@ from mereo.fitting.modes import (
     fit_rest,
     is_at_rest,
     of_rest,
-    with_turned_camera,
 )
 from mereo.fitting.modes import narrowing as modes_narrowing
 from mereo.fitting.problem.correspondences import Correspondences, agree, estimate_unit, find_correspondences
@@ -114,8 +113,7 @@ class ModesFit:
     ) -> "ModesFit":
         """Fit the modes to a cloud, with correspondences in its unit.
 
-        Where much is unexplained, the network predicts again with the camera turned (``with_turned_camera``); where
-        what is left is noise, the frame is fitted once more as a noisy one.
+        Where what is left is noise, the frame is fitted once more as a noisy one.
 
         Args:
             cloud: its lines of sight went past the object where it leaves that open.
@@ -128,16 +126,11 @@ class ModesFit:
         unit = estimate_unit(correspondences) if cloud.scene_unit is None else cloud.scene_unit
         correspondences = correspondences.scaled(1 / unit)
 
-        def predict_in_scene_units(seen: Float[np.ndarray, "s 3"]) -> Correspondences:
-            assert predict is not None
-            return predict(seen * unit).scaled(1 / unit)
-
         with limit_blas_threads():
             problem = Problem.of(model, correspondences, cloud.evidence(unit), cloud.scale_std, config)
             fit = problem, correspondences, fit_modes(problem)
-            predict_scaled = None if predict is None else predict_in_scene_units
-            fit = with_turned_camera(fit, predict_scaled)
-            problem, correspondences, modes = as_noisy(fit, cloud.points / unit, predict_scaled)
+            scaled = None if predict is None else lambda seen: predict(seen * unit).scaled(1 / unit)
+            problem, correspondences, modes = as_noisy(fit, cloud.points / unit, scaled)
             rest = fit_rest(problem, correspondences, modes.posed)
             at_rest = is_at_rest(problem, modes, rest)
         return cls(
@@ -401,7 +394,7 @@ class Registrar:
     def asks_search(self) -> bool:
         """Whether a search follows where the network's fit does not explain the frame: seconds a frame."""
         is_same_object = self.network is not None and self.network.names == self.model.rest.names
-        return self.method == "auto" and self.config.turned and is_same_object
+        return self.method == "auto" and self.config.search_rounds > 0 and is_same_object
 
     @property
     def fits_draws(self) -> bool:
@@ -414,14 +407,9 @@ class Registrar:
             _ = self.states_or_none
 
     @property
-    def without_retries(self) -> "Registrar":
-        """The same without predictions with the camera turned."""
-        return replace(self, constants=replace(self.config, turned=False))
-
-    @property
-    def with_retries(self) -> "Registrar":
-        """The same with predictions with the camera turned, however noisy a frame may be."""
-        return replace(self, constants=replace(self.config, turned_anyway=True))
+    def without_search(self) -> "Registrar":
+        """The same without a search where the network's fit does not explain the frame."""
+        return replace(self, constants=replace(self.config, search_rounds=0)) if self.asks_search else self
 
     def asking(self, network: Trained | None) -> "Registrar":
         """The same with the same weights on another device; scene and states that are known stay so."""
