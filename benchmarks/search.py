@@ -102,7 +102,7 @@ def measured(name: str, condition: str, finder: str, seed: int, index: int) -> l
     registrar = owned.registrar(METHODS[finder])
     assert registrar is not None
     registrar.prepare()
-    registrar = registrar.without_search if finder == "before" else registrar
+    registrar = registrar.without_retries if finder == "before" else registrar
     started = time.perf_counter()
     answer = answer_frame(seen, owned.network, registrar, scene_unit=1.0)
     fit = answer.registration

@@ -169,7 +169,7 @@ def test_without_its_mesh_auto_fits_the_modes_and_full_says_what_is_missing(
 def test_a_refused_registration_leaves_the_answer_to_the_network(model: Model, view: SampleView) -> None:
     stretched = view.depth.to_points().points * np.array([1.0, 2.5, 1.0])
     without_scene = replace(model, provenance={"scene": "mine"})
-    found = answer_to(stretched, model, Registrar.of(without_scene).without_search, 32)
+    found = answer_to(stretched, model, Registrar.of(without_scene).without_retries, 32)
     assert found.registration is not None and not found.registration.accepted and not found.taken
     forced = answer_to(stretched, model, Registrar.of(model, "modes"), 32)
     assert forced.taken and forced.registration is not None and not forced.registration.accepted

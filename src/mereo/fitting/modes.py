@@ -77,9 +77,9 @@ def shaken(problem: Problem, best: "ScoredFit") -> "ScoredFit":
 
     What folds or has joints has many optima next to each other, and the right one is rarely far from a wrong one.
     """
-    rng = np.random.default_rng(0)
-    for _ in range(SHAKES if has_many_optima(problem) else 0):
-        if best.explains(problem) or best.misfit.cloud > HOPELESS or problem.wants_noise(best.surface):
+    rng, is_patient = np.random.default_rng(0), problem.config.search_rounds > 0
+    for _ in range(SHAKES if is_patient and has_many_optima(problem) else 0):
+        if best.explains(problem) or best.misfit.cloud > HOPELESS or problem.leaves_camera_noise(best.surface):
             break
         before, z = best, best.posed.z
         starts = [replace(best.posed, z=z + rng.standard_normal(len(z))) for _ in range(SHAKEN)]

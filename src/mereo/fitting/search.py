@@ -401,8 +401,8 @@ RIVAL = 1.5
 ALIKE = 0.05
 """Difference of the cloud's misfit up to which two states explain a frame alike."""
 
-SHAKEN = 3
-"""Fits around which states are tried in each round."""
+SHAKEN_FITS = 3
+"""Fits that differ, around each of which states are tried in each round."""
 
 HEAVY, HEAVIER_STEPS, HELPS = 3000.0, (0.04, 12), 0.65
 """Weight of a cloud that an elastic solid explains only under it, the first sigma and the steps of the fit with it, and
@@ -464,7 +464,7 @@ class _Trail:
     def shake(self) -> None:
         """Fit again from states around the best fits that differ: an object that looks alike turned is one of them."""
         ranked = sorted(self.fitted, key=_total)
-        for row in differing(self.problem, [scored.posed for scored in ranked], APART)[:SHAKEN]:
+        for row in differing(self.problem, [scored.posed for scored in ranked], APART)[:SHAKEN_FITS]:
             if self.is_explained:
                 return
             self.fitted.append(shaken(self.problem, ranked[row]))

@@ -147,8 +147,8 @@ class Problem:
             return None
         return replace(self, config=config, evidence=self.evidence.with_more_samples, noisy=True)
 
-    def wants_noise(self, surface: Surface) -> bool:
-        """Whether a fit leaves a camera's noise over, for which the constants are not: it would be fitted, too."""
+    def leaves_camera_noise(self, surface: Surface) -> bool:
+        """Whether a fit with a clean frame's constants leaves a camera's noise over, to which it would bend."""
         return not self.noisy and self.residual_noise(surface) >= CAMERA
 
     @property

@@ -407,9 +407,9 @@ class Registrar:
             _ = self.states_or_none
 
     @property
-    def without_search(self) -> "Registrar":
-        """The same without a search where the network's fit does not explain the frame."""
-        return replace(self, constants=replace(self.config, search_rounds=0)) if self.asks_search else self
+    def without_retries(self) -> "Registrar":
+        """The same without what takes seconds where the network's fit does not explain the frame."""
+        return replace(self, constants=replace(self.config, search_rounds=0)) if self.asks_network else self
 
     def asking(self, network: Trained | None) -> "Registrar":
         """The same with the same weights on another device; scene and states that are known stay so."""
