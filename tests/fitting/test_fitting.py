@@ -16,7 +16,7 @@ from mereo.fitting.modes import ScoredFit, fit_wide, narrowing, refined, shaken
 from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import POSE, Posed, along
-from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
+from mereo.fitting.problem.problem import KNOWN_SCALE_STD, OPEN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import NetworkTerm
 from mereo.fitting.registration.recognition import recognize
 from mereo.fitting.registration.register import CloudToFit, ModesFit, is_drawn
@@ -268,5 +268,6 @@ def test_what_is_explained_hopeless_or_a_cameras_noise_is_left(robot: Statistica
     assert shaken(problem, other_thing) is other_thing
     hasty = replace(problem, config=replace(problem.config, search_rounds=0))
     assert shaken(hasty, wrong) is wrong, "a tracker has no time"
+    assert shaken(replace(problem, scale_std=OPEN_SCALE_STD), wrong) is wrong
     noisy, fitted = stuck(robot, 4, 4, noise=0.5)
     assert not fitted.explains(noisy) and shaken(noisy, fitted) is fitted
