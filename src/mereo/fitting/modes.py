@@ -76,7 +76,7 @@ def shaken(problem: Problem, best: "ScoredFit") -> "ScoredFit":
     """Fit again from states around the best, drawn from the prior's spread, as long as one of them is better.
 
     What folds or has joints has many optima next to each other, and the right one is rarely far from a wrong one. Not
-    where the unit is unknown: at any size, a sheet that is shaken takes the shape of other objects.
+    where the unit is unknown: frames of other things are explained no less without it, and cost a third more with it.
     """
     rng, is_patient = np.random.default_rng(0), problem.config.search_rounds > 0 and not problem.is_scale_open
     for _ in range(SHAKES if is_patient and has_many_optima(problem) else 0):
