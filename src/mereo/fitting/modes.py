@@ -69,7 +69,8 @@ SHAKES, SHAKEN = 8, 12
 """Rounds of shaking at most, and starts in each."""
 
 HOPELESS = 4.0
-"""Misfit of the cloud from which on a fit is of something else: own views have up to 2.6, most else 4.3 to 6."""
+"""Misfit of the cloud from which on a fit is of something else: after two rounds of a search own views have up to 2.6,
+most else 4.3 to 6."""
 
 
 def shaken(problem: Problem, best: "ScoredFit") -> "ScoredFit":
