@@ -81,7 +81,7 @@ class TrainConfig:
         offset_examples: training examples from which the finished network's class offsets are chosen; 0 is off.
         holdout: examples at the end of the dataset kept for the validation curve.
         precision: auto takes bfloat16 on CUDA and on CPUs that are much faster in it.
-        compile: torch.compile of the network; auto means where it pays: on CUDA, and for long runs on a CPU.
+        compile: torch.compile of the network; auto means where it pays: in long runs.
         seed: initialization, shuffling and augmentation.
     """
 

@@ -63,7 +63,8 @@ def test_bfloat16_changes_few_labels_and_little_distance(tmp_path: Path) -> None
     """The stated cost: about one label in a thousand; a rounding of coordinates instead would change every tenth."""
     points = np.load(cloud_file(tmp_path))
     queries = np.random.default_rng(1).uniform(points.min(axis=0), points.max(axis=0), (4000, 3))
-    models = load_for("bunny", CPU), load_for("bunny", EXACT), load_for("bunny", InferenceConfig(device="cpu"))
+    on_cpu = replace(EXACT, device="cpu")
+    models = [load_for("bunny", config) for config in (CPU, on_cpu, InferenceConfig(device="cpu"))]
     assert {model.device.type for model in models} == {"cpu"}
     auto = "bfloat16" if bfloat16_pays() else "float32"
     assert [model.working_precision for model in models] == ["bfloat16", "float32", auto]

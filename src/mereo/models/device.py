@@ -77,9 +77,12 @@ def exact(tensor: Tensor) -> AbstractContextManager[object]:
 
 
 def compiling_pays(device: torch.device, steps: int) -> bool:
-    """Whether torch.compile earns its minute back: always on CUDA, on CPUs in long runs where a C++ compiler exists."""
+    """Whether torch.compile earns its minute or two back: in long runs, on CPUs where a C++ compiler exists.
+
+    An H100 took over 75 s to compile `large` and gained some 5 of 50 ms a step (docs/experiments/075.md).
+    """
     if device.type == "cuda":
-        return True
+        return steps >= 20_000
     return steps >= 1000 and shutil.which("g++") is not None
 
 
