@@ -28,11 +28,14 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
+import trimesh
+from jaxtyping import Float
 from occluded_views import occlude
+from scipy.spatial.transform import Rotation
 
 from mereo.api.generate import generate
 from mereo.api.objects import load_object
@@ -41,8 +44,11 @@ from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.recognition import MOST, Recognition
 from mereo.fitting.registration.register import Registrar
-from mereo.geometry.camera import PointCloud
+from mereo.geometry.camera import Camera, PointCloud
+from mereo.geometry.conventions import MIN_POINTS
+from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.metrics import grid_confusion, intersection_over_union, labels_on, truth_grid
+from mereo.geometry.solids import Solids
 from mereo.io.atomic_files import atomic_file
 from mereo.models.model import Model
 from mereo.models.weights import load_model
@@ -50,17 +56,12 @@ from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import Observation, find_object, observe
 from mereo.scenes.draw_recorder import OutOfDraws, Recorder
 from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import Scene, SourceFrame
+from mereo.scenes.scene import SCENES, AssetUnavailable, Scene, SourceFrame
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.synthesis.config import SENSORS, GenerateConfig
+from mereo.synthesis.depth_sensor import observe as observe_scene
 from mereo.synthesis.examples import View, sample_view
-from mereo_learning.calibrate import (
-    VIEWS,
-    calibrate,
-    ece_of,
-    other_objects,
-    strange_frames,
-)
+from mereo_learning.calibrate import VIEWS, calibrate, ece_of
 from mereo_learning.cases import RegistrationErrors, nearest_truth, sample_cells, seen_points
 from mereo_learning.config import PRESETS
 from mereo_learning.scoring import trained_scene, true_material
@@ -405,6 +406,93 @@ def main() -> None:
         print(lines[-1], flush=True)
         if arguments.output is not None:
             (arguments.output / "table.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+# --- frames of something else -----------------------------------------------------------------------------------------
+
+# Clouds of what no scene shows: planes, and heaps of boxes, balls and cylinders.
+#
+# For trials of what is said of a frame that does not show the object. They are as large as the object and seen by the
+# same camera, so that size and noise tell nothing.
+
+Stranger = Literal["plane", "clutter"]
+
+
+def stranger_cloud(scene: Scene, kind: Stranger, settings: GenerateConfig, rng: np.random.Generator) -> PointCloud:
+    """Cloud of a plane or a heap, about as large as a scene's object, by a camera as far away as the scene's."""
+    workspace = scene.workspace_named(settings.workspace)
+    camera = Camera.from_fov(settings.image_size, settings.image_size, workspace.fov_rad)
+    low, high = scene.rest.bounds
+    size = float((high - low).max())
+    while True:
+        middle = np.array([0.0, 0.0, rng.uniform(*workspace.distance)])
+        bodies = [_plate(size, rng)] if kind == "plane" else _heap(size, rng)
+        parts = tuple(
+            Segment(
+                f"body {i + 1}", PALETTE[i % len(PALETTE)], np.asarray(body.vertices) + middle, np.asarray(body.faces)
+            )
+            for i, body in enumerate(bodies)
+        )
+        seen = observe_scene(Solids(SegmentedMesh(parts)), camera, settings.noise_std, settings.sensor, rng)
+        if seen.object_points >= 4 * MIN_POINTS:
+            return seen.image.to_points()
+
+
+def _plate(size: float, rng: np.random.Generator) -> trimesh.Trimesh:
+    """Flat box, whose normal is turned by up to 1.2 rad from the line of sight."""
+    plate = trimesh.creation.box([*(rng.uniform(0.5, 1.0, size=2) * size), 0.01 * size])
+    roll = Rotation.from_euler("z", rng.uniform(0.0, 2 * np.pi))
+    tilt = Rotation.from_euler("zx", [rng.uniform(0.0, 2 * np.pi), rng.uniform(0.0, 1.2)])
+    return _placed(plate, tilt * roll, np.zeros(3))
+
+
+def _heap(size: float, rng: np.random.Generator) -> list[trimesh.Trimesh]:
+    """Three to eight boxes, balls and cylinders of a tenth to a half of ``size``, anywhere within it, any way up."""
+    makers: tuple[Callable[[Float[np.ndarray, "3"]], trimesh.Trimesh], ...] = (
+        lambda sides: trimesh.creation.box(sides),
+        lambda sides: trimesh.creation.icosphere(subdivisions=2, radius=sides[0] / 2),
+        lambda sides: trimesh.creation.cylinder(radius=sides[0] / 3, height=1.5 * sides[1], sections=24),
+    )
+    bodies = []
+    for _ in range(int(rng.integers(3, 9))):
+        body = makers[int(rng.integers(len(makers)))](rng.uniform(0.1, 0.5, size=3) * size)
+        turned = Rotation.from_quat(rng.normal(size=4))
+        bodies.append(_placed(body, turned, rng.uniform(-0.35, 0.35, size=3) * size))
+    return bodies
+
+
+def _placed(body: trimesh.Trimesh, turned: Rotation, place: Float[np.ndarray, "3"]) -> trimesh.Trimesh:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = turned.as_matrix(), place
+    body.apply_transform(T)
+    return body
+
+
+def strange_frames(
+    scene: Scene, others: Sequence[Scene], each: int, seed: int
+) -> Iterator[tuple[Literal["other object", "plane or clutter"], PointCloud]]:
+    """Frames that do not show the object: of every other one (``other_objects``), and ``4 * each`` planes and heaps."""
+    settings = GenerateConfig()
+    for other in others:
+        for index in range(each):
+            view = sample_view(other, settings, example_rng(seed + 1, index))
+            yield "other object", view.depth.to_points()
+    for index in range(4 * each):
+        plane, heap = example_rng(seed + 2, index), example_rng(seed + 3, index)
+        yield "plane or clutter", stranger_cloud(scene, "plane", settings, plane)
+        yield "plane or clutter", stranger_cloud(scene, "clutter", settings, heap)
+
+
+def other_objects(scene: Scene) -> list[Scene]:
+    """Built-in scenes of other objects than this one, whose meshes are here."""
+    livers = ("liver", "tumor", "liver-simulated")  # of one liver: one is as good as another to be told from the rest
+    same = livers if scene.name in livers else (scene.name,)
+    others = []
+    for name in SCENES:
+        with suppress(AssetUnavailable):
+            if name not in (*same, *livers[1:]):
+                others.append(load_scene(name))
+    return others
 
 
 if __name__ == "__main__":

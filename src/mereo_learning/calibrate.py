@@ -1,44 +1,37 @@
 """Calibration of weights on views of training seeds: what they say of these is compared with what is true.
 
-    Model, Scene -object_views, strange_frames-> Answer -measured-> Calibration
+    Model, Scene -object_views-> Answer -measured-> Calibration
 
-Three parts are measured: the network's probabilities, the radii of registrations, and the limits of recognition.
+Three parts are measured: the network's probabilities, the radii of registrations, and what is usual of recognition.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-import trimesh
 from jaxtyping import Float, UInt8
 from scipy.optimize import minimize
-from scipy.spatial.transform import Rotation
 from scipy.special import log_softmax, softmax
 
 from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.answer_frame import answer_frame
-from mereo.fitting.registration.recognition import CONSERVATIVE, Signs, is_noisy, strangeness
-from mereo.fitting.registration.recognition import LEAST as LEAST_SIGNS
+from mereo.fitting.registration.recognition import CONSERVATIVE, MEASURED, Signs, is_noisy
 from mereo.fitting.registration.register import Registrar, registrar_for
 from mereo.fitting.registration.registration import Registration
-from mereo.geometry.camera import Camera, PointCloud
-from mereo.geometry.conventions import MIN_POINTS
-from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.camera import PointCloud
+from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.metrics import truth_grid
-from mereo.geometry.solids import Solids
 from mereo.io.progress import progress
 from mereo.models.calibration import Calibration, RadiusFactors, Recognizing, Scaling, SignName, Usual
 from mereo.models.model import Model, scaled_array
 from mereo.reconstruction.observation import observe
 from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import SCENES, AssetUnavailable, Scene
+from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor
-from mereo.synthesis.depth_sensor import observe as observe_scene
 from mereo.synthesis.examples import sample_view
 from mereo_learning.cases import RegistrationErrors, Reliability, nearest_truth, sample_cells, seen_points
 from mereo_learning.scoring import check_names, trained_scene, true_material
@@ -57,18 +50,16 @@ def calibrate(
     *,
     views: int = VIEWS,
     seed: int = SEED,
-    strangers: bool = True,
     radius_views: int = 0,
     quiet: bool = True,
 ) -> Calibration:
-    """Calibration of a model by views of its scene: clean ones, noisy ones, and frames of what is not its object.
+    """Calibration of a model by views of its scene, clean ones and noisy ones.
 
     Args:
         model: the weights; of such without a statistical model only the probabilities are calibrated.
         scene: their scene, its name or its file; by default the built-in one that they were trained on.
-        views: of the object, half of them clean; at least ``LEAST_VIEWS``. About as many strange frames come on top.
+        views: of the object, half of them clean; at least ``LEAST_VIEWS``.
         seed: a training seed other than that of the weights' examples.
-        strangers: take in frames of other things too, which place the second limit of recognition.
         radius_views: further clean views for the radii alone, with the scene unit known: of a fit that ends in a wrong
             state once in twenty, a few views tell nothing.
         quiet: show no progress.
@@ -85,11 +76,9 @@ def calibrate(
     bare = replace(model, calibration=None)
     registrar = None if model.statistical_model is None else registrar_for(bare, "modes", scene)
     more = radius_views if registrar is not None else 0
-    each = max(1, round(views / 24)) if strangers and registrar is not None else 0
-    others = other_objects(scene) if each else []
     logits, truth, signs = [], [], RecognitionSigns()
     radii = ViewRadii() if registrar is None else ViewRadii(replace(registrar, method="auto"))
-    with progress("calibrate", views + more + each * (len(others) + 8), "views", quiet=quiet) as shown:
+    with progress("calibrate", views + more, "views", quiet=quiet) as shown:
         for number, view in enumerate(object_views(scene, views, seed, more)):
             answer = answer_frame(observe(view.seen), bare, registrar, scene_unit=view.scene_unit)
             radii.add(view, answer)
@@ -102,9 +91,6 @@ def calibrate(
                     logits.append(bare.logits(answer.likelier.code, points))
                     truth.append(np.minimum(labels, logits[-1].shape[1] - 1).astype(np.uint8))
             shown.advance()
-        for _, cloud in strange_frames(scene, others, each, seed):
-            signs.add(answer_frame(observe(cloud), bare, registrar), is_strange=True)
-            shown.advance()
     joint, labels = np.concatenate(logits), np.concatenate(truth)
     scaling = fit_scaling(joint, labels)
     return Calibration(
@@ -113,7 +99,7 @@ def calibrate(
         temperature=scaling.temperature,
         biases=scaling.biases,
         ece=(ece_of(joint, labels), ece_of(joint, labels, scaling)),
-        recognizing=signs.limits(),
+        recognizing=signs.usual(),
         **radii.fields(),
     )
 
@@ -156,33 +142,6 @@ def object_views(scene: Scene, count: int, seed: int, clean: int = 0) -> Iterato
         scene_unit = 1.0 if index // len(CAMERAS) % 2 == 0 or index >= count else None
         view = sample_view(scene.for_seed(seed), GenerateConfig(sensor=SENSORS[camera]), example_rng(seed, index))
         yield CalibrationView(view.mesh, view.depth.to_points(), camera, scene_unit, partial(true_material, view))
-
-
-def strange_frames(
-    scene: Scene, others: Sequence[Scene], each: int, seed: int
-) -> Iterator[tuple[Literal["other object", "plane or clutter"], PointCloud]]:
-    """Frames that do not show the object: of every other one (``other_objects``), and ``4 * each`` planes and heaps."""
-    settings = GenerateConfig()
-    for other in others:
-        for index in range(each):
-            view = sample_view(other, settings, example_rng(seed + 1, index))
-            yield "other object", view.depth.to_points()
-    for index in range(4 * each):
-        plane, heap = example_rng(seed + 2, index), example_rng(seed + 3, index)
-        yield "plane or clutter", stranger_cloud(scene, "plane", settings, plane)
-        yield "plane or clutter", stranger_cloud(scene, "clutter", settings, heap)
-
-
-def other_objects(scene: Scene) -> list[Scene]:
-    """Built-in scenes of other objects than this one, whose meshes are here."""
-    livers = ("liver", "tumor", "liver-simulated")  # of one liver: one is as good as another to be told from the rest
-    same = livers if scene.name in livers else (scene.name,)
-    others = []
-    for name in SCENES:
-        with suppress(AssetUnavailable):
-            if name not in (*same, *livers[1:]):
-                others.append(load_scene(name))
-    return others
 
 
 # --- probabilities ----------------------------------------------------------------------------------------------------
@@ -339,14 +298,10 @@ def factors_of(views: Sequence[MeasuredRadii]) -> RadiusFactors:
 
 # --- recognition ------------------------------------------------------------------------------------------------------
 
-MEASURED: tuple[SignName, ...] = tuple(name for name in LEAST_SIGNS if name != "size")
-"""Signs that are measured; what is usual of the size follows from how far units are apart."""
-
 SMALLEST_STD: dict[SignName, float] = {
     "unexplained": 0.5,
     "ruled_out": 0.5,
     "beyond": 0.5,
-    "unusual": 0.2,
     "displaced": 0.1,
 }
 """Least standard deviations of the signs' logarithms: a few views may be more alike than others will be.
@@ -364,38 +319,22 @@ class RecognitionSigns:
     Attributes:
         clean: of views of the object.
         noisy: of views of the object by a depth camera.
-        strange: of frames that show something else, each with whether it is noisy.
     """
 
     clean: list[Signs] = field(default_factory=list)
     noisy: list[Signs] = field(default_factory=list)
-    strange: list[tuple[Signs, bool]] = field(default_factory=list)
 
-    def add(self, answer: Answer, is_strange: bool = False) -> None:
+    def add(self, answer: Answer) -> None:
         """Take in a frame; one that was not registered has no signs."""
-        if answer.registration is None or answer.recognition.signs is None:
-            return
-        signs, noisy = answer.recognition.signs, is_noisy(answer.registration)
-        if is_strange:
-            self.strange.append((signs, noisy))
-        else:
-            (self.noisy if noisy else self.clean).append(signs)
+        if answer.registration is not None and answer.recognition.signs is not None:
+            (self.noisy if is_noisy(answer.registration) else self.clean).append(answer.recognition.signs)
 
-    def limits(self) -> Recognizing | None:
-        """What is usual, and both limits; None where too few views were registered."""
+    def usual(self) -> Recognizing | None:
+        """What is usual; None where too few views were registered."""
         if len(self.clean) < TRUSTED:
             return None
-        clean = usual_of(self.clean)
         noisy = usual_of(self.noisy) if len(self.noisy) >= TRUSTED else dict(CONSERVATIVE.noisy)
-        objects = [strangeness(signs.strange(clean)) for signs in self.clean]
-        objects += [strangeness(signs.strange(noisy)) for signs in self.noisy]
-        # not the largest: a camera's view that the network misread may well be called strange
-        unsure = max(1.25 * float(np.quantile(objects, 0.95)), 3.0)
-        others = [strangeness(signs.strange(noisy if is_noise else clean)) for signs, is_noise in self.strange]
-        apart = 1.6  # the second limit at least, in the first; else it is in the middle between it and other things
-        lowest = float(np.quantile(others, 0.1)) if others else unsure * apart**2
-        refused = max(float(np.sqrt(unsure * lowest)), apart * unsure)
-        return Recognizing(clean=clean, noisy=noisy, unsure=unsure, refused=refused)
+        return Recognizing(clean=usual_of(self.clean), noisy=noisy)
 
 
 def usual_of(signs: Sequence[Signs]) -> dict[SignName, Usual]:
@@ -407,63 +346,3 @@ def usual_of(signs: Sequence[Signs]) -> dict[SignName, Usual]:
             low, middle, high = np.quantile(values, [0.16, 0.5, 0.84])
             result[name] = Usual(mean=float(middle), std=max(float(high - low) / 2, SMALLEST_STD[name]))
     return result
-
-
-# --- distractors ------------------------------------------------------------------------------------------------------
-
-# Clouds of what no scene shows: planes, and heaps of boxes, balls and cylinders.
-#
-# For trials of what is said of a frame that does not show the object. They are as large as the object and seen by the
-# same camera, so that size and noise tell nothing.
-
-Stranger = Literal["plane", "clutter"]
-
-
-def stranger_cloud(scene: Scene, kind: Stranger, settings: GenerateConfig, rng: np.random.Generator) -> PointCloud:
-    """Cloud of a plane or a heap, about as large as a scene's object, by a camera as far away as the scene's."""
-    workspace = scene.workspace_named(settings.workspace)
-    camera = Camera.from_fov(settings.image_size, settings.image_size, workspace.fov_rad)
-    low, high = scene.rest.bounds
-    size = float((high - low).max())
-    while True:
-        middle = np.array([0.0, 0.0, rng.uniform(*workspace.distance)])
-        bodies = [_plate(size, rng)] if kind == "plane" else _heap(size, rng)
-        parts = tuple(
-            Segment(
-                f"body {i + 1}", PALETTE[i % len(PALETTE)], np.asarray(body.vertices) + middle, np.asarray(body.faces)
-            )
-            for i, body in enumerate(bodies)
-        )
-        seen = observe_scene(Solids(SegmentedMesh(parts)), camera, settings.noise_std, settings.sensor, rng)
-        if seen.object_points >= 4 * MIN_POINTS:
-            return seen.image.to_points()
-
-
-def _plate(size: float, rng: np.random.Generator) -> trimesh.Trimesh:
-    """Flat box, whose normal is turned by up to 1.2 rad from the line of sight."""
-    plate = trimesh.creation.box([*(rng.uniform(0.5, 1.0, size=2) * size), 0.01 * size])
-    roll = Rotation.from_euler("z", rng.uniform(0.0, 2 * np.pi))
-    tilt = Rotation.from_euler("zx", [rng.uniform(0.0, 2 * np.pi), rng.uniform(0.0, 1.2)])
-    return _placed(plate, tilt * roll, np.zeros(3))
-
-
-def _heap(size: float, rng: np.random.Generator) -> list[trimesh.Trimesh]:
-    """Three to eight boxes, balls and cylinders of a tenth to a half of ``size``, anywhere within it, any way up."""
-    makers: tuple[Callable[[Float[np.ndarray, "3"]], trimesh.Trimesh], ...] = (
-        lambda sides: trimesh.creation.box(sides),
-        lambda sides: trimesh.creation.icosphere(subdivisions=2, radius=sides[0] / 2),
-        lambda sides: trimesh.creation.cylinder(radius=sides[0] / 3, height=1.5 * sides[1], sections=24),
-    )
-    bodies = []
-    for _ in range(int(rng.integers(3, 9))):
-        body = makers[int(rng.integers(len(makers)))](rng.uniform(0.1, 0.5, size=3) * size)
-        turned = Rotation.from_quat(rng.normal(size=4))
-        bodies.append(_placed(body, turned, rng.uniform(-0.35, 0.35, size=3) * size))
-    return bodies
-
-
-def _placed(body: trimesh.Trimesh, turned: Rotation, place: Float[np.ndarray, "3"]) -> trimesh.Trimesh:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = turned.as_matrix(), place
-    body.apply_transform(T)
-    return body

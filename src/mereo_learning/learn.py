@@ -367,7 +367,7 @@ def _calibrated(weights: Path, output: Path, scene: str, left_s: float) -> float
     each_s = (time.monotonic() - started) / TIMED
     views = min(max(views_for(CALIBRATION_SHARE * left_s, each_s), LEAST_VIEWS), VIEWS)
     # other things than the object would take as long again, and only place the second limit of recognition
-    calibration = calibrate(load_model(weights), scene, views=views, strangers=False, quiet=False)
+    calibration = calibrate(load_model(weights), scene, views=views, quiet=False)
     with atomic_file(output / WEIGHTS) as scratch:
         scratch.write_bytes(with_calibration(weights, calibration))
     return each_s

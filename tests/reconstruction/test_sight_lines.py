@@ -164,6 +164,18 @@ def test_what_a_bare_cloud_is_cut_by_is_what_it_is_declared_to_be(views: list[Vi
     assert Evidence.of(points, lines=SightLines.of_cloud("unknown")).hidden_edge == 1.0
 
 
+def test_what_was_to_be_seen_and_was_not_counts_where_nothing_says_what_is_there(views: list[View]) -> None:
+    triangles = np.concatenate([segment.vertices[segment.faces] for segment in views[0].mesh.segments])
+    points, nothing = views[0].depth.to_points().points, np.empty((0, 3))
+    is_left = points[:, 0] < np.median(points[:, 0])
+    left, right = points[is_left], points[~is_left]
+    assert Evidence.of(points, lines=SightLines.of_cloud("unknown")).unseen(triangles) < 0.02
+    assert 0.3 < Evidence.of(left, lines=SightLines.of_cloud("unknown")).unseen(triangles) < 0.7
+    assert Evidence.of(left, lines=SightLines.of_cloud("past")).unseen(triangles) == 0.0  # ruled out
+    hidden, empty = SightLines(nothing, right, "unknown"), SightLines(2 * right, nothing, "unknown")
+    assert max(Evidence.of(left, lines=lines).unseen(triangles) for lines in (hidden, empty)) < 0.05
+
+
 # --- images by hand ---------------------------------------------------------------------------------------------------
 
 WIDE = Camera(60, 50, 80.0, 80.0, 30.0, 25.0)

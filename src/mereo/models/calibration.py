@@ -4,13 +4,13 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, Field, FiniteFloat, model_validator
+from pydantic import BaseModel, Field, FiniteFloat
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
-SignName = Literal["size", "unexplained", "ruled_out", "beyond", "unusual", "displaced"]
+SignName = Literal["size", "unexplained", "ruled_out", "beyond", "unusual", "displaced", "unseen"]
 """Signs that a frame does not show the object in a state that was learned; ``fitting.registration`` tells them."""
 
 
@@ -27,20 +27,10 @@ class Recognizing(BaseModel, frozen=True):
     Attributes:
         clean: usual signs of views without noise beyond the paper's.
         noisy: the same of simulated depth cameras' views.
-        unsure: strangeness up to which the object is known.
-        refused: strangeness from which on it is not.
     """
 
     clean: dict[SignName, Usual]
     noisy: dict[SignName, Usual]
-    unsure: Positive
-    refused: Positive
-
-    @model_validator(mode="after")
-    def _ordered(self) -> "Recognizing":
-        if self.unsure >= self.refused:
-            raise ValueError(f"the limits are {self.unsure:g} and {self.refused:g}; the first must be the smaller")
-        return self
 
 
 MISFITTING = 2.0
@@ -148,7 +138,7 @@ class Calibration(BaseModel, frozen=True):
 def calibration_rows(calibration: Calibration | None) -> list[tuple[str, str]]:
     """Calibration in words, each with its title."""
     if calibration is None:
-        return [("calibration", "none: confidences are not calibrated, recognition has conservative limits")]
+        return [("calibration", "none: confidences are not calibrated, what is usual of recognition is conservative")]
     rows = [("calibration", f"{calibration.views} views of the training seed {calibration.seed}")]
     if calibration.temperature is not None:
         kind = "a temperature" if calibration.biases is None else "a temperature and a bias for each class"
@@ -161,6 +151,5 @@ def calibration_rows(calibration: Calibration | None) -> list[tuple[str, str]]:
             of_draws = "" if draws is None else f", {draws:.2f} of fits of the scene's draws"
             rows.append((what, f"the posterior's times {modes:.2f} of fits of the modes{of_draws}"))
     if calibration.recognizing is not None:
-        limits = calibration.recognizing
-        rows.append(("recognition", f"unsure above a strangeness of {limits.unsure:.2g}, no from {limits.refused:.2g}"))
+        rows.append(("recognition", "what is usual of the object's own views"))
     return rows

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
+from scipy.special import ndtri
 
 from mereo.deformation.moving_least_squares import ANCHORS, Anchors, PointWeights, spread
 from mereo.geometry.brief import counted, listed
@@ -279,6 +280,23 @@ class StatisticalModel:
         low, high = self.library.min(axis=0), self.library.max(axis=0)
         excess = np.maximum(np.maximum(z - high, low - z), 0.0) * self.motion
         return float(np.sqrt((excess**2).sum()))
+
+    @cached_property
+    def _squares(self) -> Float[np.ndarray, " n"]:
+        """Logarithms of the library's mean squared coefficients, in order."""
+        squares = (self.library.astype(np.float64) ** 2).mean(axis=1)
+        return np.log(np.sort(np.maximum(squares, np.finfo(float).tiny)))
+
+    def unusual(self, z: Float[np.ndarray, " k"]) -> float:
+        """How improbable a state is that is bent so far, in standard deviations: by the library's states bent farther.
+
+        A normal number is as rarely as large. Beyond all of the library, it goes on as from its median to its largest.
+        """
+        levels, middle = self._squares, np.median(self._squares)
+        level = np.log(max((z**2).mean(), np.finfo(float).tiny))
+        within = np.interp(level, levels, ndtri((np.arange(len(levels)) + 0.5) / len(levels)))
+        far = (level - middle) / max(levels[-1] - middle, np.finfo(float).eps)
+        return float(within * max(far, 1.0))
 
     def mesh(self, material: Float[np.ndarray, "m 3"]) -> SegmentedMesh:
         """The segments, with the rest mesh's faces, at these positions."""

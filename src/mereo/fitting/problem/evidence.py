@@ -39,6 +39,9 @@ With a pixel's own depth alone, 6 to 13 % of the true surface counted as in fron
 
 AROUND = 9
 
+UNSEEN_PITCHES = 2.0
+"""Farther from the nearest line of sight that met the object, nothing of it was seen: noise and small gaps stay out."""
+
 NORMAL_POINTS = 12
 """Points by which the surface's direction at an observed one is estimated."""
 
@@ -184,6 +187,23 @@ class Evidence:
         start = np.linalg.lstsq(terms, height, rcond=None)[0]
         patch = least_squares(away, start, loss="cauchy", f_scale=tolerance, x_scale="jac").x
         return float((np.abs(away(patch)) <= tolerance).mean())
+
+    def unseen(self, triangles: Float[np.ndarray, "f 3 3"]) -> float:
+        """Share of what a surface shows the camera that lies where nothing was seen, and nothing says what is there.
+
+        ``triangles`` are wound outwards. What they hide of each other counts too.
+        """
+        if self.other_lines == "past":
+            return 0.0
+        center = triangles.mean(axis=1)
+        distance = np.linalg.norm(center, axis=1)
+        across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        shown = np.maximum(-np.einsum("fi,fi->f", across, center), 0.0) / distance**3
+        toward = center / distance[:, None]
+        angle, near = self.sight.query(toward)
+        is_open = self._free(toward, np.full(len(toward), np.inf)) == 0.0
+        is_unseen = is_open & (near < len(self.points)) & (angle > UNSEEN_PITCHES * self.pitch)
+        return float(shown[is_unseen].sum() / max(shown.sum(), np.finfo(float).tiny))
 
     def violations(
         self, vertices: Float[np.ndarray, "n 3"], slack: float

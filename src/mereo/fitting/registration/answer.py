@@ -45,15 +45,12 @@ class Candidate:
     Attributes:
         encoded: these points, and what the network made of them.
         modes: the fit; None where none was wanted, or none was found for ``error``.
-        rival: how far another fit, which explains a noisy frame too, has the object from this one, root mean square, as
-            a share of half its length; None where none was made.
     """
 
     encoded: EncodedFrame
     modes: ModesFit | None = None
     error: ValueError | None = None
     located_by: LocatedBy = "network"
-    rival: float | None = None
 
     @property
     def hypothesis(self) -> Reading:
@@ -93,6 +90,11 @@ class Candidate:
     def explained(self, tolerance: float) -> float:
         """Share of all points, outliers included, that lie on the facing surface up to a tolerance in scene units."""
         return float((self.off_surface <= tolerance).mean())
+
+    def unseen(self, registration: Registration) -> float:
+        """Share of what the camera would see of a registration that it has not seen (``Evidence.unseen``)."""
+        assert self.modes is not None
+        return self.modes.problem.evidence.unseen((registration.material / self.modes.unit)[registration.model.faces])
 
     def displaced(self, registration: Registration) -> float | None:
         """How far apart network and registration have the same points (``Signs.displaced``); None without a fit."""

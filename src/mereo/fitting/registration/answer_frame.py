@@ -51,12 +51,6 @@ HIDDEN = 0.12
 Whole clean views have at most .03, those of which a tool hides 30 % .01 to .32, others that are cut .15 to .57."""
 
 
-AS_GOOD = 1.25
-"""Misfit of a second fit, in that of the first, up to which it explains a noisy frame as well.
-
-Of second fits that lie apart, those of two wrong answers had 1.15 and 1.17, those of right ones up to 2.5."""
-
-
 def answer_frame(
     seen: Observation,
     model: Trained | None,
@@ -112,7 +106,8 @@ def answer_of(
     stated = None if registrar is None else registrar.stated_scene_unit(seen.frame.unit_m)
     refusal = None if candidate.error is None else str(candidate.error)
     calibration = None if model is None else model.calibration
-    recognition = recognize(registration, calibration, displaced, stated, refusal).with_rival(candidate.rival)
+    unseen = None if registration is None or seen.lines.other_lines is not None else candidate.unseen(registration)
+    recognition = recognize(registration, calibration, displaced, stated, refusal, unseen)
     if recognition.known is True and candidate.is_featureless:
         recognition = recognition.doubted(FEATURELESS)
     taken = registrar is not None and registration is not None and registrar.takes(registration)
@@ -150,8 +145,7 @@ def find(
     """Find the best fit to a frame by itself, and the hypothesis on its points that is likelier without a fit.
 
     A network starts the fit where there is one, in tenths of a second; where that is doubtful (``is_doubtful``), a
-    search follows, and the fit with the greater evidence is taken. In a noisy frame many states explain the points:
-    how far a fit from another start is from the network's is kept (``rival_distance``).
+    search follows, and the fit with the greater evidence is taken.
 
     Takes the arguments of ``answer_frame``, and raises as it does for unusable clouds.
     """
@@ -167,7 +161,7 @@ def find(
     if registrar is None or not registrar.asks_search:
         return candidate, likelier
     if not is_doubtful(seen, candidate):
-        return (replace(candidate, rival=rival_distance(candidate)) if candidate.is_noisy else candidate), likelier
+        return candidate, likelier
     searched, _ = search_hypotheses(seen, registrar, keep_all, scene_unit)
     return more_evident(candidate, searched), likelier
 
@@ -220,33 +214,10 @@ def more_evident(first: Candidate, second: Candidate) -> Candidate:
     return second if cost[1] < cost[0] else first
 
 
-def rival_distance(candidate: Candidate) -> float | None:
-    """Distance of a fit from the best that one round of search makes of the same frame, noise and all, without network.
-
-    Root mean square over the material points, as a share of half the object's length; None where the search explains
-    too little, or clearly worse.
-    """
-    modes = candidate.modes
-    assert modes is not None
-    problem = modes.problem
-    with limit_blas_threads():
-        config = replace(problem.config, search_rounds=1)
-        outcome = search(replace(problem, network=NetworkTerm.none(problem.model), config=config))
-    other = replace(modes, posed=outcome.best.posed, rest=None)
-    rival = other.registration()
-    if not rival.accepted or misfit_in(modes, other) > AS_GOOD * misfit_in(modes, modes):
-        return None
-    offset = rival.material - modes.registration().material
-    return float(np.sqrt((offset**2).sum(axis=1).mean())) / (problem.model.half * modes.unit)
-
-
 def misfit_in(frame: ModesFit, fitted: ModesFit) -> float:
-    """Misfit of a fit's state in the problem of another fit to the frame, without the network's term."""
-    model, surface = frame.problem.model, fitted.surface
-    if fitted.unit != frame.unit:
-        surface = Surface.through(model, surface.material * (fitted.unit / frame.unit))
-    z = fitted.posed.z if fitted.rest is None else model.rest_z
-    return frame.problem.misfit(replace(fitted.posed, z=z), surface).without_network
+    """Misfit of a fit's state in the problem of another fit in the same unit, without the network's term."""
+    z = fitted.posed.z if fitted.rest is None else frame.problem.model.rest_z
+    return frame.problem.misfit(replace(fitted.posed, z=z), fitted.surface).without_network
 
 
 # --- outlier hypotheses -----------------------------------------------------------------------------------------------

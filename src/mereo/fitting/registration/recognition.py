@@ -3,9 +3,8 @@
     Registration, correspondences, stated scene unit -Signs.of-> Signs -recognize-> Recognition (known or not, and why)
 
 A sign is a number that is small for the object in learned states, and grows with what is wrong. Views of the object
-tell how large it usually is, clean and under a camera's noise (``Calibration.recognizing``; conservative values for
-weights that were not calibrated). How far the logarithms of all signs lie above the usual, in standard deviations and
-together, is the frame's strangeness; two limits make three answers of it. The strangest sign gives the reason.
+tell how large some usually are, clean and under a camera's noise (``Calibration.recognizing``). How far all lie above
+the usual, in standard deviations and together, is the frame's strangeness; the strangest sign gives the reason.
 """
 
 from collections.abc import Mapping
@@ -19,6 +18,12 @@ from mereo.models.calibration import Calibration, Recognizing, SignName, Usual
 
 Known = bool | Literal["unsure"]
 
+UNSURE, REFUSED = 3.5, 7.0
+"""Strangeness up to which the object is known, and that from which on it is not.
+
+Of 295 right answers to training views of eleven objects four lie beyond the first, and none beyond the second
+(docs/experiments/075.md)."""
+
 MOST = 1e3
 """Strangeness that is not exceeded, and that of a frame in which nothing was found."""
 
@@ -27,29 +32,32 @@ LEAST: Mapping[SignName, float] = {
     "unexplained": 0.1,
     "ruled_out": 0.01,
     "beyond": 0.1,
-    "unusual": 0.05,
     "displaced": 0.005,
+    "unseen": 0.02,
 }
 """What is added to a sign before its logarithm is taken: less than that means nothing."""
 
-SIZE = Usual(mean=float(np.log(LEAST["size"] + 0.03)), std=0.5)
-"""Usual logarithm of how far sizes are off, of all weights: by 3 %, and by 15 % at most where the unit is right."""
+FIXED: Mapping[SignName, Usual] = {
+    "size": Usual(mean=float(np.log(LEAST["size"] + 0.03)), std=0.5),
+    "unseen": Usual(mean=float(np.log(LEAST["unseen"] + 0.02)), std=0.45),
+}
+"""Usual logarithms of two signs, of all weights.
+
+Sizes are off by 3 %, and by 15 % at most where the unit is right. Of whole objects, cameras miss 2 to 3 %; of what was
+fitted to other things, 12 to 90 % would have been seen and was not (docs/experiments/075.md)."""
 
 
-def _usual(unexplained: float, ruled_out: float, beyond: float, displaced: float) -> dict[SignName, Usual]:
-    """Usual values of the signs, with wider spreads of their logarithms than single objects have."""
-    return {
-        "unexplained": Usual(mean=float(np.log(unexplained)), std=0.5),
-        "ruled_out": Usual(mean=float(np.log(ruled_out)), std=0.5),
-        "beyond": Usual(mean=float(np.log(beyond)), std=0.5),
-        "unusual": Usual(mean=float(np.log(0.6)), std=0.5),
-        "displaced": Usual(mean=float(np.log(displaced)), std=0.4),
-    }
+MEASURED: tuple[SignName, ...] = ("unexplained", "ruled_out", "beyond", "displaced")
+"""Signs of which a calibration measures what is usual."""
 
 
-CONSERVATIVE = Recognizing(
-    clean=_usual(0.12, 0.015, 0.15, 0.06), noisy=_usual(0.6, 0.03, 0.2, 0.09), unsure=4.0, refused=8.0
-)
+def _usual(*means: float) -> dict[SignName, Usual]:
+    """Usual values of the ``MEASURED`` signs, with wider spreads of their logarithms than single objects have."""
+    usual = zip(MEASURED, means, (0.5, 0.5, 0.5, 0.4), strict=True)
+    return {name: Usual(mean=float(np.log(mean)), std=std) for name, mean, std in usual}
+
+
+CONSERVATIVE = Recognizing(clean=_usual(0.12, 0.015, 0.15, 0.06), noisy=_usual(0.6, 0.03, 0.2, 0.09))
 """For weights that were not calibrated."""
 
 
@@ -64,9 +72,11 @@ class Signs:
             leave (5 % of a clean frame, 25 % of a noisy one).
         ruled_out: share of the model's surface that the frame rules out.
         beyond: how far the state lies outside all that were learned, scene units; None at rest.
-        unusual: mean square of the state's coefficients; None at rest.
+        unusual: ``StatisticalModel.unusual``, which needs no usual value; None at rest.
         displaced: how far apart network and registered model have the same places of the object, as a share of half its
             length (``Correspondences.displaced``); None without correspondences.
+        unseen: share of what the camera would see of the model that it has not seen, though nothing is known to hide it
+            (``Evidence.unseen``); None where the frame says what is around the object.
     """
 
     size: float | None = None
@@ -75,10 +85,15 @@ class Signs:
     beyond: float | None = None
     unusual: float | None = None
     displaced: float | None = None
+    unseen: float | None = None
 
     @classmethod
     def of(
-        cls, registration: Registration, displaced: float | None = None, stated_scene_unit: float | None = None
+        cls,
+        registration: Registration,
+        displaced: float | None = None,
+        stated_scene_unit: float | None = None,
+        unseen: float | None = None,
     ) -> "Signs":
         """Signs of a registration; ``stated_scene_unit`` is the length of a scene unit as the frame's unit says it."""
         at_rest, z = registration.method == "rest", registration.modes_z  # at rest it is known, whatever was learned
@@ -87,24 +102,28 @@ class Signs:
             unexplained=(1.0 - registration.explained) / max(1.0 - registration.needed, 0.01),
             ruled_out=registration.ruled_out,
             beyond=None if at_rest else registration.beyond_states,
-            unusual=None if at_rest or not len(z) else float((z**2).mean()),
+            unusual=None if at_rest or not len(z) else registration.model.unusual(z),
             displaced=displaced,
+            unseen=unseen,
         )
 
     @property
     def logarithms(self) -> dict[SignName, float]:
-        """Logarithms of the signs that are known."""
+        """Logarithms of the signs that are known, of which views of the object tell what is usual."""
         signs = {name: getattr(self, name) for name in LEAST}
         return {name: float(np.log(value + LEAST[name])) for name, value in signs.items() if value is not None}
 
     def strange(self, usual: Mapping[SignName, Usual]) -> dict[SignName, float]:
         """Standard deviations by which each sign lies above what is usual; 0 where it does not."""
-        known = {"size": SIZE, **usual}
-        return {
-            name: min(max((value - known[name].mean) / known[name].std, 0.0), MOST)
+        known = {**usual, **FIXED}
+        strange: dict[SignName, float] = {
+            name: (value - known[name].mean) / known[name].std
             for name, value in self.logarithms.items()
             if name in known
         }
+        if self.unusual is not None:
+            strange["unusual"] = self.unusual
+        return {name: min(max(value, 0.0), MOST) for name, value in strange.items()}
 
 
 def strangeness(strange: Mapping[SignName, float]) -> float:
@@ -127,7 +146,6 @@ class Recognition:
         strangeness: of all signs together, in standard deviations of what is usual.
         signs: what it was made of; None where no registration was found.
         calibrated: whether the limits are the weights' own.
-        rival: ``Candidate.rival``.
     """
 
     known: Known
@@ -135,17 +153,6 @@ class Recognition:
     strangeness: float
     signs: Signs | None = None
     calibrated: bool = False
-    rival: float | None = None
-
-    def with_rival(self, rival: float | None) -> "Recognition":
-        """The same with how far another fit is that explains the frame too; from ``RIVAL`` on nothing is known."""
-        recognition = replace(self, rival=rival)
-        if rival is None or rival < RIVAL:
-            return recognition
-        return recognition.doubted(
-            f"two fits explain this noisy frame, and the places of the object are {rival:.0%} of half its length apart "
-            f"in them: {LOOK}, or take a frame with less noise, from nearer, or from another side"
-        )
 
     def doubted(self, reason: str) -> "Recognition":
         """The same, unsure for this reason where the object was known."""
@@ -167,7 +174,6 @@ class Recognition:
             "reason": self.reason,
             "strangeness": self.strangeness,
             "calibrated": self.calibrated,
-            "rival": self.rival,
             "signs": None if self.signs is None else asdict(self.signs),
         }
 
@@ -182,6 +188,7 @@ def recognize(
     displaced: float | None = None,
     stated_scene_unit: float | None = None,
     refusal: str | None = None,
+    unseen: float | None = None,
 ) -> Recognition:
     """Whether a frame shows the object, in a state that was learned.
 
@@ -191,32 +198,24 @@ def recognize(
         displaced: as in ``Signs``.
         stated_scene_unit: length of a scene unit in the frame's unit, where the input states that.
         refusal: why no registration was found; None where none was wanted, and then recognition is not possible.
+        unseen: as in ``Signs``.
     """
     if registration is None:
         return NOT_EVALUATED if refusal is None else Recognition(False, refusal, MOST)
     calibrated = None if calibration is None else calibration.recognizing
-    limits = CONSERVATIVE if calibrated is None else calibrated
-    signs = Signs.of(registration, displaced, stated_scene_unit)
-    usual, unsure = limits.noisy, limits.unsure
-    if not is_noisy(registration):
-        usual, unsure = limits.clean, min(limits.unsure, CONSERVATIVE.unsure)  # only noise has made it wider
-    each = signs.strange(usual)
+    usual = CONSERVATIVE if calibrated is None else calibrated
+    signs = Signs.of(registration, displaced, stated_scene_unit, unseen)
+    each = signs.strange(usual.noisy if is_noisy(registration) else usual.clean)
     total = strangeness(each)
     is_unit_wrong = signs.size is not None and signs.size > float(np.log(2.0))  # a factor of two
-    if total <= unsure and not is_unit_wrong:
+    if total <= UNSURE and not is_unit_wrong:
         return Recognition(True, None, total, signs, calibrated is not None)
-    known: Known = False if total >= limits.refused or is_unit_wrong else "unsure"
+    known: Known = False if total >= REFUSED or is_unit_wrong else "unsure"
     reason = _reason("size" if is_unit_wrong else max(each, key=lambda name: each[name]), registration, signs)
     return Recognition(known, reason, total, signs, calibrated is not None)
 
 
 # --- reasons ----------------------------------------------------------------------------------------------------------
-
-RIVAL = 0.2
-"""``Candidate.rival`` from which on a noisy frame does not say where the object is.
-
-Of 50 noisy training views of ten objects, three of eight wrong answers (IoU below .7) lie beyond it, and one of 36
-right ones (docs/experiments/070.md)."""
 
 FEATURELESS = (
     "neither the object's outline nor any relief is in the frame, and any smooth surface explains its points as well: "
@@ -250,6 +249,12 @@ def _reason(sign: SignName, registration: Registration, signs: Signs) -> str:
         return (
             f"{registration.ruled_out:.0%} of the model's surface lies where the frame shows none of it, next to or in "
             f"front of what was seen: {LOOK}, or take the frame from nearer"
+        )
+    if sign == "unseen":
+        return (
+            f"{signs.unseen:.0%} of what the camera would see of the object was not seen, and the frame does not say "
+            "what hides it: give the whole depth image, state that a part is seen (--extent partial), or take a frame "
+            "of the whole object"
         )
     if sign == "beyond" or (sign == "unusual" and registration.beyond_states > 0.5):
         return (
