@@ -62,11 +62,6 @@ class Candidate:
         """Whether the fit explains the frame."""
         return self.modes is not None and self.modes.registration().accepted
 
-    @property
-    def is_noisy(self) -> bool:
-        """Whether the frame was fitted as one with more noise than the paper's."""
-        return self.modes is not None and self.modes.problem.noisy
-
     @cached_property
     def off_surface(self) -> Float[np.ndarray, " n"]:
         """Distance of each of all points from the facing surface, scene units."""
@@ -77,8 +72,8 @@ class Candidate:
     def is_featureless(self) -> bool:
         """Whether the frame shows neither outline nor relief, so that any smooth surface explains it as well.
 
-        Parts of planes show neither, and many objects with an unknown unit, or with a flat side, explain them. Where a
-        pose is given, its giver knows the object.
+        Parts of planes show neither, and many objects with an unknown unit, or with a flat side, explain them. A given
+        pose decides, as in ``unseen``.
         """
         if self.modes is None or self.located_by == "pose":
             return False
@@ -91,9 +86,13 @@ class Candidate:
         """Share of all points, outliers included, that lie on the facing surface up to a tolerance in scene units."""
         return float((self.off_surface <= tolerance).mean())
 
-    def unseen(self, registration: Registration) -> float:
-        """Share of what the camera would see of a registration that it has not seen (``Evidence.unseen``)."""
-        assert self.modes is not None
+    def unseen(self, registration: Registration) -> float | None:
+        """Share of what the camera would see of a registration that it has not seen (``Evidence.unseen``).
+
+        None where a pose is given: its giver knows the object.
+        """
+        if self.modes is None or self.located_by == "pose":
+            return None
         return self.modes.problem.evidence.unseen((registration.material / self.modes.unit)[registration.model.faces])
 
     def displaced(self, registration: Registration) -> float | None:

@@ -109,7 +109,7 @@ def answer_of(
     unseen = None if registration is None or seen.lines.other_lines is not None else candidate.unseen(registration)
     recognition = recognize(registration, calibration, displaced, stated, refusal, unseen)
     if recognition.known is True and candidate.is_featureless:
-        recognition = recognition.doubted(FEATURELESS)
+        recognition = replace(recognition, known="unsure", reason=FEATURELESS)
     taken = registrar is not None and registration is not None and registrar.takes(registration)
     hypothesis = candidate.hypothesis if taken else likelier.reading
     if taken and registrar is not None and registration is not None:

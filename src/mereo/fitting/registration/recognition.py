@@ -8,7 +8,7 @@ the usual, in standard deviations and together, is the frame's strangeness; the 
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -153,10 +153,6 @@ class Recognition:
     strangeness: float
     signs: Signs | None = None
     calibrated: bool = False
-
-    def doubted(self, reason: str) -> "Recognition":
-        """The same, unsure for this reason where the object was known."""
-        return replace(self, known="unsure", reason=reason) if self.known is True else self
 
     @property
     def description(self) -> str | None:
