@@ -145,7 +145,7 @@ class Recognition:
         reason: why it is not true, a sentence with what to do; None where it is.
         strangeness: of all signs together, in standard deviations of what is usual.
         signs: what it was made of; None where no registration was found.
-        calibrated: whether the limits are the weights' own.
+        calibrated: whether what is usual was measured with the weights.
     """
 
     known: Known
