@@ -91,6 +91,7 @@ def test_a_search_is_asked_too_where_the_network_is_lost(liver: Model, cloud: Po
     found = answer(liver, cloud)
     assert found.located_by == "search" and found.taken and found.registration is not None
     assert found.registration.accepted and found.recognition.known is True
+    assert found.registration.radius_scale is not None  # by the weights' calibration, as those of the network's fits
     assert all(0 < segment.confidence <= 1 for segment in found.reconstruction.segments)  # the network's, all the same
 
 

@@ -82,6 +82,8 @@ def answer_frame(
     started = time.perf_counter()
     with stage("register the model"):
         candidate, likelier = find(seen, model, registrar, keep_all, scene_unit)
+    if model is not None and candidate.modes is not None and candidate.located_by != "network":
+        candidate = replace(candidate, modes=replace(candidate.modes, calibration=model.calibration))
     if candidate.error is not None and model is None:
         raise candidate.error
     registration = None
