@@ -21,7 +21,7 @@ Known = bool | Literal["unsure"]
 UNSURE, REFUSED = 3.5, 7.0
 """Strangeness up to which the object is known, and that from which on it is not.
 
-Of 295 right answers to training views of eleven objects four lie beyond the first, and none beyond the second
+Of 295 right answers to training views of ten objects four lie beyond the first, and none beyond the second
 (docs/experiments/075.md)."""
 
 MOST = 1e3
@@ -44,7 +44,7 @@ FIXED: Mapping[SignName, Usual] = {
 """Usual logarithms of two signs, of all weights.
 
 Sizes are off by 3 %, and by 15 % at most where the unit is right. Of whole objects, cameras miss 2 to 3 %; of what was
-fitted to other things, 12 to 90 % would have been seen and was not (docs/experiments/075.md)."""
+fitted to other things by a search, 10 to 87 % would have been seen and was not (docs/experiments/075.md)."""
 
 
 MEASURED: tuple[SignName, ...] = ("unexplained", "ruled_out", "beyond", "displaced")
