@@ -381,33 +381,6 @@ def kept_row(name: str, arguments: argparse.Namespace) -> dict[str, Any]:
     return numbers
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("objects", nargs="*", default=["bunny", "liver", "rope", "robot"])
-    parser.add_argument("--views", type=int, default=8)
-    parser.add_argument("--strangers", type=int, default=2)
-    parser.add_argument("--own", action="store_true", help="measure the object's own views alone")
-    parser.add_argument("--seed", type=int, default=TEST_SEED_START)
-    parser.add_argument("--calibration-views", type=int, default=VIEWS)
-    parser.add_argument("--scene", default=None)
-    parser.add_argument("--method", default="modes", choices=("modes", "auto"))
-    parser.add_argument("--output", type=Path, default=None)
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    heads = [f"{kind} (known)" for kind in KINDS]
-    heads += [f"{kind}: unsure, refused, wrong and known; within radii, seen / hidden" for kind in OWN]
-    heads += ["ECE", "calibrated", "seconds"]
-    lines = [f"| AUROC against | {' | '.join(heads)} |", "|---" * (len(heads) + 1) + "|"]
-    print("\n".join(lines), flush=True)
-    if arguments.output is not None:
-        arguments.output.mkdir(parents=True, exist_ok=True)
-    for name in arguments.objects:
-        lines.append(line(kept_row(name, arguments)))
-        print(lines[-1], flush=True)
-        if arguments.output is not None:
-            (arguments.output / "table.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
 # --- frames of something else -----------------------------------------------------------------------------------------
 
 # Clouds of what no scene shows: planes, and heaps of boxes, balls and cylinders.
@@ -493,6 +466,33 @@ def other_objects(scene: Scene) -> list[Scene]:
             if name not in (*same, *livers[1:]):
                 others.append(load_scene(name))
     return others
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("objects", nargs="*", default=["bunny", "liver", "rope", "robot"])
+    parser.add_argument("--views", type=int, default=8)
+    parser.add_argument("--strangers", type=int, default=2)
+    parser.add_argument("--own", action="store_true", help="measure the object's own views alone")
+    parser.add_argument("--seed", type=int, default=TEST_SEED_START)
+    parser.add_argument("--calibration-views", type=int, default=VIEWS)
+    parser.add_argument("--scene", default=None)
+    parser.add_argument("--method", default="modes", choices=("modes", "auto"))
+    parser.add_argument("--output", type=Path, default=None)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    heads = [f"{kind} (known)" for kind in KINDS]
+    heads += [f"{kind}: unsure, refused, wrong and known; within radii, seen / hidden" for kind in OWN]
+    heads += ["ECE", "calibrated", "seconds"]
+    lines = [f"| AUROC against | {' | '.join(heads)} |", "|---" * (len(heads) + 1) + "|"]
+    print("\n".join(lines), flush=True)
+    if arguments.output is not None:
+        arguments.output.mkdir(parents=True, exist_ok=True)
+    for name in arguments.objects:
+        lines.append(line(kept_row(name, arguments)))
+        print(lines[-1], flush=True)
+        if arguments.output is not None:
+            (arguments.output / "table.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

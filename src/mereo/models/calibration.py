@@ -138,7 +138,7 @@ class Calibration(BaseModel, frozen=True):
 def calibration_rows(calibration: Calibration | None) -> list[tuple[str, str]]:
     """Calibration in words, each with its title."""
     if calibration is None:
-        return [("calibration", "none: confidences are not calibrated, what is usual of recognition is conservative")]
+        return [("calibration", "none: confidences are not calibrated, recognition has values for all objects")]
     rows = [("calibration", f"{calibration.views} views of the training seed {calibration.seed}")]
     if calibration.temperature is not None:
         kind = "a temperature" if calibration.biases is None else "a temperature and a bias for each class"
@@ -151,5 +151,5 @@ def calibration_rows(calibration: Calibration | None) -> list[tuple[str, str]]:
             of_draws = "" if draws is None else f", {draws:.2f} of fits of the scene's draws"
             rows.append((what, f"the posterior's times {modes:.2f} of fits of the modes{of_draws}"))
     if calibration.recognizing is not None:
-        rows.append(("recognition", "what is usual of the object's own views"))
+        rows.append(("recognition", "features are compared with those of the object's own views"))
     return rows
