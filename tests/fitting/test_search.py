@@ -1,14 +1,20 @@
 """The search for pose and state without a network: what its tables hold, and what it finds."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from fit_cases import seen
 
+from mereo.fitting.config import FitConfig
+from mereo.fitting.modes import fit_wide, refined
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import Posed
+from mereo.fitting.problem.problem import OPEN_SCALE_STD, Problem
+from mereo.fitting.problem.residuals import NetworkTerm
 from mereo.fitting.registration.answer_frame import search_modes
 from mereo.fitting.registration.register import CloudToFit
-from mereo.fitting.search import SightTable, medoids, rotations
+from mereo.fitting.search import SightTable, Trail, as_noisy, medoids, rotations
 from mereo.geometry.camera import SightLines
 from mereo.models.weights import load_model
 from mereo.scenes.statistical_model import StatisticalModel
@@ -113,3 +119,20 @@ def test_noise_is_told_from_a_wrong_state(model: StatisticalModel, patched: bool
     assert fitted.problem.noisy and fitted.registration().accepted
     assert off(model, fitted.registration().material, posed) < 0.1
     assert patched or not search_modes(CloudToFit(points, 1.0), model).problem.noisy
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4])
+def test_under_noise_a_part_is_hidden_where_it_is_by_the_noises_constants_too(
+    model: StatisticalModel, share: float
+) -> None:
+    posed = state(model, 3)
+    points = cut(view(model, posed), share)[0]
+    points = points * (1 + np.random.default_rng(0).normal(scale=0.5 / 150.0, size=(len(points), 1)))
+    evidence = Evidence.of(points)
+    whole = Problem(model, NetworkTerm.none(model), evidence, OPEN_SCALE_STD, FitConfig())
+    partial = replace(whole, evidence=replace(evidence, other_lines="unknown"))
+    trails = [Trail(each, 0.0, [refined(each, fit_wide(each, posed))]) for each in (whole, partial)]
+    for chosen in trails if not share else trails[1:]:
+        noisy = as_noisy(trails, chosen)
+        assert noisy is not None and noisy.problem.is_camera
+        assert noisy.problem.evidence.other_lines == ("unknown" if share else "past")

@@ -23,7 +23,7 @@ from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.tracking import Tracker
-from mereo.fitting.uncertainty import NOISY_FACTOR, ModesOptimum, Posterior, Uncertainty, radius95
+from mereo.fitting.uncertainty import LEAST_RADIUS, NOISY_FACTOR, ModesOptimum, Posterior, Uncertainty, radius95
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import owned_centroids, owned_gradients
@@ -118,6 +118,9 @@ def test_radii_are_in_the_unit_of_the_input(model: StatisticalModel, material: n
 
 
 def test_a_calibration_scales_radii_and_intervals(found: Registration, sure: Uncertainty) -> None:
+    """The least radius, which every position has in addition, is no part of what is scaled."""
+    assert sure.extra_radius == LEAST_RADIUS and (sure.material > LEAST_RADIUS).all()
+    sure, found = replace(sure, extra_radius=0.0), replace(found, extra_radius=0.0)
     wide = replace(found, radius_scale=3.0).uncertainty
     assert wide is not None and wide.calibrated and not sure.calibrated
     np.testing.assert_allclose(wide.material, 3.0 * sure.material)
@@ -148,6 +151,7 @@ def test_the_interval_of_a_volume_is_around_it_and_not_far_from_the_true_one(
 
 def test_the_scale_is_that_which_holds_95_percent(found: Registration, sure: Uncertainty, material: np.ndarray) -> None:
     shown = seen_points(material, PointCloud(seen(found.model.mesh(material))), 1.0)
+    sure, found = replace(sure, extra_radius=0.0), replace(found, extra_radius=0.0)
     one = RegistrationErrors.of(found, material, shown, 1.0)
     np.testing.assert_array_equal(one.seen, shown)
     calibrated = RegistrationErrors.of(replace(found, radius_scale=7.0, extra_radius=0.05), material, shown, 1.0)

@@ -9,6 +9,7 @@
 4. While the frame is not explained, the same again from other states of the library, more and more of them.
 """
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -435,7 +436,7 @@ def rotations(count: int) -> Float[np.ndarray, "n 3 3"]:
 
 
 @dataclass(eq=False)
-class _Trail:
+class Trail:
     """Search under one hypothesis on the lines of sight around the cloud."""
 
     problem: Problem
@@ -444,10 +445,12 @@ class _Trail:
 
     @property
     def best(self) -> ScoredFit:
+        """Fit of the lowest misfit."""
         return min(self.fitted, key=_total)
 
     @property
     def is_explained(self) -> bool:
+        """Whether that explains the frame."""
         return self.best.explains(self.problem)
 
     def go_on(self, stage: SearchRound) -> None:
@@ -469,7 +472,7 @@ class _Trail:
                 return
             self.fitted.append(shaken(self.problem, ranked[row]))
 
-    def with_heavier_cloud(self) -> "_Trail | None":
+    def with_heavier_cloud(self) -> "Trail | None":
         """The same with a cloud that is worth more, where the prior of an elastic solid keeps it from being explained.
 
         Where that hardly helps, the object moves in ways that the modes do not have, and the prior is right.
@@ -480,9 +483,9 @@ class _Trail:
         problem = replace(problem, config=replace(problem.config, cloud_weight=HEAVY))
         posed = fit_cloud(problem, best.posed, Prior.whole(problem.model), *HEAVIER_STEPS, 0.0)
         heavier = ScoredFit.of(problem, posed)
-        return _Trail(problem, 0.0, [heavier]) if heavier.misfit.cloud < HELPS * best.misfit.cloud else None
+        return Trail(problem, 0.0, [heavier]) if heavier.misfit.cloud < HELPS * best.misfit.cloud else None
 
-    def as_noisy(self) -> "_Trail | None":
+    def as_noisy(self) -> "Trail | None":
         """The same with the constants for what the best fit leaves over, where that is noise and not the fit's error.
 
         None where that is not so, or the frame is explained. Only after other states were tried: a wrong state may
@@ -490,19 +493,25 @@ class _Trail:
         """
         if self.is_explained:
             return None
-        states = [scored.posed for scored in sorted(self.fitted, key=_total)]
         for is_shared in (False, True):
             noisy = self.problem.as_noisy_as(self.best.surface, is_shared)
             if noisy is None:
                 continue
-            rows = differing(noisy, states, BENT_APART)[:4]
-            trail = _Trail(noisy, 0.0, [explored(noisy, refined(noisy, fit_wide(noisy, states[row]))) for row in rows])
-            trail.shake()
+            trail = self.again(noisy)
             if noisy.leaves_noise(trail.best.surface, is_shared):
                 return trail
         return None
 
+    def again(self, noisy: Problem) -> "Trail":
+        """The same from its best states that differ, in the problem of a frame of this noise."""
+        states = [scored.posed for scored in sorted(self.fitted, key=_total)]
+        rows = differing(noisy, states, BENT_APART)[:4]
+        trail = Trail(noisy, 0.0, [explored(noisy, refined(noisy, fit_wide(noisy, states[row]))) for row in rows])
+        trail.shake()
+        return trail
+
     def outcome(self) -> SearchOutcome:
+        """The best fit, and how many explain the frame alike."""
         best = self.best
         rivals = [scored for scored in self.fitted if scored.misfit.cloud < best.misfit.cloud + ALIKE]
         alike = differing(self.problem, [scored.posed for scored in sorted(rivals, key=_total)], APART)
@@ -515,18 +524,19 @@ def search(whole: Problem, partial: Problem | None = None, start: Posed | None =
     ``partial`` is the same where it is open whether the object is seen whole: with nothing known around the cloud. It
     is taken where it explains the frame better by more than ``WHOLE``.
     """
-    trails = [_Trail(whole)] if partial is None else [_Trail(whole), _Trail(partial, WHOLE)]
+    trails = [Trail(whole)] if partial is None else [Trail(whole), Trail(partial, WHOLE)]
     if start is not None:
         for trail in trails:
             trail.fitted.append(refined(trail.problem, fit_wide(trail.problem, start)))
         chosen = min(trails, key=lambda trail: trail.best.misfit.total + trail.handicap)
-        return (chosen.with_heavier_cloud() or chosen.as_noisy() or chosen).outcome()
+        return (chosen.with_heavier_cloud() or as_noisy(trails, chosen) or chosen).outcome()
+    going = trails
     for number, stage in enumerate(ROUNDS[: whole.config.search_rounds]):
-        for trail in trails:
+        for trail in going:
             trail.go_on(stage)
-        for trail, other in permutations(trails, 2):  # either may have found what the other has missed
+        for trail, other in permutations(going, 2):  # either may have found what the other has missed
             trail.fitted.append(refined(trail.problem, other.best.posed))
-        chosen = min(trails, key=lambda trail: trail.best.misfit.total + trail.handicap)
+        chosen = min(going, key=lambda trail: trail.best.misfit.total + trail.handicap)
         chosen.shake()
         heavier = chosen.with_heavier_cloud()
         if heavier is not None and heavier.is_explained:
@@ -534,13 +544,27 @@ def search(whole: Problem, partial: Problem | None = None, start: Posed | None =
         if chosen.is_explained or (number > 0 and chosen.best.misfit.cloud < whole.config.unexplained):
             break
         if number > 0:
-            better = heavier or chosen.as_noisy()
+            better = heavier or as_noisy(trails, chosen)
             # less noise than a camera's may be the error of a wrong state: the last round decides
             is_sure = better is not None and (better is heavier or better.problem.is_camera)
             if is_sure or number + 1 == whole.config.search_rounds or chosen.best.misfit.cloud > HOPELESS:
                 return (better or chosen).outcome()
-            trails = [chosen]
+            going = [chosen]
     return (heavier or chosen).outcome()
+
+
+def as_noisy(trails: Sequence[Trail], chosen: Trail) -> Trail | None:
+    """``Trail.as_noisy`` of the chosen one of two hypotheses, the first of which is that the object is seen whole.
+
+    To a clean frame's constants a camera's noise at the rim looks like more than ``WHOLE``, so a part is hidden only
+    where it is by those of the noise too.
+    """
+    noisy, whole = chosen.as_noisy(), trails[0]
+    if noisy is None or chosen is whole:
+        return noisy
+    lines = whole.problem.evidence.other_lines
+    again = whole.again(replace(noisy.problem, evidence=replace(noisy.problem.evidence, other_lines=lines)))
+    return again if again.best.misfit.total < noisy.best.misfit.total + WHOLE else noisy
 
 
 def _total(scored: ScoredFit) -> float:

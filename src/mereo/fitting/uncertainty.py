@@ -46,6 +46,11 @@ NOISY_FACTOR = 1.5
 """Factor of the posterior's radii in a noisy frame, of an object that was not calibrated: on training views fits of the
 modes hold 96 % with it and 84 % without; clean views need none (docs/experiments/071.md)."""
 
+LEAST_RADIUS = 0.15
+"""Radius in scene units that every position has in addition: below it lie errors of what no posterior knows, how far a
+fit is from its optimum and facets from the surface. Without it the .02 units of whole views' fits are said of others,
+too (docs/experiments/076.md)."""
+
 _FREEDOM = np.linspace(1.0, 3.0, 201)
 _QUANTILE = chdtri(_FREEDOM, 1.0 - LEVEL)
 """Quantile of chi square by its degrees of freedom, between which it is nearly straight."""
@@ -418,7 +423,8 @@ class Uncertainty:
         model: statistical model of the object.
         scale: factor by which views of training seeds showed the posterior's radii to be too small, in frames like
             this; None where that was not measured.
-        extra_radius: radius added in quadrature at every position where network and fit disagree; scene units.
+        extra_radius: radius added in quadrature at every position: the least one, and where network and fit disagree;
+            scene units.
     """
 
     optimum: Optimum

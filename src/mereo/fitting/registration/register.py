@@ -32,7 +32,7 @@ from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, OPEN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import Surface
 from mereo.fitting.registration.registration import Method, Registration
-from mereo.fitting.uncertainty import DrawsOptimum, ModesOptimum, Optimum
+from mereo.fitting.uncertainty import LEAST_RADIUS, DrawsOptimum, ModesOptimum, Optimum
 from mereo.geometry.brief import listed
 from mereo.geometry.camera import PointCloud, SightLines
 from mereo.geometry.symmetry import describe_symmetries
@@ -220,11 +220,11 @@ class ModesFit:
     def _radius_factors(self, method: Method, surface: Surface) -> tuple[float | None, float]:
         """``Registration.radius_scale`` and ``extra_radius``."""
         if self.calibration is None:
-            return None, 0.0
+            return None, LEAST_RADIUS
         factors, model = self.calibration.radii(draws=method == "draws", noisy=self.problem.noisy), self.problem.model
         scale = factors.scale if factors.misfit is None else factors.scale_at(self.problem.cloud_misfit(surface))
         displaced = None if factors.displaced is None else self.correspondences.displaced(model, surface.material)
-        return scale, model.half * factors.extra_radius(displaced)
+        return scale, float(np.hypot(LEAST_RADIUS, model.half * factors.extra_radius(displaced)))
 
     def _is_believed(self, explained: float, surface: Surface) -> bool:
         """Whether a fit explains enough of the points; less is enough where the network sees the same segments there.
