@@ -159,7 +159,8 @@ def swing(rng: np.random.Generator) -> Bends:
     phases = named(rng, SWINGS, "rad").uniform(0, 2 * np.pi, size=(2, HARMONICS, 1))
     amplitudes = named(rng, "amplitudes").normal(size=(2, HARMONICS, 1)) / np.sqrt(k)[:, None]
     bends = (amplitudes * np.cos(np.pi * k[:, None] * NODES / LENGTH + phases)).sum(axis=1)
-    bends *= named(rng, "bend").uniform(0.15, 1.0) * MAX_BEND / np.linalg.norm(bends, axis=0).max()
+    largest = max(float(np.linalg.norm(bends, axis=0).max()), np.finfo(float).tiny)  # 0 where all amplitudes are
+    bends *= named(rng, "bend").uniform(0.15, 1.0) * MAX_BEND / largest
     return bends * np.clip(NODES / 6.0, 0.0, 1.0)  # leaves the base straight
 
 

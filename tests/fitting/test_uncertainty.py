@@ -131,11 +131,19 @@ def test_a_calibration_scales_radii_and_intervals(found: Registration, sure: Unc
     assert wide.summary()["median"] == pytest.approx(3 * sure.summary()["median"])
 
 
-def test_radii_of_noisy_frames_are_wider_where_nothing_is_calibrated(sure: Uncertainty) -> None:
+def test_radii_of_noisy_frames_are_wider_where_nothing_is_calibrated_and_by_what_is_more_than_noise(
+    sure: Uncertainty,
+) -> None:
     optimum = sure.optimum
     assert isinstance(optimum, ModesOptimum)
-    noisy = replace(sure, optimum=replace(optimum, problem=replace(optimum.problem, noisy=True)))
+    problem = replace(optimum.problem, noisy=True)
+    noisy = replace(sure, optimum=replace(optimum, problem=problem))
     assert noisy.factor == NOISY_FACTOR > 1.0 == sure.factor and replace(noisy, scale=0.7).factor == 0.7
+    # of constants for much less noise than is left
+    narrow = replace(problem, config=replace(problem.config, cloud_sigma=0.002))
+    misfit = narrow.cloud_misfit(optimum.surface)
+    wide = replace(noisy, optimum=replace(optimum, problem=narrow))
+    assert misfit > 1.0 and wide.factor == pytest.approx(NOISY_FACTOR * misfit * 1.5**2)
 
 
 def test_the_interval_of_a_volume_is_around_it_and_not_far_from_the_true_one(

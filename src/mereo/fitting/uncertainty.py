@@ -23,7 +23,7 @@ from mereo.deformation.moving_least_squares import PointWeights
 from mereo.fitting.draws.fit import DrawsFit, DrawsProblem
 from mereo.fitting.draws.fit import terms as terms_of_draws
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, rigid_motion
-from mereo.fitting.problem.problem import Problem
+from mereo.fitting.problem.problem import SIGMAS, Problem
 from mereo.fitting.problem.residuals import Prior, Surface, Terms
 from mereo.fitting.problem.segments import left_open
 from mereo.geometry.brief import counted
@@ -46,10 +46,9 @@ NOISY_FACTOR = 1.5
 """Factor of the posterior's radii in a noisy frame, of an object that was not calibrated: on training views fits of the
 modes hold 96 % with it and 84 % without; clean views need none (docs/experiments/071.md)."""
 
-LEAST_RADIUS = 0.15
-"""Radius in scene units that every position has in addition: below it lie errors of what no posterior knows, how far a
-fit is from its optimum and facets from the surface. Without it the .02 units of whole views' fits are said of others,
-too (docs/experiments/076.md)."""
+LEAST_RADIUS = 0.1
+"""Radius in scene units that every position has in addition, the noise of the paper's camera: how far a fit is from its
+optimum, and facets from the surface, no posterior knows (docs/experiments/076.md)."""
 
 _FREEDOM = np.linspace(1.0, 3.0, 201)
 _QUANTILE = chdtri(_FREEDOM, 1.0 - LEVEL)
@@ -442,12 +441,17 @@ class Uncertainty:
         """Posterior of pose, scale and state, in scene units."""
         return self.optimum.posterior
 
-    @property
+    @cached_property
     def factor(self) -> float:
-        """Factor of the posterior's radii: ``scale``, or without one what noisy frames of most objects need."""
-        if self.scale is not None:
-            return self.scale
-        return NOISY_FACTOR if self.optimum.frame.noisy else 1.0
+        """Factor of the posterior's radii: ``scale``, or without one what most objects need.
+
+        In a noisy frame times the cloud's misfit over that of noise alone: what is beyond it, the fit has not explained.
+        """
+        frame, scale = self.optimum.frame, self.scale
+        if not frame.noisy:
+            return 1.0 if scale is None else scale
+        misfit = frame.cloud_misfit(self.optimum.surface)
+        return (NOISY_FACTOR if scale is None else scale) * max(misfit * SIGMAS**2, 1.0)
 
     def _of(self, parts: RadiusParts) -> Float[np.ndarray, " n"]:
         return self.optimum.unit * parts.radii(self.factor, self.extra_radius)
