@@ -203,8 +203,8 @@ def _most_likely(logits: Float[np.ndarray, "n c"], truth: UInt8[np.ndarray, " n"
 # --- radii ------------------------------------------------------------------------------------------------------------
 
 FIELDS = (
-    ("radius_scale", "usual_misfit", "usual_displaced", "noisy_radius_scale"),
-    ("draws_radius_scale", "draws_usual_misfit", "draws_usual_displaced", "noisy_draws_radius_scale"),
+    ("radius_scale", "usual_misfit", "noisy_radius_scale"),
+    ("draws_radius_scale", "draws_usual_misfit", "noisy_draws_radius_scale"),
 )
 """Fields of ``Calibration`` that are of fits of the modes, and of a scene's parameters."""
 
@@ -219,14 +219,10 @@ class MeasuredRadii:
     Attributes:
         errors: with the posterior's own radii.
         misfit: ``Problem.cloud_misfit``.
-        displaced: ``Correspondences.displaced``.
-        half: of the object's length, scene units.
     """
 
     errors: RegistrationErrors
     misfit: float
-    displaced: float
-    half: float
 
     @classmethod
     def of(cls, view: CalibrationView, candidate: Candidate, registration: Registration) -> "MeasuredRadii":
@@ -235,13 +231,11 @@ class MeasuredRadii:
         raw = replace(registration, radius_scale=1.0, extra_radius=0.0)
         errors = RegistrationErrors.of(raw, truth, seen_points(truth, view.seen, 1.0), 1.0)
         assert registration.optimum is not None and candidate.modes is not None
-        misfit = candidate.modes.problem.cloud_misfit(registration.optimum.surface)
-        return cls(errors, misfit, candidate.displaced(registration) or 0.0, registration.model.half)
+        return cls(errors, candidate.modes.problem.cloud_misfit(registration.optimum.surface))
 
     def widened(self, factors: RadiusFactors) -> RegistrationErrors:
         """Errors with the radii that a calibration makes wider; its scale is left out."""
-        extra_radius = self.half * factors.extra_radius(self.displaced)
-        return self.errors.scaled(factors.widening(self.misfit)).with_extra_radius(extra_radius)
+        return self.errors.scaled(replace(factors, scale=1.0).scale_at(self.misfit))
 
 
 class ViewRadii:
@@ -274,10 +268,10 @@ class ViewRadii:
     def fields(self) -> dict[str, Any]:
         """Fields of the ``Calibration``: factors of both kinds of fits; none where their views are too few."""
         fields: dict[str, Any] = {}
-        for (scale, misfit, displaced, noisy_scale), clean, noisy in zip(FIELDS, self.clean, self.noisy, strict=True):
+        for (scale, misfit, noisy_scale), clean, noisy in zip(FIELDS, self.clean, self.noisy, strict=True):
             if len(clean) >= LEAST:
                 factors = factors_of(clean)
-                fields |= {scale: factors.scale, misfit: factors.misfit, displaced: factors.displaced}
+                fields |= {scale: factors.scale, misfit: factors.misfit}
             # of which half of the points are farther off, a fit has ended in a wrong state. One such view in twenty
             # would be all that the scale is made of, and of a camera's views there are more; recognition tells them
             right = [view.errors for view in noisy if np.median(view.errors.ratios) <= 5.0]
@@ -288,10 +282,7 @@ class ViewRadii:
 
 def factors_of(views: Sequence[MeasuredRadii]) -> RadiusFactors:
     """Factors by clean views, those that ended in a wrong state included: users meet them."""
-    misfit = float(np.median([view.misfit for view in views]))
-    # a few views may hold none that ended in a wrong state, so it cannot be measured from where on they do
-    displaced = float(np.quantile([view.displaced for view in views], 0.9))
-    factors = RadiusFactors(None, misfit or None, displaced or None)
+    factors = RadiusFactors(None, float(np.median([view.misfit for view in views])) or None)
     scale = RegistrationErrors.together([view.widened(factors) for view in views]).scale()
     return replace(factors, scale=scale)
 

@@ -144,11 +144,6 @@ class RegistrationErrors:
         """The same with the Gaussian's radii times a scale, where there is one."""
         return self if scale is None else replace(self, ratios=self.ratios / scale, gaussian=self.gaussian * scale)
 
-    def with_extra_radius(self, radius: float) -> "RegistrationErrors":
-        """The same with a radius, in scene units, that every point has on top of the others."""
-        off = np.maximum((self.ratios * self.gaussian) ** 2 - radius**2, 0.0)
-        return replace(self, ratios=np.sqrt(off) / self.gaussian, other=np.hypot(self.other, radius))
-
     def summary(self, unit_mm: float | None) -> dict[str, dict[str, float | None]]:
         """Median and 95 % quantile of seen and of hidden points' distances, in scene units, and in mm where known."""
         return {

@@ -9,11 +9,11 @@
 4. While the frame is not explained, the same again from other states of the library, more and more of them.
 """
 
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import permutations
+from operator import attrgetter
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32
@@ -435,6 +435,9 @@ def rotations(count: int) -> Float[np.ndarray, "n 3 3"]:
     return Rotation.from_quat(np.stack(spiral, axis=1)).as_matrix()
 
 
+_total = attrgetter("misfit.total")
+
+
 @dataclass(eq=False)
 class Trail:
     """Search under one hypothesis on the lines of sight around the cloud."""
@@ -481,8 +484,7 @@ class Trail:
         if not problem.model.is_normal or self.is_explained:
             return None
         problem = replace(problem, config=replace(problem.config, cloud_weight=HEAVY))
-        posed = fit_cloud(problem, best.posed, Prior.whole(problem.model), *HEAVIER_STEPS, 0.0)
-        heavier = ScoredFit.of(problem, posed)
+        heavier = ScoredFit.of(problem, fit_cloud(problem, best.posed, Prior.whole(problem.model), *HEAVIER_STEPS, 0.0))
         return Trail(problem, 0.0, [heavier]) if heavier.misfit.cloud < HELPS * best.misfit.cloud else None
 
     def as_noisy(self) -> "Trail | None":
@@ -524,7 +526,7 @@ def search(whole: Problem, partial: Problem | None = None, start: Posed | None =
     ``partial`` is the same where it is open whether the object is seen whole: with nothing known around the cloud. It
     is taken where it explains the frame better by more than ``WHOLE``.
     """
-    trails = [Trail(whole)] if partial is None else [Trail(whole), Trail(partial, WHOLE)]
+    trails = [Trail(whole), *([] if partial is None else [Trail(partial, WHOLE)])]
     if start is not None:
         for trail in trails:
             trail.fitted.append(refined(trail.problem, fit_wide(trail.problem, start)))
@@ -553,7 +555,7 @@ def search(whole: Problem, partial: Problem | None = None, start: Posed | None =
     return (heavier or chosen).outcome()
 
 
-def as_noisy(trails: Sequence[Trail], chosen: Trail) -> Trail | None:
+def as_noisy(trails: list[Trail], chosen: Trail) -> Trail | None:
     """``Trail.as_noisy`` of the chosen one of two hypotheses, the first of which is that the object is seen whole.
 
     To a clean frame's constants a camera's noise at the rim looks like more than ``WHOLE``, so a part is hidden only
@@ -562,13 +564,9 @@ def as_noisy(trails: Sequence[Trail], chosen: Trail) -> Trail | None:
     noisy, whole = chosen.as_noisy(), trails[0]
     if noisy is None or chosen is whole:
         return noisy
-    lines = whole.problem.evidence.other_lines
-    again = whole.again(replace(noisy.problem, evidence=replace(noisy.problem.evidence, other_lines=lines)))
+    evidence = replace(noisy.problem.evidence, other_lines=whole.problem.evidence.other_lines)
+    again = whole.again(replace(noisy.problem, evidence=evidence))
     return again if again.best.misfit.total < noisy.best.misfit.total + WHOLE else noisy
-
-
-def _total(scored: ScoredFit) -> float:
-    return scored.misfit.total
 
 
 def candidates(problem: Problem, stage: SearchRound) -> list[tuple[float, Posed]]:

@@ -445,13 +445,11 @@ class Uncertainty:
     def factor(self) -> float:
         """Factor of the posterior's radii: ``scale``, or without one what most objects need.
 
-        In a noisy frame times the cloud's misfit over that of noise alone: what is beyond it, the fit has not explained.
+        In a noisy frame times the misfit over that of noise alone: what is beyond it, the fit has not explained.
         """
-        frame, scale = self.optimum.frame, self.scale
-        if not frame.noisy:
-            return 1.0 if scale is None else scale
-        misfit = frame.cloud_misfit(self.optimum.surface)
-        return (NOISY_FACTOR if scale is None else scale) * max(misfit * SIGMAS**2, 1.0)
+        frame = self.optimum.frame
+        usual = self.scale or (NOISY_FACTOR if frame.noisy else 1.0)
+        return usual * max(frame.cloud_misfit(self.optimum.surface) * SIGMAS**2, 1.0) if frame.noisy else usual
 
     def _of(self, parts: RadiusParts) -> Float[np.ndarray, " n"]:
         return self.optimum.unit * parts.radii(self.factor, self.extra_radius)

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -47,27 +46,16 @@ class RadiusFactors:
     Attributes:
         scale: factor of the Gaussian's radii; None where it was not measured.
         misfit: usual misfit of the cloud (``Problem.cloud_misfit``), above which they are wider; None without one.
-        displaced: how far network and registered model are apart in most views (``Correspondences.displaced``), above
-            which every place is as unsure as they are farther apart; None without one.
     """
 
     scale: float | None = None
     misfit: float | None = None
-    displaced: float | None = None
-
-    def widening(self, misfit: float) -> float:
-        """Factor of the scale in a frame of this misfit, 1 and more."""
-        return 1.0 if self.misfit is None else max(misfit / self.misfit, 1.0) ** MISFITTING
 
     def scale_at(self, misfit: float) -> float | None:
-        """Scale in a frame of this misfit."""
-        return None if self.scale is None else self.scale * self.widening(misfit)
-
-    def extra_radius(self, displaced: float | None) -> float:
-        """Radius that every position has in addition, where network and model are so far apart; in half lengths."""
-        if self.displaced is None or displaced is None:
-            return 0.0
-        return float(np.sqrt(max(displaced**2 - self.displaced**2, 0.0)))
+        """Scale in a frame of this misfit: wider where that is more than usual."""
+        if self.scale is None or self.misfit is None:
+            return self.scale
+        return self.scale * max(misfit / self.misfit, 1.0) ** MISFITTING
 
 
 @dataclass(frozen=True)
@@ -97,7 +85,6 @@ class Calibration(BaseModel, frozen=True):
         noisy_radius_scale: the same of simulated depth cameras' frames.
         draws_radius_scale, noisy_draws_radius_scale: both, of fits of a scene's own draws instead of the modes.
         usual_misfit, draws_usual_misfit: ``RadiusFactors.misfit`` of the first and the third of these scales.
-        usual_displaced, draws_usual_displaced: ``RadiusFactors.displaced`` of the same.
         temperature: by which logits are divided before they become probabilities (temperature scaling; Guo et al.,
             ICML 2017).
         biases: added to the divided logits of empty space and each segment (with the temperature: vector scaling, but
@@ -114,8 +101,6 @@ class Calibration(BaseModel, frozen=True):
     noisy_draws_radius_scale: Positive | None = None
     usual_misfit: Positive | None = None
     draws_usual_misfit: Positive | None = None
-    usual_displaced: Positive | None = None
-    draws_usual_displaced: Positive | None = None
     temperature: Positive | None = None
     biases: tuple[FiniteFloat, ...] | None = None
     ece: tuple[Share, Share] | None = None
@@ -126,8 +111,8 @@ class Calibration(BaseModel, frozen=True):
         if noisy:
             return RadiusFactors(self.noisy_draws_radius_scale if draws else self.noisy_radius_scale)
         if draws:
-            return RadiusFactors(self.draws_radius_scale, self.draws_usual_misfit, self.draws_usual_displaced)
-        return RadiusFactors(self.radius_scale, self.usual_misfit, self.usual_displaced)
+            return RadiusFactors(self.draws_radius_scale, self.draws_usual_misfit)
+        return RadiusFactors(self.radius_scale, self.usual_misfit)
 
     @property
     def scaling(self) -> Scaling:

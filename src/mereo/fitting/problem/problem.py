@@ -147,10 +147,6 @@ class Problem:
             return None
         return replace(self, config=config, evidence=self.evidence.with_more_samples, noisy=True)
 
-    def leaves_camera_noise(self, surface: Surface) -> bool:
-        """Whether a fit with a clean frame's constants leaves a camera's noise over, to which it would bend."""
-        return not self.noisy and self.residual_noise(surface) >= CAMERA
-
     @property
     def by_every_point(self) -> "Problem":
         """The problem with as many observed samples as a noisy frame has; the same where it has them already."""
@@ -158,10 +154,6 @@ class Problem:
         if len(evidence.observed_samples) >= min(len(evidence.points), MORE_SAMPLES):
             return self
         return replace(self, evidence=evidence.with_more_samples)
-
-    def with_network(self, correspondences: Correspondences) -> "Problem":
-        """The problem with other correspondences."""
-        return replace(self, network=NetworkTerm.of(self.model, correspondences))
 
     def leaves_noise(self, surface: Surface, is_shared: bool = False) -> bool:
         """Whether what a fit leaves over is noise, and not its own error; ``is_shared`` as in ``as_noisy_as``."""

@@ -38,7 +38,7 @@ from mereo.geometry.camera import PointCloud, SightLines
 from mereo.geometry.symmetry import describe_symmetries
 from mereo.io.cores import limit_blas_threads
 from mereo.io.progress import stage
-from mereo.models.calibration import Calibration
+from mereo.models.calibration import Calibration, RadiusFactors
 from mereo.models.trained import EncodedCloud, Trained
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES, AssetUnavailable, Scene
@@ -197,7 +197,9 @@ class ModesFit:
     ) -> Registration:
         distance = surface.nearest(self.problem.evidence.observed_samples)[0]
         explained = float((distance <= self.tolerance).mean())
-        scale, extra_radius = self._radius_factors(method, surface)
+        factors = RadiusFactors()
+        if self.calibration is not None:
+            factors = self.calibration.radii(draws=method == "draws", noisy=self.problem.noisy)
         return Registration(
             model=self.problem.model,
             material=surface.material * self.unit,
@@ -212,19 +214,10 @@ class ModesFit:
             ruled_out=self.problem.ruled_out(surface),
             needed=self.problem.config.accepted,
             optimum=optimum,
-            radius_scale=scale,
-            extra_radius=extra_radius,
+            radius_scale=factors.scale_at(self.problem.cloud_misfit(surface)),
+            extra_radius=LEAST_RADIUS,
             alike=self.alike,
         )
-
-    def _radius_factors(self, method: Method, surface: Surface) -> tuple[float | None, float]:
-        """``Registration.radius_scale`` and ``extra_radius``."""
-        if self.calibration is None:
-            return None, LEAST_RADIUS
-        factors, model = self.calibration.radii(draws=method == "draws", noisy=self.problem.noisy), self.problem.model
-        scale = factors.scale if factors.misfit is None else factors.scale_at(self.problem.cloud_misfit(surface))
-        displaced = None if factors.displaced is None else self.correspondences.displaced(model, surface.material)
-        return scale, float(np.hypot(LEAST_RADIUS, model.half * factors.extra_radius(displaced)))
 
     def _is_believed(self, explained: float, surface: Surface) -> bool:
         """Whether a fit explains enough of the points; less is enough where the network sees the same segments there.
