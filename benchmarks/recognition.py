@@ -4,15 +4,15 @@
                                      [--calibration-views N] [--method modes|auto] [--output FOLDER]
 
 For each object, with its shipped weights, a file of weights, or none (a scene file, meshes): the area under the
-receiver operating characteristic (AUROC) by which ``Recognition.strangeness`` tells N clean views of the object from
-N views of every other shipped object, from planes and heaps, from balls and random points as large as it is, from two
-of it side by side, from the half of its points on one side, from clouds in another unit than is stated, from states
-with all draws 1.5 times as far and, with weights, from its own views as a network of the preset `tiny` understands
-them after ten steps; the shares of clean views, of those of which a tool hides 30 %, and of simulated cameras' views
-that are "unsure" and refused; the shares of their true material points, seen and hidden, within the 95 % radii; and the
-expected calibration error of the network's probabilities as they are and calibrated. ``--own`` measures the object's
-own views alone. Weights without a calibration are calibrated here, on training seeds, and not written. Test seeds begin
-at 1,000,000: tune on others.
+receiver operating characteristic (AUROC) by which ``Recognition.strangeness`` tells N clean views of the object from N
+views of every other shipped object, from planes and heaps, from balls and random points as large as it is, from two of
+it side by side, from the half of its points on one side, from clouds in another unit than is stated, from states with
+all draws 1.5 times as far (and of those that are believed, how many have an IoU below .7) and, with weights, from its
+own views as a network of the preset `tiny` understands them after ten steps; the shares of clean views, of those of
+which a tool hides 30 %, and of simulated cameras' views that are "unsure" and refused; the shares of their true
+material points, seen and hidden, within the 95 % radii; and the expected calibration error of the network's
+probabilities as they are and calibrated. ``--own`` measures the object's own views alone. Weights without a calibration
+are calibrated here, on training seeds, and not written. Test seeds begin at 1,000,000: tune on others.
 
 With `--output` each object's row is kept in FOLDER/OBJECT.json as soon as it is measured and FOLDER/table.md has those
 of the objects named, so that a run that was cut off goes on where it was: rows of the same settings are not measured
@@ -44,6 +44,7 @@ from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.recognition import MOST, Recognition
 from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import Camera, PointCloud
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
@@ -96,6 +97,7 @@ class Measured:
         own: of views of the object, by their kind in ``OWN``.
         errors, iou: of the registrations of those of these views that are said to show the object.
         strange: of everything else, by its kind.
+        beyond_iou: of the registrations of states beyond the object's that are said to show it.
         ece: expected calibration error as the network gives probabilities, and calibrated.
     """
 
@@ -103,6 +105,7 @@ class Measured:
     errors: dict[str, list[RegistrationErrors]] = field(default_factory=lambda: {kind: [] for kind in OWN})
     iou: dict[str, list[float]] = field(default_factory=lambda: {kind: [] for kind in OWN})
     strange: dict[str, list[Recognition]] = field(default_factory=lambda: defaultdict(list))
+    beyond_iou: list[float] = field(default_factory=list)
     ece: tuple[float, float] = (float("nan"), float("nan"))
 
     def add(self, kind: str, answer: Answer | Recognition, view: View, seen: PointCloud) -> None:
@@ -113,9 +116,21 @@ class Measured:
         fit = answer.registration
         positions = nearest_truth(fit.model, fit.material, true_material(view, fit.model))
         self.errors[kind].append(RegistrationErrors.of(fit, positions, seen_points(positions, seen, 1.0), 1.0))
-        truth = truth_grid(view.mesh, CELLS)
-        labels = labels_on(fit.mesh, truth.grid)
-        self.iou[kind].append(intersection_over_union(grid_confusion(truth, labels, len(view.mesh.names))).iou)
+        self.iou[kind].append(iou_of(fit, view))
+
+    def add_beyond(self, answer: Answer | Recognition, view: View) -> None:
+        """Take in what was said of a state beyond the object's."""
+        said = answer if isinstance(answer, Recognition) else answer.recognition
+        self.strange["state beyond"].append(said)
+        if not isinstance(answer, Recognition) and answer.registration is not None and said.known is True:
+            self.beyond_iou.append(iou_of(answer.registration, view))
+
+
+def iou_of(fit: Registration, view: View) -> float:
+    """IoU of a registration with a view's truth."""
+    truth = truth_grid(view.mesh, CELLS)
+    labels = labels_on(fit.mesh, truth.grid)
+    return intersection_over_union(grid_confusion(truth, labels, len(view.mesh.names))).iou
 
 
 def auroc(own: Sequence[float], strange: Sequence[float]) -> float:
@@ -237,12 +252,12 @@ def _farther_sampler(scene: Scene, factor: float) -> Callable[[np.random.Generat
     return sample
 
 
-def clouds_beyond(scene: Scene, count: int, seed: int) -> Iterator[PointCloud]:
-    """Clouds of the object in states whose draws are all 1.5 times as far out; none of a scene that refuses them."""
+def views_beyond(scene: Scene, count: int, seed: int) -> Iterator[View]:
+    """Views of the object in states whose draws are all 1.5 times as far out; none of a scene that refuses them."""
     with suppress(ValueError):
         for index in range(count):
             rng = example_rng(seed + 4, index)  # beyond the seeds of other strange frames
-            yield sample_view(with_farther_states(scene, 1.5), GenerateConfig(), rng).depth.to_points()
+            yield sample_view(with_farther_states(scene, 1.5), GenerateConfig(), rng)
 
 
 def barely_trained(scene: Scene, folder: Path) -> Model:
@@ -295,8 +310,8 @@ def measured(name: str, arguments: argparse.Namespace) -> Measured:
         result.strange[kind].append(recognized(cloud, model, unsized, unit_m=None))
     for kind, cloud in clouds_like(clouds, seed):
         result.strange[kind].append(recognized(cloud, model, registrar))
-    for cloud in clouds_beyond(scene, arguments.views, seed):
-        result.strange["state beyond"].append(recognized(cloud, model, registrar))
+    for view in views_beyond(scene, arguments.views, seed):
+        result.add_beyond(answered(observe(view.depth.to_points(), unit_m=1.0), model, registrar), view)
     if model is None:
         return result
     with TemporaryDirectory() as folder:
@@ -328,6 +343,7 @@ def row(name: str, result: Measured, seconds: float) -> dict[str, Any]:
         "auroc": [auroc(own, [each.strangeness for each in result.strange[kind]]) for kind in KINDS],
         "passed": [share(result.strange[kind], True) for kind in KINDS],
         "frames": [len(result.strange[kind]) for kind in KINDS],
+        "beyond_wrong": sum(iou < WRONG for iou in result.beyond_iou),
         "own": {kind: own_row(result, kind) for kind in OWN},
         "ece": list(result.ece),
         "seconds": round(seconds),
@@ -350,6 +366,7 @@ def line(numbers: dict[str, Any]) -> str:
     """Row as a line of the table."""
     strangers = zip(numbers["auroc"], numbers["passed"], numbers["frames"], strict=True)
     cells = [f"{area:.3f} ({rate:.0%} of {count})" for area, rate, count in strangers]
+    cells[KINDS.index("state beyond")] += f", {numbers['beyond_wrong']} wrong"
     for own in numbers["own"].values():
         radii = own["radii"] or {}
         covered = (radii.get(part) for part in ("seen", "hidden"))
@@ -481,7 +498,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=None)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    heads = [f"{kind} (known)" for kind in KINDS]
+    heads = [f"{kind} (known)" for kind in KINDS]  # of states beyond the object's, also how many of these are wrong
     heads += [f"{kind}: unsure, refused, wrong and known; within radii, seen / hidden" for kind in OWN]
     heads += ["ECE", "calibrated", "seconds"]
     lines = [f"| AUROC against | {' | '.join(heads)} |", "|---" * (len(heads) + 1) + "|"]
