@@ -14,7 +14,9 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from scipy.optimize import minimize_scalar
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.recognition import Known
@@ -33,6 +35,7 @@ from mereo.geometry.metrics import (
     with_segments_exchanged,
 )
 from mereo.geometry.solids import label_grid
+from mereo.geometry.symmetry import STEP, Symmetry
 from mereo.geometry.transforms import transform_points
 from mereo.models.trained import EncodedCloud, Trained
 from mereo.reconstruction.isosurfaces import sample_coarse_to_fine
@@ -49,17 +52,52 @@ def nearest_truth(
     """Choose the true positions of material points that an answer is nearest to, of those that no frame tells apart.
 
     Of an object that looks the same turned, a place of the answer is as right where the true object has its turned
-    place. Turns by any angle are not tried, and of a part of the material points the positions are those given.
+    place; where any angle looks the same, by that which brings it nearest to the answer. Turns about any axis are not
+    tried, and of a part of the material points the positions are those given.
     """
     if len(truth) < len(model.rest_points):
         return truth
     truths = [truth]
     for symmetry in model.symmetries:
-        if symmetry.angle is not None and None not in symmetry.lands_on:
-            landing = np.array([index for index in symmetry.lands_on if index is not None])
-            labels = (landing[model.labels - 1] + 1).astype(np.uint8)
-            truths.append(model.weights(transform_points(symmetry.turn, model.rest_points), labels)(truth))
+        if symmetry.axis is not None and None not in symmetry.lands_on:
+            turn = symmetry.turn if symmetry.angle is not None else _nearest_turn(model, symmetry, answer, truth)
+            truths.append(_turned(model, symmetry, turn, truth))
     return min(truths, key=lambda each: float(np.median(np.linalg.norm(answer - each, axis=1))))
+
+
+def _turned(
+    model: StatisticalModel,
+    symmetry: Symmetry,
+    turn: Float[np.ndarray, "4 4"],
+    truth: Float[np.ndarray, "m 3"],
+    rows: slice | Int[np.ndarray, " n"] = slice(None),
+) -> Float[np.ndarray, "n 3"]:
+    """Places in the true object to which a turn at rest brings material points."""
+    landing = np.array([index for index in symmetry.lands_on if index is not None])
+    labels = (landing[model.labels[rows] - 1] + 1).astype(np.uint8)
+    return model.weights(transform_points(turn, model.rest_points[rows]), labels)(truth)
+
+
+def _nearest_turn(
+    model: StatisticalModel, symmetry: Symmetry, answer: Float[np.ndarray, "m 3"], truth: Float[np.ndarray, "m 3"]
+) -> Float[np.ndarray, "4 4"]:
+    """The turn about the axis of a symmetry by any angle that brings the true places nearest to an answer."""
+    axis = symmetry.axis
+    assert axis is not None
+    middle = np.linalg.lstsq(np.eye(3) - symmetry.turn[:3, :3], symmetry.turn[:3, 3], rcond=1e-6)[0]
+
+    def turn(angle: float) -> Float[np.ndarray, "4 4"]:
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix()
+        T[:3, 3] = middle - T[:3, :3] @ middle
+        return T
+
+    def off(angle: float) -> float:
+        places = _turned(model, symmetry, turn(angle), truth, model.sparse)
+        return float(np.median(np.linalg.norm(answer[model.sparse] - places, axis=1)))
+
+    start = min(np.arange(0.0, 2 * np.pi, STEP), key=off)
+    return turn(minimize_scalar(off, bounds=(start - STEP, start + STEP), method="bounded").x)
 
 
 def seen_points(truth: Float[np.ndarray, "m 3"], cloud: PointCloud, scene_unit: float) -> Bool[np.ndarray, " m"]:

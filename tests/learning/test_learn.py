@@ -11,9 +11,11 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
+import trimesh
 from angle import write_angle
 from safetensors.torch import load_file
-from scene_files import write_bar
+from scene_files import HEAD, write_bar
+from scipy.spatial.transform import Rotation
 
 import mereo
 from mereo import __main__ as command_line
@@ -431,3 +433,20 @@ def test_radii_are_measured_against_the_nearest_of_the_truths_that_no_frame_tell
         assert np.linalg.norm(nearest - material, axis=1).max() < 0.5, "as much as the turn that was settled is off"
     part = truth[:10]
     assert nearest_truth(model, turned, part) is part
+
+
+def test_radii_of_what_is_round_are_measured_by_the_nearest_angle(tmp_path: Path) -> None:
+    for name, radius, low in (("left", 30.0, 0.0), ("right", 12.0, 60.0)):  # a bottle and its neck
+        part = trimesh.creation.cylinder(radius, segment=[[0, 0, low], [0, 0, low + 60.0]], sections=90)
+        part.subdivide().export(tmp_path / f"{name}.stl")
+    path = tmp_path / "bottle.yaml"
+    path.write_text(HEAD + "deformations: stiff\n", encoding="utf-8")
+    model = scene_model(load_scene(str(path)), 4)
+    (symmetry,) = model.symmetries
+    assert symmetry.angle is None and symmetry.axis is not None
+    truth = transform_points(rigid(np.eye(3), np.array([0.0, 0.0, 150.0])), model.rest_points)
+    spin = rigid(Rotation.from_rotvec(2.345 * symmetry.axis).as_matrix(), np.zeros(3))
+    center = truth.mean(axis=0)
+    spun = transform_points(spin, truth - center) + center
+    assert np.linalg.norm(spun - truth, axis=1).max() > 0.5 * model.half
+    assert np.linalg.norm(nearest_truth(model, spun, truth) - spun, axis=1).max() < 0.5
