@@ -8,12 +8,12 @@ from answers import fit_correspondences
 from fit_cases import IN_FRONT, SCENE, said, seen, shown
 from scipy.spatial.transform import Rotation
 
-from mereo.fitting.config import FitConfig
+from mereo.fitting.config import FitConfig, TrackConfig
 from mereo.fitting.draws.fit import DrawsFit, DrawsProblem, Shape, approach, fit_draws, lay_on_shape, secant
 from mereo.fitting.draws.fit import narrowing as narrowing_of_draws
 from mereo.fitting.draws.playback import Drawn, DrawnStates
 from mereo.fitting.modes import ScoredFit, fit_wide, narrowing, refined, shaken
-from mereo.fitting.problem.correspondences import Correspondences
+from mereo.fitting.problem.correspondences import Correspondences, nothing
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import POSE, Posed, along
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, OPEN_SCALE_STD, Problem
@@ -22,6 +22,7 @@ from mereo.fitting.registration.recognition import recognize
 from mereo.fitting.registration.register import CloudToFit, ModesFit, is_drawn
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.search import rotations
+from mereo.fitting.tracking import PAUSE_S, Track, explore
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.models.weights import load_model
 from mereo.scenes.random_states import build_model, interior_nodes, sample_states, state_points
@@ -271,3 +272,17 @@ def test_what_is_explained_hopeless_or_a_cameras_noise_is_left(robot: Statistica
     assert shaken(replace(problem, scale_std=OPEN_SCALE_STD), wrong) is wrong
     noisy, fitted = stuck(robot, 4, 4, noise=0.5)
     assert not fitted.explains(noisy) and shaken(noisy, fitted) is fitted
+
+
+def test_a_track_looks_for_other_states_where_it_is_wrong_and_not_again_at_once(robot: StatisticalModel) -> None:
+    problem, wrong = stuck(robot, 4, 5)
+    fitted = ModesFit(problem, nothing(), 1.0, wrong.posed, 0.0)
+    track = Track.of(fitted, 0.0, TrackConfig(), FitConfig())
+    better, after = explore(track, fitted, 1.0)
+    left = problem.misfit(better.posed).cloud
+    assert left < 0.5 * wrong.misfit.cloud and (after.explored_s, after.left) == (1.0, pytest.approx(left))
+    assert explore(after, fitted, 1.0 + 0.9 * PAUSE_S)[0] is fitted
+    assert explore(after, fitted, 1.0 + PAUSE_S)[1].explored_s > 1.0, "a wrong state again"
+    assert explore(replace(after, left=wrong.misfit.cloud), fitted, 9.0)[0] is fitted, "nothing better was found"
+    right = replace(fitted, posed=shaken(problem, wrong).posed)
+    assert explore(track, right, 1.0) == (right, track)

@@ -130,16 +130,12 @@ FEW_DRAWS = 30
 StreamMethod = Literal["auto", "network", "search", "modes"]
 """Source of the answers to a sequence, as ``AnswerMethod``; draws take longer than the time between two frames."""
 
-MotionModel = Literal["pose", "velocity"]
-"""What is expected of the next frame: the last state, or the last state moved on as it has moved."""
-
 
 @dataclass(frozen=True)
 class TrackConfig:
     """Constants of following an object.
 
     Attributes:
-        motion: what is expected of the next frame.
         speed: standard deviation of a material point's way from there, scene units per second.
         gain: how many times its present speed is added to that: what is still stays still, what moves may turn.
         dead: speed that noise alone makes a still object seem to have, which is not counted, neither here nor in where
@@ -162,7 +158,6 @@ class TrackConfig:
         longest_s: a longer time without a frame ends the track.
     """
 
-    motion: MotionModel = "velocity"
     speed: float = 1.0
     gain: float = 10.0
     dead: float = 0.5

@@ -556,12 +556,8 @@ def search(whole: Problem, partial: Problem | None = None, start: Posed | None =
 
 
 def as_noisy(trails: list[Trail], chosen: Trail) -> Trail | None:
-    """``Trail.as_noisy`` of the chosen one of two hypotheses, the first of which is that the object is seen whole.
-
-    To a clean frame's constants a camera's noise at the rim looks like more than ``WHOLE``, so a part is hidden only
-    where it is by those of the noise too.
-    """
-    noisy, whole = chosen.as_noisy(), trails[0]
+    """``Trail.as_noisy``; one other than the first, of a whole object, must win by the noise's constants too."""
+    noisy, whole = chosen.as_noisy(), trails[0]  # to a clean frame's, noise at the rim looks like more than ``WHOLE``
     if noisy is None or chosen is whole:
         return noisy
     evidence = replace(noisy.problem.evidence, other_lines=whole.problem.evidence.other_lines)

@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mereo.fitting.config import FitConfig, LocatedBy, TrackConfig, Tracking
+from mereo.fitting.modes import ScoredFit, explored, has_many_optima, refine
 from mereo.fitting.problem.correspondences import nothing
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import DAMPING, POSE, NormalEquations, Posed, in_space
@@ -60,6 +61,7 @@ class Track:
         clean: constants of frames without noise; ``problem`` has those for ``noise``.
         other_lines: kind of the lines of sight of which a frame says nothing, as it was when the track began.
         area: greatest area of the object that was seen (``seen_area``).
+        left, explored_s: misfit of the cloud that the last exploration left over (``explore``), and when.
     """
 
     problem: Problem
@@ -73,6 +75,8 @@ class Track:
     other_lines: SightKind
     area: float
     calibration: Calibration | None = None
+    left: float = 0.0
+    explored_s: float = -np.inf
 
     @classmethod
     def of(cls, fitted: ModesFit, time_s: float, config: TrackConfig, clean: FitConfig) -> "Track":
@@ -96,8 +100,6 @@ class Track:
 
     def expected(self, time_s: float, config: TrackConfig) -> Posed:
         """State that is expected at a time."""
-        if config.motion == "pose":
-            return self.posed
         # James and Stein's estimate of a mean, positive part: small motion may be noise alone, large motion is not
         counted = max(1.0 - (config.dead / max(self.speed, 1e-9)) ** 2, 0.0)
         return self.posed.moved(counted * self.velocity * (time_s - self.time_s))
@@ -171,8 +173,25 @@ def next_fit(
             partial = fit("unknown")
             whole_misfit, misfit = (end.problem.misfit(end.posed, end.surface).total for end in (fitted, partial))
             fitted = partial if misfit + WHOLE < whole_misfit else fitted
+        fitted, track = explore(track, fitted, time_s)
     fitted = replace(fitted, seconds=time.perf_counter() - started)
     return fitted, followed(track, fitted, time_s, config)
+
+
+WORSE, PAUSE_S = 1.2, 0.5
+"""Misfit, in what the last exploration left over, and time after it, from which on another may pay: each takes long."""
+
+
+def explore(track: Track, fitted: ModesFit, time_s: float) -> tuple[ModesFit, Track]:
+    """Look for other states near a frame's fit that does not explain it: what bends may follow into a wrong one."""
+    problem = fitted.problem
+    if time_s - track.explored_s < PAUSE_S or not has_many_optima(problem):
+        return fitted, track
+    best = ScoredFit(fitted.posed, problem.misfit(fitted.posed, fitted.surface), fitted.surface)
+    if best.misfit.cloud < WORSE * track.left or best.explains(problem):
+        return fitted, track
+    best = explored(problem, best.better(problem, refine(problem, best.posed)))
+    return replace(fitted, posed=best.posed), replace(track, left=best.misfit.cloud, explored_s=time_s)
 
 
 def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig) -> Track:

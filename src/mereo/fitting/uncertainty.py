@@ -443,10 +443,7 @@ class Uncertainty:
 
     @cached_property
     def factor(self) -> float:
-        """Factor of the posterior's radii: ``scale``, or without one what most objects need.
-
-        In a noisy frame times the misfit over that of noise alone: what is beyond it, the fit has not explained.
-        """
+        """Factor of the posterior's radii; in a noisy frame also by how much more than noise the fit leaves over."""
         frame = self.optimum.frame
         usual = self.scale or (NOISY_FACTOR if frame.noisy else 1.0)
         return usual * max(frame.cloud_misfit(self.optimum.surface) * SIGMAS**2, 1.0) if frame.noisy else usual

@@ -257,13 +257,9 @@ def sample_mask(
     outward -= 0.5 * np.sign(outward)
     shift = sensor.mask_shift_px * streams["mask_shift_px"].normal(size=2)
     outward = ndimage.shift(outward, shift, order=1, mode="nearest")
-    height, width = seen.shape
-    return outward < sensor.mask_offset_px * smooth_field(height, width, streams["mask_offset_px"])
-
-
-def smooth_field(height: int, width: int, rng: np.random.Generator, nodes: int = 7) -> Float[np.ndarray, "h w"]:
-    """Gaussian random field of mean 0 and variance 1 everywhere, with ``nodes`` hills along each axis."""
-    return _bumps(height, nodes) @ rng.normal(size=(nodes, nodes)) @ _bumps(width, nodes).T
+    rows, columns = (_bumps(size, 7) for size in seen.shape)  # so many hills along each axis
+    field = rows @ streams["mask_offset_px"].normal(size=(7, 7)) @ columns.T  # mean 0 and variance 1
+    return outward < sensor.mask_offset_px * field
 
 
 @lru_cache(maxsize=8)

@@ -66,7 +66,8 @@ class Candidate:
     def off_surface(self) -> Float[np.ndarray, " n"]:
         """Distance of each of all points from the facing surface, scene units."""
         assert self.modes is not None
-        return self.modes.off_surface(transform_points(self.encoded.T_camera_input, self.hypothesis.whole.points))
+        points = transform_points(self.encoded.T_camera_input, self.hypothesis.whole.points)
+        return self.modes.surface.nearest(points / self.modes.unit)[0]
 
     @property
     def is_featureless(self) -> bool:
@@ -78,9 +79,8 @@ class Candidate:
         if self.modes is None or self.located_by == "pose":
             return False
         evidence = self.modes.problem.evidence
-        if evidence.hidden_edge <= NO_OUTLINE:
-            return False
-        return evidence.patch_share(self.modes.tolerance) > self.modes.registration().explained - PATCH
+        least = self.modes.registration().explained - PATCH
+        return evidence.hidden_edge > NO_OUTLINE and evidence.patch_share(self.modes.tolerance) > least
 
     def explained(self, tolerance: float) -> float:
         """Share of all points, outliers included, that lie on the facing surface up to a tolerance in scene units."""

@@ -147,10 +147,6 @@ class ModesFit:
         """Distance in scene units up to which an observed point lies on the surface, by the frame's noise."""
         return self.problem.config.tolerance
 
-    def off_surface(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Distances, in scene units, of points of the camera frame in the cloud's unit from the facing surface."""
-        return self.surface.nearest(points / self.unit)[0]
-
     @cached_property
     def surface(self) -> Surface:
         """The posed model in scene units: by its modes, or at rest where the frame speaks for that."""
