@@ -178,8 +178,8 @@ def next_fit(
     return fitted, followed(track, fitted, time_s, config)
 
 
-WORSE, PAUSE_S = 1.2, 0.5
-"""Misfit, in what the last exploration left over, and time after it, from which on another may pay: each takes long."""
+WORSE, PAUSE_S, BETTER = 1.2, 0.5, 100.0
+"""Misfit, in that after the last exploration, and time since, for another; its gain, so that nothing still jumps."""
 
 
 def explore(track: Track, fitted: ModesFit, time_s: float) -> tuple[ModesFit, Track]:
@@ -190,8 +190,10 @@ def explore(track: Track, fitted: ModesFit, time_s: float) -> tuple[ModesFit, Tr
     best = ScoredFit(fitted.posed, problem.misfit(fitted.posed, fitted.surface), fitted.surface)
     if best.misfit.cloud < WORSE * track.left or best.explains(problem):
         return fitted, track
-    best = explored(problem, best.better(problem, refine(problem, best.posed)))
-    return replace(fitted, posed=best.posed), replace(track, left=best.misfit.cloud, explored_s=time_s)
+    found = explored(problem, best.better(problem, refine(problem, best.posed)))
+    if found.misfit.total < best.misfit.total - BETTER:
+        best, fitted = found, replace(fitted, posed=found.posed)
+    return fitted, replace(track, left=best.misfit.cloud, explored_s=time_s)
 
 
 def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig) -> Track:

@@ -47,8 +47,7 @@ NOISY_FACTOR = 1.5
 modes hold 96 % with it and 84 % without; clean views need none (docs/experiments/071.md)."""
 
 LEAST_RADIUS = 0.1
-"""Radius in scene units that every position has in addition, the noise of the paper's camera: how far a fit is from its
-optimum, and facets from the surface, no posterior knows (docs/experiments/076.md)."""
+"""Radius in scene units that every position has in addition: the paper camera's noise, for facets and a fit's end."""
 
 _FREEDOM = np.linspace(1.0, 3.0, 201)
 _QUANTILE = chdtri(_FREEDOM, 1.0 - LEVEL)
