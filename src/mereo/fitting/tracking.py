@@ -190,9 +190,9 @@ def explore(track: Track, fitted: ModesFit, time_s: float) -> tuple[ModesFit, Tr
     best = ScoredFit(fitted.posed, problem.misfit(fitted.posed, fitted.surface), fitted.surface)
     if best.misfit.cloud < WORSE * track.left or best.explains(problem):
         return fitted, track
-    found = explored(problem, best.better(problem, refine(problem, best.posed)))
-    if found.misfit.total < best.misfit.total - BETTER:
-        best, fitted = found, replace(fitted, posed=found.posed)
+    other = explored(problem, best.better(problem, refine(problem, best.posed)))
+    if other.misfit.total < best.misfit.total - BETTER:
+        best, fitted = other, replace(fitted, posed=other.posed)
     return fitted, replace(track, left=best.misfit.cloud, explored_s=time_s)
 
 
