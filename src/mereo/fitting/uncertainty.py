@@ -421,8 +421,7 @@ class Uncertainty:
         model: statistical model of the object.
         scale: factor by which views of training seeds showed the posterior's radii to be too small, in frames like
             this; None where that was not measured.
-        extra_radius: radius added in quadrature at every position: the least one, and where network and fit disagree;
-            scene units.
+        extra_radius: radius added in quadrature at every position, ``LEAST_RADIUS`` of a fit; scene units.
     """
 
     optimum: Optimum

@@ -79,8 +79,8 @@ class Candidate:
         if self.modes is None or self.located_by == "pose":
             return False
         evidence = self.modes.problem.evidence
-        least = self.modes.registration().explained - PATCH
-        return evidence.hidden_edge > NO_OUTLINE and evidence.patch_share(self.modes.tolerance) > least
+        is_cut = evidence.hidden_edge > NO_OUTLINE
+        return is_cut and evidence.patch_share(self.modes.tolerance) > self.modes.registration().explained - PATCH
 
     def explained(self, tolerance: float) -> float:
         """Share of all points, outliers included, that lie on the facing surface up to a tolerance in scene units."""

@@ -196,6 +196,7 @@ class ModesFit:
         factors = RadiusFactors()
         if self.calibration is not None:
             factors = self.calibration.radii(draws=method == "draws", noisy=self.problem.noisy)
+        misfit = 0.0 if factors.misfit is None else self.problem.cloud_misfit(surface)
         return Registration(
             model=self.problem.model,
             material=surface.material * self.unit,
@@ -210,7 +211,7 @@ class ModesFit:
             ruled_out=self.problem.ruled_out(surface),
             needed=self.problem.config.accepted,
             optimum=optimum,
-            radius_scale=factors.scale_at(self.problem.cloud_misfit(surface)),
+            radius_scale=factors.scale_at(misfit),
             extra_radius=LEAST_RADIUS,
             alike=self.alike,
         )
