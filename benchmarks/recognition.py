@@ -110,20 +110,32 @@ class Measured:
 
     def add(self, kind: str, answer: Answer | Recognition, view: View, seen: PointCloud) -> None:
         """Take in what was said of a view of the object, in scene units."""
-        self.own[kind].append(answer if isinstance(answer, Recognition) else answer.recognition)
-        if isinstance(answer, Recognition) or answer.registration is None or answer.recognition.known is not True:
+        self.own[kind].append(recognition_of(answer))
+        fit = believed(answer)
+        if fit is None:
             return
-        fit = answer.registration
         positions = nearest_truth(fit.model, fit.material, true_material(view, fit.model))
         self.errors[kind].append(RegistrationErrors.of(fit, positions, seen_points(positions, seen, 1.0), 1.0))
         self.iou[kind].append(iou_of(fit, view))
 
     def add_beyond(self, answer: Answer | Recognition, view: View) -> None:
         """Take in what was said of a state beyond the object's."""
-        said = answer if isinstance(answer, Recognition) else answer.recognition
-        self.strange["state beyond"].append(said)
-        if not isinstance(answer, Recognition) and answer.registration is not None and said.known is True:
-            self.beyond_iou.append(iou_of(answer.registration, view))
+        self.strange["state beyond"].append(recognition_of(answer))
+        fit = believed(answer)
+        if fit is not None:
+            self.beyond_iou.append(iou_of(fit, view))
+
+
+def recognition_of(answer: Answer | Recognition) -> Recognition:
+    """What was said of a frame (``answered``)."""
+    return answer if isinstance(answer, Recognition) else answer.recognition
+
+
+def believed(answer: Answer | Recognition) -> Registration | None:
+    """The registration of a frame that is said to show the object; None where it is not, or there is none."""
+    if isinstance(answer, Recognition) or answer.recognition.known is not True:
+        return None
+    return answer.registration
 
 
 def iou_of(fit: Registration, view: View) -> float:
@@ -151,8 +163,7 @@ def answered(seen: Observation, model: Model | None, registrar: Registrar) -> An
 
 def recognized(cloud: PointCloud, model: Model | None, registrar: Registrar, unit_m: float | None = 1.0) -> Recognition:
     """Whether it says that a cloud of this unit shows the object."""
-    answer = answered(observe(cloud, unit_m=unit_m), model, registrar)
-    return answer if isinstance(answer, Recognition) else answer.recognition
+    return recognition_of(answered(observe(cloud, unit_m=unit_m), model, registrar))
 
 
 def sized(registrar: Registrar) -> Registrar:

@@ -14,7 +14,7 @@ from mereo.fitting.problem.problem import OPEN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import NetworkTerm
 from mereo.fitting.registration.answer_frame import search_modes
 from mereo.fitting.registration.register import CloudToFit
-from mereo.fitting.search import SightTable, Trail, as_noisy, medoids, rotations
+from mereo.fitting.search import SightTable, _Trail, as_noisy, medoids, rotations
 from mereo.geometry.camera import SightLines
 from mereo.models.weights import load_model
 from mereo.scenes.statistical_model import StatisticalModel
@@ -131,7 +131,7 @@ def test_under_noise_a_part_is_hidden_where_it_is_by_the_noises_constants_too(
     evidence = Evidence.of(points)
     whole = Problem(model, NetworkTerm.none(model), evidence, OPEN_SCALE_STD, FitConfig())
     partial = replace(whole, evidence=replace(evidence, other_lines="unknown"))
-    trails = [Trail(each, 0.0, [refined(each, fit_wide(each, posed))]) for each in (whole, partial)]
+    trails = [_Trail(each, 0.0, [refined(each, fit_wide(each, posed))]) for each in (whole, partial)]
     for chosen in trails if not share else trails[1:]:
         noisy = as_noisy(trails, chosen)
         assert noisy is not None and noisy.problem.is_camera

@@ -17,7 +17,7 @@ from jaxtyping import Float, Float32
 from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.evidence import MOST_POINTS
 from mereo.fitting.problem.gauss_newton import DAMPING, Posed
-from mereo.fitting.problem.problem import CAMERA, Misfit, Problem
+from mereo.fitting.problem.problem import Misfit, Problem
 from mereo.fitting.problem.residuals import NetworkTerm, Prior, Surface
 from mereo.fitting.problem.segments import (
     corner_positions,
@@ -81,8 +81,7 @@ def shaken(problem: Problem, best: "ScoredFit") -> "ScoredFit":
     """
     rng, is_patient = np.random.default_rng(0), problem.config.search_rounds > 0 and not problem.is_scale_open
     for _ in range(SHAKES if is_patient and has_many_optima(problem) else 0):
-        bends_to_noise = not problem.noisy and problem.residual_noise(best.surface) >= CAMERA
-        if best.explains(problem) or best.misfit.cloud > HOPELESS or bends_to_noise:
+        if best.explains(problem) or best.misfit.cloud > HOPELESS or problem.leaves_camera_noise(best.surface):
             break
         before, z = best, best.posed.z
         starts = [replace(best.posed, z=z + rng.standard_normal(len(z))) for _ in range(SHAKEN)]
@@ -319,10 +318,10 @@ def as_noisy(start: NetworkFit, points: Float[np.ndarray, "n 3"], predict: Predi
     noisy = problem.as_noisy_as(modes.surface)
     if noisy is None:
         return start
-    others = [] if predict is None else [predict(smoothed(means_along_sight(points, MOST_POINTS)))]
-    fits = list[NetworkFit]()
-    for each in (correspondences, *others):
-        problem = replace(noisy, network=NetworkTerm.of(noisy.model, each))
-        fits.append((problem, each, fit_modes(problem)))
+    fits = [(noisy, correspondences, fit_modes(noisy))]
+    if predict is not None:
+        other = predict(smoothed(means_along_sight(points, MOST_POINTS)))
+        again = replace(noisy, network=NetworkTerm.of(noisy.model, other))
+        fits.append((again, other, fit_modes(again)))
     best = min(fits, key=lambda fit: fit[2].misfit.without_network)
     return best if best[0].leaves_noise(best[2].surface) else start

@@ -439,7 +439,7 @@ _total = attrgetter("misfit.total")
 
 
 @dataclass(eq=False)
-class Trail:
+class _Trail:
     """Search under one hypothesis on the lines of sight around the cloud."""
 
     problem: Problem
@@ -448,12 +448,10 @@ class Trail:
 
     @property
     def best(self) -> ScoredFit:
-        """Fit of the lowest misfit."""
         return min(self.fitted, key=_total)
 
     @property
     def is_explained(self) -> bool:
-        """Whether that explains the frame."""
         return self.best.explains(self.problem)
 
     def go_on(self, stage: SearchRound) -> None:
@@ -475,7 +473,7 @@ class Trail:
                 return
             self.fitted.append(shaken(self.problem, ranked[row]))
 
-    def with_heavier_cloud(self) -> "Trail | None":
+    def with_heavier_cloud(self) -> "_Trail | None":
         """The same with a cloud that is worth more, where the prior of an elastic solid keeps it from being explained.
 
         Where that hardly helps, the object moves in ways that the modes do not have, and the prior is right.
@@ -485,9 +483,9 @@ class Trail:
             return None
         problem = replace(problem, config=replace(problem.config, cloud_weight=HEAVY))
         heavier = ScoredFit.of(problem, fit_cloud(problem, best.posed, Prior.whole(problem.model), *HEAVIER_STEPS, 0.0))
-        return Trail(problem, 0.0, [heavier]) if heavier.misfit.cloud < HELPS * best.misfit.cloud else None
+        return _Trail(problem, 0.0, [heavier]) if heavier.misfit.cloud < HELPS * best.misfit.cloud else None
 
-    def as_noisy(self) -> "Trail | None":
+    def as_noisy(self) -> "_Trail | None":
         """The same with the constants for what the best fit leaves over, where that is noise and not the fit's error.
 
         None where that is not so, or the frame is explained. Only after other states were tried: a wrong state may
@@ -504,16 +502,15 @@ class Trail:
                 return trail
         return None
 
-    def again(self, noisy: Problem) -> "Trail":
+    def again(self, noisy: Problem) -> "_Trail":
         """The same from its best states that differ, in the problem of a frame of this noise."""
         states = [scored.posed for scored in sorted(self.fitted, key=_total)]
         rows = differing(noisy, states, BENT_APART)[:4]
-        trail = Trail(noisy, 0.0, [explored(noisy, refined(noisy, fit_wide(noisy, states[row]))) for row in rows])
+        trail = _Trail(noisy, 0.0, [explored(noisy, refined(noisy, fit_wide(noisy, states[row]))) for row in rows])
         trail.shake()
         return trail
 
     def outcome(self) -> SearchOutcome:
-        """The best fit, and how many explain the frame alike."""
         best = self.best
         rivals = [scored for scored in self.fitted if scored.misfit.cloud < best.misfit.cloud + ALIKE]
         alike = differing(self.problem, [scored.posed for scored in sorted(rivals, key=_total)], APART)
@@ -526,7 +523,7 @@ def search(whole: Problem, partial: Problem | None = None, start: Posed | None =
     ``partial`` is the same where it is open whether the object is seen whole: with nothing known around the cloud. It
     is taken where it explains the frame better by more than ``WHOLE``.
     """
-    trails = [Trail(whole), *([] if partial is None else [Trail(partial, WHOLE)])]
+    trails = [_Trail(whole)] if partial is None else [_Trail(whole), _Trail(partial, WHOLE)]
     if start is not None:
         for trail in trails:
             trail.fitted.append(refined(trail.problem, fit_wide(trail.problem, start)))
@@ -555,8 +552,8 @@ def search(whole: Problem, partial: Problem | None = None, start: Posed | None =
     return (heavier or chosen).outcome()
 
 
-def as_noisy(trails: list[Trail], chosen: Trail) -> Trail | None:
-    """``Trail.as_noisy``; one other than the first, of a whole object, must win by the noise's constants too."""
+def as_noisy(trails: list[_Trail], chosen: _Trail) -> _Trail | None:
+    """``_Trail.as_noisy``; one other than the first, of a whole object, must win by the noise's constants too."""
     noisy, whole = chosen.as_noisy(), trails[0]  # to a clean frame's, noise at the rim looks like more than ``WHOLE``
     if noisy is None or chosen is whole:
         return noisy

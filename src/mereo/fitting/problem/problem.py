@@ -147,6 +147,10 @@ class Problem:
             return None
         return replace(self, config=config, evidence=self.evidence.with_more_samples, noisy=True)
 
+    def leaves_camera_noise(self, surface: Surface) -> bool:
+        """Whether a fit with a clean frame's constants leaves a camera's noise over, to which it would bend."""
+        return not self.noisy and self.residual_noise(surface) >= CAMERA
+
     @property
     def by_every_point(self) -> "Problem":
         """The problem with as many observed samples as a noisy frame has; the same where it has them already."""
