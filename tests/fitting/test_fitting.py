@@ -267,7 +267,7 @@ def test_what_is_explained_hopeless_or_a_cameras_noise_is_left(robot: Statistica
     assert right.explains(problem) and shaken(problem, right) is right
     other_thing = replace(wrong, misfit=replace(wrong.misfit, cloud=5.0))
     assert shaken(problem, other_thing) is other_thing
-    hasty = replace(problem, config=replace(problem.config, search_rounds=0))
+    hasty = replace(problem, config=replace(problem.config, retries=False))
     assert shaken(hasty, wrong) is wrong, "a tracker has no time"
     assert shaken(replace(problem, scale_std=OPEN_SCALE_STD), wrong) is wrong
     noisy, fitted = stuck(robot, 4, 4, noise=0.5)

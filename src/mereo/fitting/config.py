@@ -33,8 +33,7 @@ class FitConfig:
         exact_steps: last steps, which use the faces themselves.
         normal_length: distance, as a share of the same half, that a difference of unit normals by 1 is worth in the
             search for the sample of each observed point; 0 compares places alone.
-        search_rounds: rounds of the search at most, while nothing explains the frame; 0 keeps a network's fit,
-            and tries no states around it either.
+        retries: whether other states are tried, and a search is made, where a network's fit does not explain the frame.
         accepted, tolerance: a fit is believed where this share of the observed points lies as near its facing surface.
             Where network and fit give .8 of the correspondences the same segment, a share of .85 is enough.
     """
@@ -49,7 +48,7 @@ class FitConfig:
     silhouette_vertices: int = 500
     exact_steps: int = 3
     normal_length: float = 0.0
-    search_rounds: int = 3
+    retries: bool = True
     accepted: float = 0.95
     tolerance: float = 0.45
 

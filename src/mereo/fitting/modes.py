@@ -79,7 +79,7 @@ def shaken(problem: Problem, best: "ScoredFit") -> "ScoredFit":
     What folds or has joints has many optima next to each other, and the right one is rarely far from a wrong one. Not
     where the unit is unknown: frames of other things are explained no less without it, and cost a third more with it.
     """
-    rng, is_patient = np.random.default_rng(0), problem.config.search_rounds > 0 and not problem.is_scale_open
+    rng, is_patient = np.random.default_rng(0), problem.config.retries and not problem.is_scale_open
     for _ in range(SHAKES if is_patient and has_many_optima(problem) else 0):
         if best.explains(problem) or best.misfit.cloud > HOPELESS or problem.leaves_camera_noise(best.surface):
             break

@@ -6,7 +6,7 @@
    frame (``Screen``).
 2. The best that differ are bent towards the frame by few points, from wide to narrow.
 3. The best of these are fitted as a frame always is, as long as they may be better or as good.
-4. While the frame is not explained, the same again from other states of the library, more and more of them.
+4. Where the frame is not explained, the same again from other states of the library.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -23,7 +23,6 @@ from scipy.spatial.transform import Rotation
 
 from mereo.fitting.modes import (
     BENT_APART,
-    HOPELESS,
     ScoredFit,
     bend_by_few,
     differing,
@@ -384,7 +383,7 @@ class SearchRound:
     fitted: int
 
 
-ROUNDS = (SearchRound(0, 400, 12, 4), SearchRound(12, 200, 24, 6), SearchRound(40, 150, 40, 8))
+ROUNDS = (SearchRound(0, 400, 12, 4), SearchRound(12, 200, 24, 6))
 """Rounds of the search, one after the other while the frame is not explained."""
 
 SIGMAS = (
@@ -408,6 +407,12 @@ SHAKEN_FITS = 3
 HEAVY, HEAVIER_STEPS, HELPS = 3000.0, (0.04, 12), 0.65
 """Weight of a cloud that an elastic solid explains only under it, the first sigma and the steps of the fit with it, and
 the share of the misfit that may be left: bends of a bunny's ears leave .45 to .54, states of livers .77 up."""
+
+ALL_NOISE = 0.55
+"""Misfit of a camera's frame up to which only noise is left over: right states have .4 to .5, wrong ones .74 up."""
+
+MAYBE_NOISE = 6.0
+"""Misfit after the first round, in ``unexplained`` ones, up to which what is left over may be noise alone."""
 
 WHOLE = 150.0
 """Misfit by which an object that is seen whole may be explained worse than one that something hides in part: it is on
@@ -453,6 +458,17 @@ class _Trail:
     @property
     def is_explained(self) -> bool:
         return self.best.explains(self.problem)
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether other states need not be tried: a clean frame is explained, or a camera's but for its noise."""
+        is_noise = self.problem.is_camera and self.best.misfit.cloud < ALL_NOISE
+        return self.is_explained and (is_noise or not self.problem.noisy)
+
+    def may_be_noise(self, is_last: bool) -> bool:
+        """Whether what the best fit leaves over may be noise; before the last round, much is a wrong state's."""
+        misfit, unexplained = self.best.misfit.cloud, self.problem.config.unexplained
+        return misfit >= unexplained and (is_last or misfit < MAYBE_NOISE * unexplained)
 
     def go_on(self, stage: SearchRound) -> None:
         """Fit the candidates of a round that may be the best, and explore from there."""
@@ -529,27 +545,21 @@ def search(whole: Problem, partial: Problem | None = None, start: Posed | None =
             trail.fitted.append(refined(trail.problem, fit_wide(trail.problem, start)))
         chosen = min(trails, key=lambda trail: trail.best.misfit.total + trail.handicap)
         return (chosen.with_heavier_cloud() or as_noisy(trails, chosen) or chosen).outcome()
-    going = trails
-    for number, stage in enumerate(ROUNDS[: whole.config.search_rounds]):
-        for trail in going:
+    for stage in ROUNDS:
+        for trail in trails:
             trail.go_on(stage)
-        for trail, other in permutations(going, 2):  # either may have found what the other has missed
+        for trail, other in permutations(trails, 2):  # either may have found what the other has missed
             trail.fitted.append(refined(trail.problem, other.best.posed))
-        chosen = min(going, key=lambda trail: trail.best.misfit.total + trail.handicap)
+        chosen = min(trails, key=lambda trail: trail.best.misfit.total + trail.handicap)
         chosen.shake()
-        heavier = chosen.with_heavier_cloud()
-        if heavier is not None and heavier.is_explained:
-            return heavier.outcome()
-        if chosen.is_explained or (number > 0 and chosen.best.misfit.cloud < whole.config.unexplained):
+        if chosen.is_explained:
             break
-        if number > 0:
-            better = heavier or as_noisy(trails, chosen)
-            # less noise than a camera's may be the error of a wrong state: the last round decides
-            is_sure = better is not None and (better is heavier or better.problem.is_camera)
-            if is_sure or number + 1 == whole.config.search_rounds or chosen.best.misfit.cloud > HOPELESS:
-                return (better or chosen).outcome()
-            going = [chosen]
-    return (heavier or chosen).outcome()
+        better, is_last = chosen.with_heavier_cloud(), stage is ROUNDS[-1]
+        if better is None and chosen.may_be_noise(is_last):
+            better = as_noisy(trails, chosen)
+        if better is not None and (is_last or better.is_sure):
+            return better.outcome()
+    return chosen.outcome()
 
 
 def as_noisy(trails: list[_Trail], chosen: _Trail) -> _Trail | None:

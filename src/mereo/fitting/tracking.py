@@ -293,8 +293,7 @@ class BackgroundSearch:
     """
 
     def __init__(self, registrar: Registrar, executor: Executor | None = None) -> None:
-        # a newer frame is worth more than the last round, which takes as long as the two before and longer
-        self.registrar = replace(registrar, constants=replace(registrar.config, search_rounds=2))
+        self.registrar = registrar
         self.executor = executor
         self._thread = ThreadPoolExecutor(1, "mereo-search")
         self._running: tuple[TrackedFrame, Future[Candidate]] | None = None

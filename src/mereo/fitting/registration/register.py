@@ -384,7 +384,7 @@ class Registrar:
     def asks_search(self) -> bool:
         """Whether a search follows where the network's fit does not explain the frame: seconds a frame."""
         is_same_object = self.network is not None and self.network.names == self.model.rest.names
-        return self.method == "auto" and self.config.search_rounds > 0 and is_same_object
+        return self.method == "auto" and self.config.retries and is_same_object
 
     @property
     def fits_draws(self) -> bool:
@@ -399,7 +399,7 @@ class Registrar:
     @property
     def without_retries(self) -> "Registrar":
         """The same without what takes seconds where the network's fit does not explain the frame."""
-        return replace(self, constants=replace(self.config, search_rounds=0)) if self.asks_network else self
+        return replace(self, constants=replace(self.config, retries=False)) if self.asks_network else self
 
     def asking(self, network: Trained | None) -> "Registrar":
         """The same with the same weights on another device; scene and states that are known stay so."""
