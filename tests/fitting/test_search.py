@@ -133,6 +133,6 @@ def test_under_noise_a_part_is_hidden_where_it_is_by_the_noises_constants_too(
     partial = replace(whole, evidence=replace(evidence, other_lines="unknown"))
     trails = [_Trail(each, 0.0, [refined(each, fit_wide(each, posed))]) for each in (whole, partial)]
     for chosen in trails if not share else trails[1:]:
-        noisy = as_noisy(trails, chosen)
+        noisy = as_noisy(trails, chosen, False)
         assert noisy is not None and noisy.problem.is_camera
         assert noisy.problem.evidence.other_lines == ("unknown" if share else "past")

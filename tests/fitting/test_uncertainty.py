@@ -23,7 +23,15 @@ from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.tracking import Tracker
-from mereo.fitting.uncertainty import LEAST_RADIUS, NOISY_FACTOR, ModesOptimum, Posterior, Uncertainty, radius95
+from mereo.fitting.uncertainty import (
+    CLEAN_FACTOR,
+    LEAST_RADIUS,
+    NOISY_FACTOR,
+    ModesOptimum,
+    Posterior,
+    Uncertainty,
+    radius95,
+)
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import owned_centroids, owned_gradients
@@ -121,7 +129,7 @@ def test_a_calibration_scales_radii_and_intervals(found: Registration, sure: Unc
     """The least radius, which every position has in addition, is no part of what is scaled."""
     assert sure.extra_radius == LEAST_RADIUS and (sure.material > LEAST_RADIUS).all()
     sure, found = replace(sure, extra_radius=0.0), replace(found, extra_radius=0.0)
-    wide = replace(found, radius_scale=3.0).uncertainty
+    wide = replace(found, radius_scale=3.0 * CLEAN_FACTOR).uncertainty
     assert wide is not None and wide.calibrated and not sure.calibrated
     np.testing.assert_allclose(wide.material, 3.0 * sure.material)
     for one, other in zip(wide.segments, sure.segments, strict=True):
@@ -138,7 +146,7 @@ def test_radii_of_noisy_frames_are_wider_where_nothing_is_calibrated_and_by_what
     assert isinstance(optimum, ModesOptimum)
     problem = replace(optimum.problem, noisy=True)
     noisy = replace(sure, optimum=replace(optimum, problem=problem))
-    assert noisy.factor == NOISY_FACTOR > 1.0 == sure.factor and replace(noisy, scale=0.7).factor == 0.7
+    assert noisy.factor == NOISY_FACTOR > CLEAN_FACTOR == sure.factor and replace(noisy, scale=0.7).factor == 0.7
     # of constants for much less noise than is left
     narrow = replace(problem, config=replace(problem.config, cloud_sigma=0.002))
     misfit = narrow.cloud_misfit(optimum.surface)
@@ -159,7 +167,7 @@ def test_the_interval_of_a_volume_is_around_it_and_not_far_from_the_true_one(
 
 def test_the_scale_is_that_which_holds_95_percent(found: Registration, sure: Uncertainty, material: np.ndarray) -> None:
     shown = seen_points(material, PointCloud(seen(found.model.mesh(material))), 1.0)
-    sure, found = replace(sure, extra_radius=0.0), replace(found, extra_radius=0.0)
+    sure, found = replace(sure, scale=1.0, extra_radius=0.0), replace(found, radius_scale=1.0, extra_radius=0.0)
     one = RegistrationErrors.of(found, material, shown, 1.0)
     np.testing.assert_array_equal(one.seen, shown)
     calibrated = RegistrationErrors.of(replace(found, radius_scale=7.0, extra_radius=0.05), material, shown, 1.0)

@@ -42,9 +42,9 @@ LEVEL = 0.95
 WITHIN = float(norm.ppf(0.5 + LEVEL / 2))
 """Standard deviations of one Gaussian number on either side that hold it with this probability: 1.96."""
 
-NOISY_FACTOR = 1.5
-"""Factor of the posterior's radii in a noisy frame, of an object that was not calibrated: on training views fits of the
-modes hold 96 % with it and 84 % without; clean views need none (docs/experiments/071.md)."""
+CLEAN_FACTOR, NOISY_FACTOR = 1.25, 1.5
+"""Factors of the posterior's radii of an object that was not calibrated, in clean frames and in noisy ones: by training
+views, of ten shipped objects without their calibrations and of soft ones (docs/experiments/071.md and 077.md)."""
 
 LEAST_RADIUS = 0.1
 """Radius in scene units that every position has in addition: the paper camera's noise, for facets and a fit's end."""
@@ -443,7 +443,7 @@ class Uncertainty:
     def factor(self) -> float:
         """Factor of the posterior's radii; in a noisy frame also by how much more than noise the fit leaves over."""
         frame = self.optimum.frame
-        usual = self.scale or (NOISY_FACTOR if frame.noisy else 1.0)
+        usual = self.scale or (NOISY_FACTOR if frame.noisy else CLEAN_FACTOR)
         return usual * max(frame.cloud_misfit(self.optimum.surface) * SIGMAS**2, 1.0) if frame.noisy else usual
 
     def _of(self, parts: RadiusParts) -> Float[np.ndarray, " n"]:
