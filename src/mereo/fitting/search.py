@@ -408,9 +408,9 @@ HEAVY, HEAVIER_STEPS, HELPS = 3000.0, (0.04, 12), 0.65
 """Weight of a cloud that an elastic solid explains only under it, the first sigma and the steps of the fit with it, and
 the share of the misfit that may be left: bends of a bunny's ears leave .45 to .54, states of livers .77 up."""
 
-NOISE_ALONE = (0.3, 0.75)
-"""Misfits of a camera's frame between which nothing but its noise is left over: right states have .4 to .7, wrong ones
-.8 and more, or less than noise would leave where their error is taken for it."""
+NOISE_ALONE = (0.3, 0.6)
+"""Misfits of a camera's frame between which nothing but its noise is left over, .44 where that is normal: wrong states
+leave more, or less where their error is taken for noise (docs/experiments/077.md)."""
 
 WHOLE = 150.0
 """Misfit by which an object that is seen whole may be explained worse than one that something hides in part: it is on
