@@ -70,6 +70,13 @@ def test_the_more_is_wrong_the_less_is_known(registration: Registration) -> None
     assert order == sorted(order)
 
 
+def test_an_elastic_solid_is_near_its_states_and_never_in_one(registration: Registration) -> None:
+    solid = replace(registration, model=replace(registration.model, is_normal=True))
+    for share, known, of_solid in ((0.95, "unsure", True), (0.8, False, "unsure"), (0.5, False, False)):
+        assert recognize(replace(registration, explained=share)).known == known
+        assert recognize(replace(solid, explained=share)).known == of_solid
+
+
 def test_what_should_have_been_seen_of_it_makes_it_doubtful(registration: Registration) -> None:
     said = [recognize(registration, unseen=share) for share in (None, 0.03, 0.5, 0.9)]
     assert [one.known for one in said] == [True, True, "unsure", "unsure"]

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import permutations
 from operator import attrgetter
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32
@@ -367,15 +368,8 @@ def _moved(poses: Poses, matrix: Float[np.ndarray, "n 7 7"], gradient: Float[np.
 # --- the search -------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class SearchRound:
-    """One round of the search.
-
-    Attributes:
-        states: medoids of the library that are tried; 0 tries the mean state.
-        rotations: tried with each of them.
-        bent, fitted: candidates that are bent towards the frame by few points, and of these fitted at most.
-    """
+class SearchRound(NamedTuple):
+    """Round of the search: medoids of the library (0: the mean state), rotations of each, bent and fitted at most."""
 
     states: int
     rotations: int
@@ -456,10 +450,6 @@ class _Trail:
     @property
     def is_explained(self) -> bool:
         return self.best.explains(self.problem)
-
-    @property
-    def is_likely_wrong(self) -> bool:
-        return self.best.misfit.cloud >= self.problem.config.unexplained
 
     @property
     def is_sure(self) -> bool:
@@ -559,7 +549,7 @@ def search(whole: Problem, partial: Problem | None = None, start: Posed | None =
         if chosen.is_explained:
             break
         better, is_last = chosen.with_heavier_cloud(), stage is ROUNDS[-1]
-        if better is None and chosen.is_likely_wrong:
+        if better is None and chosen.best.misfit.cloud >= whole.config.unexplained:
             better = as_noisy(trails, chosen, not is_last)
         if better is not None and (is_last or better.is_sure):
             return better.outcome()

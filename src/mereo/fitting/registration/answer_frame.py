@@ -34,21 +34,16 @@ from mereo.reconstruction.pipeline import EncodedFrame, encode_frame
 from mereo.scenes.statistical_model import StatisticalModel
 
 FORCED = 350.0
-"""Misfit of prior and ruled-out surface together from which a search follows.
-
-Fits to whole clean training views have at most 150; fits that take a view whose half is hidden for a whole one have 400
-and more, although they explain its points."""
+"""Misfit of prior and ruled-out surface together from which a search follows: whole views have at most 150, those of
+which half is hidden and that are taken for whole ones 400 and more."""
 
 ASTRAY = 0.25
-"""Distance between network and fit, in half lengths, from which a search follows: the network is no start there.
-
-Of 48 clean training views of six shipped objects none has more than .1, under a camera's noise one in six has; weights
-after 40 seconds of training have .3 to .5 in each view, where their fits explain the points by chance at most."""
+"""Distance between network and fit, in half lengths, from which a search follows, as the network is no start there:
+right ones are at most .1 apart, those after 40 seconds of training .3 to .5."""
 
 HIDDEN = 0.12
-"""Share of the silhouette next to which nothing is known from which a search follows, as a part is hidden.
-
-Whole clean views have at most .03, those of which a tool hides 30 % .01 to .32, others that are cut .15 to .57."""
+"""Share of the silhouette next to which nothing is known from which a search follows, as a part is hidden: whole views
+have at most .03, those that are cut .15 to .57."""
 
 
 def answer_frame(
@@ -160,9 +155,7 @@ def find(
         return search_hypotheses(seen, registrar, keep_all, scene_unit)
     assert model is not None
     candidate, likelier = fit_hypotheses(seen, model, registrar, keep_all, scene_unit)
-    if registrar is None or not registrar.asks_search:
-        return candidate, likelier
-    if not is_doubtful(seen, candidate):
+    if registrar is None or not registrar.asks_search or not is_doubtful(seen, candidate):
         return candidate, likelier
     searched, _ = search_hypotheses(seen, registrar, keep_all, scene_unit)
     return more_evident(candidate, searched), likelier
