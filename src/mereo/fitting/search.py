@@ -456,7 +456,7 @@ class _Trail:
         """Whether other states need not be tried: a clean frame is explained, or a camera's but for its noise."""
         low, high = NOISE_ALONE
         is_noise = self.problem.is_camera and low < self.best.misfit.cloud < high
-        return self.is_explained and (is_noise or not self.problem.noisy)
+        return is_noise if self.problem.noisy else self.is_explained
 
     def go_on(self, stage: SearchRound) -> None:
         """Fit the candidates of a round that may be the best, and explore from there."""
