@@ -81,13 +81,13 @@ def answer_frame(
         candidate = replace(candidate, modes=replace(candidate.modes, calibration=model.calibration))
     if candidate.error is not None and model is None:
         raise candidate.error
-    registration = None
-    if registrar is not None and candidate.modes is not None:
+    modes = None if registrar is None else candidate.modes
+    answer = answer_of(seen, model, registrar, candidate, likelier, None if modes is None else modes.registration())
+    # of what is no view of the object, the parameters of its scene say nothing, and take longest
+    if registrar is not None and modes is not None and (registrar.method == "full" or answer.recognition.known):
         with stage("fit the parameters of the scene"):
-            registration = registrar.finish(candidate.modes)
-    answer = answer_of(seen, model, registrar, candidate, likelier, registration)
-    seconds = time.perf_counter() - started
-    return replace(answer, resolution=resolution, label_points=label_points, seconds=seconds)
+            answer = answer_of(seen, model, registrar, candidate, likelier, registrar.finish(modes))
+    return replace(answer, resolution=resolution, label_points=label_points, seconds=time.perf_counter() - started)
 
 
 def answer_of(
