@@ -101,6 +101,19 @@ def test_the_network_is_left_out_on_request(liver: Model, cloud: PointCloud, mon
     assert found.located_by == "search" and found.taken
 
 
+def test_the_parameters_of_a_scene_are_fitted_to_what_may_be_a_view_of_the_object(
+    liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finish = Mock(side_effect=lambda modes: modes.registration())
+    monkeypatch.setattr(Registrar, "finish", lambda registrar, modes: finish(modes))
+    registrar = Registrar.of(liver).without_retries
+    assert answer_to(cloud, liver, registrar, 24).recognition.known is True and finish.call_count == 1
+    noise = PointCloud(cloud.points.mean(axis=0) + np.random.default_rng(0).uniform(-40, 40, cloud.points.shape))
+    assert answer_to(noise, liver, registrar, 24).recognition.known is False and finish.call_count == 1
+    asked = replace(registrar, method="full")
+    assert answer_to(noise, liver, asked, 24).recognition.known is False and finish.call_count == 2
+
+
 def test_the_state_with_the_greater_evidence_is_taken_whatever_its_unit(by_network: Candidate) -> None:
     right = by_network.modes
     astray = replace(right, posed=replace(right.posed, translation=right.posed.translation + 3.0))

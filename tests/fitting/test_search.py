@@ -14,7 +14,7 @@ from mereo.fitting.problem.problem import OPEN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import NetworkTerm
 from mereo.fitting.registration.answer_frame import search_modes
 from mereo.fitting.registration.register import CloudToFit
-from mereo.fitting.search import SightTable, _Trail, as_noisy, medoids, rotations
+from mereo.fitting.search import ROUNDS, SearchRound, SightTable, _Trail, as_noisy, medoids, rotations
 from mereo.geometry.camera import SightLines
 from mereo.models.weights import load_model
 from mereo.scenes.statistical_model import StatisticalModel
@@ -106,8 +106,17 @@ def test_a_view_of_which_a_half_is_hidden_is_found_as_one(model: StatisticalMode
 
 
 @pytest.mark.parametrize("patched", [False, True])
-def test_noise_is_told_from_a_wrong_state(model: StatisticalModel, patched: bool) -> None:
-    """Also that of a stereo camera that matches windows: each patch of the frame is off by one amount."""
+def test_noise_is_told_from_a_wrong_state(
+    model: StatisticalModel, patched: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also that of a stereo camera that matches windows, after the last round: each patch is off by one amount."""
+    rounds, go_on = list[SearchRound](), _Trail.go_on
+
+    def counted(trail: _Trail, stage: SearchRound) -> None:
+        rounds.append(stage)
+        go_on(trail, stage)
+
+    monkeypatch.setattr(_Trail, "go_on", counted)
     posed = state(model, 1)
     points, rows = view(model, posed), slice(None)
     if patched:
@@ -118,6 +127,7 @@ def test_noise_is_told_from_a_wrong_state(model: StatisticalModel, patched: bool
     fitted = search_modes(CloudToFit(noisy, 1.0, lines=SightLines.of_cloud("past")), model)
     assert fitted.problem.noisy and fitted.registration().accepted
     assert off(model, fitted.registration().material, posed) < 0.1
+    assert rounds == list(ROUNDS if patched else ROUNDS[:1])
     assert patched or not search_modes(CloudToFit(points, 1.0), model).problem.noisy
 
 
@@ -136,3 +146,13 @@ def test_under_noise_a_part_is_hidden_where_it_is_by_the_noises_constants_too(
         noisy = as_noisy(trails, chosen, False)
         assert noisy is not None and noisy.problem.is_camera
         assert noisy.problem.evidence.other_lines == ("unknown" if share else "past")
+
+
+def test_noise_alone_is_neither_more_nor_less_than_was_assumed(model: StatisticalModel) -> None:
+    posed, rng = state(model, 3), np.random.default_rng(0)
+    points = view(model, posed)
+    for noise, sure in ((0.1, False), (0.5, True), (0.8, False)):
+        seen = points * (1 + rng.normal(scale=noise / 150.0, size=(len(points), 1)))
+        config = replace(FitConfig(), cloud_sigma=0.75)  # of a noise of .5
+        problem = Problem(model, NetworkTerm.none(model), Evidence.of(seen), OPEN_SCALE_STD, config, noisy=True)
+        assert _Trail(problem, 0.0, [refined(problem, posed)]).is_sure == sure
