@@ -557,11 +557,11 @@ def search(whole: Problem, partial: Problem | None = None, start: Posed | None =
 
 
 def as_noisy(trails: list[_Trail], chosen: _Trail, only_sure: bool) -> _Trail | None:
-    """``_Trail.as_noisy``; one other than the first, of a whole object, must win by the noise's constants too."""
-    noisy, whole = (
-        chosen.as_noisy(only_sure),
-        trails[0],
-    )  # to a clean frame's, noise at the rim looks like more than ``WHOLE``
+    """``_Trail.as_noisy``; one other than the first, of a whole object, must win by the noise's constants too.
+
+    To a clean frame's constants, noise at the rim looks like more than ``WHOLE``.
+    """
+    noisy, whole = chosen.as_noisy(only_sure), trails[0]
     if noisy is None or chosen is whole:
         return noisy
     evidence = replace(noisy.problem.evidence, other_lines=whole.problem.evidence.other_lines)
