@@ -9,6 +9,7 @@
 4. Where the frame is not explained, the same again from other states of the library.
 """
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -454,8 +455,7 @@ class _Trail:
     @property
     def is_sure(self) -> bool:
         """Whether other states need not be tried: a clean frame is explained, or a camera's but for its noise."""
-        low, high = NOISE_ALONE
-        is_noise = self.problem.is_camera and low < self.best.misfit.cloud < high
+        is_noise = self.problem.is_camera and NOISE_ALONE[0] < self.best.misfit.cloud < NOISE_ALONE[1]
         return is_noise if self.problem.noisy else self.is_explained
 
     def go_on(self, stage: SearchRound) -> None:
@@ -503,7 +503,7 @@ class _Trail:
                 continue
             first = _Trail(noisy, 0.0, [refined(noisy, fit_wide(noisy, self.best.posed))])
             if first.leaves_noise(is_shared, only_sure):  # of most wrong states it does not, in a tenth of the time
-                trail = self.again(noisy)
+                trail = self.again(noisy, first.fitted)
                 if trail.leaves_noise(is_shared, only_sure):
                     return trail
         return None
@@ -512,11 +512,12 @@ class _Trail:
         """``Problem.leaves_noise`` of the best state, with ``only_sure`` only where that is sure."""
         return self.problem.leaves_noise(self.best.surface, is_shared) and (self.is_sure or not only_sure)
 
-    def again(self, noisy: Problem) -> "_Trail":
-        """The same from its best states that differ, in the problem of a frame of this noise."""
+    def again(self, noisy: Problem, begun: Sequence[ScoredFit] = ()) -> "_Trail":
+        """The same from its best states that differ, of which ``begun`` are fitted, in the problem of this noise."""
         states = [scored.posed for scored in sorted(self.fitted, key=_total)]
-        rows = differing(noisy, states, BENT_APART)[:4]
-        trail = _Trail(noisy, 0.0, [explored(noisy, refined(noisy, fit_wide(noisy, states[row]))) for row in rows])
+        rows = differing(noisy, states, BENT_APART)[len(begun) : 4]
+        fits = (*begun, *(refined(noisy, fit_wide(noisy, states[row])) for row in rows))
+        trail = _Trail(noisy, 0.0, [explored(noisy, fit) for fit in fits])
         trail.shake()
         return trail
 
@@ -557,10 +558,8 @@ def search(whole: Problem, partial: Problem | None = None, start: Posed | None =
 
 
 def as_noisy(trails: list[_Trail], chosen: _Trail, only_sure: bool) -> _Trail | None:
-    """``_Trail.as_noisy``; one other than the first, of a whole object, must win by the noise's constants too.
-
-    To a clean frame's constants, noise at the rim looks like more than ``WHOLE``.
-    """
+    """``_Trail.as_noisy``; one other than the first, of a whole object, must win by the noise's constants too."""
+    # to a clean frame's constants, noise at the rim looks like more than ``WHOLE``
     noisy, whole = chosen.as_noisy(only_sure), trails[0]
     if noisy is None or chosen is whole:
         return noisy

@@ -86,7 +86,9 @@ def answer_frame(
     # of what is no view of the object, the parameters of its scene say nothing, and take longest
     if registrar is not None and modes is not None and (registrar.method == "full" or answer.recognition.known):
         with stage("fit the parameters of the scene"):
-            answer = answer_of(seen, model, registrar, candidate, likelier, registrar.finish(modes))
+            registration = registrar.finish(modes)
+        if registration is not modes.registration():
+            answer = answer_of(seen, model, registrar, candidate, likelier, registration)
     return replace(answer, resolution=resolution, label_points=label_points, seconds=time.perf_counter() - started)
 
 

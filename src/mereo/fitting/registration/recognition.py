@@ -44,7 +44,6 @@ FIXED: Mapping[SignName, Usual] = {
 """Usual logarithms of two signs, of all weights: sizes are off by 3 %, and by 15 % at most where the unit is right; of
 whole objects, cameras miss 2 to 3 %, of what was fitted to other things 10 to 87 % (docs/experiments/075.md)."""
 
-
 MEASURED: tuple[SignName, ...] = ("unexplained", "ruled_out", "beyond", "displaced")
 """Signs of which a calibration measures what is usual."""
 
