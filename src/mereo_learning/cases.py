@@ -116,6 +116,7 @@ class RegistrationErrors:
             0 where it lies within in any case.
         gaussian: these radii, scene units.
         other: radii of the other parts, whose squares add: ``RadiusParts.open``, ``Uncertainty.extra_radius``.
+        reach: ``RadiusParts.reach``, which is added to all.
         seen: which of the points the cloud shows.
         calibrated: whether the radii are.
     """
@@ -124,6 +125,7 @@ class RegistrationErrors:
     ratios: Float[np.ndarray, " n"]
     gaussian: Float[np.ndarray, " n"]
     other: Float[np.ndarray, " n"]
+    reach: Float[np.ndarray, " n"]
     seen: Bool[np.ndarray, " n"]
     calibrated: bool = False
 
@@ -152,27 +154,27 @@ class RegistrationErrors:
         count, unit = len(truth), sure.optimum.unit / registration.scene_unit
         distances = np.linalg.norm(registration.material[:count] - truth, axis=1)
         off = distances / registration.scene_unit
-        gaussian, other = (
-            unit * sure.parts.gaussian[:count],
-            unit * np.hypot(sure.parts.open[:count], sure.extra_radius),
+        gaussian, other, reach = (
+            unit * part[:count]
+            for part in (sure.parts.gaussian, np.hypot(sure.parts.open, sure.extra_radius), sure.parts.reach)
         )
-        ratios = np.sqrt(np.maximum(off**2 - other**2, 0.0)) / gaussian
-        errors = cls(distances / scene_unit, ratios, gaussian, other, seen, registration.radius_scale is not None)
+        ratios = np.sqrt(np.maximum(np.maximum(off - reach, 0.0) ** 2 - other**2, 0.0)) / gaussian
+        errors = cls(
+            distances / scene_unit, ratios, gaussian, other, reach, seen, registration.radius_scale is not None
+        )
         return errors.scaled(sure.factor)
 
     @classmethod
     def together(cls, each: Sequence["RegistrationErrors"]) -> "RegistrationErrors":
         """Errors of several views, every point counted once; calibrated where all of them are."""
-        columns = (
-            [getattr(view, name) for view in each] for name in ("distances", "ratios", "gaussian", "other", "seen")
-        )
-        distances, ratios, gaussian, other, seen = (np.concatenate(column) for column in columns)
-        return cls(distances, ratios, gaussian, other, seen, all(view.calibrated for view in each))
+        names = ("distances", "ratios", "gaussian", "other", "reach", "seen")
+        columns = {name: np.concatenate([getattr(view, name) for view in each]) for name in names}
+        return cls(**columns, calibrated=all(view.calibrated for view in each))
 
     @property
     def radii(self) -> Float[np.ndarray, " n"]:
         """Radii of all points, scene units."""
-        return np.hypot(self.gaussian, self.other)
+        return self.reach + np.hypot(self.gaussian, self.other)
 
     def scale(self) -> float:
         """Factor of the Gaussian's radii that holds 95 % of the true positions: ``Calibration.radius_scale``."""

@@ -5,17 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fit_cases import seen
+from scipy.spatial.transform import Rotation
 
 from mereo.fitting.config import FitConfig
-from mereo.fitting.modes import fit_wide, refined
+from mereo.fitting.modes import ScoredFit, fit_wide, refined
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.problem import OPEN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import NetworkTerm
 from mereo.fitting.registration.answer_frame import search_modes
 from mereo.fitting.registration.register import CloudToFit
-from mereo.fitting.search import ROUNDS, SearchRound, SightTable, _Trail, as_noisy, medoids, rotations
+from mereo.fitting.search import ALIKE, ROUNDS, SearchRound, SightTable, _Trail, as_noisy, medoids, rotations
 from mereo.geometry.camera import SightLines
+from mereo.geometry.symmetry import Symmetry
 from mereo.models.weights import load_model
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -156,3 +158,26 @@ def test_noise_alone_is_neither_more_nor_less_than_was_assumed(model: Statistica
         config = replace(FitConfig(), cloud_sigma=0.75)  # of a noise of .5
         problem = Problem(model, NetworkTerm.none(model), Evidence.of(seen), OPEN_SCALE_STD, config, noisy=True)
         assert _Trail(problem, 0.0, [refined(problem, posed)]).is_sure == sure
+
+
+def test_others_explain_a_frame_alike_where_their_misfit_is_hardly_greater(
+    model: StatisticalModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those that differ, and not by a turn after which the object looks the same."""
+    posed = state(model, 3)
+    problem = Problem(model, NetworkTerm.none(model), Evidence.of(view(model, posed)), OPEN_SCALE_STD, FitConfig())
+    first = ScoredFit.of(problem, posed)
+    turned = replace(posed, rotation=posed.rotation @ Rotation.from_euler("y", np.pi).as_matrix())
+    others = [ScoredFit.of(problem, replace(each, log_scale=0.0)) for each in (turned, posed)]
+
+    def said(worse: float) -> int:
+        misfit = replace(first.misfit, total=first.misfit.total + worse)
+        fits = [first, *(replace(other, misfit=misfit) for other in others)]
+        return len(_Trail(problem, 0.0, fits).outcome().others)
+
+    assert (said(0.9 * ALIKE), said(1.1 * ALIKE)) == (1, 0)
+    half_turn = Symmetry(np.eye(4), np.pi, np.array([0.0, 1.0, 0.0]), (0,))
+    monkeypatch.setitem(vars(model), "symmetries", (half_turn,))
+    assert said(0.9 * ALIKE) == 1  # where it is bent, it does not look the same
+    others[0] = replace(others[0], surface=first.surface)
+    assert said(0.9 * ALIKE) == 0

@@ -154,6 +154,15 @@ def test_radii_of_noisy_frames_are_wider_where_nothing_is_calibrated_and_by_what
     assert misfit > 1.0 and wide.factor == pytest.approx(NOISY_FACTOR * misfit * 1.5**2)
 
 
+def test_radii_reach_other_states_that_explain_the_frame_alike_and_no_farther(sure: Uncertainty) -> None:
+    optimum, way = sure.optimum, np.array([3.0, -4.0, 12.0])
+    assert isinstance(optimum, ModesOptimum)
+    moved = replace(sure, optimum=replace(optimum, others=(sure.posterior.material + way,)))
+    np.testing.assert_allclose(moved.material, sure.material + 13.0 * optimum.unit, rtol=1e-5)
+    for one, other in zip(moved.segments, sure.segments, strict=True):
+        assert one.centroid_radius95 == pytest.approx(other.centroid_radius95 + 13.0 * optimum.unit, rel=1e-3)
+
+
 def test_the_interval_of_a_volume_is_around_it_and_not_far_from_the_true_one(
     found: Registration, sure: Uncertainty, material: np.ndarray
 ) -> None:

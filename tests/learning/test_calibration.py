@@ -139,7 +139,7 @@ def test_radii_between_points_are_between_theirs_and_their_scale_ends_at_all_but
 def measured(off: np.ndarray, misfit: float = 0.1) -> calibration.MeasuredRadii:
     """A view whose radii are all 1, and whose points are so far off."""
     one = np.ones(len(off))
-    errors = RegistrationErrors(np.abs(off), np.abs(off), one, 0 * one, one > 0)
+    errors = RegistrationErrors(np.abs(off), np.abs(off), one, 0 * one, 0 * one, one > 0)
     return calibration.MeasuredRadii(errors, misfit)
 
 

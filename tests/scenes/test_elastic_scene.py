@@ -208,7 +208,7 @@ def test_a_search_finds_a_state_of_the_solid(scene: Scene, model: StatisticalMod
     assert np.quantile(distance, 0.9) < 0.3
     found = fitted.surface.material
     turned = transform_points(IN_FRONT, model.mean)
-    assert min(off(model, found, true), 1.0) < 0.6 * off(model, turned, true) or fitted.alike > 1
+    assert min(off(model, found, true), 1.0) < 0.6 * off(model, turned, true) or fitted.others
 
 
 def test_a_given_pose_starts_the_fit_and_holds_what_is_held(held: tuple[Scene, StatisticalModel]) -> None:

@@ -393,8 +393,9 @@ APART = 0.15
 RIVAL = 1.5
 """Misfit by few points, in misfits of the best, up to which a candidate may still be as good."""
 
-ALIKE = 0.05
-"""Difference of the cloud's misfit up to which two states explain a frame alike."""
+ALIKE = 12.0
+"""Misfit by which a state may be worse than the best and be the true one with 5 % of its probability, which a quarter
+of the misfit decides: points' errors are not independent (docs/experiments/078.md)."""
 
 SHAKEN_FITS = 3
 """Fits that differ, around each of which states are tried in each round."""
@@ -416,12 +417,12 @@ WHOLE = 150.0
 class SearchOutcome:
     """Outcome of a search: the frame with the constants of its noise, and the candidate that explains it best.
 
-    ``alike`` candidates explain it alike and differ from each other, the best included.
+    ``others`` are positions of the material points in other states that explain it alike.
     """
 
     problem: Problem
     best: ScoredFit
-    alike: int
+    others: tuple[Float[np.ndarray, "m 3"], ...]
 
 
 def rotations(count: int) -> Float[np.ndarray, "n 3 3"]:
@@ -522,10 +523,19 @@ class _Trail:
         return trail
 
     def outcome(self) -> SearchOutcome:
-        best = self.best
-        rivals = [scored for scored in self.fitted if scored.misfit.cloud < best.misfit.cloud + ALIKE]
-        alike = differing(self.problem, [scored.posed for scored in sorted(rivals, key=_total)], APART)
-        return SearchOutcome(self.problem, best, len(alike))
+        best, model = self.best, self.problem.model
+        rivals = sorted((fit for fit in self.fitted if _total(fit) < _total(best) + ALIKE), key=_total)
+        rows = differing(self.problem, [fit.posed for fit in rivals], APART)[1:]
+        others = (rivals[row].surface.material for row in rows)
+        return SearchOutcome(self.problem, best, tuple(each for each in others if not is_turned(model, best, each)))
+
+
+def is_turned(model: StatisticalModel, best: ScoredFit, other: Float[np.ndarray, "m 3"]) -> bool:
+    """Whether a state is another turned by a symmetry that brings segments onto segments, which is said at any rate."""
+    if all(None in symmetry.lands_on for symmetry in model.symmetries):
+        return False
+    apart: float = cKDTree(best.surface.material).query(other[model.sparse])[0].mean()
+    return apart <= BENT_APART * model.half
 
 
 def search(whole: Problem, partial: Problem | None = None, start: Posed | None = None) -> SearchOutcome:

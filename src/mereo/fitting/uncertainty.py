@@ -9,6 +9,7 @@ which is linear in them, is Gaussian too. Lengths are scene units, those of ``Un
 Notation: m material points, n queried ones, k coefficients, p = 7 + k parameters as in ``gauss_newton``.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -69,19 +70,34 @@ def radius95(covariance: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
 
 @dataclass(frozen=True, eq=False)
 class RadiusParts:
-    """Radii of 95 % in two parts, whose squares add: views of the object calibrate the first.
+    """Radii of 95 % in parts: the squares of the first two add, and views of the object calibrate the first.
 
     Attributes:
         gaussian: by the Gaussian around the optimum, which a calibration scales.
         open: by what else the frame leaves open, far from it (``Posterior.open``), which is as it is.
+        reach: distance of the farthest of the other states, around which a place is as unsure as around this one.
     """
 
     gaussian: Float[np.ndarray, " n"]
     open: Float[np.ndarray, " n"]
+    reach: Float[np.ndarray, " n"]
+
+    @classmethod
+    def of(
+        cls,
+        motion: Float[np.ndarray, "n 3 p"],
+        open: Float[np.ndarray, "n 3 e"],
+        ways: Float[np.ndarray, "n 3 o"],
+        residue: float = 0.0,
+    ) -> "RadiusParts":
+        """Radii of n points, with the arguments as of ``Posterior``."""
+        gaussian, far = (np.matmul(each, each.transpose(0, 2, 1)).astype(np.float64) for each in (motion, open))
+        gaussian[:, range(3), range(3)] += residue**2 / 3
+        return cls(radius95(gaussian), radius95(far), np.linalg.norm(ways, axis=1).max(axis=1, initial=0.0))
 
     def radii(self, scale: float = 1.0, extra_radius: float = 0.0) -> Float[np.ndarray, " n"]:
         """Radii with a scale of the Gaussian, and a radius that all points have in addition; in the parts' unit."""
-        result: np.ndarray = np.sqrt((scale * self.gaussian) ** 2 + self.open**2 + extra_radius**2)
+        result: np.ndarray = self.reach + np.sqrt((scale * self.gaussian) ** 2 + self.open**2 + extra_radius**2)
         return result
 
 
@@ -96,15 +112,17 @@ class Posterior:
         factor: p x p, ``factor factor^T`` is the covariance of the parameters.
         residue: root mean square distance of the object's states from what the coefficients can express.
         open: motion of the material points with further standard normal numbers, by the second moments of what is far
-            from Gaussian (``find_segment_turns``, a state near rest), in the camera's axes; None without.
+            from Gaussian (``find_segment_turns``, a state near rest), in the camera's axes.
+        ways: to other states that explain the frame alike, in the camera's axes.
     """
 
     posed: Posed
     material: Float[np.ndarray, "m 3"]
     modes: Float32[np.ndarray, "m 3 k"]
     factor: Float[np.ndarray, "p p"]
-    residue: float = 0.0
-    open: Float32[np.ndarray, "m 3 e"] | None = None
+    residue: float
+    open: Float32[np.ndarray, "m 3 e"]
+    ways: Float32[np.ndarray, "m 3 o"]
 
     @classmethod
     def of(
@@ -114,10 +132,19 @@ class Posterior:
         material: Float[np.ndarray, "m 3"],
         modes: Float32[np.ndarray, "m 3 k"],
         residue: float = 0.0,
-        open: Float32[np.ndarray, "m 3 e"] | None = None,
+        open: Sequence[Float[np.ndarray, "m 3 e"]] = (),
+        others: Sequence[Float[np.ndarray, "m 3"]] = (),
     ) -> "Posterior":
-        """Posterior whose precision is the matrix of the normal equations at the optimum."""
-        return cls(posed, material, modes, covariance_factor(normal.matrix), residue, open)
+        """Posterior whose precision is the matrix of the normal equations at the optimum.
+
+        ``open`` are motions with further numbers, ``others`` the material points in other states.
+        """
+        nothing = np.empty((len(material), 3, 0), dtype=np.float32)
+        motion = np.concatenate([nothing, *open], axis=2, dtype=np.float32)
+        ways = np.concatenate(
+            [nothing, *((other - material)[:, :, None] for other in others)], axis=2, dtype=np.float32
+        )
+        return cls(posed, material, modes, covariance_factor(normal.matrix), residue, motion, ways)
 
     @cached_property
     def _local(self) -> tuple[Float32[np.ndarray, "r p"], Float32[np.ndarray, "k p"]]:
@@ -144,31 +171,18 @@ class Posterior:
             moved += self.modes[rows].reshape(-1, len(state)) @ state
         return moved.reshape(-1, 3, moved.shape[1])
 
-    def radii(self, follow: PointWeights | None = None) -> "RadiusParts":
+    def radii(self, follow: PointWeights | None = None) -> RadiusParts:
         """Radii of 95 % of all material points, or of points that follow them; scene units."""
         with limit_blas_threads():
-            motion, open_motion = self.motion, self._open(slice(None))
-            if follow is not None:
-                motion, open_motion = follow(motion), follow(open_motion)
-            return self._radii(motion, open_motion)
+            motion, open_motion, ways = (
+                part if follow is None else follow(part) for part in (self.motion, self.open, self.ways)
+            )
+            return RadiusParts.of(motion, open_motion, ways, self.residue)
 
-    def radii_of(self, rows: Int[np.ndarray, " n"]) -> "RadiusParts":
+    def radii_of(self, rows: Int[np.ndarray, " n"]) -> RadiusParts:
         """Radii of 95 % of some material points alone, which cost as little as they are few."""
         with limit_blas_threads():
-            return self._radii(self._motion(rows), self._open(rows))
-
-    def _open(self, rows: slice | Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n 3 e"]:
-        """``open`` in the object's axes."""
-        if self.open is None:
-            return np.zeros((len(self._arm[rows]), 3, 0), dtype=np.float32)
-        return np.matmul(self.posed.rotation.T.astype(np.float32), self.open[rows])
-
-    def _radii(self, motion: Float32[np.ndarray, "n 3 p"], open_motion: Float32[np.ndarray, "n 3 e"]) -> "RadiusParts":
-        gaussian, open_ = (
-            np.matmul(part, part.transpose(0, 2, 1)).astype(np.float64) for part in (motion, open_motion)
-        )
-        gaussian[:, range(3), range(3)] += self.residue**2 / 3
-        return RadiusParts(radius95(gaussian), radius95(open_))
+            return RadiusParts.of(self._motion(rows), self.open[rows], self.ways[rows], self.residue)
 
     def motion_of(self, gradient: Float[np.ndarray, "c v 3"]) -> Float[np.ndarray, "c p"]:
         """Change of c numbers with each of p independent standard normal ones.
@@ -216,6 +230,7 @@ class ModesOptimum:
         problem: everything the fit worked on.
         posed: coefficients and pose.
         unit: length of a scene unit in the input's unit, before the fit's own scale.
+        others: positions of the material points in other states that explain the frame alike; scene units.
         bent: positions of the material points by a fit of the modes, where the answer is the rest model: an object that
             is hardly bent may pass for one at rest. None else.
     """
@@ -223,6 +238,7 @@ class ModesOptimum:
     problem: Problem
     posed: Posed
     unit: float
+    others: tuple[Float[np.ndarray, "m 3"], ...] = ()
     bent: Float[np.ndarray, "m 3"] | None = None
 
     @property
@@ -257,11 +273,9 @@ class ModesOptimum:
         model = self.problem.model
         material = self.posed.place(model.material(self.posed.z))
         with limit_blas_threads():
-            open_motion = turns_left_open(self.problem, material)
-            if self.bent is not None:
-                bending = (self.bent - material)[:, :, None].astype(np.float32)
-                open_motion = np.concatenate([open_motion, bending], axis=2)
-            return Posterior.of(self.terms.total, self.posed, material, model.modes, model.residue, open_motion)
+            open = [turns_left_open(self.problem, material)]
+            open += [] if self.bent is None else [(self.bent - material)[:, :, None]]
+            return Posterior.of(self.terms.total, self.posed, material, model.modes, model.residue, open, self.others)
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,12 +285,13 @@ class DrawsOptimum:
     Attributes:
         problem: everything the fit worked on.
         fit: the played state.
-        unit: length of a scene unit in the input's unit, before the fit's own scale.
+        unit, others: as of ``ModesOptimum``.
     """
 
     problem: DrawsProblem
     fit: DrawsFit
     unit: float
+    others: tuple[Float[np.ndarray, "m 3"], ...] = ()
 
     @property
     def frame(self) -> Problem:
@@ -306,7 +321,7 @@ class DrawsOptimum:
         material: Float[np.ndarray, "m 3"] = self.fit.surface.material
         with limit_blas_threads():
             turns = turns_left_open(self.problem.base, material)
-            return Posterior.of(self.terms.total, self.fit.posed, material, modes, open=turns)
+            return Posterior.of(self.terms.total, self.fit.posed, material, modes, 0.0, [turns], self.others)
 
 
 def turns_left_open(problem: Problem, material: Float[np.ndarray, "m 3"]) -> Float32[np.ndarray, "m 3 e"]:
@@ -485,23 +500,28 @@ class Uncertainty:
         return result
 
     @cached_property
-    def _owned(self) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, "s 4 p"]]:
-        """Volume that belongs to each segment, and the motion of it and of its centroid; scene units, camera's axes."""
-        mesh: SegmentedMesh = self.model.mesh(self.posterior.material)
+    def _owned(self) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, "s 4 p"], RadiusParts]:
+        """Volume that belongs to each segment, the motion of it and of its centroid, and the radii of the centroids.
+
+        Scene units, camera's axes.
+        """
+        posterior = self.posterior
+        mesh: SegmentedMesh = self.model.mesh(posterior.material)
         gradients = owned_gradients(mesh)
-        motion = self.posterior.motion_of(gradients.reshape(-1, *gradients.shape[2:]))
-        return mesh.owned_volumes, motion.reshape(*gradients.shape[:2], -1)
+        motion = posterior.motion_of(gradients.reshape(-1, *gradients.shape[2:])).reshape(*gradients.shape[:2], -1)
+        others = (part[: gradients.shape[2]] for part in (posterior.open, posterior.ways))
+        open_motion, ways = (np.tensordot(gradients[:, 1:], part, axes=2) for part in others)
+        return mesh.owned_volumes, motion, RadiusParts.of(motion[:, 1:], open_motion, ways)
 
     @cached_property
     def segments(self) -> tuple[SegmentUncertainty, ...]:
         """Each segment's, of the volume that belongs to it, without that of segments nested in it."""
-        unit, scale = self.optimum.unit, self.factor
-        result = []
-        for name, volume, motion in zip(self.model.rest.names, *self._owned, strict=True):
-            off = WITHIN * scale * float(np.linalg.norm(motion[0]))
-            radius = unit * float(np.hypot(scale * radius95((motion[1:] @ motion[1:].T)[None])[0], self.extra_radius))
+        unit, result = self.optimum.unit, list[SegmentUncertainty]()
+        volumes, motion, parts = self._owned
+        for name, volume, moved, radius in zip(self.model.rest.names, volumes, motion, self._of(parts), strict=True):
+            off = WITHIN * self.factor * float(np.linalg.norm(moved[0]))
             between = (max(float(volume) - off, 0.0) * unit**3, (float(volume) + off) * unit**3)
-            result.append(SegmentUncertainty(name, radius, between))
+            result.append(SegmentUncertainty(name, float(radius), between))
         return tuple(result)
 
     @cached_property

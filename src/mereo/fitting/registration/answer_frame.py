@@ -409,7 +409,7 @@ def search_modes(
         rest = fit_rest(problem, nothing(), modes.posed)
         at_rest = is_at_rest(problem, modes, rest)
     seconds = time.perf_counter() - started
-    return ModesFit(problem, nothing(), unit, modes.posed, seconds, rest if at_rest else None, alike=outcome.alike)
+    return ModesFit(problem, nothing(), unit, modes.posed, seconds, rest if at_rest else None, others=outcome.others)
 
 
 def size_of(points: Float[np.ndarray, "n 3"], model: StatisticalModel) -> float:

@@ -90,7 +90,7 @@ class ModesFit:
         seconds: that it took.
         rest: pose of the rest model, where the frame speaks for an object at rest; then that is the answer.
         calibration: the network's, by which radii are scaled.
-        alike: number of states that a search found to explain the frame alike, this included; 1 without a search.
+        others: positions of the material points in other states that a search found to explain the frame alike.
     """
 
     problem: Problem
@@ -100,7 +100,7 @@ class ModesFit:
     seconds: float
     rest: ScoredFit | None = None
     calibration: Calibration | None = None
-    alike: int = 1
+    others: tuple[Float[np.ndarray, "m 3"], ...] = ()
 
     @classmethod
     def of(
@@ -162,10 +162,11 @@ class ModesFit:
     @cached_property
     def _registered(self) -> Registration:
         if self.rest is not None:
+            problem, posed = of_rest(self.problem, self.correspondences), self.rest.posed
             bent = self.posed.place(self.problem.model.material(self.posed.z))
-            end = ModesOptimum(of_rest(self.problem, self.correspondences), self.rest.posed, self.unit, bent)
-            return self._registration("rest", self.problem.model.rest_z, end, self.rest.posed, self.surface)
-        end = ModesOptimum(self.problem, self.posed, self.unit)
+            end = ModesOptimum(problem, posed, self.unit, self.others, bent)
+            return self._registration("rest", self.problem.model.rest_z, end, posed, self.surface)
+        end = ModesOptimum(self.problem, self.posed, self.unit, self.others)
         return self._registration("modes", self.posed.z, end, self.posed, self.surface)
 
     def with_draws(self, states: DrawnStates) -> Registration:
@@ -184,7 +185,7 @@ class ModesFit:
         seconds = self.seconds + time.perf_counter() - started
         if drawn is None or not taken:
             return replace(self.registration(), seconds=seconds)
-        end = DrawsOptimum(problem, drawn, self.unit)
+        end = DrawsOptimum(problem, drawn, self.unit, self.others)
         registration = self._registration("draws", drawn.z, end, drawn.posed, drawn.surface)
         return replace(registration, drawn=replace(drawn.drawn, z=drawn.z), seconds=seconds)
 
@@ -213,7 +214,7 @@ class ModesFit:
             optimum=optimum,
             radius_scale=factors.scale_at(misfit),
             extra_radius=LEAST_RADIUS,
-            alike=self.alike,
+            alike=1 + len(self.others),
         )
 
     def _is_believed(self, explained: float, surface: Surface) -> bool:
