@@ -58,7 +58,7 @@ def main() -> None:
                     truth = truth_grid(view.mesh, 60)
                     labels = labels_on(model.mesh(fitted.surface.material), truth.grid)
                     scores = intersection_over_union(grid_confusion(truth, labels, len(model.rest.segments)))
-                    rows.append((scores.iou, scores.miou, fitted.registration().explained))
+                    rows.append((scores.iou, scores.miou, fitted.registration.explained))
                 iou, miou, explained = np.mean(rows, axis=0)
                 spent = (time.perf_counter() - start) / len(views)
                 row = f"{iou:.3f} / {miou:.3f} | {100 * explained:.1f} | {spent:.1f} |"

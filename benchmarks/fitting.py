@@ -95,7 +95,7 @@ def row(
         confusion = grid_confusion(grid, predict_grid(network, case.cloud, grid), len(network.names))
         alone = intersection_over_union(confusion, True)
         modes = fit_frame(CloudToFit(case.cloud.points, case.unit), network, model)
-        best = modes.registration() if states is None else modes.with_draws(states)
+        best = modes.registration if states is None else modes.with_draws(states)
         near, far = errors(best, case)
         seen.append(near)
         hidden.append(far)

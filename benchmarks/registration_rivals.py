@@ -130,7 +130,7 @@ def ours(view: Prepared, network: Model, grid: TruthGrid) -> dict[str, Row]:
     """Scores of the network alone and of the fit of the modes."""
     case, model = view.case, view.rest.model
     alone = score(predict_grid(network, case.cloud, grid), grid, len(network.names))
-    modes = scored(fit_frame(CloudToFit(case.cloud.points, case.unit), network, model).registration(), case, grid)
+    modes = scored(fit_frame(CloudToFit(case.cloud.points, case.unit), network, model).registration, case, grid)
     return {"network": (*alone, np.nan, True, np.empty(0), np.empty(0)), "modes (ours)": modes}
 
 

@@ -358,7 +358,7 @@ def find_candidates(
     known, names = answer.recognition.known, names_for(registrar)
     if answer.candidate.modes is None or answer.registration is None:  # too few correspondences, whoever is scored
         return Candidates(code, dict.fromkeys(names, network), "network", known, answer.seconds)
-    registrations = {"modes": answer.candidate.modes.registration(), "full": answer.registration}
+    registrations = {"modes": answer.candidate.modes.registration, "full": answer.registration}
     each: dict[AnswerName, Candidate] = {"network": network}
     for name in names[1:]:
         fit = registrations[name]

@@ -464,11 +464,11 @@ def test_the_command_carries_in_the_frame_and_unit_of_its_other_files(folder: Pa
 
 def test_a_wrong_unit_is_not_believed(weights: Model) -> None:
     registrar, cloud = Registrar.of(weights, "modes"), load_view("rope").depth.to_points()
-    free = registrar.fit_modes(CloudToFit(cloud.points)).registration()
+    free = registrar.fit_modes(CloudToFit(cloud.points)).registration
     metres, true = (registrar.stated_scene_unit(unit_m) for unit_m in (1.0, 0.01))
     # the cloud is said to be in metres
-    wrong = registrar.fit_modes(CloudToFit(cloud.points, scene_unit=metres, is_unit_certain=False)).registration()
-    right = registrar.fit_modes(CloudToFit(cloud.points, scene_unit=true, is_unit_certain=False)).registration()
+    wrong = registrar.fit_modes(CloudToFit(cloud.points, scene_unit=metres, is_unit_certain=False)).registration
+    right = registrar.fit_modes(CloudToFit(cloud.points, scene_unit=true, is_unit_certain=False)).registration
     np.testing.assert_array_equal(wrong.material, free.material)
     assert not wrong.unit_known and not free.unit_known
     assert right.unit_known and right.scene_unit == pytest.approx(1.0, rel=1e-4)

@@ -104,7 +104,7 @@ def test_the_network_is_left_out_on_request(liver: Model, cloud: PointCloud, mon
 def test_the_parameters_of_a_scene_are_fitted_to_what_may_be_a_view_of_the_object(
     liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    finish = Mock(side_effect=lambda modes: modes.registration())
+    finish = Mock(side_effect=lambda modes: modes.registration)
     monkeypatch.setattr(Registrar, "finish", lambda registrar, modes: finish(modes))
     registrar = Registrar.of(liver).without_retries
     assert answer_to(cloud, liver, registrar, 24).recognition.known is True and finish.call_count == 1
@@ -140,7 +140,7 @@ def test_a_network_far_from_what_it_starts_is_no_start(by_network: Candidate) ->
     guessed = replace(found, rest=np.random.default_rng(0).permutation(found.rest))
     lucky = replace(by_network, modes=replace(by_network.modes, correspondences=guessed))
     assert lucky.is_accepted and is_astray(lucky)
-    displaced = lucky.displaced(by_network.modes.registration())
+    displaced = lucky.displaced(by_network.modes.registration)
     assert displaced is not None and displaced > ASTRAY
 
 
@@ -190,7 +190,7 @@ def test_strays_are_left_out_and_all_else_is_kept(registrar: Registrar, points: 
     found = fitted(registrar, with_rim(points))
     assert clean.hypothesis.dropped == 0 and clean.encoded is likelier
     assert not found.hypothesis.keep[len(points) :].any() and found.hypothesis.keep[: len(points)].mean() > 0.99
-    moved = np.linalg.norm(found.modes.registration().material - clean.modes.registration().material, axis=1)
+    moved = np.linalg.norm(found.modes.registration.material - clean.modes.registration.material, axis=1)
     assert np.median(moved) < 0.2
     assert fitted(registrar, with_rim(points), keep_all=True).hypothesis.dropped == 0
 
@@ -230,7 +230,7 @@ def test_a_noisy_frame_is_fitted_by_its_own_noise(registrar: Registrar, points: 
     config = found.problem.config
     assert 0.3 < config.cloud_sigma <= LARGEST and config.tolerance == pytest.approx(4.5 * config.cloud_sigma, rel=0.5)
     assert len(found.problem.evidence.observed_samples) > len(clean.problem.evidence.observed_samples)
-    assert found.registration().accepted
+    assert found.registration.accepted
     metres = fitted(registrar, noisy(points, 0.4) * 0.005, unit=0.005).modes
     assert metres is not None and metres.problem.config.cloud_sigma == pytest.approx(config.cloud_sigma, rel=0.02)
 
@@ -239,7 +239,7 @@ def test_what_a_calm_frame_cannot_have_is_no_noise(
     registrar: Registrar, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     modes = fitted(registrar, points).modes
-    problem, surface = modes.problem, Surface.through(modes.problem.model, modes.registration().material)
+    problem, surface = modes.problem, Surface.through(modes.problem.model, modes.registration.material)
     offset = np.random.default_rng(1).normal(scale=0.4, size=len(points))
     monkeypatch.setattr(Surface, "offsets", lambda _, given: offset[: len(given)])
     calm, rough = (replace(problem, evidence=Evidence.of(cloud)) for cloud in (points, noisy(points, 0.4)))

@@ -150,7 +150,7 @@ def test_auto_plays_the_scene_where_it_is_at_hand(
     assert modes.finish(fitted).method == "modes" and "states_or_none" not in vars(modes)
     foreign = replace(registrar, network=replace(model, provenance={"scene": "mine"}))
     assert foreign.finish(fitted).method == "modes" and foreign.states_or_none is None
-    with_draws = Mock(return_value=fitted.registration())
+    with_draws = Mock(return_value=fitted.registration)
     monkeypatch.setattr(ModesFit, "with_draws", with_draws)
     registrar.finish(fitted)
     with_draws.assert_called_once_with(few_rope_states)
@@ -243,7 +243,7 @@ def test_a_registration_is_as_far_off_as_its_points_are(engine: Model, engine_vi
     truth = state_points(state, statistical.nodes, statistical.node_labels)
     truth = transform_points(inverse_rigid(engine_view.T_world_camera), truth)
     cloud = engine_view.depth.to_points()
-    found = Registrar.of(engine, "modes").fit_modes(CloudToFit(cloud.points, scene_unit=1.0)).registration()
+    found = Registrar.of(engine, "modes").fit_modes(CloudToFit(cloud.points, scene_unit=1.0)).registration
     shown = seen_points(truth, cloud, 1.0)
     exact = RegistrationErrors.of(replace(found, material=truth), truth, shown, 1.0)
     assert exact.distances.max() == 0.0 and len(exact.distances) == len(truth) and 0 < exact.seen.sum() < len(truth)

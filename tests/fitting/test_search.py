@@ -15,7 +15,7 @@ from mereo.fitting.problem.problem import OPEN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import NetworkTerm
 from mereo.fitting.registration.answer_frame import search_modes
 from mereo.fitting.registration.register import CloudToFit
-from mereo.fitting.search import ALIKE, ROUNDS, SearchRound, SightTable, _Trail, as_noisy, medoids, rotations
+from mereo.fitting.search import ALIKE, ROUNDS, SearchRound, SightTable, Trail, as_noisy, medoids, rotations
 from mereo.geometry.camera import SightLines
 from mereo.geometry.symmetry import Symmetry
 from mereo.models.weights import load_model
@@ -90,7 +90,7 @@ def test_a_view_is_found_from_nothing(model: StatisticalModel, index: int, unit:
     posed = state(model, index)
     scale = 1.0 if unit else 0.0021
     fitted = search_modes(CloudToFit(scale * view(model, posed), unit), model)
-    found = fitted.registration()
+    found = fitted.registration
     assert found.accepted and off(model, found.material / scale, posed) < 0.05
     assert found.scene_unit == pytest.approx(scale, rel=0.02)
     assert fitted.problem.evidence.other_lines == "past"  # seen whole, and taken for that
@@ -102,7 +102,7 @@ def test_a_view_of_which_a_half_is_hidden_is_found_as_one(model: StatisticalMode
     told = search_modes(CloudToFit(points, 1.0, lines=SightLines(np.empty((0, 3)), unknown, "past")), model)
     open_ = search_modes(CloudToFit(points, 1.0), model)
     wrong = search_modes(CloudToFit(points, 1.0, lines=SightLines.of_cloud("past")), model)
-    apart = [off(model, fitted.registration().material, posed) for fitted in (told, open_, wrong)]
+    apart = [off(model, fitted.registration.material, posed) for fitted in (told, open_, wrong)]
     assert max(apart[:2]) < 0.1 < apart[2]
     assert open_.problem.evidence.other_lines == "unknown"
 
@@ -112,13 +112,13 @@ def test_noise_is_told_from_a_wrong_state(
     model: StatisticalModel, patched: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also that of a stereo camera that matches windows, after the last round: each patch is off by one amount."""
-    rounds, go_on = list[SearchRound](), _Trail.go_on
+    rounds, go_on = list[SearchRound](), Trail.go_on
 
-    def counted(trail: _Trail, stage: SearchRound) -> None:
+    def counted(trail: Trail, stage: SearchRound) -> None:
         rounds.append(stage)
         go_on(trail, stage)
 
-    monkeypatch.setattr(_Trail, "go_on", counted)
+    monkeypatch.setattr(Trail, "go_on", counted)
     posed = state(model, 1)
     points, rows = view(model, posed), slice(None)
     if patched:
@@ -127,8 +127,8 @@ def test_noise_is_told_from_a_wrong_state(
     off_by = np.random.default_rng(0).normal(scale=0.5, size=len(points))[rows]
     noisy = points * (1 + off_by / np.linalg.norm(points, axis=1))[:, None]
     fitted = search_modes(CloudToFit(noisy, 1.0, lines=SightLines.of_cloud("past")), model)
-    assert fitted.problem.noisy and fitted.registration().accepted
-    assert off(model, fitted.registration().material, posed) < 0.1
+    assert fitted.problem.noisy and fitted.registration.accepted
+    assert off(model, fitted.registration.material, posed) < 0.1
     assert rounds == list(ROUNDS if patched else ROUNDS[:1])
     assert patched or not search_modes(CloudToFit(points, 1.0), model).problem.noisy
 
@@ -143,7 +143,7 @@ def test_under_noise_a_part_is_hidden_where_it_is_by_the_noises_constants_too(
     evidence = Evidence.of(points)
     whole = Problem(model, NetworkTerm.none(model), evidence, OPEN_SCALE_STD, FitConfig())
     partial = replace(whole, evidence=replace(evidence, other_lines="unknown"))
-    trails = [_Trail(each, 0.0, [refined(each, fit_wide(each, posed))]) for each in (whole, partial)]
+    trails = [Trail(each, 0.0, [refined(each, fit_wide(each, posed))]) for each in (whole, partial)]
     for chosen in trails if not share else trails[1:]:
         noisy = as_noisy(trails, chosen, False)
         assert noisy is not None and noisy.problem.is_camera
@@ -157,7 +157,7 @@ def test_noise_alone_is_neither_more_nor_less_than_was_assumed(model: Statistica
         seen = points * (1 + rng.normal(scale=noise / 150.0, size=(len(points), 1)))
         config = replace(FitConfig(), cloud_sigma=0.75)  # of a noise of .5
         problem = Problem(model, NetworkTerm.none(model), Evidence.of(seen), OPEN_SCALE_STD, config, noisy=True)
-        assert _Trail(problem, 0.0, [refined(problem, posed)]).is_sure == sure
+        assert Trail(problem, 0.0, [refined(problem, posed)]).is_sure == sure
 
 
 def test_others_explain_a_frame_alike_where_their_misfit_is_hardly_greater(
@@ -173,7 +173,7 @@ def test_others_explain_a_frame_alike_where_their_misfit_is_hardly_greater(
     def said(worse: float) -> int:
         misfit = replace(first.misfit, total=first.misfit.total + worse)
         fits = [first, *(replace(other, misfit=misfit) for other in others)]
-        return len(_Trail(problem, 0.0, fits).outcome().others)
+        return len(Trail(problem, 0.0, fits).others)
 
     assert (said(0.9 * ALIKE), said(1.1 * ALIKE)) == (1, 0)
     half_turn = Symmetry(np.eye(4), np.pi, np.array([0.0, 1.0, 0.0]), (0,))

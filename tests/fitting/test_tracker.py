@@ -397,7 +397,7 @@ def test_an_object_that_jumps_or_goes_and_comes_again_is_found_in_its_own_frame(
     with pytest.raises(ValueError, match="points"):
         tracker.follow(observe(PointCloud(seen(scene, first).points[:3])), 0.1, scene_unit=1.0)
     assert tracker.follow(observe(seen(scene, first)), 0.2, scene_unit=1.0).tracked
-    own = engine.fit_modes(CloudToFit(seen(scene, second).points, scene_unit=1.0)).registration()
+    own = engine.fit_modes(CloudToFit(seen(scene, second).points, scene_unit=1.0)).registration
     # elsewhere: at once, and after more time than any expectation lasts
     for mesh, time_s in ((second, 0.23), (first, 5.0), (second, 10.0)):
         jumped, tracked = (

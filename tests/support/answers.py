@@ -54,4 +54,4 @@ def fit_correspondences(
 ) -> Registration:
     """Registration of a cloud, with ``states`` by the scene's draws too."""
     fitted = ModesFit.of(CloudToFit(points, scene_unit), correspondences, model)
-    return fitted.registration() if states is None else fitted.with_draws(states)
+    return fitted.registration if states is None else fitted.with_draws(states)

@@ -15,8 +15,8 @@ Notation: n nodes, m tetrahedra, k modes; X are node positions at rest.
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import permutations
 from typing import Any
 
@@ -283,6 +283,10 @@ MOST_SWELLING = 0.02
 """Largest change of a drawn state's volume, as a share."""
 
 
+_KEPT_MODES = dict[str, tuple[Float[np.ndarray, " k"], Float[np.ndarray, "n 3 k"]]]()
+"""Modes of the last few solids by ``ElasticSampler.digest``: one command loads a scene several times."""
+
+
 @dataclass(frozen=True, eq=False)
 class ElasticSampler:
     """Random states of an elastic solid: normal coefficients of its modes, the smaller the more it would fold.
@@ -318,7 +322,11 @@ class ElasticSampler:
     @cached_property
     def modes(self) -> Float[np.ndarray, "n 3 k"]:
         """Displacements of the nodes for coefficients of variance 1."""
-        return scale_modes(*_kept_modes(_Wanted(self.digest, self)), self.motion)
+        if self.digest not in _KEPT_MODES:
+            while len(_KEPT_MODES) > 3:
+                del _KEPT_MODES[next(iter(_KEPT_MODES))]
+            _KEPT_MODES[self.digest] = find_modes(self.solid, self.count, self.material, self.held)
+        return scale_modes(*_KEPT_MODES[self.digest], self.motion)
 
     @cached_property
     def _state(self) -> StateMap:
@@ -334,21 +342,6 @@ class ElasticSampler:
             if ratios.min() >= LEAST_RATIO and abs(share @ ratios - 1) <= MOST_SWELLING:
                 return state
             coefficients = CALMER * coefficients
-
-
-@dataclass(frozen=True)
-class _Wanted:
-    """A sampler whose modes are wanted, equal to another one with the same."""
-
-    digest: str
-    sampler: ElasticSampler = field(compare=False)
-
-
-@lru_cache(maxsize=4)
-def _kept_modes(wanted: _Wanted) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "n 3 k"]]:
-    """Modes of the last few solids: one command loads a scene several times."""
-    sampler = wanted.sampler
-    return find_modes(sampler.solid, sampler.count, sampler.material, sampler.held)
 
 
 def elastic_motion(draw: object) -> ElasticSampler | None:

@@ -413,18 +413,6 @@ WHOLE = 150.0
 36 of 40 whole training views, and on none of 40 of which 30 % are hidden."""
 
 
-@dataclass(frozen=True, eq=False)
-class SearchOutcome:
-    """Outcome of a search: the frame with the constants of its noise, and the candidate that explains it best.
-
-    ``others`` are positions of the material points in other states that explain it alike.
-    """
-
-    problem: Problem
-    best: ScoredFit
-    others: tuple[Float[np.ndarray, "m 3"], ...]
-
-
 def rotations(count: int) -> Float[np.ndarray, "n 3 3"]:
     """Return rotations, evenly over all (super-Fibonacci spirals; Alexa, CVPR 2022)."""
     step = np.arange(count) + 0.5
@@ -438,8 +426,8 @@ _total = attrgetter("misfit.total")
 
 
 @dataclass(eq=False)
-class _Trail:
-    """Search under one hypothesis on the lines of sight around the cloud."""
+class Trail:
+    """Search under one hypothesis on the lines of sight around the cloud, by the constants of one noise."""
 
     problem: Problem
     handicap: float = 0.0
@@ -447,10 +435,12 @@ class _Trail:
 
     @property
     def best(self) -> ScoredFit:
+        """The state of the least misfit."""
         return min(self.fitted, key=_total)
 
     @property
     def is_explained(self) -> bool:
+        """Whether that explains the frame."""
         return self.best.explains(self.problem)
 
     @property
@@ -461,7 +451,8 @@ class _Trail:
 
     def go_on(self, stage: SearchRound) -> None:
         """Fit the candidates of a round that may be the best, and explore from there."""
-        ranked, fitted = candidates(self.problem, stage), list[ScoredFit]()
+        ranked = bend_by_few(self.problem, screen_poses(self.problem, stage), stage.fitted)
+        fitted = list[ScoredFit]()
         for cost, posed in ranked[: stage.fitted]:
             if fitted and cost > RIVAL * ranked[0][0] and min(fitted, key=_total).explains(self.problem):
                 break
@@ -478,7 +469,7 @@ class _Trail:
                 return
             self.fitted.append(shaken(self.problem, ranked[row]))
 
-    def with_heavier_cloud(self) -> "_Trail | None":
+    def with_heavier_cloud(self) -> "Trail | None":
         """The same with a cloud that is worth more, where the prior of an elastic solid keeps it from being explained.
 
         Where that hardly helps, the object moves in ways that the modes do not have, and the prior is right.
@@ -488,9 +479,9 @@ class _Trail:
             return None
         problem = replace(problem, config=replace(problem.config, cloud_weight=HEAVY))
         heavier = ScoredFit.of(problem, fit_cloud(problem, best.posed, Prior.whole(problem.model), *HEAVIER_STEPS, 0.0))
-        return _Trail(problem, 0.0, [heavier]) if heavier.misfit.cloud < HELPS * best.misfit.cloud else None
+        return Trail(problem, 0.0, [heavier]) if heavier.misfit.cloud < HELPS * best.misfit.cloud else None
 
-    def as_noisy(self, only_sure: bool) -> "_Trail | None":
+    def as_noisy(self, only_sure: bool) -> "Trail | None":
         """The same with the constants for what the best fit leaves over, where that is noise and not the fit's error.
 
         None where that is not so, or the frame is explained, and with ``only_sure`` where it is not sure, as after the
@@ -502,7 +493,7 @@ class _Trail:
             noisy = self.problem.as_noisy_as(self.best.surface, is_shared)
             if noisy is None:
                 continue
-            first = _Trail(noisy, 0.0, [refined(noisy, fit_wide(noisy, self.best.posed))])
+            first = Trail(noisy, 0.0, [refined(noisy, fit_wide(noisy, self.best.posed))])
             if first.leaves_noise(is_shared, only_sure):  # of most wrong states it does not, in a tenth of the time
                 trail = self.again(noisy, first.fitted)
                 if trail.leaves_noise(is_shared, only_sure):
@@ -513,43 +504,40 @@ class _Trail:
         """``Problem.leaves_noise`` of the best state, with ``only_sure`` only where that is sure."""
         return self.problem.leaves_noise(self.best.surface, is_shared) and (self.is_sure or not only_sure)
 
-    def again(self, noisy: Problem, begun: Sequence[ScoredFit] = ()) -> "_Trail":
+    def again(self, noisy: Problem, begun: Sequence[ScoredFit] = ()) -> "Trail":
         """The same from its best states that differ, of which ``begun`` are fitted, in the problem of this noise."""
         states = [scored.posed for scored in sorted(self.fitted, key=_total)]
         rows = differing(noisy, states, BENT_APART)[len(begun) : 4]
         fits = (*begun, *(refined(noisy, fit_wide(noisy, states[row])) for row in rows))
-        trail = _Trail(noisy, 0.0, [explored(noisy, fit) for fit in fits])
+        trail = Trail(noisy, 0.0, [explored(noisy, fit) for fit in fits])
         trail.shake()
         return trail
 
-    def outcome(self) -> SearchOutcome:
-        best, model = self.best, self.problem.model
+    @property
+    def others(self) -> tuple[Float[np.ndarray, "m 3"], ...]:
+        """Positions of the material points in other states that explain the frame alike."""
+        model, best = self.problem.model, self.best
         rivals = sorted((fit for fit in self.fitted if _total(fit) < _total(best) + ALIKE), key=_total)
         rows = differing(self.problem, [fit.posed for fit in rivals], APART)[1:]
         others = (rivals[row].surface.material for row in rows)
-        return SearchOutcome(self.problem, best, tuple(each for each in others if not is_turned(model, best, each)))
+        if any(None not in symmetry.lands_on for symmetry in model.symmetries):  # what looks the same is said of itself
+            near, apart = cKDTree(best.surface.material), BENT_APART * model.half
+            others = (each for each in others if near.query(each[model.sparse])[0].mean() > apart)
+        return tuple(others)
 
 
-def is_turned(model: StatisticalModel, best: ScoredFit, other: Float[np.ndarray, "m 3"]) -> bool:
-    """Whether a state is another turned by a symmetry that brings segments onto segments, which is said at any rate."""
-    if all(None in symmetry.lands_on for symmetry in model.symmetries):
-        return False
-    apart: float = cKDTree(best.surface.material).query(other[model.sparse])[0].mean()
-    return apart <= BENT_APART * model.half
-
-
-def search(whole: Problem, partial: Problem | None = None, start: Posed | None = None) -> SearchOutcome:
+def search(whole: Problem, partial: Problem | None = None, start: Posed | None = None) -> Trail:
     """Search for the state that explains a frame without correspondences, or fit it from ``start``.
 
     ``partial`` is the same where it is open whether the object is seen whole: with nothing known around the cloud. It
     is taken where it explains the frame better by more than ``WHOLE``.
     """
-    trails = [_Trail(whole)] if partial is None else [_Trail(whole), _Trail(partial, WHOLE)]
+    trails = [Trail(whole)] if partial is None else [Trail(whole), Trail(partial, WHOLE)]
     if start is not None:
         for trail in trails:
             trail.fitted.append(refined(trail.problem, fit_wide(trail.problem, start)))
         chosen = min(trails, key=lambda trail: trail.best.misfit.total + trail.handicap)
-        return (chosen.with_heavier_cloud() or as_noisy(trails, chosen, False) or chosen).outcome()
+        return chosen.with_heavier_cloud() or as_noisy(trails, chosen, False) or chosen
     for stage in ROUNDS:
         for trail in trails:
             trail.go_on(stage)
@@ -563,12 +551,12 @@ def search(whole: Problem, partial: Problem | None = None, start: Posed | None =
         if better is None and chosen.best.misfit.cloud >= whole.config.unexplained:
             better = as_noisy(trails, chosen, not is_last)
         if better is not None and (is_last or better.is_sure):
-            return better.outcome()
-    return chosen.outcome()
+            return better
+    return chosen
 
 
-def as_noisy(trails: list[_Trail], chosen: _Trail, only_sure: bool) -> _Trail | None:
-    """``_Trail.as_noisy``; one other than the first, of a whole object, must win by the noise's constants too."""
+def as_noisy(trails: list[Trail], chosen: Trail, only_sure: bool) -> Trail | None:
+    """``Trail.as_noisy``; one other than the first, of a whole object, must win by the noise's constants too."""
     # to a clean frame's constants, noise at the rim looks like more than ``WHOLE``
     noisy, whole = chosen.as_noisy(only_sure), trails[0]
     if noisy is None or chosen is whole:
@@ -576,11 +564,6 @@ def as_noisy(trails: list[_Trail], chosen: _Trail, only_sure: bool) -> _Trail | 
     evidence = replace(noisy.problem.evidence, other_lines=whole.problem.evidence.other_lines)
     again = whole.again(replace(noisy.problem, evidence=evidence))
     return again if again.best.misfit.total < noisy.best.misfit.total + WHOLE else noisy
-
-
-def candidates(problem: Problem, stage: SearchRound) -> list[tuple[float, Posed]]:
-    """Find candidates in a round, with their misfits by few points, the lowest first."""
-    return bend_by_few(problem, screen_poses(problem, stage), stage.fitted)
 
 
 def screen_poses(problem: Problem, stage: SearchRound) -> list[Posed]:

@@ -31,7 +31,6 @@ from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.answer_frame import answer_of, find, in_registered_unit, search_hypotheses
 from mereo.fitting.registration.recognition import MOST, Recognition, recognize
 from mereo.fitting.registration.register import ModesFit, Registrar
-from mereo.fitting.registration.registration import Registration
 from mereo.fitting.search import WHOLE
 from mereo.geometry.brief import counted
 from mereo.geometry.camera import SightKind, SightLines
@@ -429,7 +428,7 @@ class Tracker:
             return _Tracked(fitted, after, Reading(seen.cloud, keep))
 
         tracked = fit(self.config)
-        if not tracked.registration.accepted and not self.registrar.asks_network:  # it may have moved far
+        if not tracked.fitted.registration.accepted and not self.registrar.asks_network:  # it may have moved far
             tracked = max(tracked, fit(self.config.patient), key=lambda fit_: fit_.score)
         return tracked, ""
 
@@ -466,13 +465,13 @@ class Tracker:
         if tracked is not None and is_better and self._takes(tracked):
             return self._gone_on(frame, tracked, started, restart=True)
         if alone is None or not self._takes(alone):
-            registration = None if alone is None else alone.registration
+            registration = None if alone is None else alone.fitted.registration
             answer = answer_of(seen, registrar.network, None, candidate, likelier, registration)
             return replace(answer, registrar=registrar, tracking="lost")
         self._search.drop()
         self._track, self._best, self._located_by = alone.track, alone.score, candidate.located_by
         self._T_camera_input, self._axes = candidate.encoded.T_camera_input, seen.frame.axes
-        answer = answer_of(seen, registrar.network, registrar, candidate, likelier, alone.registration)
+        answer = answer_of(seen, registrar.network, registrar, candidate, likelier, alone.fitted.registration)
         return replace(answer, seconds=time.perf_counter() - started)
 
     def _is_believed(self, tracked: "_Tracked") -> bool:
@@ -483,13 +482,13 @@ class Tracker:
 
     def _takes(self, candidate: "_Tracked") -> bool:
         """Whether a fit is the answer to a frame; with "modes" any is."""
-        if not self.registrar.takes(candidate.registration):
+        if not self.registrar.takes(candidate.fitted.registration):
             return False
         return self.registrar.method == "modes" or not self._doubt(candidate)
 
     def _doubt(self, tracked: "_Tracked") -> str:
         """What speaks against a fit, by the frame alone, in a clause; "" where nothing does."""
-        registration, config = tracked.registration, self.config
+        registration, config = tracked.fitted.registration, self.config
         if tracked.area < config.least_area:
             return f"only {tracked.area:.0%} as much of it as before can be seen"
         if not registration.accepted:
@@ -513,15 +512,15 @@ class Tracker:
         model = self.registrar.network
         stated = self.registrar.stated_scene_unit(frame.seen.frame.unit_m)
         calibration = None if model is None else model.calibration
-        recognition = recognize(tracked.registration, calibration, stated_scene_unit=stated)
-        seen = in_registered_unit(frame.seen, self.registrar, tracked.registration, recognition)
+        recognition = recognize(tracked.fitted.registration, calibration, stated_scene_unit=stated)
+        seen = in_registered_unit(frame.seen, self.registrar, tracked.fitted.registration, recognition)
         return Answer(
             seen=seen.read_as(tracked.hypothesis),
             model=model,
             registrar=self.registrar,
             hypothesis=tracked.hypothesis,
             T_camera_input=self._T_camera_input,
-            registration=tracked.registration,
+            registration=tracked.fitted.registration,
             taken=True,
             recognition=recognition,
             located_by=self._located_by,
@@ -554,14 +553,10 @@ class _Tracked:
         fitted = replace(candidate.modes, rest=None)
         return cls(fitted, Track.of(fitted, time_s, config, clean), candidate.hypothesis)
 
-    @cached_property
-    def registration(self) -> Registration:
-        return self.fitted.registration()
-
     @property
     def score(self) -> float:
         """Share of all points of the frame that are explained."""
-        return self.registration.explained * float(self.hypothesis.keep.mean())
+        return self.fitted.registration.explained * float(self.hypothesis.keep.mean())
 
     @cached_property
     def area(self) -> float:

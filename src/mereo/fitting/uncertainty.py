@@ -139,11 +139,9 @@ class Posterior:
 
         ``open`` are motions with further numbers, ``others`` the material points in other states.
         """
-        nothing = np.empty((len(material), 3, 0), dtype=np.float32)
-        motion = np.concatenate([nothing, *open], axis=2, dtype=np.float32)
-        ways = np.concatenate(
-            [nothing, *((other - material)[:, :, None] for other in others)], axis=2, dtype=np.float32
-        )
+        motion = np.concatenate([np.empty((len(material), 3, 0)), *open], axis=2, dtype=np.float32)
+        ways = np.reshape(others, (len(others), *material.shape)) - material
+        ways = np.moveaxis(ways, 0, 2).astype(np.float32)
         return cls(posed, material, modes, covariance_factor(normal.matrix), residue, motion, ways)
 
     @cached_property

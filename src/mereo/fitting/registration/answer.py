@@ -60,7 +60,7 @@ class Candidate:
     @cached_property
     def is_accepted(self) -> bool:
         """Whether the fit explains the frame."""
-        return self.modes is not None and self.modes.registration().accepted
+        return self.modes is not None and self.modes.registration.accepted
 
     @cached_property
     def off_surface(self) -> Float[np.ndarray, " n"]:
@@ -80,7 +80,7 @@ class Candidate:
             return False
         evidence = self.modes.problem.evidence
         is_cut = evidence.hidden_edge > NO_OUTLINE
-        return is_cut and evidence.patch_share(self.modes.tolerance) > self.modes.registration().explained - PATCH
+        return is_cut and evidence.patch_share(self.modes.tolerance) > self.modes.registration.explained - PATCH
 
     def explained(self, tolerance: float) -> float:
         """Share of all points, outliers included, that lie on the facing surface up to a tolerance in scene units."""

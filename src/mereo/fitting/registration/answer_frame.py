@@ -82,12 +82,12 @@ def answer_frame(
     if candidate.error is not None and model is None:
         raise candidate.error
     modes = None if registrar is None else candidate.modes
-    answer = answer_of(seen, model, registrar, candidate, likelier, None if modes is None else modes.registration())
+    answer = answer_of(seen, model, registrar, candidate, likelier, None if modes is None else modes.registration)
     # of what is no view of the object, the parameters of its scene say nothing, and take longest
     if registrar is not None and modes is not None and (registrar.method == "full" or answer.recognition.known):
         with stage("fit the parameters of the scene"):
             registration = registrar.finish(modes)
-        if registration is not modes.registration():
+        if registration is not modes.registration:
             answer = answer_of(seen, model, registrar, candidate, likelier, registration)
     return replace(answer, resolution=resolution, label_points=label_points, seconds=time.perf_counter() - started)
 
@@ -181,7 +181,7 @@ def is_forced(candidate: Candidate) -> bool:
 def is_astray(candidate: Candidate) -> bool:
     """Whether a fit has ended far from where the network has the object, which then is no better start than chance."""
     assert candidate.modes is not None
-    displaced = candidate.displaced(candidate.modes.registration())
+    displaced = candidate.displaced(candidate.modes.registration)
     return displaced is not None and displaced > ASTRAY
 
 
@@ -404,12 +404,12 @@ def search_modes(
         given = None if start is None or not model.is_held else GivenPose(start, HELD_STD * model.half)
         whole = Problem(model, NetworkTerm.none(model), evidence, cloud.scale_std, config, given=given)
         partial = replace(whole, evidence=replace(evidence, other_lines="unknown")) if is_open else None
-        outcome = search(whole, partial, start)
-        problem, modes = outcome.problem, outcome.best
+        found = search(whole, partial, start)
+        problem, modes = found.problem, found.best
         rest = fit_rest(problem, nothing(), modes.posed)
         at_rest = is_at_rest(problem, modes, rest)
     seconds = time.perf_counter() - started
-    return ModesFit(problem, nothing(), unit, modes.posed, seconds, rest if at_rest else None, others=outcome.others)
+    return ModesFit(problem, nothing(), unit, modes.posed, seconds, rest if at_rest else None, others=found.others)
 
 
 def size_of(points: Float[np.ndarray, "n 3"], model: StatisticalModel) -> float:

@@ -155,12 +155,9 @@ class ModesFit:
             return Surface.of(model, self.posed)
         return Surface.through(model, self.rest.posed.place(model.rest_points))
 
-    def registration(self) -> Registration:
-        """Return the registration of the modes, or of the rest model where the frame speaks for that."""
-        return self._registered
-
     @cached_property
-    def _registered(self) -> Registration:
+    def registration(self) -> Registration:
+        """Registration of the modes, or of the rest model where the frame speaks for that."""
         if self.rest is not None:
             problem, posed = of_rest(self.problem, self.correspondences), self.rest.posed
             bent = self.posed.place(self.problem.model.material(self.posed.z))
@@ -176,7 +173,7 @@ class ModesFit:
         It does not speak against draws, which have the states that there really are.
         """
         if not self.may_take_draws:
-            return self.registration()
+            return self.registration
         started = time.perf_counter()
         with limit_blas_threads():
             problem = DrawsProblem.of(self.problem, states, self.correspondences)
@@ -184,7 +181,7 @@ class ModesFit:
             taken = drawn is not None and is_drawn(problem, drawn, self.posed, self.rest)
         seconds = self.seconds + time.perf_counter() - started
         if drawn is None or not taken:
-            return replace(self.registration(), seconds=seconds)
+            return replace(self.registration, seconds=seconds)
         end = DrawsOptimum(problem, drawn, self.unit, self.others)
         registration = self._registration("draws", drawn.z, end, drawn.posed, drawn.surface)
         return replace(registration, drawn=replace(drawn.drawn, z=drawn.z), seconds=seconds)
@@ -434,7 +431,7 @@ class Registrar:
         Unless that is "full", not where the modes do not explain the frame: the draws, which begin there and take
         longest on such frames, did not explain one of them either (experiments, entry 62).
         """
-        modes = fitted.registration()
+        modes = fitted.registration
         hopeless = self.method != "full" and not modes.accepted
         states = None if not self.fits_draws or hopeless or not fitted.may_take_draws else self.states_or_none
         return modes if states is None else fitted.with_draws(states)
