@@ -404,12 +404,12 @@ def search_modes(
         given = None if start is None or not model.is_held else GivenPose(start, HELD_STD * model.half)
         whole = Problem(model, NetworkTerm.none(model), evidence, cloud.scale_std, config, given=given)
         partial = replace(whole, evidence=replace(evidence, other_lines="unknown")) if is_open else None
-        found = search(whole, partial, start)
-        problem, modes = found.problem, found.best
+        trail = search(whole, partial, start)
+        problem, modes = trail.problem, trail.best
         rest = fit_rest(problem, nothing(), modes.posed)
         at_rest = is_at_rest(problem, modes, rest)
     seconds = time.perf_counter() - started
-    return ModesFit(problem, nothing(), unit, modes.posed, seconds, rest if at_rest else None, others=found.others)
+    return ModesFit(problem, nothing(), unit, modes.posed, seconds, rest if at_rest else None, others=trail.others)
 
 
 def size_of(points: Float[np.ndarray, "n 3"], model: StatisticalModel) -> float:
