@@ -38,7 +38,7 @@ from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Deformation, Identity, Rigid, smooth_step
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.geometry.read_only import read_only
-from mereo.scenes.scene import Scene, Workspace
+from mereo.scenes.scene import GUESSED_UNIT_M, Scene, Workspace
 from mereo_objects import _engine_parts as parts
 from mereo_objects._engine_block import block
 from mereo_objects._machine_parts import segment, union
@@ -153,9 +153,5 @@ def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
 
 def scene() -> Scene:
     """Scene of the engine; cameras stand before the open side, rather above than below."""
-    return Scene(
-        name="engine",
-        rest=rest_mesh(),
-        sample_deformations=sample_deformations,
-        workspace=Workspace(axis=(0.0, -0.94, 0.34), fov_rad=float(np.deg2rad(40.0))),
-    )
+    workspace = Workspace(axis=(0.0, -0.94, 0.34), fov_rad=float(np.deg2rad(40.0)))
+    return Scene("engine", rest_mesh(), sample_deformations, workspace, unit_m=GUESSED_UNIT_M)

@@ -28,7 +28,7 @@ from mereo.deformation.maps import Compose, Deformation
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.geometry.read_only import read_only
 from mereo.geometry.transforms import inverse_rigid, transform_points
-from mereo.scenes.scene import Scene, Workspace
+from mereo.scenes.scene import GUESSED_UNIT_M, Scene, Workspace
 from mereo_objects._hinges import Hinged, follow, rigid_map
 from mereo_objects._lizard_parts import (
     FRONT_LEG,
@@ -186,9 +186,5 @@ def _leg_motions(
 
 def scene() -> Scene:
     """Scene of the lizard on its belly; the paper's camera workspace above it."""
-    return Scene(
-        name="lizard",
-        rest=rest_mesh(),
-        sample_deformations=sample_deformations,
-        workspace=Workspace(fov_rad=float(np.deg2rad(46.0))),
-    )
+    workspace = Workspace(fov_rad=float(np.deg2rad(46.0)))
+    return Scene("lizard", rest_mesh(), sample_deformations, workspace, unit_m=GUESSED_UNIT_M)

@@ -40,7 +40,7 @@ from mereo.deformation.draw_names import named, unchecked
 from mereo.deformation.maps import Compose, Deformation, Identity, Rigid
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.geometry.read_only import read_only
-from mereo.scenes.scene import Scene, Workspace
+from mereo.scenes.scene import GUESSED_UNIT_M, Scene, Workspace
 from mereo_objects import _robot_parts as parts
 from mereo_objects._solids import Vector, segment
 
@@ -177,9 +177,5 @@ def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
 
 def scene() -> Scene:
     """Scene of the arm; the paper's camera workspace above it."""
-    return Scene(
-        name="robot",
-        rest=rest_mesh(),
-        sample_deformations=sample_deformations,
-        workspace=Workspace(fov_rad=float(np.deg2rad(44.0))),
-    )
+    workspace = Workspace(fov_rad=float(np.deg2rad(44.0)))
+    return Scene("robot", rest_mesh(), sample_deformations, workspace, unit_m=GUESSED_UNIT_M)

@@ -31,7 +31,7 @@ from mereo.deformation.maps import Deformation, Identity
 from mereo.deformation.warps import CurveSweep
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.read_only import read_only
-from mereo.scenes.scene import Scene, Workspace
+from mereo.scenes.scene import GUESSED_UNIT_M, Scene, Workspace
 
 SEGMENTS = 8
 SEGMENT_LENGTH = 8.0
@@ -203,9 +203,5 @@ def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
 
 def scene() -> Scene:
     """Scene of the rope; the paper's camera workspace above it."""
-    return Scene(
-        name="rope",
-        rest=rest_mesh(),
-        sample_deformations=sample_deformations,
-        workspace=Workspace(fov_rad=float(np.deg2rad(45.0))),
-    )
+    workspace = Workspace(fov_rad=float(np.deg2rad(45.0)))
+    return Scene("rope", rest_mesh(), sample_deformations, workspace, unit_m=GUESSED_UNIT_M)

@@ -31,7 +31,7 @@ from mereo.deformation.maps import Compose, Deformation, Rigid
 from mereo.deformation.warps import Bend, SmoothField, Squash, Taper, Twist
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.geometry.read_only import read_only
-from mereo.scenes.scene import Scene, Workspace
+from mereo.scenes.scene import GUESSED_UNIT_M, Scene, Workspace
 from mereo_objects import _shapes_parts as solid
 from mereo_objects._solids import segment
 
@@ -226,9 +226,5 @@ SHAPES: dict[str, Callable[[np.random.Generator], list[Deformation]]] = {
 
 def scene() -> Scene:
     """Scene of the shapes on the ground; the paper's camera workspace above them."""
-    return Scene(
-        name="shapes",
-        rest=rest_mesh(),
-        sample_deformations=sample_deformations,
-        workspace=Workspace(fov_rad=float(np.deg2rad(24.0))),
-    )
+    workspace = Workspace(fov_rad=float(np.deg2rad(24.0)))
+    return Scene("shapes", rest_mesh(), sample_deformations, workspace, unit_m=GUESSED_UNIT_M)

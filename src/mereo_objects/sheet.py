@@ -35,7 +35,7 @@ from mereo.deformation.draw_names import named, part, unchecked
 from mereo.deformation.maps import Compose, Deformation, Rigid, smooth_step
 from mereo.deformation.warps import Bend, CurveSweep, SmoothField, Twist
 from mereo.geometry.read_only import read_only
-from mereo.scenes.scene import Scene, Workspace
+from mereo.scenes.scene import GUESSED_UNIT_M, Scene, Workspace
 from mereo_objects._sheet_parts import LARGEST_OFFSET, middle_points, rest_mesh
 
 NODES = read_only(np.linspace(-42.0, 42.0, 169))
@@ -209,9 +209,5 @@ def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
 
 def scene() -> Scene:
     """Scene of the sheet; the paper's camera workspace above it."""
-    return Scene(
-        name="sheet",
-        rest=rest_mesh(),
-        sample_deformations=sample_deformations,
-        workspace=Workspace(fov_rad=float(np.deg2rad(42.0))),
-    )
+    workspace = Workspace(fov_rad=float(np.deg2rad(42.0)))
+    return Scene("sheet", rest_mesh(), sample_deformations, workspace, unit_m=GUESSED_UNIT_M)

@@ -269,7 +269,8 @@ def test_an_evaluation_compares_all_who_could_answer(engine: Model, tmp_path: Pa
         assert (values["iou"], values["miou"]) == (same["iou"], same["miou"])
     assert values["modes"]["miou"] > values["network"]["miou"] and values["full"]["seconds"] > 0
     assert 0 <= values["registration_error"]["hidden"]["median"] <= values["registration_error"]["hidden"]["p95"]
-    assert values["registration_error"]["seen"]["median_mm"] is None  # the engine has no true size
+    seen = values["registration_error"]["seen"]
+    assert seen["median_mm"] == pytest.approx(10.0 * seen["median"])  # a unit of the engine is a centimetre
     write_json(tmp_path / "metrics.json", values)
     assert json.loads((tmp_path / "metrics.json").read_text())["chosen"] == values["chosen"]
     assert "modes alone" in markdown_table(found)

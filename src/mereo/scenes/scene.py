@@ -38,6 +38,9 @@ class SourceFrame:
         return None if facts is None else cls(np.asarray(facts["T_scene_source"], dtype=np.float64), facts["unit_m"])
 
 
+GUESSED_UNIT_M = 0.01
+"""Metres per scene unit of built-in objects that are no real ones, and of objects of unknown size in sample views."""
+
 SCENES = (
     *("human", "robot", "bunny", "lizard", "rope", "skull", "engine", "liver", "shapes", "sheet"),
     *("tumor", "liver-simulated"),

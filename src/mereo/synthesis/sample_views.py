@@ -15,14 +15,12 @@ from mereo.geometry.metrics import TruthGrid
 from mereo.io.errors import SizeError, quiet, reason
 from mereo.io.readers import read_arrays, read_point_cloud
 from mereo.io.sensor_frame import SensorFrame
+from mereo.scenes.scene import GUESSED_UNIT_M
 
 SHIPPED = Path(__file__).parents[1] / "frames"
 
 SHIPPED_SCAN = "bun000"
 """Name of the shipped range scan of the Stanford bunny: 4,000 of its 40,256 points, evenly spread."""
-
-GUESSED_UNIT_M = 0.01
-"""Metres per scene unit of shipped frames of objects whose true size is not known."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,11 +38,12 @@ LEAST: Mapping[SignName, float] = {
 """What is added to a sign before its logarithm is taken: less than that means nothing."""
 
 FIXED: Mapping[SignName, Usual] = {
-    "size": Usual(mean=float(np.log(LEAST["size"] + 0.03)), std=0.5),
+    "size": Usual(mean=float(np.log(LEAST["size"] + 0.03)), std=0.3),
     "unseen": Usual(mean=float(np.log(LEAST["unseen"] + 0.02)), std=0.45),
 }
-"""Usual logarithms of two signs, of all weights: sizes are off by 3 %, and by 15 % at most where the unit is right; of
-whole objects, cameras miss 2 to 3 %, of what was fitted to other things 10 to 87 % (docs/experiments/075.md)."""
+"""Usual logarithms of two signs, of all weights: sizes are off by 3 %, and where they are by 10 %, the unit is wrong or
+the answer (docs/experiments/078.md); of whole objects, cameras miss 2 to 3 %, of what was fitted to other things 10 to
+87 % (docs/experiments/075.md)."""
 
 MEASURED: tuple[SignName, ...] = ("unexplained", "ruled_out", "beyond", "displaced")
 """Signs of which a calibration measures what is usual."""
@@ -204,12 +205,10 @@ def recognize(
     signs = Signs.of(registration, displaced, stated_scene_unit, unseen)
     each = signs.strange(usual.noisy if is_noisy(registration) else usual.clean)
     total = strangeness(each)
-    is_unit_wrong = signs.size is not None and signs.size > float(np.log(2.0))  # a factor of two
-    if total <= UNSURE and not is_unit_wrong:
+    if total <= UNSURE:
         return Recognition(True, None, total, signs, calibrated is not None)
-    known: Known = False if total >= REFUSED or is_unit_wrong else "unsure"
-    reason = _reason("size" if is_unit_wrong else max(each, key=lambda name: each[name]), registration, signs)
-    return Recognition(known, reason, total, signs, calibrated is not None)
+    reason = _reason(max(each, key=lambda name: each[name]), registration, signs)
+    return Recognition(False if total >= REFUSED else "unsure", reason, total, signs, calibrated is not None)
 
 
 # --- reasons ----------------------------------------------------------------------------------------------------------
