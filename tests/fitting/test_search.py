@@ -15,7 +15,7 @@ from mereo.fitting.problem.problem import OPEN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import NetworkTerm
 from mereo.fitting.registration.answer_frame import search_modes
 from mereo.fitting.registration.register import CloudToFit
-from mereo.fitting.search import ALIKE, ROUNDS, SearchRound, SightTable, Trail, as_noisy, medoids, rotations
+from mereo.fitting.search import ALIKE, ROUNDS, SearchRound, SightTable, Trail, medoids, rotations, search_noisy
 from mereo.geometry.camera import SightLines
 from mereo.geometry.symmetry import Symmetry
 from mereo.models.weights import load_model
@@ -145,7 +145,7 @@ def test_under_noise_a_part_is_hidden_where_it_is_by_the_noises_constants_too(
     partial = replace(whole, evidence=replace(evidence, other_lines="unknown"))
     trails = [Trail(each, 0.0, [refined(each, fit_wide(each, posed))]) for each in (whole, partial)]
     for chosen in trails if not share else trails[1:]:
-        noisy = as_noisy(trails, chosen, False)
+        noisy = search_noisy(trails, chosen, False)
         assert noisy is not None and noisy.problem.is_camera
         assert noisy.problem.evidence.other_lines == ("unknown" if share else "past")
 

@@ -308,7 +308,9 @@ NetworkFit = tuple[Problem, Correspondences, ScoredFit]
 """A frame, the network's correspondences, and the fit to both."""
 
 
-def as_noisy(start: NetworkFit, points: Float[np.ndarray, "n 3"], predict: PredictCorrespondences | None) -> NetworkFit:
+def refit_noisy(
+    start: NetworkFit, points: Float[np.ndarray, "n 3"], predict: PredictCorrespondences | None
+) -> NetworkFit:
     """Fit a noisy frame once more where what the second fit leaves over is noise; else return the first fit.
 
     The second fit decides, since noise throws the first off by more than it is itself. The network also sees the

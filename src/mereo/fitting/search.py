@@ -481,7 +481,7 @@ class Trail:
         heavier = ScoredFit.of(problem, fit_cloud(problem, best.posed, Prior.whole(problem.model), *HEAVIER_STEPS, 0.0))
         return Trail(problem, 0.0, [heavier]) if heavier.misfit.cloud < HELPS * best.misfit.cloud else None
 
-    def as_noisy(self, only_sure: bool) -> "Trail | None":
+    def with_noise(self, only_sure: bool) -> "Trail | None":
         """The same with the constants for what the best fit leaves over, where that is noise and not the fit's error.
 
         None where that is not so, or the frame is explained, and with ``only_sure`` where it is not sure, as after the
@@ -537,7 +537,7 @@ def search(whole: Problem, partial: Problem | None = None, start: Posed | None =
         for trail in trails:
             trail.fitted.append(refined(trail.problem, fit_wide(trail.problem, start)))
         chosen = min(trails, key=lambda trail: trail.best.misfit.total + trail.handicap)
-        return chosen.with_heavier_cloud() or as_noisy(trails, chosen, False) or chosen
+        return chosen.with_heavier_cloud() or search_noisy(trails, chosen, False) or chosen
     for stage in ROUNDS:
         for trail in trails:
             trail.go_on(stage)
@@ -549,16 +549,16 @@ def search(whole: Problem, partial: Problem | None = None, start: Posed | None =
             break
         better, is_last = chosen.with_heavier_cloud(), stage is ROUNDS[-1]
         if better is None and chosen.best.misfit.cloud >= whole.config.unexplained:
-            better = as_noisy(trails, chosen, not is_last)
+            better = search_noisy(trails, chosen, not is_last)
         if better is not None and (is_last or better.is_sure):
             return better
     return chosen
 
 
-def as_noisy(trails: list[Trail], chosen: Trail, only_sure: bool) -> Trail | None:
-    """``Trail.as_noisy``; one other than the first, of a whole object, must win by the noise's constants too."""
+def search_noisy(trails: list[Trail], chosen: Trail, only_sure: bool) -> Trail | None:
+    """``Trail.with_noise``; one other than the first, of a whole object, must win by the noise's constants too."""
     # to a clean frame's constants, noise at the rim looks like more than ``WHOLE``
-    noisy, whole = chosen.as_noisy(only_sure), trails[0]
+    noisy, whole = chosen.with_noise(only_sure), trails[0]
     if noisy is None or chosen is whole:
         return noisy
     evidence = replace(noisy.problem.evidence, other_lines=whole.problem.evidence.other_lines)

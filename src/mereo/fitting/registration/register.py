@@ -19,7 +19,7 @@ from mereo.fitting.draws.playback import MOST_DRAWS, STATES_SEED, Drawn, DrawnSt
 from mereo.fitting.modes import (
     PredictCorrespondences,
     ScoredFit,
-    as_noisy,
+    refit_noisy,
     fit_modes,
     fit_rest,
     is_at_rest,
@@ -130,7 +130,7 @@ class ModesFit:
             problem = Problem.of(model, correspondences, cloud.evidence(unit), cloud.scale_std, config)
             fit = problem, correspondences, fit_modes(problem)
             scaled = None if predict is None else lambda seen: predict(seen * unit).scaled(1 / unit)
-            problem, correspondences, modes = as_noisy(fit, cloud.points / unit, scaled)
+            problem, correspondences, modes = refit_noisy(fit, cloud.points / unit, scaled)
             rest = fit_rest(problem, correspondences, modes.posed)
             at_rest = is_at_rest(problem, modes, rest)
         return cls(
