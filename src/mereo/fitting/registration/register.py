@@ -19,11 +19,11 @@ from mereo.fitting.draws.playback import MOST_DRAWS, STATES_SEED, Drawn, DrawnSt
 from mereo.fitting.modes import (
     PredictCorrespondences,
     ScoredFit,
-    refit_noisy,
     fit_modes,
     fit_rest,
     is_at_rest,
     of_rest,
+    refit_noisy,
 )
 from mereo.fitting.modes import narrowing as modes_narrowing
 from mereo.fitting.problem.correspondences import Correspondences, agree, estimate_unit, find_correspondences
