@@ -289,16 +289,6 @@ def factors_of(views: Sequence[MeasuredRadii]) -> RadiusFactors:
 
 # --- recognition ------------------------------------------------------------------------------------------------------
 
-SMALLEST_STD: dict[SignName, float] = {
-    "unexplained": 0.5,
-    "ruled_out": 0.5,
-    "beyond": 0.5,
-    "displaced": 0.1,
-}
-"""Least standard deviations of the signs' logarithms: a few views may be more alike than others will be.
-
-The first three are 0 in most views, where what is added to them alone is left."""
-
 TRUSTED = 4
 """Views from which on their mean and standard deviation are taken; from fewer, the conservative ones."""
 
@@ -329,11 +319,11 @@ class RecognitionSigns:
 
 
 def usual_of(signs: Sequence[Signs]) -> dict[SignName, Usual]:
-    """What is usual of each sign, from views of the object; robust against a view that the network misread."""
+    """What is usual of each sign, from views of the object, robustly; no less wide than for objects without them."""
     result: dict[SignName, Usual] = {}
     for name in MEASURED:
         values = [each.logarithms[name] for each in signs if name in each.logarithms]
         if values:
             low, middle, high = np.quantile(values, [0.16, 0.5, 0.84])
-            result[name] = Usual(mean=float(middle), std=max(float(high - low) / 2, SMALLEST_STD[name]))
+            result[name] = Usual(mean=float(middle), std=max(float(high - low) / 2, CONSERVATIVE.clean[name].std))
     return result

@@ -17,7 +17,7 @@ from mereo.fitting.problem.correspondences import Correspondences, nothing
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import POSE, Posed, along
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, OPEN_SCALE_STD, Problem
-from mereo.fitting.problem.residuals import NetworkTerm
+from mereo.fitting.problem.residuals import NetworkTerm, are_near
 from mereo.fitting.registration.recognition import recognize
 from mereo.fitting.registration.register import CloudToFit, ModesFit, is_drawn
 from mereo.fitting.registration.registration import Registration
@@ -272,6 +272,17 @@ def test_what_is_explained_hopeless_or_a_cameras_noise_is_left(robot: Statistica
     assert shaken(replace(problem, scale_std=OPEN_SCALE_STD), wrong) is wrong
     noisy, fitted = stuck(robot, 4, 4, noise=0.5)
     assert not fitted.explains(noisy) and shaken(noisy, fitted) is fitted
+
+
+def test_states_near_one_tell_of_it_where_they_lie_on_a_curved_set_and_not_where_each_is_by_itself(
+    robot: StatisticalModel,
+) -> None:
+    """By states that are left out: a track follows under the prior that tells more of them."""
+    assert are_near(robot)
+    scattered = np.random.default_rng(0).standard_normal(robot.library.shape).astype(np.float32)
+    assert not are_near(replace(robot, library=scattered))
+    nearest = Prior.near(robot, robot.library[7].astype(np.float64), 0).center
+    assert np.abs(Prior.near(robot, robot.library[7].astype(np.float64), 1).center - nearest).max() > 0
 
 
 def test_a_track_looks_for_other_states_where_it_is_wrong_and_not_again_at_once(robot: StatisticalModel) -> None:

@@ -104,6 +104,14 @@ def test_calibrated_weights_say_what_is_usual(registration: Registration) -> Non
     assert recognize(odd, Calibration(seed=1, views=8, recognizing=strict)).known is False
 
 
+def test_a_networks_disagreement_alone_refuses_no_answer_that_was_like_few_views(registration: Registration) -> None:
+    """Of two minutes' weights, right answers are .11 of half the length from where the network has them."""
+    narrow = {"displaced": Usual(mean=np.log(0.0455), std=0.1)}
+    calibration = Calibration(seed=1, views=8, recognizing=Recognizing(clean=narrow, noisy=narrow))
+    assert recognize(registration, calibration, displaced=0.11).known is True
+    assert recognize(registration, calibration, displaced=0.4).known is not True
+
+
 @pytest.mark.parametrize("unit, known", [(0.67, False), (0.8, "unsure"), (1.05, True), (1.25, "unsure"), (1.5, False)])
 def test_a_size_that_is_not_what_the_unit_says_is_doubted(
     registration: Registration, unit: float, known: Known

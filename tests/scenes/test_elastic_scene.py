@@ -183,7 +183,7 @@ def test_the_model_has_the_modes_of_the_solid(scene: Scene, model: StatisticalMo
     T, z = model.project(points)
     assert off(model, transform_points(T, model.material(z)), points) < 3 * model.residue / model.half
     assert model.residue < 0.02 * model.half
-    prior = Prior.near(model, z, 50, 0.17)
+    prior = Prior.near(model, z)
     np.testing.assert_array_equal(prior.precision, np.eye(12))
     save_statistical_model(model, tmp_path / "m.safetensors")
     again = load_statistical_model(tmp_path / "m.safetensors")

@@ -172,7 +172,7 @@ def fit_wide(problem: Problem, posed: Posed) -> Posed:
 
 def refine(problem: Problem, posed: Posed, widening: float = 1.0, steps: int = 10) -> Posed:
     """Fit from nearby, under the prior of the library's 50 states nearest to ``posed``."""
-    prior = Prior.near(problem.model, posed.z, 50, 0.17)
+    prior = Prior.near(problem.model, posed.z)
     return fit_cloud(problem, posed, prior, widening * REFINE_SIGMA, steps, 0.0)
 
 

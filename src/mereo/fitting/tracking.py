@@ -26,7 +26,7 @@ from mereo.fitting.problem.correspondences import nothing
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import DAMPING, POSE, NormalEquations, Posed, in_space
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem, constants_for
-from mereo.fitting.problem.residuals import NetworkTerm, Prior
+from mereo.fitting.problem.residuals import NetworkTerm, Prior, are_near
 from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.answer_frame import answer_of, find, in_registered_unit, search_hypotheses
 from mereo.fitting.registration.recognition import MOST, Recognition, recognize
@@ -238,7 +238,7 @@ def motion_precision(track: Track, passed_s: float, config: TrackConfig) -> Floa
 def descend(problem: Problem, start: Posed, precision: Float[np.ndarray, "p p"], config: TrackConfig) -> Posed:
     """State that explains cloud, silhouette and prior from nearby, and lies near ``start``, which is expected."""
     constants, half = problem.config, problem.model.half
-    prior = Prior.whole(problem.model)
+    prior = Prior.near(problem.model, start.z) if are_near(problem.model) else Prior.whole(problem.model)
     posed, steps = start, config.steps + config.exact_steps
     for step in range(steps):
         sigma = max(config.first_sigma * half * config.cooling**step, constants.cloud_sigma)

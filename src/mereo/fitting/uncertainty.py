@@ -132,7 +132,7 @@ class Posterior:
         material: Float[np.ndarray, "m 3"],
         modes: Float32[np.ndarray, "m 3 k"],
         residue: float = 0.0,
-        open: Sequence[Float[np.ndarray, "m 3 e"]] = (),
+        open: Sequence[Float[np.ndarray, "m 3 _"]] = (),
         others: Sequence[Float[np.ndarray, "m 3"]] = (),
     ) -> "Posterior":
         """Posterior whose precision is the matrix of the normal equations at the optimum.
@@ -346,10 +346,6 @@ Evidence = Literal["points", "network", "silhouette", "states"]
 """What leaves a position unsure by its errors: the observed points, the network's correspondences, what the frame
 rules out, and what was known of the object's states before the frame was seen."""
 
-Decided = tuple[dict[Evidence, float], Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]
-"""Shares of each kind of evidence in what is unsure; weight of each observed sample, and its influence in the camera's
-axes."""
-
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
@@ -372,25 +368,6 @@ class Explanation:
     weights: Float[np.ndarray, " n"]
     influence: Float[np.ndarray, "n 3"]
     unexplained: Float[np.ndarray, "k 3"]
-
-    @classmethod
-    def of(
-        cls,
-        place: Float[np.ndarray, "3"],
-        decided: Decided,
-        uncertainty: "Uncertainty",
-        T_registration_fit: Float[np.ndarray, "4 4"],
-    ) -> "Explanation":
-        """Explanation in the frame to which ``T_registration_fit`` leads from the fit's, both in the input's unit."""
-        optimum, unit, (shares, weights, influence) = uncertainty.optimum, uncertainty.optimum.unit, decided
-        return cls(
-            place=place,
-            shares=shares,
-            points=transform_points(T_registration_fit, unit * optimum.terms.observed_samples),
-            weights=weights,
-            influence=influence @ T_registration_fit[:3, :3].T,
-            unexplained=transform_points(T_registration_fit, unit * uncertainty.unexplained),
-        )
 
     def __repr__(self) -> str:
         shares = ", ".join(f"{name} {share:.0%}" for name, share in self.shares.items())
@@ -540,15 +517,27 @@ class Uncertainty:
         parts = {name: factor.T @ matrix @ factor for name, matrix in others.items()}
         return terms.cloud[0].astype(np.float64) @ factor, terms.cloud[2], parts
 
-    def _decided(self, motion: Float[np.ndarray, "3 p"]) -> Decided:
-        """What decides a position that moves so."""
-        (rows, weight, parts), motion = self._whitened, motion.astype(np.float64)
+    def explain(
+        self,
+        place: Float[np.ndarray, "3"],
+        motion: Float[np.ndarray, "3 p"],
+        T_registration_fit: Float[np.ndarray, "4 4"],
+    ) -> Explanation:
+        """What decides a position that moves so; ``T_registration_fit`` leads from the fit's frame, in input units."""
+        (rows, weight, parts), motion, unit = self._whitened, motion.astype(np.float64), self.optimum.unit
         whole, leverage = float((motion**2).sum()), rows @ motion.T
         shares: dict[Evidence, float] = {"points": float((weight[:, None] * leverage**2).sum()) / whole}
         shares |= {name: float(((motion @ part) * motion).sum()) / whole for name, part in parts.items()}
         influence = weight[:, None] * leverage
         length = np.linalg.norm(influence, axis=1)
-        return shares, length / max(float(length.sum()), np.finfo(np.float64).tiny), influence
+        return Explanation(
+            place=place,
+            shares=shares,
+            points=transform_points(T_registration_fit, unit * self.optimum.terms.observed_samples),
+            weights=length / max(float(length.sum()), np.finfo(np.float64).tiny),
+            influence=influence @ T_registration_fit[:3, :3].T,
+            unexplained=transform_points(T_registration_fit, unit * self.unexplained),
+        )
 
     @cached_property
     def unexplained(self) -> Float[np.ndarray, "k 3"]:
@@ -557,13 +546,13 @@ class Uncertainty:
         points = frame.evidence.points
         return points[self.optimum.surface.nearest(points)[0] > frame.config.tolerance]
 
-    def decided_centroid(self, index: int) -> Decided:
-        """What decides where the centroid of a segment is."""
-        return self._decided(self._owned[1][index, 1:])
+    def centroid_motion(self, index: int) -> Float[np.ndarray, "3 p"]:
+        """Motion of the centroid of a segment, as ``Posterior.motion_at``."""
+        return self._owned[1][index, 1:]
 
-    def decided_point(self, point: Float[np.ndarray, "1 3"], label: UInt8[np.ndarray, "1"]) -> Decided:
-        """What decides where a point of the rest model is, which moves along with the segment ``label``."""
-        return self._decided(self.posterior.motion_at(self.model.weights(point, label))[0])
+    def point_motion(self, point: Float[np.ndarray, "1 3"], label: UInt8[np.ndarray, "1"]) -> Float[np.ndarray, "3 p"]:
+        """Motion of a point of the rest model, which moves along with the segment ``label``."""
+        return self.posterior.motion_at(self.model.weights(point, label))[0]
 
     def summary(self, radii: Float[np.ndarray, " n"] | None = None) -> dict[str, float | bool]:
         """Median and greatest ``radius95`` of the vertices, or of the given radii, and whether they are calibrated."""

@@ -368,7 +368,7 @@ class Bench:
         return Stage(name, statistics.median(mine), slowest, floor, median, _differing(answer, other))
 
 
-def _differing(ours: np.ndarray | None, theirs: np.ndarray | None) -> float | None:
+def _differing(ours: Any, theirs: Any) -> float | None:
     """Share of other labels, of logits too; None for grids of other sizes, as where a box has grown."""
     if ours is None or theirs is None or ours.shape != theirs.shape:
         return None

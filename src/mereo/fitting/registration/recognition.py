@@ -117,12 +117,11 @@ class Signs:
 
     def strange(self, usual: Mapping[SignName, Usual]) -> dict[SignName, float]:
         """Standard deviations by which each sign lies above what is usual; 0 where it does not."""
-        known = {**usual, **FIXED}
-        strange: dict[SignName, float] = {
-            name: (value - known[name].mean) / known[name].std
-            for name, value in self.logarithms.items()
-            if name in known
-        }
+        known, strange = {**usual, **FIXED}, dict[SignName, float]()
+        for name, value in self.logarithms.items():
+            if name in known:  # the few views of a calibration are more alike than others will be
+                least = known[name] if name in FIXED else CONSERVATIVE.clean[name]
+                strange[name] = (value - known[name].mean) / max(known[name].std, least.std)
         if self.unusual is not None:
             strange["unusual"] = self.unusual
         return {name: min(max(value, 0.0), MOST) for name, value in strange.items()}

@@ -238,14 +238,14 @@ class Registration:
             if what not in names:
                 raise ValueError(f"there is no segment {what!r}; the segments are {', '.join(names)}: name one of them")
             place = owned_centroids(self.mesh)[names.index(what)]
-            decided = self.uncertainty.decided_centroid(names.index(what))
+            motion = self.uncertainty.centroid_motion(names.index(what))
         else:
             rest, label = self._at_rest(rows_of_three(np.asarray(what)[None]), None, at)
             place = self.to_camera(rest, label)[0]
-            decided = self.uncertainty.decided_point(rest, label)
+            motion = self.uncertainty.point_motion(rest, label)
         optimum = self.uncertainty.optimum  # in the camera frame of the fit, which need not be that of the registration
         T_registration_fit = fit_rigid(optimum.unit * optimum.posterior.material, self.material)
-        return Explanation.of(place, decided, self.uncertainty, T_registration_fit)
+        return self.uncertainty.explain(place, motion, T_registration_fit)
 
     def moved(self, T_new_camera: Float[np.ndarray, "4 4"]) -> "Registration":
         """Registration in another frame; raises ``ValueError`` for a transform that is not rigid."""
