@@ -17,7 +17,7 @@ from mereo.fitting.problem.correspondences import Correspondences, nothing
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import POSE, Posed, along
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, OPEN_SCALE_STD, Problem
-from mereo.fitting.problem.residuals import NetworkTerm, are_near
+from mereo.fitting.problem.residuals import NetworkTerm, Prior, are_near
 from mereo.fitting.registration.recognition import recognize
 from mereo.fitting.registration.register import CloudToFit, ModesFit, is_drawn
 from mereo.fitting.registration.registration import Registration
