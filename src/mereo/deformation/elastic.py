@@ -322,11 +322,12 @@ class ElasticSampler:
     @cached_property
     def modes(self) -> Float[np.ndarray, "n 3 k"]:
         """Displacements of the nodes for coefficients of variance 1."""
-        if self.digest not in _KEPT_MODES:
-            while len(_KEPT_MODES) > 3:
-                del _KEPT_MODES[next(iter(_KEPT_MODES))]
-            _KEPT_MODES[self.digest] = find_modes(self.solid, self.count, self.material, self.held)
-        return scale_modes(*_KEPT_MODES[self.digest], self.motion)
+        kept = _KEPT_MODES.get(self.digest)
+        if kept is None:
+            kept = _KEPT_MODES[self.digest] = find_modes(self.solid, self.count, self.material, self.held)
+            while len(_KEPT_MODES) > 4:
+                _KEPT_MODES.pop(next(iter(_KEPT_MODES)), None)
+        return scale_modes(*kept, self.motion)
 
     @cached_property
     def _state(self) -> StateMap:
