@@ -22,7 +22,7 @@ from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.recognition import Known
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
-from mereo.fitting.uncertainty import LEVEL
+from mereo.fitting.uncertainty import LEVEL, RadiusParts
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.labels import LabelGrid
@@ -174,7 +174,7 @@ class RegistrationErrors:
     @property
     def radii(self) -> Float[np.ndarray, " n"]:
         """Radii of all points, scene units."""
-        return self.reach + np.hypot(self.gaussian, self.other)
+        return RadiusParts(self.gaussian, self.other, self.reach).radii()
 
     def scale(self) -> float:
         """Factor of the Gaussian's radii that holds 95 % of the true positions: ``Calibration.radius_scale``."""

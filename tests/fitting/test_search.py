@@ -168,7 +168,7 @@ def test_others_explain_a_frame_alike_where_their_misfit_is_hardly_greater(
     problem = Problem(model, NetworkTerm.none(model), Evidence.of(view(model, posed)), OPEN_SCALE_STD, FitConfig())
     first = ScoredFit.of(problem, posed)
     turned = replace(posed, rotation=posed.rotation @ Rotation.from_euler("y", np.pi).as_matrix())
-    others = [ScoredFit.of(problem, replace(each, log_scale=0.0)) for each in (turned, posed)]
+    others = [ScoredFit.of(problem, each) for each in (turned, posed)]
 
     def said(worse: float) -> int:
         misfit = replace(first.misfit, total=first.misfit.total + worse)

@@ -519,10 +519,11 @@ class Trail:
         model, best = self.problem.model, self.best
         rivals = sorted((fit for fit in self.fitted if _total(fit) < _total(best) + ALIKE), key=_total)
         rows = differing(self.problem, [fit.posed for fit in rivals], APART)[1:]
-        others = (rivals[row].surface.material for row in rows)
-        if any(None not in symmetry.lands_on for symmetry in model.symmetries):  # what looks the same is said of itself
+        others = [rivals[row].surface.material for row in rows]
+        # a state that looks the same turned is said by the symmetry, which takes a second to find the first time
+        if others and any(None not in symmetry.lands_on for symmetry in model.symmetries):
             near, apart = cKDTree(best.surface.material), BENT_APART * model.half
-            others = (each for each in others if near.query(each[model.sparse])[0].mean() > apart)
+            others = [each for each in others if near.query(each[model.sparse])[0].mean() > apart]
         return tuple(others)
 
 
