@@ -52,14 +52,18 @@ def test_every_package_keeps_the_rules_of_names(name: str) -> None:
 
 
 def test_the_house_keeps_its_budget(tmp_path: Path) -> None:
-    assert rules.over_budget(TOP, rules.BUDGET) == []
-    for name, lines in {"src/a/b.py": 3, "src/c.py": 2, "docs/d.py": 999}.items():
+    assert rules.over_budget(TOP, rules.BUDGET, rules.SIZE) == []
+    assert rules.over_budget(TOP, rules.CHOICES, rules.COMPLEXITY) == []
+    for name, code in {"src/a/b.py": "A = 1, -2.5, True\n\n\n", "src/c.py": "if 1:\n    b = 3 if 4 else 5"}.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text("#\n" * lines, "utf-8")
-    assert rules.over_budget(tmp_path, {"src": (5, 2)}) == []
-    too_many = ["src has 5 lines, more than 4: cut as much as you add", "src has 2 files, more than 1: cut as much"]
-    faults = rules.over_budget(tmp_path, {"src": (4, 1)})
-    assert [fault[: len(start)] for fault, start in zip(faults, too_many, strict=True)] == too_many
+        (tmp_path / name).write_text(code, "utf-8")
+    (tmp_path / "src" / "d.md").write_text("A = 1")
+    assert rules.over_budget(tmp_path, {"src": (21, 2)}, rules.SIZE) == []
+    assert rules.over_budget(tmp_path, {"src": (2, 2)}, rules.COMPLEXITY) == []
+    faults = rules.over_budget(tmp_path, {"src": (20, 1)}, rules.SIZE)
+    faults += rules.over_budget(tmp_path, {"src": (1, 1)}, rules.COMPLEXITY)
+    units = [("21 syntax nodes", 20), ("2 files", 1), ("2 decisions", 1), ("2 constants", 1)]
+    assert faults == [f"src has {count}, more than {limit}: cut as much as you add" for count, limit in units]
 
 
 CLOCK = re.compile(
