@@ -70,6 +70,17 @@ def test_the_more_is_wrong_the_less_is_known(registration: Registration) -> None
     assert order == sorted(order)
 
 
+def test_a_fit_that_is_not_accepted_is_never_known(registration: Registration) -> None:
+    """Neither of a noisy frame, nor where views of the object are usually explained as little."""
+    usual = {"unexplained": Usual(mean=np.log(4.1), std=0.3)}
+    lenient = Calibration(seed=1, views=8, recognizing=Recognizing(clean=usual, noisy=usual))
+    for share, needed, calibration in ((0.45, 0.75, lenient), (0.7, 0.75, None), (0.94, 0.95, lenient)):
+        fit = replace(registration, explained=share, needed=needed)
+        assert recognize(fit, calibration).known is True  # by its signs alone
+        said = recognize(replace(fit, accepted=False), calibration)
+        assert said.known == "unsure" and "% of the points " in str(said.reason)
+
+
 def test_an_elastic_solid_is_near_its_states_and_never_in_one(registration: Registration) -> None:
     solid = replace(registration, model=replace(registration.model, is_normal=True))
     for share, known, of_solid in ((0.95, "unsure", True), (0.8, False, "unsure"), (0.5, False, False)):

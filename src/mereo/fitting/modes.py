@@ -237,7 +237,7 @@ def states_like_network(problem: Problem, count: int) -> list[Posed]:
         return []
     few = np.arange(0, len(network.target), max(1, len(network.target) // FEWER))
     library = library[:: max(1, len(library) // SEARCHED)]
-    motion = library @ network.modes[few].reshape(-1, library.shape[1]).T
+    motion = library @ network.modes[few].reshape(3 * len(few), library.shape[1]).T
     states = network.mean[few].astype(np.float32) + motion.reshape(len(library), -1, 3)
     target, weight = network.target[few].astype(np.float32), network.confidence[few].astype(np.float32)
     cost, rotation, translation = robust_poses(states, target, weight, problem.network_sigma)
@@ -289,8 +289,8 @@ def of_rest(problem: Problem, correspondences: Correspondences) -> Problem:
 
 
 def is_at_rest(problem: Problem, modes: ScoredFit, rest: ScoredFit) -> bool:
-    """Whether the evidence of the rest model is greater than that of the modes."""
-    return rest.misfit.total - modes.misfit.total < narrowing(problem, modes.posed)
+    """Whether the evidence of the rest model is greater than that of the modes; a rigid object is always at rest."""
+    return problem.model.count == 0 or rest.misfit.total - modes.misfit.total < narrowing(problem, modes.posed)
 
 
 def narrowing(problem: Problem, modes: Posed) -> float:

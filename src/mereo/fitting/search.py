@@ -139,7 +139,7 @@ class ShapeTables:
     @classmethod
     def of(cls, model: StatisticalModel, z: Float32[np.ndarray, "q k"], surface: SampledSurface) -> "ShapeTables":
         """Tables of states with the coefficients ``z``."""
-        flat = z @ surface.modes.reshape(-1, model.count).T
+        flat = z @ surface.modes.reshape(surface.mean.size, model.count).T
         frame = surface.mean + flat.reshape(len(z), *surface.mean.shape)
         position = np.ascontiguousarray(frame[:, :, 0])
         normal = cross(frame[:, :, 1].reshape(-1, 3), frame[:, :, 2].reshape(-1, 3))
@@ -156,8 +156,8 @@ class ShapeTables:
 
 def medoids(model: StatisticalModel, count: int) -> Int[np.ndarray, " q"]:
     """Rows of the library's states that stand for all of them: those nearest to the centres of so many clusters."""
-    if count >= len(model.library):
-        return np.arange(len(model.library))
+    if count >= len(model.library) or model.count == 0:  # the states of a rigid object are all the same
+        return np.arange(len(model.library) if model.count else 1)
     shape = (model.library * model.motion).astype(np.float64)
     center, owner = kmeans2(shape, count, minit="++", rng=0)
     sizes = np.bincount(owner, minlength=count)
@@ -370,7 +370,10 @@ def _moved(poses: Poses, matrix: Float[np.ndarray, "n 7 7"], gradient: Float[np.
 
 
 class SearchRound(NamedTuple):
-    """Round of the search: medoids of the library (0: the mean state), rotations of each, bent and fitted at most."""
+    """Round of the search: medoids of the library (0: the mean state), rotations of each, bent and fitted at most.
+
+    Where there are fewer medoids, as of a rigid object, each has more rotations.
+    """
 
     states: int
     rotations: int
@@ -571,7 +574,7 @@ def screen_poses(problem: Problem, stage: SearchRound) -> list[Posed]:
     """Choose diverse poses from which bending goes on."""
     tables = tables_of(problem.model, stage.states)
     screen = Screen.of(tables, problem.evidence, problem.model.half, problem.is_scale_open)
-    poses = screen.starts(rotations(stage.rotations))
+    poses = screen.starts(rotations(stage.rotations * max(stage.states, 1) // len(tables.z)))
     for sigma, share in SIGMAS:
         poses = screen.scored(poses, sigma, moves=True)
         count = max(round(share * len(poses)), 2 * stage.bent)

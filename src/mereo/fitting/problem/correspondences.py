@@ -102,6 +102,10 @@ def find_correspondences(
     return everything.rows(labels > 0)
 
 
+class NoFit(ValueError):
+    """Frame to which no model can be fitted, for a reason that its sender can mend."""
+
+
 # --- length of a scene unit -------------------------------------------------------------------------------------------
 
 UNIT_TOLERANCE = 0.15
@@ -122,7 +126,7 @@ def estimate_unit(correspondences: Correspondences) -> float:
     seen = np.linalg.norm(correspondences.points[first] - correspondences.points[second], axis=1)
     usable = (correspondences.labels[first] == correspondences.labels[second]) & (rest > np.median(rest[rest > 0]) / 4)
     if not usable.any():
-        raise ValueError(
+        raise NoFit(
             f"the network finds only {len(correspondences.labels)} points of the object, too few to tell its size: "
             "name the unit with scene_unit, or isolate the object first"
         )

@@ -102,7 +102,7 @@ def positions(
     model: StatisticalModel, corners: Int[np.ndarray, "s c"], z: Float32[np.ndarray, "n k"]
 ) -> Float[np.ndarray, "n s c 3"]:
     """Positions of the corners in states."""
-    motion = z @ model.modes[corners.ravel()].reshape(-1, model.count).T
+    motion = z @ model.modes[corners.ravel()].reshape(3 * corners.size, model.count).T
     return model.mean[corners] + motion.reshape(len(z), *corners.shape, 3).astype(np.float64)
 
 

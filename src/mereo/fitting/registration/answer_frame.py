@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from mereo.fitting.config import FitConfig, LocatedBy
 from mereo.fitting.modes import fit_rest, is_at_rest
-from mereo.fitting.problem.correspondences import nothing
+from mereo.fitting.problem.correspondences import NoFit, nothing
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.problem import GivenPose, Problem
@@ -81,7 +81,7 @@ def answer_frame(
         candidate = replace(candidate, modes=replace(candidate.modes, calibration=model.calibration))
     if candidate.error is not None and model is None:
         raise candidate.error
-    modes = None if registrar is None else candidate.modes
+    modes = candidate.modes
     answer = answer_of(seen, model, registrar, candidate, likelier, None if modes is None else modes.registration)
     # of what is no view of the object, the parameters of its scene say nothing, and take longest
     if registrar is not None and modes is not None and (registrar.method == "full" or answer.recognition.known):
@@ -107,18 +107,18 @@ def answer_of(
     calibration = None if model is None else model.calibration
     unseen = None if registration is None or seen.lines.other_lines is not None else candidate.unseen(registration)
     recognition = recognize(registration, calibration, displaced, stated, refusal, unseen)
-    if recognition.known is True and candidate.is_featureless:
+    if recognition.known is not False and candidate.is_featureless:
         recognition = replace(recognition, known="unsure", reason=FEATURELESS)
     taken = registrar is not None and registration is not None and registrar.takes(registration)
-    hypothesis = candidate.hypothesis if taken else likelier.reading
+    used = candidate.encoded if taken else likelier
     if taken and registrar is not None and registration is not None:
         seen = in_registered_unit(seen, registrar, registration, recognition)
     return Answer(
-        seen=seen.read_as(hypothesis),
+        seen=seen.read_as(used.reading),
         model=model,
         registrar=registrar,
-        hypothesis=hypothesis,
-        T_camera_input=candidate.encoded.T_camera_input if taken else likelier.T_camera_input,
+        hypothesis=used.reading,
+        T_camera_input=used.T_camera_input,
         candidate=candidate,
         registration=registration,
         taken=taken,
@@ -256,7 +256,7 @@ def fit_hypotheses(
     def fit(encoded: EncodedFrame) -> Candidate:
         try:
             modes = registrar.fit_modes(cloud_to_fit(encoded, seen.lines, scene_unit, is_certain), encoded.code)
-        except ValueError as error:
+        except NoFit as error:
             return Candidate(encoded, error=error)
         return Candidate(encoded, modes)
 
@@ -309,7 +309,7 @@ def _searched(frame: EncodedFrame, registrar: Registrar, scene_unit: float | Non
         if seen.initial_pose is not None and scene_unit is not None:
             start = initial_state(frame.T_camera_input @ seen.initial_pose, model, scene_unit)
         modes = search_modes(cloud_to_fit(frame, seen.lines, scene_unit), model, registrar.config, start)
-    except ValueError as error:
+    except NoFit as error:
         return Candidate(frame, error=error, located_by=by)
     return Candidate(frame, modes, located_by=by)
 
@@ -331,13 +331,13 @@ def cloud_to_fit(
 
 
 def check_size(frame: EncodedFrame, model: StatisticalModel, scene_unit: float | None) -> None:
-    """Raise ``ValueError`` for a cloud that is no view of an object of this size, where the size is known."""
+    """Raise ``NoFit`` for a cloud that is no view of an object of this size, where the size is known."""
     if scene_unit is None:
         return
     seen, whole = float(np.ptp(frame.points, axis=0).max()), 2 * model.half * scene_unit
     if SMALLEST <= seen / whole <= LARGEST:
         return
-    raise ValueError(
+    raise NoFit(
         f"what was seen is {seen:.3g} long in the frame's unit and the object {whole:.3g}, a factor of "
         f"{max(seen / whole, whole / seen):.3g}; a view shows from {SMALLEST:.0%} to {LARGEST:.0%} of it: correct the "
         "unit of the frame (--unit-m 0.001 for millimetres, --depth-scale for images) or that of the object's files "

@@ -187,7 +187,7 @@ def recognize(
     refusal: str | None = None,
     unseen: float | None = None,
 ) -> Recognition:
-    """Whether a frame shows the object, in a state that was learned.
+    """Whether a frame shows the object, in a state that was learned; never true of a fit that is not accepted.
 
     Args:
         registration: of the object's model to the frame; None where none was found or none was wanted.
@@ -204,9 +204,11 @@ def recognize(
     signs = Signs.of(registration, displaced, stated_scene_unit, unseen)
     each = signs.strange(usual.noisy if is_noisy(registration) else usual.clean)
     total = strangeness(each)
-    if total <= UNSURE:
+    is_usual = total <= UNSURE
+    if is_usual and registration.accepted:
         return Recognition(True, None, total, signs, calibrated is not None)
-    reason = _reason(max(each, key=lambda name: each[name]), registration, signs)
+    sign = "unexplained" if is_usual else max(each, key=lambda name: each[name])
+    reason = _reason(sign, registration, signs)
     return Recognition(False if total >= REFUSED else "unsure", reason, total, signs, calibrated is not None)
 
 

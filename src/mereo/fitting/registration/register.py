@@ -26,7 +26,7 @@ from mereo.fitting.modes import (
     refit_noisy,
 )
 from mereo.fitting.modes import narrowing as modes_narrowing
-from mereo.fitting.problem.correspondences import Correspondences, agree, estimate_unit, find_correspondences
+from mereo.fitting.problem.correspondences import Correspondences, NoFit, agree, estimate_unit, find_correspondences
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, OPEN_SCALE_STD, Problem
@@ -261,11 +261,11 @@ def fit_frame(
         config: constants.
         code: of the cloud, where it is known already.
 
-    Raises ``ValueError`` for a network without rest coordinates or of other segments, and where it finds too little.
+    Raises ``NoFit`` for a network without rest coordinates or of other segments, and where it finds too little.
     """
     started = time.perf_counter()
     if network.names != model.rest.names:
-        raise ValueError(
+        raise NoFit(
             f"the weights know the segments {', '.join(network.names)} but the statistical model has "
             f"{', '.join(model.rest.names)}; they must be of one object: build the model from the weights' own scene"
         )
@@ -287,7 +287,7 @@ def predict_correspondences(network: Trained, model: StatisticalModel, code: Enc
     """Predict correspondences of a cloud with the network, and return an even subset."""
     correspondences = find_correspondences(network, code, model.rest_center, model.half)
     if correspondences is None:
-        raise ValueError(
+        raise NoFit(
             "the weights predict no rest coordinates, from which a fit starts; train with a dataset that has a template"
         )
     return correspondences.evenly()
@@ -421,7 +421,7 @@ class Registrar:
         return 1.0 if registration.unit_known and abs(unit_m - 1.0) < 1e-6 else unit_m
 
     def fit_modes(self, cloud: CloudToFit, code: EncodedCloud | None = None) -> ModesFit:
-        """Fit of the modes from the network, with ``fit_frame``'s arguments; raises ``ValueError`` as that does."""
+        """Fit of the modes from the network, with ``fit_frame``'s arguments; raises ``NoFit`` as that does."""
         assert self.network is not None
         return fit_frame(cloud, self.network, self.model, self.config, code)
 
@@ -444,15 +444,21 @@ class Registrar:
     def states_or_none(self) -> DrawnStates | None:
         """Random states of the scene, among which a fit of its draws starts; they take seconds once.
 
-        None without a scene, for an elastic solid, whose modes are its draws, for more than ``MOST_DRAWS`` draws, and
-        where the scene's mesh cannot be had: the weights carry all that the modes need. With "full" that raises
-        ``AssetUnavailable``.
+        None without a scene, for a rigid object, for an elastic solid, whose modes are its draws, for more than
+        ``MOST_DRAWS`` draws, and where the scene's mesh cannot be had: the weights carry all that the modes need. With
+        "full" that raises ``AssetUnavailable``.
         """
+        model = self.model
         try:
-            if self.scene is None or self.model.is_normal or len(Drawn.of(self.scene, STATES_SEED).z) > MOST_DRAWS:
+            if (
+                self.scene is None
+                or model.is_normal
+                or not model.count
+                or len(Drawn.of(self.scene, STATES_SEED).z) > MOST_DRAWS
+            ):
                 return None
             with stage("simulate random states of the scene, once for an object"):
-                return DrawnStates.of(self.scene, self.model)
+                return DrawnStates.of(self.scene, model)
         except AssetUnavailable:
             if self.method != "full":
                 return None
