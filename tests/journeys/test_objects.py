@@ -338,7 +338,7 @@ def test_a_rigid_object_is_placed_exactly_by_every_way(moves: str, folder: Path,
     rigid = angle_that(moves, folder, tmp_path / "angle.yaml")
     assert rigid.model is not None and rigid.model.count == 0
     points, true = view_of(rigid, 0)
-    methods: tuple[AnswerMethod, ...] = ("auto", "modes", "full") if moves == "rigid" else ("full",)
+    methods: tuple[AnswerMethod, ...] = ("auto", "full") if moves == "rigid" else ("full",)
     answers = [mereo.reconstruct(points, rigid, method, resolution=24, unit_m=1.0) for method in methods]
     answers.append(mereo.reconstruct(points, rigid, resolution=24, unit_m=1.0, initial_pose=answers[0].pose))
     tracker = mereo.Tracker(rigid)
@@ -363,5 +363,6 @@ def test_what_explains_half_of_the_points_is_not_believed(folder: Path, tmp_path
     """The object, and the same cloud 1.35 times as far away behind it: neither unit nor place is certain."""
     rigid = angle_that("rigid", folder, tmp_path / "angle.yaml")
     points, _ = view_of(rigid, 1)
-    answer = mereo.reconstruct(np.concatenate([points, 1.35 * points]), rigid, resolution=24)
+    with pytest.warns(ClustersWarning):
+        answer = mereo.reconstruct(np.concatenate([points, 1.35 * points]), rigid, resolution=24)
     assert answer.registration is not None and not answer.registration.accepted and answer.known is not True
