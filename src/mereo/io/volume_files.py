@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Shaped
@@ -18,6 +18,7 @@ from skimage.measure import marching_cubes
 
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.transforms import transform_points
+from mereo.io.config import Space
 from mereo.io.errors import quiet, readable
 from mereo.io.extras import library
 from mereo.io.readers import in_memory
@@ -67,6 +68,13 @@ class Volume:
     def holds(self, index: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Whether indices with fractions lie in a voxel."""
         return np.all((index >= -0.5) & (index <= np.array(self.values.shape) - 0.5), axis=1)
+
+    def tissue_share(self, points: Float[np.ndarray, "n 3"]) -> float:
+        """Share of points that lie in voxels above the mean: in tissue, and not in air or empty space."""
+        index = np.rint(self.index_of(points)).astype(np.int64)
+        held = np.all((index >= 0) & (index < self.values.shape), axis=1)
+        values = self.values[tuple(index[held].T)].astype(np.float64)
+        return float((np.sign(self.slope) * (values - self.values.mean()) > 0).sum() / len(points))
 
 
 def is_volume(path: Path) -> bool:
@@ -120,12 +128,35 @@ def _check_sides(sizes: Iterable[Any]) -> None:
         raise ValueError(f"its header states the size {' x '.join(map(str, sides))}")
 
 
+ANATOMICAL = re.compile("(r|l)(?:ight|eft)?-?(a|p)(?:nterior|osterior)?-?(s|i)(?:uperior|nferior)?(?:-?t(?:ime)?)?")
+"""Name of an anatomical frame in NRRD files, in small letters; its groups are the letters of the axes."""
+
+
+def file_space(path: Path) -> Space | None:
+    """Anatomical frame that positions of a mesh or a volume are in as they are read; None where its file names none.
+
+    3D Slicer states it in the header of an STL file and in comments of PLY and OBJ files: ``SPACE=LPS``. NIfTI is RAS,
+    and an NRRD file that names its space comes out in RAS. Raises ``ValueError`` for a mesh in another space.
+    """
+    if not path.is_file() or not (path.suffix.lower() in (".stl", ".ply", ".obj") or is_volume(path)):
+        return None
+    with path.open("rb") as file:
+        head = file.read(4096).decode("latin-1")
+    if path.suffix.lower() == ".nrrd":
+        space = re.search(r"^space: *(\S+)", head, re.MULTILINE)
+        return "RAS" if space is not None and ANATOMICAL.fullmatch(space[1].lower()) else None
+    if is_volume(path):
+        return "RAS"
+    space = re.search(r"\bSPACE=([LRAPIS]{3})\b", head)
+    if space is not None and space[1] not in get_args(Space):
+        raise ValueError(f"{path} is in the space {space[1]}; a mesh is in LPS or RAS: export it in one of them")
+    return None if space is None else "LPS" if space[1] == "LPS" else "RAS"
+
+
 def _to_ras(space: str) -> Float[np.ndarray, "4 4"]:
     """Transform to RAS from an anatomical frame, such as left-posterior-superior or LPS; others stay as they are."""
-    words = space.lower().split("-") if "-" in space else list(space.lower())
-    negative = ("left", "posterior", "inferior", "l", "p", "i")
-    signs = [-1.0 if word in negative else 1.0 for word in words[:3]]
-    return np.diag([*signs, *[1.0] * (4 - len(signs))])
+    axes = ANATOMICAL.fullmatch(space.lower())
+    return np.diag([*(-1.0 if axis in "lpi" else 1.0 for axis in ("ras" if axes is None else axes.groups())), 1.0])
 
 
 def read_scalar_volume(path: Path) -> Volume:
