@@ -81,7 +81,8 @@ def files_of(path: Path) -> list[Path]:
 
 def names_of_shapes(file: SceneFile) -> list[str]:
     """Paths of the meshes or volumes of the segments, as the scene file has them."""
-    names = (*(part.file for part in file.segments or ()), file.model, file.labels)
+    labels = [file.labels] if isinstance(file.labels, str) else file.labels or []
+    names = (*(part.file for part in file.segments or ()), file.model, *labels)
     return [name for name in names if name is not None]
 
 
@@ -250,7 +251,8 @@ def read_segments(document: Document, file: SceneFile) -> SegmentedMesh:
         return _assembled(document, "parts", file.parts, _from_model(document, file.parts, model))
     assert file.labels is not None and file.names is not None, "the schema asks for both"
     with document.named_at(("labels",)):
-        return segment_surfaces(read_label_volume(folder / file.labels), file.names, file.cells)
+        volume = read_label_volume(*(folder / name for name in names_of_shapes(file)))
+        return segment_surfaces(volume, file.names, file.cells)
 
 
 def _read(document: Document, place: Sequence[int | str], path: Path) -> SegmentedMesh:
