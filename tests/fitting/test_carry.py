@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from toy_scene import Lift, Shear, toy_scene
 
 from mereo import __main__ as command_line
+from mereo.api.words import python_words
 from mereo.deformation.maps import Deformation
 from mereo.fitting.registration import carry as carrying
 from mereo.fitting.registration.carry import CarriedVolume, Placed, carry, local_rotations, place, resampled
@@ -26,6 +27,7 @@ from mereo.io.attachments import (
     Attachment,
     PoseTable,
     Positions,
+    SpaceWarning,
     Surfaces,
     read_attachments,
     read_pose_table,
@@ -38,7 +40,7 @@ from mereo.models.model import Model
 from mereo.models.weights import load_model, save_model
 from mereo.scenes.random_states import scene_model, state_points
 from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import State
+from mereo.scenes.scene import SourceFrame, State
 from mereo.scenes.statistical_model import StatisticalModel, pack_model, unpack_model
 from mereo.synthesis.sample_views import load_view
 
@@ -199,6 +201,73 @@ def test_the_frame_survives_weights_and_older_ones_have_none(tmp_path: Path) -> 
     assert read.source_frame.unit_m == 0.25 and read.source_frame.scale == pytest.approx(2.0)
     tensors, facts = pack_model(model)
     assert unpack_model(tensors, {key: value for key, value in facts.items() if key != "frame"}).source_frame is None
+
+
+HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""Between RAS and LPS."""
+
+
+def in_patient(registrar: Registrar, space: str | None) -> tuple[Registrar, np.ndarray]:
+    """The object, whose own files lie far from the middle of a patient, and points inside it in their frame."""
+    frame = SourceFrame(rigid(np.eye(3), np.array([-150.0, 40, 0])), 0.001, space)  # type: ignore[arg-type]
+    model = replace(registrar.model, source_frame=frame)
+    return replace(registrar, model=model), model.nodes - frame.T_scene_source[:3, 3]
+
+
+@pytest.mark.parametrize("other, space", [("LPS", "RAS"), ("RAS", "LPS")])
+def test_what_names_the_other_space_is_turned(registrar: Registrar, other: str, space: str) -> None:
+    mine, points = in_patient(registrar, space)
+    turns = Rotation.random(len(points), rng=np.random.default_rng(0)).as_matrix()
+    half = HALF_TURN[:3, :3]
+    matrix = HALF_TURN @ rigid(np.eye(3), points.min(axis=0))
+    volume = Volume(np.ones((40, 30, 30), np.uint8), matrix)
+    turned = [
+        Attachment("t.csv", table(points @ half, half @ turns), other),  # type: ignore[arg-type]
+        Attachment("ct.nii", volume, other),  # type: ignore[arg-type]
+    ]
+    straight = [Attachment("t.csv", table(points, turns)), Attachment("t.csv", table(points, turns), space)]  # type: ignore[arg-type]
+    for frame in ("source", space):
+        (poses, ct), plain = place(turned, mine, frame), place(straight, mine, frame)  # type: ignore[arg-type]
+        for each in (poses, *plain):
+            np.testing.assert_allclose(each.content.points, mine.model.nodes, atol=1e-9)
+            np.testing.assert_allclose(each.content.rotations, turns, atol=1e-9)
+        np.testing.assert_allclose(ct.content.bounds[0], mine.model.nodes.min(axis=0) - 0.5)
+        assert poses.note == ct.note == f" (turned from {other} to {space})" and {each.note for each in plain} == {""}
+    still = registered(mine.model, mine.model.rest_points)
+    assert carry(poses, still).description.startswith(f"carried t.csv (turned from {other} to {space}): 600 points, ")
+    assert carry(ct, still).description.startswith(f"carried ct.nii (turned from {other} to {space}): ")
+    with pytest.raises(ValueError, match=f"--carry-frame is {other}, but the object's own files name {space}: leave"):
+        place(turned, mine, other)  # type: ignore[arg-type]
+
+
+def test_a_space_that_no_file_names_is_stated_or_refused_where_the_other_fits(registrar: Registrar) -> None:
+    mine, points = in_patient(registrar, None)
+    matrix, body = rigid(np.eye(3), np.array([-250.0, -150, -60])), np.zeros((100, 60, 40), np.int16)
+    index = np.stack(np.meshgrid(*map(np.arange, body.shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    matrix[:3, :3] *= 5
+    source = mine.model.source_frame.T_scene_source
+    body.reshape(-1)[Solids(mine.model.rest).label(transform_points(source @ matrix, index.astype(float))) > 0] = 1000
+    ct = Attachment("ct.nii", Volume(body - 1000, matrix), "RAS")
+    with pytest.warns(
+        SpaceWarning, match="^ct.nii is in RAS, and the object's own files are taken to be in it too, for"
+    ):
+        (taken,) = place([ct], mine)
+    np.testing.assert_array_equal(taken.content.T_world_index, source @ matrix)
+    plan = Attachment("plan.csv", table(points))
+    assert place([plan, replace(ct, content=replace(ct.content), space=None)], mine)[0].note == ""
+    wrong = [
+        Attachment("plan.csv", table(points @ HALF_TURN[:3, :3])),
+        replace(ct, content=replace(ct.content, T_world_index=HALF_TURN @ matrix)),
+    ]
+    for each in wrong:
+        with pytest.raises(
+            ValueError, match="does not fit the object, and would with x and y negated, .*--carry-frame"
+        ):
+            place([each], mine)
+    (stated,) = place(wrong[1:], mine, "LPS")
+    np.testing.assert_allclose(stated.content.T_world_index, source @ matrix)
+    with pytest.raises(ValueError, match='with files="RAS" or files="LPS", or export both'), python_words():
+        place(wrong[1:], mine)
 
 
 nibabel = pytest.importorskip("nibabel")
@@ -440,6 +509,7 @@ def run(folder: Path, files: tuple[str, ...], *options: str, cloud: str = "cloud
 
 def test_the_command_carries_in_the_frame_and_unit_of_its_other_files(folder: Path) -> None:
     options = ["--method", "modes", "--unit-m", "0.01", "--millimetres", "--formats", "ply", "glb", "json"]
+    options += ["--carry-frame", "RAS"]  # as ct.nrrd comes out
     files, out = ("own.ply", "own.glb", "grasp.csv", "ct.nrrd"), folder / "out"
     assert run(folder, files, *options) == 0
     summary = json.loads((out / "summary.json").read_text())

@@ -1,5 +1,6 @@
 """Label volumes: surfaces where the voxels are, in millimetres of the patient, closed, smooth, and in contact."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,14 @@ from shapes import ball, box
 from shapes import segment as segment_of
 
 from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
+from mereo.geometry.mesh_check import overlaps
 from mereo.geometry.solids import Solids
 from mereo.geometry.subdivision import split_at_creases
 from mereo.io.mesh_formats import read_segmented_mesh
-from mereo.io.volume_files import is_volume, read_label_volume, segment_surfaces
+from mereo.io.volume_files import LabelWarning, is_volume, read_label_volume, segment_surfaces
 from mereo.io.writers.glb import write_segments_glb
+from mereo.scenes.files.object_files import scene_of_meshes, shapes_in
+from mereo.scenes.files.template import write_scene_file
 from mereo.scenes.registry import load_scene
 
 nrrd = pytest.importorskip("nrrd")
@@ -83,7 +87,7 @@ def test_wrong_volumes_are_explained(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no labels; they must be whole numbers"):
         read_label_volume(tmp_path / "b.nii")
     nrrd.write(str(tmp_path / "c.nrrd"), np.zeros((2, 4, 4, 4), np.uint8))
-    with pytest.raises(ValueError, match="has 4 dimensions; a label volume has 3"):
+    with pytest.raises(ValueError, match="has 4 dimensions; a label volume has 3, or the layers of a segmentation of"):
         read_label_volume(tmp_path / "c.nrrd")
     with pytest.raises(FileNotFoundError, match="none.nii does not exist"):
         read_label_volume(tmp_path / "none.nii")
@@ -101,6 +105,140 @@ def test_a_scene_from_a_label_volume(tmp_path: Path) -> None:
     path.write_text("name: organs\nunits: mm\nlabels: ct.nii.gz\nnames: {1: liver, 5: spleen}\n")
     with pytest.raises(ValueError, match=r"organs.yaml:3: the volume has no voxel of 'spleen'"):
         load_scene(path)
+
+
+def sphere(center: tuple[float, ...], radius: float) -> np.ndarray:
+    """Voxels of a ball on a grid of 60 x 60 x 40, which are 1 x 1 x 1.5 mm."""
+    axes = [np.arange(n) * s for n, s in zip((60, 60, 40), GRID, strict=True)]
+    return np.linalg.norm(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1) - center, axis=-1) < radius
+
+
+GRID = np.array([1.0, 1.0, 1.5])
+
+PARTS = {"liver": sphere((30, 30, 30), 20), "tumor": sphere((24, 30, 30), 6), "kidney": sphere((47, 30, 30), 8)}
+"""The tumour lies in the liver, and of the kidney a part."""
+
+
+def write_layers(path: Path, layers: list[np.ndarray], fields: dict[str, object]) -> Path:
+    """A segmentation as 3D Slicer writes it, with the layers as first axis."""
+    header = {"space": "left-posterior-superior", "kinds": ["list", "domain", "domain", "domain"]}
+    directions = np.vstack([np.full(3, np.nan), np.diag(GRID * [-1, -1, 1])])
+    nrrd.write(str(path), np.stack(layers).astype(np.uint8), {**header, "space directions": directions, **fields})
+    return path
+
+
+def check_parts(mesh: SegmentedMesh) -> None:
+    """The segments of ``PARTS``: the smaller one has what two share, unless it is nested."""
+    mesh.check()
+    check_overlap(mesh)
+    assert overlaps(mesh) == () and mesh.nested == (("tumor", "liver"),) and mesh.names.index("tumor") == 0
+    apart = {**PARTS, "liver": PARTS["liver"] & ~PARTS["kidney"]}
+    for segment in mesh.segments:
+        assert segment.volume == pytest.approx(apart[segment.name].sum() * GRID.prod(), rel=0.04)
+    assert mesh.owned_volumes.sum() == pytest.approx(np.any([*PARTS.values()], axis=0).sum() * GRID.prod(), rel=0.02)
+
+
+def test_layers_of_a_segmentation_keep_names_and_colours_and_what_lies_inside_is_nested(tmp_path: Path) -> None:
+    fields = {
+        "Segment0_Name": "tumor",
+        "Segment0_LabelValue": 1,
+        "Segment0_Layer": 1,
+        "Segment0_Color": "1 0 0.5",
+        "Segment1_Name": "liver",
+        "Segment1_LabelValue": 1,
+        "Segment1_Layer": 0,  # each layer counts by itself
+        "Segment2_Name": "kidney",
+        "Segment2_LabelValue": 4,
+        "Segment2_Layer": 1,
+    }
+    layers = [PARTS["liver"], PARTS["tumor"] + 4 * PARTS["kidney"]]
+    volume = read_label_volume(write_layers(tmp_path / "a.seg.nrrd", layers, fields))
+    assert volume.values == (1, 2, 3) and volume.names == {1: "tumor", 2: "liver", 3: "kidney"}
+    mesh = segment_surfaces(volume, volume.names, 48)
+    check_parts(mesh)
+    assert mesh.colors[0] == (255, 0, 128)
+    alone = segment_surfaces(volume, {2: "liver"}, 48).segments[0]  # what is left out takes nothing
+    assert alone.volume == pytest.approx(PARTS["liver"].sum() * GRID.prod(), rel=0.02)
+    names = {f"Segment{number}_Name": name for number, name in enumerate(PARTS)}  # of older versions: a layer each
+    check_parts(
+        segment_surfaces(
+            read_label_volume(write_layers(tmp_path / "b.nrrd", [*PARTS.values()], names)),
+            {1: "liver", 2: "tumor", 3: "kidney"},
+            48,
+        )
+    )
+    scene = load_scene(write_scene_file([tmp_path / "a.seg.nrrd"], tmp_path / "a.yaml", report=(said := []).append))
+    assert scene.rest.nested == (("tumor", "liver"),) and "nested: tumor in liver" in said and scene.space == "RAS"
+    for change, message in (
+        ({"Segment0_Layer": 5}, "a.seg.nrrd has 2 layers, and 'tumor' in layer 5: save it again"),
+        ({"Segment2_LabelValue": 3}, r"a.seg.nrrd has \d+ voxels of no segment that its header lists: save it"),
+        ({"Segment2_LabelValue": "x"}, "a.seg.nrrd cannot be read as a label volume .invalid literal"),
+    ):
+        write_layers(tmp_path / "a.seg.nrrd", layers, {**fields, **change})
+        with pytest.raises(ValueError, match=message):
+            read_label_volume(tmp_path / "a.seg.nrrd")
+
+
+def write_parts(folder: Path, **changes: np.ndarray) -> list[Path]:
+    folder.mkdir(exist_ok=True)
+    for name, mask in {**PARTS, **changes}.items():
+        image = nibabel.Nifti1Image(mask.astype(np.uint8), np.diag([*GRID, 1.0]))
+        nibabel.save(image, folder / f"{name}.nii.gz")
+    return sorted(folder.iterdir())
+
+
+def test_one_volume_for_each_segment_is_one_object(tmp_path: Path) -> None:
+    files = write_parts(tmp_path / "ct")
+    volume = read_label_volume(*files)
+    assert volume.labels.shape == (2, 60, 60, 40) and volume.names == {1: "kidney", 2: "liver", 3: "tumor"}
+    check_parts(segment_surfaces(volume, volume.names, 48))
+    (tmp_path / "ct/frame.ply").write_bytes(trimesh.PointCloud(np.eye(3)).export(file_type="ply"))
+    assert shapes_in(tmp_path / "ct") == files
+    scene = scene_of_meshes(files)
+    assert scene.rest.names == ("tumor", "kidney", "liver") and scene.rest.nested == (("tumor", "liver"),)
+    empty = write_parts(tmp_path / "more", heart=np.zeros((60, 60, 40), bool))
+    with pytest.warns(LabelWarning, match="1 of 4 label volumes hold only empty space and are left out: heart.nii.gz"):
+        assert read_label_volume(*empty).names == {2: "kidney", 3: "liver", 4: "tumor"}
+    for changes, message in (
+        ({"liver": 2 * PARTS["liver"] + PARTS["tumor"]}, "liver.nii.gz holds the values 1?,? ?2, 3; of several label"),
+        ({"tumor": PARTS["tumor"][1:]}, "tumor.nii.gz has 59 x 60 x 40 voxels .* share one grid: resample them to it"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read_label_volume(*write_parts(tmp_path / "wrong", **changes))
+
+
+@pytest.mark.parametrize("cells", [40, 64, 128])
+def test_thin_segments_keep_their_volume_in_thick_slices(cells: int, tmp_path: Path) -> None:
+    """A vein of 9 mm along x in a liver, and slices of 5 mm: a smoothing by the slices would leave nothing of it."""
+    labels = np.zeros((120, 80, 20), dtype=np.uint8)
+    x, y, z = np.meshgrid(*(np.arange(n) * s for n, s in zip(labels.shape, (1, 1, 5), strict=True)), indexing="ij")
+    labels[((x - 60) / 55) ** 2 + ((y - 40) / 38) ** 2 + ((z - 47) / 45) ** 2 < 1] = 1
+    labels[((y - 40) ** 2 + (z - 47) ** 2 < 4.5**2) & (abs(x - 60) < 45)] = 2
+    nibabel.save(nibabel.Nifti1Image(labels, np.diag([1.0, 1.0, 5.0, 1.0])), tmp_path / "ct.nii")
+    mesh = segment_surfaces(read_label_volume(tmp_path / "ct.nii"), {1: "liver", 2: "vein"}, cells)
+    mesh.check()
+    check_overlap(mesh)
+    for label, segment in enumerate(mesh.segments, start=1):
+        assert segment.volume == pytest.approx(5 * (labels == label).sum(), rel=0.05)
+    low, high = mesh.segments[1].bounds
+    np.testing.assert_allclose([low[0], high[0]], [15, 105], atol=2.5)
+
+
+def test_what_is_lost_is_reported_and_what_is_too_thin_can_be_left_out(tmp_path: Path) -> None:
+    labels = np.zeros((100, 100, 40), dtype=np.int64)
+    labels[5:95, 5:95, 5:20], labels[10:90, 10:90, 30], labels[50, 50, 25] = 1, 2, 3
+    file = write_nifti(tmp_path / "ct.nii.gz", labels)
+    with pytest.warns(LabelWarning, match=r"^segment 'sheet' keeps 8\d% of its volume on a grid of 20 cells: raise"):
+        segment_surfaces(read_label_volume(file), {1: "block", 2: "sheet"}, 20)
+    path = write_scene_file([file], tmp_path / "ct.yaml", report=(said := []).append)
+    assert any(
+        re.match("segment 'label_3' would keep 0% of its volume on a grid of 192 cells; it must", s) for s in said
+    )
+    assert "  # 3: label_3" in path.read_text() and load_scene(path).rest.names == ("label_1", "label_2")
+    with pytest.raises(
+        ValueError, match=f"'label_3' would keep 0% .*: let `mereo scene new {file} --output .* without it"
+    ):
+        scene_of_meshes([file])
 
 
 BOX, BALL = box((-0.5, -1.0, -1.5), (0.5, 1.0, 1.5)), ball((4.0, 0.0, 0.0), 1.0, color=1, level=3)

@@ -10,7 +10,11 @@ from shapes import ball, box
 
 from mereo.geometry.subdivision import split_long_edges
 from mereo.io.attachments import Positions, Surfaces, read_attachments, read_pose_table, write_attachment
+from mereo.io.volume_files import file_space
 from mereo.io.writers.glb import viewer_rotation
+from mereo.scenes.files.template import write_scene_file
+from mereo.scenes.registry import load_scene
+from mereo.scenes.scene import SourceFrame
 
 POINTS = np.random.default_rng(0).normal(size=(20, 3))
 
@@ -108,6 +112,37 @@ def test_files_that_cannot_be_carried_say_why(tmp_path: Path) -> None:
     np.save(tmp_path / "nan.npy", np.full((4, 3), np.nan))
     with pytest.raises(ValueError, match="has no positions, or NaN or infinite ones"):
         read_attachments([tmp_path / "nan.npy"])
+
+
+def test_files_name_their_anatomical_space(tmp_path: Path) -> None:
+    """As 3D Slicer does: in the header of binary and the first line of plain STL files, in comments of PLY and OBJ."""
+    stl = ball((3.0, 1.0, 2.0), 1.5, level=1)
+    plain = trimesh.Trimesh(stl.vertices, stl.faces)
+    binary, ply = plain.export(file_type="stl"), plain.export(file_type="ply")
+    files = {
+        "a.stl": (b"3D Slicer output. SPACE=LPS".ljust(80, b"\0") + binary[80:], "LPS"),
+        "b.stl": (plain.export(file_type="stl_ascii").replace("solid", "solid Slicer SPACE=RAS", 1).encode(), "RAS"),
+        "c.ply": (ply.replace(b"comment", b"comment 3D Slicer output. SPACE=LPS\ncomment", 1), "LPS"),
+        "d.obj": (b"# 3D Slicer output. SPACE=LPS\n" + plain.export(file_type="obj").encode(), "LPS"),
+        "e.stl": (binary, None),
+        "f.nii": (b"\0" * 400, "RAS"),
+        "g.nrrd": (b"NRRD0004\nspace: left-posterior-superior\n\n", "RAS"),
+        "h.nrrd": (b"NRRD0004\nspace: 3D-left-handed\n\n", None),
+        "i.csv": (b"x,y,z\n1,2,3\n", None),
+    }
+    for name, (content, space) in files.items():
+        (tmp_path / name).write_bytes(content)
+        assert file_space(tmp_path / name) == space, name
+    found = read_attachments([tmp_path / name for name in files if name[0] in "abcdei"])
+    assert [each.space for each in found] == ["LPS", "RAS", "LPS", "LPS", None, None]
+    (tmp_path / "a.stl").write_bytes(b"SPACE=LAS".ljust(80) + binary[80:])
+    with pytest.raises(ValueError, match=r"a.stl is in the space LAS; a mesh is in LPS or RAS: export it in one"):
+        file_space(tmp_path / "a.stl")
+    scene = load_scene(write_scene_file([tmp_path / "d.obj"], tmp_path / "d.yaml"))
+    assert scene.space == scene.source_frame.space == "LPS"
+    assert SourceFrame.of_facts(scene.source_frame.facts()).space == "LPS"
+    with pytest.raises(ValueError, match=r"d.obj is in LPS and .*b.stl in RAS, by what they state; the files of an"):
+        load_scene(write_scene_file([tmp_path / "d.obj", tmp_path / "b.stl"], tmp_path / "two.yaml"))
 
 
 def test_splitting_long_edges_keeps_the_surface() -> None:

@@ -281,7 +281,12 @@ def test_nothing_is_overwritten_and_bad_input_is_explained(tmp_path: Path) -> No
         ([], None, ValueError, "no mesh is given"),
         ([file, same], tmp_path / "b.yaml", ValueError, "two files are called 'a'"),
         ([tmp_path / "none.stl"], tmp_path / "b.yaml", FileNotFoundError, "none.stl does not exist"),
-        ([file, tmp_path / "ct.nii"], tmp_path / "b.yaml", ValueError, "a label volume among them"),
+        (
+            [file, tmp_path / "ct.nii"],
+            tmp_path / "b.yaml",
+            ValueError,
+            "ct.nii is a label volume and .*a.ply is none; an object",
+        ),
         ([strange], tmp_path / "b.yaml", ValueError, "has a name that is not UTF-8; .*: rename it"),
     ):
         with pytest.raises(error, match=message):

@@ -171,7 +171,8 @@ class Result(Answer):
             what: points (whatever ``load_frame`` takes of points), which come back as an array [n, 3]; a mesh of
                 trimesh, ``Segment`` or ``SegmentedMesh``, which comes back as its kind, with edges short enough to
                 bend; or the path of a file as of ``--carry``, a volume included, which comes back as a ``CarriedFile``.
-            files: frame and unit of it: "source" is that of the object's own files, "scene" that of its scene.
+            files: frame and unit of it: "source" is that of the object's own files, "scene" that of its scene; "RAS"
+                and "LPS" state the space of the object's own files, where these do not name it.
 
         Raises ``ValueError`` where the answer is the network's, where the frame of the object's files is not known, and
         for what lies too far from the object to belong to it.

@@ -7,6 +7,7 @@ from contextvars import ContextVar
 from typing import get_args
 
 from mereo.fitting.config import AnswerMethod
+from mereo.io.config import CarryFrame
 
 SPEAKS_OPTIONS: ContextVar[bool] = ContextVar("SPEAKS_OPTIONS", default=False)
 """Whether this is the command line, whose words are options."""
@@ -18,6 +19,7 @@ ARGUMENTS = {
     "--extent": "isolation=IsolationConfig(extent=...)",
     "--frame": "axes",
     "--carry-frame": "files",
+    **{f"--carry-frame {name}": f'files="{name}"' for name in get_args(CarryFrame)},
     "--carry": "carry",
     **{f"--method {name}": f'method="{name}"' for name in get_args(AnswerMethod)},
     "--box": "isolation=IsolationConfig(box=...)",

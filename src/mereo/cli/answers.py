@@ -55,7 +55,8 @@ class ReconstructCommand:
         carry: file to bring to where the object is, its inside included; once for each: mesh (STL, PLY, OBJ, GLB),
             points (PLY, XYZ, NPY), CSV (x, y, z; qx, qy, qz, qw for poses) or volume (NIfTI, NRRD), which is
             resampled around the object.
-        carry_frame: frame and unit of these files: source is that of the object's own files, scene that of its scene.
+        carry_frame: frame and unit of these files: source is that of the object's own files, scene that of its scene;
+            RAS and LPS state the space of the object's own files, where these do not name it.
         force: replace an existing output folder that mereo wrote, and nothing else is in.
         threads: of torch and all else that computes; 0 means one per core.
         ray: answer each of several frames in a task of a Ray cluster: local, one of so many --threads for this run;

@@ -6,20 +6,23 @@ are read whole, moved with the object, and written in their own format again.
 
 import csv
 import io
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.atomic_files import atomic_file
+from mereo.io.config import CarryFrame, Space
 from mereo.io.errors import check_suffix, readable
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.readers import check_ply, read_points
-from mereo.io.volume_files import VOLUME_SUFFIXES, Volume, is_volume, read_scalar_volume
+from mereo.io.volume_files import VOLUME_SUFFIXES, Volume, file_space, is_volume, read_scalar_volume
 from mereo.io.writers.glb import write_segments_glb
 from mereo.io.writers.meshes import write_positions_ply, write_segments_obj, write_segments_ply, write_surface_stl
 from mereo.io.writers.volumes import write_volume
@@ -108,10 +111,83 @@ Content = Placeable | Volume
 
 @dataclass(frozen=True, eq=False)
 class Attachment:
-    """File that belongs to an object's rest model: its name without the folder, and what it holds, in any frame."""
+    """File that belongs to an object's rest model: its name without the folder, and what it holds, in any frame.
+
+    ``space`` is the anatomical frame that the file names, if any, and ``note`` says what was done about it.
+    """
 
     name: str
     content: Content
+    space: Space | None = None
+    note: str = ""
+
+
+class SpaceWarning(UserWarning):
+    """Warning that one of two files names its anatomical frame, and the other is taken to be in the same."""
+
+
+RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""Half a turn about the third axis, which is its inverse."""
+
+NEAR, FARTHER, SHARE, MORE = 0.15, 3.0, 0.6, 0.3
+"""Distance from an object, in its longest sides, that is no sign of another frame, and how many times nearer a point
+then lies in the other one; share of an object in a volume's tissue that is no sign either, and how much more is one."""
+
+
+def turned_attachment(
+    attachment: Attachment, frame: CarryFrame, named: Space | None, inside: Float[np.ndarray, "n 3"]
+) -> Attachment:
+    """Attachment in the space of an object's own files, turned where it names the other one.
+
+    Args:
+        attachment: in the frame of those files, or in the space that it names.
+        frame: a space states that of those files, and of an attachment that names none.
+        named: space that those files name themselves.
+        inside: points spread inside the object, in the frame of its files.
+
+    Where one of the two spaces is not known, they are taken to be the same, with a ``SpaceWarning`` where the other is.
+    Raises ``ValueError`` where the attachment would then fit far better turned, and for two spaces of the object.
+    """
+    stated = frame if frame == "RAS" or frame == "LPS" else None
+    if stated is not None and named not in (None, stated):
+        raise ValueError(
+            f"--carry-frame is {stated}, but the object's own files name {named}: leave it out, or export them again"
+        )
+    space, given, name = stated or named, attachment.space or stated, attachment.name
+    if space is not None and space == given:
+        return attachment
+    content = attachment.content
+    if isinstance(content, Volume):
+        turned: Content = replace(content, T_world_index=RAS_FROM_LPS @ content.T_world_index)
+    else:
+        turn = RAS_FROM_LPS[:3, :3]
+        turned = content.at(content.points @ turn, None if content.rotations is None else turn @ content.rotations)
+    if space is not None and given is not None:
+        return replace(attachment, content=turned, space=space, note=f" (turned from {given} to {space})")
+    if _fits_better(turned, content, inside):
+        raise ValueError(
+            f"{name} does not fit the object, and would with x and y negated, as between RAS and LPS: state the space "
+            "of the object's own files with --carry-frame RAS or --carry-frame LPS, or export both in one"
+        )
+    if given is not None:
+        warnings.warn(
+            f"{name} is in {given}, and the object's own files are taken to be in it too, for they name no space; "
+            "state theirs with --carry-frame RAS or --carry-frame LPS",
+            SpaceWarning,
+            stacklevel=2,
+        )
+    return attachment
+
+
+def _fits_better(turned: Content, content: Content, inside: Float[np.ndarray, "n 3"]) -> bool:
+    """Whether content fits an object far better when it is turned."""
+    if isinstance(turned, Volume) and isinstance(content, Volume):
+        share = content.tissue_share(inside)
+        return share < SHARE and turned.tissue_share(inside) > share + MORE
+    assert not isinstance(turned, Volume) and not isinstance(content, Volume)
+    tree, size = cKDTree(inside), float(np.ptp(inside, axis=0).max())
+    away, other = (float(np.median(tree.query(each.points)[0])) for each in (content, turned))
+    return away > NEAR * size and away > FARTHER * other
 
 
 def read_attachments(paths: Sequence[str | Path]) -> tuple[Attachment, ...]:
@@ -122,7 +198,7 @@ def read_attachments(paths: Sequence[str | Path]) -> tuple[Attachment, ...]:
         raise ValueError(
             f"two files to carry are called {repeated[0]!r}; results have the names of their files: rename one"
         )
-    return tuple(Attachment(file.name, _read(file)) for file in files)
+    return tuple(Attachment(file.name, _read(file), file_space(file)) for file in files)
 
 
 def _read(path: Path) -> Content:

@@ -28,8 +28,12 @@ class FilesConfig:
     millimetres: bool = False
 
 
-CarryFrame = Literal["source", "scene"]
-"""Frame and unit of files that are carried: those of the object's own files, or scene units."""
+Space = Literal["RAS", "LPS"]
+"""Anatomical frame: x to the patient's right, y to the front, z to the head; or x to the left, y to the back."""
+
+CarryFrame = Literal["source", "scene", "RAS", "LPS"]
+"""Frame and unit of files that are carried: those of the object's own files, which may be said to lie in RAS or LPS, or
+scene units."""
 
 DEFAULT_FILES = FilesConfig()
 

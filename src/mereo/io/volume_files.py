@@ -6,19 +6,22 @@ space they stay as they are.
 """
 
 import re
-from collections.abc import Iterable, Mapping
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, Shaped
+from jaxtyping import Bool, Float, Float32, Int, Integer, Shaped
 from scipy.ndimage import gaussian_filter
 from skimage.measure import marching_cubes
 
-from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
 from mereo.geometry.transforms import transform_points
-from mereo.io.errors import quiet, readable
+from mereo.io.config import Space
+from mereo.io.errors import limited_memory, quiet, readable
 from mereo.io.extras import library
 from mereo.io.readers import in_memory
 
@@ -67,6 +70,13 @@ class Volume:
     def holds(self, index: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Whether indices with fractions lie in a voxel."""
         return np.all((index >= -0.5) & (index <= np.array(self.values.shape) - 0.5), axis=1)
+
+    def tissue_share(self, points: Float[np.ndarray, "n 3"]) -> float:
+        """Share of points that lie in voxels above the mean: in tissue, and not in air or empty space."""
+        index = np.rint(self.index_of(points)).astype(np.int64)
+        held = np.all((index >= 0) & (index < self.values.shape), axis=1)
+        values = self.values[tuple(index[held].T)].astype(np.float64)
+        return float((np.sign(self.slope) * (values - self.values.mean()) > 0).sum() / len(points))
 
 
 def is_volume(path: Path) -> bool:
@@ -120,12 +130,35 @@ def _check_sides(sizes: Iterable[Any]) -> None:
         raise ValueError(f"its header states the size {' x '.join(map(str, sides))}")
 
 
+ANATOMICAL = re.compile("(r|l)(?:ight|eft)?-?(a|p)(?:nterior|osterior)?-?(s|i)(?:uperior|nferior)?(?:-?t(?:ime)?)?")
+"""Name of an anatomical frame in NRRD files, in small letters; its groups are the letters of the axes."""
+
+
+def file_space(path: Path) -> Space | None:
+    """Anatomical frame that positions of a mesh or a volume are in as they are read; None where its file names none.
+
+    3D Slicer states it in the header of an STL file and in comments of PLY and OBJ files: ``SPACE=LPS``. NIfTI is RAS,
+    and an NRRD file that names its space comes out in RAS. Raises ``ValueError`` for a mesh in another space.
+    """
+    if not path.is_file() or not (path.suffix.lower() in (".stl", ".ply", ".obj") or is_volume(path)):
+        return None
+    with path.open("rb") as file:
+        head = file.read(4096).decode("latin-1")
+    if path.suffix.lower() == ".nrrd":
+        space = re.search(r"^space: *(\S+)", head, re.MULTILINE)
+        return "RAS" if space is not None and ANATOMICAL.fullmatch(space[1].lower()) else None
+    if is_volume(path):
+        return "RAS"
+    space = re.search(r"\bSPACE=([LRAPIS]{3})\b", head)
+    if space is not None and space[1] not in get_args(Space):
+        raise ValueError(f"{path} is in the space {space[1]}; a mesh is in LPS or RAS: export it in one of them")
+    return None if space is None else "LPS" if space[1] == "LPS" else "RAS"
+
+
 def _to_ras(space: str) -> Float[np.ndarray, "4 4"]:
     """Transform to RAS from an anatomical frame, such as left-posterior-superior or LPS; others stay as they are."""
-    words = space.lower().split("-") if "-" in space else list(space.lower())
-    negative = ("left", "posterior", "inferior", "l", "p", "i")
-    signs = [-1.0 if word in negative else 1.0 for word in words[:3]]
-    return np.diag([*signs, *[1.0] * (4 - len(signs))])
+    axes = ANATOMICAL.fullmatch(space.lower())
+    return np.diag([*(-1.0 if axis in "lpi" else 1.0 for axis in ("ras" if axes is None else axes.groups())), 1.0])
 
 
 def read_scalar_volume(path: Path) -> Volume:
@@ -173,32 +206,166 @@ def is_labels(volume: Volume) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class LabelVolume:
-    """Voxel labels, 0 in empty space, with their place (see ``Volume``), and the names of values that the file has."""
+    """Voxel labels with their place (see ``Volume``), and what their file says of them.
 
-    labels: Int[np.ndarray, "x y z"]
+    Attributes:
+        labels: 0 in empty space; in several layers where segments overlap, which then have other labels.
+        T_world_index: from voxel indices to positions.
+        names, colors: of labels, where the file has them.
+    """
+
+    labels: Integer[np.ndarray, "l x y z"]
     T_world_index: Float[np.ndarray, "4 4"]
     names: Mapping[int, str]
+    colors: Mapping[int, Color] = field(default_factory=dict)
+
+    @cached_property
+    def values(self) -> tuple[int, ...]:
+        """Labels above 0 that occur."""
+        slices = (part for layer in self.labels for part in np.moveaxis(layer, 2, 0) if part.any())
+        return tuple(sorted({int(value) for part in slices for value in np.unique(part)} - {0}))
+
+    @property
+    def box(self) -> tuple[slice, slice, slice]:
+        """Part of a layer around all that is set, which must be something."""
+        ends = []
+        for axis in (1, 2, 3):
+            rows = np.flatnonzero(self.labels.any(axis=tuple({0, 1, 2, 3} - {axis})))
+            ends.append(slice(int(rows[0]), int(rows[-1]) + 1))
+        x, y, z = ends
+        return x, y, z
 
 
-def read_label_volume(path: Path) -> LabelVolume:
-    """Label volume of three dimensions of whole numbers from 0 up; raises as ``read_volume``."""
+class LabelWarning(UserWarning):
+    """Warning that surfaces are not all that a label volume holds."""
+
+
+def read_label_volume(*paths: Path) -> LabelVolume:
+    """Label volume of whole numbers from 0 up; raises as ``read_volume``.
+
+    A segmentation of 3D Slicer (``.seg.nrrd``) may have several layers, whose segments overlap. Several files are those
+    of one segment each on one grid, as automatic segmentation of CT writes them: labels count from 1 in their order,
+    names are those of the files, and empty ones are left out with a ``LabelWarning``.
+    """
+    if len(paths) > 1:
+        return _joined_labels(paths)
+    (path,) = paths
     if path.exists() and not is_volume(path):
         raise ValueError(f"{path} is no label volume; its name must end in {', '.join(VOLUME_SUFFIXES)}: convert it")
     volume = read_volume(path, "label volume")
-    values = volume.values
-    if values.ndim != 3:
-        raise ValueError(f"{path} has {values.ndim} dimensions; a label volume has 3: export one label map, not layers")
-    with quiet():  # what becomes of NaN and of numbers beyond all is not what it was
-        if (volume.slope, volume.intercept) != (1.0, 0.0):
-            values = volume.slope * values + volume.intercept
-        labels = np.rint(values).astype(np.int64)
-    if not (np.array_equal(labels, values) and labels.min(initial=0) >= 0):
+    with limited_memory(path):
+        return _labels(path, volume)
+
+
+def _labels(path: Path, volume: Volume) -> LabelVolume:
+    with readable(path, "label volume"):
+        values, segments = volume.values, _slicer_segments(volume)
+    if values.ndim != 3 and not (values.ndim == 4 and segments):
+        raise ValueError(
+            f"{path} has {values.ndim} dimensions; a label volume has 3, or the layers of a segmentation of 3D Slicer: "
+            "export one label map"
+        )
+    if values.dtype.kind == "f" or (volume.slope, volume.intercept) != (1.0, 0.0):
+        with quiet():  # what becomes of NaN and of numbers beyond all is not what it was
+            stored = volume.slope * values + volume.intercept
+            values = np.rint(stored).astype(np.int32)
+            is_whole = np.array_equal(values, stored)
+    else:
+        is_whole = True
+    if not is_whole or values.min(initial=0) < 0:
         raise ValueError(f"{path} holds values that are no labels; they must be whole numbers from 0: threshold it")
-    fields, names = segment_fields(volume.header), dict[int, str]()
-    for key, value in fields.items():
-        if match := re.fullmatch(r"Segment(\d+)_LabelValue", key):
-            names[int(value)] = fields.get(f"Segment{match[1]}_Name", f"label_{value}")
-    return LabelVolume(labels, volume.T_world_index, names)
+    if values.ndim == 4:
+        values = _renumbered(path, values, segments)
+        segments = [segment._replace(value=number) for number, segment in enumerate(segments, start=1)]
+    names = {segment.value: segment.name for segment in segments}
+    colors = {segment.value: segment.color for segment in segments if segment.color is not None}
+    return LabelVolume(values if values.ndim == 4 else values[None], volume.T_world_index, names, colors)
+
+
+class _SlicerSegment(NamedTuple):
+    """Segment of a segmentation of 3D Slicer: the voxels of a value in a layer."""
+
+    name: str
+    layer: int
+    value: int
+    color: Color | None
+
+
+def _slicer_segments(volume: Volume) -> list[_SlicerSegment]:
+    """Segments that the header of a segmentation lists; older ones have a layer each."""
+    fields = segment_fields(volume.header)
+    numbers = sorted({int(match[1]) for key in fields if (match := re.match(r"Segment(\d+)_", key))})
+    segments = []
+    for number in numbers:
+        part = {key.partition("_")[2]: text for key, text in fields.items() if key.startswith(f"Segment{number}_")}
+        value, layer = int(part.get("LabelValue", 1)), int(part.get("Layer", number))
+        shades = [round(255 * float(shade)) for shade in part.get("Color", "").split()]
+        color = (shades[0], shades[1], shades[2]) if len(shades) == 3 else None
+        segments.append(_SlicerSegment(part.get("Name", f"label_{value}"), layer, value, color))
+    return segments
+
+
+def _renumbered(
+    path: Path, layers: Integer[np.ndarray, "l x y z"], segments: Sequence[_SlicerSegment]
+) -> Integer[np.ndarray, "l x y z"]:
+    """Layers in which each segment has its number, from 1 up, as its label: files use a label once for each layer."""
+    result = np.zeros(layers.shape, dtype=np.int16)
+    for number, segment in enumerate(segments, start=1):
+        if not 0 <= segment.layer < len(layers):
+            raise ValueError(
+                f"{path} has {len(layers)} layers, and {segment.name!r} in layer {segment.layer}: save it again"
+            )
+        result[segment.layer][layers[segment.layer] == segment.value] = number
+    if lost := int(((layers > 0) & (result == 0)).sum()):
+        raise ValueError(f"{path} has {lost} voxels of no segment that its header lists: save it again with 3D Slicer")
+    return result
+
+
+def _joined_labels(paths: Sequence[Path]) -> LabelVolume:
+    """Label volume of files with a segment each."""
+    layers, names, empty = list[np.ndarray](), dict[int, str](), list[str]()
+    for number, path in enumerate(paths, start=1):
+        volume = read_label_volume(path)
+        if len(volume.values) > 1:
+            raise ValueError(
+                f"{path} holds the values {', '.join(map(str, volume.values))}; of several label volumes each has one "
+                "segment: name it alone, or write a file for each segment"
+            )
+        if number == 1:
+            first = volume
+        _check_same_grid(paths[0], first, path, volume)
+        if not volume.values:
+            empty.append(path.name)
+            continue
+        names[number] = volume_stem(path)
+        mask = volume.labels[0] > 0
+        free = (layer for layer in layers if not layer[mask].any())
+        if (layer := next(free, None)) is None:
+            layers.append(layer := np.zeros(mask.shape, dtype=np.int16))
+        layer[mask] = number
+    if empty:
+        text = f"{len(empty)} of {len(paths)} label volumes hold only empty space and are left out: {', '.join(empty)}"
+        warnings.warn(text, LabelWarning, stacklevel=4)
+    return LabelVolume(np.stack(layers or [first.labels[0].astype(np.int16)]), first.T_world_index, names)
+
+
+def volume_stem(path: Path) -> str:
+    """Name of a volume's file without its suffix."""
+    return re.sub(r"(\.seg)?(\.nii|\.nii\.gz|\.nrrd)$", "", path.name, flags=re.IGNORECASE)
+
+
+def _check_same_grid(path: Path, volume: LabelVolume, other_path: Path, other: LabelVolume) -> None:
+    shift = np.abs(volume.T_world_index - other.T_world_index).max()
+    if volume.labels.shape[1:] == other.labels.shape[1:] and shift < 0.01 * np.abs(volume.T_world_index[:3, :3]).max():
+        return
+    (shape, start), (other_shape, other_start) = (
+        (" x ".join(map(str, each.labels.shape[1:])), each.T_world_index[:3, 3].round(2).tolist())
+        for each in (volume, other)
+    )
+    raise ValueError(
+        f"{other_path} has {other_shape} voxels from {other_start} on, and {path} {shape} from {start}, or axes that "
+        "differ; the segments of one object share one grid: resample them to it"
+    )
 
 
 # --- surfaces of labels: closed, smoothed, neighbours in contact ------------------------------------------------------
@@ -209,90 +376,195 @@ SMOOTHING = 0.8
 MARGIN = 4
 """Empty cells around the object: a segment at the border of the volume is closed there."""
 
-LEAST_VOLUME = 0.6
-"""Share of its volume that a segment keeps at least; what keeps less is too thin for the grid."""
+LEAST_VOLUME, WHOLE = 0.6, 0.95
+"""Share of its volume that a segment keeps at least; what keeps less is too thin for the grid. And the share from which
+nothing is reported as lost."""
+
+LEAST_LEVEL, HALVINGS = 0.1, 6
+"""Share of a cell at which the surface of a thin segment lies at least (that of others lies at a half), and how often
+the interval between the two is halved."""
 
 LEAST_MARGIN = 1e-3
 """Least distance of a margin from zero: a tie between two segments at a node would make faces without area there."""
+
+NESTED = 0.95
+"""Share of a segment's voxels in another one from which it is nested in it."""
+
+
+class ThinSegmentError(ValueError):
+    """Refusal of the segment ``name``, which is too thin for a grid."""
+
+    name = ""
 
 
 def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) -> SegmentedMesh:
     """Closed surface of each named label, smoothed, in the volume's world coordinates.
 
     Labels become shares of the cells of a coarser grid, each smoothed by a Gaussian. The object is where they add up to
-    more than a half, and in it a segment is where its share is the largest: so neighbours share one interface.
+    more than a half, and in it a segment is where its share is the largest: so neighbours share one interface. A
+    segment that would lose more than ``1 - WHOLE`` of its volume is smoothed less, by each side of a cell instead of
+    the longest, and its surface lies where its volume is kept, as far as ``LEAST_LEVEL`` allows.
 
-    Labels without a name count as empty space, and several may share one. ``cells`` are those of the grid along the
-    longest side, roughly: a cell is a whole number of voxels. Raises ``ValueError`` for a value that does not occur,
-    and for a segment too thin for the grid.
+    Labels without a name count as empty space, and several may share one. Where segments overlap, one that lies in
+    another by ``NESTED`` is nested in it, and comes first; else the smaller one has the voxels. ``cells`` are those of
+    the grid along the longest side, roughly: a cell is a whole number of voxels. A lost share is reported by a
+    ``LabelWarning``. Raises ``ValueError`` for a value that does not occur, and ``ThinSegmentError``.
     """
-    present = np.unique(volume.labels)
-    if missing := [value for value in names if value not in present]:
+    if missing := [value for value in names if value not in volume.values]:
         raise ValueError(
             f"the volume has no voxel of {names[missing[0]]!r}, value {missing[0]}; it holds the values "
-            f"{', '.join(map(str, present[present > 0]))}: correct `names`"
+            f"{', '.join(map(str, volume.values))}: correct `names`"
         )
-    segments = list(dict.fromkeys(names.values()))
-    masks = [np.isin(volume.labels, [value for value in names if names[value] == name]) for name in segments]
-    grid = _Grid.around(np.logical_or.reduce(masks), volume.T_world_index, cells)
-    shares = np.stack([grid.share(mask) for mask in masks])
-    filled = 2 * shares.sum(axis=0) - 1
-    owner = np.where(filled > 0, shares.argmax(axis=0), -1)
-    parts = []
-    for index, name in enumerate(segments):
-        others = np.delete(shares, index, axis=0).max(axis=0, initial=0)
-        sign = np.where(owner == index, np.float32(1), np.float32(-1))
-        margin = sign * np.minimum(filled, shares[index] - others)
-        part = grid.surface(sign * np.maximum(margin, LEAST_MARGIN), name, index)
-        true = float(masks[index].sum()) * abs(float(np.linalg.det(volume.T_world_index[:3, :3])))
-        if part is None or part.volume < LEAST_VOLUME * true:
-            raise ValueError(
-                f"segment {name!r} would keep {0 if part is None else part.volume / true:.0%} of its volume on a grid "
-                f"of {cells} cells; it must keep {LEAST_VOLUME:.0%}: raise `cells`, or leave this segment out"
+    layers, segments = volume.labels[(slice(None), *volume.box)], list(dict.fromkeys(names.values()))
+    labels = [[value for value in names if names[value] == name] for name in segments]
+    masks = [np.logical_or.reduce([(layers == value).any(axis=0) for value in group]) for group in labels]
+    parents = _part_masks(masks)
+    first = np.array([part.start for part in volume.box])
+    grid = _Grid.around(np.logical_or.reduce(masks), first, volume.T_world_index, cells)
+    margins = _margins(_in_partition([grid.share(mask) for mask in masks], parents), parents)
+    parts, cell = list[Segment](), abs(float(np.linalg.det(volume.T_world_index[:3, :3])))
+    for index, (name, margin) in enumerate(zip(segments, margins, strict=True)):
+        part = grid.surface(margin, name, volume.colors.get(labels[index][0], PALETTE[index % len(PALETTE)]))
+        kept = 0.0 if part is None else part.volume / (float(masks[index].sum()) * cell)
+        if part is None or kept < LEAST_VOLUME:
+            error = ThinSegmentError(
+                f"segment {name!r} would keep {kept:.0%} of its volume on a grid of {cells} cells; it must keep "
+                f"{LEAST_VOLUME:.0%}: raise `cells`, or leave this segment out"
             )
+            error.name = name
+            raise error
+        if kept < WHOLE:
+            text = f"segment {name!r} keeps {kept:.0%} of its volume on a grid of {cells} cells: raise `cells` for more"
+            warnings.warn(text, LabelWarning, stacklevel=2)
         parts.append(part)
-    return SegmentedMesh(tuple(parts))
+    depth = {index: len(_ancestors(index, parents)) for index in range(len(parts))}
+    nested = tuple((segments[i], segments[j]) for i, j in parents.items())
+    return SegmentedMesh(tuple(parts[index] for index in sorted(depth, key=lambda index: -depth[index])), nested)
+
+
+def _part_masks(masks: list[Bool[np.ndarray, "x y z"]]) -> dict[int, int]:
+    """Make masks that overlap nested or apart, in place; returns the smallest one around each that is nested."""
+    sizes = [int(mask.sum()) for mask in masks]
+    order, parents = sorted(range(len(masks)), key=lambda index: sizes[index]), dict[int, int]()
+    for place, small in enumerate(order):
+        for large in order[place + 1 :]:
+            shared = int((masks[small] & masks[large]).sum())
+            if shared >= NESTED * sizes[small]:
+                parents.setdefault(small, large)
+                masks[large] |= masks[small]
+            elif shared:
+                masks[large] &= ~masks[small]
+    return parents
+
+
+def _ancestors(index: int, parents: Mapping[int, int]) -> list[int]:
+    return [] if index not in parents else [parents[index], *_ancestors(parents[index], parents)]
+
+
+def _in_partition(
+    shares: Sequence[tuple[Float32[np.ndarray, "a b c"], float]], parents: Mapping[int, int]
+) -> list[Float32[np.ndarray, "a b c"]]:
+    """Shares that are a half at each segment's surface; what a thin one gains is taken from its siblings."""
+    bent = [_bent(share, level) for share, level in shares]
+    result = list(bent)
+    for index in (index for index, (_, level) in enumerate(shares) if level < 0.5):
+        siblings = [i for i in range(len(shares)) if i != index and parents.get(i) == parents.get(index)]
+        total = np.sum([bent[other] for other in siblings], axis=0)
+        left = np.minimum((1 - bent[index]) / np.maximum(total, np.float32(1e-6)), np.float32(1))
+        for other in siblings:
+            result[other] = result[other] * left
+    return result
+
+
+def _bent(share: Float32[np.ndarray, "a b c"], level: float) -> Float32[np.ndarray, "a b c"]:
+    """Share from 0 to 1 that is a half where it was ``level``."""
+    return share if level == 0.5 else np.interp(share, [0, level, 1], [0, 0.5, 1]).astype(np.float32)
+
+
+def _margins(
+    shares: Sequence[Float32[np.ndarray, "a b c"]], parents: Mapping[int, int]
+) -> list[Float32[np.ndarray, "a b c"]]:
+    """For each segment what is positive inside it, and 0 on its surface; siblings share interfaces."""
+    margins: dict[int | None, Float32[np.ndarray, "a b c"]] = {None: np.full(shares[0].shape, np.float32(np.inf))}
+    todo: list[int | None] = [None]
+    for parent in todo:
+        members = [index for index in range(len(shares)) if parents.get(index) == parent]
+        todo += [index for index in members if index in parents.values()]
+        group = np.stack([shares[index] for index in members])
+        filled = 2 * group.sum(axis=0) - 1
+        owner = np.where((filled > 0) & (margins[parent] > 0), group.argmax(axis=0), -1)
+        for place, index in enumerate(members):
+            others = np.delete(group, place, axis=0).max(axis=0, initial=0)
+            sign = np.where(owner == place, np.float32(1), np.float32(-1))
+            margin = np.minimum(np.minimum(filled, group[place] - others), margins[parent])
+            margins[index] = sign * np.maximum(sign * margin, LEAST_MARGIN)
+    return [margins[index] for index in range(len(shares))]
 
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """A coarser grid over part of a volume, from the voxel ``first`` on: ``counts`` cells of ``block`` voxels each."""
+    """A coarser grid over part of a volume, from the voxel ``first`` of ``part`` on: cells of ``block`` voxels each.
 
+    ``part`` is the first voxel of the part of the volume that masks show.
+    """
+
+    part: Int[np.ndarray, "3"]
     first: Int[np.ndarray, "3"]
     counts: Int[np.ndarray, "3"]
     block: Int[np.ndarray, "3"]
     T_world_index: Float[np.ndarray, "4 4"]
 
     @classmethod
-    def around(cls, mask: Bool[np.ndarray, "x y z"], transform: Float[np.ndarray, "4 4"], cells: int) -> "_Grid":
+    def around(
+        cls,
+        mask: Bool[np.ndarray, "x y z"],
+        part: Int[np.ndarray, "3"],
+        transform: Float[np.ndarray, "4 4"],
+        cells: int,
+    ) -> "_Grid":
         """Grid over all that is set, with about ``cells`` along the longest side; cells are whole numbers of voxels."""
         sides = [np.flatnonzero(mask.any(axis=tuple({0, 1, 2} - {axis}))) for axis in range(3)]
         first, end = np.array([side[0] for side in sides]), np.array([side[-1] + 1 for side in sides])
         voxel = np.linalg.norm(transform[:3, :3], axis=0)
         wanted = ((end - first) * voxel).max() / cells
         block = np.maximum(np.rint(wanted / voxel).astype(np.int64), 1)
-        return cls(first, -(-(end - first) // block), block, transform)
+        return cls(part, first, -(-(end - first) // block), block, transform)
 
-    def share(self, mask: Bool[np.ndarray, "x y z"]) -> Float32[np.ndarray, "a b c"]:
-        """Share of each cell that is set, smoothed, with ``MARGIN`` empty cells around."""
+    def share(self, mask: Bool[np.ndarray, "x y z"]) -> tuple[Float32[np.ndarray, "a b c"], float]:
+        """Share of each cell that is set, smoothed, with ``MARGIN`` empty cells around; and the one at the surface."""
         end = np.minimum(self.first + self.counts * self.block, mask.shape)
         part = mask[tuple(slice(a, b) for a, b in zip(self.first, end, strict=True))]
         part = np.pad(part, [(0, int(n)) for n in self.counts * self.block - part.shape])
         (a, b, c), (i, j, k) = self.counts, self.block
-        means = part.reshape(a, i, b, j, c, k).mean(axis=(1, 3, 5), dtype=np.float32)
+        means = np.pad(part.reshape(a, i, b, j, c, k).mean(axis=(1, 3, 5), dtype=np.float32), MARGIN)
         cell = self.block * np.linalg.norm(self.T_world_index[:3, :3], axis=0)
-        smooth: Float32[np.ndarray, "a b c"] = gaussian_filter(
-            np.pad(means, MARGIN), SMOOTHING * cell.max() / cell, mode="constant"
-        )
-        return smooth
+        smooth: Float32[np.ndarray, "a b c"] = gaussian_filter(means, SMOOTHING * cell.max() / cell, mode="constant")
+        whole = float(means.sum()) * float(np.prod(cell))
+        if self.enclosed(smooth) >= WHOLE * whole:
+            return smooth, 0.5
+        smooth = gaussian_filter(means, SMOOTHING, mode="constant")
+        low, high = LEAST_LEVEL, 0.5
+        for _ in range(HALVINGS):
+            middle = (low + high) / 2
+            low, high = (low, middle) if self.enclosed(_bent(smooth, middle)) < whole else (middle, high)
+        return smooth, high
 
-    def surface(self, margin: Float32[np.ndarray, "a b c"], name: str, number: int) -> Segment | None:
+    def enclosed(self, share: Float32[np.ndarray, "a b c"]) -> float:
+        """Volume of where a share is above a half."""
+        inside = np.argwhere(share > 0.5)
+        if len(inside) == 0:
+            return 0.0
+        box = tuple(slice(a - 1, b + 2) for a, b in zip(inside.min(axis=0), inside.max(axis=0), strict=True))
+        part = self.surface(share[box] - np.float32(0.5), "", PALETTE[0])
+        return 0.0 if part is None else part.volume
+
+    def surface(self, margin: Float32[np.ndarray, "a b c"], name: str, color: Color) -> Segment | None:
         """Surface where ``margin`` is 0, outward oriented, in world coordinates; None where it is nowhere positive."""
         if margin.max() <= 0:
             return None
         vertices, faces, _, _ = marching_cubes(margin, 0.0, gradient_direction="ascent")
-        index = (vertices - MARGIN + 0.5) * self.block - 0.5 + self.first
+        index = (vertices - MARGIN + 0.5) * self.block - 0.5 + (self.part + self.first)
         world = index @ self.T_world_index[:3, :3].T + self.T_world_index[:3, 3]
         # voxel axes may be left-handed
         turned = -1 if np.linalg.det(self.T_world_index[:3, :3]) < 0 else 1
-        return Segment(name, PALETTE[number % len(PALETTE)], world, faces[:, ::turned].astype(np.int64))
+        return Segment(name, color, world, faces[:, ::turned].astype(np.int64))

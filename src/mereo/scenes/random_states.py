@@ -281,6 +281,7 @@ def model_key(scene: Scene, count: int) -> str:
     """Digest of all that a scene's model is made from."""
     drawn = scene.for_seed(STATES_SEED)
     digest = hashlib.sha256(f"{VERSION} {count} {STATES_SEED} {NODES} {scene.unit_m} {scene.rest.nested}".encode())
+    digest.update((scene.space or "").encode())
     digest.update(np.ascontiguousarray(scene.T_scene_source).tobytes())
     for segment in drawn.rest.segments:
         digest.update(f"{segment.name} {segment.color} {segment.solid} {segment.faces.shape}".encode())

@@ -13,15 +13,20 @@ from mereo.geometry.brief import counted, listed
 from mereo.geometry.conventions import WorkspaceName
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import look_at, rotation_along
+from mereo.io.config import Space
 from mereo.scenes.seeds import TEST_SEED_START
 
 
 @dataclass(frozen=True, eq=False)
 class SourceFrame:
-    """Similarity from the frame of an object's own files, and metres per scene unit, None where they are not known."""
+    """Similarity from the frame of an object's own files, and metres per scene unit, None where they are not known.
+
+    ``space`` is the anatomical frame that the files name, if any.
+    """
 
     T_scene_source: Float[np.ndarray, "4 4"]
     unit_m: float | None
+    space: Space | None = None
 
     @property
     def scale(self) -> float:
@@ -30,12 +35,14 @@ class SourceFrame:
 
     def facts(self) -> dict[str, Any]:
         """Plain values for a file's header."""
-        return {"T_scene_source": self.T_scene_source.tolist(), "unit_m": self.unit_m}
+        return {"T_scene_source": self.T_scene_source.tolist(), "unit_m": self.unit_m, "space": self.space}
 
     @classmethod
     def of_facts(cls, facts: Mapping[str, Any] | None) -> "SourceFrame | None":
         """Inverse of ``facts``; None for files from before it was known."""
-        return None if facts is None else cls(np.asarray(facts["T_scene_source"], dtype=np.float64), facts["unit_m"])
+        if facts is None:
+            return None
+        return cls(np.asarray(facts["T_scene_source"], dtype=np.float64), facts["unit_m"], facts.get("space"))
 
 
 GUESSED_UNIT_M = 0.01
@@ -120,6 +127,7 @@ class Scene:
         unit_m: metres per scene unit; None where the object's true size is not known.
         T_scene_source: similarity from the frame and unit of the files that the object was read from to the scene's;
             the identity where it is defined in scene units.
+        space: anatomical frame of those files, where they name one.
         definition: what a scene from a file states, in a text that changes exactly when its meaning does. Empty for
             built-in scenes: the version of mereo stands for it.
         file: scene file that it was read from, as it was named; None for others.
@@ -136,6 +144,7 @@ class Scene:
     definition: str = ""
     cone: Workspace | None = None
     file: Path | None = None
+    space: Space | None = None
 
     def __post_init__(self) -> None:
         if self.held_out is not None and self.held_out.rest.names != self.rest.names:
@@ -152,7 +161,7 @@ class Scene:
     @property
     def source_frame(self) -> SourceFrame:
         """Frame of the object's own files."""
-        return SourceFrame(self.T_scene_source, self.unit_m)
+        return SourceFrame(self.T_scene_source, self.unit_m, self.space)
 
     def workspace_named(self, name: WorkspaceName) -> Workspace:
         """Workspace of the scene by name, at its own distances and with its own angle of view.

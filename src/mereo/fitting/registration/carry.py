@@ -17,7 +17,7 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids, label_grid
 from mereo.geometry.subdivision import split_long_edges
 from mereo.geometry.transforms import best_rotations, transform_points
-from mereo.io.attachments import Attachment, Content, Surfaces
+from mereo.io.attachments import Attachment, Content, Surfaces, turned_attachment
 from mereo.io.bounds import check_value
 from mereo.io.config import CarryFrame
 from mereo.io.volume_files import Volume, is_labels
@@ -36,12 +36,14 @@ class Placed:
         content: rest pose, scene units; surfaces with edges short enough to bend.
         shares: of each segment in the motion of each point; rows sum to one. A volume has no points.
         distance: of each point from the nearest segment, 0 inside; scene units.
+        note: on the space that it was turned from, for what is printed.
     """
 
     name: str
     content: Content
     shares: Float[np.ndarray, "n s"]
     distance: Float[np.ndarray, " n"]
+    note: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +62,7 @@ class Carried:
     content: Content
     inside: int
     farthest: float
+    note: str = ""
 
     @property
     def description(self) -> str:
@@ -67,7 +70,7 @@ class Carried:
         assert not isinstance(self.content, Volume)
         count = len(self.content.points)
         away = f"{count - self.inside} of them outside, up to {self.farthest:.4g} away"
-        return f"carried {self.name}: {count} points, {away if count > self.inside else 'all inside'}"
+        return f"carried {self.name}{self.note}: {count} points, {away if count > self.inside else 'all inside'}"
 
     def facts(self) -> dict[str, object]:
         """Facts for a result's summary."""
@@ -86,8 +89,8 @@ class CarriedVolume(Carried):
     """
 
     content: Volume
-    within: int
-    interpolation: Interpolation
+    within: int = 0
+    interpolation: Interpolation = "linear"
 
     @property
     def description(self) -> str:
@@ -96,7 +99,8 @@ class CarriedVolume(Carried):
         beyond = self.inside - self.within
         where = f", {beyond} of them beyond the file's" if beyond else ""
         apart = f"{self.content.spacing.min():.4g} apart"
-        return f"carried {self.name}: {sides} voxels {apart} ({self.interpolation}), {self.inside} inside{where}"
+        voxels = f"{sides} voxels {apart} ({self.interpolation})"
+        return f"carried {self.name}{self.note}: {voxels}, {self.inside} inside{where}"
 
     def facts(self) -> dict[str, object]:
         """Facts for a result's summary."""
@@ -117,14 +121,16 @@ def place(attachments: Sequence[Attachment], registrar: Registrar, frame: CarryF
     Args:
         attachments: in the frame and unit that ``frame`` names.
         registrar: of the object.
-        frame: "source" is that of the object's own files, "scene" that of its scene.
+        frame: "source" is that of the object's own files, "scene" that of its scene; "RAS" and "LPS" state the space of
+            the object's own files, where these do not name it.
 
-    Raises ``ValueError`` where the frame of the object's files is not known, and for an attachment that cannot belong
-    to the object: most of its points are farther from it than it is long, or none of its voxels is in it.
+    What names the other space is turned. Raises ``ValueError`` where the frame of the object's files is not known, and
+    for an attachment that cannot belong to the object: most of its points are farther from it than it is long, none of
+    its voxels is in it, or it would fit far better in the other space.
     """
     check_value("files", frame, CarryFrame, "source")
     T_scene_file = np.eye(4)
-    if frame == "source":
+    if frame != "scene":
         source = registrar.model.source_frame
         if source is None and registrar.given is not None:
             source = registrar.given.source_frame
@@ -135,6 +141,8 @@ def place(attachments: Sequence[Attachment], registrar: Registrar, frame: CarryF
                 "--carry-frame scene"
             )
         T_scene_file = source.T_scene_source
+        inside = transform_points(np.linalg.inv(T_scene_file), registrar.model.nodes)
+        attachments = [turned_attachment(each, frame, source.space, inside) for each in attachments]
     solids = Solids(registrar.model.rest)
     return tuple(_placed(attachment, T_scene_file, registrar.model, solids) for attachment in attachments)
 
@@ -146,7 +154,7 @@ def _placed(
     if isinstance(content, Volume):
         volume = replace(content, T_world_index=T_scene_file @ content.T_world_index)
         check_overlap(name, volume, T_scene_file, model, solids)
-        return Placed(name, volume, np.zeros((0, solids.count)), np.zeros(0))
+        return Placed(name, volume, np.zeros((0, solids.count)), np.zeros(0), attachment.note)
     turn = T_scene_file[:3, :3] / np.cbrt(np.linalg.det(T_scene_file[:3, :3]))  # orientations are not scaled
     rotations = None if content.rotations is None else turn @ content.rotations
     content = content.at(transform_points(T_scene_file, content.points), rotations)
@@ -165,7 +173,7 @@ def _placed(
         parts = tuple(replace(part, vertices=v, faces=f) for part, (v, f) in zip(parts, short, strict=True))
         content = Surfaces(SegmentedMesh(parts))
         shares, distance = _shares(solids, content.points)
-    return Placed(name, content, shares, distance)
+    return Placed(name, content, shares, distance, attachment.note)
 
 
 def check_overlap(
@@ -218,13 +226,14 @@ def carry(placed: Placed, registration: Registration) -> Carried:
     """
     content = placed.content
     if isinstance(content, Volume):
-        return resampled(content, registration, placed.name)
+        return replace(resampled(content, registration, placed.name), note=placed.note)
     points = moved(registration, content.points, placed.shares)
     rotations = None
     if content.rotations is not None:
         rotations = local_rotations(registration, content.points, placed.shares) @ content.rotations
     farthest = float(placed.distance.max()) * registration.scene_unit
-    return Carried(placed.name, content.at(points, rotations), int((placed.distance == 0).sum()), farthest)
+    inside = int((placed.distance == 0).sum())
+    return Carried(placed.name, content.at(points, rotations), inside, farthest, placed.note)
 
 
 def moved(
@@ -297,7 +306,7 @@ def resampled(source: Volume, registration: Registration, name: str = "", most: 
     transform = np.diag([*[fill.spacing] * 3, 1.0])
     transform[:3, 3] = fill.origin
     volume = replace(source, values=fill.values, T_world_index=transform)
-    return CarriedVolume(name, volume, int(inside.sum()), fill.margin, within, interpolation)
+    return CarriedVolume(name, volume, int(inside.sum()), fill.margin, within=within, interpolation=interpolation)
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,8 +22,10 @@ from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.mesh_check import examine, mesh_of, solid_of
 from mereo.geometry.subdivision import TooManyFaces, split_edges
 from mereo.geometry.transforms import Normalizer
+from mereo.io.config import Space
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.simulation_states import files_of_states, frame_files
+from mereo.io.volume_files import file_space, read_label_volume, segment_surfaces
 from mereo.io.yaml_document import Document, similar
 from mereo.scenes.files.deformation_blocks import (
     AnyDeformation,
@@ -70,12 +72,18 @@ def read(document: Document) -> SceneFile:
 def files_of(path: Path) -> list[Path]:
     """The scene file, the meshes or volume that it names, and its recorded states, whether they exist or not."""
     file = read(Document(path))
-    parts = [part.file for part in file.segments or ()]
-    named = [path.parent / name for name in (*parts, file.model, file.labels) if name is not None]
+    named = [path.parent / name for name in names_of_shapes(file)]
     if file.states is not None:
         states, mesh = _paths_of_states(path, file)
         named += [states, *files_of_states(states, mesh)]
     return [path, *named, *_volume_meshes(path, file)]
+
+
+def names_of_shapes(file: SceneFile) -> list[str]:
+    """Paths of the meshes or volumes of the segments, as the scene file has them."""
+    labels = [file.labels] if isinstance(file.labels, str) else file.labels or []
+    names = (*(part.file for part in file.segments or ()), file.model, *labels)
+    return [name for name in names if name is not None]
 
 
 def _volume_meshes(path: Path, file: SceneFile) -> list[Path]:
@@ -126,7 +134,21 @@ def build(document: Document, file: SceneFile, mesh: SegmentedMesh) -> Scene:
         key = f"{_content(rest)} {placement.matrix.tolist()} {definition}"
         rest = _kept(refined, _Keyed(key, (rest, motions)))
         scene = Scene(file.name, rest, replace(motions, rest=rest), workspace, file.source)
-    return replace(scene, unit_m=unit_m, T_scene_source=placement.matrix, definition=definition)
+    return replace(
+        scene, unit_m=unit_m, T_scene_source=placement.matrix, definition=definition, space=_space(document, file)
+    )
+
+
+def _space(document: Document, file: SceneFile) -> Space | None:
+    """Anatomical frame that the files of the segments name; ``ValueError`` where they name two."""
+    files = [document.path.parent / name for name in names_of_shapes(file)]
+    spaces = {space: path for path in files if (space := file_space(path)) is not None}
+    if len(spaces) > 1:
+        raise ValueError(
+            f"{spaces['LPS']} is in LPS and {spaces['RAS']} in RAS, by what they state; the files of an object share "
+            "one frame: export them in one space"
+        )
+    return next(iter(spaces), None)
 
 
 # --- what takes most of the time of loading a scene, which one command does several times ----------------------------
@@ -227,11 +249,10 @@ def read_segments(document: Document, file: SceneFile) -> SegmentedMesh:
         if file.parts is None:
             return model
         return _assembled(document, "parts", file.parts, _from_model(document, file.parts, model))
-    from mereo.io.volume_files import read_label_volume, segment_surfaces
-
     assert file.labels is not None and file.names is not None, "the schema asks for both"
     with document.named_at(("labels",)):
-        return segment_surfaces(read_label_volume(folder / file.labels), file.names, file.cells)
+        volume = read_label_volume(*(folder / name for name in names_of_shapes(file)))
+        return segment_surfaces(volume, file.names, file.cells)
 
 
 def _read(document: Document, place: Sequence[int | str], path: Path) -> SegmentedMesh:

@@ -575,8 +575,9 @@ class SceneFile(Block):
         source: where they come from, and their licence.
         segments: a mesh file for each.
         model, parts: one file of named parts, and which of them to take; all where ``parts`` is absent.
-        labels, names, cells: a label volume, which of its values are which segments, and the number of cells along the
-            longest side of the grid on which their surfaces are found.
+        labels, names, cells: a label volume, or a list of them with a segment each, whose values count from 1; which
+            values are which segments, and the number of cells along the longest side of the grid on which their
+            surfaces are found.
         size: length of the object's shortest side, in scene units.
         camera: its workspace.
         deformations: applied in this order; ``template.default_deformations`` where absent.
@@ -589,7 +590,7 @@ class SceneFile(Block):
     segments: Annotated[list[FilePart], Field(min_length=1)] | None = None
     model: str | None = None
     parts: Annotated[list[ModelPart], Field(min_length=1)] | None = None
-    labels: str | None = None
+    labels: str | Annotated[list[str], Field(min_length=2)] | None = None
     names: Annotated[dict[Annotated[int, Field(ge=1)], Name], Field(min_length=1)] | None = None
     cells: Annotated[int, Field(ge=16, le=400)] = 64
     size: Positive = 20.0

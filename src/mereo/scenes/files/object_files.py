@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 
 from mereo.geometry.mesh_check import examine
 from mereo.io.mesh_formats import MESH_SUFFIXES, read_segmented_mesh
+from mereo.io.readers import check_ply
 from mereo.io.volume_files import is_volume
 from mereo.scenes.files.build import MeshWarning
 from mereo.scenes.files.template import write_scene_file
@@ -25,8 +26,17 @@ SEARCH = "search.json"
 
 
 def shapes_in(folder: Path) -> list[Path]:
-    """Meshes and label volumes that lie in a folder, in the order of their names."""
-    return sorted(file for file in folder.glob("[!.]*") if file.suffix.lower() in MESH_SUFFIXES or is_volume(file))
+    """Meshes and label volumes that lie in a folder, in the order of their names; clouds are neither."""
+    files = (file for file in folder.glob("[!.]*") if file.suffix.lower() in MESH_SUFFIXES or is_volume(file))
+    return sorted(file for file in files if not _is_cloud(file))
+
+
+def _is_cloud(file: Path) -> bool:
+    """Whether a file is a PLY file without faces, such as a frame; a damaged one is for its reader to refuse."""
+    if file.suffix.lower() == ".ply" and file.is_file():
+        with suppress(ValueError):
+            return check_ply(file).get("face", 0) == 0
+    return False
 
 
 def names_scene(files: Sequence[Path]) -> bool:

@@ -7,7 +7,10 @@ lattices of cubes follow, one after the other, all scaled until the surface move
 
 import os
 import re
-from collections.abc import Callable, Sequence
+import shlex
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -27,7 +30,14 @@ from mereo.geometry.mesh_check import likely_unit
 from mereo.geometry.transforms import Normalizer, fit_rigid, inverse_rigid, transform_points
 from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.io.mesh_formats import read_segmented_mesh
-from mereo.io.volume_files import is_volume, read_label_volume, segment_surfaces
+from mereo.io.volume_files import (
+    LabelVolume,
+    LabelWarning,
+    ThinSegmentError,
+    is_volume,
+    read_label_volume,
+    segment_surfaces,
+)
 from mereo.scenes.files.deformation_blocks import (
     SOFT,
     STIFF,
@@ -284,13 +294,15 @@ def placed(mesh: SegmentedMesh, size: float) -> Normalizer:
 SIZE, LONGEST = 20.0, 80.0
 """Shortest side in scene units, as in the paper, unless the object is longer than ``LONGEST`` then."""
 
-LABEL_CELLS = 64
+LABEL_CELLS = (64, 96, 128, 192)
+"""Cells along the longest side of label volumes: the first number for which no segment is too thin."""
 
 
 class _Source(NamedTuple):
     """Segments of files in their unit, the lines that name them, and the likely unit and upward axis, with reasons.
 
-    ``assembly`` is whether the segments are parts, which may have joints, and not regions of one body.
+    ``assembly`` is whether the segments are parts, which may have joints, and not regions of one body; ``lost`` are
+    sentences about segments that are left out, ``notes`` about what others lose.
     """
 
     block: str
@@ -300,6 +312,8 @@ class _Source(NamedTuple):
     up: int
     up_reason: str
     assembly: bool = True
+    lost: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def write_scene_file(
@@ -314,7 +328,7 @@ def write_scene_file(
     """Write a commented YAML file that names ``files`` relative to itself; returns its path.
 
     Args:
-        files: one mesh for each segment, one file of named parts, or one label volume.
+        files: one mesh for each segment, one file of named parts, one label volume, or one for each segment.
         output: by default ``NAME.yaml`` in the working directory, after the first file.
         units: a key of ``geometry.conventions.UNITS_M``; None guesses.
         name: of the scene; by default that of ``output``.
@@ -322,7 +336,8 @@ def write_scene_file(
         report: called with each sentence about what was found, once the file is written.
         deformations: how the object moves.
 
-    Raises ``FileExistsError`` where ``output`` exists, ``ValueError`` and ``FileNotFoundError`` for unusable files.
+    Raises ``FileExistsError`` where ``output`` exists, ``ValueError`` and ``FileNotFoundError`` for unusable files, and
+    where a segment has to be left out and nobody is there for the ``report``.
     """
     if not files:
         raise ValueError("no mesh is given; a scene needs at least one: name your files")
@@ -334,11 +349,16 @@ def write_scene_file(
     if path.exists():
         raise FileExistsError(f"{path} exists; it is not overwritten: choose another --output")
     source = _source(files, path.parent)
+    if source.lost and report is None:
+        raise ValueError(
+            f"{source.lost[0]}: let `mereo scene new {shlex.join(map(str, files))} --output object.yaml` write a scene "
+            "file without it, and name that"
+        )
     text, notes = _draft(name, source, units, aperture, deformations)
     with atomic_file(path, force=False) as temporary:
         temporary.write_text(text, encoding="utf-8")
     if report is not None:
-        for note in notes:
+        for note in (*source.lost, *source.notes, *notes):
             report(note)
     return path
 
@@ -354,12 +374,13 @@ def _source(files: Sequence[Path], folder: Path) -> _Source:
     for file, text in zip(files, relative, strict=True):
         if text != text.encode("utf-8", "replace").decode():
             raise ValueError(f"{file} has a name that is not UTF-8; a scene file is text in UTF-8: rename it")
-    if any(is_volume(file) for file in files):
-        if len(files) > 1:
+    if volumes := [file for file in files if is_volume(file)]:
+        if others := [file for file in files if file not in volumes]:
             raise ValueError(
-                f"{len(files)} files are given, with a label volume among them; it comes alone: name it only"
+                f"{volumes[0]} is a label volume and {others[0]} is none; an object is of one kind: name label volumes "
+                "alone, or meshes alone"
             )
-        return _from_volume(files[0], relative[0])
+        return _from_volumes(files, relative)
     meshes = [read_segmented_mesh(file) for file in files]
     if len(files) == 1 and len(meshes[0].segments) > 1:
         return _from_model(files[0], relative[0], meshes[0])
@@ -400,17 +421,38 @@ def _from_model(file: Path, relative: str, mesh: SegmentedMesh) -> _Source:
     return _Source("\n".join(lines), mesh, *_likely_frame(file, mesh.bounds))
 
 
-def _from_volume(file: Path, relative: str) -> _Source:
-    volume = read_label_volume(file)
-    values = [int(value) for value in np.unique(volume.labels) if value > 0]
-    if not values:
-        raise ValueError(f"{file} holds only empty space; a label volume has values above 0: export it again")
-    names = {value: _segment_name(volume.names.get(value, f"label_{value}")) for value in values}
-    mesh = segment_surfaces(volume, names, LABEL_CELLS)
-    lines = [f"labels: {quoted(relative)}", "names:  # of the volume's values; delete what is not wanted"]
-    lines += [f"  {value}: {quoted(name)}" for value, name in names.items()]
-    lines.append(f"cells: {LABEL_CELLS}  # of the grid along the longest side on which surfaces are found")
-    return _Source("\n".join(lines), mesh, "mm", "the convention of NIfTI and NRRD", 2, "z is to the head", False)
+def _from_volumes(files: Sequence[Path], relative: Sequence[str]) -> _Source:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", LabelWarning)
+        volume = read_label_volume(*files)
+        if not volume.values:
+            raise ValueError(f"{files[0]} holds only empty space; a label volume has values above 0: export it again")
+        names = {value: _segment_name(volume.names.get(value, f"label_{value}")) for value in volume.values}
+        mesh, cells, thin = _surfaces(volume, names)
+    listed = quoted(relative[0]) if len(files) == 1 else f"[{', '.join(map(quoted, relative))}]"
+    lines = [f"labels: {listed}", "names:  # of the volume's values; delete what is not wanted"]
+    lines += [f"  {'# ' if name in thin else ''}{value}: {quoted(name)}" for value, name in names.items()]
+    lines.append(f"cells: {cells}  # of the grid along the longest side on which surfaces are found")
+    notes = dict.fromkeys(str(warning.message) for warning in caught if warning.category is LabelWarning)
+    notes |= {f"nested: {inner} in {outer}": None for inner, outer in mesh.nested}
+    facts = ("mm", "the convention of NIfTI and NRRD", 2, "z is to the head", False)
+    return _Source("\n".join(lines), mesh, *facts, tuple(thin.values()), tuple(notes))
+
+
+def _surfaces(volume: LabelVolume, names: Mapping[int, str]) -> tuple[SegmentedMesh, int, dict[str, str]]:
+    """Surfaces on the coarsest grid of ``LABEL_CELLS`` that holds all, its cells, and why segments are left out."""
+    thin = dict[str, str]()
+    for cells in LABEL_CELLS:
+        with suppress(ThinSegmentError):
+            return segment_surfaces(volume, names, cells), cells, thin
+    while True:
+        try:
+            kept = {value: name for value, name in names.items() if name not in thin}
+            return segment_surfaces(volume, kept, cells), cells, thin
+        except ThinSegmentError as error:
+            if len(thin) + 1 == len(set(names.values())):
+                raise
+            thin[error.name] = str(error)
 
 
 def _likely_frame(file: Path, bounds: Float[np.ndarray, "2 3"]) -> tuple[str, str, int, str]:
