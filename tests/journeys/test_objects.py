@@ -16,8 +16,10 @@ from mereo.cli.options import loaded_object
 from mereo.fitting.registration.register import Registrar
 from mereo.geometry.metrics import grid_confusion, intersection_over_union, labels_on, truth_grid
 from mereo.io.config import InputConfig
+from mereo.io.mesh_formats import MeshWarning
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import ClustersWarning
+from mereo.scenes.files.object_files import scene_of_meshes
 from mereo.scenes.random_states import CACHE_VARIABLE, kept_model
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
@@ -26,6 +28,9 @@ from mereo.synthesis.examples import sample_view
 from mereo_serving.answering import Answerer
 from mereo_serving.messages import JSON, FrameRequest, Served, Setup
 from mereo_viewer.server import OpenPage
+
+
+BOX = trimesh.creation.box()
 
 
 @pytest.fixture(scope="module")
@@ -110,6 +115,17 @@ def test_the_model_is_made_once_and_read_again(folder: Path, scene: Scene, monke
     np.testing.assert_array_equal(kept_model(scene).modes, first.modes)
 
 
+@pytest.mark.slow
+def test_what_is_said_of_a_file_is_said_once(tmp_path: Path) -> None:
+    faces = "".join(
+        f"usemtl m{number % 2}\nf {' '.join(map(str, face + 1))}\n" for number, face in enumerate(BOX.faces)
+    )
+    (tmp_path / "box.obj").write_text("".join(f"v {x} {y} {z}\n" for x, y, z in BOX.vertices) + faces)
+    with pytest.warns(MeshWarning, match="box.obj has 2 materials, which are no closed parts") as caught:
+        assert scene_of_meshes([tmp_path / "box.obj"], "m").rest.names == ("box",)
+    assert len(caught) == 1
+
+
 def test_a_tracker_begins_with_a_search_and_follows(angle: mereo.Object, points: np.ndarray) -> None:
     tracker = mereo.Tracker(angle)
     first, second = (tracker.follow(points, 0.03 * step, unit_m=1.0) for step in range(2))
@@ -184,9 +200,9 @@ def test_a_mesh_without_volume_is_a_sentence(tmp_path: Path) -> None:
     flat.export(tmp_path / "flat.stl")
     with pytest.raises(ValueError, match="flat.stl is flat, without any volume; an object's parts are solids: name a"):
         mereo.load_object(tmp_path / "flat.stl")
-    tilted = trimesh.Trimesh([[0, 0, 0], [90, 0, 10], [0, 60, 20]], [[0, 1, 2]], process=False)
+    tilted = trimesh.Trimesh([[0, 0, 0], [90, 0, 10], [0, 60, 20], [70, 70, 70]], [[0, 1, 2], [1, 3, 2]], process=False)
     tilted.export(tmp_path / "tilted.stl")
-    with pytest.raises(ValueError, match=r"tilted.stl is an open surface \(3 open edges\) that encloses no"):
+    with pytest.raises(ValueError, match=r"tilted.stl is an open surface \(4 open edges\) that encloses no"):
         mereo.load_object(tmp_path / "tilted.stl")
 
 
