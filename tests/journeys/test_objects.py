@@ -29,7 +29,6 @@ from mereo_serving.answering import Answerer
 from mereo_serving.messages import JSON, FrameRequest, Served, Setup
 from mereo_viewer.server import OpenPage
 
-
 BOX = trimesh.creation.box()
 
 
