@@ -1,6 +1,7 @@
 """Objects without weights: meshes and a frame are enough, and bad input is one sentence."""
 
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,7 +21,7 @@ from mereo.io.mesh_formats import MeshWarning
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import ClustersWarning
 from mereo.scenes.files.object_files import scene_of_meshes
-from mereo.scenes.random_states import CACHE_VARIABLE, kept_model
+from mereo.scenes.random_states import CACHE_VARIABLE, CacheWarning, kept_model
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
@@ -112,6 +113,33 @@ def test_the_model_is_made_once_and_read_again(folder: Path, scene: Scene, monke
     monkeypatch.undo()
     path.write_bytes(path.read_bytes()[:100])  # damaged: made anew, with the same bits
     np.testing.assert_array_equal(kept_model(scene).modes, first.modes)
+
+
+def test_a_cache_that_cannot_be_used_is_named_and_what_it_holds_is_never_waited_for(
+    folder: Path, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (kept,) = (folder / "cache/models").iterdir()
+    model = kept_model(scene)
+    monkeypatch.setattr("mereo.scenes.random_states.scene_model", lambda *_: model)
+    (tmp_path / "file").touch()
+    (tmp_path / "broken").symlink_to("nothing")
+    os.mkfifo(tmp_path / "pipe")
+    places = {f"{tmp_path / name}": f"cannot be kept \\(.*{name}.*\\), and" for name in ("file", "broken", "pipe")}
+    for name in ("a", "b", "c"):
+        (tmp_path / name / "models").mkdir(parents=True)
+    os.mkfifo(tmp_path / "a/models" / kept.name)
+    (tmp_path / "b/models" / kept.name).mkdir()
+    (tmp_path / "c/models" / kept.name).symlink_to("/dev/zero")
+    places |= {f"{tmp_path / name}": f"cannot be kept \\(.*{kept.name} is a" for name in ("a", "b", "c")}
+    for place, expected in (places | {"/dev/zero": "cannot be kept .*/dev/zero"}).items():
+        monkeypatch.setenv(CACHE_VARIABLE, place)
+        with pytest.warns(CacheWarning, match=expected) as caught:
+            np.testing.assert_array_equal(kept_model(scene).modes, model.modes)
+        text = str(caught[0].message)
+        assert "--output" not in text and text.endswith("with MEREO_CACHE") and len(caught) == 1
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "new"))  # made
+    kept_model(scene)
+    assert (tmp_path / "new/models" / kept.name).read_bytes() == kept.read_bytes()
 
 
 @pytest.mark.slow
