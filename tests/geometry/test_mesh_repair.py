@@ -1,5 +1,6 @@
 """Faulty meshes: each fault is found, repaired, and said; what is left is labelled by the winding number."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,8 +17,8 @@ from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.mesh_check import examine, mesh_of, overlaps, solid_of
 from mereo.geometry.mesh_repair import farthest, repaired, without_overlaps
 from mereo.geometry.solids import Solids, label_grid, signed_distance_and_direction
+from mereo.io.mesh_formats import MeshWarning
 from mereo.scenes.files import check
-from mereo.scenes.files.build import MeshWarning
 from mereo.scenes.files.check import check_scene
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import example_rng
@@ -68,7 +69,7 @@ FLECK = Segment("fleck", (0, 0, 0), np.eye(3) * 0.01 + 4, np.array([[0, 1, 2]]))
         (half_turned(TORUS), "disagree in orientation", "turned 640 faces", TORUS.volume),
         (soup(TORUS, 1e-5), "open edges", "merged 4800 vertices", TORUS.volume),
         (replace(TORUS, faces=TORUS.faces[[*range(1920), 0, 5]]), "more than two faces", "dropped 2", TORUS.volume),
-        (joined(TORUS, FLECK), "3 open edges", "removed 1 fragment (1 face), 0.01 long, near [4.0", TORUS.volume),
+        (joined(TORUS, FLECK), "3 open edges", "% of its surface), 0.01 long, near [4.0", TORUS.volume),
         (
             joined(ball((0, 0, 0), 2.0), ball((2, 0, 0), 2.0)),
             "intersects itself",
@@ -123,7 +124,10 @@ def test_thin_horns_stay_where_a_new_surface_is_made() -> None:
 
 def test_what_is_too_thin_for_the_finest_cells_is_said() -> None:
     fixed = repaired(horned(1e-5, 1), "mm")
-    assert "also lost is what lies near [-1.6, 0, 0] mm, 0.6 mm from it, too thin or inside out" in fixed.changes[-1]
+    lost = (
+        r"also lost is (.*) % of the surface, which lies near \[-1.6, 0, 0\] mm, 0.6 mm from it, too thin or inside out"
+    )
+    assert (share := re.search(lost, fixed.changes[-1])) and float(share[1]) < 1e-3, fixed.changes[-1]
     (distance, place), _ = farthest(fixed.kept, fixed.segment)
     assert distance == pytest.approx(0.6, abs=0.02)
     np.testing.assert_allclose(place, [-1.6, 0, 0], atol=1e-4)
@@ -149,6 +153,34 @@ def test_all_faults_of_a_segment_are_named_at_once() -> None:
         "intersects itself",
     ]
     assert any("1 fragment" in note and "near [9, 0, 0] mm" in note for note in health.notes), health.notes
+
+
+def test_a_vessel_that_faces_inwards_is_kept_and_noted() -> None:
+    tube = mesh_of(manifold3d.Manifold.cylinder(9.0, 0.005, 0.005, 8).translate((0, 0, 11)))
+    vessel = turned(Segment("vessel", (0, 0, 0), *tube))
+    crossing = joined(ball((0, 0, 0), 10.0), ball((3, 0, 0), 9.0), vessel)
+    assert any("% of its surface facing inwards, near [-0.0" in note for note in examine(crossing).notes)
+    fixed = repaired(crossing)
+    assert fixed.changes == ("united 3 shells that overlap, of which 1 outside the others faced inwards",)
+    assert (
+        fixed.segment.bounds[1, 2] == 20 and len(solid_of(fixed.segment.vertices, fixed.segment.faces).decompose()) == 2
+    )
+
+
+def test_what_a_cut_drops_is_said_with_its_share() -> None:
+    crumb = ball((9, 0, 0), 0.02, level=1)
+    mesh, changes = without_overlaps(SegmentedMesh((box((1, 0, 0), (3, 2, 2)), joined(ball((0, 0, 0), 2.0), crumb))))
+    (change,) = changes["part"]
+    assert (share := re.fullmatch("cut out 'box' and dropped 1 fleck, (.*) % of it", change)), change
+    assert float(share[1]) == pytest.approx(100 * crumb.volume / mesh.segments[1].volume, rel=0.1)
+
+
+@pytest.mark.parametrize("axes", [np.array([[1, 2, 3]]), np.array([[1, 2, 3], [3, -1, 2]])])
+def test_a_line_or_plane_in_any_direction_is_no_solid(axes: np.ndarray) -> None:
+    places = np.random.default_rng(0).random((12, len(axes))) @ axes
+    for vertices in (places, places.astype(np.float32).astype(float)):
+        health = examine(Segment("part", (1, 2, 3), vertices, np.arange(12).reshape(4, 3)))
+        assert health.hopeless == ("is flat, without any volume",) and not health.mendable
 
 
 def test_nothing_is_made_of_nothing() -> None:

@@ -1,9 +1,12 @@
 """Every format gives back the points that were written; every damaged file gets one sentence with its cure."""
 
 import io
+import json
+import os
 import struct
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +15,7 @@ from PIL import Image
 from point_files import save_pcd, save_ply
 
 from mereo.geometry.camera import Camera
-from mereo.io.mesh_formats import read_segmented_mesh
+from mereo.io.mesh_formats import MeshWarning, read_glb, read_segmented_mesh
 from mereo.io.readers import is_depth_image, read_depth_image, read_mask, read_point_cloud
 
 POINTS = np.random.default_rng(0).normal(size=(57, 3)).astype(np.float32) + np.float32(3)
@@ -157,6 +160,11 @@ def test_bad_meshes_get_one_sentence(tmp_path: Path) -> None:
         ("fewer than none.off", b"OFF\n-3 1 0\n0 0 0\n" + triangle, "its header states -3 vertices"),
         ("huge.stl", bytes(80) + b"\xff" * 4 + bytes(100), "cannot be read as a mesh"),
         ("broken.obj", b"v 0 0 0\nf 1 2 3\n", "refers to vertex 2 of 1"),
+        ("zero.obj", b"v 0 0 0\nf 0 1 1\n", "refers to vertex 0 of 1"),
+        ("two.obj", b"v 0 0 0\nv 1 2\n", "its line 2 is 'v 1 2'; a vertex or face has three entries or more"),
+        ("edge.obj", b"v 0 0 0\n" * 3 + b"f 1 2\n", "its line 4 is 'f 1 2'; a vertex"),
+        ("nan.obj", b"v 0 nan 0\n" * 3 + b"f 1 2 3\n", "its part 'nan' has vertices that are NaN, infinite or beyond"),
+        ("point.obj", b"v 1 2 3\n" * 3 + b"f 1 2 3\n", "it has no faces of three different places"),
         ("broken.glb", b"glTF but not really", "cannot be read as a mesh"),
         ("drawing.step", b"ISO-10303-21;", "suffix '.step'"),
     ):
@@ -164,6 +172,147 @@ def test_bad_meshes_get_one_sentence(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=expected) as caught:
             read_segmented_mesh(tmp_path / name)
         assert_sentence(caught.value, tmp_path / name)
+
+
+def write_glb(path: Path, arrays: list[np.ndarray], **tree: Any) -> Path:
+    """GLB file of a tree whose accessor i is array i, in one buffer: its second chunk, unless the tree names others."""
+    kinds = {"f4": 5126, "u2": 5123, "i2": 5122, "i1": 5120}
+    content = b"".join(array.tobytes() for array in arrays)
+    starts = np.cumsum([0, *(array.nbytes for array in arrays)]).tolist()
+    views = [{"buffer": 0, "byteOffset": at, "byteLength": a.nbytes} for at, a in zip(starts, arrays, strict=False)]
+    accessors = [
+        {
+            "bufferView": index,
+            "componentType": kinds[a.dtype.str[1:]],
+            "count": len(a),
+            "normalized": a.dtype.kind == "i",
+        }
+        | {"type": "SCALAR" if a.ndim == 1 else f"VEC{a.shape[1]}"}
+        for index, a in enumerate(arrays)
+    ]
+    common = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": list(range(len(tree["nodes"])))}]}
+    common |= {"bufferViews": views, "buffers": [{"byteLength": len(content)}], "accessors": accessors}
+    text = json.dumps(common | tree).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(content), b"BIN\0") + content
+    path.write_bytes(b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks)
+    return path
+
+
+BOX = trimesh.creation.box()
+CORNERS, SIDES = BOX.vertices.astype("<f4"), BOX.faces.reshape(-1).astype("<u2")
+SOLID = {"attributes": {"POSITION": 0}, "indices": 1}
+
+
+def test_each_instance_and_node_of_a_glb_file_is_a_segment_in_its_place(tmp_path: Path) -> None:
+    shifts = np.array([[0, 0, 0], [2, 0, 0], [0, 4, 0]], "<f4")
+    turns = np.array([[0, 0, 0, 127], [0, 0, 127, 0], [0, 0, 0, 127]], "<i1")
+    sizes = np.array([[1, 1, 1], [1, 2, 1], [1, 1, 3]], "<f4")
+    places = {"attributes": {"TRANSLATION": 2, "ROTATION": 3, "SCALE": 4}}
+    nodes = [
+        {"name": "finger", "mesh": 0, "translation": [0, 0, 10], "extensions": {"EXT_mesh_gpu_instancing": places}},
+        *({"name": "thumb", "mesh": 0, "translation": [9 * side, 0, 0]} for side in (1, -1)),
+    ]
+    arrays = [CORNERS, SIDES, shifts, turns, sizes]
+    mesh = read_segmented_mesh(write_glb(tmp_path / "hand.glb", arrays, nodes=nodes, meshes=[{"primitives": [SOLID]}]))
+    mesh.check()
+    middles = {part.name: part.bounds.mean(axis=0).tolist() for part in mesh.segments}
+    fingers = {f"finger_{number}": [x, y, 10] for number, (x, y, _) in enumerate(shifts.tolist(), 1)}
+    assert middles == fingers | {"thumb": [9, 0, 0], "thumb_1": [-9, 0, 0]}
+    np.testing.assert_allclose([part.volume for part in mesh.segments], [1, 2, 3, 1, 1], rtol=1e-6)
+    assert read_glb(tmp_path / "hand.glb").mesh.names == mesh.names
+
+
+def test_materials_of_a_node_are_segments_where_each_is_closed(tmp_path: Path) -> None:
+    halves = [{"attributes": {"POSITION": 0}, "indices": index, "material": index - 2} for index in (2, 3)]
+    meshes = [{"primitives": halves}, {"primitives": [SOLID | {"material": 1}, SOLID]}]
+    nodes = [{"name": "whole", "mesh": 0}, {"name": "pair", "mesh": 1, "translation": [5, 0, 0]}]
+    arrays = [CORNERS, SIDES, SIDES[:15], SIDES[15:]]
+    materials = [{"name": "red"}, {"name": "blue"}]
+    path = write_glb(tmp_path / "two.glb", arrays, nodes=nodes, meshes=meshes, materials=materials)
+    mesh = read_segmented_mesh(path)
+    mesh.check()
+    assert mesh.names == ("whole", "pair_blue", "pair_2")
+    assert read_glb(path).mesh.names == ("whole_red", "whole_blue", "pair_blue", "pair_2")
+
+
+def test_positions_as_shares_of_integers_and_sparse_ones_are_read_as_such(tmp_path: Path) -> None:
+    shares = np.round(CORNERS * 2 * 32767).astype("<i2")
+    node = {"name": "part", "mesh": 0, "scale": [0.5, 0.5, 0.5]}
+    meshes = [{"primitives": [SOLID]}]
+    mesh = read_segmented_mesh(write_glb(tmp_path / "a.glb", [shares, SIDES], nodes=[node], meshes=meshes))
+    assert mesh.segments[0].volume == pytest.approx(1.0)
+    moved = np.flatnonzero(CORNERS[:, 2] > 0).astype("<u2")
+    arrays = [CORNERS, SIDES, moved, CORNERS[moved] + np.array([0, 0, 2], "<f4")]
+    sparse = {"count": 4, "indices": {"bufferView": 2, "componentType": 5123}, "values": {"bufferView": 3}}
+    changed = {"bufferView": 0, "componentType": 5126, "count": 8, "type": "VEC3", "sparse": sparse}
+    indices = {"bufferView": 1, "componentType": 5123, "count": 36, "type": "SCALAR"}
+    tree = {"nodes": [{"name": "part", "mesh": 0}], "meshes": meshes, "accessors": [changed, indices]}
+    assert read_segmented_mesh(write_glb(tmp_path / "b.glb", arrays, **tree)).segments[0].volume == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize("extension", ["KHR_draco_mesh_compression", "EXT_meshopt_compression"])
+def test_a_compressed_glb_file_is_refused_by_its_compression(extension: str, tmp_path: Path) -> None:
+    tree = {"nodes": [{"mesh": 0}], "meshes": [{"primitives": [SOLID]}], "extensionsUsed": [extension]}
+    path = write_glb(tmp_path / "a.glb", [CORNERS, SIDES], **tree)
+    with pytest.raises(ValueError, match=f"it is compressed by {extension}, which is not read: export") as caught:
+        read_segmented_mesh(path)
+    assert_sentence(caught.value, path)
+
+
+def test_a_mesh_opens_no_files_but_buffers_in_its_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "mesh"
+    (folder / "below").mkdir(parents=True)
+    content = CORNERS.tobytes() + SIDES.tobytes()
+    for place in (tmp_path / "secret.bin", folder / "below" / "in here.bin"):
+        place.write_bytes(content)
+    (folder / "link.bin").symlink_to("../secret.bin")
+    os.mkfifo(folder / "pipe.bin")
+    look = {"materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}], "textures": [{"source": 0}]}
+    tree = {"nodes": [{"mesh": 0}], "meshes": [{"primitives": [SOLID | {"material": 0}]}], **look}
+    tree |= {"images": [{"uri": "pipe.bin"}]}  # which would be waited for
+    path = folder / "a.glb"
+    good = {"buffers": [{"uri": "below/in%20here.bin", "byteLength": len(content)}]}
+    assert read_segmented_mesh(write_glb(path, [CORNERS, SIDES], **tree, **good)).segments[0].volume == 1.0
+    for uri in (
+        "../secret.bin",
+        str(tmp_path / "secret.bin"),
+        "link.bin",
+        "pipe.bin",
+        "/dev/zero",
+        "below",
+        "none.bin",
+    ):
+        bad = {"buffers": [{"uri": uri, "byteLength": len(content)}]}
+        with pytest.raises(ValueError, match=f"it names '{uri}', which is no regular file in its folder or below"):
+            read_segmented_mesh(write_glb(path, [CORNERS, SIDES], **tree, **bad))
+    text = BOX.export(file_type="ply", encoding="ascii")
+    text = text.decode() if isinstance(text, bytes) else text
+    (folder / "a.ply").write_text(text.replace("element vertex", "comment TextureFile pipe.bin\nelement vertex"))
+    assert read_segmented_mesh(folder / "a.ply").segments[0].volume == 1.0
+    assert len(read_point_cloud(folder / "a.ply").points) == 8
+    (folder / "a.obj").write_text("mtllib pipe.bin\nmtllib /dev/zero\n" + BOX.export(file_type="obj"))
+    assert read_segmented_mesh(folder / "a.obj").segments[0].volume == 1.0
+
+
+def write_materials(path: Path, parts: list[tuple[str, np.ndarray]]) -> Path:
+    """OBJ file of boxes' faces, of which each material has its own vertices."""
+    lines = list[str]()
+    for index, (material, faces) in enumerate(parts):
+        lines += [*(f"v {x + 3 * index} {y} {z}" for x, y, z in BOX.vertices), f"usemtl {material}"]
+        lines += [f"f {a} {b} {c}" for a, b, c in faces + 8 * index + 1]
+    path.write_text("\n".join(lines))
+    return path
+
+
+def test_materials_of_an_obj_file_are_segments_where_closed_or_it_is_said(tmp_path: Path) -> None:
+    mesh = read_segmented_mesh(write_materials(tmp_path / "a.obj", [("red", BOX.faces), ("blue", BOX.faces)]))
+    mesh.check()
+    assert mesh.names == ("red", "blue")
+    path = write_materials(tmp_path / "b.obj", [("red", BOX.faces), ("blue", BOX.faces[1:])])
+    with pytest.warns(MeshWarning, match="b.obj has 2 materials, which are no closed parts, but no objects") as caught:
+        assert read_segmented_mesh(path).names == ("b",)
+    assert len(caught) == 1
 
 
 # --- depth images -----------------------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """Objects without weights: meshes and a frame are enough, and bad input is one sentence."""
 
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,10 +23,12 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.metrics import Scores, grid_confusion, intersection_over_union, labels_on, truth_grid
 from mereo.geometry.transforms import rigid as rigid_transform
 from mereo.io.config import InputConfig
+from mereo.io.mesh_formats import MeshWarning
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import ClustersWarning
 from mereo.scenes.files.deformation_blocks import WORDS, AnyDeformation
-from mereo.scenes.random_states import CACHE_VARIABLE, kept_model
+from mereo.scenes.files.object_files import scene_of_meshes
+from mereo.scenes.random_states import CACHE_VARIABLE, CacheWarning, kept_model
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
@@ -33,6 +36,8 @@ from mereo.synthesis.examples import sample_view
 from mereo_serving.answering import Answerer
 from mereo_serving.messages import JSON, FrameRequest, Served, Setup
 from mereo_viewer.server import OpenPage
+
+BOX = trimesh.creation.box()
 
 
 @pytest.fixture(scope="module")
@@ -117,6 +122,44 @@ def test_the_model_is_made_once_and_read_again(folder: Path, scene: Scene, monke
     np.testing.assert_array_equal(kept_model(scene).modes, first.modes)
 
 
+def test_a_cache_that_cannot_be_used_is_named_and_what_it_holds_is_never_waited_for(
+    folder: Path, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (kept,) = (folder / "cache/models").iterdir()
+    model = kept_model(scene)
+    monkeypatch.setattr("mereo.scenes.random_states.scene_model", lambda *_: model)
+    (tmp_path / "file").touch()
+    (tmp_path / "broken").symlink_to("nothing")
+    os.mkfifo(tmp_path / "pipe")
+    places = {f"{tmp_path / name}": f"cannot be kept \\(.*{name}.*\\), and" for name in ("file", "broken", "pipe")}
+    for name in ("a", "b", "c"):
+        (tmp_path / name / "models").mkdir(parents=True)
+    os.mkfifo(tmp_path / "a/models" / kept.name)
+    (tmp_path / "b/models" / kept.name).mkdir()
+    (tmp_path / "c/models" / kept.name).symlink_to("/dev/zero")
+    places |= {f"{tmp_path / name}": f"cannot be kept \\(.*{kept.name} is a" for name in ("a", "b", "c")}
+    for place, expected in (places | {"/dev/zero": "cannot be kept .*/dev/zero"}).items():
+        monkeypatch.setenv(CACHE_VARIABLE, place)
+        with pytest.warns(CacheWarning, match=expected) as caught:
+            np.testing.assert_array_equal(kept_model(scene).modes, model.modes)
+        text = str(caught[0].message)
+        assert "--output" not in text and text.endswith("with MEREO_CACHE") and len(caught) == 1
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "new"))  # made
+    kept_model(scene)
+    assert (tmp_path / "new/models" / kept.name).read_bytes() == kept.read_bytes()
+
+
+@pytest.mark.slow
+def test_what_is_said_of_a_file_is_said_once(tmp_path: Path) -> None:
+    faces = "".join(
+        f"usemtl m{number % 2}\nf {' '.join(map(str, face + 1))}\n" for number, face in enumerate(BOX.faces)
+    )
+    (tmp_path / "box.obj").write_text("".join(f"v {x} {y} {z}\n" for x, y, z in BOX.vertices) + faces)
+    with pytest.warns(MeshWarning, match="box.obj has 2 materials, which are no closed parts") as caught:
+        assert scene_of_meshes([tmp_path / "box.obj"], "m").rest.names == ("box",)
+    assert len(caught) == 1
+
+
 def test_a_tracker_begins_with_a_search_and_follows(angle: mereo.Object, points: np.ndarray) -> None:
     tracker = mereo.Tracker(angle)
     first, second = (tracker.follow(points, 0.03 * step, unit_m=1.0) for step in range(2))
@@ -191,9 +234,9 @@ def test_a_mesh_without_volume_is_a_sentence(tmp_path: Path) -> None:
     flat.export(tmp_path / "flat.stl")
     with pytest.raises(ValueError, match="flat.stl is flat, without any volume; an object's parts are solids: name a"):
         mereo.load_object(tmp_path / "flat.stl")
-    tilted = trimesh.Trimesh([[0, 0, 0], [90, 0, 10], [0, 60, 20]], [[0, 1, 2]], process=False)
+    tilted = trimesh.Trimesh([[0, 0, 0], [90, 0, 10], [0, 60, 20], [70, 70, 70]], [[0, 1, 2], [1, 3, 2]], process=False)
     tilted.export(tmp_path / "tilted.stl")
-    with pytest.raises(ValueError, match=r"tilted.stl is an open surface \(3 open edges\) that encloses no"):
+    with pytest.raises(ValueError, match=r"tilted.stl is an open surface \(4 open edges\) that encloses no"):
         mereo.load_object(tmp_path / "tilted.stl")
 
 

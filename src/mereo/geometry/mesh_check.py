@@ -22,6 +22,10 @@ MOST_BURIED, MOST_BACKWARDS, MOST_UNDECIDED = 5e-3, 0.05, 0.5
 inwards before the winding number has no meaning, and have as much inside before as behind: of open ones it is all."""
 
 
+FLAT = 1e-6
+"""Extent in its shortest direction, in that of its longest, at which a mesh is a plane or a line."""
+
+
 class Health(NamedTuple):
     """Faults of one segment, as parts of a sentence that starts with its name.
 
@@ -57,7 +61,8 @@ def examine(segment: Segment, unit: str = "") -> Health:
     if len(faces) == 0:
         return Health(hopeless=tuple(hopeless), mendable=False)
     corners = vertices[np.unique(faces)] if hopeless else vertices
-    if not (np.ptp(corners, axis=0) > 0).all():
+    extent = np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)
+    if len(corners) < 4 or not extent[2] > FLAT * extent[0]:  # in any direction: of float32, a plane is this rough
         return Health(hopeless=(*hopeless, "is flat, without any volume"), mendable=False)
     collapsed = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
     dirty = []
@@ -83,7 +88,10 @@ def examine(segment: Segment, unit: str = "") -> Health:
     if surface.share_where(buried) > MOST_BURIED:
         share = f"{surface.share_where(buried):.1%} of its surface lies within it"
         dirty.append(f"intersects itself ({share}, {surface.place(buried, unit)})")
-    return Health(tuple(dirty), tuple(hopeless), notes=_notes(vertices, faces, surface, unit))
+    notes = _notes(vertices, faces, surface, unit)
+    if 1e-5 < turned <= MOST_BACKWARDS:
+        notes += (f"has {100 * turned:.2g} % of its surface facing inwards, {surface.place(backwards, unit)}",)
+    return Health(tuple(dirty), tuple(hopeless), notes=notes)
 
 
 def _broken_data(vertices: Vertices, faces: Faces) -> tuple[list[str], Bool[np.ndarray, " f"]]:
@@ -192,7 +200,7 @@ FRAGMENT = 0.02
 
 
 def fragments(vertices: Vertices, faces: Faces, unit: str = "") -> tuple[Bool[np.ndarray, " f"], str]:
-    """Faces of pieces that are tiny compared with the whole, and a phrase with their number, size and place."""
+    """Faces of pieces that are tiny compared with the whole, and a phrase with their number, share, size and place."""
     piece = pieces(faces, len(vertices))
     corners = vertices[faces]
     low, high = (np.full((piece.max() + 1, 3), end) for end in (np.inf, -np.inf))
@@ -207,7 +215,10 @@ def fragments(vertices: Vertices, faces: Faces, unit: str = "") -> tuple[Bool[np
     length = f"{np.ptp([low[largest], high[largest]], axis=0).max():.2g}{unit and f' {unit}'}"
     which = f"the largest {length} long" if tiny.sum() > 1 else f"{length} long"
     where = near((low[largest] + high[largest]) / 2, unit)
-    return stray, f"{counted(int(tiny.sum()), 'fragment')} ({counted(int(stray.sum()), 'face')}), {which}, {where}"
+    area = np.linalg.norm(area_vectors(vertices, faces), axis=1)
+    share = f"{100 * area[stray].sum() / max(area.sum(), 1e-300):.2g} % of its surface"
+    count = f"{counted(int(tiny.sum()), 'fragment')} ({counted(int(stray.sum()), 'face')}, {share})"
+    return stray, f"{count}, {which}, {where}"
 
 
 def likely_unit(bounds: Float[np.ndarray, "2 3"]) -> str:

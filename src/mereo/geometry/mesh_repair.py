@@ -142,7 +142,10 @@ def _fill_holes(vertices: Vertices, faces: Faces, unit: str) -> Step:
 
 
 def _unite(vertices: Vertices, faces: Faces, unit: str) -> Step:
-    """Closed shells that reach into each other become one; shells that face inwards are cavities, and are cut out."""
+    """Closed shells that reach into each other become one; shells that face inwards in others are cut out as cavities.
+
+    Those that face inwards and lie outside are turned around.
+    """
     try:
         solid = solid_of(vertices, faces)
     except ValueError:
@@ -153,8 +156,11 @@ def _unite(vertices: Vertices, faces: Faces, unit: str) -> Step:
     filled = [shell for shell in shells if shell.volume() > 0]
     hollow = [solid_of(v, f[:, ::-1]) for v, f in (mesh_of(shell) for shell in shells if shell.volume() < 0)]
     united = manifold3d.Manifold.batch_boolean(filled, manifold3d.OpType.Add)
-    united -= manifold3d.Manifold.batch_boolean(hollow, manifold3d.OpType.Add)
-    return *mesh_of(united), f"united {len(shells)} shells that overlap"
+    outside = [shell for shell in hollow if (shell ^ united).volume() < 0.5 * shell.volume()]
+    for shell in hollow:
+        united = united + shell if shell in outside else united - shell
+    turned = f", of which {len(outside)} outside the others faced inwards" if outside else ""
+    return *mesh_of(united), f"united {len(shells)} shells that overlap{turned}"
 
 
 # --- a new surface ----------------------------------------------------------------------------------------------------
@@ -186,8 +192,12 @@ def _remesh(vertices: Vertices, faces: Faces, unit: str) -> Step:
         change += f", in thin places those below {2 * cell * step:.2g}{behind}"
     if lost:
         where = f"{near((lost[1] - 2.5) * step + low, unit)}, {lost[0] * step:.2g}{behind} from it"
-        change += f"; also lost is what lies {where}, too thin or inside out: thicken it, turn its faces around, or "
-        change += "make it a segment of its own, which has finer cells"
+        places, face = surface_points(body.vertices, body.faces, MOST_SAMPLES)
+        normals = area_vectors(body.vertices, body.faces)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        share = 100 * _cut_off(body, solid, places, normals[face])[1].mean()
+        change += f"; also lost is {share:.2g} % of the surface, which lies {where}, too thin or inside out: thicken "
+        change += "it, turn its faces around, or make it a segment of its own, which has finer cells"
     corners, triangles = mesh_of(solid)
     return (corners - 2.5) * step + low, triangles, change
 
@@ -426,20 +436,23 @@ def without_overlaps(mesh: SegmentedMesh) -> tuple[SegmentedMesh, dict[str, list
             raise ValueError(
                 f"segment {changed!r} lies within {overlap.small!r}; nothing of it would be left: remove one"
             )
-        vertices, faces = _without_flecks(*mesh_of(cut))
+        vertices, faces, flecks = _without_flecks(*mesh_of(cut))
         segments[changed] = replace(segments[changed], vertices=vertices, faces=faces)
         what = f"cut off what reached out of {overlap.large!r}" if overlap.nested else f"cut out {overlap.small!r}"
-        changes.setdefault(changed, []).append(what)
+        changes.setdefault(changed, []).append(what + flecks)
     return replace(mesh, segments=tuple(segments.values())), changes
 
 
-def _without_flecks(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
+def _without_flecks(vertices: Vertices, faces: Faces) -> Step:
     """Mesh without pieces of hardly any volume: Booleans of meshes that nearly touch leave them."""
     piece = pieces(faces, len(vertices))
     a, b, c = (vertices[faces[:, k]] - vertices.mean(axis=0) for k in range(3))
     volume = np.abs(np.bincount(piece, weights=np.einsum("ij,ij->i", a, np.cross(b, c))))
-    used, kept = np.unique(faces[(volume > 1e-5 * volume.max())[piece]], return_inverse=True)
-    return vertices[used], kept.reshape(-1, 3)
+    kept = volume > 1e-5 * volume.max()
+    used, left = np.unique(faces[kept[piece]], return_inverse=True)
+    share = 100 * volume[~kept].sum() / volume.sum()
+    dropped = f" and dropped {counted(int((~kept).sum()), 'fleck')}, {share:.2g} % of it" if not kept.all() else ""
+    return vertices[used], left.reshape(-1, 3), dropped
 
 
 # --- the largest piece, and holes -------------------------------------------------------------------------------------

@@ -3,19 +3,25 @@
 ``read_segmented_mesh`` reads files for what they enclose; ``read_glb`` reads GLB files as a viewer shows them.
 """
 
+import json
 import re
+import warnings
+from base64 import b64decode
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from io import BytesIO
+from itertools import groupby
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int, UInt8
 
 from mereo.geometry.conventions import LARGEST
-from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
+from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh, edge_uses
 from mereo.geometry.radii import Radii
 from mereo.io.errors import check_count, check_suffix, readable
 from mereo.io.extras import library
@@ -31,14 +37,21 @@ MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", ".3mf")
 """Suffixes of mesh files that are read."""
 
 
+class MeshWarning(UserWarning):
+    """Warning that a mesh is used, but not as its file may mean it."""
+
+
 def read_segmented_mesh(*paths: str | Path) -> SegmentedMesh:
     """Segments of one or more GLB, OBJ, 3MF, PLY, STL or OFF files, in label order; they are not checked.
 
-    A file with several named parts (GLB nodes, OBJ objects or groups, 3MF objects) gives one segment each; a file with
-    one part gives one segment called after its GLB node, or as our own STL files say, or else after the file. A
-    directory stands for the mesh files in it, by name. Node transforms are applied, except the root of GLB files
-    written by mereo: those come back in the camera frame. Vertices at the same position are merged, because exporters
-    split them at normals and texture seams, which would open a closed mesh.
+    A file with several named parts (GLB nodes and their instances, OBJ objects or groups, 3MF objects) gives one
+    segment each; a file with one part gives one segment called after its GLB node, or as our own STL files say, or else
+    after the file. Materials are parts where each of them is closed by itself: those of one GLB node, and of an OBJ
+    file without objects and groups; of such a file whose materials are not, a ``MeshWarning`` says so. A directory
+    stands for the mesh files in it, by name. Node transforms are applied, except the root of GLB files written by
+    mereo: those come back in the camera frame. Vertices at the same position are merged, because exporters split them
+    at normals and texture seams, which would open a closed mesh. Other files are opened only where a glTF file names
+    them as buffers, and an OBJ file for its materials' colours, and only in the same folder or below.
 
     Raises ``FileNotFoundError``, ``ValueError`` where a file is of another format, damaged or without faces, or two
     segments have the same name, and ``ImportError`` for a 3MF file without the extra `cad`.
@@ -71,8 +84,8 @@ def _parts(path: Path) -> list[Part]:
         if suffix == ".off":
             _check_off(path)
         parts = _obj_parts(path) if suffix == ".obj" else _scene_parts(path)
-        if not parts:
-            raise ValueError("it has no faces")
+        if not any(len(faces) for _, _, _, faces in parts):
+            raise ValueError("it has no faces of three different places" if parts else "it has no faces")
         for name, _, vertices, _ in parts:
             _check_places(name, vertices)
     return parts
@@ -101,8 +114,10 @@ def _obj_parts(path: Path) -> list[Part]:
     faces: list[list[int]] = []
     owners: list[tuple[str, str, str]] = []
     name = {"o": "", "g": "", "usemtl": "", "mtllib": ""}
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
         kind, *cells = line.split() or [""]
+        if kind in ("v", "f") and len(cells) < 3:
+            raise ValueError(f"its line {number} is {line.strip()[:40]!r}; a vertex or face has three entries or more")
         if kind == "v":
             positions.append([float(cell) for cell in cells[:3]])
         elif kind in name:
@@ -112,7 +127,32 @@ def _obj_parts(path: Path) -> list[Part]:
             faces += [[corners[0], corners[i], corners[i + 1]] for i in range(1, len(corners) - 1)]
             owners += [(name["o"], name["g"], name["usemtl"])] * (len(corners) - 2)
     colors = _material_colors(path, name["mtllib"])
-    return _split_parts(np.asarray(positions), np.asarray(faces, dtype=np.int64), owners, colors, path.stem)
+    vertices, triangles = np.asarray(positions), np.asarray(faces, dtype=np.int64)
+    if materials := _material_parts(vertices, triangles, owners, path):
+        owners = materials
+    return _split_parts(vertices, triangles, owners, colors, path.stem)
+
+
+def _material_parts(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], owners: list[tuple[str, str, str]], path: Path
+) -> list[tuple[str, str, str]]:
+    """Owners of which materials are the objects, in a file without others; none where these are not closed parts."""
+    names = list(dict.fromkeys(material for _, _, material in owners))
+    if len(names) < 2 or any(name or group for name, group, _ in owners):
+        return []
+    index = np.array([names.index(material) for _, _, material in owners])
+    _, place = _distinct(vertices)
+    if all(_is_closed(place[faces[index == each]]) for each in range(len(names))):
+        return [(material or path.stem, "", material) for _, _, material in owners]
+    text = f"{path} has {len(names)} materials, which are no closed parts, but no objects or groups; it is one segment"
+    warnings.warn(f"{text}: where it is several, export each as an object", MeshWarning, stacklevel=5)
+    return []
+
+
+def _is_closed(faces: Int[np.ndarray, "f 3"]) -> bool:
+    """Whether each edge has as many faces on its one side as on its other."""
+    _, uses, unbalanced = edge_uses(faces)
+    return not (unbalanced | (uses % 2 == 1)).any()
 
 
 def _obj_index(cell: str, count: int) -> int:
@@ -148,10 +188,12 @@ def _split_parts(
 def _material_colors(mesh: Path, library: str) -> dict[str, Color]:
     """Diffuse colour (``Kd``, taken as that on the screen) of each material without a texture in an OBJ file's library.
 
-    Only a file in the same folder is read, because a downloaded mesh should not choose which files are opened.
+    A library that is no file in the mesh's folder or below is left alone, as if the materials had no colours.
     """
-    path = mesh.parent / library
-    if not library or Path(library).name != library or not path.is_file():
+    path = None
+    with suppress(ValueError, OSError, RuntimeError):  # the last of links in a circle
+        path = _neighbour(mesh, library)
+    if path is None:
         return {}
     colors, textured, name = dict[str, Color](), set[str](), ""
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
@@ -168,8 +210,20 @@ def _material_colors(mesh: Path, library: str) -> dict[str, Color]:
     return {name: color for name, color in colors.items() if name not in textured}
 
 
+def _neighbour(path: Path, name: str) -> Path:
+    """File that a mesh file names; raises ``ValueError`` (its reason only) unless it lies in its folder or below.
+
+    A downloaded mesh should not choose which other files, or devices, are opened.
+    """
+    folder = path.parent.resolve()
+    file = (folder / name).resolve()
+    if not (file.is_relative_to(folder) and file.is_file()):
+        raise ValueError(f"it names {name[:100]!r}, which is no regular file in its folder or below")
+    return file
+
+
 def _scene_parts(path: Path) -> list[Part]:
-    scene: Any = trimesh.load_scene(path, process=False)
+    scene = _load_scene(path)
     base = VIEWER_ROOT if VIEWER_ROOT in scene.graph.nodes else scene.graph.base_frame
     nodes, parts = _nodes_with_faces(scene), list[Part]()
     for node in nodes:
@@ -177,6 +231,9 @@ def _scene_parts(path: Path) -> list[Part]:
         # a file without names gets its own name as the node's
         is_unnamed = len(nodes) == 1 and (node.startswith("geometry_") or Path(node).stem == path.stem)
         parts.append((path.stem if is_unnamed else node, _color(geometry), *merge_positions(vertices, faces)))
+    parts = [part for _, group in groupby(parts, _node_of) for part in _whole_parts(list(group))]
+    names = _numbered([name for name, *_ in parts])
+    parts = [(name, *rest) for name, (_, *rest) in zip(names, parts, strict=True)]  # type: ignore[misc]
     if path.suffix.lower() == ".stl":
         with path.open("rb") as file:
             header = file.read(80)
@@ -184,6 +241,41 @@ def _scene_parts(path: Path) -> list[Part]:
         if header.startswith(STL_NAME) and name:
             return [(name, *rest) for _, *rest in parts]  # type: ignore[misc]
     return parts
+
+
+def _load_scene(path: Path) -> Any:
+    """trimesh's scene of a file; no other file is opened but the buffers of glTF."""
+    if path.suffix.lower() not in (".glb", ".gltf"):
+        return trimesh.load_scene(path, resolver={}, process=False)
+    tree, buffers = _plain_gltf(path)
+    return trimesh.load_scene(BytesIO(json.dumps(tree).encode()), "gltf", buffers, process=False)
+
+
+def _node_of(part: Part) -> str:
+    """Name of a node with its number, of which the part may be one material."""
+    return part[0].rpartition(MATERIAL)[0] or part[0]
+
+
+def _joined(name: str) -> str:
+    """Name of a node and of its material in one."""
+    node, *more = name.split(MATERIAL)
+    return "_".join((node, *more[1:]))
+
+
+def _whole_parts(materials: list[Part]) -> list[Part]:
+    """Materials of a node where each is closed by itself, else all of them as one part."""
+    if len(materials) == 1 or all(_is_closed(faces) for _, _, _, faces in materials):
+        return [(_joined(name), *rest) for name, *rest in materials]  # type: ignore[misc]
+    pieces = [Segment(name, color or PALETTE[0], vertices, faces) for name, color, vertices, faces in materials]
+    vertices, faces, _ = SegmentedMesh(tuple(pieces)).merged()
+    colors = {color for _, color, _, _ in materials}
+    return [
+        (
+            materials[0][0].partition(MATERIAL)[0],
+            colors.pop() if len(colors) == 1 else None,
+            *merge_positions(vertices, faces),
+        )
+    ]
 
 
 def _nodes_with_faces(scene: Any) -> list[str]:
@@ -236,6 +328,119 @@ def _distinct(rows: Float[np.ndarray, "v k"]) -> tuple[Int[np.ndarray, " w"], In
     return np.sort(first), rank[inverse.reshape(-1)]
 
 
+# --- glTF as trimesh reads all of it ----------------------------------------------------------------------------------
+
+MATERIAL = "\0"
+"""What stands between the name of a node, its number, and that of a material where the node has several."""
+
+INSTANCES = "EXT_mesh_gpu_instancing"
+
+KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+"""Components of glTF's accessors."""
+
+Buffers = dict[str, bytes]
+
+
+def _plain_gltf(path: Path) -> tuple[dict[str, Any], Buffers]:
+    """JSON of a GLB or glTF file and its buffers, without what trimesh leaves out or takes for something else.
+
+    Instances and the materials of a mesh become nodes of their own, and normalized or sparse positions become floats.
+    Images in other files are not opened: shapes do not need them.
+    """
+    content, chunk = path.read_bytes(), b""
+    if content[:4] == b"glTF":
+        start = 28 + int.from_bytes(content[12:16], "little")
+        size = int.from_bytes(content[start - 8 : start - 4], "little")
+        content, chunk = content[20 : start - 8], content[start : start + size]
+        check_count(size, len(chunk), "bytes")
+    tree = json.loads(content)
+    for extension in (*tree.get("extensionsUsed", ()), *tree.get("extensionsRequired", ())):
+        if "compression" in extension:
+            raise ValueError(
+                f"it is compressed by {extension}, which is not read: export it without compression, or open it in "
+                "https://threejs.org/editor and export it there as GLB"
+            )
+    buffers = {str(n): _buffer(path, each.get("uri"), chunk) for n, each in enumerate(tree.get("buffers", ()))}
+    for name, buffer in zip(buffers, tree.get("buffers", ()), strict=True):
+        buffer["uri"] = name
+    for mesh in tree.get("meshes", ()):
+        for part in mesh["primitives"]:
+            if part.get("mode") == 6:
+                raise ValueError("it has triangle fans, which are not read: export triangles")
+            accessor = tree["accessors"][part["attributes"]["POSITION"]]
+            if accessor.get("normalized") or "sparse" in accessor:
+                accessor.update(_stored(tree, buffers, _values(tree, buffers, accessor)), normalized=False)
+                accessor.pop("sparse", None)
+    for node in list(tree.get("nodes", ())):
+        node.pop("camera", None)  # of the first one trimesh loses the children
+        if "mesh" in node:
+            _spread(tree, buffers, node)
+    return tree, buffers
+
+
+def _buffer(path: Path, uri: str | None, chunk: bytes) -> bytes:
+    """Content of a buffer: the file's second chunk, text in it, or another file."""
+    if uri is None:
+        return chunk
+    return b64decode(uri.partition(",")[2]) if uri.startswith("data:") else _neighbour(path, unquote(uri)).read_bytes()
+
+
+def _values(tree: dict[str, Any], buffers: Buffers, accessor: dict[str, Any]) -> Float[np.ndarray, "n k"]:
+    """Values of an accessor (glTF 2.0, sections 3.6.2 and 5.1)."""
+    kind, width = np.dtype(KINDS[accessor["componentType"]]), WIDTHS[accessor["type"]]
+    shape = accessor["count"], width
+    values = np.zeros(shape)
+    if "bufferView" in accessor:
+        view = tree["bufferViews"][accessor["bufferView"]]
+        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        strides = view.get("byteStride", width * kind.itemsize), kind.itemsize
+        values = np.ndarray(shape, kind, buffers[str(view["buffer"])], start, strides).astype(np.float64)
+    if sparse := accessor.get("sparse"):
+        count = {"count": sparse["count"]}
+        rows = _values(tree, buffers, {"type": "SCALAR"} | sparse["indices"] | count)[:, 0].astype(np.int64)
+        same = {key: accessor[key] for key in ("componentType", "type")}
+        values[rows] = _values(tree, buffers, same | sparse["values"] | count)
+    return np.maximum(values / np.iinfo(kind).max, -1.0) if accessor.get("normalized") else values
+
+
+def _stored(tree: dict[str, Any], buffers: Buffers, values: Float[np.ndarray, "n 3"]) -> dict[str, Any]:
+    """Accessor of values in a new buffer."""
+    content = values.astype("<f4").tobytes()
+    tree["bufferViews"].append({"buffer": len(buffers), "byteLength": len(content)})
+    buffers[str(len(buffers))] = content
+    tree["buffers"].append({"uri": str(len(buffers) - 1), "byteLength": len(content)})
+    return {"bufferView": len(tree["bufferViews"]) - 1, "byteOffset": 0, "componentType": 5126}
+
+
+def _spread(tree: dict[str, Any], buffers: Buffers, node: dict[str, Any]) -> None:
+    """Give a node's mesh to children, one for each instance and each of its materials, where it has several."""
+    mesh = tree["meshes"][node["mesh"]]
+    stated, materials = node.get("extensions", {}).pop(INSTANCES, None), mesh["primitives"]
+    if mesh.get("name"):
+        node.setdefault("name", mesh["name"])
+    if stated is None and len(materials) == 1:
+        return
+    number, title = node.pop("mesh"), node.get("name", "part")
+    places = {
+        key.lower(): _values(tree, buffers, tree["accessors"][index])
+        for key, index in (stated or {}).get("attributes", {}).items()
+        if key in ("TRANSLATION", "ROTATION", "SCALE")
+    }
+    for row in range(max(map(len, places.values()), default=1)):
+        place = {key: values[row].tolist() for key, values in places.items()}
+        name, first = title if stated is None else f"{title}_{row + 1}", str(len(tree["nodes"]))
+        for index, part in enumerate(materials):
+            child = {"mesh": number, "name": name, **place}
+            if len(materials) > 1:
+                look = tree["materials"][part["material"]] if "material" in part else {}
+                words = name, first, look.get("name") or str(index + 1)
+                child |= {"mesh": len(tree["meshes"]), "name": MATERIAL.join(words)}
+                tree["meshes"].append({**mesh, "primitives": [part]})
+            node.setdefault("children", []).append(len(tree["nodes"]))
+            tree["nodes"].append(child)
+
+
 # --- GLB files as a viewer shows them ---------------------------------------------------------------------------------
 
 
@@ -270,7 +475,7 @@ def read_glb(path: str | Path) -> GlbScene:
     """Meshes of any GLB file; raises ``FileNotFoundError``, and ``ValueError`` where it is damaged or has no faces."""
     path = Path(path)
     with readable(path, "GLB file"):
-        scene: Any = trimesh.load_scene(path, process=False)
+        scene = _load_scene(path)
         is_ours = VIEWER_ROOT in scene.graph.nodes
         base = VIEWER_ROOT if is_ours else scene.graph.base_frame
         root = np.asarray(scene.graph.get(VIEWER_ROOT)[0] if is_ours else np.eye(4), dtype=np.float64)[:3, :3]
@@ -282,7 +487,8 @@ def read_glb(path: str | Path) -> GlbScene:
         unit_m = float(abs(np.linalg.det(root)) ** (1 / 3))
         if not unit_m > 0:
             raise ValueError("its root node has a scale of 0")
-        mesh = SegmentedMesh(_renamed(segments))
+        names = _numbered([segment.name for segment in segments])
+        mesh = SegmentedMesh(tuple(replace(each, name=name) for each, name in zip(segments, names, strict=True)))
         return GlbScene(mesh, colors, _radii(segments, radii, all(calibrated)), root / unit_m, unit_m, is_ours)
 
 
@@ -295,9 +501,10 @@ def _glb_part(
     color, colors = _colors(geometry, PALETTE[number % len(PALETTE)])
     radii = geometry.vertex_attributes.get("_RADIUS95")
     facts = geometry.metadata.get("radius95")
+    name = stem if node.startswith("geometry_") else _joined(node)
     kept, index = _distinct(vertices if colors is None else np.column_stack([vertices, colors]))
     return (
-        Segment(stem if node.startswith("geometry_") else node, color, vertices[kept], index[faces], solid=False),
+        Segment(name, color, vertices[kept], index[faces], solid=False),
         None if colors is None else colors[kept],
         None if radii is None else np.asarray(radii, dtype=np.float64).reshape(-1)[kept],
         isinstance(facts, dict) and facts.get("calibrated") is True,
@@ -334,13 +541,13 @@ def _screen(linear: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
     return np.rint(255 * share).astype(np.uint8)
 
 
-def _renamed(segments: Sequence[Segment]) -> tuple[Segment, ...]:
-    """Segments of which no two have the same name: repeated ones are numbered."""
+def _numbered(given: Sequence[str]) -> list[str]:
+    """Names of which no two are the same: repeated ones are numbered."""
     names: list[str] = []
-    for segment in segments:
-        tries = (segment.name if n == 1 else f"{segment.name} ({n})" for n in range(1, len(segments) + 1))
+    for name in given:
+        tries = (name if n == 1 else f"{name} ({n})" for n in range(1, len(given) + 1))
         names.append(next(name for name in tries if name not in names))
-    return tuple(replace(segment, name=name) for segment, name in zip(segments, names, strict=True))
+    return names
 
 
 def _radii(

@@ -266,7 +266,7 @@ def _ply_points(path: Path) -> Float[np.ndarray, "n 3"]:
     count = check_ply(path).get("vertex", 0)
     if count == 0:
         raise ValueError("it has 0 vertices")
-    loaded: Any = trimesh.load(path, file_type="ply", process=False)
+    loaded: Any = trimesh.load(path, file_type="ply", resolver={}, process=False)  # no textures
     check_count(count, len(loaded.vertices), "points")
     return np.asarray(loaded.vertices, dtype=np.float64)
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import warnings
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import align_all, fit_rigid
 from mereo.io.cores import limit_blas_threads
+from mereo.io.errors import limited_memory, words_of
 from mereo.io.progress import stage, tracked
 from mereo.scenes.rest_pose import rest_frame
 from mereo.scenes.scene import Scene, State
@@ -255,15 +257,29 @@ VERSION = 1
 """To be raised where the same states give another model."""
 
 
+class CacheWarning(UserWarning):
+    """Warning that something is made each time, because it cannot be kept."""
+
+
 def kept_model(scene: Scene, count: int = OBJECT_STATES) -> StatisticalModel:
-    """Statistical model of a scene: read where it was made before, else made, and kept where that can be written."""
+    """Statistical model of a scene: read where it was made before, else made, and kept for the next time.
+
+    A ``CacheWarning`` says where it cannot be kept.
+    """
     path = cache_folder() / "models" / f"{model_key(scene, count)}.safetensors"
-    with suppress(OSError, ValueError):  # not there, or damaged: it is made again
-        return read_statistical_model(path.read_bytes())
+    with suppress(OSError, ValueError), limited_memory(path):  # not there, or damaged: it is made again
+        if path.is_file():  # a pipe would be waited for
+            return read_statistical_model(path.read_bytes())
     with stage("make the object's statistical model, once"):
         made = scene_model(scene, count)
-    with suppress(OSError):  # a full disk, or a home that cannot be written to: it is made again next time
+    try:
         save_statistical_model(made, path)
+    except (OSError, ValueError) as error:  # a full disk, a place that cannot be written to, or something else there
+        why = words_of(error).rpartition(": ")[0]
+        text = (
+            f"the object's statistical model cannot be kept ({why}), and is made again each time: name a folder that "
+        )
+        warnings.warn(f"{text}can be written to with {CACHE_VARIABLE}", CacheWarning, stacklevel=2)
     return read_statistical_model(statistical_model_bytes(made))  # the same bits as from the file
 
 

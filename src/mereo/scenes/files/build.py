@@ -23,7 +23,7 @@ from mereo.geometry.mesh_check import examine, mesh_of, solid_of
 from mereo.geometry.subdivision import TooManyFaces, split_edges
 from mereo.geometry.transforms import Normalizer
 from mereo.io.config import Space
-from mereo.io.mesh_formats import read_segmented_mesh
+from mereo.io.mesh_formats import MeshWarning, read_segmented_mesh
 from mereo.io.simulation_states import files_of_states, frame_files
 from mereo.io.volume_files import file_space, read_label_volume, segment_surfaces
 from mereo.io.yaml_document import Document, similar
@@ -43,10 +43,6 @@ from mereo.scenes.seeds import example_rng
 
 SOURCES = {"source", "segments", "model", "parts", "labels", "names", "cells"}
 """Keys that decide the meshes, which identify themselves, or nothing."""
-
-
-class MeshWarning(UserWarning):
-    """Warning that a mesh is no solid and is used all the same."""
 
 
 def load(path: Path) -> Scene:
@@ -274,11 +270,13 @@ def _from_model(document: Document, parts: Sequence[ModelPart], model: Segmented
 
 
 def _joined(part: PartLook, pieces: Sequence[Segment]) -> Segment:
-    """One segment of all pieces: their union where each is a solid, else all of their faces."""
+    """One segment of all pieces: their union where each is a solid that faces outwards, else all of their faces."""
     if len(pieces) == 1:
         return Segment(part.name, pieces[0].color, pieces[0].vertices, pieces[0].faces)
     try:
         solids = [solid_of(piece.vertices, piece.faces) for piece in pieces]
+        if min(solid.volume() for solid in solids) <= 0:
+            raise ValueError("a piece is inside out, and would be cut off the others")
         vertices, faces = mesh_of(Manifold.batch_boolean(solids, OpType.Add))
     except ValueError:
         vertices, faces, _ = SegmentedMesh(tuple(pieces)).merged()
