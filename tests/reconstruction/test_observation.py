@@ -1,7 +1,9 @@
 """One frame from any kind of file, with the options that belong to it, and its size against that of training."""
 
 import json
+import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ from point_files import save_pcd
 from scipy.spatial.transform import Rotation
 
 import mereo
-from mereo.geometry.camera import Camera, PointCloud
+from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.transforms import rigid, transform_points
 from mereo.io.config import InputConfig
 from mereo.io.readers import InputWarning
@@ -21,7 +23,7 @@ from mereo.io.sensor_frame import read_frame
 from mereo.models.trained import checked_points
 from mereo.models.weights import load_model
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.observation import find_object, size_warning
+from mereo.reconstruction.observation import find_object, hidden_share, observe, size_warning
 
 CAMERA = Camera(20, 10, 30.0, 30.0, 10.0, 5.0)
 
@@ -158,6 +160,44 @@ def test_points_behind_the_camera_get_the_cure_of_their_axes(turn: list[list[int
     np.testing.assert_allclose(checked_points(frame.cloud), CAP)
     with pytest.raises(ValueError, match=r"--camera-pose FILE\) for a cloud in a robot's base or a map, or .*scanner"):
         checked_points(PointCloud(CAP - CAP.mean(axis=0)))
+
+
+def test_a_merged_cloud_is_known_by_what_it_hides() -> None:
+    """Of a sphere's surface all but the cap that faces the camera is hidden; a single view hides nothing of itself."""
+    rng, (x, y) = np.random.default_rng(0), np.meshgrid(*[(np.arange(80) - 39.5) / 200] * 2)
+    normals = rng.normal(size=(6000, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    sphere = normals + np.array([0.0, 0.0, 5.0])
+    front = sphere[(normals * sphere).sum(axis=1) < 0]
+    opposite = front * [1.0, 1.0, -1.0] + [0.0, 0.0, 10.0]  # as a camera on the other side sees it
+    side = (front - [0.0, 0.0, 5.0]) @ np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]]) + [0.0, 0.0, 5.0]
+    wall = np.where(np.arange(80) // 4 % 2, 1.0, 1.5) + 0 * y  # bars, four pixels wide, in front of it
+    single = {
+        "sphere": front,
+        "few points": front[:200],
+        "noisy": front * rng.normal(1.0, 0.004, (len(front), 1)),
+        "in steps": front * np.round(1 / np.linalg.norm(front, axis=1)[:, None], 2) * 5,
+        "strays": np.concatenate([front, rng.uniform((-1.2, -1.2, 4), (1.2, 1.2, 7), (80, 3))]),
+        "bars": np.stack([x * wall, y * wall, wall], axis=-1).reshape(-1, 3),
+        "one place": np.ones((500, 3)),
+    }
+    for name, points in single.items():
+        assert observe(PointCloud(points)).doubt is None and hidden_share(points) < 0.05, name
+    for points, least, most in (
+        (sphere, 0.2, 0.6),
+        (sphere[:600], 0.2, 0.6),
+        (np.concatenate([front, opposite]), 0.2, 0.5),
+        (np.concatenate([front, side]), 0.15, 0.3),
+    ):
+        assert least < hidden_share(points) < most and hidden_share(1000 * points) == pytest.approx(
+            hidden_share(points)
+        )
+    merged = observe(PointCloud(sphere))
+    assert merged.doubt is not None and re.match(
+        r"2\d% of the points lie behind others, .*: give one view", merged.doubt
+    )
+    image = DepthImage(np.full((10, 20), 2.0), CAMERA)
+    assert replace(merged, frame=replace(merged.frame, depth=image)).self_hidden == 0.0
 
 
 def test_a_scan_has_no_depth(tmp_path: Path) -> None:
