@@ -188,6 +188,12 @@ def test_a_smooth_patch_is_not_believed(model: StatisticalModel) -> None:
     part, whole = (answer_frame(each, None, Registrar(None, model)) for each in (replace(seen, extent="partial"), seen))
     assert part.recognition.known == "unsure" and part.recognition.reason == FEATURELESS
     assert whole.recognition.known is False and "was not seen" in str(whole.recognition.reason)
+    merged = replace(seen, extent="partial")
+    vars(merged)["self_hidden"] = 0.3  # as if another view's points lay behind: nothing believes it, tracked or not
+    again = answer_frame(merged, None, Registrar(None, model)).recognition
+    assert again.known == "unsure" and again.reason == merged.doubt and "30% of the points lie behind" in again.reason
+    refused = recognize(None, refusal="too small")
+    assert refused.doubted(merged.doubt) is refused and part.recognition.doubted(None) is part.recognition
 
 
 def test_only_a_patch_is_explained_by_a_patch() -> None:

@@ -396,7 +396,11 @@ def test_an_object_that_jumps_or_goes_and_comes_again_is_found_in_its_own_frame(
     tracker.follow(observe(seen(scene, first)), 0.0, scene_unit=1.0)
     with pytest.raises(ValueError, match="points"):
         tracker.follow(observe(PointCloud(seen(scene, first).points[:3])), 0.1, scene_unit=1.0)
-    assert tracker.follow(observe(seen(scene, first)), 0.2, scene_unit=1.0).tracked
+    assert tracker.follow(observe(seen(scene, first)), 0.2, scene_unit=1.0).recognition.known is True
+    merged = observe(seen(scene, first))
+    vars(merged)["self_hidden"] = 0.3  # as if another view's points lay behind
+    followed = tracker.follow(merged, 0.21, scene_unit=1.0)
+    assert followed.tracked and followed.recognition.known == "unsure" and followed.recognition.reason == merged.doubt
     own = engine.fit_modes(CloudToFit(seen(scene, second).points, scene_unit=1.0)).registration
     # elsewhere: at once, and after more time than any expectation lasts
     for mesh, time_s in ((second, 0.23), (first, 5.0), (second, 10.0)):

@@ -1,7 +1,9 @@
 """One frame from any kind of file, with the options that belong to it, and its size against that of training."""
 
 import json
+import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +11,19 @@ import numpy as np
 import pytest
 from camera_files import write_camera
 from PIL import Image
+from point_files import save_pcd
+from scipy.spatial.transform import Rotation
 
-from mereo.geometry.camera import Camera
+import mereo
+from mereo.geometry.camera import Camera, DepthImage, PointCloud
+from mereo.geometry.transforms import rigid, transform_points
 from mereo.io.config import InputConfig
+from mereo.io.readers import InputWarning
 from mereo.io.sensor_frame import read_frame
+from mereo.models.trained import checked_points
 from mereo.models.weights import load_model
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.observation import find_object, size_warning
+from mereo.reconstruction.observation import find_object, hidden_share, observe, size_warning
 
 CAMERA = Camera(20, 10, 30.0, 30.0, 10.0, 5.0)
 
@@ -70,6 +78,126 @@ FILE = Path("k.json")
 def test_contradictory_inputs(name: str, options: dict[str, Any], text: str) -> None:
     with pytest.raises(ValueError, match=text):
         read_frame(Path(name), InputConfig(**options))
+
+
+BASE = rigid(Rotation.from_euler("xyz", [-110.0, 20.0, 5.0], degrees=True).as_matrix(), np.array([1.5, -0.5, 0.3]))
+"""Pose of a camera in a robot's base frame, at the side of the points."""
+
+CAP = np.random.default_rng(3).uniform((-0.1, -0.1, 0.5), (0.1, 0.1, 0.7), (60, 3)).astype(np.float32)
+
+
+def stored_at(pose: np.ndarray, points: np.ndarray) -> bytes:
+    """A PCD file with a camera's pose in its header."""
+    qx, qy, qz, qw = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
+    words = " ".join(map(repr, [*pose[:3, 3].tolist(), qw, qx, qy, qz]))
+    content = save_pcd(points.astype(np.float32), "binary")
+    return content.replace(b"VIEWPOINT 0 0 0 1 0 0 0", f"VIEWPOINT {words}".encode())
+
+
+def test_a_stated_viewpoint_is_used_where_the_points_fit_it(tmp_path: Path) -> None:
+    path, based = tmp_path / "c.pcd", transform_points(BASE, CAP.astype(np.float64))
+    path.write_bytes(stored_at(BASE, based))
+    with pytest.warns(
+        InputWarning, match=r"c.pcd states a camera's pose \(VIEWPOINT\); .* moved into the camera's axes"
+    ):
+        frame = read_frame(path)
+    np.testing.assert_allclose(frame.cloud.points, CAP, atol=1e-6)
+    np.testing.assert_allclose(find_object(frame).facts()["T_input_camera"], BASE, atol=1e-9)
+    np.testing.assert_allclose(read_frame(path, InputConfig(viewpoint="pose")).cloud.points, CAP, atol=1e-6)
+    ignored = read_frame(path, InputConfig(viewpoint="ignored"))
+    np.testing.assert_allclose(ignored.cloud.points, based, atol=1e-6)
+    assert ignored.T_input_camera is None and find_object(ignored).facts()["T_input_camera"] is None
+    path.write_bytes(stored_at(BASE, CAP))  # next to what the sensor measured, as other programs do
+    with pytest.warns(InputWarning, match="its points are taken to be in the camera's axes$"):
+        np.testing.assert_array_equal(read_frame(path).cloud.points, CAP)
+    ahead = rigid(np.eye(3), np.array([0.0, 0.0, -0.2]))
+    for points, fit in ((CAP, "both"), (-CAP, "neither")):
+        path.write_bytes(stored_at(ahead, points))
+        with pytest.raises(ValueError, match=f"they fit {fit}: give --viewpoint pose or --viewpoint ignored"):
+            read_frame(path)
+    path.write_bytes(stored_at(BASE, CAP).replace(b"VIEWPOINT", b"VIEWPOINT 7"))
+    with pytest.raises(ValueError, match=r"its VIEWPOINT is 7 1.5 .*, not x y z and a unit quaternion"):
+        read_frame(path)
+
+
+def test_a_camera_pose_moves_any_cloud_into_the_cameras_axes(folder: Path) -> None:
+    based = transform_points(BASE, CAP.astype(np.float64))
+    np.save(folder / "c.npy", based)
+    np.savetxt(folder / "pose.txt", BASE)
+    for frame in (
+        read_frame(folder / "c.npy", InputConfig(camera_pose=folder / "pose.txt")),
+        mereo.load_frame(folder / "c.npy", camera_pose=BASE),
+        mereo.load_frame(based, camera_pose=folder / "pose.txt"),
+        mereo.load_frame(PointCloud(based), camera_pose=BASE.tolist()),
+    ):
+        np.testing.assert_allclose(frame.cloud.points, CAP, atol=1e-7)
+        np.testing.assert_allclose(frame.T_input_camera, BASE)
+    for name, options in (("d.png", {"intrinsics": folder / "k.json"}), ("c.npy", {"frame": "scanner"})):
+        with pytest.raises(ValueError, match="a camera pose is given, but .* leave out --camera-pose"):
+            read_frame(folder / name, InputConfig(camera_pose=folder / "pose.txt", **options))
+    with pytest.raises(ValueError, match="the pose is .*rotation and a translation"):
+        mereo.load_frame(based, camera_pose=2 * BASE)
+
+
+@pytest.mark.parametrize(
+    "turn, cure",
+    [
+        (
+            [[0, 0, 1], [-1, 0, 0], [0, -1, 0]],
+            "like x forward, y left, z up .*: write the rows 0 0 1 0, -1 0 0 0, 0 -1",
+        ),
+        ([[1, 0, 0], [0, 0, 1], [0, -1, 0]], "like x right, y forward, z up .*: write the rows 1 0 0 0, 0 0 1 0, 0 -1"),
+        ([[1, 0, 0], [0, -1, 0], [0, 0, -1]], "like x right, y up, z backward .* rows 1 0 0 0, 0 -1 0 0, 0 0 -1 0"),
+    ],
+)
+def test_points_behind_the_camera_get_the_cure_of_their_axes(turn: list[list[int]], cure: str) -> None:
+    matrix = np.array(turn, dtype=np.float64)
+    with pytest.raises(ValueError, match=f"points have z <= 0, behind the camera; .*{cure}") as caught:
+        checked_points(PointCloud(CAP @ matrix.T))
+    rows = str(caught.value).partition("rows ")[2].partition(" and")[0].split(", ")
+    pose = np.array([row.split() for row in [*rows, "0 0 0 1"]], dtype=np.float64)
+    frame = mereo.load_frame(CAP @ matrix.T, camera_pose=pose)
+    np.testing.assert_allclose(checked_points(frame.cloud), CAP)
+    with pytest.raises(ValueError, match=r"--camera-pose FILE\) for a cloud in a robot's base or a map, or .*scanner"):
+        checked_points(PointCloud(CAP - CAP.mean(axis=0)))
+
+
+def test_a_merged_cloud_is_known_by_what_it_hides() -> None:
+    """Of a sphere's surface all but the cap that faces the camera is hidden; a single view hides nothing of itself."""
+    rng, (x, y) = np.random.default_rng(0), np.meshgrid(*[(np.arange(80) - 39.5) / 200] * 2)
+    normals = rng.normal(size=(6000, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    sphere = normals + np.array([0.0, 0.0, 5.0])
+    front = sphere[(normals * sphere).sum(axis=1) < 0]
+    opposite = front * [1.0, 1.0, -1.0] + [0.0, 0.0, 10.0]  # as a camera on the other side sees it
+    side = (front - [0.0, 0.0, 5.0]) @ np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]]) + [0.0, 0.0, 5.0]
+    wall = np.where(np.arange(80) // 4 % 2, 1.0, 1.5) + 0 * y  # bars, four pixels wide, in front of it
+    single = {
+        "sphere": front,
+        "few points": front[:200],
+        "noisy": front * rng.normal(1.0, 0.004, (len(front), 1)),
+        "in steps": front * np.round(1 / np.linalg.norm(front, axis=1)[:, None], 2) * 5,
+        "strays": np.concatenate([front, rng.uniform((-1.2, -1.2, 4), (1.2, 1.2, 7), (80, 3))]),
+        "bars": np.stack([x * wall, y * wall, wall], axis=-1).reshape(-1, 3),
+        "one place": np.ones((500, 3)),
+    }
+    for name, points in single.items():
+        assert observe(PointCloud(points)).doubt is None and hidden_share(points) < 0.05, name
+    for points, least, most in (
+        (sphere, 0.2, 0.6),
+        (sphere[:600], 0.2, 0.6),
+        (np.concatenate([front, opposite]), 0.2, 0.5),
+        (np.concatenate([front, side]), 0.15, 0.3),
+    ):
+        assert least < hidden_share(points) < most and hidden_share(1000 * points) == pytest.approx(
+            hidden_share(points)
+        )
+    merged = observe(PointCloud(sphere))
+    assert merged.doubt is not None and re.match(
+        r"2\d% of the points lie behind others, .*: give one view", merged.doubt
+    )
+    image = DepthImage(np.full((10, 20), 2.0), CAMERA)
+    assert replace(merged, frame=replace(merged.frame, depth=image)).self_hidden == 0.0
 
 
 def test_a_scan_has_no_depth(tmp_path: Path) -> None:

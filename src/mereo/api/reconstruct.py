@@ -28,7 +28,7 @@ from mereo.geometry.transforms import checked_pose
 from mereo.io.config import InputConfig
 from mereo.io.intrinsics import read_intrinsics
 from mereo.io.point_arrays import is_frame_list, points_of
-from mereo.io.readers import depth_of, usable_depth
+from mereo.io.readers import depth_of, read_pose, usable_depth
 from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.reconstruction.config import IsolationConfig
@@ -53,6 +53,7 @@ def load_frame(
     axes: CloudAxes | None = None,
     intrinsics: Camera | str | Path | None = None,
     mask: str | Path | None = None,
+    camera_pose: ArrayLike | str | Path | None = None,
     **options: Any,
 ) -> SensorFrame:
     """Load one frame of a depth camera or scanner.
@@ -64,6 +65,8 @@ def load_frame(
         axes: of points: "camera" (default) is x right, y down, z forward; "scanner" is y up, z toward the scanner.
         intrinsics: of a depth image: a camera, or a file of one.
         mask: file of an image that is not 0 where the object is.
+        camera_pose: of points in another frame, such as a robot's base: 4 x 4 numbers, or a file of them, that take
+            camera coordinates to theirs. The points are moved, and results come out in the camera's axes.
         options: the other fields of ``InputConfig``: ``unit_m``, metres per unit of points (0.001 for millimetres;
             without it the fit finds the unit); ``depth_scale``, stored values per metre of a depth image;
             ``drop_invalid``, to leave out points without a measurement, which are refused otherwise; ``topic`` of a
@@ -73,12 +76,15 @@ def load_frame(
     and for options that do not belong to this kind of frame; ``TypeError`` for an option that there is none of.
     """
     mask, axes_or_camera = None if mask is None else Path(mask), "camera" if axes is None else axes
-    reading = InputConfig(frame=axes_or_camera, mask=mask, **options)
+    reading, pose = InputConfig(frame=axes_or_camera, mask=mask, **options), None
+    if camera_pose is not None:
+        pose = read_pose(Path(camera_pose)) if isinstance(camera_pose, str | Path) else checked_pose(camera_pose)
     if not isinstance(source, str | Path):
-        return _frame_in_memory(source, axes, intrinsics, reading)
+        frame = _frame_in_memory(source, axes, intrinsics, reading)
+        return frame if pose is None else frame.seen_from(pose)
     path = Path(source)
     if str(source) in shipped_frames() and not (path.is_file() or is_recording(path)):
-        if axes is not None or intrinsics is not None or replace(reading, drop_invalid=False) != InputConfig():
+        if (axes, intrinsics, pose) != (None,) * 3 or replace(reading, drop_invalid=False) != InputConfig():
             raise ValueError(f"the shipped frame {str(source)!r} is in metres and needs no options: leave them out")
         return shipped_frame(str(source))
     if not path.exists() and path.suffix == "":
@@ -86,7 +92,7 @@ def load_frame(
         raise FileNotFoundError(f"there is no frame {str(source)!r}; give a file or one of the shipped: {known}")
     if isinstance(intrinsics, Camera):
         raise ValueError(f"{source} is a file; its intrinsics are read from one as well: give the path of that")
-    return read_frame(source, replace(reading, intrinsics=None if intrinsics is None else Path(intrinsics)))
+    return read_frame(source, replace(reading, intrinsics=None if intrinsics is None else Path(intrinsics)), pose)
 
 
 def _frame_in_memory(

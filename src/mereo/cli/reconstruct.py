@@ -89,7 +89,8 @@ class FrameJob:
         """Files that are read besides the frames."""
         command = self.command
         scene = () if command.scene is None else files_of(command.scene)
-        given = (command.reading.intrinsics, command.reading.mask, command.initial_pose, *command.carry)
+        reading = command.reading
+        given = (reading.intrinsics, reading.mask, reading.camera_pose, command.initial_pose, *command.carry)
         return (*files_read(command.object, command.weights), *scene, *(path for path in given if path is not None))
 
     @cached_property

@@ -513,6 +513,7 @@ class Tracker:
         stated = self.registrar.stated_scene_unit(frame.seen.frame.unit_m)
         calibration = None if model is None else model.calibration
         recognition = recognize(tracked.fitted.registration, calibration, stated_scene_unit=stated)
+        recognition = recognition.doubted(frame.seen.doubt)
         seen = in_registered_unit(frame.seen, self.registrar, tracked.fitted.registration, recognition)
         return Answer(
             seen=seen.read_as(tracked.hypothesis),

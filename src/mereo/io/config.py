@@ -38,6 +38,10 @@ scene units."""
 DEFAULT_FILES = FilesConfig()
 
 
+Viewpoint = Literal["auto", "pose", "ignored"]
+"""Use of the pose in a PCD file's header, see ``InputConfig.viewpoint``."""
+
+
 @dataclass(frozen=True)
 class InputConfig:
     """Settings of reading a frame.
@@ -47,6 +51,11 @@ class InputConfig:
         depth_scale: pixel value of one metre; by default what the intrinsics say, else 1000 (floats: 1).
         mask: image that is not 0 on the object.
         frame: axes of a point cloud: camera is x right, y down, z forward; scanner is y up, z toward the scanner.
+        camera_pose: pose of the camera in the frame of a point cloud, such as a robot's base: 4 x 4 numbers (text, NPY,
+            JSON) that take camera coordinates to the cloud's, in its unit. The cloud is moved into the camera's axes,
+            in which all options count and results come out; their summary.json has it as T_input_camera.
+        viewpoint: the pose in a PCD file's header: pose is used as a camera pose, ignored means that the points are in
+            the camera's axes already; auto takes what the points fit, and refuses the file where they fit both.
         drop_invalid: leave out NaN, infinite and all-zero points instead of refusing the file.
         unit_m: metres per unit of a point cloud: 0.001 for millimetres (ZDF has it). Without it lengths of options are
             in the cloud's unit, and the fit finds the unit where the object's true size is known.
@@ -58,6 +67,8 @@ class InputConfig:
     depth_scale: PositiveOrUnknown = None
     mask: Path | None = None
     frame: CloudAxes = "camera"
+    camera_pose: Path | None = None
+    viewpoint: Viewpoint = "auto"
     drop_invalid: bool = False
     unit_m: PositiveOrUnknown = None
     topic: str | None = None

@@ -16,10 +16,11 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, Real
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import LARGEST
-from mereo.geometry.transforms import checked_pose
+from mereo.geometry.transforms import checked_pose, rigid
 from mereo.io.errors import check_count, check_suffix, limited_memory, quiet, readable, without_output
 from mereo.io.extras import library
 
@@ -34,6 +35,11 @@ NOTHING_M = 1e9
 
 NARROWEST = 16
 """Least number of columns of an image; with fewer an array is a list of points, or of points with something else."""
+
+
+class InputWarning(UserWarning):
+    """Warning that a file may be meant in two ways, and in which it was taken."""
+
 
 Raw = Real[np.ndarray, "h w"]
 """Values of a depth image as they are stored."""
@@ -347,12 +353,7 @@ def _check_array(array: np.ndarray) -> Float[np.ndarray, "n 3"]:
 
 def _pcd_points(path: Path) -> Float[np.ndarray, "n 3"]:
     """Points of a PCD file: ascii, binary, binary_compressed; organized clouds come row by row, with their NaN rows."""
-    content = path.read_bytes()
-    match = re.search(rb"^DATA[ \t]+\S+[ \t]*\r?\n?", content[:65536], re.MULTILINE)
-    if match is None:
-        raise ValueError("it has no PCD header")
-    lines = [line.split() for line in content[: match.end()].decode("ascii").splitlines() if not line.startswith("#")]
-    header, body = {line[0]: line[1:] for line in lines if len(line) > 1}, content[match.end() :]
+    header, body = _pcd_parts(path.read_bytes())
     if missing := [key for key in ("FIELDS", "SIZE", "TYPE", "POINTS") if key not in header]:
         raise ValueError(f"its header has no {missing[0]}")
     count, row = int(header["POINTS"][0]), _pcd_row(header)
@@ -371,6 +372,31 @@ def _pcd_points(path: Path) -> Float[np.ndarray, "n 3"]:
     check_count(count, len(body) // row.itemsize, "points")
     records = np.frombuffer(body, row, count)
     return np.stack([records[axis].astype(np.float64).reshape(count) for axis in "xyz"], axis=1)
+
+
+def _pcd_parts(content: bytes) -> tuple[dict[str, list[str]], bytes]:
+    """Header of a PCD file, each line's words by the first, and what follows it."""
+    match = re.search(rb"^DATA[ \t]+\S+[ \t]*\r?\n?", content[:65536], re.MULTILINE)
+    if match is None:
+        raise ValueError("it has no PCD header")
+    lines = [line.split() for line in content[: match.end()].decode("ascii").splitlines() if not line.startswith("#")]
+    return {line[0]: line[1:] for line in lines if len(line) > 1}, content[match.end() :]
+
+
+def read_viewpoint(path: Path) -> Float[np.ndarray, "4 4"] | None:
+    """Pose of the camera by a PCD file's header; None where that is the identity, or missing, and for other files.
+
+    Raises ``ValueError`` for one that is no position and unit quaternion (x y z, qw qx qy qz).
+    """
+    if path.suffix.lower() != ".pcd":
+        return None
+    with readable(path, "point cloud"), path.open("rb") as file:
+        words = _pcd_parts(file.read(65536))[0].get("VIEWPOINT", ["0", "0", "0", "1", "0", "0", "0"])
+        numbers = np.array(words, dtype=np.float64)
+        if numbers.shape != (7,) or not np.isfinite(numbers).all() or abs(np.linalg.norm(numbers[3:]) - 1.0) > 1e-2:
+            raise ValueError(f"its VIEWPOINT is {' '.join(words)}, not x y z and a unit quaternion qw qx qy qz")
+        pose = rigid(Rotation.from_quat(numbers[3:], scalar_first=True).as_matrix(), numbers[:3])
+        return None if np.allclose(pose, np.eye(4)) else pose
 
 
 def _pcd_row(header: dict[str, list[str]]) -> np.dtype:

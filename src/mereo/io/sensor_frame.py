@@ -3,21 +3,38 @@
 Options that do not belong to a file's kind are refused, because ignored ones are wrong results that nobody notices.
 """
 
+import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from mereo.geometry.brief import counted
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.bounds import PositiveOrUnknown, check_bounds
 from mereo.io.config import InputConfig
 from mereo.io.intrinsics import read_intrinsics
-from mereo.io.readers import depth_of, is_depth_image, read_points, read_raw_depth, usable_depth, valid_points
+from mereo.io.readers import (
+    InputWarning,
+    depth_of,
+    is_depth_image,
+    read_points,
+    read_pose,
+    read_raw_depth,
+    read_viewpoint,
+    usable_depth,
+    valid_points,
+)
 from mereo.io.ros_recordings import RecordedFrame, is_recording, recorded_frame, recorded_frames
+
+IN_VIEW, MOST_IN_VIEW = 0.5, 0.95
+"""Cosine of the angle from the optical axis up to which a camera sees, and the share of points that have to be there.
+
+The widest depth cameras see 60 degrees to either side. Others of a file's points may be stray."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +50,8 @@ class SensorFrame:
         message: the recording's message, by topic and time; empty for other files.
         invalid: number of points without a measurement that were left out.
         whole: the whole depth image, without any mask; None for clouds.
+        T_input_camera: pose of the camera in the file's frame, in its unit, from which the cloud was moved into the
+            camera's axes; None where it was not moved.
     """
 
     path: Path
@@ -43,6 +62,7 @@ class SensorFrame:
     message: str = ""
     invalid: int = 0
     whole: DepthImage | None = None
+    T_input_camera: Float[np.ndarray, "4 4"] | None = None
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -51,6 +71,16 @@ class SensorFrame:
         size = " x ".join(f"{side:.3g}" for side in np.ptp(self.cloud.points, axis=0) * self.metres)
         points = counted(len(self.cloud), "point")
         return f"SensorFrame({self.source!r}, {points}, {size} {self.length_name}, {self.axes} axes)"
+
+    def seen_from(self, T_input_camera: Float[np.ndarray, "4 4"]) -> "SensorFrame":
+        """Frame with its cloud in the axes of a camera of this pose; ``ValueError`` where axes are known already."""
+        if self.axes != "camera" or self.depth is not None:
+            raise ValueError(
+                f"a camera pose is given, but {self.path} is a depth image, or a scan that --frame turns; it is for "
+                "clouds in another frame, such as a robot's base: leave out --camera-pose"
+            )
+        points = transform_points(np.linalg.inv(T_input_camera), self.cloud.points)  # its digits may be few
+        return replace(self, cloud=PointCloud(points), T_input_camera=T_input_camera)
 
     @property
     def metres(self) -> float:
@@ -68,14 +98,25 @@ class SensorFrame:
         return f"{self.path.name}, {self.message}" if self.message else self.path.name
 
 
-def read_frame(path: str | Path, reading: InputConfig = InputConfig()) -> SensorFrame:  # noqa: B008 (frozen)
+def read_frame(
+    path: str | Path,
+    reading: InputConfig = InputConfig(),  # noqa: B008 (frozen)
+    T_input_camera: Float[np.ndarray, "4 4"] | None = None,
+) -> SensorFrame:
     """Frame that a depth image, point cloud or ROS recording holds, or that ``reading`` picks from it.
 
-    Depth images and recordings come in metres and camera axes; point clouds keep their file's unit and axes. Raises
+    Depth images and recordings come in metres and camera axes; point clouds keep their file's unit and axes, unless the
+    camera's pose is given, here or by the file's name, or stated in the file: then they are moved into the camera's.
+
+    Warns with ``InputWarning`` where a file states such a pose. Raises
     ``FileNotFoundError``, ``ImportError`` for a missing extra, and ``ValueError`` for a damaged file and for options
     that do not belong to this kind of file.
     """
     path = Path(path)
+    return _in_camera(_as_stored(path, reading), reading, T_input_camera)
+
+
+def _as_stored(path: Path, reading: InputConfig) -> SensorFrame:
     kind = "recording" if is_recording(path) else "depth image" if is_depth_image(path) else "point cloud"
     _check_options(path, kind, reading)
     if kind == "recording":
@@ -90,15 +131,56 @@ def read_frame(path: str | Path, reading: InputConfig = InputConfig()) -> Sensor
     return SensorFrame(path, cloud, unit_m, reading.frame, invalid=len(points) - len(cloud))
 
 
+def _in_camera(frame: SensorFrame, reading: InputConfig, pose: Float[np.ndarray, "4 4"] | None = None) -> SensorFrame:
+    """Frame in the camera's axes, where its pose is given, by an option or by the file."""
+    if pose is None:
+        pose = _stated_pose(frame, reading) if reading.camera_pose is None else read_pose(reading.camera_pose)
+    return frame if pose is None else frame.seen_from(pose)
+
+
+def _stated_pose(frame: SensorFrame, reading: InputConfig) -> Float[np.ndarray, "4 4"] | None:
+    """Pose of the camera that the file states, where its points are in the frame of that; None where they are not.
+
+    Some programs store points as the sensor measured them next to its pose, others points in the frame of the pose.
+    """
+    path, points, pose = frame.path, frame.cloud.points, read_viewpoint(frame.path)
+    if pose is None or reading.viewpoint == "ignored" or frame.axes == "scanner":
+        return None
+    if reading.viewpoint == "pose":
+        return pose
+    as_stored, moved = _is_in_view(points), _is_in_view(transform_points(inverse_rigid(pose), points))
+    if as_stored == moved:
+        fit = "fit both" if moved else "fit neither"
+        raise ValueError(
+            f"{path} states a camera's pose (VIEWPOINT), and its points may be in the frame of that pose or in the "
+            f"camera's axes: they {fit}: give --viewpoint pose or --viewpoint ignored"
+        )
+    taken = "in its frame, from which they were moved into the camera's axes" if moved else "in the camera's axes"
+    back = ", where results come out (T_input_camera in summary.json leads back)" if moved else ""
+    warnings.warn(
+        f"{path} states a camera's pose (VIEWPOINT); its points are taken to be {taken}{back}",
+        InputWarning,
+        stacklevel=3,
+    )
+    return pose if moved else None
+
+
+def _is_in_view(points: Float[np.ndarray, "n 3"]) -> bool:
+    """Whether a camera at the origin that looks along z may see these points."""
+    return bool((points[:, 2] > IN_VIEW * np.linalg.norm(points, axis=1)).mean() >= MOST_IN_VIEW)
+
+
 def read_frames(path: Path, reading: InputConfig) -> Iterator[tuple[RecordedFrame, Callable[[], SensorFrame]]]:
     """Messages of a ROS recording's topic in their order, each with what decodes it; raises as ``read_frame``."""
     for message in recorded_frames(path, *_recording_options(reading)):
-        yield message, partial(_recorded, message, path, reading)
+        yield message, lambda message=message: _in_camera(_recorded(message, path, reading), reading)
 
 
 def _check_options(path: Path, kind: str, reading: InputConfig) -> None:
     if reading.topic is not None and kind != "recording":
         raise ValueError(f"{path} is no ROS recording and has no topics: leave out --topic")
+    if reading.viewpoint != "auto" and path.suffix.lower() != ".pcd":
+        raise ValueError(f"{path} is no PCD file, which alone states a viewpoint: leave out --viewpoint")
     if kind == "point cloud":
         if reading.intrinsics is not None or reading.mask is not None or reading.depth_scale is not None:
             raise ValueError(f"{path} is read as a point cloud; leave out intrinsics, mask and depth scale")

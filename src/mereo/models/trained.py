@@ -139,6 +139,30 @@ def checked_points(cloud: PointCloud) -> Float[np.ndarray, "n 3"]:
     if (points[:, 2] <= 0).any():
         raise ValueError(
             f"{int((points[:, 2] <= 0).sum())} of {len(points)} points have z <= 0, behind the camera; the cloud must "
-            "be in a camera frame (x right, y down, z forward): turn it, or pass --frame scanner for y-up scans"
+            f"be in a camera frame (x right, y down, z forward): {_cure_of_axes(points)}"
         )
     return points
+
+
+FORWARD = {
+    "x forward, y left, z up": ((1, 0, 0), "0 0 1 0, -1 0 0 0, 0 -1 0 0"),
+    "x right, y forward, z up": ((0, 1, 0), "1 0 0 0, 0 0 1 0, 0 -1 0 0"),
+    "x right, y up, z backward": ((0, 0, -1), "1 0 0 0, 0 -1 0 0, 0 0 -1 0"),
+}
+"""Direction in which a camera looks along other usual axes, and its pose in them (the first three rows)."""
+
+
+def _cure_of_axes(points: Float[np.ndarray, "n 3"]) -> str:
+    """Advice for a cloud that is not in front of a camera, by the axes in which it is in front of the origin."""
+    ahead = points.mean(axis=0)
+    axes = max(FORWARD, key=lambda name: ahead @ FORWARD[name][0])
+    direction, rows = FORWARD[axes]
+    if (points @ direction > 0).all():
+        return (
+            f"it looks like {axes} from the origin, which --camera-pose FILE turns: write the rows {rows} and 0 0 0 1 "
+            "into the file, or the camera's pose where that is not the origin"
+        )
+    return (
+        "name the file of the camera's pose in the cloud's frame (--camera-pose FILE) for a cloud in a robot's base or "
+        "a map, or pass --frame scanner for a range scan with y up and z toward the scanner"
+    )

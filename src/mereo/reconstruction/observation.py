@@ -77,6 +77,24 @@ class Observation:
         """Lines of sight around the object, in the frame's axes and unit; strays count as the object's points."""
         return lines_of_frame(self.frame, self.selection, self.extent)
 
+    @cached_property
+    def self_hidden(self) -> float:
+        """Share of the points that others would hide from the camera (``hidden_share``); 0 of a depth image."""
+        if self.frame.depth is not None:
+            return 0.0
+        points = self.cloud.points
+        return hidden_share(transform_points(into_camera(points, self.frame.axes), points))
+
+    @property
+    def doubt(self) -> str | None:
+        """Sentence why no answer to the frame can be believed, as it cannot be one view; None where it can be."""
+        if self.self_hidden <= MOST_HIDDEN:
+            return None
+        return (
+            f"{self.self_hidden:.0%} of the points lie behind others, so the cloud holds surfaces that hide each other "
+            "from the camera, as merged views do: give one view, as its camera saw it"
+        )
+
     def read_as(self, reading: Reading) -> "Observation":
         """The object as a reading of ``cloud`` has it: what was dropped as strays is a step of its own."""
         steps = self.steps if reading.step is None else (*self.steps, reading.step)
@@ -116,6 +134,7 @@ class Observation:
             "depth_m": self.depth_m if known and self.frame.axes == "camera" else None,
             "visible_size_m": self.size_m if known else None,
             "invalid_points": self.frame.invalid,
+            "T_input_camera": None if self.frame.T_input_camera is None else self.frame.T_input_camera.tolist(),
             "isolation": [asdict(step) for step in self.steps],
         }
 
@@ -224,6 +243,55 @@ def clusters_warning(observation: Observation) -> str | None:
         f"{gap * metres:.3g} {name} apart), and one object is looked for in all of it: if they are two, crop to one "
         "with --box, or take the larger one with --largest-cluster"
     )
+
+
+# --- merged views -----------------------------------------------------------------------------------------------------
+
+# A camera measures one depth along each line of sight. In a cloud of several views, or of a whole surface, points lie
+# behind a closed ring of nearer ones, by more than a slope or noise explains.
+
+RING, PROBES = 12, 2000
+"""Neighbours in the picture around a line of sight, and the number of points that are looked at."""
+
+STEP = 3.0
+"""Gap in distance between the nearer and the farther of these neighbours, in standard deviations within either, from
+which on they are two surfaces. Noise alone, however strong, heavy-tailed or stepped, does it at 1 % of the points."""
+
+MOST_HIDDEN = 0.1
+"""Share of points behind others from which on a cloud is no single view.
+
+Of 684 simulated views of eleven objects (three kinds of noise, hands and tools in front, wrong masks; 64 to 192 pixels)
+none has more than .091, of real frames and scans none more than .033. Liver, skull, bunny and tumor have .39 to .53
+from front and back, .29 to .39 from all sides, .11 to .28 in two views at a right angle. What is thinner than four
+pixels has less, and bars or holes of one or two pixels have more."""
+
+
+def hidden_share(points: Float[np.ndarray, "n 3"]) -> float:
+    """Share of points that other points hide from a camera at the origin, by the pitch of the points in the picture.
+
+    0 for fewer than ``RING`` points; ``points`` are in the camera frame, in any unit.
+    """
+    points = random_subset(points, MAX_POINTS)
+    if len(points) <= RING:
+        return 0.0
+    distance = np.linalg.norm(points, axis=1)
+    sight = points / np.maximum(distance, 1e-300)[:, None]
+    flat = sight @ np.linalg.svd(sight.mean(axis=0)[None])[2][1:].T
+    probes = random_subset(np.arange(len(points)), PROBES)
+    angle, ring = cKDTree(flat).query(flat[probes], k=RING + 1)
+    ordered = np.sort(distance[ring], axis=1)
+    gaps = np.diff(ordered, axis=1)
+    last = gaps.argmax(axis=1)[:, None]
+    gap, edge = (np.take_along_axis(values, last, axis=1) for values in (gaps, ordered))
+    is_near = np.arange(RING + 1) <= last
+    near, far = (np.average(ordered, axis=1, weights=each)[:, None] for each in (is_near, ~is_near))
+    spread = (ordered - np.where(is_near, near, far)).std(axis=1, keepdims=True)
+    pitch = np.median(angle[:, 4])  # the fourth neighbour of a pixel is one pitch away, as the first is
+    is_behind = (distance[probes, None] > edge) & (gap > STEEPEST * pitch * edge) & (gap > STEP * spread)
+    turns = np.linspace(0, 2 * np.pi, RING, endpoint=False)
+    ahead = (flat[ring] - flat[probes, None]) @ np.stack([np.cos(turns), np.sin(turns)]) > 0
+    is_closed = (ahead & (distance[ring] <= edge)[..., None]).any(axis=1).all(axis=1)
+    return float((is_behind[:, 0] & is_closed).mean())
 
 
 # --- lines of sight ---------------------------------------------------------------------------------------------------

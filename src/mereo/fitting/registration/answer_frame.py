@@ -106,9 +106,8 @@ def answer_of(
     refusal = None if candidate.error is None else str(candidate.error)
     calibration = None if model is None else model.calibration
     unseen = None if registration is None or seen.lines.other_lines is not None else candidate.unseen(registration)
-    recognition = recognize(registration, calibration, displaced, stated, refusal, unseen)
-    if recognition.known is not False and candidate.is_featureless:
-        recognition = replace(recognition, known="unsure", reason=FEATURELESS)
+    doubt = seen.doubt or (candidate.is_featureless and FEATURELESS) or None
+    recognition = recognize(registration, calibration, displaced, stated, refusal, unseen).doubted(doubt)
     taken = registrar is not None and registration is not None and registrar.takes(registration)
     used = candidate.encoded if taken else likelier
     if taken and registrar is not None and registration is not None:

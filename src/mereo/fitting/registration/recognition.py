@@ -8,7 +8,7 @@ the usual, in standard deviations and together, is the frame's strangeness; the 
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -163,6 +163,10 @@ class Recognition:
         return (
             f"{'doubtful' if self.known == 'unsure' else 'not the object in a state that was learned'}: {self.reason}"
         )
+
+    def doubted(self, reason: str | None) -> "Recognition":
+        """The same, unsure for a reason that outweighs its own; itself where there is none, or the object is refused."""
+        return replace(self, known="unsure", reason=reason) if reason and self.known is not False else self
 
     def facts(self) -> dict[str, Any]:
         """Content of ``recognition`` in a result's summary."""
