@@ -156,7 +156,7 @@ PROGRAMS = ("mereo view", "mereo serve")
 
 @pytest.fixture
 def clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Folder with the command ``mereo``, for which neither assets nor, unless MEREO_TEST_TORCH is set, torch are there."""
+    """Folder with the command ``mereo``; assets are not there, and torch only where MEREO_TEST_TORCH is set."""
     (tmp_path / "bin").mkdir()
     (tmp_path / "bin/mereo").write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m mereo "$@"\n')
     (tmp_path / "bin/mereo").chmod(0o755)

@@ -180,8 +180,8 @@ def load_object(
 def _built_in_by_model(name: str) -> Object:
     """Built-in object without its weights' network, by the statistical model that they carry."""
     warnings.warn(
-        f"PyTorch is not installed, so {name} is searched by its model: pip install 'mereo[network]' brings its weights, "
-        "which start the fit at once",
+        f"PyTorch is not installed, so {name} is searched by its model: pip install 'mereo[network]' lets its weights "
+        "start the fit at once",
         WithoutWeightsWarning,
         stacklevel=4,
     )
