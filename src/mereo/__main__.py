@@ -105,26 +105,33 @@ class Command(Protocol):
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line, and return the exit code. With MEREO_TRACEBACK=1 errors are raised as they are."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    if arguments in (["--version"], ["-V"]):
-        print(f"mereo {__version__}")
-        return 0
     warnings.formatwarning = _warning_line
+    for stream in ("stdout", "stderr"):  # Python has none where whoever started it has closed it
+        if getattr(sys, stream) is None:
+            setattr(sys, stream, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (to the end)
     if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal that lacks a character gets another one, and no error
         sys.stdout.reconfigure(errors="replace")
     try:
         with option_words(), stop_signals():
-            command = parse(arguments)
-            use_threads(getattr(command, "threads", 0))
-            status = _run(command)
+            if arguments in (["--version"], ["-V"]):
+                print(f"mereo {__version__}")
+                status = 0
+            else:
+                command = parse(arguments)
+                use_threads(getattr(command, "threads", 0))
+                status = _run(command)
             sys.stdout.flush()
     except Stopped as stopped:
         return _stop(f"mereo: stopped by {stopped.signal.name}", 128 + stopped.signal)
     except KeyboardInterrupt:
         return _stop("mereo: interrupted", INTERRUPTED)
-    except BrokenPipeError:
-        # the reader (head, less) has gone; without this, flushing at exit would complain again
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:  # the reader (head, less) has gone
+        _drop_output()
         return BROKEN_PIPE
+    except SystemExit as end:
+        if isinstance(end.__context__, BrokenPipeError):  # which rich has caught in a table
+            return BROKEN_PIPE
+        raise
     except Exception as error:
         if os.environ.get(TRACEBACK_VARIABLE) == "1":
             raise
@@ -153,10 +160,19 @@ def _warning_line(message: Warning | str, *_: Any, **__: Any) -> str:
 
 
 def _stop(message: str, code: int) -> int:
-    with suppress(OSError):  # a terminal that was closed (HUP) takes no words
+    try:
         sys.stdout.flush()
+    except OSError:
+        _drop_output()
+    with suppress(OSError):  # a terminal that was closed (HUP) takes no words
         print(message, file=sys.stderr)
     return code
+
+
+def _drop_output() -> None:
+    """Let what is left of standard output go nowhere: else flushing it at exit would complain once more."""
+    with suppress(OSError):  # of a stream that is no file
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 # --- how a command ends before its end --------------------------------------------------------------------------------
