@@ -96,7 +96,7 @@ class Mereo:
             capture_output=True,
             text=True,
         )
-        if done.returncode not in (0, 3):
+        if done.returncode not in (0, 3, 4):
             raise RuntimeError(done.stderr)
         seconds = time.perf_counter() - start
         surface = trimesh.load(self.place / "out" / "segments.ply", process=False)

@@ -1,6 +1,7 @@
 """``mereo`` and ``python -m mereo``: run one command, and answer what a user can cause with one line."""
 
 import io
+import multiprocessing
 import os
 import signal
 import sys
@@ -104,26 +105,33 @@ class Command(Protocol):
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line, and return the exit code. With MEREO_TRACEBACK=1 errors are raised as they are."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    if arguments in (["--version"], ["-V"]):
-        print(f"mereo {__version__}")
-        return 0
     warnings.formatwarning = _warning_line
+    for stream in ("stdout", "stderr"):  # Python has none where whoever started it has closed it
+        if getattr(sys, stream) is None:
+            setattr(sys, stream, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (to the end)
     if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal that lacks a character gets another one, and no error
         sys.stdout.reconfigure(errors="replace")
     try:
         with option_words(), stop_signals():
-            command = parse(arguments)
-            use_threads(getattr(command, "threads", 0))
-            status = _run(command)
+            if arguments in (["--version"], ["-V"]):
+                print(f"mereo {__version__}")
+                status = 0
+            else:
+                command = parse(arguments)
+                use_threads(getattr(command, "threads", 0))
+                status = _run(command)
             sys.stdout.flush()
     except Stopped as stopped:
         return _stop(f"mereo: stopped by {stopped.signal.name}", 128 + stopped.signal)
     except KeyboardInterrupt:
         return _stop("mereo: interrupted", INTERRUPTED)
-    except BrokenPipeError:
-        # the reader (head, less) has gone; without this, flushing at exit would complain again
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:  # the reader (head, less) has gone
+        _drop_output()
         return BROKEN_PIPE
+    except SystemExit as end:
+        if isinstance(end.__context__, BrokenPipeError):  # which rich has caught in a table
+            return BROKEN_PIPE
+        raise
     except Exception as error:
         if os.environ.get(TRACEBACK_VARIABLE) == "1":
             raise
@@ -152,10 +160,19 @@ def _warning_line(message: Warning | str, *_: Any, **__: Any) -> str:
 
 
 def _stop(message: str, code: int) -> int:
-    with suppress(OSError):  # a terminal that was closed (HUP) takes no words
+    try:
         sys.stdout.flush()
+    except OSError:
+        _drop_output()
+    with suppress(OSError):  # a terminal that was closed (HUP) takes no words
         print(message, file=sys.stderr)
     return code
+
+
+def _drop_output() -> None:
+    """Let what is left of standard output go nowhere: else flushing it at exit would complain once more."""
+    with suppress(OSError):  # of a stream that is no file
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 # --- how a command ends before its end --------------------------------------------------------------------------------
@@ -173,9 +190,20 @@ class Stopped(KeyboardInterrupt):
         self.signal = signal.Signals(number)
 
 
+LOOK_S = 0.02
+"""Seconds after which it is looked again whether a signal can be obeyed."""
+
+WHOLE = "<frozen importlib", str(Path(multiprocessing.__file__).with_name("popen_"))
+"""Beginnings of the files of Python whose work is not broken off: some modules catch whatever is raised while they are
+imported, so that it would be lost, and a process that has got half of its work prints a traceback."""
+
+
 @contextmanager
 def stop_signals() -> Iterator[None]:
-    """Raise ``Stopped`` in the block where a signal asks for the end; once, so that a second cuts no cleaning short.
+    """Raise ``Stopped`` in the block where a signal asks for the end, and ``KeyboardInterrupt`` where Ctrl-C does.
+
+    They wait for what is not broken off (``WHOLE``). After the first signal cleaning goes on whatever HUP says, but a
+    second TERM ends the process at once.
 
     A signal that is ignored stays so (``nohup``). Outside the main thread, where Python sets no handlers, nothing
     changes; nor do processes that are started meanwhile inherit anything.
@@ -183,21 +211,55 @@ def stop_signals() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {number: signal.getsignal(number) for number in STOPPING}
-    taken = {number: handler for number, handler in before.items() if handler not in (signal.SIG_IGN, None)}
+    alarm = tuple(getattr(signal, name) for name in ("SIGALRM",) if hasattr(signal, name))  # Windows has none
+    before = {number: signal.getsignal(number) for number in (*STOPPING, signal.SIGINT, *alarm)}
+    ignored = signal.SIG_IGN, None
+    taken = [number for number in STOPPING if before[number] not in ignored]
+    waiting = list[KeyboardInterrupt]()
 
-    def stop(number: int, _: FrameType | None) -> None:
+    def stop(number: int, frame: FrameType | None) -> None:
         for each in taken:
-            signal.signal(each, signal.SIG_IGN)
-        raise Stopped(number)
+            signal.signal(each, _end_at_once if each == signal.SIGTERM else signal.SIG_IGN)
+        waiting.append(Stopped(number))
+        end(number, frame)
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        waiting.append(KeyboardInterrupt())
+        end(number, frame)
+
+    def end(_: int, frame: FrameType | None) -> None:
+        if alarm and _is_whole(frame):
+            signal.signal(alarm[0], end)
+            signal.setitimer(signal.ITIMER_REAL, LOOK_S)
+        elif waiting:
+            raise waiting.pop(0)
 
     for number in taken:
         signal.signal(number, stop)
+    if before[signal.SIGINT] is signal.default_int_handler:
+        signal.signal(signal.SIGINT, interrupt)
     try:
         yield
+        end(0, None)
     finally:
-        for number, handler in taken.items():
-            signal.signal(number, handler)
+        if alarm and signal.getsignal(alarm[0]) is end:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+        for number, handler in before.items():
+            if handler is not None:  # that of a library, which Python cannot set
+                signal.signal(number, handler)
+
+
+def _is_whole(frame: FrameType | None) -> bool:
+    """Whether a command is within what is not broken off."""
+    while frame is not None and frame.f_code is not main.__code__:
+        if frame.f_code.co_filename.startswith(WHOLE):
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _end_at_once(number: int, _: FrameType | None) -> None:
+    os._exit(128 + number)
 
 
 def fault_sentence(error: Exception, arguments: list[str]) -> str:

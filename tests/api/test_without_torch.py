@@ -1,12 +1,19 @@
-"""An object without weights needs no torch, and what does need it says how to get it."""
+"""An object without weights needs no torch, and what does need it says how to get it: the pages run as printed."""
 
+import json
+import os
+import re
+import shlex
+import signal
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import numpy as np
 import pytest
 from angle import write_angle
+from page_blocks import FENCE, ROOT, blocks
 
 from mereo.scenes.files.object_files import scene_of_meshes
 from mereo.scenes.random_states import CACHE_VARIABLE
@@ -16,15 +23,17 @@ from mereo.synthesis.examples import sample_view
 
 HIDDEN = """
 import sys
+from importlib.machinery import PathFinder
 
-class Hidden:
+class Hidden(PathFinder):
     asked = []
-    def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] == "torch":
-            self.asked.append(name)
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+    @classmethod
+    def find_spec(cls, name, path=None, target=None):
+        if name.partition(".")[0] != "torch":
+            return super().find_spec(name, path, target)
+        cls.asked.append(name)
 
-sys.meta_path.insert(0, Hidden())
+sys.meta_path[sys.meta_path.index(PathFinder)] = Hidden
 """
 """Beginning of a program for which torch is not installed."""
 
@@ -103,7 +112,8 @@ def test_what_needs_torch_says_which_extra(tmp_path: Path) -> None:
     program = """
 import mereo
 from mereo.__main__ import main
-for call in ("load_object('bunny')", "load_model('bunny')", "learn('rope', 'out')", "reconstruct('bun000', 'bunny')"):
+load = "load_object(weights='bunny')", "load_object('bunny', 'bunny')", "load_model('bunny')"
+for call in (*load, "learn('rope', 'out')"):
     try:
         eval(f"mereo.{call}")
     except ImportError as error:
@@ -114,3 +124,104 @@ Hidden.asked.clear()
     ran = hidden(program, tmp_path)
     assert ran.stdout.count("run pip install 'mereo[network]'") == 4 and ran.stdout.endswith("\n2\n"), ran.stderr
     assert ran.stderr.startswith("mereo: error: PyTorch is not installed") and ran.stderr.count("\n") == 1
+
+
+# --- the pages, as printed, after a clone and its ./demo --------------------------------------------------------------
+
+PAGES = {page: ROOT / page for page in ("README.md", "docs/quickstart.md")}
+
+
+def test_five_lines_find_a_built_in_object(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of the README, where neither PyTorch nor the object's own mesh is to be had."""
+    monkeypatch.setenv("MEREO_ASSETS", str(tmp_path / "none"))
+    (code,) = blocks(PAGES["README.md"], "python")
+    checks = """
+import numpy as np
+assert repr(bunny) == "Object('bunny': body, head, ear_left, ear_right, tail)"
+assert result.known is True and result.located_by == "search" and result["head"].error_radius > 0
+np.testing.assert_allclose(result.carry([[0.0, 0.1, 0.0]]), [[0.0, 0.1, 0.0]], atol=0.002)  # the scan is in their frame
+"""
+    ran = hidden(f"{code}{checks}Hidden.asked.clear()", tmp_path)
+    assert ran.returncode == 0, ran.stderr
+    assert (
+        ran.stderr.count("Warning") == 1
+        and "so bunny is searched by its model: pip install 'mereo[network]'" in ran.stderr
+    )
+    assert (tmp_path / "result/segments.glb").is_file()
+
+
+PROGRAMS = ("mereo view", "mereo serve")
+"""Commands that go on until Ctrl-C."""
+
+
+@pytest.fixture
+def clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folder with the command ``mereo``; assets are not there, and torch only where MEREO_TEST_TORCH is set."""
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin/mereo").write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m mereo "$@"\n')
+    (tmp_path / "bin/mereo").chmod(0o755)
+    torch = 'import os\nif "MEREO_TEST_TORCH" not in os.environ:\n'
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site/sitecustomize.py").write_text(torch + textwrap.indent(HIDDEN, "    "))
+    for name, first, divider in (("PATH", "bin", ":"), ("PYTHONPATH", "site", os.pathsep)):
+        monkeypatch.setenv(name, f"{tmp_path / first}{divider}{os.environ.get(name, '')}")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("MEREO_ASSETS", str(tmp_path / "none"))
+    return tmp_path
+
+
+def run_line(line: str, clone: Path) -> None:
+    """Run a line of a shell block; one that installs is done already, one that waits is interrupted when it does."""
+    if line.startswith(("git clone ", "pip install ")):
+        return
+    line = re.sub(r"^\./demo\b", "mereo demo", line).replace("source .venv/bin/activate", "true")
+    if not line.startswith(PROGRAMS):
+        ran = subprocess.run(["bash", "-ec", line], cwd=clone, capture_output=True, text=True, timeout=600)
+        assert ran.returncode == 0, f"{line}\n{ran.stdout}{ran.stderr}"
+        return
+    words = [*shlex.split(line, comments=True), "--port", "0"]
+    with subprocess.Popen(words, cwd=clone, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        assert process.stdout is not None
+        printed = []
+        for text in process.stdout:
+            printed.append(text)
+            if "Ctrl-C ends" in text:
+                process.send_signal(signal.SIGINT)
+    assert "Ctrl-C ends" in "".join(printed) and process.returncode in (0, 130), f"{line}\n{''.join(printed)}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES)
+def test_every_block_of_a_page_runs_as_printed(page: str, clone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the order of the page; those after a paragraph that installs PyTorch with it, all others without."""
+    for library in ("viser", "fastapi", "onnxscript"):
+        pytest.importorskip(library)
+    text, done = PAGES[page].read_text("utf-8"), 0
+    for block in FENCE.finditer(text):
+        before = text[: block.start()].rstrip().rsplit("\n\n", 1)[-1]
+        monkeypatch.delenv("MEREO_TEST_TORCH", raising=False)
+        if re.search(r"pip install '[^']*network", before) and "```" not in before:
+            monkeypatch.setenv("MEREO_TEST_TORCH", "1")
+        if block[1] == "python":
+            # as somebody who types it, whose pages stay open while the next line is typed
+            program = f"import sys\nsys.ps1 = '>>> '\n{block[2]}"
+            ran = subprocess.run(
+                [sys.executable, "-c", program], cwd=clone, capture_output=True, text=True, timeout=600
+            )
+            assert ran.returncode == 0, f"{block[2]}\n{ran.stdout}{ran.stderr}"
+        else:
+            assert block[1] == "sh", block[0]
+            for line in block[2].splitlines():
+                run_line(line, clone)
+        done += 1
+    assert done >= 2 and (clone / "out/demo/bun000-meshes/report.html").is_file()
+
+
+@pytest.mark.slow
+def test_the_tour_needs_torch_only_where_it_says_so(tmp_path: Path) -> None:
+    cells = json.loads((ROOT / "docs/tour.ipynb").read_text("utf-8"))["cells"]
+    sources = ["".join(cell["source"]) for cell in cells]
+    (first,) = [n for n, source in enumerate(sources) if "pip install 'mereo[network]'" in source]
+    code = [source for cell, source in zip(cells[:first], sources, strict=False) if cell["cell_type"] == "code"]
+    ran = hidden("\n".join([*code, "Hidden.asked.clear()"]), tmp_path)
+    assert ran.returncode == 0 and "the tip of ear_left" in ran.stdout, ran.stderr

@@ -74,14 +74,23 @@ def test_an_error_of_a_process_is_one_line_with_its_code() -> None:
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGPIPE"), reason="this system has no SIGPIPE")
-def test_closed_pipe_is_quiet() -> None:
+@pytest.mark.parametrize("line", ["assets list", "--version", "weights list", "learn --help"])
+def test_closed_pipe_is_quiet(line: str) -> None:
+    """As of ``head``: what prints by itself, in a table, and a help."""
     read, write = os.pipe()
     os.close(read)
-    command = [sys.executable, "-m", "mereo", "assets", "list"]
+    command = [sys.executable, "-m", "mereo", *line.split()]
     result = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, check=False)
     os.close(write)
-    assert result.stderr == ""
-    assert result.returncode == 128 + signal.SIGPIPE
+    assert (result.stderr, result.returncode) == ("", 128 + signal.SIGPIPE)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="streams are closed by a POSIX shell")
+@pytest.mark.parametrize(("streams", "line", "status"), [(">&-", "scene list", 0), (">&- 2>&-", "scene check cube", 2)])
+def test_without_standard_streams_a_command_does_its_work(streams: str, line: str, status: int) -> None:
+    command = ["sh", "-c", f'exec "$@" {streams}', "sh", sys.executable, "-m", "mereo", *line.split()]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stdout, result.stderr) == (status, "", "")
 
 
 @pytest.mark.parametrize(

@@ -121,10 +121,10 @@ def test_a_result_is_made_again_from_its_own_options(
     monkeypatch.chdir(tmp_path)
     np.save("cloud.npy", scene("camera")[0])
     line = "reconstruct cloud.npy --weights any --output first --resolution 12 --formats npz --keep-all"
-    assert command_line.main(line.split()) == 0
+    assert command_line.main(line.split()) == 4, "the network alone"
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
-    assert command_line.main(["reconstruct", "--config", "../first/config.json", "--output", "second"]) == 0
+    assert command_line.main(["reconstruct", "--config", "../first/config.json", "--output", "second"]) == 4
     first, second = tmp_path / "first", tmp_path / "elsewhere/second"
     assert {path.name for path in first.iterdir()} == {path.name for path in second.iterdir()}
     assert (first / "config.json").read_text() == (second / "config.json").read_text()
@@ -150,10 +150,11 @@ def mereo(*arguments: str) -> int:
 
 
 def test_one_frame_is_one_object_and_the_rest_goes_elsewhere(here: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    assert mereo("reconstruct", "rope.npy", "--weights", "rope", "--method", "network", "--json") == 0
+    assert mereo("reconstruct", "rope.npy", "--weights", "rope", "--method", "network", "--json") == 4
     out, err = capfd.readouterr()
     found = json.loads(out)
     assert found["output"] == "result" and found["unit_m"] is None and found["recognition"]["known"] == "unsure"
+    assert found["verdict"] == "alone", "nothing says whether it is the object, so the status is not 0"
     assert [segment["name"] for segment in found["segments"]][:2] == ["base", "segment_1"]
     assert "wrote result in" in err and not Path("result/summary.json").exists()
 
@@ -164,11 +165,14 @@ def test_what_is_not_the_object_has_a_status_of_its_own_and_a_failure_outweighs_
     asked = ("--weights", PLIERS, "--method", "modes", "--json", "--output")
     assert mereo("reconstruct", "plane.npy", *asked, "one") == 3
     found = json.loads(capfd.readouterr().out)
-    assert found["recognition"]["known"] is False and found["unit_m"] is None, "another object's size says nothing"
+    assert found["recognition"]["known"] is False and found["verdict"] == "no"
+    assert found["unit_m"] is None, "another object's size says nothing"
     assert mereo("reconstruct", "plane.npy", "rope.npy", *asked, "many") == 3
     frames = json.loads(capfd.readouterr().out)["frames"]
     assert [Path(frame["output"]).name for frame in frames] == ["plane", "rope"]
     assert frames[0]["recognition"] == found["recognition"]
+    assert mereo("reconstruct", "rope.npy", "--weights", "rope", "--json", "--output", "known") == 0
+    assert json.loads(capfd.readouterr().out)["verdict"] == "yes"
     assert mereo("reconstruct", "plane.npy", "text.npy", *asked, "more") == 2
     out, err = capfd.readouterr()
     assert out == "" and "text.npy" in err

@@ -53,17 +53,64 @@ def test_a_signal_leaves_nothing_half_written(
 
 
 @pytest.mark.parametrize("number", STOPPING)
-def test_a_second_signal_cuts_no_cleaning_short(number: signal.Signals) -> None:
+def test_a_terminal_that_closes_meanwhile_cuts_no_cleaning_short(number: signal.Signals) -> None:
     cleaned = []
     with pytest.raises(Stopped), stop_signals():
         try:
             os.kill(os.getpid(), number)
             threading.Event().wait(20)
         finally:
-            for each in STOPPING:
-                os.kill(os.getpid(), each)
+            os.kill(os.getpid(), signal.SIGHUP)
             cleaned.append(number)
     assert cleaned == [number]
+
+
+def test_a_second_term_ends_the_process_at_once() -> None:
+    program = """
+import os, signal, threading
+from mereo.__main__ import stop_signals
+with stop_signals():
+    try:
+        os.kill(os.getpid(), signal.SIGTERM)
+        threading.Event().wait(20)
+    finally:
+        print("cleaning", flush=True)
+        os.kill(os.getpid(), signal.SIGTERM)
+        print("cleaned", flush=True)
+"""
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert (ran.returncode, ran.stdout, ran.stderr) == (128 + signal.SIGTERM, "cleaning\n", "")
+
+
+SWALLOWING = """
+import os, time
+try:
+    os.kill(os.getpid(), {number})
+    for _ in range({steps}):
+        time.sleep(0.001)
+except BaseException:  # as a library does that tries one import after the other
+    raise SystemExit("the signal is lost")
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, *STOPPING])
+@pytest.mark.parametrize("is_last", [False, True])
+def test_no_signal_is_lost_in_an_import(
+    number: signal.Signals, is_last: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Some modules catch whatever is raised while they are imported; the command ends as soon as they are there."""
+    monkeypatch.syspath_prepend(tmp_path)
+    for attempt in range(12):
+        name = f"swallowing_{number}_{is_last}_{attempt}"
+        (tmp_path / f"{name}.py").write_text(SWALLOWING.format(number=int(number), steps=4 * attempt))
+        end = KeyboardInterrupt if number == signal.SIGINT else Stopped
+        with pytest.raises(end) as caught, stop_signals():
+            __import__(name)
+            if not is_last:
+                threading.Event().wait(20)
+        assert name in sys.modules and (number == signal.SIGINT or caught.value.signal == number)
+        assert signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler)
+        assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
 
 
 def test_what_is_ignored_stays_ignored() -> None:

@@ -17,7 +17,7 @@ from mereo.fitting.registration.recognition import MOST, NOT_EVALUATED, Recognit
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.visualization.contact_sheets import MISSING, MOST_DEPTH_PX, depth_data
-from mereo.visualization.reconstruction_report import BUDGET_BYTES, VERDICTS, Report, trust
+from mereo.visualization.reconstruction_report import BUDGET_BYTES, VERDICTS, Report, page_words, trust
 from mereo.visualization.units import Unit
 from mereo_learning.evaluation_report import write_evaluation_report
 
@@ -180,6 +180,25 @@ def test_a_verdict_is_one_line_with_its_reason(
     found = trust(summary if registration is None else {**summary, "registration": registration})
     verdict = f"{VERDICTS[found.level]}: {found.why}.".replace("\N{NO-BREAK SPACE}", " ")
     assert (found.level, found.cure) == (level, cure) and verdict.startswith(line)
+
+
+@pytest.mark.parametrize("is_accepted", [True, False])
+@pytest.mark.parametrize("answer", ["registration", "network"])
+@pytest.mark.parametrize("known", [True, "unsure", False])
+def test_report_summary_and_exit_status_say_the_same(known: bool | str, answer: str, is_accepted: bool) -> None:
+    """Only what is known, explained, and the model's own answer can be relied on without looking."""
+    for signs in (Signs(size=0.01, unexplained=0.2), None):
+        recognition = Recognition(known, None if known is True else "it is bent: look", 5.0, signs)  # type: ignore[arg-type]
+        fit = {"answer": answer, "explained": 0.9, "accepted": is_accepted}
+        summary = {"recognition": recognition.facts(), "registration": fit}
+        level, word, _ = page_words(summary, Unit(None))["trust"]
+        verdict = trust(summary)
+        assert (level, word) == (verdict.level, f"{VERDICTS[verdict.level]}:")
+        is_sure = known is True and is_accepted and answer == "registration"
+        expected = ("Trust it", 0) if is_sure else ("Do not trust it", 3) if known is False else ("Doubtful", 4)
+        if known == "unsure" and signs is None:
+            expected = ("Not checked" if answer == "registration" else "Network alone", 4)
+        assert (VERDICTS[verdict.level], verdict.status) == expected
 
 
 @pytest.mark.parametrize("junk", [None, 3, [], {"known": None, "explained": float("nan"), "answer": 7}])

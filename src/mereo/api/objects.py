@@ -6,7 +6,9 @@ Meshes are enough: their scene bends them as if they were of rubber, and a searc
 are any, start the fit at once and tell segments apart that look alike; only they need torch.
 """
 
+import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import get_args
@@ -15,14 +17,15 @@ from mereo.api.words import python_words
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.register import Registrar, other_mesh, registrar_for, statistical_model_of
 from mereo.geometry.mesh import SegmentedMesh
+from mereo.io.extras import has_network
 from mereo.io.mesh_formats import MESH_SUFFIXES
 from mereo.models.config import Device, InferenceConfig, Precision
 from mereo.models.trained import Trained
-from mereo.models.weights_place import is_weights, load_weights, shipped_names
+from mereo.models.weights_place import is_weights, load_weights, shipped_names, statistical_model_in
 from mereo.scenes.files.object_files import SCENE, names_scene, scene_of_folder, scene_of_meshes, shapes_in
 from mereo.scenes.random_states import kept_model
 from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import SCENES, Scene
+from mereo.scenes.scene import SCENES, AssetUnavailable, Scene
 from mereo.scenes.statistical_model import StatisticalModel
 
 Source = Scene | Trained | str | Path | Sequence[str | Path]
@@ -37,12 +40,14 @@ class Object:
         network: its weights; None of an object without, which is searched.
         scene: how it deforms, where that is not the built-in scene that the weights were trained on.
         model: statistical model of its states; by default that of the weights, None where these carry none.
+        known_as: its name, where neither weights nor a scene have it.
     """
 
     network: Trained | None
     scene: Scene | None = None
     _registrars: dict[str, Registrar | None] = field(default_factory=dict)
     model: StatisticalModel | None = None
+    known_as: str = ""
 
     def __post_init__(self) -> None:
         if self.network is None and self.model is None:
@@ -58,7 +63,7 @@ class Object:
         """Name of its weights, or of its scene."""
         if self.network is not None:
             return self.network.name
-        return "" if self.scene is None else self.scene.name
+        return self.known_as if self.scene is None else self.scene.name
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -113,7 +118,11 @@ class Object:
             method: None if registrar is None else registrar.asking(network)
             for method, registrar in self._registrars.items()
         }
-        return Object(network, self.scene, moved, self.model)
+        return Object(network, self.scene, moved, self.model, self.known_as)
+
+
+class WithoutWeightsWarning(UserWarning):
+    """Warning that a built-in object is searched by its model, as its weights need PyTorch."""
 
 
 @python_words()
@@ -132,7 +141,8 @@ def load_object(
         source: its meshes, one file for each segment, one file of named parts, a folder of either, or label volumes,
             one or one for each segment; a scene file, a built-in scene's name or a scene; the folder that ``mereo learn`` has written; or weights: a
             shipped name, a file, or some that are loaded already. A name that both weights and a scene have means the
-            weights, which know that scene.
+            weights, which know that scene; without PyTorch the object is searched by the model that they carry, with a
+            ``WithoutWeightsWarning``.
         scene: of weights: the object's scene, its name or its file, where it is not the built-in one of the weights.
         weights: to start the fit with, where ``source`` is meshes or a scene, or none of them.
         units: of meshes: "mm", "cm", "m" or "in"; guessed where not given.
@@ -148,6 +158,8 @@ def load_object(
     if isinstance(network, Trained) or (isinstance(network, str | Path) and (source is None or is_weights(network))):
         if source is not None and weights is not None:
             raise ValueError(f"{source} has weights, and weights are named too: name one of them")
+        if scene is None and str(source) in SCENES and not has_network():
+            return _built_in_by_model(str(source))
         scene = _learned_scene(network) if scene is None else scene
         return Object(
             load_weights(network, inference), load_scene(str(scene)) if isinstance(scene, str | Path) else scene
@@ -163,6 +175,20 @@ def load_object(
     if loaded.statistical_model is not None and (fault := other_mesh(scene, loaded.statistical_model)):
         raise ValueError(f"{fault}; both must be of one object: name the weights of this one, or leave them out")
     return Object(loaded, scene)
+
+
+def _built_in_by_model(name: str) -> Object:
+    """Built-in object without its weights' network, by the statistical model that they carry."""
+    warnings.warn(
+        f"PyTorch is not installed, so {name} is searched by its model: pip install 'mereo[network]' lets its weights "
+        "start the fit at once",
+        WithoutWeightsWarning,
+        stacklevel=4,
+    )
+    scene = None
+    with suppress(AssetUnavailable):  # the model has all that a search needs
+        scene = load_scene(name)
+    return Object(None, scene, model=statistical_model_in(name), known_as=name)
 
 
 def object_of(given: Object | Source) -> Object:

@@ -66,9 +66,8 @@ def view(
         known = object_of(object)
         if path is None:
             scene = known.scene
-            if scene is None and known.network is not None:
-                scene = load_scene(str(known.network.provenance.get("scene")))
-            assert scene is not None  # what has no weights has a scene
+            if scene is None:
+                scene = load_scene(known.name if known.network is None else str(known.network.provenance.get("scene")))
             page = open_laboratory(scene, known.network, known.registrar(), port)
         else:
             is_shipped = str(path) in shipped_frames() and not path.exists()

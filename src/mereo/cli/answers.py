@@ -28,8 +28,8 @@ class ReconstructCommand:
     Several frames, or folders of them, share one loading of the weights and all options. Each gets a folder of its own
     in --output, named by its file; one that cannot be answered is reported and skipped.
 
-    The exit status is 0 where every frame is answered, 3 where an answer is not recognized as the object, 2 where a
-    frame cannot be answered.
+    The exit status is 0 where every answer is recognized as the object, 4 where one is doubtful or was not checked (the
+    network alone), 3 where one is not the object, 2 where a frame cannot be answered.
 
     Attributes:
         inputs: depth images (PNG, TIFF, EXR, NPY), point clouds (PLY, PCD, XYZ, NPY, NPZ, ZDF), ROS recordings (bag,

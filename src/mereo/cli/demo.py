@@ -16,7 +16,13 @@ if TYPE_CHECKING:
 
 RESOLUTION = 100
 
+FRAME, MESHES = Path("frames/bun000.ply"), Path("bunny-meshes")
+"""The scan as a depth camera's frame, and the folder of its object's meshes: with these a user goes on."""
+
 NEXT = """
+The same by hand, from the scan and the meshes that are used here
+  mereo reconstruct {frame} --object {meshes} --output result
+
 On your own object, from its meshes: nothing is trained; docs/own-object.md has joints
   mereo reconstruct cloud.ply --object PART.stl PART.stl --output result
   mereo reconstruct depth.png --intrinsics camera.json --depth-scale 1000 --object PART.stl PART.stl --output result
@@ -33,7 +39,7 @@ class Demo:
     """Find an object in a real scan by its meshes; with the extra `network` also shipped frames, by network and fit.
 
     Attributes:
-        output: folder for meshes, pictures and reports.
+        output: folder for the frame and the meshes of the first input, pictures and reports.
         json: print one JSON object on standard output, of the scores, and all else on standard error.
     """
 
@@ -62,21 +68,24 @@ class Demo:
         if not has_network():
             print("PyTorch is not installed, so nothing is shown of networks, which start the fit at once:")
             print("run pip install 'mereo[network]' and this again.\n")
-        print(f"All in {time.perf_counter() - began:.0f} s.\n{NEXT}")
+        print(f"All in {time.perf_counter() - began:.0f} s.")
+        print(NEXT.format(frame=self.output / FRAME, meshes=self.output / MESHES))
         return Outcome(scores)
 
 
 def _inputs(output: Path) -> "Iterator[tuple[str, str, Object, SensorFrame, TruthGrid]]":
-    """Name, title, object, frame and truth of each input; the bunny's meshes are written: a user has such files."""
+    """Name, title, object, frame and truth of each input; the first one's frame and meshes are written."""
     import numpy as np
 
     from mereo.api.objects import load_object
     from mereo.api.reconstruct import load_frame
+    from mereo.geometry.camera import into_camera
     from mereo.geometry.mesh import SegmentedMesh
     from mereo.geometry.metrics import truth_grid
+    from mereo.geometry.transforms import transform_points
     from mereo.io.atomic_files import new_directory
     from mereo.io.extras import has_network
-    from mereo.io.writers.meshes import write_surface_stl
+    from mereo.io.writers.meshes import write_positions_ply, write_surface_stl
     from mereo.models.weights_place import statistical_model_in
     from mereo.synthesis.sample_views import SHIPPED_SCAN, load_view
     from mereo_learning.scans import BUNNY_SCAN_POSES
@@ -85,10 +94,14 @@ def _inputs(output: Path) -> "Iterator[tuple[str, str, Object, SensorFrame, Trut
     assert model.source_frame is not None
     rest = model.rest.transformed(np.linalg.inv(model.source_frame.T_scene_source))  # as in its files, metres
     frame, truth = load_frame(SHIPPED_SCAN), truth_grid(rest.transformed(np.linalg.inv(BUNNY_SCAN_POSES[SHIPPED_SCAN])))
-    with new_directory(output / "bunny-meshes", force=True) as folder:
+    with new_directory(output / FRAME.parent, force=True) as folder:
+        points = frame.cloud.points
+        seen = transform_points(into_camera(points, frame.axes), points)
+        write_positions_ply(folder / FRAME.name, seen, f"{SHIPPED_SCAN}: metres, x right, y down, z forward")
+    with new_directory(output / MESHES, force=True) as folder:
         for part in rest.segments:
             write_surface_stl(folder / f"{part.name}.stl", SegmentedMesh((part,)))
-    meshes = [output / "bunny-meshes" / f"{part.name}.stl" for part in rest.segments]
+    meshes = [output / MESHES / f"{part.name}.stl" for part in rest.segments]
     title = f"{SHIPPED_SCAN}: a real range scan of the Stanford bunny, by its meshes alone, nothing trained"
     yield f"{SHIPPED_SCAN}-meshes", title, load_object(meshes, units="m"), frame, truth
     if has_network():

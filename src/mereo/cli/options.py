@@ -28,9 +28,6 @@ from mereo.models.config import InferenceConfig
 if TYPE_CHECKING:
     from mereo.api.objects import Object
 
-NOT_RECOGNIZED = 3
-"""Exit status of a command whose answer is not recognized as the object."""
-
 
 @dataclass(frozen=True)
 class Outcome:

@@ -27,7 +27,7 @@ from mereo.api.reconstruct import reconstruct_observation
 from mereo.api.result import Pose, Result, registration_of
 from mereo.api.words import option_words
 from mereo.cli.answers import ReconstructCommand
-from mereo.cli.options import NOT_RECOGNIZED, Outcome, check_named, files_read, loaded_object, options_of
+from mereo.cli.options import Outcome, check_named, files_read, loaded_object, options_of
 from mereo.cli.stream import frame_error, frames_in
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.carry import Placed, carry, place
@@ -47,7 +47,7 @@ from mereo.models.config import InferenceConfig
 from mereo.models.trained import Trained
 from mereo.reconstruction.observation import FrameWarning, find_object
 from mereo.scenes.registry import files_of
-from mereo.visualization.reconstruction_report import confidence_title
+from mereo.visualization.reconstruction_report import confidence_title, trust
 from mereo.visualization.result_files import summary_of, write_answer
 from mereo.visualization.units import Unit, rounded
 from mereo.workers.spread import Cluster, spread
@@ -195,7 +195,7 @@ def reconstruct_inputs(inputs: Sequence[Path], output: Path, job: FrameJob, clus
         raise ValueError("--ray is for several frames, each of which is a task: name more, or leave it out")
     result = reconstruct_file(inputs[0], output, job)
     facts = {"output": str(output), **summary_of(result)}
-    return Outcome(facts, NOT_RECOGNIZED if result.known is False else 0)
+    return Outcome(facts, trust(facts).status)
 
 
 def is_folder_of_frames(path: Path) -> bool:
@@ -268,8 +268,9 @@ def reconstruct_frames(files: Sequence[Path], output: Path, job: FrameJob, clust
             "others are written: correct them, and name only those again"
         )
     results = [{"output": str(folder), **(summaries[file] or {})} for file, folder in frames]
-    unknown = any(summary["recognition"]["known"] is False for summary in results)
-    return Outcome({"output": str(output), "frames": results}, NOT_RECOGNIZED if unknown else 0)
+    statuses = {trust(summary).status for summary in results}
+    # what is not the object outweighs what may not be
+    return Outcome({"output": str(output), "frames": results}, min(statuses - {0}, default=0))
 
 
 def _reconstruct_alone(file: Path, folder: Path, job: FrameJob) -> Summary:
@@ -295,7 +296,7 @@ def _print_table(frames: Sequence[tuple[Path, Path]], summaries: Mapping[Path, S
             file.name,
             "registered model" if fit.get("answer") == "registration" else "network",
             f"{fit['explained']:.1%}" if "explained" in fit else "",
-            {True: "yes", False: "no", "unsure": "unsure"}[summary["recognition"]["known"]],
+            {"yes": "yes", "no": "no"}.get(trust(summary).level, "unsure"),
             f"{sum(segment['voxels'] > 0 for segment in segments)} of {len(segments)}",
             f"{sum(summary['timings_s'].values()):.1f}",
             folder.name,

@@ -211,6 +211,18 @@ VERDICTS: Mapping[Level, str] = {
 }
 """First words of the line."""
 
+NOT_RECOGNIZED, NOT_SURE = 3, 4
+"""Exit statuses of a command with an answer that is not the object, and with one that may not be."""
+
+STATUSES: Mapping[Level, int] = {
+    "yes": 0,
+    "doubt": NOT_SURE,
+    "no": NOT_RECOGNIZED,
+    "unchecked": NOT_SURE,
+    "alone": NOT_SURE,
+}
+"""Exit status of a command with such an answer: 0 is what can be relied on without looking."""
+
 
 @dataclass(frozen=True)
 class Trust:
@@ -227,9 +239,14 @@ class Trust:
     why: str
     cure: str | None = None
 
+    @property
+    def status(self) -> int:
+        """Exit status of a command that ends with this answer."""
+        return STATUSES[self.level]
+
 
 def trust(summary: Mapping[str, Any]) -> Trust:
-    """Verdict on the answer that a summary is of; every key of it may be missing.
+    """Verdict on the answer that a summary is of, which report, summary and exit status state; any key may be missing.
 
     Args:
         summary: its ``recognition`` and ``registration`` are read.
@@ -240,7 +257,7 @@ def trust(summary: Mapping[str, Any]) -> Trust:
     explained = None if number is None else f"{100 * number:.1f}\N{NO-BREAK SPACE}% of the points"
     model_explains = "" if explained is None else f"; the model explains {explained}"
     is_model = registration.get("answer") == "registration"
-    if known is not True and not recognition.get("signs") and not registration.get("refusal"):
+    if not isinstance(known, bool) and not recognition.get("signs") and not registration.get("refusal"):
         return Trust("unchecked" if is_model else "alone", f"nothing says whether this is the object{model_explains}")
     if known is not True:
         # a reason is what was seen, a colon, and what to do about it
@@ -284,7 +301,7 @@ NO_FACTS = (
     *("title", "recognition", "radius95", "unit", "unit_m", "source", "frame", "points", "segments", "nested"),
     *("timings_s", "registration", "weights", "spacing", "device", "resolution", "clipped", "calibrated"),
     *("precision", "evaluated_points", "depth_m", "visible_size_m", "invalid_points", "isolation", "carried"),
-    "scene_file",
+    *("scene_file", "verdict"),
 )
 """Keys of a summary that the page shows in another place, and those that only summary.json has."""
 

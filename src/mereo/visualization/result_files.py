@@ -24,7 +24,7 @@ from mereo.io.writers.formats import WRITERS, Results, chosen_formats, write_for
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.scenes.rest_pose import rest_digest
 from mereo.visualization.previews import render_cloud_and_segments
-from mereo.visualization.reconstruction_report import REPORT, Report, cluster
+from mereo.visualization.reconstruction_report import REPORT, Report, cluster, trust
 from mereo.visualization.units import Unit
 
 
@@ -53,10 +53,12 @@ def summary_of(
         radii["radius95"] = {**sure.summary(), "unit_m": frame.unit_m}
         for row, segment in zip(segments, sure.segments, strict=True):
             row |= {"centroid_radius95": segment.centroid_radius95, "volume95": list(segment.volume95)}
+    facts = frame_facts(answer, carried)
     return {
         "frame": frame.axes,
         "unit_m": frame.unit_m,
-        **frame_facts(answer, carried),
+        "verdict": trust(facts).level,
+        **facts,
         **radii,
         "pose": None if registered is None else registered.pose().tolist(),
         "nested": [list(pair) for pair in result.surfaces.nested],
