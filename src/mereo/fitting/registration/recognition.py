@@ -165,7 +165,7 @@ class Recognition:
         )
 
     def doubted(self, reason: str | None) -> "Recognition":
-        """The same, unsure for a reason that outweighs its own; itself where there is none, or the object is refused."""
+        """The same, unsure for a reason that outweighs its own; itself without one, and where the object is refused."""
         return replace(self, known="unsure", reason=reason) if reason and self.known is not False else self
 
     def facts(self) -> dict[str, Any]:
