@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
@@ -216,6 +217,9 @@ def test_what_a_library_says_of_its_arguments_is_no_sentence_for_users(
 ) -> None:
     """``json`` names neither the file nor a cure, and a ``ValueError`` of its own is a ``ValueError``."""
     monkeypatch.delenv(command_line.TRACEBACK_VARIABLE, raising=False)
+    compiled = "ValueError: cannot reshape array of size 0 into shape (0)"  # it has no frame of its own
+    assert run(lambda: np.empty(0).reshape(-1, 0), monkeypatch, "align", "my.py", __file__) == command_line.FAULT
+    assert f"mereo align on {__file__}: {compiled}" in capsys.readouterr().err
     assert run(lambda: json.loads("{"), monkeypatch, "align", "my.py", __file__) == command_line.FAULT
     assert f"mereo align on {__file__}: JSONDecodeError: Expecting" in (line := capsys.readouterr().err)
     assert "this is a fault of mereo, or of the Python file: run it again with MEREO_TRACEBACK=1" in line

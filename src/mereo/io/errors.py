@@ -14,8 +14,8 @@ import sysconfig
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout
+from dis import opmap
 from pathlib import Path
-from traceback import walk_tb
 from typing import TYPE_CHECKING
 
 from mereo.io.cores import SharedLimit
@@ -55,14 +55,19 @@ for _name in ("trimesh", "nibabel.global"):  # they log tracebacks and repairs, 
 def is_foreseen(error: Exception) -> bool:
     """Whether the text of an error is a sentence for users: not what a library's ``ValueError`` says of its arguments.
 
-    Those of the operating system, and imports that fail, name what is wrong themselves.
+    Those of the operating system, and imports that fail, name what is wrong themselves. Compiled libraries have no
+    frames of their own: what they raise comes from a call of ours, and not from a ``raise``.
     """
     if isinstance(error, OSError | ImportError):
         return True
-    if not isinstance(error, ValueError):
-        return False
-    files = [frame.f_code.co_filename for frame, _ in walk_tb(error.__traceback__)]
-    return not files or not files[-1].startswith(LIBRARIES) or Path(files[-1]).is_relative_to(PACKAGE)
+    last = error.__traceback__
+    while last is not None and last.tb_next is not None:
+        last = last.tb_next
+    if last is None or not isinstance(error, ValueError):
+        return isinstance(error, ValueError)
+    code = last.tb_frame.f_code
+    is_ours = not code.co_filename.startswith(LIBRARIES) or Path(code.co_filename).is_relative_to(PACKAGE)
+    return is_ours and code.co_code[last.tb_lasti] == opmap["RAISE_VARARGS"]
 
 
 def words_of(error: Exception) -> str:
