@@ -11,6 +11,7 @@ from overlapping import check_overlap
 from shapes import ball, box
 from shapes import segment as segment_of
 
+from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
 from mereo.geometry.mesh_check import overlaps
 from mereo.geometry.solids import Solids
@@ -18,6 +19,7 @@ from mereo.geometry.subdivision import split_at_creases
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.volume_files import LabelWarning, is_volume, read_label_volume, segment_surfaces
 from mereo.io.writers.glb import write_segments_glb
+from mereo.io.writers.volumes import write_labels_seg_nrrd
 from mereo.scenes.files.object_files import scene_of_meshes, shapes_in
 from mereo.scenes.files.template import write_scene_file
 from mereo.scenes.registry import load_scene
@@ -167,7 +169,11 @@ def test_layers_of_a_segmentation_keep_names_and_colours_and_what_lies_inside_is
             48,
         )
     )
-    scene = load_scene(write_scene_file([tmp_path / "a.seg.nrrd"], tmp_path / "a.yaml", report=(said := []).append))
+    scene = load_scene(
+        write_scene_file(
+            [tmp_path / "a.seg.nrrd"], tmp_path / "a.yaml", report=(said := []).append, deformations="rigid"
+        )
+    )
     assert scene.rest.nested == (("tumor", "liver"),) and "nested: tumor in liver" in said and scene.space == "RAS"
     for change, message in (
         ({"Segment0_Layer": 5}, "a.seg.nrrd has 2 layers, and 'tumor' in layer 5: save it again"),
@@ -177,6 +183,16 @@ def test_layers_of_a_segmentation_keep_names_and_colours_and_what_lies_inside_is
         write_layers(tmp_path / "a.seg.nrrd", layers, {**fields, **change})
         with pytest.raises(ValueError, match=message):
             read_label_volume(tmp_path / "a.seg.nrrd")
+
+
+def test_what_mereo_writes_for_slicer_comes_back_with_all_letters_of_its_names_and_its_colours(tmp_path: Path) -> None:
+    labels, colors = np.kron(np.eye(2), np.ones((4, 4)))[..., None].repeat(5, axis=2), ((250, 1, 2), (3, 128, 5))
+    labels[4:] *= 2
+    grid = LabelGrid(labels.astype(np.uint8), ORIGIN, SPACING, ("Größe", "肝臓"))
+    write_labels_seg_nrrd(tmp_path / "a.seg.nrrd", grid, colors, 0.001)
+    volume = read_label_volume(tmp_path / "a.seg.nrrd")
+    assert volume.names == {1: "Größe", 2: "肝臓"} and volume.colors == {1: colors[0], 2: colors[1]}
+    np.testing.assert_array_equal(volume.labels[0], labels)
 
 
 def write_parts(folder: Path, **changes: np.ndarray) -> list[Path]:
@@ -194,7 +210,7 @@ def test_one_volume_for_each_segment_is_one_object(tmp_path: Path) -> None:
     check_parts(segment_surfaces(volume, volume.names, 48))
     (tmp_path / "ct/frame.ply").write_bytes(trimesh.PointCloud(np.eye(3)).export(file_type="ply"))
     assert shapes_in(tmp_path / "ct") == files
-    scene = scene_of_meshes(files)
+    scene = load_scene(write_scene_file(files, tmp_path / "ct.yaml", deformations="rigid"))
     assert scene.rest.names == ("tumor", "kidney", "liver") and scene.rest.nested == (("tumor", "liver"),)
     empty = write_parts(tmp_path / "more", heart=np.zeros((60, 60, 40), bool))
     with pytest.warns(LabelWarning, match="1 of 4 label volumes hold only empty space and are left out: heart.nii.gz"):
@@ -230,7 +246,7 @@ def test_what_is_lost_is_reported_and_what_is_too_thin_can_be_left_out(tmp_path:
     file = write_nifti(tmp_path / "ct.nii.gz", labels)
     with pytest.warns(LabelWarning, match=r"^segment 'sheet' keeps 8\d% of its volume on a grid of 20 cells: raise"):
         segment_surfaces(read_label_volume(file), {1: "block", 2: "sheet"}, 20)
-    path = write_scene_file([file], tmp_path / "ct.yaml", report=(said := []).append)
+    path = write_scene_file([file], tmp_path / "ct.yaml", report=(said := []).append, deformations="rigid")
     assert any(
         re.match("segment 'label_3' would keep 0% of its volume on a grid of 192 cells; it must", s) for s in said
     )

@@ -5,6 +5,7 @@ by NIfTI's convention). NRRD files say which frame they are in; those of 3D Slic
 space they stay as they are.
 """
 
+import math
 import re
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,7 +22,7 @@ from skimage.measure import marching_cubes
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
 from mereo.geometry.transforms import transform_points
 from mereo.io.config import Space
-from mereo.io.errors import limited_memory, quiet, readable
+from mereo.io.errors import check_memory, limited_memory, quiet, readable
 from mereo.io.extras import library
 from mereo.io.readers import in_memory
 
@@ -98,12 +99,17 @@ def read_volume(path: Path, kind: str = "volume") -> Volume:
         raise ValueError(
             f"{path} has voxels of the type {volume.values.dtype}; each must be one real number: export one channel"
         )
+    matrix = volume.T_world_index
+    if not (np.isfinite(matrix).all() and abs(np.linalg.det(matrix)) > 1e-12 * np.prod(volume.spacing) > 0):
+        raise ValueError(
+            f"{path} has voxels whose axes are {matrix[:3, :3].T.tolist()}; they must span space: export it again"
+        )
     return volume
 
 
 def _nifti(nibabel: Any, path: Path) -> Volume:
     image = nibabel.load(path)
-    _check_sides(image.shape)
+    _check_sides(path, image.shape, image.get_data_dtype().itemsize)
     values = image.dataobj.get_unscaled()
     values = values[..., 0] if values.ndim == 4 and values.shape[3] == 1 else values
     slope, intercept = float(image.dataobj.slope), float(image.dataobj.inter)
@@ -111,9 +117,13 @@ def _nifti(nibabel: Any, path: Path) -> Volume:
 
 
 def _nrrd(nrrd: Any, path: Path) -> Volume:
-    with path.open("rb") as file:
-        _check_sides(nrrd.read_header(file)["sizes"])
-    values, header = nrrd.read(str(path))
+    with path.open("rb") as file:  # names of segments have any letters, which pynrrd drops
+        header = nrrd.read_header(line.decode("utf-8", "replace") for line in file)
+    _check_sides(path, header["sizes"], 1)
+    data = header.get("data file", header.get("datafile"))
+    if data is not None and not _lies_below(path.parent, path.parent / data):
+        raise ValueError(f"its data file {data!r} is not a regular file in its folder or below")
+    values, _ = nrrd.read(str(path))
     transform = np.eye(4)
     directions = header.get("space directions")
     if directions is not None:
@@ -124,10 +134,16 @@ def _nrrd(nrrd: Any, path: Path) -> Volume:
     return Volume(in_memory(values), _to_ras(str(header.get("space", ""))) @ transform, header=header)
 
 
-def _check_sides(sizes: Iterable[Any]) -> None:
+def _lies_below(folder: Path, file: Path) -> bool:
+    """Whether it is a regular file in a folder: a file should not choose which others are opened."""
+    return file.resolve().is_relative_to(folder.resolve()) and file.is_file()
+
+
+def _check_sides(path: Path, sizes: Iterable[Any], item_bytes: int) -> None:
     sides = [int(side) for side in sizes]
     if min(sides, default=0) < 1:
         raise ValueError(f"its header states the size {' x '.join(map(str, sides))}")
+    check_memory(path, 2 * item_bytes * math.prod(sides))  # as it is stored, and in the machine's order of bytes
 
 
 ANATOMICAL = re.compile("(r|l)(?:ight|eft)?-?(a|p)(?:nterior|osterior)?-?(s|i)(?:uperior|nferior)?(?:-?t(?:ime)?)?")
@@ -169,13 +185,10 @@ def read_scalar_volume(path: Path) -> Volume:
             f"{path} has {volume.values.ndim} dimensions; a volume that is carried has 3, with one number for each "
             "voxel: export one time step or one component"
         )
-    if not np.isfinite(volume.values).all():
+    with limited_memory(path):
+        is_finite = np.isfinite(volume.values).all()
+    if not is_finite:
         raise ValueError(f"{path} has NaN or infinite values; all must be finite: replace them, for example by 0")
-    matrix = volume.T_world_index
-    if not (np.isfinite(matrix).all() and abs(np.linalg.det(matrix)) > 1e-12 * np.prod(volume.spacing) > 0):
-        raise ValueError(
-            f"{path} has voxels whose axes are {matrix[:3, :3].T.tolist()}; they must span space: export it again"
-        )
     return volume
 
 
@@ -416,6 +429,7 @@ def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) 
             f"{', '.join(map(str, volume.values))}: correct `names`"
         )
     layers, segments = volume.labels[(slice(None), *volume.box)], list(dict.fromkeys(names.values()))
+    check_memory("the label volume", (len(segments) + 3) * layers[0].size)  # a byte for each voxel of a mask
     labels = [[value for value in names if names[value] == name] for name in segments]
     masks = [np.logical_or.reduce([(layers == value).any(axis=0) for value in group]) for group in labels]
     parents = _part_masks(masks)
