@@ -17,7 +17,7 @@ from mereo.geometry.mesh_check import overlaps
 from mereo.geometry.solids import Solids
 from mereo.geometry.subdivision import split_at_creases
 from mereo.io.mesh_formats import read_segmented_mesh
-from mereo.io.volume_files import LabelWarning, is_volume, read_label_volume, segment_surfaces
+from mereo.io.volume_files import LabelVolume, LabelWarning, is_volume, read_label_volume, segment_surfaces
 from mereo.io.writers.glb import write_segments_glb
 from mereo.io.writers.volumes import write_labels_seg_nrrd
 from mereo.scenes.files.object_files import scene_of_meshes, shapes_in
@@ -185,6 +185,15 @@ def test_layers_of_a_segmentation_keep_names_and_colours_and_what_lies_inside_is
             read_label_volume(tmp_path / "a.seg.nrrd")
 
 
+def test_a_segment_in_a_nested_one_comes_before_it_whatever_the_order_of_their_labels() -> None:
+    balls = [sphere((30, 30, 30), radius) for radius in (12, 20, 6)]
+    volume = LabelVolume(np.stack([mask * label for label, mask in enumerate(balls, start=1)]), np.diag([*GRID, 1]), {})
+    mesh = segment_surfaces(volume, {1: "b", 2: "c", 3: "a"}, 48)
+    assert mesh.names == ("a", "b", "c") and set(mesh.nested) == {("a", "b"), ("b", "c")} and overlaps(mesh) == ()
+    owned = np.diff([mask.sum() for mask in sorted(balls, key=np.sum)], prepend=0) * GRID.prod()
+    np.testing.assert_allclose(mesh.owned_volumes, owned, rtol=0.06)
+
+
 def test_what_mereo_writes_for_slicer_comes_back_with_all_letters_of_its_names_and_its_colours(tmp_path: Path) -> None:
     labels, colors = np.kron(np.eye(2), np.ones((4, 4)))[..., None].repeat(5, axis=2), ((250, 1, 2), (3, 128, 5))
     labels[4:] *= 2
@@ -217,7 +226,7 @@ def test_one_volume_for_each_segment_is_one_object(tmp_path: Path) -> None:
         assert read_label_volume(*empty).names == {2: "kidney", 3: "liver", 4: "tumor"}
     for changes, message in (
         ({"liver": 2 * PARTS["liver"] + PARTS["tumor"]}, "liver.nii.gz holds the values 1?,? ?2, 3; of several label"),
-        ({"tumor": PARTS["tumor"][1:]}, "tumor.nii.gz has 59 x 60 x 40 voxels .* share one grid: resample them to it"),
+        ({"tumor": PARTS["tumor"][1:]}, r"tumor.nii.gz has .59, 60, 40. voxels .* share one grid: resample them to it"),
     ):
         with pytest.raises(ValueError, match=message):
             read_label_volume(*write_parts(tmp_path / "wrong", **changes))

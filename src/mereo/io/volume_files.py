@@ -238,16 +238,6 @@ class LabelVolume:
         slices = (part for layer in self.labels for part in np.moveaxis(layer, 2, 0) if part.any())
         return tuple(sorted({int(value) for part in slices for value in np.unique(part)} - {0}))
 
-    @property
-    def box(self) -> tuple[slice, slice, slice]:
-        """Part of a layer around all that is set, which must be something."""
-        ends = []
-        for axis in (1, 2, 3):
-            rows = np.flatnonzero(self.labels.any(axis=tuple({0, 1, 2, 3} - {axis})))
-            ends.append(slice(int(rows[0]), int(rows[-1]) + 1))
-        x, y, z = ends
-        return x, y, z
-
 
 class LabelWarning(UserWarning):
     """Warning that surfaces are not all that a label volume holds."""
@@ -350,7 +340,7 @@ def _joined_labels(paths: Sequence[Path]) -> LabelVolume:
         if not volume.values:
             empty.append(path.name)
             continue
-        names[number] = volume_stem(path)
+        names[number] = re.sub(r"(\.seg)?(\.nii|\.nii\.gz|\.nrrd)$", "", path.name, flags=re.IGNORECASE)
         mask = volume.labels[0] > 0
         free = (layer for layer in layers if not layer[mask].any())
         if (layer := next(free, None)) is None:
@@ -362,26 +352,24 @@ def _joined_labels(paths: Sequence[Path]) -> LabelVolume:
     return LabelVolume(np.stack(layers or [first.labels[0].astype(np.int16)]), first.T_world_index, names)
 
 
-def volume_stem(path: Path) -> str:
-    """Name of a volume's file without its suffix."""
-    return re.sub(r"(\.seg)?(\.nii|\.nii\.gz|\.nrrd)$", "", path.name, flags=re.IGNORECASE)
-
-
 def _check_same_grid(path: Path, volume: LabelVolume, other_path: Path, other: LabelVolume) -> None:
     shift = np.abs(volume.T_world_index - other.T_world_index).max()
     if volume.labels.shape[1:] == other.labels.shape[1:] and shift < 0.01 * np.abs(volume.T_world_index[:3, :3]).max():
         return
-    (shape, start), (other_shape, other_start) = (
-        (" x ".join(map(str, each.labels.shape[1:])), each.T_world_index[:3, 3].round(2).tolist())
-        for each in (volume, other)
-    )
     raise ValueError(
-        f"{other_path} has {other_shape} voxels from {other_start} on, and {path} {shape} from {start}, or axes that "
-        "differ; the segments of one object share one grid: resample them to it"
+        f"{other_path} has {other.labels.shape[1:]} voxels from {other.T_world_index[:3, 3]} on, and {path} "
+        f"{volume.labels.shape[1:]} from {volume.T_world_index[:3, 3]}, or they have other axes; the segments of one "
+        "object share one grid: resample them to it"
     )
 
 
 # --- surfaces of labels: closed, smoothed, neighbours in contact ------------------------------------------------------
+
+Share = Float32[np.ndarray, "a b c"]
+"""Share of a segment in each cell of a grid, or what is positive inside it."""
+
+Mask = Bool[np.ndarray, "x y z"]
+"""Voxels of a segment."""
 
 SMOOTHING = 0.8
 """Standard deviation of the smoothing, in the longest side of a cell: enough against stairs, and little volume lost."""
@@ -428,13 +416,12 @@ def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) 
             f"the volume has no voxel of {names[missing[0]]!r}, value {missing[0]}; it holds the values "
             f"{', '.join(map(str, volume.values))}: correct `names`"
         )
-    layers, segments = volume.labels[(slice(None), *volume.box)], list(dict.fromkeys(names.values()))
+    layers, segments = volume.labels, list(dict.fromkeys(names.values()))
     check_memory("the label volume", (len(segments) + 3) * layers[0].size)  # a byte for each voxel of a mask
     labels = [[value for value in names if names[value] == name] for name in segments]
     masks = [np.logical_or.reduce([(layers == value).any(axis=0) for value in group]) for group in labels]
     parents = _part_masks(masks)
-    first = np.array([part.start for part in volume.box])
-    grid = _Grid.around(np.logical_or.reduce(masks), first, volume.T_world_index, cells)
+    grid = _Grid.around(np.logical_or.reduce(masks), volume.T_world_index, cells)
     margins = _margins(_in_partition([grid.share(mask) for mask in masks], parents), parents)
     parts, cell = list[Segment](), abs(float(np.linalg.det(volume.T_world_index[:3, :3])))
     for index, (name, margin) in enumerate(zip(segments, margins, strict=True)):
@@ -451,13 +438,13 @@ def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) 
             text = f"segment {name!r} keeps {kept:.0%} of its volume on a grid of {cells} cells: raise `cells` for more"
             warnings.warn(text, LabelWarning, stacklevel=2)
         parts.append(part)
-    depth = {index: len(_ancestors(index, parents)) for index in range(len(parts))}
     nested = tuple((segments[i], segments[j]) for i, j in parents.items())
-    return SegmentedMesh(tuple(parts[index] for index in sorted(depth, key=lambda index: -depth[index])), nested)
+    order = dict.fromkeys((*parents, *range(len(parts))))
+    return SegmentedMesh(tuple(parts[index] for index in order), nested)
 
 
-def _part_masks(masks: list[Bool[np.ndarray, "x y z"]]) -> dict[int, int]:
-    """Make masks that overlap nested or apart, in place; returns the smallest one around each that is nested."""
+def _part_masks(masks: list[Mask]) -> dict[int, int]:
+    """Make masks nested or apart, in place; returns those that are nested, from the smallest on, and what is around."""
     sizes = [int(mask.sum()) for mask in masks]
     order, parents = sorted(range(len(masks)), key=lambda index: sizes[index]), dict[int, int]()
     for place, small in enumerate(order):
@@ -471,13 +458,7 @@ def _part_masks(masks: list[Bool[np.ndarray, "x y z"]]) -> dict[int, int]:
     return parents
 
 
-def _ancestors(index: int, parents: Mapping[int, int]) -> list[int]:
-    return [] if index not in parents else [parents[index], *_ancestors(parents[index], parents)]
-
-
-def _in_partition(
-    shares: Sequence[tuple[Float32[np.ndarray, "a b c"], float]], parents: Mapping[int, int]
-) -> list[Float32[np.ndarray, "a b c"]]:
+def _in_partition(shares: Sequence[tuple[Share, float]], parents: Mapping[int, int]) -> list[Share]:
     """Shares that are a half at each segment's surface; what a thin one gains is taken from its siblings."""
     bent = [_bent(share, level) for share, level in shares]
     result = list(bent)
@@ -490,16 +471,14 @@ def _in_partition(
     return result
 
 
-def _bent(share: Float32[np.ndarray, "a b c"], level: float) -> Float32[np.ndarray, "a b c"]:
+def _bent(share: Share, level: float) -> Share:
     """Share from 0 to 1 that is a half where it was ``level``."""
     return share if level == 0.5 else np.interp(share, [0, level, 1], [0, 0.5, 1]).astype(np.float32)
 
 
-def _margins(
-    shares: Sequence[Float32[np.ndarray, "a b c"]], parents: Mapping[int, int]
-) -> list[Float32[np.ndarray, "a b c"]]:
+def _margins(shares: Sequence[Share], parents: Mapping[int, int]) -> list[Share]:
     """For each segment what is positive inside it, and 0 on its surface; siblings share interfaces."""
-    margins: dict[int | None, Float32[np.ndarray, "a b c"]] = {None: np.full(shares[0].shape, np.float32(np.inf))}
+    margins: dict[int | None, Share] = {None: np.full(shares[0].shape, np.float32(np.inf))}
     todo: list[int | None] = [None]
     for parent in todo:
         members = [index for index in range(len(shares)) if parents.get(index) == parent]
@@ -517,12 +496,8 @@ def _margins(
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """A coarser grid over part of a volume, from the voxel ``first`` of ``part`` on: cells of ``block`` voxels each.
+    """A coarser grid over part of a volume, from the voxel ``first`` on: ``counts`` cells of ``block`` voxels each."""
 
-    ``part`` is the first voxel of the part of the volume that masks show.
-    """
-
-    part: Int[np.ndarray, "3"]
     first: Int[np.ndarray, "3"]
     counts: Int[np.ndarray, "3"]
     block: Int[np.ndarray, "3"]
@@ -531,8 +506,7 @@ class _Grid:
     @classmethod
     def around(
         cls,
-        mask: Bool[np.ndarray, "x y z"],
-        part: Int[np.ndarray, "3"],
+        mask: Mask,
         transform: Float[np.ndarray, "4 4"],
         cells: int,
     ) -> "_Grid":
@@ -542,9 +516,9 @@ class _Grid:
         voxel = np.linalg.norm(transform[:3, :3], axis=0)
         wanted = ((end - first) * voxel).max() / cells
         block = np.maximum(np.rint(wanted / voxel).astype(np.int64), 1)
-        return cls(part, first, -(-(end - first) // block), block, transform)
+        return cls(first, -(-(end - first) // block), block, transform)
 
-    def share(self, mask: Bool[np.ndarray, "x y z"]) -> tuple[Float32[np.ndarray, "a b c"], float]:
+    def share(self, mask: Mask) -> tuple[Share, float]:
         """Share of each cell that is set, smoothed, with ``MARGIN`` empty cells around; and the one at the surface."""
         end = np.minimum(self.first + self.counts * self.block, mask.shape)
         part = mask[tuple(slice(a, b) for a, b in zip(self.first, end, strict=True))]
@@ -552,7 +526,7 @@ class _Grid:
         (a, b, c), (i, j, k) = self.counts, self.block
         means = np.pad(part.reshape(a, i, b, j, c, k).mean(axis=(1, 3, 5), dtype=np.float32), MARGIN)
         cell = self.block * np.linalg.norm(self.T_world_index[:3, :3], axis=0)
-        smooth: Float32[np.ndarray, "a b c"] = gaussian_filter(means, SMOOTHING * cell.max() / cell, mode="constant")
+        smooth: Share = gaussian_filter(means, SMOOTHING * cell.max() / cell, mode="constant")
         whole = float(means.sum()) * float(np.prod(cell))
         if self.enclosed(smooth) >= WHOLE * whole:
             return smooth, 0.5
@@ -563,7 +537,7 @@ class _Grid:
             low, high = (low, middle) if self.enclosed(_bent(smooth, middle)) < whole else (middle, high)
         return smooth, high
 
-    def enclosed(self, share: Float32[np.ndarray, "a b c"]) -> float:
+    def enclosed(self, share: Share) -> float:
         """Volume of where a share is above a half."""
         inside = np.argwhere(share > 0.5)
         if len(inside) == 0:
@@ -572,12 +546,12 @@ class _Grid:
         part = self.surface(share[box] - np.float32(0.5), "", PALETTE[0])
         return 0.0 if part is None else part.volume
 
-    def surface(self, margin: Float32[np.ndarray, "a b c"], name: str, color: Color) -> Segment | None:
+    def surface(self, margin: Share, name: str, color: Color) -> Segment | None:
         """Surface where ``margin`` is 0, outward oriented, in world coordinates; None where it is nowhere positive."""
         if margin.max() <= 0:
             return None
         vertices, faces, _, _ = marching_cubes(margin, 0.0, gradient_direction="ascent")
-        index = (vertices - MARGIN + 0.5) * self.block - 0.5 + (self.part + self.first)
+        index = (vertices - MARGIN + 0.5) * self.block - 0.5 + self.first
         world = index @ self.T_world_index[:3, :3].T + self.T_world_index[:3, 3]
         # voxel axes may be left-handed
         turned = -1 if np.linalg.det(self.T_world_index[:3, :3]) < 0 else 1
