@@ -148,14 +148,19 @@ def test_layers_of_a_segmentation_keep_names_and_colours_and_what_lies_inside_is
         "Segment0_Color": "1 0 0.5",
         "Segment1_Name": "liver",
         "Segment1_LabelValue": 1,
-        "Segment1_Layer": 0,  # each layer counts by itself
+        "Segment1_Layer": 0,
+        "Segment1_Color": "0 0 2",  # each layer counts by itself
         "Segment2_Name": "kidney",
         "Segment2_LabelValue": 4,
         "Segment2_Layer": 1,
     }
     layers = [PARTS["liver"], PARTS["tumor"] + 4 * PARTS["kidney"]]
     volume = read_label_volume(write_layers(tmp_path / "a.seg.nrrd", layers, fields))
-    assert volume.values == (1, 2, 3) and volume.names == {1: "tumor", 2: "liver", 3: "kidney"}
+    assert (
+        volume.values == (1, 2, 3)
+        and set(volume.colors) == {1}
+        and volume.names == {1: "tumor", 2: "liver", 3: "kidney"}
+    )
     mesh = segment_surfaces(volume, volume.names, 48)
     check_parts(mesh)
     assert mesh.colors[0] == (255, 0, 128)

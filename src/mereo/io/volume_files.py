@@ -296,14 +296,16 @@ class _SlicerSegment(NamedTuple):
 
 def _slicer_segments(volume: Volume) -> list[_SlicerSegment]:
     """Segments that the header of a segmentation lists; older ones have a layer each."""
-    fields = segment_fields(volume.header)
-    numbers = sorted({int(match[1]) for key in fields if (match := re.match(r"Segment(\d+)_", key))})
+    parts = dict[int, dict[str, str]]()
+    for key, text in segment_fields(volume.header).items():
+        if match := re.fullmatch(r"Segment(\d+)_(\w+)", key):
+            parts.setdefault(int(match[1]), {})[match[2]] = text
     segments = []
-    for number in numbers:
-        part = {key.partition("_")[2]: text for key, text in fields.items() if key.startswith(f"Segment{number}_")}
+    for number, part in sorted(parts.items()):
         value, layer = int(part.get("LabelValue", 1)), int(part.get("Layer", number))
         shades = [round(255 * float(shade)) for shade in part.get("Color", "").split()]
-        color = (shades[0], shades[1], shades[2]) if len(shades) == 3 else None
+        is_color = len(shades) == 3 and all(0 <= shade <= 255 for shade in shades)
+        color = (shades[0], shades[1], shades[2]) if is_color else None
         segments.append(_SlicerSegment(part.get("Name", f"label_{value}"), layer, value, color))
     return segments
 
