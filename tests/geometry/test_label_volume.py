@@ -11,13 +11,15 @@ from overlapping import check_overlap
 from shapes import ball, box
 from shapes import segment as segment_of
 
+from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
 from mereo.geometry.mesh_check import overlaps
 from mereo.geometry.solids import Solids
 from mereo.geometry.subdivision import split_at_creases
 from mereo.io.mesh_formats import read_segmented_mesh
-from mereo.io.volume_files import LabelWarning, is_volume, read_label_volume, segment_surfaces
+from mereo.io.volume_files import LabelVolume, LabelWarning, is_volume, read_label_volume, segment_surfaces
 from mereo.io.writers.glb import write_segments_glb
+from mereo.io.writers.volumes import write_labels_seg_nrrd
 from mereo.scenes.files.object_files import scene_of_meshes, shapes_in
 from mereo.scenes.files.template import write_scene_file
 from mereo.scenes.registry import load_scene
@@ -146,14 +148,19 @@ def test_layers_of_a_segmentation_keep_names_and_colours_and_what_lies_inside_is
         "Segment0_Color": "1 0 0.5",
         "Segment1_Name": "liver",
         "Segment1_LabelValue": 1,
-        "Segment1_Layer": 0,  # each layer counts by itself
+        "Segment1_Layer": 0,
+        "Segment1_Color": "0 0 2",  # each layer counts by itself
         "Segment2_Name": "kidney",
         "Segment2_LabelValue": 4,
         "Segment2_Layer": 1,
     }
     layers = [PARTS["liver"], PARTS["tumor"] + 4 * PARTS["kidney"]]
     volume = read_label_volume(write_layers(tmp_path / "a.seg.nrrd", layers, fields))
-    assert volume.values == (1, 2, 3) and volume.names == {1: "tumor", 2: "liver", 3: "kidney"}
+    assert (
+        volume.values == (1, 2, 3)
+        and set(volume.colors) == {1}
+        and volume.names == {1: "tumor", 2: "liver", 3: "kidney"}
+    )
     mesh = segment_surfaces(volume, volume.names, 48)
     check_parts(mesh)
     assert mesh.colors[0] == (255, 0, 128)
@@ -167,7 +174,11 @@ def test_layers_of_a_segmentation_keep_names_and_colours_and_what_lies_inside_is
             48,
         )
     )
-    scene = load_scene(write_scene_file([tmp_path / "a.seg.nrrd"], tmp_path / "a.yaml", report=(said := []).append))
+    scene = load_scene(
+        write_scene_file(
+            [tmp_path / "a.seg.nrrd"], tmp_path / "a.yaml", report=(said := []).append, deformations="rigid"
+        )
+    )
     assert scene.rest.nested == (("tumor", "liver"),) and "nested: tumor in liver" in said and scene.space == "RAS"
     for change, message in (
         ({"Segment0_Layer": 5}, "a.seg.nrrd has 2 layers, and 'tumor' in layer 5: save it again"),
@@ -177,6 +188,25 @@ def test_layers_of_a_segmentation_keep_names_and_colours_and_what_lies_inside_is
         write_layers(tmp_path / "a.seg.nrrd", layers, {**fields, **change})
         with pytest.raises(ValueError, match=message):
             read_label_volume(tmp_path / "a.seg.nrrd")
+
+
+def test_a_segment_in_a_nested_one_comes_before_it_whatever_the_order_of_their_labels() -> None:
+    balls = [sphere((30, 30, 30), radius) for radius in (12, 20, 6)]
+    volume = LabelVolume(np.stack([mask * label for label, mask in enumerate(balls, start=1)]), np.diag([*GRID, 1]), {})
+    mesh = segment_surfaces(volume, {1: "b", 2: "c", 3: "a"}, 48)
+    assert mesh.names == ("a", "b", "c") and set(mesh.nested) == {("a", "b"), ("b", "c")} and overlaps(mesh) == ()
+    owned = np.diff([mask.sum() for mask in sorted(balls, key=np.sum)], prepend=0) * GRID.prod()
+    np.testing.assert_allclose(mesh.owned_volumes, owned, rtol=0.06)
+
+
+def test_what_mereo_writes_for_slicer_comes_back_with_all_letters_of_its_names_and_its_colours(tmp_path: Path) -> None:
+    labels, colors = np.kron(np.eye(2), np.ones((4, 4)))[..., None].repeat(5, axis=2), ((250, 1, 2), (3, 128, 5))
+    labels[4:] *= 2
+    grid = LabelGrid(labels.astype(np.uint8), ORIGIN, SPACING, ("Größe", "肝臓"))
+    write_labels_seg_nrrd(tmp_path / "a.seg.nrrd", grid, colors, 0.001)
+    volume = read_label_volume(tmp_path / "a.seg.nrrd")
+    assert volume.names == {1: "Größe", 2: "肝臓"} and volume.colors == {1: colors[0], 2: colors[1]}
+    np.testing.assert_array_equal(volume.labels[0], labels)
 
 
 def write_parts(folder: Path, **changes: np.ndarray) -> list[Path]:
@@ -194,14 +224,14 @@ def test_one_volume_for_each_segment_is_one_object(tmp_path: Path) -> None:
     check_parts(segment_surfaces(volume, volume.names, 48))
     (tmp_path / "ct/frame.ply").write_bytes(trimesh.PointCloud(np.eye(3)).export(file_type="ply"))
     assert shapes_in(tmp_path / "ct") == files
-    scene = scene_of_meshes(files)
+    scene = load_scene(write_scene_file(files, tmp_path / "ct.yaml", deformations="rigid"))
     assert scene.rest.names == ("tumor", "kidney", "liver") and scene.rest.nested == (("tumor", "liver"),)
     empty = write_parts(tmp_path / "more", heart=np.zeros((60, 60, 40), bool))
     with pytest.warns(LabelWarning, match="1 of 4 label volumes hold only empty space and are left out: heart.nii.gz"):
         assert read_label_volume(*empty).names == {2: "kidney", 3: "liver", 4: "tumor"}
     for changes, message in (
         ({"liver": 2 * PARTS["liver"] + PARTS["tumor"]}, "liver.nii.gz holds the values 1?,? ?2, 3; of several label"),
-        ({"tumor": PARTS["tumor"][1:]}, "tumor.nii.gz has 59 x 60 x 40 voxels .* share one grid: resample them to it"),
+        ({"tumor": PARTS["tumor"][1:]}, r"tumor.nii.gz has .59, 60, 40. voxels .* share one grid: resample them to it"),
     ):
         with pytest.raises(ValueError, match=message):
             read_label_volume(*write_parts(tmp_path / "wrong", **changes))
@@ -230,7 +260,7 @@ def test_what_is_lost_is_reported_and_what_is_too_thin_can_be_left_out(tmp_path:
     file = write_nifti(tmp_path / "ct.nii.gz", labels)
     with pytest.warns(LabelWarning, match=r"^segment 'sheet' keeps 8\d% of its volume on a grid of 20 cells: raise"):
         segment_surfaces(read_label_volume(file), {1: "block", 2: "sheet"}, 20)
-    path = write_scene_file([file], tmp_path / "ct.yaml", report=(said := []).append)
+    path = write_scene_file([file], tmp_path / "ct.yaml", report=(said := []).append, deformations="rigid")
     assert any(
         re.match("segment 'label_3' would keep 0% of its volume on a grid of 192 cells; it must", s) for s in said
     )

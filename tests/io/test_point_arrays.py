@@ -12,7 +12,7 @@ import trimesh
 from memory_frames import FORMS, GRID, POINTS, Tensor, TensorMap, message, records, with_data
 
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
-from mereo.io.point_arrays import is_frame_list, points_of
+from mereo.io.point_arrays import is_frame_list, model_points, points_of
 
 CAMERA = Camera(8, 6, 10.0, 11.0, 4.0, 3.0)
 DEPTH = DepthImage(np.ones((6, 8)), CAMERA)
@@ -165,6 +165,24 @@ def test_lists_of_frames(case: str) -> None:
     assert is_frame_list(FRAME_LISTS[case])
     with pytest.raises(ValueError, match="holds .* frames?; one is needed"):
         points_of(FRAME_LISTS[case])
+
+
+def test_points_of_a_model_may_be_its_origin_and_must_be_finite() -> None:
+    for form in (
+        [[0, 0, 0], [1, 2, 3]],
+        np.array([[0.0, 0, 0], [1, 2, 3]]),
+        PointCloud(np.array([[0.0, 0, 0], [1, 2, 3]])),
+    ):
+        np.testing.assert_array_equal(model_points(form), [[0, 0, 0], [1, 2, 3]])
+    for wrong in ([[0, 0, np.nan]], np.empty((0, 3)), [[1e13, 0, 0]]):
+        with pytest.raises(
+            ValueError, match=r"of shape .* has no points, or some that are NaN, infinite or beyond 1e.12"
+        ):
+            model_points(wrong)
+    with pytest.raises(
+        ValueError, match="a depth image is no part of an object's files: carry points, a mesh or a file"
+    ):
+        model_points(DEPTH)
 
 
 def test_what_is_no_list_of_frames() -> None:

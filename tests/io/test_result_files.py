@@ -250,7 +250,7 @@ def test_both_volumes_coincide(tmp_path: Path, unit_m: float) -> None:
     nifti, nrrd = read_label_volume(tmp_path / "l.nii"), read_label_volume(tmp_path / "l.seg.nrrd")
     np.testing.assert_array_equal(nifti.labels, nrrd.labels)
     np.testing.assert_allclose(nifti.T_world_index, nrrd.T_world_index, atol=1e-3 * unit_m)
-    place = nrrd.T_world_index @ [*np.argwhere(nrrd.labels == 3).mean(axis=0), 1.0]
+    place = nrrd.T_world_index @ [*np.argwhere(nrrd.labels[0] == 3).mean(axis=0), 1.0]
     np.testing.assert_allclose(place[:3], 1000 * unit_m * CENTER * RAS_OF_INPUT, atol=0.5 * unit_m)
 
 

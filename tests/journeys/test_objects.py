@@ -194,6 +194,8 @@ def test_what_is_defined_in_the_meshes_is_carried(found: mereo.Result, scene: Sc
     assert np.abs(corners - found.surfaces.merged()[0]).max() < 0.02 * np.ptp(corners, axis=0).max()
     mesh = found.carry(scene.rest, files="scene")
     assert mesh.names == found.names and np.abs(mesh.bounds - found.surfaces.bounds).max() < 0.02 * np.ptp(mesh.bounds)
+    origin, near = found.carry([[0, 0, 0]]), found.carry(np.array([[1e-9, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+    np.testing.assert_allclose(near, np.repeat(origin, 2, axis=0), atol=1e-9)  # of the files: a point like any other
 
 
 def test_it_is_served_without_weights(folder: Path, meshes: list[str], points: np.ndarray) -> None:

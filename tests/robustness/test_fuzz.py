@@ -10,6 +10,7 @@ import os
 import resource
 import struct
 import time
+import tracemalloc
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
@@ -29,7 +30,7 @@ from mereo.io.mesh_formats import read_glb, read_segmented_mesh
 from mereo.io.readers import read_point_cloud, read_raw_depth
 from mereo.io.sensor_frame import read_frame
 from mereo.io.simulation_states import read_states
-from mereo.io.volume_files import read_label_volume
+from mereo.io.volume_files import LabelVolume, Volume, read_label_volume, read_scalar_volume, segment_surfaces
 from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
 
@@ -231,6 +232,55 @@ def test_a_volume_whose_header_lies_is_refused(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=f"{name}.*({sentence})") as caught:
             read_label_volume(tmp_path / name)
         assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("read", [read_label_volume, read_scalar_volume])
+def test_a_volume_is_refused_by_its_header_and_takes_a_few_bytes_a_voxel(
+    read: Callable[[Path], Volume | LabelVolume], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The voxels of the first file are not there: they were never looked for."""
+    (tmp_path / "a.nii.gz").write_bytes(gzip.compress(nifti(2200, 2200, 2200)))
+    (tmp_path / "a.nrrd").write_bytes(nrrd("2200 2200 2200", "gzip", b"none"))
+    for name in ("a.nii.gz", "a.nrrd"):
+        with pytest.raises(ValueError, match=rf"{name} takes more than 8 GB of memory to read: check that it is what"):
+            read(tmp_path / name)
+    (tmp_path / "b.nii.gz").write_bytes(gzip.compress(nifti(200, 200, 200) + bytes(200**3), 1))
+    tracemalloc.start()
+    assert not np.any(read(tmp_path / "b.nii.gz").values)
+    assert tracemalloc.get_traced_memory()[1] < 3.5 * 200**3
+    tracemalloc.stop()
+    volume = LabelVolume(np.ones((1, 60, 60, 60), np.uint8), np.eye(4), {})
+    monkeypatch.setenv(LIMIT_VARIABLE, "0.0005")
+    with pytest.raises(ValueError, match=r"the label volume takes more than 0\.0005 GB of memory to read"):
+        segment_surfaces(volume, {1: "a"}, 16)
+
+
+def test_a_volume_opens_no_file_outside_its_folder_and_none_that_is_no_file(tmp_path: Path) -> None:
+    (folder := tmp_path / "ct").mkdir()
+    (folder / "sub").mkdir()
+    for place in (folder / "sub/a.raw", tmp_path / "a.raw"):
+        place.write_bytes(bytes(32) + bytes([2]) * 32)
+    os.mkfifo(folder / "pipe")
+    (folder / "link.raw").symlink_to(tmp_path / "a.raw")
+    for name in ("sub/a.raw", "../a.raw", str(tmp_path / "a.raw"), "pipe", "link.raw", "none.raw", "sub"):
+        for key in ("data file", "datafile"):
+            (folder / "a.nrrd").write_bytes(nrrd(f"4 4 4\n{key}: {name}", "raw", b""))
+            if name == "sub/a.raw":
+                assert read_label_volume(folder / "a.nrrd").values == (2,)
+                continue
+            with pytest.raises(ValueError, match=rf"\(its data file '{name}' is not a regular file in its folder or"):
+                read_label_volume(folder / "a.nrrd")
+
+
+@pytest.mark.parametrize("axis", [np.nan, np.inf, 0.0])
+def test_a_volume_whose_axes_do_not_span_space_is_refused(axis: float, tmp_path: Path) -> None:
+    nibabel = pytest.importorskip("nibabel")
+    header = nibabel.Nifti1Header.from_fileobj(io.BytesIO(nifti(4, 4, 4)))
+    header["sform_code"], header["srow_x"], header["srow_y"] = 1, [1, 0, 0, 0], [0, 1, 0, 0]
+    header["srow_z"] = [0, 0, axis, 0]
+    (tmp_path / "a.nii").write_bytes(bytes(header.binaryblock) + bytes(4) + bytes([1]) * 64)
+    with pytest.raises(ValueError, match=r"a.nii has voxels whose axes are \[\[.*\]\]; they must span space: export"):
+        read_label_volume(tmp_path / "a.nii")
 
 
 BOMBS: dict[str, Callable[[Path], object]] = {"a.npz": read_point_cloud, "a.nrrd": read_label_volume}

@@ -438,6 +438,22 @@ exactly_read = partial(read_point_cloud, drop_invalid=True)
 of_segment = partial(read_states, names=("a",))
 
 
+LAYERS = f"""NRRD0004
+type: uchar
+dimension: 4
+space: left-posterior-superior
+sizes: 2 3 3 4
+space directions: none (1,0,0) (0,1,0) (0,0,2)
+kinds: list domain domain domain
+encoding: ascii
+space origin: (0,0,0)
+{chr(10).join(f"Segment{k}_Name:=s{k}{chr(10)}Segment{k}_LabelValue:=1{chr(10)}Segment{k}_Layer:={k}" for k in (0, 1))}
+Segment1_Color:=1 0 0.5
+
+{"1 0 1 1 0 0 " * 12}
+"""
+
+
 class Target(NamedTuple):
     """What makes a kind of file in a folder of its own, what reads it, and the library that this needs."""
 
@@ -475,6 +491,7 @@ ALL: dict[str, Target] = {
     "labels.nii": Target(lambda p: write_labels_nifti(p, grid(), COLORS), read_label_volume, "nibabel"),
     "labels.nii.gz": Target(lambda p: write_labels_nifti(p, grid(), COLORS), read_label_volume, "nibabel"),
     "labels.seg.nrrd": Target(lambda p: write_labels_seg_nrrd(p, grid(), COLORS), read_label_volume, "nrrd"),
+    "layers.seg.nrrd": Target(text(LAYERS), read_label_volume, "nrrd"),
     "tetrahedra.npz": Target(lambda p: np.savez(p, rest_nodes=NODES, tetrahedra=ELEMENTS, nodes=FRAMES), of_segment),
     "surfaces.npz": Target(lambda p: np.savez(p, a=FRAMES), of_segment),
     **{f"frames.{kind}": Target(vtk, of_segment, "pyvista") for kind in ("vtu", "pvd", "xdmf")},

@@ -22,13 +22,13 @@ from mereo.api.words import python_words
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.carry import carry, place
 from mereo.fitting.registration.registration import Registration
-from mereo.geometry.camera import PointCloud, camera_axes
+from mereo.geometry.camera import camera_axes
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.transforms import transform_points
 from mereo.io.atomic_files import atomic_file, new_directory
 from mereo.io.attachments import Attachment, Content, Positions, Surfaces, read_attachments, write_attachment
 from mereo.io.config import DEFAULT_FILES, CarryFrame, FilesConfig, Format
-from mereo.io.point_arrays import points_of
+from mereo.io.point_arrays import model_points
 from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame
 from mereo.io.writers.formats import chosen_formats
@@ -375,10 +375,7 @@ def _attachment(what: Any) -> Attachment:
         return read_attachments([what])[0]
     if isinstance(what, SegmentedMesh | Segment) or (hasattr(what, "vertices") and hasattr(what, "faces")):
         return Attachment("the mesh", Surfaces(_segmented(what)))
-    cloud, _ = points_of(what)
-    if not isinstance(cloud, PointCloud):
-        raise ValueError("a depth image is no part of an object's files: carry points, a mesh or a file")
-    return Attachment("the points", Positions(cloud.points))
+    return Attachment("the points", Positions(model_points(what)))
 
 
 def _segmented(mesh: Any) -> SegmentedMesh:

@@ -134,6 +134,12 @@ def _too_large(path: str | Path) -> SizeError:
     )
 
 
+def check_memory(path: str | Path, needed: int) -> None:
+    """Raise ``SizeError`` for a file that takes so many bytes to read, by its header, before anything is read."""
+    if needed > max_bytes():
+        raise _too_large(path)
+
+
 @contextmanager
 def _memory_limit() -> Iterator[None]:
     more, before = max_bytes(), resource.getrlimit(resource.RLIMIT_AS)

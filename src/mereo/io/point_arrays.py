@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import DepthImage, PointCloud
-from mereo.geometry.conventions import check_real
+from mereo.geometry.conventions import LARGEST, check_real
 from mereo.io.errors import reason
 from mereo.io.readers import valid_points
 from mereo.io.ros_recordings import cloud_points
@@ -50,6 +50,24 @@ def points_of(source: object, drop_invalid: bool = False) -> tuple[PointCloud | 
             cure = "organized clouds mark pixels without a measurement so, and drop_invalid=True leaves them out"
         kept = valid_points(points, name, drop_invalid, cure)
     return PointCloud(kept), len(points) - len(kept)
+
+
+def model_points(source: object) -> Float[np.ndarray, "n 3"]:
+    """Points of a model, of whatever ``points_of`` takes but depth images; its origin is a point like any other.
+
+    Raises ``ValueError`` as that does, and for points that are not finite.
+    """
+    if isinstance(source, DepthImage):
+        raise ValueError("a depth image is no part of an object's files: carry points, a mesh or a file")
+    if isinstance(source, PointCloud):
+        return source.points
+    with np.errstate(over="ignore", invalid="ignore"):
+        points, name, _ = _positions(source)
+        if not len(points) or not (np.abs(points) <= LARGEST).all():
+            raise ValueError(
+                f"{name} has no points, or some that are NaN, infinite or beyond {LARGEST:g}: correct them"
+            )
+    return points
 
 
 def is_frame_list(source: object) -> bool:

@@ -5,6 +5,7 @@ by NIfTI's convention). NRRD files say which frame they are in; those of 3D Slic
 space they stay as they are.
 """
 
+import math
 import re
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,7 +22,7 @@ from skimage.measure import marching_cubes
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
 from mereo.geometry.transforms import transform_points
 from mereo.io.config import Space
-from mereo.io.errors import limited_memory, quiet, readable
+from mereo.io.errors import check_memory, limited_memory, quiet, readable
 from mereo.io.extras import library
 from mereo.io.readers import in_memory
 
@@ -98,12 +99,17 @@ def read_volume(path: Path, kind: str = "volume") -> Volume:
         raise ValueError(
             f"{path} has voxels of the type {volume.values.dtype}; each must be one real number: export one channel"
         )
+    matrix = volume.T_world_index
+    if not (np.isfinite(matrix).all() and abs(np.linalg.det(matrix)) > 1e-12 * np.prod(volume.spacing) > 0):
+        raise ValueError(
+            f"{path} has voxels whose axes are {matrix[:3, :3].T.tolist()}; they must span space: export it again"
+        )
     return volume
 
 
 def _nifti(nibabel: Any, path: Path) -> Volume:
     image = nibabel.load(path)
-    _check_sides(image.shape)
+    _check_sides(path, image.shape, image.get_data_dtype().itemsize)
     values = image.dataobj.get_unscaled()
     values = values[..., 0] if values.ndim == 4 and values.shape[3] == 1 else values
     slope, intercept = float(image.dataobj.slope), float(image.dataobj.inter)
@@ -111,9 +117,13 @@ def _nifti(nibabel: Any, path: Path) -> Volume:
 
 
 def _nrrd(nrrd: Any, path: Path) -> Volume:
-    with path.open("rb") as file:
-        _check_sides(nrrd.read_header(file)["sizes"])
-    values, header = nrrd.read(str(path))
+    with path.open("rb") as file:  # names of segments have any letters, which pynrrd drops
+        header = nrrd.read_header(line.decode("utf-8", "replace") for line in file)
+    _check_sides(path, header["sizes"], 1)
+    data = header.get("data file", header.get("datafile"))
+    if data is not None and not _lies_below(path.parent, path.parent / data):
+        raise ValueError(f"its data file {data!r} is not a regular file in its folder or below")
+    values, _ = nrrd.read(str(path))
     transform = np.eye(4)
     directions = header.get("space directions")
     if directions is not None:
@@ -124,10 +134,16 @@ def _nrrd(nrrd: Any, path: Path) -> Volume:
     return Volume(in_memory(values), _to_ras(str(header.get("space", ""))) @ transform, header=header)
 
 
-def _check_sides(sizes: Iterable[Any]) -> None:
+def _lies_below(folder: Path, file: Path) -> bool:
+    """Whether it is a regular file in a folder: a file should not choose which others are opened."""
+    return file.resolve().is_relative_to(folder.resolve()) and file.is_file()
+
+
+def _check_sides(path: Path, sizes: Iterable[Any], item_bytes: int) -> None:
     sides = [int(side) for side in sizes]
     if min(sides, default=0) < 1:
         raise ValueError(f"its header states the size {' x '.join(map(str, sides))}")
+    check_memory(path, 2 * item_bytes * math.prod(sides))  # as it is stored, and in the machine's order of bytes
 
 
 ANATOMICAL = re.compile("(r|l)(?:ight|eft)?-?(a|p)(?:nterior|osterior)?-?(s|i)(?:uperior|nferior)?(?:-?t(?:ime)?)?")
@@ -169,13 +185,10 @@ def read_scalar_volume(path: Path) -> Volume:
             f"{path} has {volume.values.ndim} dimensions; a volume that is carried has 3, with one number for each "
             "voxel: export one time step or one component"
         )
-    if not np.isfinite(volume.values).all():
+    with limited_memory(path):
+        is_finite = np.isfinite(volume.values).all()
+    if not is_finite:
         raise ValueError(f"{path} has NaN or infinite values; all must be finite: replace them, for example by 0")
-    matrix = volume.T_world_index
-    if not (np.isfinite(matrix).all() and abs(np.linalg.det(matrix)) > 1e-12 * np.prod(volume.spacing) > 0):
-        raise ValueError(
-            f"{path} has voxels whose axes are {matrix[:3, :3].T.tolist()}; they must span space: export it again"
-        )
     return volume
 
 
@@ -224,16 +237,6 @@ class LabelVolume:
         """Labels above 0 that occur."""
         slices = (part for layer in self.labels for part in np.moveaxis(layer, 2, 0) if part.any())
         return tuple(sorted({int(value) for part in slices for value in np.unique(part)} - {0}))
-
-    @property
-    def box(self) -> tuple[slice, slice, slice]:
-        """Part of a layer around all that is set, which must be something."""
-        ends = []
-        for axis in (1, 2, 3):
-            rows = np.flatnonzero(self.labels.any(axis=tuple({0, 1, 2, 3} - {axis})))
-            ends.append(slice(int(rows[0]), int(rows[-1]) + 1))
-        x, y, z = ends
-        return x, y, z
 
 
 class LabelWarning(UserWarning):
@@ -293,14 +296,16 @@ class _SlicerSegment(NamedTuple):
 
 def _slicer_segments(volume: Volume) -> list[_SlicerSegment]:
     """Segments that the header of a segmentation lists; older ones have a layer each."""
-    fields = segment_fields(volume.header)
-    numbers = sorted({int(match[1]) for key in fields if (match := re.match(r"Segment(\d+)_", key))})
+    parts = dict[int, dict[str, str]]()
+    for key, text in segment_fields(volume.header).items():
+        if match := re.fullmatch(r"Segment(\d+)_(\w+)", key):
+            parts.setdefault(int(match[1]), {})[match[2]] = text
     segments = []
-    for number in numbers:
-        part = {key.partition("_")[2]: text for key, text in fields.items() if key.startswith(f"Segment{number}_")}
+    for number, part in sorted(parts.items()):
         value, layer = int(part.get("LabelValue", 1)), int(part.get("Layer", number))
         shades = [round(255 * float(shade)) for shade in part.get("Color", "").split()]
-        color = (shades[0], shades[1], shades[2]) if len(shades) == 3 else None
+        is_color = len(shades) == 3 and all(0 <= shade <= 255 for shade in shades)
+        color = (shades[0], shades[1], shades[2]) if is_color else None
         segments.append(_SlicerSegment(part.get("Name", f"label_{value}"), layer, value, color))
     return segments
 
@@ -337,7 +342,7 @@ def _joined_labels(paths: Sequence[Path]) -> LabelVolume:
         if not volume.values:
             empty.append(path.name)
             continue
-        names[number] = volume_stem(path)
+        names[number] = re.sub(r"(\.seg)?(\.nii|\.nii\.gz|\.nrrd)$", "", path.name, flags=re.IGNORECASE)
         mask = volume.labels[0] > 0
         free = (layer for layer in layers if not layer[mask].any())
         if (layer := next(free, None)) is None:
@@ -349,26 +354,24 @@ def _joined_labels(paths: Sequence[Path]) -> LabelVolume:
     return LabelVolume(np.stack(layers or [first.labels[0].astype(np.int16)]), first.T_world_index, names)
 
 
-def volume_stem(path: Path) -> str:
-    """Name of a volume's file without its suffix."""
-    return re.sub(r"(\.seg)?(\.nii|\.nii\.gz|\.nrrd)$", "", path.name, flags=re.IGNORECASE)
-
-
 def _check_same_grid(path: Path, volume: LabelVolume, other_path: Path, other: LabelVolume) -> None:
     shift = np.abs(volume.T_world_index - other.T_world_index).max()
     if volume.labels.shape[1:] == other.labels.shape[1:] and shift < 0.01 * np.abs(volume.T_world_index[:3, :3]).max():
         return
-    (shape, start), (other_shape, other_start) = (
-        (" x ".join(map(str, each.labels.shape[1:])), each.T_world_index[:3, 3].round(2).tolist())
-        for each in (volume, other)
-    )
     raise ValueError(
-        f"{other_path} has {other_shape} voxels from {other_start} on, and {path} {shape} from {start}, or axes that "
-        "differ; the segments of one object share one grid: resample them to it"
+        f"{other_path} has {other.labels.shape[1:]} voxels from {other.T_world_index[:3, 3]} on, and {path} "
+        f"{volume.labels.shape[1:]} from {volume.T_world_index[:3, 3]}, or they have other axes; the segments of one "
+        "object share one grid: resample them to it"
     )
 
 
 # --- surfaces of labels: closed, smoothed, neighbours in contact ------------------------------------------------------
+
+Share = Float32[np.ndarray, "a b c"]
+"""Share of a segment in each cell of a grid, or what is positive inside it."""
+
+Mask = Bool[np.ndarray, "x y z"]
+"""Voxels of a segment."""
 
 SMOOTHING = 0.8
 """Standard deviation of the smoothing, in the longest side of a cell: enough against stairs, and little volume lost."""
@@ -415,12 +418,12 @@ def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) 
             f"the volume has no voxel of {names[missing[0]]!r}, value {missing[0]}; it holds the values "
             f"{', '.join(map(str, volume.values))}: correct `names`"
         )
-    layers, segments = volume.labels[(slice(None), *volume.box)], list(dict.fromkeys(names.values()))
+    layers, segments = volume.labels, list(dict.fromkeys(names.values()))
+    check_memory("the label volume", (len(segments) + 3) * layers[0].size)  # a byte for each voxel of a mask
     labels = [[value for value in names if names[value] == name] for name in segments]
     masks = [np.logical_or.reduce([(layers == value).any(axis=0) for value in group]) for group in labels]
     parents = _part_masks(masks)
-    first = np.array([part.start for part in volume.box])
-    grid = _Grid.around(np.logical_or.reduce(masks), first, volume.T_world_index, cells)
+    grid = _Grid.around(np.logical_or.reduce(masks), volume.T_world_index, cells)
     margins = _margins(_in_partition([grid.share(mask) for mask in masks], parents), parents)
     parts, cell = list[Segment](), abs(float(np.linalg.det(volume.T_world_index[:3, :3])))
     for index, (name, margin) in enumerate(zip(segments, margins, strict=True)):
@@ -437,13 +440,13 @@ def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) 
             text = f"segment {name!r} keeps {kept:.0%} of its volume on a grid of {cells} cells: raise `cells` for more"
             warnings.warn(text, LabelWarning, stacklevel=2)
         parts.append(part)
-    depth = {index: len(_ancestors(index, parents)) for index in range(len(parts))}
     nested = tuple((segments[i], segments[j]) for i, j in parents.items())
-    return SegmentedMesh(tuple(parts[index] for index in sorted(depth, key=lambda index: -depth[index])), nested)
+    order = dict.fromkeys((*parents, *range(len(parts))))
+    return SegmentedMesh(tuple(parts[index] for index in order), nested)
 
 
-def _part_masks(masks: list[Bool[np.ndarray, "x y z"]]) -> dict[int, int]:
-    """Make masks that overlap nested or apart, in place; returns the smallest one around each that is nested."""
+def _part_masks(masks: list[Mask]) -> dict[int, int]:
+    """Make masks nested or apart, in place; returns those that are nested, from the smallest on, and what is around."""
     sizes = [int(mask.sum()) for mask in masks]
     order, parents = sorted(range(len(masks)), key=lambda index: sizes[index]), dict[int, int]()
     for place, small in enumerate(order):
@@ -457,13 +460,7 @@ def _part_masks(masks: list[Bool[np.ndarray, "x y z"]]) -> dict[int, int]:
     return parents
 
 
-def _ancestors(index: int, parents: Mapping[int, int]) -> list[int]:
-    return [] if index not in parents else [parents[index], *_ancestors(parents[index], parents)]
-
-
-def _in_partition(
-    shares: Sequence[tuple[Float32[np.ndarray, "a b c"], float]], parents: Mapping[int, int]
-) -> list[Float32[np.ndarray, "a b c"]]:
+def _in_partition(shares: Sequence[tuple[Share, float]], parents: Mapping[int, int]) -> list[Share]:
     """Shares that are a half at each segment's surface; what a thin one gains is taken from its siblings."""
     bent = [_bent(share, level) for share, level in shares]
     result = list(bent)
@@ -476,16 +473,14 @@ def _in_partition(
     return result
 
 
-def _bent(share: Float32[np.ndarray, "a b c"], level: float) -> Float32[np.ndarray, "a b c"]:
+def _bent(share: Share, level: float) -> Share:
     """Share from 0 to 1 that is a half where it was ``level``."""
     return share if level == 0.5 else np.interp(share, [0, level, 1], [0, 0.5, 1]).astype(np.float32)
 
 
-def _margins(
-    shares: Sequence[Float32[np.ndarray, "a b c"]], parents: Mapping[int, int]
-) -> list[Float32[np.ndarray, "a b c"]]:
+def _margins(shares: Sequence[Share], parents: Mapping[int, int]) -> list[Share]:
     """For each segment what is positive inside it, and 0 on its surface; siblings share interfaces."""
-    margins: dict[int | None, Float32[np.ndarray, "a b c"]] = {None: np.full(shares[0].shape, np.float32(np.inf))}
+    margins: dict[int | None, Share] = {None: np.full(shares[0].shape, np.float32(np.inf))}
     todo: list[int | None] = [None]
     for parent in todo:
         members = [index for index in range(len(shares)) if parents.get(index) == parent]
@@ -503,12 +498,8 @@ def _margins(
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """A coarser grid over part of a volume, from the voxel ``first`` of ``part`` on: cells of ``block`` voxels each.
+    """A coarser grid over part of a volume, from the voxel ``first`` on: ``counts`` cells of ``block`` voxels each."""
 
-    ``part`` is the first voxel of the part of the volume that masks show.
-    """
-
-    part: Int[np.ndarray, "3"]
     first: Int[np.ndarray, "3"]
     counts: Int[np.ndarray, "3"]
     block: Int[np.ndarray, "3"]
@@ -517,8 +508,7 @@ class _Grid:
     @classmethod
     def around(
         cls,
-        mask: Bool[np.ndarray, "x y z"],
-        part: Int[np.ndarray, "3"],
+        mask: Mask,
         transform: Float[np.ndarray, "4 4"],
         cells: int,
     ) -> "_Grid":
@@ -528,9 +518,9 @@ class _Grid:
         voxel = np.linalg.norm(transform[:3, :3], axis=0)
         wanted = ((end - first) * voxel).max() / cells
         block = np.maximum(np.rint(wanted / voxel).astype(np.int64), 1)
-        return cls(part, first, -(-(end - first) // block), block, transform)
+        return cls(first, -(-(end - first) // block), block, transform)
 
-    def share(self, mask: Bool[np.ndarray, "x y z"]) -> tuple[Float32[np.ndarray, "a b c"], float]:
+    def share(self, mask: Mask) -> tuple[Share, float]:
         """Share of each cell that is set, smoothed, with ``MARGIN`` empty cells around; and the one at the surface."""
         end = np.minimum(self.first + self.counts * self.block, mask.shape)
         part = mask[tuple(slice(a, b) for a, b in zip(self.first, end, strict=True))]
@@ -538,7 +528,7 @@ class _Grid:
         (a, b, c), (i, j, k) = self.counts, self.block
         means = np.pad(part.reshape(a, i, b, j, c, k).mean(axis=(1, 3, 5), dtype=np.float32), MARGIN)
         cell = self.block * np.linalg.norm(self.T_world_index[:3, :3], axis=0)
-        smooth: Float32[np.ndarray, "a b c"] = gaussian_filter(means, SMOOTHING * cell.max() / cell, mode="constant")
+        smooth: Share = gaussian_filter(means, SMOOTHING * cell.max() / cell, mode="constant")
         whole = float(means.sum()) * float(np.prod(cell))
         if self.enclosed(smooth) >= WHOLE * whole:
             return smooth, 0.5
@@ -549,7 +539,7 @@ class _Grid:
             low, high = (low, middle) if self.enclosed(_bent(smooth, middle)) < whole else (middle, high)
         return smooth, high
 
-    def enclosed(self, share: Float32[np.ndarray, "a b c"]) -> float:
+    def enclosed(self, share: Share) -> float:
         """Volume of where a share is above a half."""
         inside = np.argwhere(share > 0.5)
         if len(inside) == 0:
@@ -558,12 +548,12 @@ class _Grid:
         part = self.surface(share[box] - np.float32(0.5), "", PALETTE[0])
         return 0.0 if part is None else part.volume
 
-    def surface(self, margin: Float32[np.ndarray, "a b c"], name: str, color: Color) -> Segment | None:
+    def surface(self, margin: Share, name: str, color: Color) -> Segment | None:
         """Surface where ``margin`` is 0, outward oriented, in world coordinates; None where it is nowhere positive."""
         if margin.max() <= 0:
             return None
         vertices, faces, _, _ = marching_cubes(margin, 0.0, gradient_direction="ascent")
-        index = (vertices - MARGIN + 0.5) * self.block - 0.5 + (self.part + self.first)
+        index = (vertices - MARGIN + 0.5) * self.block - 0.5 + self.first
         world = index @ self.T_world_index[:3, :3].T + self.T_world_index[:3, 3]
         # voxel axes may be left-handed
         turned = -1 if np.linalg.det(self.T_world_index[:3, :3]) < 0 else 1
