@@ -87,6 +87,7 @@ BAD_CLOUDS: dict[str, tuple[bytes, str]] = {
     "pickle.npy": (npy(np.array([{}], dtype=object)), "cannot be read"),
     "transposed.npy": (npy(POINTS.T), r"shape is \(3, 57\)"),
     "words.npy": (npy(np.array([["a", "b", "c"]])), "not a number"),
+    "mesh.stl": (b"solid", "is a mesh, not what a camera has measured, .*: give the frame, and the mesh as the object"),
     "suffix.las": (b"LASF", "suffix '.las'.*convert"),
     "fewer than none.ply": (PLY.replace(b"vertex 57", b"vertex -5"), "its header states -5 of element 'vertex'"),
     "no such format.ply": (PLY.replace(b"little", b"middle"), "its format is 'binary_middle_endian'"),

@@ -39,6 +39,9 @@ from mereo.scenes.recorded_states import load_states
 from mereo.scenes.scene import SCENES, Scene, Workspace
 from mereo.scenes.seeds import example_rng
 
+SMALLEST = 1.0
+"""Longest side in scene units at least."""
+
 SOURCES = {"source", "segments", "model", "parts", "labels", "names", "cells"}
 """Keys that decide the meshes, which identify themselves, or nothing."""
 
@@ -98,6 +101,12 @@ def _with_warnings(document: Document, mesh: SegmentedMesh) -> SegmentedMesh:
 def build(document: Document, file: SceneFile, mesh: SegmentedMesh) -> Scene:
     """Scene of a mesh in the file's unit: scaled to ``size`` and centred, with its deformations."""
     placement = placed(mesh, file.size)
+    if (longest := placement.scale * float(np.ptp(mesh.bounds, axis=0).max())) < SMALLEST:
+        raise document.error(
+            ("size",),
+            f"`size` is {file.size:g}, which makes the object {longest:.3g} scene units long; {SMALLEST:g} is the "
+            f"least, as the camera's noise is 0.1: raise it to {file.size * SMALLEST / longest:.3g} or more",
+        )
     rest = mesh.with_vertices([placement.apply(segment.vertices) for segment in mesh.segments])
     nearest, radius = file.camera.distance[0], float(np.linalg.norm(np.ptp(rest.bounds, axis=0))) / 2
     if not nearest > radius:
