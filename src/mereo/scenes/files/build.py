@@ -22,7 +22,7 @@ from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.mesh_check import examine, mesh_of, solid_of
 from mereo.geometry.subdivision import TooManyFaces, split_edges
 from mereo.geometry.transforms import Normalizer
-from mereo.io.mesh_formats import MeshWarning, read_segmented_mesh
+from mereo.io.mesh_formats import MeshWarning, read_object_mesh
 from mereo.io.simulation_states import files_of_states, frame_files
 from mereo.io.yaml_document import Document, similar
 from mereo.scenes.files.deformation_blocks import (
@@ -89,8 +89,8 @@ def _with_warnings(document: Document, mesh: SegmentedMesh) -> SegmentedMesh:
     segments = []
     for segment in mesh.segments:
         health = examine(segment)
-        if health.hopeless:
-            raise ValueError(f"{document.path}: segment {segment.name!r} {health.hopeless[0]}: {cure}")
+        if refusal := health.refusal(len(segment.faces)):
+            raise ValueError(f"{document.path}: segment {segment.name!r} {refusal}: {cure}")
         if health.dirty:
             text = f"{document.path}: segment {segment.name!r} {' and '.join(health.dirty)}; the winding number "
             warnings.warn(text + f"decides what is inside it, which is slower: {cure}", MeshWarning, stacklevel=3)
@@ -242,7 +242,7 @@ def read_segments(document: Document, file: SceneFile) -> SegmentedMesh:
 def _read(document: Document, place: Sequence[int | str], path: Path) -> SegmentedMesh:
     """A mesh file; errors say which line names it."""
     with document.named_at(place):
-        return read_segmented_mesh(path)
+        return read_object_mesh(path)
 
 
 def _from_model(document: Document, parts: Sequence[ModelPart], model: SegmentedMesh) -> list[Segment]:
