@@ -13,11 +13,12 @@ from overlapping import check_overlap
 from scene_files import write_bar, write_mesh
 from shapes import ball, box, knobbly_torus, one, segment
 
-from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry import mesh_check, mesh_repair
+from mereo.geometry.mesh import Segment, SegmentedMesh, connected
 from mereo.geometry.mesh_check import examine, mesh_of, overlaps, solid_of
-from mereo.geometry.mesh_repair import farthest, repaired, without_overlaps
+from mereo.geometry.mesh_repair import close_holes, farthest, open_edges, repaired, without_overlaps
 from mereo.geometry.solids import Solids, label_grid, signed_distance_and_direction
-from mereo.io.mesh_formats import MeshWarning
+from mereo.io.mesh_formats import MeshWarning, read_object_mesh
 from mereo.scenes.files import check
 from mereo.scenes.files.check import check_scene
 from mereo.scenes.registry import load_scene
@@ -181,6 +182,51 @@ def test_a_line_or_plane_in_any_direction_is_no_solid(axes: np.ndarray) -> None:
     for vertices in (places, places.astype(np.float32).astype(float)):
         health = examine(Segment("part", (1, 2, 3), vertices, np.arange(12).reshape(4, 3)))
         assert health.hopeless == ("is flat, without any volume",) and not health.mendable
+
+
+def test_holes_are_closed_as_one_by_one() -> None:
+    part = replace(TORUS, faces=np.delete(TORUS.faces, np.random.default_rng(0).integers(0, 1920, 60), axis=0))
+    vertices, faces = part.vertices, part.faces
+    rim = open_edges(vertices, faces)
+    group = connected(rim, len(vertices))
+    for number in np.unique(group[rim[:, 0]]):
+        loop = rim[group[rim[:, 0]] == number]
+        faces = np.concatenate([faces, [[b, a, len(vertices)] for a, b in loop]])
+        vertices = np.concatenate([vertices, vertices[loop[:, :1]].mean(axis=0)])
+    assert len(vertices) > len(part.vertices) + 20
+    closed = close_holes(part.vertices, part.faces)
+    np.testing.assert_array_equal(closed[0], vertices)
+    np.testing.assert_array_equal(closed[1], faces)
+
+
+def test_a_solid_of_many_faces_is_simplified_and_how_far_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mesh_repair, "MOST_FACES", 10_000)
+    part = ball((5, 0, 0), 1.0, level=5)
+    fewer, way = mesh_repair.simplified(part)
+    SegmentedMesh((fewer,)).check()
+    assert len(fewer.faces) <= 10_000 and 0 < way < 0.002 and fewer.volume == pytest.approx(part.volume, rel=1e-2)
+    for other in (TORUS, replace(part, faces=part.faces[1:])):  # of few faces, and no solid
+        assert mesh_repair.simplified(other) == (other, 0.0)
+    path = write_mesh(part, tmp_path / "ball.stl")
+    with pytest.warns(MeshWarning, match=r"ball.stl has 20,480 faces in 'ball'; it is taken with .*,.*, at most 0.00"):
+        mesh = read_object_mesh(path)
+    (tmp_path / "more").mkdir()
+    assert read_object_mesh(tmp_path / "more" / ".." / "ball.stl") is mesh
+    write_mesh(ball((5, 0, 0), 1.0, level=2), path)
+    assert len(read_object_mesh(path).segments[0].faces) == 320
+
+
+def test_what_is_no_solid_may_have_fewer_faces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mesh_check, "MOST_DIRTY", 100)
+    path = write_bar(tmp_path)
+    part = trimesh.load_mesh(tmp_path / "left.stl")
+    write_mesh(Segment("left", (0, 0, 0), part.vertices, part.faces[1:]), tmp_path / "left.stl")
+    with pytest.raises(
+        ValueError, match=r"'left' has 3 open edges \(.*\) and 191 faces, of which .* may have 100: repair"
+    ):
+        load_scene(path)
 
 
 def test_nothing_is_made_of_nothing() -> None:

@@ -5,6 +5,7 @@ import json
 import os
 import struct
 import sys
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +88,7 @@ BAD_CLOUDS: dict[str, tuple[bytes, str]] = {
     "pickle.npy": (npy(np.array([{}], dtype=object)), "cannot be read"),
     "transposed.npy": (npy(POINTS.T), r"shape is \(3, 57\)"),
     "words.npy": (npy(np.array([["a", "b", "c"]])), "not a number"),
+    "mesh.stl": (b"solid", "is a mesh, not what a camera has measured, .*: give the frame, and the mesh as the object"),
     "suffix.las": (b"LASF", "suffix '.las'.*convert"),
     "fewer than none.ply": (PLY.replace(b"vertex 57", b"vertex -5"), "its header states -5 of element 'vertex'"),
     "no such format.ply": (PLY.replace(b"little", b"middle"), "its format is 'binary_middle_endian'"),
@@ -293,6 +295,20 @@ def test_a_mesh_opens_no_files_but_buffers_in_its_folder(tmp_path: Path) -> None
     assert len(read_point_cloud(folder / "a.ply").points) == 8
     (folder / "a.obj").write_text("mtllib pipe.bin\nmtllib /dev/zero\n" + BOX.export(file_type="obj"))
     assert read_segmented_mesh(folder / "a.obj").segments[0].volume == 1.0
+
+
+def test_a_3mf_file_that_unpacks_to_more_than_the_limit_is_refused_unread(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("lxml", reason="lxml comes with the extra cad")
+    BOX.export(tmp_path / "a.3mf")
+    with zipfile.ZipFile(tmp_path / "a.3mf", "a", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("3D/zeros.bin", bytes(20_000_000))
+    assert read_segmented_mesh(tmp_path / "a.3mf").segments[0].volume == 1.0
+    monkeypatch.setenv("MEREO_MAX_FILE_GB", "0.02")
+    monkeypatch.setattr(trimesh, "load_scene", None)
+    with pytest.raises(ValueError, match="a.3mf takes more than 0.02 GB of memory to read: .* MEREO_MAX_FILE_GB=1"):
+        read_segmented_mesh(tmp_path / "a.3mf")
 
 
 def write_materials(path: Path, parts: list[tuple[str, np.ndarray]]) -> Path:

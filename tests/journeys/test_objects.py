@@ -2,6 +2,8 @@
 
 import json
 import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -147,6 +149,33 @@ def test_a_cache_that_cannot_be_used_is_named_and_what_it_holds_is_never_waited_
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "new"))  # made
     kept_model(scene)
     assert (tmp_path / "new/models" / kept.name).read_bytes() == kept.read_bytes()
+
+
+def test_words_that_cannot_be_meant_are_refused_before_the_work(
+    meshes: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mereo.api.objects.scene_of_meshes", None)
+    with pytest.raises(ValueError, match="the units are 'feet'; they must be one of mm, cm, m, in: correct"):
+        mereo.load_object(meshes, units="feet")
+    with pytest.raises(FileNotFoundError, match="there are no weights 'nothing'"):
+        mereo.load_object(meshes, weights="nothing")
+
+
+def test_what_is_no_object_is_a_sentence() -> None:
+    """In a process of its own, which does not check types itself."""
+    program = """
+import mereo
+for given in ([None], b"bytes", [], {}, {"a.stl"}, 3, "", ["a.stl", ""], [b"a.stl"]):
+    try:
+        mereo.load_object(given)
+    except ValueError as error:
+        print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100)
+    lines = done.stdout.splitlines()
+    assert len(lines) == 9 and lines.pop(2).startswith("no object is given; name its meshes"), done
+    assert lines[0].startswith("the object is [None]; it must be the path of a file or folder, a list of such paths")
+    assert all(line.startswith("the object is ") and line.endswith(": name its meshes") for line in lines), lines
 
 
 @pytest.mark.slow

@@ -16,6 +16,7 @@ from typing import get_args
 from mereo.api.words import python_words
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.register import Registrar, other_mesh, registrar_for, statistical_model_of
+from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.extras import has_network
 from mereo.io.mesh_formats import MESH_SUFFIXES
@@ -154,6 +155,8 @@ def load_object(
     other files and for meshes without volume, ``ImportError`` for weights without the extra `network`.
     """
     inference = InferenceConfig(device, precision)
+    if units is not None and units not in list(UNITS_M):
+        raise ValueError(f"the units are {units!r}; they must be one of {', '.join(UNITS_M)}: correct the spelling")
     network = weights if source is None else source
     if isinstance(network, Trained) or (isinstance(network, str | Path) and (source is None or is_weights(network))):
         if source is not None and weights is not None:
@@ -168,10 +171,10 @@ def load_object(
         raise ValueError("no object is given; name its meshes, its scene or its weights")
     if scene is not None:
         raise ValueError(f"{source} is no weights and has its own scene, but another one is named: leave it out")
+    loaded = None if weights is None else load_weights(weights, inference)  # first, for a scene may take long
     scene = _scene(source, units)
-    if weights is None:
+    if loaded is None:
         return Object(None, scene, model=kept_model(scene))
-    loaded = load_weights(weights, inference)
     if loaded.statistical_model is not None and (fault := other_mesh(scene, loaded.statistical_model)):
         raise ValueError(f"{fault}; both must be of one object: name the weights of this one, or leave them out")
     return Object(loaded, scene)
@@ -207,7 +210,13 @@ def _scene(source: Source, units: str | None) -> Scene:
     if isinstance(source, Scene):
         return source
     assert not isinstance(source, Trained)
-    files = [Path(file) for file in ([source] if isinstance(source, str | Path) else source)]
+    given: Sequence[object] = [source] if isinstance(source, str | Path) else source
+    if not isinstance(given, Sequence) or not all(isinstance(file, str | Path) and str(file) for file in given):
+        raise ValueError(
+            f"the object is {repr(source)[:80]}; it must be the path of a file or folder, a list of such paths, the "
+            "name of a scene, or a scene: name its meshes"
+        )
+    files = [Path(str(file)) for file in given]
     if len(files) == 1 and files[0].is_dir():
         folder, learned = files[0], scene_of_folder(files[0])
         files = [Path(learned)] if learned is not None else shapes_in(folder)

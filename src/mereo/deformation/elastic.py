@@ -33,6 +33,7 @@ from mereo.deformation.tetrahedral import Tetrahedra, TetrahedralMap
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.read_only import read_only, read_only_view
 from mereo.geometry.solids import label_grid
+from mereo.io.progress import stage
 
 _CORNERS = read_only(np.argwhere(np.ones((2, 2, 2))))
 _SPLIT = read_only(np.array([[0, *np.cumsum([4 >> axis for axis in path])] for path in permutations(range(3))]))
@@ -324,7 +325,8 @@ class ElasticSampler:
         """Displacements of the nodes for coefficients of variance 1."""
         kept = _KEPT_MODES.get(self.digest)
         if kept is None:
-            kept = _KEPT_MODES[self.digest] = find_modes(self.solid, self.count, self.material, self.held)
+            with stage("find the modes of the elastic solid, once"):
+                kept = _KEPT_MODES[self.digest] = find_modes(self.solid, self.count, self.material, self.held)
             while len(_KEPT_MODES) > 4:
                 _KEPT_MODES.pop(next(iter(_KEPT_MODES)), None)
         return scale_modes(*kept, self.motion)

@@ -22,6 +22,9 @@ MOST_BURIED, MOST_BACKWARDS, MOST_UNDECIDED = 5e-3, 0.05, 0.5
 inwards before the winding number has no meaning, and have as much inside before as behind: of open ones it is all."""
 
 
+MOST_DIRTY = 300_000
+"""Faces of a mesh that is no solid: the winding number takes as long for every place that is asked for."""
+
 FLAT = 1e-6
 """Extent in its shortest direction, in that of its longest, at which a mesh is a plane or a line."""
 
@@ -42,6 +45,12 @@ class Health(NamedTuple):
     def sound(self) -> bool:
         """Whether the segment has no fault."""
         return not (self.dirty or self.hopeless)
+
+    def refusal(self, faces: int) -> str:
+        """Why a mesh of so many faces cannot be used even with winding numbers; empty where it can."""
+        if self.dirty and not self.hopeless and faces > MOST_DIRTY:
+            return f"{self.dirty[0]} and {faces:,} faces, of which what is no solid may have {MOST_DIRTY:,}"
+        return self.hopeless[0] if self.hopeless else ""
 
 
 def examine(segment: Segment, unit: str = "") -> Health:

@@ -121,8 +121,8 @@ def _orient(vertices: Vertices, faces: Faces, unit: str) -> Step:
         return vertices, faces, ""
     turned, patch = igl.bfs_orient(faces.astype(np.int64))
     turned = turned.astype(np.int64)  # C's long long, which numpy tells apart
-    for index in range(int(patch.max()) + 1):
-        members = patch == index
+    order = np.argsort(patch, kind="stable")
+    for members in np.split(order, np.flatnonzero(np.diff(patch[order])) + 1):
         corners = vertices[turned[members]]
         a, b, c = np.moveaxis(
             corners - corners.mean(axis=(0, 1)), 1, 0
@@ -390,6 +390,32 @@ def _cut_off(
     return way, np.isin(np.arange(len(places)), far)
 
 
+# --- fewer faces ------------------------------------------------------------------------------------------------------
+
+MOST_FACES, WITHIN = 100_000, (2.5e-4, 5e-4, 1e-3)
+"""Faces of a solid that all later work takes as they are; how far simpler ones may be, in longest sides: the first that
+leaves few enough, else the last."""
+
+
+def simplified(segment: Segment) -> tuple[Segment, float]:
+    """Solid of fewer faces, and how far the given surface is from it at most; itself and 0 where ``MOST_FACES`` do.
+
+    What is no solid stays as it is.
+    """
+    if len(segment.faces) <= MOST_FACES:
+        return segment, 0.0
+    try:
+        solid = solid_of(segment.vertices, segment.faces)
+    except ValueError:
+        return segment, 0.0
+    for share in WITHIN:
+        vertices, faces = mesh_of(solid.simplify(share * float(np.ptp(segment.vertices, axis=0).max())))
+        if len(faces) <= MOST_FACES:
+            break
+    fewer = replace(segment, vertices=vertices, faces=faces)
+    return fewer, max(way for way, _ in farthest(segment, fewer))
+
+
 # --- what a repair moved ----------------------------------------------------------------------------------------------
 
 Reach = tuple[float, Float[np.ndarray, "3"]]
@@ -476,9 +502,10 @@ def close_holes(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
     """Mesh whose open loops are closed by fans around the mean of their vertices; a closed mesh stays as it is."""
     rim = open_edges(vertices, faces)
     group = connected(rim.reshape(-1, 2), len(vertices))
-    for index in np.unique(group[rim[:, 0]]):
-        loop = rim[group[rim[:, 0]] == index]
-        fan = np.stack([loop[:, 1], loop[:, 0], np.full(len(loop), len(vertices))], axis=1)
-        vertices = np.concatenate([vertices, vertices[loop[:, :1]].mean(axis=0)])
-        faces = np.concatenate([faces, fan])
-    return vertices, faces
+    owner = group[rim[:, 0]]
+    order = np.argsort(owner, kind="stable")
+    loops = np.split(rim[order], np.flatnonzero(np.diff(owner[order])) + 1) if len(rim) else []
+    middles = [vertices[loop[:, :1]].mean(axis=0) for loop in loops]
+    tips = np.repeat(len(vertices) + np.arange(len(loops)), list(map(len, loops)))
+    fans = np.stack([rim[order, 1], rim[order, 0], tips], axis=1)
+    return np.concatenate([vertices, *middles]), np.concatenate([faces, fans])

@@ -126,6 +126,12 @@ def max_bytes() -> int:
     return int(limit * 1e9)
 
 
+def check_size(path: str | Path, size: int) -> None:
+    """Raise ``SizeError`` for a file whose content of ``size`` bytes is more than the limit."""
+    if size > max_bytes():
+        raise _too_large(path)
+
+
 def _too_large(path: str | Path) -> SizeError:
     limit = max_bytes() / 1e9
     return SizeError(
@@ -197,8 +203,7 @@ def readable(path: Path, kind: str) -> Iterator[None]:
         raise ValueError(f"{path} is {what}; a {kind} is needed: name a file")
     if (size := path.stat().st_size) == 0:
         raise ValueError(f"{path} is empty (0 bytes); a {kind} is needed: export or download it again")
-    if size > max_bytes():
-        raise _too_large(path)
+    check_size(path, size)
     try:
         with quiet(), limited_memory(path):
             yield

@@ -9,12 +9,14 @@ import warnings
 from base64 import b64decode
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from io import BytesIO
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
+from zipfile import ZipFile
 
 import numpy as np
 import trimesh
@@ -22,9 +24,11 @@ from jaxtyping import Float, Int, UInt8
 
 from mereo.geometry.conventions import LARGEST
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh, edge_uses
+from mereo.geometry.mesh_repair import simplified
 from mereo.geometry.radii import Radii
-from mereo.io.errors import check_count, check_suffix, readable
+from mereo.io.errors import check_count, check_size, check_suffix, readable
 from mereo.io.extras import library
+from mereo.io.progress import stage
 from mereo.io.readers import check_ply
 
 VIEWER_ROOT = "camera_frame"
@@ -69,6 +73,42 @@ def read_segmented_mesh(*paths: str | Path) -> SegmentedMesh:
     return SegmentedMesh(tuple(segments))
 
 
+def read_object_mesh(path: str | Path) -> SegmentedMesh:
+    """Segments of a file, or of a folder's files, for an object that is to be found; raises as ``read_segmented_mesh``.
+
+    Solids of more than ``mesh_repair.MOST_FACES`` faces are simplified, and a ``MeshWarning`` says how far. What was
+    read before is kept, as long as its files are the same.
+    """
+    path = Path(path)
+    states = [
+        (file.name, file.stat()) for file in (sorted(path.iterdir()) if path.is_dir() else [path]) if file.exists()
+    ]
+    return _kept_mesh(_Known(path, tuple((name, s.st_dev, s.st_ino, s.st_size, s.st_mtime_ns) for name, s in states)))
+
+
+@dataclass(frozen=True)
+class _Known:
+    """Place of files, by whatever path, whose names and states on the disk are known."""
+
+    path: Path = field(compare=False)
+    states: tuple[tuple[str | int, ...], ...]
+
+
+@lru_cache(maxsize=64)
+def _kept_mesh(known: _Known) -> SegmentedMesh:
+    path = known.path
+    with stage(f"read {path}"):
+        mesh, segments = read_segmented_mesh(path), list[Segment]()
+        for segment in mesh.segments:
+            fewer, way = simplified(segment)
+            segments.append(fewer)
+            if fewer is not segment:
+                text = f"{path} has {len(segment.faces):,} faces in {segment.name!r}; it is taken with "
+                text += f"{len(fewer.faces):,}, at most {way:.2g} of its units away from them"
+                warnings.warn(text, MeshWarning, stacklevel=4)
+    return replace(mesh, segments=tuple(segments))
+
+
 Part = tuple[str, Color | None, Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
 """Part of a mesh file: name, colour if known, vertices, faces."""
 
@@ -83,6 +123,9 @@ def _parts(path: Path) -> list[Part]:
             check_ply(path)
         if suffix == ".off":
             _check_off(path)
+        if suffix == ".3mf":
+            with ZipFile(path) as archive:  # no more than it states can come out of it
+                check_size(path, sum(entry.file_size for entry in archive.infolist()))
         parts = _obj_parts(path) if suffix == ".obj" else _scene_parts(path)
         if not any(len(faces) for _, _, _, faces in parts):
             raise ValueError("it has no faces of three different places" if parts else "it has no faces")

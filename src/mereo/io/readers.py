@@ -67,6 +67,11 @@ def read_point_cloud(path: str | Path, drop_invalid: bool = False) -> PointCloud
 def read_points(path: str | Path) -> Float[np.ndarray, "n 3"]:
     """Points of a file as ``read_point_cloud`` reads them, those without a measurement included."""
     path = Path(path)
+    if path.suffix.lower() in (".stl", ".obj", ".glb", ".gltf", ".off", ".3mf") and path.exists():
+        raise ValueError(
+            f"{path} is a mesh, not what a camera has measured, which is a depth image or a point cloud ("
+            f"{', '.join(CLOUD_READERS)}): give the frame, and the mesh as the object (--object)"
+        )
     check_suffix(path, CLOUD_READERS, "point cloud")
     with readable(path, "point cloud"):
         return np.asarray(CLOUD_READERS[path.suffix.lower()](path), dtype=np.float64).reshape(-1, 3)

@@ -1,5 +1,6 @@
 """A YAML file with its line numbers: what is wrong in it is said as file, line, value, rule and cure."""
 
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
@@ -18,6 +19,9 @@ Model = TypeVar("Model", bound=BaseModel)
 Place = Sequence[int | str]
 """Keys and indices from the top of the document, for example ("deformations", 0, "angle")."""
 
+MOST_BYTES = 500_000
+"""Size of a file, which is parsed in some ten seconds."""
+
 MOST_VALUES = 100_000
 """Values of a document, those of aliases counted where they stand: a few lines of nested aliases are billions."""
 
@@ -30,6 +34,10 @@ class Document:
         self.path = path
         if not path.is_file():
             raise FileNotFoundError(f"{path} does not exist; a scene file is needed: check the path")
+        if (size := path.stat().st_size) > MOST_BYTES:
+            raise ValueError(
+                f"{path} has {size:,} bytes; a scene file has at most {MOST_BYTES:,}: is it the right one?"
+            )
         try:
             self.text = path.read_text(encoding="utf-8")
             # two passes, because only nodes know their lines and only values their types
@@ -108,7 +116,8 @@ class Document:
     def _sentence(self, problem: ErrorDetails, model: type[BaseModel]) -> str:
         place, kind, value, context = problem["loc"], problem["type"], problem["input"], problem.get("ctx", {})
         key = str(place[-1]) if place else "the file"
-        rule = problem["msg"].removeprefix("Value error, ").replace("Input should", "it must").replace("should", "must")
+        rule = re.sub("^(Input|String|List) should", "it must", problem["msg"].removeprefix("Value error, "))
+        rule = rule.replace("should", "must")
         if kind == "missing" and isinstance(place[-1], int):
             return f"`{_key_of(place)}` has too few entries; it must have more than {place[-1]}: add the others"
         if kind == "missing":

@@ -23,7 +23,7 @@ from mereo.geometry.mesh_check import examine, mesh_of, solid_of
 from mereo.geometry.subdivision import TooManyFaces, split_edges
 from mereo.geometry.transforms import Normalizer
 from mereo.io.config import Space
-from mereo.io.mesh_formats import MeshWarning, read_segmented_mesh
+from mereo.io.mesh_formats import MeshWarning, read_object_mesh
 from mereo.io.simulation_states import files_of_states, frame_files
 from mereo.io.volume_files import file_space, read_label_volume, segment_surfaces
 from mereo.io.yaml_document import Document, similar
@@ -40,6 +40,9 @@ from mereo.scenes.files.template import default_deformations, placed
 from mereo.scenes.recorded_states import load_states
 from mereo.scenes.scene import SCENES, Scene, Workspace
 from mereo.scenes.seeds import example_rng
+
+SMALLEST = 1.0
+"""Longest side in scene units at least."""
 
 SOURCES = {"source", "segments", "model", "parts", "labels", "names", "cells"}
 """Keys that decide the meshes, which identify themselves, or nothing."""
@@ -94,8 +97,8 @@ def _with_warnings(document: Document, mesh: SegmentedMesh) -> SegmentedMesh:
     segments = []
     for segment in mesh.segments:
         health = examine(segment)
-        if health.hopeless:
-            raise ValueError(f"{document.path}: segment {segment.name!r} {health.hopeless[0]}: {cure}")
+        if refusal := health.refusal(len(segment.faces)):
+            raise ValueError(f"{document.path}: segment {segment.name!r} {refusal}: {cure}")
         if health.dirty:
             text = f"{document.path}: segment {segment.name!r} {' and '.join(health.dirty)}; the winding number "
             warnings.warn(text + f"decides what is inside it, which is slower: {cure}", MeshWarning, stacklevel=3)
@@ -106,6 +109,12 @@ def _with_warnings(document: Document, mesh: SegmentedMesh) -> SegmentedMesh:
 def build(document: Document, file: SceneFile, mesh: SegmentedMesh) -> Scene:
     """Scene of a mesh in the file's unit: scaled to ``size`` and centred, with its deformations."""
     placement = placed(mesh, file.size)
+    if (longest := placement.scale * float(np.ptp(mesh.bounds, axis=0).max())) < SMALLEST:
+        raise document.error(
+            ("size",),
+            f"`size` is {file.size:g}, which makes the object {longest:.3g} scene units long; {SMALLEST:g} is the "
+            f"least, as the camera's noise is 0.1: raise it to {file.size * SMALLEST / longest:.3g} or more",
+        )
     rest = mesh.with_vertices([placement.apply(segment.vertices) for segment in mesh.segments])
     nearest, radius = file.camera.distance[0], float(np.linalg.norm(np.ptp(rest.bounds, axis=0))) / 2
     if not nearest > radius:
@@ -254,7 +263,7 @@ def read_segments(document: Document, file: SceneFile) -> SegmentedMesh:
 def _read(document: Document, place: Sequence[int | str], path: Path) -> SegmentedMesh:
     """A mesh file; errors say which line names it."""
     with document.named_at(place):
-        return read_segmented_mesh(path)
+        return read_object_mesh(path)
 
 
 def _from_model(document: Document, parts: Sequence[ModelPart], model: SegmentedMesh) -> list[Segment]:

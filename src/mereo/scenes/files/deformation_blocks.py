@@ -57,6 +57,8 @@ MOST = 1e12
 
 Number = Annotated[FiniteFloat, Field(ge=-MOST, le=MOST)]
 Byte = Annotated[int, Field(ge=0, le=255)]
+FileName = Annotated[str, Field(min_length=1)]
+
 Positive = Annotated[FiniteFloat, Field(gt=0, le=MOST)]
 Name = Annotated[str, Field(min_length=1, pattern=r"^[^/\\\x00-\x1f]+$")]
 Point = tuple[Number, Number, Number]
@@ -332,8 +334,9 @@ SOFT, STIFF = 0.1, 0.025
 """``ElasticBlock.motion`` of what is soft, as organs are, and of what is stiff, as hard rubber is."""
 
 
-MOST_TETRAHEDRA = 200_000
-"""Of a volume mesh from a file: 160,000 of a liver take 146 s and 2.9 GB to find 100 modes, on two busy cores."""
+MOST_LATTICE, MOST_TETRAHEDRA = 100_000, 200_000
+"""Tetrahedra of a lattice, and of a volume mesh from a file: 160,000 of a liver take 146 s and 2.9 GB to find 100
+modes, on two busy cores; 55,000 of a cube half as much, as more of them are neighbours."""
 
 CELLS, FULL = (16, 24, 32, 48), 0.6
 """Cells along the longest side of an elastic solid, and how full one is on average of those that hold material."""
@@ -358,7 +361,7 @@ class ElasticBlock(DeformationBlock):
     stiffness: dict[Name, Annotated[FiniteFloat, Field(ge=1e-3, le=1e3)]] = {}
     held: Annotated[list[HeldPlace], Field(min_length=1)] | None = None
     cells: Annotated[int, Field(ge=4, le=64)] | None = None
-    tetrahedra: Annotated[str, Field(min_length=1)] | None = None
+    tetrahedra: FileName | None = None
     modes: Annotated[int, Field(ge=1, le=150)] = 100
 
     @model_validator(mode="after")
@@ -369,10 +372,18 @@ class ElasticBlock(DeformationBlock):
 
     def lattice(self, mesh: SegmentedMesh, stiffness: list[float] | None = None) -> ElasticSolid:
         """Lattice of ``cells``, or the coarsest of which a typical cell that holds material is half full."""
-        if self.cells is not None:
-            return build_lattice(mesh, self.cells, stiffness)
-        for cells in CELLS:
-            solid = build_lattice(mesh, cells, stiffness)
+        for cells in CELLS if self.cells is None else (self.cells,):
+            finer = build_lattice(mesh, cells, stiffness)
+            if (count := len(finer.mesh.elements)) > MOST_LATTICE:
+                if self.cells is None and cells > CELLS[0]:
+                    break
+                fitting = int(cells * (MOST_LATTICE / count) ** (1 / 3))
+                raise Misfit(
+                    "cells",
+                    f"a lattice of {cells} cells has {count:,} tetrahedra here, and {MOST_LATTICE:,} is the most, for "
+                    f"minutes: make it {fitting} or fewer, or leave it out",
+                )
+            solid = finer
             if np.average(solid.filled, weights=solid.volumes) >= FULL:
                 break
         return solid
@@ -512,13 +523,20 @@ class PartLook(Block):
 class FilePart(PartLook):
     """Segment from a mesh file of its own."""
 
-    file: str
+    file: FileName
 
 
 class ModelPart(PartLook):
     """Segment from one or more named parts of ``model``; by default the part that is called as it is."""
 
     parts: Annotated[list[str], Field(min_length=1)] | None = None
+
+
+def _any_roll(value: object) -> object:
+    """A truth value; an angle, which it is easily taken for, is refused."""
+    if not isinstance(value, bool):
+        raise ValueError("it must be true, where the camera may be rolled by any angle, or false, where by none")
+    return value
 
 
 class CameraBlock(Block):
@@ -531,7 +549,7 @@ class CameraBlock(Block):
     aperture: Annotated[FiniteFloat, Field(gt=0, le=360)] = 140.0
     distance: PositiveRange = (100.0, 200.0)
     axis: Direction = (0.0, 0.0, 1.0)
-    roll: bool = False
+    roll: Annotated[bool, BeforeValidator(_any_roll)] = False
     field_of_view: Annotated[FiniteFloat, Field(gt=0, lt=170)] = 35.0
 
     def workspace(self) -> Workspace:
@@ -548,8 +566,8 @@ class CameraBlock(Block):
 class StatesBlock(Block):
     """Recorded states: file, directory or pattern of positions, and the file of their mesh at rest."""
 
-    positions: Annotated[str, Field(min_length=1)]
-    mesh: Annotated[str, Field(min_length=1)] | None = None
+    positions: FileName
+    mesh: FileName | None = None
 
     @model_serializer
     def _written(self) -> str | dict[str, str]:
@@ -588,9 +606,9 @@ class SceneFile(Block):
     units: Annotated[Positive, BeforeValidator(_unit_m)]
     source: str = "the user's own"
     segments: Annotated[list[FilePart], Field(min_length=1)] | None = None
-    model: str | None = None
+    model: FileName | None = None
     parts: Annotated[list[ModelPart], Field(min_length=1)] | None = None
-    labels: str | Annotated[list[str], Field(min_length=2)] | None = None
+    labels: FileName | Annotated[list[FileName], Field(min_length=2)] | None = None
     names: Annotated[dict[Annotated[int, Field(ge=1)], Name], Field(min_length=1)] | None = None
     cells: Annotated[int, Field(ge=16, le=400)] = 64
     size: Positive = 20.0

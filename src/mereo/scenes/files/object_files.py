@@ -10,7 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from mereo.geometry.mesh_check import examine
-from mereo.io.mesh_formats import MESH_SUFFIXES, MeshWarning, read_segmented_mesh
+from mereo.io.mesh_formats import MESH_SUFFIXES, MeshWarning, read_object_mesh
 from mereo.io.readers import check_ply
 from mereo.io.volume_files import is_volume
 from mereo.scenes.files.template import write_scene_file
@@ -71,19 +71,15 @@ def scene_of_meshes(files: Sequence[Path], units: str | None = None) -> Scene:
     with TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", MeshWarning)
         for file in () if is_volume(files[0]) else files:
-            for part in read_segmented_mesh(file).segments:
+            for part in read_object_mesh(file).segments:
                 health = examine(part)
-                if health.hopeless:
+                if refusal := health.refusal(len(part.faces)):
                     solid = "name a file of its whole, closed surface" + (f", or {cure}" if health.mendable else "")
-                    fault = f"segment {part.name!r} of {file} {health.hopeless[0]}"
+                    fault = f"segment {part.name!r} of {file} {refusal}"
                     raise ValueError(f"{fault}; an object's parts are solids: {solid}")
         path = write_scene_file(files, Path(folder) / SCENE, units, name=files[0].name.split(".")[0])
         scene = load_scene(path)
-    texts = dict[str, tuple[str, type[Warning]]]()  # each once, though files are read several times, by other paths
     for warning in caught:  # which name the file that is gone
         text = str(warning.message).replace(f"{path}: ", "")
-        text = text.replace(f"repair it with `mereo scene check {path} --repair`", cure)
-        texts.setdefault(text.rpartition("/")[2], (text, warning.category))
-    for text, category in texts.values():
-        warnings.warn(text, category, 2)
+        warnings.warn(text.replace(f"repair it with `mereo scene check {path} --repair`", cure), warning.category, 2)
     return replace(scene, file=None)

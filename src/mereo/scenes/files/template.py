@@ -29,7 +29,7 @@ from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, surface_points
 from mereo.geometry.mesh_check import likely_unit
 from mereo.geometry.transforms import Normalizer, fit_rigid, inverse_rigid, transform_points
 from mereo.io.atomic_files import atomic_file, check_file_place
-from mereo.io.mesh_formats import read_segmented_mesh
+from mereo.io.mesh_formats import read_object_mesh
 from mereo.io.volume_files import (
     LabelVolume,
     LabelWarning,
@@ -381,7 +381,7 @@ def _source(files: Sequence[Path], folder: Path) -> _Source:
                 "alone, or meshes alone"
             )
         return _from_volumes(files, relative)
-    meshes = [read_segmented_mesh(file) for file in files]
+    meshes = [read_object_mesh(file) for file in files]
     if len(files) == 1 and len(meshes[0].segments) > 1:
         return _from_model(files[0], relative[0], meshes[0])
     # one segment for each file, called after it, with all of its parts
