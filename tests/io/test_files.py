@@ -13,7 +13,7 @@ from point_files import save_pcd, save_ply
 
 from mereo.geometry.camera import Camera
 from mereo.io.mesh_formats import read_segmented_mesh
-from mereo.io.readers import is_depth_image, read_depth_image, read_mask, read_point_cloud
+from mereo.io.readers import InputWarning, is_depth_image, read_depth_image, read_mask, read_point_cloud
 
 POINTS = np.random.default_rng(0).normal(size=(57, 3)).astype(np.float32) + np.float32(3)
 
@@ -226,6 +226,63 @@ def test_masks_of_all_kinds_agree(tmp_path: Path) -> None:
     ):
         image.save(tmp_path / f"{name}.png")
         np.testing.assert_array_equal(read_mask(tmp_path / f"{name}.png"), truth, err_msg=name)
+
+
+def disk(*values: int) -> np.ndarray:
+    """Nested disks of these values on an image of 0."""
+    row, column = np.mgrid[:40, :60]
+    radius = np.hypot(row - 20, column - 30)
+    return np.select([radius < 18 - 5 * i for i in range(len(values))][::-1], values[::-1], 0).astype(np.uint8)
+
+
+def test_soft_edges_are_taken_from_half_of_white_and_a_word_is_said(tmp_path: Path) -> None:
+    truth = disk(255) > 0
+    grey = Image.fromarray(disk(255))
+    grey.save(tmp_path / "mask.jpg", quality=60)
+    assert ((np.asarray(Image.open(tmp_path / "mask.jpg")) > 0) != truth).sum() > 50, "grey would count as object"
+    grey.convert("RGB").resize((120, 80), Image.Resampling.BILINEAR).save(tmp_path / "resized.png")
+    for name, why, factor in (("mask.jpg", r" \(a lossy format makes them\)", 1), ("resized.png", "", 2)):
+        with pytest.warns(InputWarning, match=f"{name} has grey edges{why}; its pixels from half of white"):
+            mask = read_mask(tmp_path / name)
+        np.testing.assert_array_equal(mask, np.kron(truth, np.ones((factor, factor))) > 0, err_msg=name)
+
+
+def test_a_mask_of_ids_needs_the_objects(tmp_path: Path) -> None:
+    ids, path = disk(1, 4, 3), tmp_path / "ids.png"
+    save_depth(path, ids)
+    palette = Image.fromarray(ids)
+    palette.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0, 128, 128, 0, 0, 0, 128])
+    palette.save(tmp_path / "colors.png")
+    save_depth(tmp_path / "deep.png", ids.astype(np.uint16))
+    for name in ("ids.png", "colors.png", "deep.png"):
+        with pytest.raises(
+            ValueError, match=r"has the values 0, 1, 3, 4, which may be ids .* --mask-value 4 or others"
+        ):
+            read_mask(tmp_path / name)
+        np.testing.assert_array_equal(read_mask(tmp_path / name, values=(3,)), ids == 3)
+        np.testing.assert_array_equal(read_mask(tmp_path / name, values=(3, 4)), ids >= 3)
+    with pytest.raises(
+        ValueError, match=r"has the values 0, 1, 3, 4, and the object's are to be \[7\]; .*--mask-value"
+    ):
+        read_mask(path, values=(7,))
+    palette.convert("RGB").save(tmp_path / "ids.jpg")
+    with pytest.raises(ValueError, match="is in a lossy format, and the object's are to be"):
+        read_mask(tmp_path / "ids.jpg", values=(3,))
+
+
+def test_what_is_opaque_is_the_object(tmp_path: Path) -> None:
+    truth, noise = disk(255) > 0, np.random.default_rng(3).integers(0, 256, (40, 60, 3)).astype(np.uint8)
+    alpha = Image.fromarray(truth.astype(np.uint8) * 250)
+    for name, image in (
+        ("colors", Image.merge("RGBA", (*Image.fromarray(noise).split(), alpha))),
+        ("grey", Image.merge("LA", (Image.fromarray(noise[..., 0]), alpha))),
+    ):
+        image.save(tmp_path / f"{name}.png")
+        np.testing.assert_array_equal(read_mask(tmp_path / f"{name}.png"), truth, err_msg=name)
+    cut_out = Image.fromarray(np.where(truth, 7, 2).astype(np.uint8))
+    cut_out.putpalette([9] * 30)
+    cut_out.save(tmp_path / "palette.png", transparency=2)
+    np.testing.assert_array_equal(read_mask(tmp_path / "palette.png"), truth)
 
 
 MILLIMETRES = np.random.default_rng(5).integers(400, 9000, (6, 8)).astype(np.uint16)

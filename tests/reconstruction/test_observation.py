@@ -52,6 +52,40 @@ def test_a_depth_image_becomes_the_points_it_shows(folder: Path) -> None:
     ]
 
 
+def test_lengths_along_rays_become_depths(folder: Path) -> None:
+    """Distances from the camera to a plane at half a metre are the plane again, from a file and in memory."""
+    lengths = 0.5 * np.linalg.norm(CAMERA.directions(), axis=-1)
+    np.save(folder / "r.npy", lengths)
+    reading = InputConfig(intrinsics=folder / "k.json", depth_along="ray")
+    for frame in (
+        read_frame(folder / "r.npy", reading),
+        mereo.load_frame(lengths, intrinsics=CAMERA, depth_along="ray"),
+        mereo.load_frame(DepthImage(lengths, CAMERA), depth_along="ray"),
+    ):
+        np.testing.assert_allclose(frame.cloud.points[:, 2], 0.5)
+        assert frame.whole is not None
+        np.testing.assert_allclose(frame.whole.depth, 0.5)
+    assert np.ptp(read_frame(folder / "r.npy", replace(reading, depth_along="z")).cloud.points[:, 2]) > 0.02
+    with pytest.raises(ValueError, match="depth_along is given for points"):
+        mereo.load_frame(frame.cloud, depth_along="ray")
+
+
+def test_the_objects_id_in_a_mask(folder: Path) -> None:
+    ids = np.ones((10, 20), np.uint8)
+    ids[2:5, 5:15] = 2
+    Image.fromarray(ids).save(folder / "ids.png")
+    reading = InputConfig(intrinsics=folder / "k.json", depth_scale=5000.0, mask=folder / "ids.png")
+    with pytest.raises(ValueError, match="has the values 1, 2, which may be ids"):
+        read_frame(folder / "d.png", reading)
+    assert len(read_frame(folder / "d.png", replace(reading, mask_value=(2,))).cloud) == 30
+    array = mereo.load_frame(
+        np.load(folder / "d.npy"), intrinsics=folder / "k.json", mask=folder / "ids.png", mask_value=2
+    )
+    assert len(array.cloud) == 30
+    with pytest.raises(ValueError, match="--mask-value says which pixels of a mask are the object, and none is given"):
+        read_frame(folder / "d.png", replace(reading, mask=None, mask_value=(2,)))
+
+
 def test_the_depth_scale_of_the_intrinsics_is_for_integers_and_gives_way(folder: Path) -> None:
     fields = json.loads((folder / "k.json").read_text())
     (folder / "bop.json").write_text(json.dumps({**fields, "depth_scale": 0.2}))
@@ -72,6 +106,9 @@ FILE = Path("k.json")
         ("d.png", {"intrinsics": FILE, "topic": "/d"}, "is no ROS recording and has no topics"),
         ("c.ply", {"intrinsics": FILE}, "is read as a point cloud; leave out intrinsics, mask and depth scale"),
         ("c.ply", {"mask": FILE}, "is read as a point cloud"),
+        ("c.ply", {"depth_along": "ray"}, "is read as a point cloud; leave out .* depth scale or direction"),
+        ("c.ply", {"viewpoint": "pose"}, "is no PCD file, which alone states a viewpoint: leave out --viewpoint"),
+        ("d.png", {"intrinsics": FILE, "viewpoint": "pose"}, "is no PCD file"),
         ("c.ply", {"depth_scale": 1000.0}, "is read as a point cloud"),
     ],
 )

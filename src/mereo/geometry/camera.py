@@ -124,6 +124,10 @@ class DepthImage:
         """Pixels with a measurement."""
         return self.depth > 0
 
+    def from_ray_lengths(self) -> "DepthImage":
+        """Image of depths along z, of this one whose values are distances from the camera along each pixel's ray."""
+        return DepthImage(self.depth / np.linalg.norm(self.camera.directions(), axis=-1), self.camera)
+
     def to_points(self, mask: Bool[np.ndarray, "h w"] | None = None) -> PointCloud:
         """Point cloud of every measured pixel (inside ``mask`` when given), row by row."""
         keep = self.valid if mask is None else self.valid & mask

@@ -182,8 +182,10 @@ def _check_options(path: Path, kind: str, reading: InputConfig) -> None:
     if reading.viewpoint != "auto" and path.suffix.lower() != ".pcd":
         raise ValueError(f"{path} is no PCD file, which alone states a viewpoint: leave out --viewpoint")
     if kind == "point cloud":
-        if reading.intrinsics is not None or reading.mask is not None or reading.depth_scale is not None:
-            raise ValueError(f"{path} is read as a point cloud; leave out intrinsics, mask and depth scale")
+        if (reading.intrinsics, reading.mask, reading.depth_scale, reading.depth_along) != (None, None, None, "z"):
+            raise ValueError(
+                f"{path} is read as a point cloud; leave out intrinsics, mask and depth scale or direction"
+            )
         if reading.frame_index is not None:
             raise ValueError(f"{path} is one point cloud, not a recording of many: leave out --frame-index")
         return
@@ -200,9 +202,14 @@ def _depth_image(path: Path, reading: InputConfig) -> SensorFrame:
     intrinsics = read_intrinsics(reading.intrinsics, (raw.shape[1], raw.shape[0]), path, reading.frame_index)
     stated = None if raw.dtype.kind == "f" else intrinsics.depth_scale
     scale = stated if reading.depth_scale is None else reading.depth_scale
-    whole = depth_of(path, raw, scale, intrinsics.camera)
-    image = usable_depth(whole, path, reading.mask)
+    whole = along_z(depth_of(path, raw, scale, intrinsics.camera), reading)
+    image = usable_depth(whole, path, reading.mask, reading.mask_value)
     return SensorFrame(path, image.to_points(), 1.0, "camera", image, whole=whole)
+
+
+def along_z(image: DepthImage, reading: InputConfig) -> DepthImage:
+    """Image of depths along z, of one whose values are what ``reading.depth_along`` says."""
+    return image.from_ray_lengths() if reading.depth_along == "ray" else image
 
 
 def _recording_options(reading: InputConfig) -> tuple[str | None, Camera | None, float | None]:
@@ -214,10 +221,14 @@ def _recording_options(reading: InputConfig) -> tuple[str | None, Camera | None,
 def _recorded(message: RecordedFrame, path: Path, reading: InputConfig) -> SensorFrame:
     content = message.read()
     if isinstance(content, DepthImage):
-        image = usable_depth(content, path, reading.mask)
+        content = along_z(content, reading)
+        image = usable_depth(content, path, reading.mask, reading.mask_value)
         return SensorFrame(path, image.to_points(), 1.0, reading.frame, image, message.name, whole=content)
-    if reading.mask is not None:
-        raise ValueError(f"{message.topic} in {path} has point clouds; leave out the mask, or name an image's --topic")
+    if reading.mask is not None or reading.depth_along == "ray":
+        raise ValueError(
+            f"{message.topic} in {path} has point clouds; leave out the mask and --depth-along, or name an image's "
+            "--topic"
+        )
     cloud = PointCloud(valid_points(content, path, reading.drop_invalid))
     lost = len(content) - len(cloud)
     return SensorFrame(path, cloud, 1.0, reading.frame, message=message.name, invalid=lost)
