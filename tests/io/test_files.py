@@ -36,6 +36,9 @@ CLOUDS: dict[str, bytes] = {
     "shuffled.csv": ('"id","z","x","y"\n' + text(np.column_stack([np.ones(57), POINTS[:, [2, 0, 1]]]), ",")).encode(),
     "commented.txt": ("# id x y z\n" + text(np.column_stack([np.ones(57), POINTS]), " ")).encode(),
     "german.csv": text(POINTS, "; ").encode(),
+    "commas.csv": ("X;Y;Z\n" + text(POINTS, ";").replace(".", ",")).encode(),
+    "spaced commas.txt": text(POINTS, " ").replace(".", ",").encode(),
+    "tabs and commas.asc": ("x\ty\tz\tname\n" + text(POINTS, "\t", extra="\ta,b").replace(".", ",")).encode(),
 }
 
 
@@ -43,6 +46,12 @@ CLOUDS: dict[str, bytes] = {
 def test_every_format_gives_back_the_points(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(CLOUDS[name])
     np.testing.assert_array_equal(read_point_cloud(tmp_path / name).points, POINTS.astype(np.float64))
+
+
+def test_whole_numbers_between_commas_are_numbers(tmp_path: Path) -> None:
+    """Millimetres with colours, and zeros among them, are no halves of numbers."""
+    (tmp_path / "a.csv").write_text("x,y,z,r,g,b\n10,0,300,0,255,0\n-12,20,301,7,0,0\n")
+    np.testing.assert_array_equal(read_point_cloud(tmp_path / "a.csv").points, [[10, 0, 300], [-12, 20, 301]])
 
 
 def test_arrays_in_numpy_files(tmp_path: Path) -> None:
@@ -80,6 +89,8 @@ BAD_CLOUDS: dict[str, tuple[bytes, str]] = {
     "words.xyz": (b"once upon a time\nthere was a cloud\n", "no row of three numbers"),
     "a word among numbers.xyz": (b"1 2 3\n4 five 6\n", "cannot be read.*five"),
     "empty cell.csv": (b"1,2,3\n4,,6\n", "cannot be read"),
+    "all commas.csv": (b"0,51,-0,95,0,35\n0,52,-0,09,0,36\n", "its first row is '0,51,-0,95,0,35', where commas are "),
+    "titled commas.csv": (b"x,y,z\n1,51,-1,95,7,35\n", "commas are between numbers and seem to be in them: export it"),
     "really ply.pcd": (CLOUDS["ascii.ply"], "no PCD header"),
     "pickle.npy": (npy(np.array([{}], dtype=object)), "cannot be read"),
     "transposed.npy": (npy(POINTS.T), r"shape is \(3, 57\)"),

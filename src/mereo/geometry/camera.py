@@ -109,7 +109,7 @@ class DepthImage:
         if self.depth.shape != expected:
             raise ValueError(
                 f"the depth image is {self.depth.shape[1]} x {self.depth.shape[0]} pixels but the intrinsics say "
-                f"{expected[1]} x {expected[0]}; they must agree: use the intrinsics of this stream"
+                f"{expected[1]} x {expected[0]}; they must agree: use the intrinsics of this stream, at this resolution"
             )
         if not np.isfinite(self.depth).all() or (self.depth < 0).any():
             raise ValueError("the depth image has negative, NaN or infinite values; use 0 where nothing was measured")

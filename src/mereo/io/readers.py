@@ -365,14 +365,32 @@ def _text_points(path: Path) -> Float[np.ndarray, "n 3"]:
     if first is None:
         raise ValueError("it has no row of three numbers")
     # an empty cell must not shift its neighbours, so a separator is kept where the file has one
-    delimiter = next((mark for mark in (",", ";") if mark in lines[first]), None)
+    words = lines[first].split()
+    is_spaced = len(words) >= 3 and all(re.fullmatch(r"[-+]?\d+(,\d+)?(e[-+]?\d+)?", word, re.I) for word in words[:3])
+    delimiter = None if is_spaced else next((mark for mark in ";," if lines[first].count(mark) >= 2), None)
     title = lines[first - 1].lstrip("#/ ") if first else ""
     header = [cell.strip().strip('"').lower() for cell in title.split(delimiter)]
     columns = [header.index(axis) if set("xyz") <= set(header) else i for i, axis in enumerate("xyz")]
     rows = [line for line in lines[first:] if not line.lstrip().startswith(("#", "//"))]
+    if delimiter == "," and _has_decimal_commas(rows[:100], header):
+        raise ValueError(
+            f"its first row is {lines[first].strip()[:60]!r}, where commas are between numbers and seem to be in them: "
+            "export it with points in the numbers, or with semicolons between them"
+        )
+    if delimiter != ",":  # commas are in numbers
+        rows = [line.replace(",", ".") for line in rows]
     if path.suffix.lower() == ".pts" and title.strip().isdecimal():
         check_count(int(title), len(rows), "points")
     return np.loadtxt(rows, delimiter=delimiter, usecols=columns, ndmin=2)
+
+
+def _has_decimal_commas(rows: list[str], header: list[str]) -> bool:
+    """Whether cells are halves of numbers: some begin with 0 as no number does, or they are twice as many as titles."""
+    cells = [row.replace(" ", "").split(",") for row in rows]
+    if any("." in row or len(row.split(",")) not in (6, 8, 12) for row in rows):
+        return False
+    is_titled = set("xyz") <= set(header) and len(cells[0]) == 2 * len(header)
+    return is_titled or any(re.match(r"0\d", half) for row in cells for half in row[1::2])
 
 
 def _is_row(line: str) -> bool:
