@@ -139,11 +139,11 @@ def test_a_stated_viewpoint_is_used_where_the_points_fit_it(tmp_path: Path) -> N
     ):
         frame = read_frame(path)
     np.testing.assert_allclose(frame.cloud.points, CAP, atol=1e-6)
-    np.testing.assert_allclose(find_object(frame).facts()["T_input_camera"], BASE, atol=1e-9)
+    np.testing.assert_allclose(find_object(frame).facts()["T_input_result"], BASE, atol=1e-9)
     np.testing.assert_allclose(read_frame(path, InputConfig(viewpoint="pose")).cloud.points, CAP, atol=1e-6)
     ignored = read_frame(path, InputConfig(viewpoint="ignored"))
     np.testing.assert_allclose(ignored.cloud.points, based, atol=1e-6)
-    assert ignored.T_input_camera is None and find_object(ignored).facts()["T_input_camera"] is None
+    assert ignored.T_input_result is None and find_object(ignored).facts()["T_input_result"] is None
     path.write_bytes(stored_at(BASE, CAP))  # next to what the sensor measured, as other programs do
     with pytest.warns(InputWarning, match="its points are taken to be in the camera's axes$"):
         np.testing.assert_array_equal(read_frame(path).cloud.points, CAP)
@@ -168,12 +168,31 @@ def test_a_camera_pose_moves_any_cloud_into_the_cameras_axes(folder: Path) -> No
         mereo.load_frame(PointCloud(based), camera_pose=BASE.tolist()),
     ):
         np.testing.assert_allclose(frame.cloud.points, CAP, atol=1e-7)
-        np.testing.assert_allclose(frame.T_input_camera, BASE)
+        np.testing.assert_allclose(frame.T_input_result, BASE)
     for name, options in (("d.png", {"intrinsics": folder / "k.json"}), ("c.npy", {"frame": "scanner"})):
         with pytest.raises(ValueError, match="a camera pose is given, but .* leave out --camera-pose"):
             read_frame(folder / name, InputConfig(camera_pose=folder / "pose.txt", **options))
     with pytest.raises(ValueError, match="the pose is .*rotation and a translation"):
         mereo.load_frame(based, camera_pose=2 * BASE)
+
+
+def test_coordinates_of_a_map_keep_their_digits(tmp_path: Path) -> None:
+    offset, path = np.array([500000.25, 5400000.5, 300.125]), tmp_path / "c.xyz"
+    np.savetxt(path, CAP + offset, fmt="%.6f")
+    with pytest.raises(
+        ValueError, match=r"lie around \(50000.*, .* times their extent from the origin, .*--camera-pose F"
+    ):
+        read_frame(path)
+    with pytest.raises(ValueError, match=r"has to be, as in a map: give the camera's pose .* with camera_pose=file"):
+        mereo.load_frame(CAP + offset)
+    with pytest.warns(InputWarning, match=r"lie around \(.*\); 500000 5400000 30[01] is taken away, .*T_input_result"):
+        scan = read_frame(path, InputConfig(frame="scanner"))
+    assert scan.T_input_result is not None
+    for frame in (scan, mereo.load_frame(CAP + offset, camera_pose=rigid(np.eye(3), offset))):
+        assert np.abs(frame.cloud.points).max() < 1.0
+        np.testing.assert_allclose(transform_points(frame.T_input_result, frame.cloud.points), CAP + offset, atol=1e-6)
+    with pytest.raises(ValueError, match="they|times their extent"):
+        mereo.load_frame(CAP + offset, camera_pose=BASE)
 
 
 @pytest.mark.parametrize(

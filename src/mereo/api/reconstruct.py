@@ -30,7 +30,7 @@ from mereo.io.intrinsics import read_intrinsics
 from mereo.io.point_arrays import is_frame_list, points_of
 from mereo.io.readers import depth_of, read_pose, usable_depth
 from mereo.io.ros_recordings import is_recording
-from mereo.io.sensor_frame import SensorFrame, along_z, read_frame
+from mereo.io.sensor_frame import SensorFrame, along_z, in_camera, read_frame
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import (
     CLOUD,
@@ -85,7 +85,7 @@ def load_frame(
         pose = read_pose(Path(camera_pose)) if isinstance(camera_pose, str | Path) else checked_pose(camera_pose)
     if not isinstance(source, str | Path):
         frame = _frame_in_memory(source, axes, intrinsics, reading)
-        return frame if pose is None else frame.seen_from(pose)
+        return in_camera(frame, reading, pose)
     path = Path(source)
     if str(source) in shipped_frames() and not (path.is_file() or is_recording(path)):
         if (axes, intrinsics, pose) != (None,) * 3 or replace(reading, drop_invalid=False) != InputConfig():

@@ -55,7 +55,7 @@ class InputConfig:
         frame: axes of a point cloud: camera is x right, y down, z forward; scanner is y up, z toward the scanner.
         camera_pose: pose of the camera in the frame of a point cloud, such as a robot's base: 4 x 4 numbers (text, NPY,
             JSON) that take camera coordinates to the cloud's, in its unit. The cloud is moved into the camera's axes,
-            in which all options count and results come out; their summary.json has it as T_input_camera.
+            in which all options count and results come out; their summary.json has it as T_input_result.
         viewpoint: the pose in a PCD file's header: pose is used as a camera pose, ignored means that the points are in
             the camera's axes already; auto takes what the points fit, and refuses the file where they fit both.
         drop_invalid: leave out NaN, infinite and all-zero points instead of refusing the file.

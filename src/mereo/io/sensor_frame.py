@@ -14,7 +14,7 @@ from jaxtyping import Float
 from mereo.geometry.brief import counted
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import CloudAxes
-from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
 from mereo.io.bounds import PositiveOrUnknown, check_bounds
 from mereo.io.config import InputConfig
 from mereo.io.intrinsics import read_intrinsics
@@ -37,6 +37,10 @@ IN_VIEW, MOST_IN_VIEW = 0.5, 0.95
 The widest depth cameras see 60 degrees to either side. Others of a file's points may be stray."""
 
 
+FAR = 1000.0
+"""Distance of a cloud from the origin, in its extent, from which on no camera at the origin has two pixels of it."""
+
+
 @dataclass(frozen=True, eq=False)
 class SensorFrame:
     """Everything that a sensor measured at one moment, before the object is looked for.
@@ -50,8 +54,8 @@ class SensorFrame:
         message: the recording's message, by topic and time; empty for other files.
         invalid: number of points without a measurement that were left out.
         whole: the whole depth image, without any mask; None for clouds.
-        T_input_camera: pose of the camera in the file's frame, in its unit, from which the cloud was moved into the
-            camera's axes; None where it was not moved.
+        T_input_result: from the coordinates of ``cloud``, in which results come out, to the file's, in its unit: the
+            camera's pose, or what was taken away of a map's coordinates; None where nothing was moved.
     """
 
     path: Path
@@ -62,7 +66,7 @@ class SensorFrame:
     message: str = ""
     invalid: int = 0
     whole: DepthImage | None = None
-    T_input_camera: Float[np.ndarray, "4 4"] | None = None
+    T_input_result: Float[np.ndarray, "4 4"] | None = None
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -80,7 +84,7 @@ class SensorFrame:
                 "clouds in another frame, such as a robot's base: leave out --camera-pose"
             )
         points = transform_points(np.linalg.inv(T_input_camera), self.cloud.points)  # its digits may be few
-        return replace(self, cloud=PointCloud(points), T_input_camera=T_input_camera)
+        return replace(self, cloud=PointCloud(points), T_input_result=T_input_camera)
 
     @property
     def metres(self) -> float:
@@ -108,12 +112,12 @@ def read_frame(
     Depth images and recordings come in metres and camera axes; point clouds keep their file's unit and axes, unless the
     camera's pose is given, here or by the file's name, or stated in the file: then they are moved into the camera's.
 
-    Warns with ``InputWarning`` where a file states such a pose. Raises
-    ``FileNotFoundError``, ``ImportError`` for a missing extra, and ``ValueError`` for a damaged file and for options
-    that do not belong to this kind of file.
+    Warns with ``InputWarning`` where a file states such a pose, and where a map's offset is taken away from a scan.
+    Raises ``FileNotFoundError``, ``ImportError`` for a missing extra, and ``ValueError`` for a damaged file and for
+    options that do not belong to this kind of file.
     """
     path = Path(path)
-    return _in_camera(_as_stored(path, reading), reading, T_input_camera)
+    return in_camera(_as_stored(path, reading), reading, T_input_camera)
 
 
 def _as_stored(path: Path, reading: InputConfig) -> SensorFrame:
@@ -131,11 +135,37 @@ def _as_stored(path: Path, reading: InputConfig) -> SensorFrame:
     return SensorFrame(path, cloud, unit_m, reading.frame, invalid=len(points) - len(cloud))
 
 
-def _in_camera(frame: SensorFrame, reading: InputConfig, pose: Float[np.ndarray, "4 4"] | None = None) -> SensorFrame:
+def in_camera(frame: SensorFrame, reading: InputConfig, pose: Float[np.ndarray, "4 4"] | None = None) -> SensorFrame:
     """Frame in the camera's axes, where its pose is given, by an option or by the file."""
     if pose is None:
         pose = _stated_pose(frame, reading) if reading.camera_pose is None else read_pose(reading.camera_pose)
-    return frame if pose is None else frame.seen_from(pose)
+    return _near_origin(frame if pose is None else frame.seen_from(pose))
+
+
+def _near_origin(frame: SensorFrame) -> SensorFrame:
+    """Frame without the offset of a map's coordinates, for which lines of sight and files of 7 digits are not made.
+
+    A scan is moved by whole units, where the origin means nothing. Raises ``ValueError`` where it is to be the camera.
+    """
+    points, size = frame.cloud.points, float(np.ptp(frame.cloud.points, axis=0).max())
+    middle = np.median(points, axis=0)
+    times = float(np.linalg.norm(middle)) / size if size > 0 else 0.0
+    if frame.depth is not None or times <= FAR:
+        return frame
+    where = f"the points of {frame.path} lie around ({', '.join(f'{value:.10g}' for value in np.round(middle, 3))})"
+    if frame.axes == "camera":
+        raise ValueError(
+            f"{where}, {times:.2g} times their extent from the origin, where the camera has to be, as in a map: give "
+            "the camera's pose in these coordinates with --camera-pose FILE, or --frame scanner for a scan with y up"
+        )
+    offset = np.round(middle)
+    warnings.warn(
+        f"{where}; {' '.join(f'{value:.0f}' for value in offset)} is taken away, and results come out without it, as "
+        "their files have 7 digits (T_input_result in summary.json leads back)",
+        InputWarning,
+        stacklevel=4,
+    )
+    return replace(frame, cloud=PointCloud(points - offset), T_input_result=rigid(np.eye(3), offset))
 
 
 def _stated_pose(frame: SensorFrame, reading: InputConfig) -> Float[np.ndarray, "4 4"] | None:
@@ -156,7 +186,7 @@ def _stated_pose(frame: SensorFrame, reading: InputConfig) -> Float[np.ndarray, 
             f"camera's axes: they {fit}: give --viewpoint pose or --viewpoint ignored"
         )
     taken = "in its frame, from which they were moved into the camera's axes" if moved else "in the camera's axes"
-    back = ", where results come out (T_input_camera in summary.json leads back)" if moved else ""
+    back = ", where results come out (T_input_result in summary.json leads back)" if moved else ""
     warnings.warn(
         f"{path} states a camera's pose (VIEWPOINT); its points are taken to be {taken}{back}",
         InputWarning,
@@ -173,7 +203,7 @@ def _is_in_view(points: Float[np.ndarray, "n 3"]) -> bool:
 def read_frames(path: Path, reading: InputConfig) -> Iterator[tuple[RecordedFrame, Callable[[], SensorFrame]]]:
     """Messages of a ROS recording's topic in their order, each with what decodes it; raises as ``read_frame``."""
     for message in recorded_frames(path, *_recording_options(reading)):
-        yield message, lambda message=message: _in_camera(_recorded(message, path, reading), reading)
+        yield message, lambda message=message: in_camera(_recorded(message, path, reading), reading)
 
 
 def _check_options(path: Path, kind: str, reading: InputConfig) -> None:

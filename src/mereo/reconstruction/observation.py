@@ -134,7 +134,7 @@ class Observation:
             "depth_m": self.depth_m if known and self.frame.axes == "camera" else None,
             "visible_size_m": self.size_m if known else None,
             "invalid_points": self.frame.invalid,
-            "T_input_camera": None if self.frame.T_input_camera is None else self.frame.T_input_camera.tolist(),
+            "T_input_result": None if self.frame.T_input_result is None else self.frame.T_input_result.tolist(),
             "isolation": [asdict(step) for step in self.steps],
         }
 
