@@ -114,7 +114,7 @@ class Service:
         if weights not in self.names:
             raise Refused(404, f"no weights {weights[:60]!a} are served; there are {', '.join(self.names)}: name one")
         media = media_of(request.headers.get("accept", "*/*"))
-        resolution = options.cells(self.resolution, max(self.config.max_resolution, self.resolution))
+        resolution = options.cells(self.resolution, self.config.max_resolution)
         isolation = options.isolation()
         options.reading(self.root, None, None)  # what is wrong with it is said before the body comes
         if int(request.headers.get("content-length", 0)) > self.config.max_body:

@@ -8,7 +8,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from pydantic_core import ErrorDetails
 
 from mereo.geometry.conventions import CloudAxes
-from mereo.io.config import InputConfig
+from mereo.io.config import DepthAlong, InputConfig, Viewpoint
 from mereo.reconstruction.config import Extent, IsolationConfig
 from mereo_serving.messages import Refused
 
@@ -32,6 +32,9 @@ class FrameOptions(BaseModel):
     format: str | None = Field(None, description="Suffix of the frame's format, where its Content-Type does not say it")
     intrinsics: str | None = Field(None, description="The depth camera as JSON; or send it as a part of that name")
     depth_scale: float | None = Field(None, alias="depth-scale", description="Pixel value of one metre")
+    depth_along: DepthAlong = Field("z", alias="depth-along", description="What a depth image measures: z, ray")
+    mask_value: list[int] = Field([], alias="mask-value", description="The object's values in a mask of ids")
+    viewpoint: Viewpoint = Field("auto", description="Use of a PCD file's pose: auto, pose, ignored")
     frame: CloudAxes = Field("camera", description="Axes of a point cloud")
     drop_invalid: bool = Field(False, alias="drop-invalid", description="Leave out points without a measurement")
     unit_m: float | None = Field(None, alias="unit-m", description="Metres per unit of a point cloud")
@@ -50,7 +53,7 @@ class FrameOptions(BaseModel):
         """How the frame is read, with the files of these names in a folder; raises ``Refused`` (422)."""
         files = {"intrinsics": intrinsics, "mask": mask}
         paths = {name: None if file is None else folder / file for name, file in files.items()}
-        return self._config(InputConfig, paths)
+        return self._config(InputConfig, {**paths, "mask_value": tuple(self.mask_value)})
 
     def isolation(self) -> IsolationConfig:
         """What of the frame is left out; raises ``Refused`` (422)."""

@@ -49,10 +49,16 @@ def serve(
         config: limits.
         inference: where and how exactly the networks compute.
 
-    Raises ``ValueError`` and ``OSError`` for weights that cannot be served, and ``OSError`` for an address that is
+    Raises ``ValueError`` and ``OSError`` for weights that cannot be served, ``ValueError`` for a resolution that no
+    request may have, and ``OSError`` for an address that is
     taken or not this machine's.
     """
     config = config or ServeConfig()
+    if resolution > config.max_resolution:
+        raise ValueError(
+            f"--resolution is {resolution}, more than --max-resolution {config.max_resolution}, which no request may "
+            "exceed: lower the one or raise the other"
+        )
     setup = Setup(tuple(served), method, inference or InferenceConfig(), config.max_points, config.max_body)
     entry, metrics = Entry.of(address[0]), Metrics()
     with ExitStack() as stack:

@@ -34,6 +34,7 @@ from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Located
 from mereo.geometry.camera import SCANNER_TO_CAMERA, Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.labels import SegmentedCloud
 from mereo.geometry.transforms import transform_points
 from mereo.io.atomic_files import MARKER
 from mereo.io.config import InputConfig
@@ -61,6 +62,14 @@ def result() -> Result:
 
 LINE = np.linspace(0.1, 1.0, 99)[:, None] * [1.0, 0.5, 2.0]
 CAMERA = Camera(32, 32, 40.0, 40.0, 16.0, 16.0)
+IMAGE = DepthImage(np.ones((32, 32)), CAMERA)
+
+
+def queried(points: np.ndarray) -> object:
+    """Answer of a network at these points."""
+    model = untrained(NAMES)
+    return model.query(model.encode(seen()), points)
+
 
 GRID = "resolution is .*; it must be a whole number, from 4 to 4096: give for example 128"
 REFUSED: dict[str, tuple[Callable[[], object], str]] = {
@@ -81,7 +90,29 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "boolean depth": (
         lambda: mereo.load_frame(np.ones((32, 32), bool), intrinsics=CAMERA), "the depth image has values of type bool"
     ),
-    "a line": (lambda: mereo.reconstruct(LINE, MODEL), "the 99 points of cloud lie on a line; the object's surface"),
+    "a line": (lambda: mereo.reconstruct(LINE, MODEL), "the 99 points of cloud lie on a line or at one place; the obj"),
+    "one place": (lambda: mereo.reconstruct(np.ones((500, 3)), MODEL), "the 500 points of .* at one place"),
+    **{
+        f"an image of {width} columns": (lambda width=width: replace(CAMERA, width=width), f"size is {width} x 32;")
+        for width in (2.5, True, 0, "32", None)
+    },
+    "a complex focal length": (lambda: replace(CAMERA, focal_x_px=40j), "the camera has values of type complex128"),
+    "a matrix of four": (lambda: Camera.from_K(np.eye(4), 32, 32), "the camera matrix is .*; it must be 3 x 3 numbers"),
+    "a column-wise matrix": (lambda: Camera.from_K([40, 0, 0, 0, 40, 0, 16, 16, 1], 32, 32), "0 0 1 in the last row"),
+    "depths in a row": (lambda: DepthImage(np.ones(5), CAMERA), r"has the shape \(5,\); it must be rows of pixels"),
+    "depths in layers": (lambda: DepthImage(np.ones((32, 32, 1)), CAMERA), "must be rows of pixels"),
+    "another image's mask": (lambda: IMAGE.to_points(np.ones((3, 4), bool)), r"has the shape \(3, 4\)"),
+    "a mask of numbers": (lambda: IMAGE.to_points(np.ones((32, 32), int)), "type int64; it must be .* mask > 0"),
+    "a complex pose": (lambda: mereo.load_frame(seen(), camera_pose=np.eye(4) * 1j), "the pose is not of real numbers"),
+    "a ragged pose": (lambda: mereo.load_frame(seen(), camera_pose=[[1, 2], [3]]), "the pose is of the shape"),
+    "a pose of words": (lambda: mereo.load_frame(seen(), camera_pose=[["a"] * 4] * 4), "is not of real numbers"),
+    "labels of other points": (
+        lambda: SegmentedCloud(seen(), np.ones(4, np.uint8), np.ones(4), np.ones(4), ("a",), ((0, 0, 0),)),
+        "points have 4 labels, 4 confidences and 4 occupancies; each point needs one"
+    ),
+    "no query": (lambda: queried(np.empty((0, 3))), "0 points are queried; at least one is needed"),
+    "a query of NaN": (lambda: queried(np.full((2, 3), np.nan)), "2 of 2 points are NaN or infinite"),
+    "a query of pairs": (lambda: queried(np.ones((2, 2))), r"the shape \(2, 2\); they must be n x 3"),
     "a negative unit": (lambda: replace(mereo.load_frame(seen()), unit_m=-1.0), "unit_m is -1.0; it must be greater"),
 }  # fmt: skip
 

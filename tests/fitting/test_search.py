@@ -13,12 +13,14 @@ from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.problem import OPEN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import NetworkTerm
-from mereo.fitting.registration.answer_frame import search_modes
+from mereo.fitting.registration.answer_frame import check_size, search_modes
 from mereo.fitting.registration.register import CloudToFit
 from mereo.fitting.search import ALIKE, ROUNDS, SearchRound, SightTable, Trail, medoids, rotations, search_noisy
-from mereo.geometry.camera import SightLines
+from mereo.geometry.camera import PointCloud, SightLines
 from mereo.geometry.symmetry import Symmetry
 from mereo.models.weights import load_model
+from mereo.reconstruction.isolation import Reading
+from mereo.reconstruction.pipeline import encode_frame
 from mereo.scenes.statistical_model import StatisticalModel
 
 FAR = np.array([12.0, -7.0, 150.0])
@@ -50,6 +52,20 @@ def cut(points: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
 def off(model: StatisticalModel, material: np.ndarray, posed: Posed) -> float:
     true = posed.place(model.material(posed.z))
     return float(np.sqrt(((material - true) ** 2).sum(axis=1).mean()) / model.half)
+
+
+def test_points_far_off_are_named_before_the_unit(model: StatisticalModel) -> None:
+    """A pixel at 65 m spoils the size of a frame whose unit is right; of one whose unit is wrong all points do."""
+    points = view(model, state(model, 0))
+    far = np.concatenate([points, 100 * points[:1]])
+    for cloud, cure in (
+        (far, "leave out of the cloud .*, or correct the unit"),
+        (1e3 * points, "correct the unit .*, or le"),
+    ):
+        frame = encode_frame(Reading.of_all(PointCloud(cloud)), None)
+        with pytest.raises(ValueError, match=f"a view shows from 5% to 300% of it: {cure}"):
+            check_size(frame, model, 1.0)
+    check_size(encode_frame(Reading.of_all(PointCloud(points)), None), model, 1.0)
 
 
 def test_rotations_are_even() -> None:

@@ -17,7 +17,7 @@ from point_files import save_pcd, save_ply
 
 from mereo.geometry.camera import Camera
 from mereo.io.mesh_formats import MeshWarning, read_glb, read_segmented_mesh
-from mereo.io.readers import is_depth_image, read_depth_image, read_mask, read_point_cloud
+from mereo.io.readers import InputWarning, is_depth_image, read_depth_image, read_mask, read_point_cloud
 
 POINTS = np.random.default_rng(0).normal(size=(57, 3)).astype(np.float32) + np.float32(3)
 
@@ -40,6 +40,9 @@ CLOUDS: dict[str, bytes] = {
     "shuffled.csv": ('"id","z","x","y"\n' + text(np.column_stack([np.ones(57), POINTS[:, [2, 0, 1]]]), ",")).encode(),
     "commented.txt": ("# id x y z\n" + text(np.column_stack([np.ones(57), POINTS]), " ")).encode(),
     "german.csv": text(POINTS, "; ").encode(),
+    "commas.csv": ("X;Y;Z\n" + text(POINTS, ";").replace(".", ",")).encode(),
+    "spaced commas.txt": text(POINTS, " ").replace(".", ",").encode(),
+    "tabs and commas.asc": ("x\ty\tz\tname\n" + text(POINTS, "\t", extra="\ta,b").replace(".", ",")).encode(),
 }
 
 
@@ -47,6 +50,12 @@ CLOUDS: dict[str, bytes] = {
 def test_every_format_gives_back_the_points(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(CLOUDS[name])
     np.testing.assert_array_equal(read_point_cloud(tmp_path / name).points, POINTS.astype(np.float64))
+
+
+def test_whole_numbers_between_commas_are_numbers(tmp_path: Path) -> None:
+    """Millimetres with colours, and zeros among them, are no halves of numbers."""
+    (tmp_path / "a.csv").write_text("x,y,z,r,g,b\n10,0,300,0,255,0\n-12,20,301,7,0,0\n")
+    np.testing.assert_array_equal(read_point_cloud(tmp_path / "a.csv").points, [[10, 0, 300], [-12, 20, 301]])
 
 
 def test_arrays_in_numpy_files(tmp_path: Path) -> None:
@@ -84,6 +93,8 @@ BAD_CLOUDS: dict[str, tuple[bytes, str]] = {
     "words.xyz": (b"once upon a time\nthere was a cloud\n", "no row of three numbers"),
     "a word among numbers.xyz": (b"1 2 3\n4 five 6\n", "cannot be read.*five"),
     "empty cell.csv": (b"1,2,3\n4,,6\n", "cannot be read"),
+    "all commas.csv": (b"0,51,-0,95,0,35\n0,52,-0,09,0,36\n", "its first row is '0,51,-0,95,0,35', where commas are "),
+    "titled commas.csv": (b"x,y,z\n1,51,-1,95,7,35\n", "commas are between numbers and seem to be in them: export it"),
     "really ply.pcd": (CLOUDS["ascii.ply"], "no PCD header"),
     "pickle.npy": (npy(np.array([{}], dtype=object)), "cannot be read"),
     "transposed.npy": (npy(POINTS.T), r"shape is \(3, 57\)"),
@@ -391,6 +402,63 @@ def test_masks_of_all_kinds_agree(tmp_path: Path) -> None:
     ):
         image.save(tmp_path / f"{name}.png")
         np.testing.assert_array_equal(read_mask(tmp_path / f"{name}.png"), truth, err_msg=name)
+
+
+def disk(*values: int) -> np.ndarray:
+    """Nested disks of these values on an image of 0."""
+    row, column = np.mgrid[:40, :60]
+    radius = np.hypot(row - 20, column - 30)
+    return np.select([radius < 18 - 5 * i for i in range(len(values))][::-1], values[::-1], 0).astype(np.uint8)
+
+
+def test_soft_edges_are_taken_from_half_of_white_and_a_word_is_said(tmp_path: Path) -> None:
+    truth = disk(255) > 0
+    grey = Image.fromarray(disk(255))
+    grey.save(tmp_path / "mask.jpg", quality=60)
+    assert ((np.asarray(Image.open(tmp_path / "mask.jpg")) > 0) != truth).sum() > 50, "grey would count as object"
+    grey.convert("RGB").resize((120, 80), Image.Resampling.BILINEAR).save(tmp_path / "resized.png")
+    for name, why, factor in (("mask.jpg", r" \(a lossy format makes them\)", 1), ("resized.png", "", 2)):
+        with pytest.warns(InputWarning, match=f"{name} has grey edges{why}; its pixels from half of white"):
+            mask = read_mask(tmp_path / name)
+        np.testing.assert_array_equal(mask, np.kron(truth, np.ones((factor, factor))) > 0, err_msg=name)
+
+
+def test_a_mask_of_ids_needs_the_objects(tmp_path: Path) -> None:
+    ids, path = disk(1, 4, 3), tmp_path / "ids.png"
+    save_depth(path, ids)
+    palette = Image.fromarray(ids)
+    palette.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0, 128, 128, 0, 0, 0, 128])
+    palette.save(tmp_path / "colors.png")
+    save_depth(tmp_path / "deep.png", ids.astype(np.uint16))
+    for name in ("ids.png", "colors.png", "deep.png"):
+        with pytest.raises(
+            ValueError, match=r"has the values 0, 1, 3, 4, which may be ids .* --mask-value 4 or others"
+        ):
+            read_mask(tmp_path / name)
+        np.testing.assert_array_equal(read_mask(tmp_path / name, values=(3,)), ids == 3)
+        np.testing.assert_array_equal(read_mask(tmp_path / name, values=(3, 4)), ids >= 3)
+    with pytest.raises(
+        ValueError, match=r"has the values 0, 1, 3, 4, and the object's are to be \[7\]; .*--mask-value"
+    ):
+        read_mask(path, values=(7,))
+    palette.convert("RGB").save(tmp_path / "ids.jpg")
+    with pytest.raises(ValueError, match="is in a lossy format, and the object's are to be"):
+        read_mask(tmp_path / "ids.jpg", values=(3,))
+
+
+def test_what_is_opaque_is_the_object(tmp_path: Path) -> None:
+    truth, noise = disk(255) > 0, np.random.default_rng(3).integers(0, 256, (40, 60, 3)).astype(np.uint8)
+    alpha = Image.fromarray(truth.astype(np.uint8) * 250)
+    for name, image in (
+        ("colors", Image.merge("RGBA", (*Image.fromarray(noise).split(), alpha))),
+        ("grey", Image.merge("LA", (Image.fromarray(noise[..., 0]), alpha))),
+    ):
+        image.save(tmp_path / f"{name}.png")
+        np.testing.assert_array_equal(read_mask(tmp_path / f"{name}.png"), truth, err_msg=name)
+    cut_out = Image.fromarray(np.where(truth, 7, 2).astype(np.uint8))
+    cut_out.putpalette([9] * 30)
+    cut_out.save(tmp_path / "palette.png", transparency=2)
+    np.testing.assert_array_equal(read_mask(tmp_path / "palette.png"), truth)
 
 
 MILLIMETRES = np.random.default_rng(5).integers(400, 9000, (6, 8)).astype(np.uint16)

@@ -21,6 +21,7 @@ CAMERAS = {
     "realsense.json": json.dumps({"fx": 525, "fy": 520, "ppx": 319.5, "ppy": 239.5, **SIZE}),
     "open3d.json": json.dumps({"intrinsic_matrix": np.array(K).T.ravel().tolist(), **SIZE}),
     "matrix.json": json.dumps({"K": K, **SIZE}),
+    "record3d.json": json.dumps({"K": np.array(K).T.ravel().tolist(), "w": 640, "h": 480, "fps": 60}),
     "centred.json": json.dumps({"fx": 525, "fy": 520, "cx": 320.0, "cy": 240.0, "pixel_center": 0.5, **SIZE}),
     "ros2.yaml": ROS2,
     "ros1.yaml": ROS1,
@@ -43,6 +44,15 @@ def test_all_forms_of_intrinsics_mean_the_same_camera(tmp_path: Path, name: str)
     assert read_camera(tmp_path / name) == Camera(640, 480, 525.0, 520.0, 320.0, 240.0)
 
 
+def test_a_matrix_of_opencv_is_the_camera_of_its_file(tmp_path: Path) -> None:
+    """The constructor has pixel centres at 0.5, ``from_K`` and files of matrices at 0, flat (ROS) or not (OpenCV)."""
+    (tmp_path / "c.json").write_text(json.dumps({"K": K, **SIZE}))
+    for matrix in (K, FLAT, np.array(K)):
+        assert (
+            Camera.from_K(matrix, 640, 480) == read_camera(tmp_path / "c.json") == Camera(640, 480, 525, 520, 320, 240)
+        )
+
+
 @pytest.mark.parametrize(
     "content, expected",
     [
@@ -52,7 +62,7 @@ def test_all_forms_of_intrinsics_mean_the_same_camera(tmp_path: Path, name: str)
         ('{"fx": 5, "fy": 5, "cx": 2, "cy": 2}', "no width and height"),
         ('{"fx": -5, "fy": 5, "cx": 2, "cy": 2, "width": 4, "height": 3}', "focal length is -5"),
         ('{"K": [5, 0, 2, 0], "width": 4, "height": 3}', "4 numbers instead of 9"),
-        (json.dumps({"K": np.array(K).T.ravel().tolist(), **SIZE}), "last row"),
+        (json.dumps({"K": [*FLAT[:6], 1, 2, 1], **SIZE}), "last row of its matrix is .1.0, 2.0, 1.0. instead"),
         (json.dumps({"K": K, **SIZE, "depth_scale": 50}), "its depth scale is 50; .* correct it there"),
         (json.dumps({"K": K, **SIZE, "depth_scale": 0}), "its depth scale is 0"),
     ],
@@ -62,6 +72,48 @@ def test_bad_intrinsics_get_one_sentence(tmp_path: Path, content: str, expected:
     with pytest.raises(ValueError, match=expected) as caught:
         read_camera(tmp_path / "c.json")
     assert "\n" not in str(caught.value)
+
+
+PADDED = np.pad(np.array(K), ((0, 1), (0, 1))) + np.diag([0, 0, 0, 1])
+NUMBERS = {
+    "cam_K.txt": "\n".join(" ".join(f"{v:.18e}" for v in row) for row in K),
+    "row.txt": " ".join(map(str, FLAT)),
+    "printed.txt": f"# of the depth camera\n{K}\n",
+    "four by four.txt": "\n".join(" ".join(map(str, row)) for row in PADDED.tolist()),
+    "three by four.txt": ", ".join(str(v) for row in PADDED[:3].tolist() for v in row),
+    "tum.txt": "525.0 520.0 319.5 239.5\n",
+    "tum with a lens.txt": "525.0 520.0 319.5 239.5 0 0 0 0 0",
+}
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_bare_numbers_are_intrinsics_of_the_image(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text(NUMBERS[name])
+    assert read_camera(tmp_path / name, (640, 480)) == Camera(640, 480, 525.0, 520.0, 320.0, 240.0)
+
+
+def test_bare_numbers_of_another_image_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "cam_K.txt"
+    for text, size, expected in (
+        (
+            "525 520 639.5 359.5",
+            (640, 480),
+            "cam_K.txt is in the middle of about 1280 x 720 pixels, the image is 640 x 480; they must agree: give ",
+        ),
+        (
+            "525 520 159.5 119.5",
+            (640, 480),
+            "in the middle of about 320 x 240 pixels, .*: give the intrinsics of this image",
+        ),
+        ("525 520 319.5", (640, 480), "it has 3 numbers, not a matrix of 3 x 3, 3 x 4 or 4 x 4, nor fx fy cx cy"),
+        ("525 520 319.5 239.5", None, "no width and height"),
+    ):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=expected):
+            read_camera(path, size)
+    path.write_text("525 520 319.5 239.5 0.1 0 0 0")
+    with pytest.warns(CameraWarning, match="pixels in the corners"):
+        read_camera(path, (640, 480))
 
 
 BOP = {"0": {"cam_K": FLAT, "depth_scale": 0.1}, "7": {"cam_K": [600.0, *FLAT[1:]], "depth_scale": 1.0}}

@@ -52,6 +52,40 @@ def test_a_depth_image_becomes_the_points_it_shows(folder: Path) -> None:
     ]
 
 
+def test_lengths_along_rays_become_depths(folder: Path) -> None:
+    """Distances from the camera to a plane at half a metre are the plane again, from a file and in memory."""
+    lengths = 0.5 * np.linalg.norm(CAMERA.directions(), axis=-1)
+    np.save(folder / "r.npy", lengths)
+    reading = InputConfig(intrinsics=folder / "k.json", depth_along="ray")
+    for frame in (
+        read_frame(folder / "r.npy", reading),
+        mereo.load_frame(lengths, intrinsics=CAMERA, depth_along="ray"),
+        mereo.load_frame(DepthImage(lengths, CAMERA), depth_along="ray"),
+    ):
+        np.testing.assert_allclose(frame.cloud.points[:, 2], 0.5)
+        assert frame.whole is not None
+        np.testing.assert_allclose(frame.whole.depth, 0.5)
+    assert np.ptp(read_frame(folder / "r.npy", replace(reading, depth_along="z")).cloud.points[:, 2]) > 0.02
+    with pytest.raises(ValueError, match="depth_along is given for points"):
+        mereo.load_frame(frame.cloud, depth_along="ray")
+
+
+def test_the_objects_id_in_a_mask(folder: Path) -> None:
+    ids = np.ones((10, 20), np.uint8)
+    ids[2:5, 5:15] = 2
+    Image.fromarray(ids).save(folder / "ids.png")
+    reading = InputConfig(intrinsics=folder / "k.json", depth_scale=5000.0, mask=folder / "ids.png")
+    with pytest.raises(ValueError, match="has the values 1, 2, which may be ids"):
+        read_frame(folder / "d.png", reading)
+    assert len(read_frame(folder / "d.png", replace(reading, mask_value=(2,))).cloud) == 30
+    array = mereo.load_frame(
+        np.load(folder / "d.npy"), intrinsics=folder / "k.json", mask=folder / "ids.png", mask_value=2
+    )
+    assert len(array.cloud) == 30
+    with pytest.raises(ValueError, match="--mask-value says which pixels of a mask are the object, and none is given"):
+        read_frame(folder / "d.png", replace(reading, mask=None, mask_value=(2,)))
+
+
 def test_the_depth_scale_of_the_intrinsics_is_for_integers_and_gives_way(folder: Path) -> None:
     fields = json.loads((folder / "k.json").read_text())
     (folder / "bop.json").write_text(json.dumps({**fields, "depth_scale": 0.2}))
@@ -72,6 +106,9 @@ FILE = Path("k.json")
         ("d.png", {"intrinsics": FILE, "topic": "/d"}, "is no ROS recording and has no topics"),
         ("c.ply", {"intrinsics": FILE}, "is read as a point cloud; leave out intrinsics, mask and depth scale"),
         ("c.ply", {"mask": FILE}, "is read as a point cloud"),
+        ("c.ply", {"depth_along": "ray"}, "is read as a point cloud; leave out .* depth scale or direction"),
+        ("c.ply", {"viewpoint": "pose"}, "is no PCD file, which alone states a viewpoint: leave out --viewpoint"),
+        ("d.png", {"intrinsics": FILE, "viewpoint": "pose"}, "is no PCD file"),
         ("c.ply", {"depth_scale": 1000.0}, "is read as a point cloud"),
     ],
 )
@@ -102,11 +139,11 @@ def test_a_stated_viewpoint_is_used_where_the_points_fit_it(tmp_path: Path) -> N
     ):
         frame = read_frame(path)
     np.testing.assert_allclose(frame.cloud.points, CAP, atol=1e-6)
-    np.testing.assert_allclose(find_object(frame).facts()["T_input_camera"], BASE, atol=1e-9)
+    np.testing.assert_allclose(find_object(frame).facts()["T_input_result"], BASE, atol=1e-9)
     np.testing.assert_allclose(read_frame(path, InputConfig(viewpoint="pose")).cloud.points, CAP, atol=1e-6)
     ignored = read_frame(path, InputConfig(viewpoint="ignored"))
     np.testing.assert_allclose(ignored.cloud.points, based, atol=1e-6)
-    assert ignored.T_input_camera is None and find_object(ignored).facts()["T_input_camera"] is None
+    assert ignored.T_input_result is None and find_object(ignored).facts()["T_input_result"] is None
     path.write_bytes(stored_at(BASE, CAP))  # next to what the sensor measured, as other programs do
     with pytest.warns(InputWarning, match="its points are taken to be in the camera's axes$"):
         np.testing.assert_array_equal(read_frame(path).cloud.points, CAP)
@@ -131,12 +168,31 @@ def test_a_camera_pose_moves_any_cloud_into_the_cameras_axes(folder: Path) -> No
         mereo.load_frame(PointCloud(based), camera_pose=BASE.tolist()),
     ):
         np.testing.assert_allclose(frame.cloud.points, CAP, atol=1e-7)
-        np.testing.assert_allclose(frame.T_input_camera, BASE)
+        np.testing.assert_allclose(frame.T_input_result, BASE)
     for name, options in (("d.png", {"intrinsics": folder / "k.json"}), ("c.npy", {"frame": "scanner"})):
         with pytest.raises(ValueError, match="a camera pose is given, but .* leave out --camera-pose"):
             read_frame(folder / name, InputConfig(camera_pose=folder / "pose.txt", **options))
     with pytest.raises(ValueError, match="the pose is .*rotation and a translation"):
         mereo.load_frame(based, camera_pose=2 * BASE)
+
+
+def test_coordinates_of_a_map_keep_their_digits(tmp_path: Path) -> None:
+    offset, path = np.array([500000.25, 5400000.5, 300.125]), tmp_path / "c.xyz"
+    np.savetxt(path, CAP + offset, fmt="%.6f")
+    with pytest.raises(
+        ValueError, match=r"lie around \(50000.*, .* times their extent from the origin, .*--camera-pose F"
+    ):
+        read_frame(path)
+    with pytest.raises(ValueError, match=r"has to be, as in a map: give the camera's pose .* with camera_pose=file"):
+        mereo.load_frame(CAP + offset)
+    with pytest.warns(InputWarning, match=r"lie around \(.*\); 500000 5400000 30[01] is taken away, .*T_input_result"):
+        scan = read_frame(path, InputConfig(frame="scanner"))
+    assert scan.T_input_result is not None
+    for frame in (scan, mereo.load_frame(CAP + offset, camera_pose=rigid(np.eye(3), offset))):
+        assert np.abs(frame.cloud.points).max() < 1.0
+        np.testing.assert_allclose(transform_points(frame.T_input_result, frame.cloud.points), CAP + offset, atol=1e-6)
+    with pytest.raises(ValueError, match="they|times their extent"):
+        mereo.load_frame(CAP + offset, camera_pose=BASE)
 
 
 @pytest.mark.parametrize(

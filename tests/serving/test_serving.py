@@ -54,7 +54,7 @@ from mereo_serving.dispatcher import Dispatcher
 from mereo_serving.gate import Entry, bound_socket
 from mereo_serving.messages import GLB, FrameRequest, Reply, Served, Setup
 from mereo_serving.metrics import Metrics
-from mereo_serving.server import served_objects
+from mereo_serving.server import serve, served_objects
 from mereo_serving.workers import WorkerDied, WorkerProcess
 
 pytestmark = pytest.mark.anyio
@@ -526,6 +526,13 @@ def test_a_port_that_is_taken_is_said_before_the_work() -> None:
 
 
 # --- refusals: each has its status and one sentence, and leaves no trace of what was brought --------------------------
+
+
+def test_no_default_is_beyond_the_most_of_a_request() -> None:
+    with pytest.raises(
+        ValueError, match="--resolution is 128, more than --max-resolution 64, which no .*: lower the one"
+    ):
+        serve((), config=ServeConfig(max_resolution=64))
 
 
 PLY, TEXT, PNG = ({"Content-Type": kind} for kind in ("application/ply", "text/plain", "image/png"))

@@ -476,7 +476,9 @@ ALL: dict[str, Target] = {
     "packed.tif": Target(image(DEPTH.astype(np.float32) / 1000, compression="tiff_deflate"), depth),
     "depth.exr": Target(image(DEPTH.astype(np.float32) / 1000), depth, "OpenEXR"),
     "depth.npy": Target(image(DEPTH), depth),
-    "mask.png": Target(image(np.stack([DEPTH.astype(np.uint8)] * 3, axis=-1)), lambda p: read_mask(p, (16, 12))),
+    "mask.png": Target(
+        image(np.stack([255 * (DEPTH > 700).astype(np.uint8)] * 3, axis=-1)), lambda p: read_mask(p, (16, 12))
+    ),
     **{f"frames.{kind}": Target(bag, every_frame, "rosbags") for kind in ("bag", "db3", "mcap")},
     "camera.json": Target(lambda p: write_camera(p, CAMERA), read_intrinsics),
     "ros.yaml": Target(text(ROS_YAML), read_intrinsics),

@@ -30,7 +30,7 @@ from mereo.io.intrinsics import read_intrinsics
 from mereo.io.point_arrays import is_frame_list, points_of
 from mereo.io.readers import depth_of, read_pose, usable_depth
 from mereo.io.ros_recordings import is_recording
-from mereo.io.sensor_frame import SensorFrame, read_frame
+from mereo.io.sensor_frame import SensorFrame, along_z, in_camera, read_frame
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import (
     CLOUD,
@@ -53,6 +53,7 @@ def load_frame(
     axes: CloudAxes | None = None,
     intrinsics: Camera | str | Path | None = None,
     mask: str | Path | None = None,
+    mask_value: int | tuple[int, ...] = (),
     camera_pose: ArrayLike | str | Path | None = None,
     **options: Any,
 ) -> SensorFrame:
@@ -65,10 +66,12 @@ def load_frame(
         axes: of points: "camera" (default) is x right, y down, z forward; "scanner" is y up, z toward the scanner.
         intrinsics: of a depth image: a camera, or a file of one.
         mask: file of an image that is not 0 where the object is.
+        mask_value: of the object in a mask that holds ids of several things, or its values.
         camera_pose: of points in another frame, such as a robot's base: 4 x 4 numbers, or a file of them, that take
             camera coordinates to theirs. The points are moved, and results come out in the camera's axes.
         options: the other fields of ``InputConfig``: ``unit_m``, metres per unit of points (0.001 for millimetres;
             without it the fit finds the unit); ``depth_scale``, stored values per metre of a depth image;
+            ``depth_along="ray"``, where these are distances along its rays;
             ``drop_invalid``, to leave out points without a measurement, which are refused otherwise; ``topic`` of a
             recording; ``frame_index`` of a recording's frames, or of an entry of the intrinsics.
 
@@ -76,12 +79,13 @@ def load_frame(
     and for options that do not belong to this kind of frame; ``TypeError`` for an option that there is none of.
     """
     mask, axes_or_camera = None if mask is None else Path(mask), "camera" if axes is None else axes
-    reading, pose = InputConfig(frame=axes_or_camera, mask=mask, **options), None
+    values = (mask_value,) if isinstance(mask_value, int) else mask_value
+    reading, pose = InputConfig(frame=axes_or_camera, mask=mask, mask_value=values, **options), None
     if camera_pose is not None:
         pose = read_pose(Path(camera_pose)) if isinstance(camera_pose, str | Path) else checked_pose(camera_pose)
     if not isinstance(source, str | Path):
         frame = _frame_in_memory(source, axes, intrinsics, reading)
-        return frame if pose is None else frame.seen_from(pose)
+        return in_camera(frame, reading, pose)
     path = Path(source)
     if str(source) in shipped_frames() and not (path.is_file() or is_recording(path)):
         if (axes, intrinsics, pose) != (None,) * 3 or replace(reading, drop_invalid=False) != InputConfig():
@@ -112,7 +116,10 @@ def _frame_in_memory(
     if isinstance(observed, DepthImage):
         if axes == "scanner":
             raise ValueError("a depth image is in the camera's axes: leave out axes")
-        return SensorFrame(CLOUD, observed.to_points(), unit_m, "camera", observed, whole=observed)
+        image = along_z(observed, reading)
+        return SensorFrame(CLOUD, image.to_points(), unit_m, "camera", image, whole=image)
+    if reading.depth_along == "ray":
+        raise ValueError("depth_along is given for points, whose distance is known in any case: leave it out")
     return SensorFrame(CLOUD, observed, unit_m, reading.frame, invalid=invalid)
 
 
@@ -126,8 +133,8 @@ def _depth_frame(raw: Num[np.ndarray, "h w"], intrinsics: Camera | str | Path, r
         entry = read_intrinsics(camera, (raw.shape[1], raw.shape[0]))
         camera = entry.camera
         scale = entry.depth_scale if scale is None and raw.dtype.kind != "f" else scale
-    image = depth_of(path, raw, scale, camera)
-    usable = usable_depth(image, path, reading.mask)
+    image = along_z(depth_of(path, raw, scale, camera), reading)
+    usable = usable_depth(image, path, reading.mask, reading.mask_value)
     return SensorFrame(path, usable.to_points(), 1.0, "camera", usable, whole=image)
 
 

@@ -5,10 +5,12 @@ pixel (column u, row v) is at (u + 0.5, v + 0.5). ``unproject`` and ``project`` 
 """
 
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
 
 from mereo.geometry.brief import counted, sides
 from mereo.geometry.conventions import CloudAxes, check_real
@@ -23,7 +25,9 @@ class Camera:
     Attributes:
         width, height: image size in pixels.
         focal_x_px, focal_y_px: focal lengths.
-        center_x_px, center_y_px: principal point, with pixel centres at +0.5.
+        center_x_px, center_y_px: principal point, where the centre of the first pixel is at (0.5, 0.5). OpenCV, ROS,
+            RealSense and Open3D put it at (0, 0): for their numbers take ``from_K``, or add 0.5. Files of them are
+            read as their programs mean them (``mereo.read_camera``).
     """
 
     width: int
@@ -34,8 +38,11 @@ class Camera:
     center_y_px: float
 
     def __post_init__(self) -> None:
-        if self.width < 1 or self.height < 1:
-            raise ValueError(f"image size is {self.width} x {self.height}; both must be positive: check the intrinsics")
+        if not all(isinstance(n, Integral) and not isinstance(n, bool) and n > 0 for n in (self.width, self.height)):
+            raise ValueError(
+                f"image size is {self.width} x {self.height}; both must be positive whole numbers: check the intrinsics"
+            )
+        check_real(np.array([self.focal_x_px, self.focal_y_px, self.center_x_px, self.center_y_px]), "the camera")
         if not (0 < self.focal_x_px < np.inf and 0 < self.focal_y_px < np.inf):
             raise ValueError(
                 f"focal length is {self.focal_x_px} x {self.focal_y_px} pixels; both must be positive: "
@@ -49,6 +56,23 @@ class Camera:
         """Camera of square pixels, principal point in the middle, ``fov_rad`` the full horizontal angle of view."""
         focal_px = 0.5 * width / float(np.tan(0.5 * fov_rad))
         return cls(width, height, focal_px, focal_px, 0.5 * width, 0.5 * height)
+
+    @classmethod
+    def from_K(cls, K: ArrayLike, width: int, height: int) -> "Camera":
+        """Camera of a matrix as OpenCV and ROS state it (``CameraInfo.k``), for an image of this size in pixels.
+
+        There pixel centres are whole numbers, so 0.5 is added to the principal point. Raises ``ValueError`` for
+        anything but 3 x 3 real numbers, or 9 row by row, with 0 0 1 in the last row.
+        """
+        matrix = np.asarray(K)
+        check_real(matrix, "the camera matrix")
+        if matrix.size != 9 or matrix.reshape(3, 3)[2].tolist() != [0, 0, 1]:
+            raise ValueError(
+                f"the camera matrix is {matrix.tolist()}; it must be 3 x 3 numbers with 0 0 1 in the last row: give K "
+                "as OpenCV and ROS have it, row by row"
+            )
+        (focal_x, _, center_x), (_, focal_y, center_y), _ = matrix.reshape(3, 3).astype(np.float64).tolist()
+        return cls(width, height, focal_x, focal_y, center_x + 0.5, center_y + 0.5)
 
     def directions(self) -> Float[np.ndarray, "h w 3"]:
         """Rays through the pixel centres, scaled to z = 1, so that depth times direction is the point."""
@@ -105,11 +129,15 @@ class DepthImage:
 
     def __post_init__(self) -> None:
         check_real(self.depth, "the depth image")
+        if self.depth.ndim != 2:
+            raise ValueError(
+                f"the depth image has the shape {self.depth.shape}; it must be rows of pixels: give h x w values"
+            )
         expected = (self.camera.height, self.camera.width)
         if self.depth.shape != expected:
             raise ValueError(
                 f"the depth image is {self.depth.shape[1]} x {self.depth.shape[0]} pixels but the intrinsics say "
-                f"{expected[1]} x {expected[0]}; they must agree: use the intrinsics of this stream"
+                f"{expected[1]} x {expected[0]}; they must agree: use the intrinsics of this stream, at this resolution"
             )
         if not np.isfinite(self.depth).all() or (self.depth < 0).any():
             raise ValueError("the depth image has negative, NaN or infinite values; use 0 where nothing was measured")
@@ -124,8 +152,20 @@ class DepthImage:
         """Pixels with a measurement."""
         return self.depth > 0
 
+    def from_ray_lengths(self) -> "DepthImage":
+        """Image of depths along z, of this one whose values are distances from the camera along each pixel's ray."""
+        return DepthImage(self.depth / np.linalg.norm(self.camera.directions(), axis=-1), self.camera)
+
     def to_points(self, mask: Bool[np.ndarray, "h w"] | None = None) -> PointCloud:
-        """Point cloud of every measured pixel (inside ``mask`` when given), row by row."""
+        """Point cloud of every measured pixel (inside ``mask`` when given), row by row.
+
+        Raises ``ValueError`` for a mask of another size, or of anything but truth values.
+        """
+        if mask is not None and (mask.shape != self.depth.shape or mask.dtype != np.bool_):
+            raise ValueError(
+                f"the mask has the shape {mask.shape} and type {mask.dtype}; it must be {self.depth.shape} truth "
+                "values as the depth image: give for example mask > 0"
+            )
         keep = self.valid if mask is None else self.valid & mask
         points = self.camera.directions()[keep] * self.depth[keep][:, None]
         return PointCloud(points.astype(np.float64))

@@ -66,6 +66,14 @@ class SegmentedCloud:
     names: tuple[str, ...]
     colors: tuple[Color, ...]
 
+    def __post_init__(self) -> None:
+        count, *others = map(len, (self.points, self.labels, self.confidence, self.occupancy))
+        if others != [count] * 3:
+            raise ValueError(
+                f"{count} points have {others[0]} labels, {others[1]} confidences and {others[2]} occupancies; each "
+                "point needs one: give arrays of one length"
+            )
+
     def __repr__(self) -> str:
         return f"SegmentedCloud({counted(len(self.points), 'point')}; {listed(self.names)})"
 

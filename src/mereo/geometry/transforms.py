@@ -1,6 +1,7 @@
 """Rigid transforms and the joint normalizer. Notation: ``T_a_b`` maps b-coordinates to a-coordinates."""
 
 from dataclasses import dataclass
+from numbers import Real
 
 import numpy as np
 from jaxtyping import Float
@@ -31,12 +32,18 @@ def is_rigid(transform: Float[np.ndarray, "4 4"], tolerance: float = 1e-6) -> bo
 
 def checked_pose(pose: ArrayLike) -> Float[np.ndarray, "4 4"]:
     """A rigid pose as numbers, of a few printed digits or more; ``ValueError`` for what is none."""
-    T: np.ndarray = np.asarray(pose, dtype=np.float64)
-    if T.shape == (4, 4) and is_rigid(T, 1e-3):
-        return T
+    entries: np.ndarray = np.asarray(pose, dtype=object)  # of which rows may differ in length
+    what = f"of the shape {entries.shape}"
+    if entries.shape == (4, 4):
+        what = "not of real numbers"
+        if all(isinstance(entry, Real) for entry in entries.flat):
+            T: np.ndarray = entries.astype(np.float64)
+            if is_rigid(T, 1e-3):
+                return T
+            what = str(np.round(T, 3).tolist())
     raise ValueError(
-        f"the pose is {np.round(T, 3).tolist() if T.shape == (4, 4) else f'of the shape {T.shape}'}, and must be 4 x 4 "
-        "finite numbers: a rotation and a translation, with 0 0 0 1 in the last row"
+        f"the pose is {what}, and must be 4 x 4 finite numbers: a rotation and a translation, with 0 0 0 1 in the last "
+        "row"
     )
 
 

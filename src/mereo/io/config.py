@@ -42,6 +42,10 @@ Viewpoint = Literal["auto", "pose", "ignored"]
 """Use of the pose in a PCD file's header, see ``InputConfig.viewpoint``."""
 
 
+DepthAlong = Literal["z", "ray"]
+"""Direction along which a depth image measures, see ``InputConfig.depth_along``."""
+
+
 @dataclass(frozen=True)
 class InputConfig:
     """Settings of reading a frame.
@@ -49,11 +53,13 @@ class InputConfig:
     Attributes:
         intrinsics: the depth camera, JSON or YAML; recordings have their own.
         depth_scale: pixel value of one metre; by default what the intrinsics say, else 1000 (floats: 1).
-        mask: image that is not 0 on the object.
+        depth_along: z, or ray where the image holds distances along each pixel's ray (many renderers and simulators).
+        mask: image that is not 0 on the object, or opaque there where it has transparent parts.
+        mask_value: values of the object's pixels in a mask that holds ids of several things; by default all but 0.
         frame: axes of a point cloud: camera is x right, y down, z forward; scanner is y up, z toward the scanner.
         camera_pose: pose of the camera in the frame of a point cloud, such as a robot's base: 4 x 4 numbers (text, NPY,
             JSON) that take camera coordinates to the cloud's, in its unit. The cloud is moved into the camera's axes,
-            in which all options count and results come out; their summary.json has it as T_input_camera.
+            in which all options count and results come out; their summary.json has it as T_input_result.
         viewpoint: the pose in a PCD file's header: pose is used as a camera pose, ignored means that the points are in
             the camera's axes already; auto takes what the points fit, and refuses the file where they fit both.
         drop_invalid: leave out NaN, infinite and all-zero points instead of refusing the file.
@@ -65,7 +71,9 @@ class InputConfig:
 
     intrinsics: Path | None = None
     depth_scale: PositiveOrUnknown = None
+    depth_along: DepthAlong = "z"
     mask: Path | None = None
+    mask_value: tuple[int, ...] = ()
     frame: CloudAxes = "camera"
     camera_pose: Path | None = None
     viewpoint: Viewpoint = "auto"

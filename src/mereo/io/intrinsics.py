@@ -34,7 +34,10 @@ NAMED = (
 """Names of focal lengths and principal point: plain, RealSense, nerfstudio, 3DObjectTracking."""
 
 MATRICES = ("intrinsic_matrix", "K", "k", "cam_K", "camera_matrix")
-"""Names of camera matrices, 3 x 3 or 9 numbers row by row; the first is Open3D's, column by column."""
+"""Names of camera matrices, 3 x 3 or 9 numbers, row by row or column by column."""
+
+OFF_MIDDLE = 0.15
+"""Distance of the principal point from the image's middle, in its sides, beyond which it is another image's."""
 
 SIDES = (("width", "height"), ("image_width", "image_height"), ("w", "h"))
 """Names of the size in pixels."""
@@ -79,10 +82,11 @@ def written_intrinsics(camera: Camera) -> dict[str, float]:
 def read_intrinsics(
     path: str | Path, size: tuple[int, int] | None = None, image: str | Path | None = None, index: int | None = None
 ) -> Intrinsics:
-    """Pinhole intrinsics, and the depth scale where it is stated, from JSON or ROS YAML.
+    """Pinhole intrinsics, and the depth scale where it is stated, from JSON, ROS YAML or a text of numbers.
 
-    Understood: the names in ``NAMED`` and ``MATRICES``, ROS CameraInfo as YAML or JSON, and files of many frames: BOP's
-    scene_camera.json, and transforms.json with intrinsics for each frame.
+    Understood: the names in ``NAMED`` and ``MATRICES``, ROS CameraInfo as YAML or JSON, files of many frames (BOP's
+    scene_camera.json, and transforms.json with intrinsics for each frame), and numbers alone: a matrix of 3 x 3
+    (cam_K.txt), 3 x 4 or 4 x 4 in any number of rows, or fx fy cx cy, with distortion behind them (TUM).
 
     Args:
         path: the file.
@@ -97,6 +101,8 @@ def read_intrinsics(
         text = path.read_text(encoding="utf-8-sig")
         if path.suffix.lower() == ".json":
             fields = json.loads(text)
+        elif (numbers := _bare_numbers(text)) is not None:
+            fields = _fields_of_numbers(numbers)
         else:  # the first document; OpenCV's header and type tags are not YAML to others
             plain = re.sub(r"^%YAML.*$|!!opencv-matrix", "", text, flags=re.MULTILINE)
             fields = next(iter(yaml.safe_load_all(plain.removeprefix("\n---"))), None)
@@ -107,7 +113,19 @@ def read_intrinsics(
             fields = {**fields, **fields[key]} if isinstance(fields.get(key), dict) else fields
         intrinsics = Intrinsics(camera_from_fields(fields, size), _depth_scale(fields))
         warn_of_distortion(intrinsics.camera, fields, str(path))
+    camera = intrinsics.camera
+    u, v, width, height = camera.center_x_px, camera.center_y_px, camera.width, camera.height
+    if _names_of_sides(fields) is None and max(abs(u / width - 0.5), abs(v / height - 0.5)) > OFF_MIDDLE:
+        raise ValueError(
+            f"the principal point of {path} is in the middle of about {2 * u:.0f} x {2 * v:.0f} pixels, the image is "
+            f"{width} x {height}; they must agree: give the intrinsics of this image, or state its width and height in "
+            "JSON where it was cropped"
+        )
     return intrinsics
+
+
+def _names_of_sides(fields: Fields) -> tuple[str, str] | None:
+    return next((names for names in SIDES if all(fields.get(name) is not None for name in names)), None)
 
 
 def camera_from_fields(fields: Fields, size: tuple[int, int] | None = None) -> Camera:
@@ -116,12 +134,32 @@ def camera_from_fields(fields: Fields, size: tuple[int, int] | None = None) -> C
     Raises ``ValueError`` that says which fields are missing.
     """
     focal_x, focal_y, center_x, center_y = _pinhole(fields)
-    sides = next((names for names in SIDES if all(fields.get(name) is not None for name in names)), None)
+    sides = _names_of_sides(fields)
     if sides is None and size is None:
         raise ValueError("it has no width and height")
     width, height = size if sides is None else [int(fields[name]) for name in sides]  # type: ignore[misc]
     shift = 0.5 - float(fields.get("pixel_center", 0.5 if "fl_x" in fields else 0.0))
     return Camera(width, height, focal_x, focal_y, center_x + shift, center_y + shift)
+
+
+def _bare_numbers(text: str) -> list[float] | None:
+    """Numbers of a text that holds nothing else but comments; None of others."""
+    try:
+        return [float(word) for word in re.split(r"[\s,;\[\]]+", re.sub(r"#.*", "", text)) if word]
+    except ValueError:
+        return None
+
+
+def _fields_of_numbers(numbers: list[float]) -> Fields:
+    """Fields that numbers alone state; raises ``ValueError`` (its reason only) for other counts of them."""
+    count = len(numbers)
+    if count in (12, 16) or (count == 9 and 0 in (numbers[1], numbers[3])):
+        return {"K": np.reshape(numbers, (3, 3) if count == 9 else (-1, 4))[:3, :3]}
+    if count in (4, 8, 9):
+        return dict(zip(("fx", "fy", "cx", "cy"), numbers, strict=False)) | {"D": numbers[4:]}
+    raise ValueError(
+        f"it has {count} numbers, not a matrix of 3 x 3, 3 x 4 or 4 x 4, nor fx fy cx cy with 4 or 5 of distortion"
+    )
 
 
 def _frame(fields: Fields, stem: str, index: int | None) -> Fields:
@@ -171,8 +209,9 @@ def _pinhole(fields: Fields) -> tuple[float, float, float, float]:
     matrix = np.asarray(values["data"] if isinstance(values, dict) else values, dtype=np.float64)
     if matrix.size != 9:
         raise ValueError(f"its matrix has {matrix.size} numbers instead of 9")
-    column_major = key == "intrinsic_matrix" and matrix.ndim == 1
-    matrix = matrix.reshape(3, 3).T if column_major else matrix.reshape(3, 3)
+    matrix = matrix.reshape(3, 3)
+    if matrix.T[2].tolist() == [0, 0, 1] != matrix[2].tolist():  # Open3D and Record3D go column by column
+        matrix = matrix.T
     if matrix[2, 2] != 1 or np.any(matrix[2, :2]):
         raise ValueError(f"the last row of its matrix is {matrix[2].tolist()} instead of 0, 0, 1")
     return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])

@@ -6,6 +6,7 @@ raises any exception whose text completes "cannot be read as a point cloud (...)
 
 import json
 import re
+import warnings
 from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from io import BytesIO
@@ -18,6 +19,7 @@ from jaxtyping import Bool, Float, Real
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from mereo.geometry.brief import listed
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import LARGEST
 from mereo.geometry.transforms import checked_pose, rigid
@@ -120,7 +122,7 @@ def read_depth_image(
         camera: intrinsics of the same size, see ``read_camera``.
         depth_scale: pixel value of one metre, so that metres = value / depth_scale; by default 1000 for integers and 1
             for floats (``mereo.io.intrinsics`` on BOP and RealSense).
-        mask_path: image of the same size, not 0 on the object.
+        mask_path: image of the same size, not 0 on the object, see ``read_mask``.
 
     Raises ``FileNotFoundError``, ``ValueError`` where it is damaged, of another kind or size, without any measured
     pixel, or of an implausible median depth, and ``ImportError`` for an EXR file without the extra `sensors`.
@@ -174,11 +176,19 @@ def depth_of(path: Path, raw: Raw, depth_scale: float | None, camera: Camera) ->
         raise ValueError(f"{path} cannot be used: {error}") from None
 
 
-def usable_depth(image: DepthImage, path: str | Path, mask_path: str | Path | None = None) -> DepthImage:
-    """Depth image in metres without what its mask leaves out; raises ``ValueError`` as ``read_depth_image`` does."""
+def usable_depth(
+    image: DepthImage, path: str | Path, mask_path: str | Path | None = None, mask_values: tuple[int, ...] = ()
+) -> DepthImage:
+    """Depth image in metres without what its mask leaves out; raises ``ValueError`` as ``read_depth_image`` does.
+
+    ``mask_values`` are as in ``read_mask``.
+    """
     depth = image.depth
+    if mask_path is None and np.size(mask_values):
+        raise ValueError("--mask-value says which pixels of a mask are the object, and none is given: give --mask FILE")
     if mask_path is not None:
-        depth = np.where(read_mask(mask_path, (image.camera.width, image.camera.height)), depth, 0.0)
+        mask = read_mask(mask_path, (image.camera.width, image.camera.height), mask_values)
+        depth = np.where(mask, depth, 0.0)
     if not (depth > 0).any():
         where = "inside the mask" if image.valid.any() else "in the image"
         raise ValueError(f"{path} measures 0 pixels {where}; the object must be visible: check the image and the mask")
@@ -192,13 +202,61 @@ def usable_depth(image: DepthImage, path: str | Path, mask_path: str | Path | No
     return DepthImage(depth, image.camera)
 
 
-def read_mask(path: str | Path, size: tuple[int, int] | None = None) -> Bool[np.ndarray, "h w"]:
-    """Pixels of an image that are not 0 (in any channel but alpha); ``size`` is the expected (width, height)."""
+FULL = (1, 255, 65535)
+"""Values of white in images of floats, 8 and 16 bits: where it is the commonest next to 0, others are soft edges."""
+
+LOSSY = ("JPEG", "MPO", "JPEG2000", "WEBP")
+"""Formats (as Pillow calls them) that may store other values than they were given."""
+
+
+def read_mask(
+    path: str | Path, size: tuple[int, int] | None = None, values: tuple[int, ...] = ()
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels of an image that show the object.
+
+    These are the opaque ones of an image with transparent parts; else those that are not 0, in any channel, or that
+    have some ``values``, the ids of an image of several things. Where grey is an edge's, as in lossy formats and where
+    an image was resized, they are those from half of white.
+
+    ``size`` is the expected (width, height). Warns with ``InputWarning`` where half of white was taken. Raises
+    ``FileNotFoundError``, or ``ValueError``, also for several ids without ``values``, and for ``values`` it has not.
+    """
     path = Path(path)
     with readable(path, "mask image"), open_image(path) as image:
+        is_lossy = image.format in LOSSY
+        opacity = np.asarray(image.convert("RGBA").getchannel("A")) if image.has_transparency_data else np.zeros(1)
         # a 1-bit or palette image is taken by what it shows, anything else by its stored values
-        pixels = np.asarray(image.convert("RGB") if image.mode in ("1", "P", "RGBA", "LA", "CMYK") else image)
-    mask = np.asarray(pixels.reshape(*pixels.shape[:2], -1).any(axis=-1))
+        shown = np.asarray(image.convert("RGB") if image.mode in ("1", "P", "PA", "RGBA", "LA", "CMYK") else image)
+        stored = np.asarray(image) if image.mode == "P" else shown
+    channels = stored.reshape(*stored.shape[:2], -1)
+    ids, has_ids = channels.max(axis=-1), bool((channels == channels[..., :1]).all())
+    mask = np.asarray(shown.reshape(*shown.shape[:2], -1).any(axis=-1))
+    present, counts = np.unique(ids[mask], return_counts=True)
+    seen = listed(f"{value:g}" for value in np.unique(ids))
+    is_soft = is_lossy or (has_ids and len(present) > 1 and present[-1] == present[counts.argmax()] in FULL)
+    if opacity.min() < 128 <= opacity.max():
+        mask = opacity >= 128
+    elif np.size(values):
+        if is_lossy or not has_ids or not np.isin(values, present).all():
+            kind = "is in a lossy format" if is_lossy else f"has the values {seen}" if has_ids else "has colours"
+            raise ValueError(
+                f"the mask {path} {kind}, and the object's are to be {np.atleast_1d(values).tolist()}; ids are needed: "
+                "save them as a grey PNG, or correct --mask-value"
+            )
+        mask = np.isin(ids, values)
+    elif is_soft:
+        mask = ids >= 0.5 * present.max(initial=1)
+        warnings.warn(
+            f"the mask {path} has grey edges{' (a lossy format makes them)' if is_lossy else ''}; its pixels from half "
+            "of white are taken for the object's: save masks as PNG, in black and white",
+            InputWarning,
+            stacklevel=3,
+        )
+    elif has_ids and len(present) > 1:
+        raise ValueError(
+            f"the mask {path} has the values {seen}, which may be ids of several things; the object's are needed: give "
+            f"--mask-value {present[-1]:g} or others"
+        )
     if size is not None and mask.shape != (size[1], size[0]):
         raise ValueError(
             f"the mask {path} is {mask.shape[1]} x {mask.shape[0]} pixels but the depth image is "
@@ -312,14 +370,32 @@ def _text_points(path: Path) -> Float[np.ndarray, "n 3"]:
     if first is None:
         raise ValueError("it has no row of three numbers")
     # an empty cell must not shift its neighbours, so a separator is kept where the file has one
-    delimiter = next((mark for mark in (",", ";") if mark in lines[first]), None)
+    words = lines[first].split()
+    is_spaced = len(words) >= 3 and all(re.fullmatch(r"[-+]?\d+(,\d+)?(e[-+]?\d+)?", word, re.I) for word in words[:3])
+    delimiter = None if is_spaced else next((mark for mark in ";," if lines[first].count(mark) >= 2), None)
     title = lines[first - 1].lstrip("#/ ") if first else ""
     header = [cell.strip().strip('"').lower() for cell in title.split(delimiter)]
     columns = [header.index(axis) if set("xyz") <= set(header) else i for i, axis in enumerate("xyz")]
     rows = [line for line in lines[first:] if not line.lstrip().startswith(("#", "//"))]
+    if delimiter == "," and _has_decimal_commas(rows[:100], header):
+        raise ValueError(
+            f"its first row is {lines[first].strip()[:60]!r}, where commas are between numbers and seem to be in them: "
+            "export it with points in the numbers, or with semicolons between them"
+        )
+    if delimiter != ",":  # commas are in numbers
+        rows = [line.replace(",", ".") for line in rows]
     if path.suffix.lower() == ".pts" and title.strip().isdecimal():
         check_count(int(title), len(rows), "points")
     return np.loadtxt(rows, delimiter=delimiter, usecols=columns, ndmin=2)
+
+
+def _has_decimal_commas(rows: list[str], header: list[str]) -> bool:
+    """Whether cells are halves of numbers: some begin with 0 as no number does, or they are twice as many as titles."""
+    cells = [row.replace(" ", "").split(",") for row in rows]
+    if any("." in row or len(row.split(",")) not in (6, 8, 12) for row in rows):
+        return False
+    is_titled = set("xyz") <= set(header) and len(cells[0]) == 2 * len(header)
+    return is_titled or any(re.match(r"0\d", half) for row in cells for half in row[1::2])
 
 
 def _is_row(line: str) -> bool:

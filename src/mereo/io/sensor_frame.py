@@ -15,7 +15,7 @@ from jaxtyping import Float
 from mereo.geometry.brief import counted
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import CloudAxes
-from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
 from mereo.io.bounds import PositiveOrUnknown, check_bounds
 from mereo.io.config import InputConfig
 from mereo.io.intrinsics import read_intrinsics
@@ -38,6 +38,10 @@ IN_VIEW, MOST_IN_VIEW = 0.5, 0.95
 The widest depth cameras see 60 degrees to either side. Others of a file's points may be stray."""
 
 
+FAR = 1000.0
+"""Distance of a cloud from the origin, in its extent, from which on no camera at the origin has two pixels of it."""
+
+
 @dataclass(frozen=True, eq=False)
 class SensorFrame:
     """Everything that a sensor measured at one moment, before the object is looked for.
@@ -51,8 +55,8 @@ class SensorFrame:
         message: the recording's message, by topic and time; empty for other files.
         invalid: number of points without a measurement that were left out.
         whole: the whole depth image, without any mask; None for clouds.
-        T_input_camera: pose of the camera in the file's frame, in its unit, from which the cloud was moved into the
-            camera's axes; None where it was not moved.
+        T_input_result: from the coordinates of ``cloud``, in which results come out, to the file's, in its unit: the
+            camera's pose, or what was taken away of a map's coordinates; None where nothing was moved.
     """
 
     path: Path
@@ -63,7 +67,7 @@ class SensorFrame:
     message: str = ""
     invalid: int = 0
     whole: DepthImage | None = None
-    T_input_camera: Float[np.ndarray, "4 4"] | None = None
+    T_input_result: Float[np.ndarray, "4 4"] | None = None
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -81,7 +85,7 @@ class SensorFrame:
                 "clouds in another frame, such as a robot's base: leave out --camera-pose"
             )
         points = transform_points(np.linalg.inv(T_input_camera), self.cloud.points)  # its digits may be few
-        return replace(self, cloud=PointCloud(points), T_input_camera=T_input_camera)
+        return replace(self, cloud=PointCloud(points), T_input_result=T_input_camera)
 
     @property
     def metres(self) -> float:
@@ -109,12 +113,12 @@ def read_frame(
     Depth images and recordings come in metres and camera axes; point clouds keep their file's unit and axes, unless the
     camera's pose is given, here or by the file's name, or stated in the file: then they are moved into the camera's.
 
-    Warns with ``InputWarning`` where a file states such a pose. Raises
-    ``FileNotFoundError``, ``ImportError`` for a missing extra, and ``ValueError`` for a damaged file and for options
-    that do not belong to this kind of file.
+    Warns with ``InputWarning`` where a file states such a pose, and where a map's offset is taken away from a scan.
+    Raises ``FileNotFoundError``, ``ImportError`` for a missing extra, and ``ValueError`` for a damaged file and for
+    options that do not belong to this kind of file.
     """
     path = Path(path)
-    return _in_camera(_as_stored(path, reading), reading, T_input_camera)
+    return in_camera(_as_stored(path, reading), reading, T_input_camera)
 
 
 def _as_stored(path: Path, reading: InputConfig) -> SensorFrame:
@@ -132,11 +136,37 @@ def _as_stored(path: Path, reading: InputConfig) -> SensorFrame:
     return SensorFrame(path, cloud, unit_m, reading.frame, invalid=len(points) - len(cloud))
 
 
-def _in_camera(frame: SensorFrame, reading: InputConfig, pose: Float[np.ndarray, "4 4"] | None = None) -> SensorFrame:
+def in_camera(frame: SensorFrame, reading: InputConfig, pose: Float[np.ndarray, "4 4"] | None = None) -> SensorFrame:
     """Frame in the camera's axes, where its pose is given, by an option or by the file."""
     if pose is None:
         pose = _stated_pose(frame, reading) if reading.camera_pose is None else read_pose(reading.camera_pose)
-    return frame if pose is None else frame.seen_from(pose)
+    return _near_origin(frame if pose is None else frame.seen_from(pose))
+
+
+def _near_origin(frame: SensorFrame) -> SensorFrame:
+    """Frame without the offset of a map's coordinates, for which lines of sight and files of 7 digits are not made.
+
+    A scan is moved by whole units, where the origin means nothing. Raises ``ValueError`` where it is to be the camera.
+    """
+    points, size = frame.cloud.points, float(np.ptp(frame.cloud.points, axis=0).max())
+    middle = np.median(points, axis=0)
+    times = float(np.linalg.norm(middle)) / size if size > 0 else 0.0
+    if frame.depth is not None or times <= FAR:
+        return frame
+    where = f"the points of {frame.path} lie around ({', '.join(f'{value:.10g}' for value in np.round(middle, 3))})"
+    if frame.axes == "camera":
+        raise ValueError(
+            f"{where}, {times:.2g} times their extent from the origin, where the camera has to be, as in a map: give "
+            "the camera's pose in these coordinates with --camera-pose FILE, or --frame scanner for a scan with y up"
+        )
+    offset = np.round(middle)
+    warnings.warn(
+        f"{where}; {' '.join(f'{value:.0f}' for value in offset)} is taken away, and results come out without it, as "
+        "their files have 7 digits (T_input_result in summary.json leads back)",
+        InputWarning,
+        stacklevel=4,
+    )
+    return replace(frame, cloud=PointCloud(points - offset), T_input_result=rigid(np.eye(3), offset))
 
 
 def _stated_pose(frame: SensorFrame, reading: InputConfig) -> Float[np.ndarray, "4 4"] | None:
@@ -157,7 +187,7 @@ def _stated_pose(frame: SensorFrame, reading: InputConfig) -> Float[np.ndarray, 
             f"camera's axes: they {fit}: give --viewpoint pose or --viewpoint ignored"
         )
     taken = "in its frame, from which they were moved into the camera's axes" if moved else "in the camera's axes"
-    back = ", where results come out (T_input_camera in summary.json leads back)" if moved else ""
+    back = ", where results come out (T_input_result in summary.json leads back)" if moved else ""
     warnings.warn(
         f"{path} states a camera's pose (VIEWPOINT); its points are taken to be {taken}{back}",
         InputWarning,
@@ -178,7 +208,7 @@ def read_frames(path: Path, reading: InputConfig) -> Iterator[tuple[RecordedFram
 
 
 def _of_message(message: RecordedFrame, path: Path, reading: InputConfig) -> SensorFrame:
-    return _in_camera(_recorded(message, path, reading), reading)
+    return in_camera(_recorded(message, path, reading), reading)
 
 
 def _check_options(path: Path, kind: str, reading: InputConfig) -> None:
@@ -187,8 +217,10 @@ def _check_options(path: Path, kind: str, reading: InputConfig) -> None:
     if reading.viewpoint != "auto" and path.suffix.lower() != ".pcd":
         raise ValueError(f"{path} is no PCD file, which alone states a viewpoint: leave out --viewpoint")
     if kind == "point cloud":
-        if reading.intrinsics is not None or reading.mask is not None or reading.depth_scale is not None:
-            raise ValueError(f"{path} is read as a point cloud; leave out intrinsics, mask and depth scale")
+        if (reading.intrinsics, reading.mask, reading.depth_scale, reading.depth_along) != (None, None, None, "z"):
+            raise ValueError(
+                f"{path} is read as a point cloud; leave out intrinsics, mask and depth scale or direction"
+            )
         if reading.frame_index is not None:
             raise ValueError(f"{path} is one point cloud, not a recording of many: leave out --frame-index")
         return
@@ -205,9 +237,14 @@ def _depth_image(path: Path, reading: InputConfig) -> SensorFrame:
     intrinsics = read_intrinsics(reading.intrinsics, (raw.shape[1], raw.shape[0]), path, reading.frame_index)
     stated = None if raw.dtype.kind == "f" else intrinsics.depth_scale
     scale = stated if reading.depth_scale is None else reading.depth_scale
-    whole = depth_of(path, raw, scale, intrinsics.camera)
-    image = usable_depth(whole, path, reading.mask)
+    whole = along_z(depth_of(path, raw, scale, intrinsics.camera), reading)
+    image = usable_depth(whole, path, reading.mask, reading.mask_value)
     return SensorFrame(path, image.to_points(), 1.0, "camera", image, whole=whole)
+
+
+def along_z(image: DepthImage, reading: InputConfig) -> DepthImage:
+    """Image of depths along z, of one whose values are what ``reading.depth_along`` says."""
+    return image.from_ray_lengths() if reading.depth_along == "ray" else image
 
 
 def _recording_options(reading: InputConfig) -> tuple[str | None, Camera | None, float | None]:
@@ -219,10 +256,14 @@ def _recording_options(reading: InputConfig) -> tuple[str | None, Camera | None,
 def _recorded(message: RecordedFrame, path: Path, reading: InputConfig) -> SensorFrame:
     content = message.read()
     if isinstance(content, DepthImage):
-        image = usable_depth(content, path, reading.mask)
+        content = along_z(content, reading)
+        image = usable_depth(content, path, reading.mask, reading.mask_value)
         return SensorFrame(path, image.to_points(), 1.0, reading.frame, image, message.name, whole=content)
-    if reading.mask is not None:
-        raise ValueError(f"{message.topic} in {path} has point clouds; leave out the mask, or name an image's --topic")
+    if reading.mask is not None or reading.depth_along == "ray":
+        raise ValueError(
+            f"{message.topic} in {path} has point clouds; leave out the mask and --depth-along, or name an image's "
+            "--topic"
+        )
     cloud = PointCloud(valid_points(content, path, reading.drop_invalid))
     lost = len(content) - len(cloud)
     return SensorFrame(path, cloud, 1.0, reading.frame, message=message.name, invalid=lost)

@@ -146,7 +146,13 @@ class Model:
         return torch.from_numpy(seen[np.arange(limit) % len(seen)][None]), normalizer
 
     def query(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Answer:
-        """Segment, probabilities, signed distance and direction at each point."""
+        """Segment, probabilities, signed distance and direction at each point.
+
+        Raises ``ValueError`` for no points, and for what is no position.
+        """
+        points = PointCloud(np.asarray(points)).points
+        if len(points) == 0:
+            raise ValueError("0 points are queried; at least one is needed: give n x 3 positions")
 
         def answer(prediction: Prediction, queries: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
             logits, distance, direction = self.respond(prediction, queries)

@@ -134,7 +134,7 @@ class Observation:
             "depth_m": self.depth_m if known and self.frame.axes == "camera" else None,
             "visible_size_m": self.size_m if known else None,
             "invalid_points": self.frame.invalid,
-            "T_input_camera": None if self.frame.T_input_camera is None else self.frame.T_input_camera.tolist(),
+            "T_input_result": None if self.frame.T_input_result is None else self.frame.T_input_result.tolist(),
             "isolation": [asdict(step) for step in self.steps],
         }
 
@@ -181,18 +181,18 @@ def find_object(
     cloud = frame.cloud if selection.keep.all() else PointCloud(frame.cloud.points[selection.keep])
     if _is_straight(cloud.points):
         raise ValueError(
-            f"the {len(cloud)} points of {frame.source} lie on a line; the object's surface must be seen: check the "
-            "columns of the file, and what is cropped"
+            f"the {len(cloud)} points of {frame.source} lie on a line or at one place; the object's surface must be "
+            "seen: check the columns of the file, and what is cropped"
         )
     return Observation(frame, cloud, selection.steps, selection, isolation.extent)
 
 
 def _is_straight(points: Float[np.ndarray, "n 3"]) -> bool:
-    """Whether enough points lie on a line; fewer, and points in one place, are refused by that."""
+    """Whether enough points lie on a line or at one place; fewer are refused by that."""
     if len(points) < MIN_POINTS:
         return False
     along, across, _ = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(along > 0 and across <= STRAIGHT * along)
+    return bool(across <= STRAIGHT * along)
 
 
 def observe(

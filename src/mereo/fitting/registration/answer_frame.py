@@ -336,11 +336,21 @@ def check_size(frame: EncodedFrame, model: StatisticalModel, scene_unit: float |
     seen, whole = float(np.ptp(frame.points, axis=0).max()), 2 * model.half * scene_unit
     if SMALLEST <= seen / whole <= LARGEST:
         return
+    most = float(np.ptp(np.quantile(frame.points, [0.01, 0.99], axis=0), axis=0).max())
+    unit = (
+        "correct the unit of the frame (--unit-m 0.001 for millimetres, --depth-scale for images) or that of the "
+        "object's files (--units)"
+    )
+    crop = (
+        "leave out of the cloud what is not the object (--remove-outliers, --depth-range, --box; most points span "
+        f"{most:.3g})"
+    )
+    # where most points fit, others are stray, and the unit is right
+    first, second = sorted((unit, crop), key=lambda cure: (cure == unit) == (SMALLEST <= most / whole <= LARGEST))
     raise NoFit(
         f"what was seen is {seen:.3g} long in the frame's unit and the object {whole:.3g}, a factor of "
-        f"{max(seen / whole, whole / seen):.3g}; a view shows from {SMALLEST:.0%} to {LARGEST:.0%} of it: correct the "
-        "unit of the frame (--unit-m 0.001 for millimetres, --depth-scale for images) or that of the object's files "
-        "(--units), or leave out of the cloud what is not the object"
+        f"{max(seen / whole, whole / seen):.3g}; a view shows from {SMALLEST:.0%} to {LARGEST:.0%} of it: {first}, or "
+        f"{second}"
     )
 
 
