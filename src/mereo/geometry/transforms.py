@@ -31,7 +31,10 @@ def is_rigid(transform: Float[np.ndarray, "4 4"], tolerance: float = 1e-6) -> bo
 
 def checked_pose(pose: ArrayLike) -> Float[np.ndarray, "4 4"]:
     """A rigid pose as numbers, of a few printed digits or more; ``ValueError`` for what is none."""
-    T: np.ndarray = np.asarray(pose, dtype=np.float64)
+    try:
+        T: np.ndarray = np.asarray(pose, dtype=np.float64)
+    except (TypeError, ValueError):  # no numbers, or rows of several lengths
+        T = np.array(np.nan)
     if T.shape == (4, 4) and is_rigid(T, 1e-3):
         return T
     raise ValueError(

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from mereo.geometry.conventions import Way
 from mereo.geometry.mesh_check import examine
 from mereo.io.mesh_formats import MESH_SUFFIXES, read_segmented_mesh
 from mereo.io.volume_files import is_volume
@@ -51,8 +52,8 @@ def scene_of_folder(folder: Path) -> str | None:
     return None
 
 
-def scene_of_meshes(files: Sequence[Path], units: str | None = None) -> Scene:
-    """Scene of meshes, whose file is not kept.
+def scene_of_meshes(files: Sequence[Path], units: str | None = None, deformations: Way = "auto") -> Scene:
+    """Scene of meshes, whose file is not kept; ``units`` and ``deformations`` are those of ``write_scene_file``.
 
     Raises as ``write_scene_file`` does, and ``ValueError`` for a part without volume; a mesh that is no solid is used
     with a ``MeshWarning``.
@@ -68,7 +69,8 @@ def scene_of_meshes(files: Sequence[Path], units: str | None = None) -> Scene:
                 raise ValueError(f"{fault}; an object's parts are solids: {solid}")
     with TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", MeshWarning)
-        path = write_scene_file(files, Path(folder) / SCENE, units, name=files[0].name.split(".")[0])
+        name = files[0].name.split(".")[0]
+        path = write_scene_file(files, Path(folder) / SCENE, units, name=name, deformations=deformations)
         scene = load_scene(path)
     for warning in caught:  # which name the file that is gone
         text = str(warning.message).replace(f"{path}: ", "")
