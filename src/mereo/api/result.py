@@ -6,7 +6,7 @@ Result[name] -> SegmentResult
 -carry-> what is defined in the object's own files, in the frame's axes and unit
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from html import escape
@@ -257,7 +257,8 @@ class Result(Answer):
             path = free_folder() if path is None else checked_path(path, "path")
             suffix = file_suffix(path)
             if suffix == "":
-                wanted = chosen_formats(DEFAULT_FILES.formats if formats is None else _listed(formats))
+                _check_list(formats)
+                wanted = chosen_formats(DEFAULT_FILES.formats if formats is None else formats)
                 with new_directory(path, overwrite, self._read()) as directory:
                     write_answer(directory, self, FilesConfig(wanted, millimetres))
             elif formats is not None:
@@ -309,10 +310,9 @@ class Result(Answer):
         return result_html(self.seen.frame.source, lines, points, surfaces, segments, Unit(self.unit_m), calibrated)
 
 
-def _listed(formats: object) -> Sequence[Format]:
-    if not isinstance(formats, Sequence) or isinstance(formats, str):
+def _check_list(formats: object) -> None:
+    if isinstance(formats, str) or not isinstance(formats, Iterable | None):
         raise ValueError(f"formats is {formats!r}; it must be a list of names: give for example ('glb', 'json')")
-    return formats
 
 
 def free_folder(name: str = "result") -> Path:

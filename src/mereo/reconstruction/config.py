@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 from numbers import Real
-from typing import Literal
+from typing import Any, Literal
 
 from mereo.io.bounds import NotNegative, check_bounds
 
@@ -70,10 +70,10 @@ class IsolationConfig:
         return replace(self, keep_all=False, extent="auto") != IsolationConfig()
 
 
-def is_numbers(values: object, count: int) -> bool:
+def is_numbers(values: Any, count: int) -> bool:
     """Whether these are so many real numbers, in a tuple, list or array."""
     try:
-        numbers = tuple(values)  # type: ignore[call-overload]
+        numbers = tuple(values)
     except TypeError:
         return False
     return len(numbers) == count and all(isinstance(number, Real) for number in numbers)
