@@ -150,8 +150,8 @@ def served_objects(
     Objects without weights are ``scene.yaml``, ``part.stl,other.stl`` or ``liver=part.stl,other.stl``. Without a name a
     file is called by its own, and one that is called weights by its folder; meshes are called by the first.
 
-    Raises ``ValueError`` for none, for a name that is no part of an address, for two of one name, and for a scene to
-    which there are no weights.
+    Raises ``ValueError`` for none, for a name that is no part of an address, for two of one name, and for a scene of
+    an object that has its own, or to which there are no weights.
     """
     if not weights and not objects:
         raise ValueError(
@@ -168,6 +168,8 @@ def served_objects(
             )
         if names.count(name) > 1:
             raise ValueError(f"two objects are called {name!r}; clients must tell them apart: --weights NAME=FILE")
+    if double := sorted(set(played) & {name for name, _ in bare}):
+        raise ValueError(f"--scene is for {double[0]!r}, whose --object says what it is: leave one of them out")
     if lost := sorted(set(played) - set(names)):
         raise ValueError(f"--scene is for {lost[0]!r}, which is not served; there are {', '.join(names)}: name one")
     of_weights = [Served(name, file, played.get(name)) for name, file in named]

@@ -9,7 +9,7 @@ import pickle
 import re
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
@@ -18,6 +18,7 @@ import jaxtyping
 import numpy as np
 import pytest
 from analytic import untrained
+from angle import write_angle
 from answers import answer_to
 from PIL import Image
 from toy_frames import CENTERS, MODEL, NAMES, RADII, seen
@@ -33,15 +34,20 @@ from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Located
 from mereo.geometry.camera import SCANNER_TO_CAMERA, Camera, DepthImage, PointCloud
-from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.conventions import CloudAxes, Way
 from mereo.geometry.labels import SegmentedCloud
 from mereo.geometry.transforms import transform_points
 from mereo.io.atomic_files import MARKER
 from mereo.io.config import InputConfig
+from mereo.io.sensor_frame import SensorFrame
 from mereo.models.model import Model
-from mereo.reconstruction.observation import SizeWarning
+from mereo.reconstruction.config import IsolationConfig
+from mereo.reconstruction.observation import Observation, SizeWarning, find_object
+from mereo.scenes.files.template import write_scene_file
+from mereo.scenes.random_states import CACHE_VARIABLE
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SourceFrame
+from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.sample_views import load_view
 from mereo.visualization.units import Unit
@@ -113,6 +119,66 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "no query": (lambda: queried(np.empty((0, 3))), "0 points are queried; at least one is needed"),
     "a query of NaN": (lambda: queried(np.full((2, 3), np.nan)), "2 of 2 points are NaN or infinite"),
     "a query of pairs": (lambda: queried(np.ones((2, 2))), r"the shape \(2, 2\); they must be n x 3"),
+    "no path": (lambda: Result.save(MagicMock(), 3), "^path is 3; it must be a path: give a text or a p"),
+    "formats": (
+        lambda: Result.save(MagicMock(), "x", formats="glb"), "^formats is 'glb'; it must be a list of names: g"
+    ),
+    "an object of None": (lambda: mereo.load_object([None]), "^the object's file is None; it must be a path: give"),
+    "an object of a number": (lambda: mereo.load_object(3), "^the object's file is 3; it must be a path: give"),
+    "weights": (lambda: mereo.load_object(weights=3), "^weights is 3; it must be a path"),
+    "a scene": (lambda: mereo.load_object("rope", scene=3), "^scene is 3; it must be a path"),
+    "units": (
+        lambda: mereo.load_object("x.stl", units="feet"), "^units is 'feet'; it must be one of mm, cm, m, in: give"
+    ),
+    "deformations": (
+        lambda: mereo.load_object("x.stl", deformations="hard"),
+        "^deformations is 'hard'; it must be one of auto, rigid, soft, stiff, articulated: give for example 'rigid'$",
+    ),
+    "deformations of a scene": (
+        lambda: mereo.load_object(toy_scene(), deformations="stiff"),
+        "^the deformations are stiff, but .* says its own: l"
+    ),
+    "deformations of weights": (
+        lambda: mereo.load_object(MODEL, deformations="stiff"),
+        "^the deformations are stiff, but .* says its own: leave"
+    ),
+    "units of weights": (
+        lambda: mereo.load_object("rope", units="mm"), "^the units are mm, but rope says its own: leave"
+    ),
+    "isolation": (
+        lambda: mereo.reconstruct(seen(), MODEL, isolation={}), "^isolation is {}; it must be an IsolationConfig"
+    ),
+    "an extent": (
+        lambda: mereo.reconstruct(seen(), MODEL, extent="half"),
+        "^extent is 'half'; it must be one of auto, whole, partial"
+    ),
+    "a box": (
+        lambda: mereo.reconstruct(seen(), MODEL, box=3), r"^the box is 3; it must be 6 numbers: give them in metres$"
+    ),
+    "a short range": (
+        lambda: mereo.reconstruct(seen(), MODEL, depth_range=(1,)), r"^the depth range is \(1,\); it must be 2 numbers"
+    ),
+    "a pose": (
+        lambda: mereo.reconstruct(seen(), MODEL, initial_pose="x"), "^the pose is of the shape .*must be 4 x 4 finite"
+    ),
+    "a ragged pose of a tracker": (
+        lambda: mereo.Tracker(MODEL, initial_pose=[[1], [1, 2]]), "^the pose is of the shape .*must be 4 x"
+    ),
+    "isolation of a tracker": (lambda: mereo.Tracker(MODEL, isolation=3), "^isolation is 3; it must be an Isolation"),
+    "what to view": (lambda: mereo.view(3, block=False), "^input is 3; it must be a path"),
+    "a port": (
+        lambda: mereo.view("x.glb", port=-1), "^port is -1; it must be a whole number, from 0 to 65535: give for"
+    ),
+    "a folder": (lambda: mereo.generate("rope", 3, examples=1), "^the folder is 3; it must be a path: give a text"),
+    "minutes": (lambda: mereo.learn("rope", "x", minutes=-1), "^minutes is -1; it must be greater than 0: give for"),
+    "what to learn": (lambda: mereo.learn(3, "x"), "^object is 3; it must be a path"),
+    "a unit of what is learned": (
+        lambda: mereo.learn("rope", "x", units="feet"), "^units is 'feet'; it must be one of mm, cm"
+    ),
+    "a format": (
+        lambda: mereo.export("rope", "x", "onxx"), "^format is 'onxx'; it must be one of onnx, torch: give for"
+    ),
+    "a unit in words": (lambda: mereo.load_frame(seen(), unit_m="mm"), "^unit_m is 'mm'; it must be greater than 0"),
     "a negative unit": (lambda: replace(mereo.load_frame(seen()), unit_m=-1.0), "unit_m is -1.0; it must be greater"),
 }  # fmt: skip
 
@@ -263,6 +329,63 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
         mereo.load_frame(seen(), mask=tmp_path / "mask.png")
     with pytest.raises(TypeError, match="unit"):
         mereo.load_frame(tmp_path / "x.ply", unit=1.0)
+
+
+def test_fields_of_isolation_are_arguments_by_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken = list[tuple[IsolationConfig, Observation]]()
+
+    def isolate(frame: SensorFrame, isolation: IsolationConfig) -> Observation:
+        taken.append((isolation, find_object(frame, isolation)))
+        return taken[-1][1]
+
+    monkeypatch.setattr(reconstruct, "find_object", isolate)
+    mereo.reconstruct(seen(), MODEL, resolution=8, extent="partial", unit_m=1.0)
+    isolation, observed = taken.pop()
+    assert isolation == IsolationConfig(extent="partial") and observed.extent == "partial"
+    assert observed.frame.unit_m == 1.0, "the arguments of load_frame are those of the frame"
+    mereo.reconstruct(seen(), MODEL, resolution=8, isolation=IsolationConfig(extent="whole"), keep_all=True)
+    assert taken.pop()[0] == IsolationConfig(extent="whole", keep_all=True)
+    with pytest.raises(ValueError, match="isolation is given for an object that is isolated already"):
+        mereo.reconstruct(observed, MODEL, extent="whole")
+    assert {item.name for item in fields(IsolationConfig)}.isdisjoint(item.name for item in fields(InputConfig))
+
+
+def test_a_tracker_begins_at_a_pose_and_leaves_out_what_it_is_told(rope: Model, registrar: Registrar) -> None:
+    cloud = load_view("rope").depth.to_points().points
+    pose = Result.of(answer_to(cloud, rope, registrar, 16, unit_m=UNIT_M)).pose
+    known = mereo.Object(None, None, model=registrar.model)
+    low, high = UNIT_M * (cloud.min(axis=0) - 1), UNIT_M * (cloud.max(axis=0) + 1)
+    around = IsolationConfig(box=(*low.tolist(), *high.tolist()))
+    beyond = np.concatenate([cloud, cloud[:50] + np.array([0, 0, 1000.0])])
+    with mereo.Tracker(known, "modes", initial_pose=pose, isolation=around) as tracker:
+        first, second = (tracker.follow(beyond, 0.03 * step, unit_m=UNIT_M) for step in range(2))
+        assert (first.located_by, first.tracked, second.tracked) == ("pose", False, True)
+        assert len(first.seen.cloud) <= len(cloud) and first.seen.steps[0].name == "box"
+        third = tracker.follow(cloud, 0.09, isolation=IsolationConfig(), unit_m=UNIT_M, extent="partial")
+        assert third.tracked and third.seen.extent == "partial" and not third.seen.steps
+
+
+@pytest.mark.parametrize("way", ["rigid", "soft", "stiff", "articulated"])
+def test_meshes_deform_as_their_user_says(way: Way, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in the file that ``mereo scene new --deformations`` writes."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    files = write_angle(tmp_path)
+    scene = load_scene(write_scene_file(files, tmp_path / "angle.yaml", "mm", deformations=way))
+    known = mereo.load_object(files, units="mm", deformations=way)
+    assert known.scene is not None
+    ours, theirs = (each.sample_state(example_rng(0, 7)).mesh.merged()[0] for each in (known.scene, scene))
+    np.testing.assert_array_equal(ours, theirs)
+    moved = np.abs(ours - known.scene.rest.merged()[0]).max()
+    assert moved == 0 if way == "rigid" else moved > 0
+    command = ReconstructCommand((), object=tuple(map(str, files)), units="mm", deformations=way)
+    loaded = FrameJob(command).object.scene
+    assert loaded is not None
+    np.testing.assert_array_equal(loaded.sample_state(example_rng(0, 7)).mesh.merged()[0], theirs)
+
+
+def test_a_part_alone_has_no_joints(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="to be articulated, and no parts of it touch as in a joint: take soft, "):
+        mereo.load_object(write_angle(tmp_path)[0], units="mm", deformations="articulated")
 
 
 def test_a_page_stays_open_where_somebody_goes_on(
@@ -468,7 +591,11 @@ OUT = "choose another --output or pass --force"
     ("option", "argument"),
     [
         (OUT, "choose another output or pass overwrite=True"),
-        ("(--keep-all keeps them)", "(isolation=IsolationConfig(keep_all=True) keeps them)"),
+        ("(--keep-all keeps them)", "(keep_all=True keeps them)"),
+        ("state that a part is seen (--extent partial)", 'state that a part is seen (extent="partial")'),
+        ("for example --depth-range 0.4 0.9", "for example depth_range=(0.4, 0.9)"),
+        ("widen --depth-range, or crop with --box", "widen depth_range, or crop with box"),
+        ("--largest-cluster --cluster-gap 0.01", "largest_cluster=True cluster_gap=0.01"),
         (
             "the unit (--unit-m 0.001 for millimetres, --depth-scale)",
             "the unit (unit_m=0.001 for millimetres, depth_scale)",

@@ -512,6 +512,12 @@ def test_weights_that_cannot_be_served_are_a_sentence(weights: Any, scenes: Any,
         served_objects(weights, scenes)
 
 
+def test_an_object_that_is_served_has_one_scene() -> None:
+    words = "--scene is for 'x', whose --object says what it is: leave one of them out"
+    with pytest.raises(ValueError, match=words):
+        served_objects((), ("x=bunny",), ("x=part.stl",))
+
+
 def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mereo.cli.answers.find_spec", lambda name: None)
     with pytest.raises(ImportError, match=r"fastapi is not installed; .* run pip install 'mereo\[serve\]'"):

@@ -7,7 +7,7 @@ are any, start the fit at once and tell segments apart that look alike; only the
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,8 +16,10 @@ from typing import get_args
 from mereo.api.words import python_words
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.register import Registrar, other_mesh, registrar_for, statistical_model_of
-from mereo.geometry.conventions import UNITS_M
+from mereo.geometry.conventions import LengthUnit, Way
 from mereo.geometry.mesh import SegmentedMesh
+from mereo.io.bounds import check_value
+from mereo.io.errors import checked_path
 from mereo.io.extras import has_network
 from mereo.io.mesh_formats import MESH_SUFFIXES
 from mereo.models.config import Device, InferenceConfig, Precision
@@ -132,7 +134,8 @@ def load_object(
     scene: Scene | str | Path | None = None,
     *,
     weights: Trained | str | Path | None = None,
-    units: str | None = None,
+    units: LengthUnit | None = None,
+    deformations: Way = "auto",
     device: Device = "auto",
     precision: Precision = "auto",
 ) -> Object:
@@ -147,6 +150,9 @@ def load_object(
         scene: of weights: the object's scene, its name or its file, where it is not the built-in one of the weights.
         weights: to start the fit with, where ``source`` is meshes or a scene, or none of them.
         units: of meshes: "mm", "cm", "m" or "in"; guessed where not given.
+        deformations: how an object of meshes moves, as in ``mereo scene new``: "rigid", "soft" or "stiff" (as an
+            elastic solid), or "articulated" (by the joints that its contacts suggest); "auto" is articulated where it
+            has such joints, else soft.
         device: where a network computes; "auto" takes a CUDA device where there is one.
         precision: of its products; "float32" is exact.
 
@@ -154,25 +160,29 @@ def load_object(
     user's cache for the next time. Raises ``FileNotFoundError`` where there is no such file or name, ``ValueError`` for
     other files and for meshes without volume, ``ImportError`` for weights without the extra `network`.
     """
+    if units is not None:
+        check_value("units", units, LengthUnit, "mm")
+    check_value("deformations", deformations, Way, "rigid")
     inference = InferenceConfig(device, precision)
-    if units is not None and units not in list(UNITS_M):
-        raise ValueError(f"the units are {units!r}; they must be one of {', '.join(UNITS_M)}: correct the spelling")
     network = weights if source is None else source
     if isinstance(network, Trained) or (isinstance(network, str | Path) and (source is None or is_weights(network))):
         if source is not None and weights is not None:
             raise ValueError(f"{source} has weights, and weights are named too: name one of them")
+        _check_meshless(network.name if isinstance(network, Trained) else network, units, deformations)
         if scene is None and str(source) in SCENES and not has_network():
             return _built_in_by_model(str(source))
         scene = _learned_scene(network) if scene is None else scene
-        return Object(
-            load_weights(network, inference), load_scene(str(scene)) if isinstance(scene, str | Path) else scene
-        )
+        if not isinstance(scene, Scene | None):
+            scene = load_scene(str(checked_path(scene, "scene")))
+        return Object(load_weights(network, inference), scene)
+    if weights is not None and not isinstance(weights, Trained):
+        checked_path(weights, "weights")
     if source is None:
         raise ValueError("no object is given; name its meshes, its scene or its weights")
     if scene is not None:
         raise ValueError(f"{source} is no weights and has its own scene, but another one is named: leave it out")
     loaded = None if weights is None else load_weights(weights, inference)  # first, for a scene may take long
-    scene = _scene(source, units)
+    scene = _scene(source, units, deformations)
     if loaded is None:
         return Object(None, scene, model=kept_model(scene))
     if loaded.statistical_model is not None and (fault := other_mesh(scene, loaded.statistical_model)):
@@ -205,18 +215,21 @@ def _learned_scene(weights: Trained | str | Path) -> str | None:
     return scene if scene is not None and (scene in SCENES or Path(scene).is_file()) else None
 
 
-def _scene(source: Source, units: str | None) -> Scene:
+def _check_meshless(source: object, units: LengthUnit | None, deformations: Way) -> None:
+    """Raise ``ValueError`` for what is stated of meshes, where the object is of none."""
+    for what, value in (("units", units), ("deformations", None if deformations == "auto" else deformations)):
+        if value is not None:
+            raise ValueError(f"the {what} are {value}, but {source or 'the object'} says its own: leave them out")
+
+
+def _scene(source: Source, units: LengthUnit | None, deformations: Way) -> Scene:
     """Scene of what has no weights."""
     if isinstance(source, Scene):
+        _check_meshless(source.name, units, deformations)
         return source
     assert not isinstance(source, Trained)
-    given: Sequence[object] = [source] if isinstance(source, str | Path) else source
-    if not isinstance(given, Sequence) or not all(isinstance(file, str | Path) and str(file) for file in given):
-        raise ValueError(
-            f"the object is {repr(source)[:80]}; it must be the path of a file or folder, a list of such paths, the "
-            "name of a scene, or a scene: name its meshes"
-        )
-    files = [Path(str(file)) for file in given]
+    given = source if isinstance(source, Iterable) and not isinstance(source, str) else [source]
+    files = [checked_path(file, "the object's file") for file in given]
     if len(files) == 1 and files[0].is_dir():
         folder, learned = files[0], scene_of_folder(files[0])
         files = [Path(learned)] if learned is not None else shapes_in(folder)
@@ -228,12 +241,11 @@ def _scene(source: Source, units: str | None) -> Scene:
     if not files:
         raise ValueError("no object is given; name its meshes, one file for each segment, or its scene file")
     if names_scene(files):
-        if units is not None:
-            raise ValueError(f"the units are {units}, but {files[0]} says its own: leave them out")
+        _check_meshless(files[0], units, deformations)
         return load_scene(files[0] if files[0].suffix else str(files[0]))
     if len(files) == 1 and files[0].suffix == "" and not files[0].exists():
         raise FileNotFoundError(
             f"there is no object {str(files[0])!r}: name its meshes, its scene file, a folder of mereo learn, a "
             f"built-in scene ({', '.join(SCENES)}), or weights ({', '.join(shipped_names())}, or a .safetensors file)"
         )
-    return scene_of_meshes(files, units)
+    return scene_of_meshes(files, units, deformations)

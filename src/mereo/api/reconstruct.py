@@ -8,7 +8,7 @@ A source is whatever holds a frame: a file, a shipped name, arrays, the clouds a
 
 import warnings
 from concurrent.futures import Executor
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, overload
 
@@ -138,8 +138,22 @@ def _depth_frame(raw: Num[np.ndarray, "h w"], intrinsics: Camera | str | Path, r
     return SensorFrame(path, usable.to_points(), 1.0, "camera", usable, whole=image)
 
 
+def split_options(isolation: IsolationConfig | None, options: dict[str, Any]) -> tuple[IsolationConfig, dict[str, Any]]:
+    """Settings of isolation, with what of ``options`` is a field of them, and the other options."""
+    if not isinstance(isolation, IsolationConfig | None):
+        raise ValueError(
+            f"isolation is {isolation!r}; it must be an IsolationConfig, or its fields are given by themselves: give "
+            "for example largest_cluster=True"
+        )
+    names = {item.name for item in fields(IsolationConfig)} & options.keys()
+    stated = replace(isolation or IsolationConfig(), **{name: options[name] for name in names})
+    return stated, {name: value for name, value in options.items() if name not in names}
+
+
 def observation_of(frame: Any, isolation: IsolationConfig, reading: dict[str, Any]) -> Observation:
     """Object in a frame, whatever holds it."""
+    if isinstance(frame, Observation) and replace(isolation, keep_all=False) != IsolationConfig():
+        raise ValueError("isolation is given for an object that is isolated already: give it to find_object")
     if not isinstance(frame, SensorFrame | Observation):
         frame = load_frame(frame, **reading)
     elif reading:
@@ -172,7 +186,7 @@ def reconstruct(
     isolation: IsolationConfig | None = None,
     label_points: bool = False,
     initial_pose: ArrayLike | None = None,
-    **reading: Any,
+    **options: Any,
 ) -> Result | list[Result]:
     """Find all segments of an object in a frame, hidden side included: what ``mereo reconstruct`` does.
 
@@ -187,17 +201,20 @@ def reconstruct(
         label_points: also say on which segment each observed point lies (``Result.reconstruction.observed``).
         initial_pose: rough pose of the object, as ``Result.pose``, from which the fit starts instead of a search or a
             network; what the scene holds (``held``) stays there. Both units must be known.
-        reading: arguments of ``load_frame``: ``axes``, ``unit_m``, ``intrinsics``, ``drop_invalid`` and others.
+        options: fields of ``isolation`` by themselves, ``extent="partial"`` where a part of the object is hidden or cut
+            off, ``box``, ``remove_plane``, ``keep_all`` and others; and arguments of ``load_frame``, ``axes``,
+            ``unit_m``, ``intrinsics``, ``drop_invalid`` and others.
 
     Warns with ``SizeWarning`` where the visible part cannot be the object of the weights, and without weights with
     ``ClustersWarning`` where the cloud may be two objects. Raises ``ValueError`` for unusable frames,
     where nothing is found, and for methods other than "auto" where the model cannot be registered.
     """
-    isolation, results = isolation or IsolationConfig(), list[Result]()
+    results = list[Result]()
     are_many = is_frame_list(frame) or (
         isinstance(frame, list | tuple) and any(isinstance(each, SensorFrame | Observation) for each in frame)
     )
     with python_words():
+        isolation, reading = split_options(isolation, options)
         known = object_of(object)
         for each in frame if are_many else [frame]:  # not a comprehension: a warning names the caller's line
             observation = observation_of(each, isolation, reading)
@@ -266,7 +283,13 @@ class Tracker:
     """
 
     def __init__(
-        self, object: Object | Source, method: AnswerMethod = "auto", *, executor: Executor | None = None
+        self,
+        object: Object | Source,
+        method: AnswerMethod = "auto",
+        *,
+        executor: Executor | None = None,
+        isolation: IsolationConfig | None = None,
+        initial_pose: ArrayLike | None = None,
     ) -> None:
         """Follow an object.
 
@@ -274,10 +297,14 @@ class Tracker:
             object: from ``load_object``, or whatever that takes.
             method: "auto", or "modes" to take the registered model even where it does not explain the frame.
             executor: what searches for a lost object; by default a thread of the tracker's own.
+            isolation: what of each frame is left out, as in ``reconstruct``.
+            initial_pose: rough pose of the object in the first frame, as in ``reconstruct``.
 
-        Raises ``ValueError`` for other methods, and for weights without a deformation model.
+        Raises ``ValueError`` for other methods and poses, and for weights without a deformation model.
         """
         with python_words():
+            self._isolation, _ = split_options(isolation, {})
+            self._initial_pose = None if initial_pose is None else checked_pose(initial_pose)
             registrar = None if method == "network" else object_of(object).registrar(method)
         if registrar is None or method == "full":
             raise ValueError(
@@ -286,22 +313,26 @@ class Tracker:
             )
         self._tracker = tracking.Tracker(registrar, executor=executor)
 
-    def follow(self, frame: Any, time_s: float, *, isolation: IsolationConfig | None = None, **reading: Any) -> Result:
+    def follow(self, frame: Any, time_s: float, *, isolation: IsolationConfig | None = None, **options: Any) -> Result:
         """Find the object in the next frame.
 
         Args:
             frame: whatever ``load_frame`` takes, or what it has returned; in one unit throughout the sequence.
             time_s: of the frame, seconds from any zero, later than the last one's.
-            isolation: what of the frame is left out.
-            reading: arguments of ``load_frame``.
+            isolation: what of the frame is left out, where that is not as of the tracker.
+            options: as in ``reconstruct``: fields of ``isolation`` by themselves, and arguments of ``load_frame``.
 
         Raises ``ValueError`` for unusable frames, after which the sequence may go on. Surfaces, labels and figures are
         made on first use.
         """
-        isolation = isolation or IsolationConfig()
         with python_words():
+            isolation, reading = split_options(self._isolation if isolation is None else isolation, options)
             seen = observation_of(frame, isolation, reading)
-            return Result.of(self._tracker.follow(seen, time_s, keep_all=isolation.keep_all))
+            if self._initial_pose is not None:
+                seen = replace(seen, initial_pose=self._initial_pose)
+            answer = self._tracker.follow(seen, time_s, keep_all=isolation.keep_all)
+        self._initial_pose = None
+        return Result.of(answer)
 
     def forget(self) -> None:
         """Start again: the next frame is fitted by itself; a search that goes on is given up."""

@@ -6,7 +6,7 @@ Result[name] -> SegmentResult
 -carry-> what is defined in the object's own files, in the frame's axes and unit
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from html import escape
@@ -27,7 +27,9 @@ from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.transforms import transform_points
 from mereo.io.atomic_files import atomic_file, new_directory
 from mereo.io.attachments import Attachment, Content, Positions, Surfaces, read_attachments, write_attachment
+from mereo.io.bounds import Port, check_value
 from mereo.io.config import DEFAULT_FILES, CarryFrame, FilesConfig, Format
+from mereo.io.errors import checked_path
 from mereo.io.point_arrays import model_points
 from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame
@@ -177,6 +179,7 @@ class Result(Answer):
         Raises ``ValueError`` where the answer is the network's, where the frame of the object's files is not known, and
         for what lies too far from the object to belong to it.
         """
+        check_value("files", files, CarryFrame, "source")
         attachment, registered = _attachment(what), registration_of(self)
         assert self.registrar is not None
         (placed,) = place([attachment], self.registrar, files)
@@ -251,10 +254,11 @@ class Result(Answer):
         Raises ``FileExistsError`` for what exists, unless ``overwrite`` may replace it; ``ValueError`` for a suffix or
         a format that there is none of, and ``ImportError`` where a format's extra is missing.
         """
-        path = free_folder() if path is None else Path(path)
         with python_words():
+            path = free_folder() if path is None else checked_path(path, "path")
             suffix = file_suffix(path)
             if suffix == "":
+                _check_list(formats)
                 wanted = chosen_formats(DEFAULT_FILES.formats if formats is None else formats)
                 with new_directory(path, overwrite, self._read()) as directory:
                     write_answer(directory, self, FilesConfig(wanted, millimetres))
@@ -278,6 +282,8 @@ class Result(Answer):
         """
         from mereo_viewer.result_page import open_answer
 
+        if port is not None:
+            check_value("port", port, Port, 8080)
         return open_answer(self, port or 0).stay(block)
 
     def _read(self) -> list[Path]:
@@ -303,6 +309,11 @@ class Result(Answer):
         lines = [self.source, *([] if doubt is None else [doubt])]
         segments, calibrated = self.reconstruction.segments, self.reconstruction.calibrated
         return result_html(self.seen.frame.source, lines, points, surfaces, segments, Unit(self.unit_m), calibrated)
+
+
+def _check_list(formats: object) -> None:
+    if isinstance(formats, str) or not isinstance(formats, Iterable | None):
+        raise ValueError(f"formats is {formats!r}; it must be a list of names: give for example ('glb', 'json')")
 
 
 def free_folder(name: str = "result") -> Path:
@@ -361,7 +372,7 @@ class CarriedFile:
 
         Raises ``FileExistsError`` for what exists, unless ``overwrite``, and ``ValueError`` for another suffix.
         """
-        path = Path(self.name if path is None else path)
+        path = Path(self.name) if path is None else checked_path(path, "path")
         if path.suffixes[-1:] != Path(self.name).suffixes[-1:]:
             raise ValueError(f"{path} has another suffix than {self.name}, in whose format it is written: use that one")
         factor = MM_PER_M * self.frame.metres if millimetres else 1.0

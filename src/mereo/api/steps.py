@@ -8,14 +8,17 @@ They print their progress as the commands do, and raise the sentences that those
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 from mereo.api.words import python_words
 from mereo.fitting.config import AnswerMethod
+from mereo.geometry.conventions import LengthUnit
 from mereo.geometry.metrics import format_score
+from mereo.io.bounds import Positive, check_value
+from mereo.io.errors import checked_path
 from mereo.io.object_storage import ObjectPath, place_of
 from mereo.models.config import EXACT, Device, InferenceConfig
 from mereo.models.export.onnx_export import export_weights
@@ -110,6 +113,7 @@ def export(
     with content unless ``overwrite``.
     """
     with python_words():
+        check_value("format", format, Literal["onnx", "torch"], "onnx")
         export_weights(model, output, format, overwrite)
     return Path(output)
 
@@ -159,7 +163,7 @@ def learn(
     *,
     minutes: float = 10.0,
     init: str = "",
-    units: Literal["mm", "cm", "m", "in"] | None = None,
+    units: LengthUnit | None = None,
     workers: int = 1,
     train: TrainChoice = "auto",
 ) -> Learned:
@@ -177,11 +181,14 @@ def learn(
 
     Raises ``ValueError`` for other arguments than the folder was begun with, and as the stages do.
     """
-    given = [object] if isinstance(object, str | Path) else object
-    files, folder = [Path(file) for file in given], Path(output)
+    given = object if isinstance(object, Iterable) and not isinstance(object, str) else [object]
+    files, folder = [checked_path(file, "object") for file in given], checked_path(output, "output")
     if train not in get_args(TrainChoice):
         known = ", ".join(get_args(TrainChoice))
         raise ValueError(f"train is {train!r}; it must be one of {known}: correct the spelling")
+    check_value("minutes", minutes, Positive, 10.0)
+    if units is not None:
+        check_value("units", units, LengthUnit, "mm")
     processes = workers or os.cpu_count() or 1
     with python_words():
         metrics = learning.learn(files, folder, learning.LearnConfig(minutes, init, units, processes, train))

@@ -6,7 +6,9 @@ from mereo.api.objects import Object, Source, object_of
 from mereo.api.reconstruct import reconstruct_observation
 from mereo.api.words import python_words
 from mereo.fitting.registration.answer import Answer
+from mereo.io.bounds import Port, check_value
 from mereo.io.config import InputConfig
+from mereo.io.errors import checked_path
 from mereo.io.progress import shown_stages
 from mereo.io.sensor_frame import read_frame
 from mereo.reconstruction.config import IsolationConfig
@@ -49,11 +51,12 @@ def view(
     import_viser()
     block = not is_interactive() if block is None else block
     port = (PORT if block else 0) if port is None else port
+    check_value("port", port, Port, PORT)
     if isinstance(input, Answer):
         return open_answer(input, port).stay(block)
     if input is None and object is None:
         input = object = shipped_views()[0]
-    path = None if input is None else Path(input)
+    path = None if input is None else checked_path(input, "input")
     if path is not None and are_files(path):
         if object is not None:
             raise ValueError(f"{path} is shown as it is, and no object is looked for: leave out --object and --weights")

@@ -8,6 +8,7 @@ from typing import get_args
 
 from mereo.fitting.config import AnswerMethod
 from mereo.io.config import CarryFrame
+from mereo.reconstruction.config import Extent
 
 SPEAKS_OPTIONS: ContextVar[bool] = ContextVar("SPEAKS_OPTIONS", default=False)
 """Whether this is the command line, whose words are options."""
@@ -15,15 +16,17 @@ SPEAKS_OPTIONS: ContextVar[bool] = ContextVar("SPEAKS_OPTIONS", default=False)
 ARGUMENTS = {
     "--force": "overwrite=True",
     "--drop-invalid": "drop_invalid=True",
-    "--keep-all": "isolation=IsolationConfig(keep_all=True)",
-    "--extent": "isolation=IsolationConfig(extent=...)",
+    "--keep-all": "keep_all=True",
+    "--remove-plane": "remove_plane=True",
+    "--remove-outliers": "remove_outliers=True",
+    "--largest-cluster": "largest_cluster=True",
+    "--depth-range 0.4 0.9": "depth_range=(0.4, 0.9)",
+    **{f"--extent {extent}": f'extent="{extent}"' for extent in get_args(Extent)},
     "--frame": "axes",
     "--carry-frame": "files",
     **{f"--carry-frame {name}": f'files="{name}"' for name in get_args(CarryFrame)},
     "--carry": "carry",
     **{f"--method {name}": f'method="{name}"' for name in get_args(AnswerMethod)},
-    "--box": "isolation=IsolationConfig(box=...)",
-    "--depth-range": "isolation=IsolationConfig(depth_range=...)",
 }
 """Arguments that are not called as their options are."""
 

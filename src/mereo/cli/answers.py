@@ -10,6 +10,7 @@ from tyro.conf import UseAppendAction, arg
 
 from mereo.cli.options import ConfigFile, InputName, InputOrNone, Inputs, MeshUnits, Outcome, loaded_object
 from mereo.fitting.config import AnswerMethod, StreamMethod
+from mereo.geometry.conventions import Way
 from mereo.io.bounds import Cells, Port, Positive, Threads, Workers
 from mereo.io.config import CarryFrame, FilesConfig, InputConfig
 from mereo.models.config import InferenceConfig
@@ -38,6 +39,7 @@ class ReconstructCommand:
             scene file, a built-in scene's name, or the folder of `mereo learn`. Nothing is trained for it.
         weights: a shipped name or a file; with --object they start the fit, without they say what is looked for.
         units: of the object's meshes; guessed where not given.
+        deformations: how an object of meshes moves, as for `mereo scene new`: rigid, soft, stiff or articulated.
         output: folder to create, by default result, result2, ...; of several frames, the folder in which each one's is
             created.
         resolution: grid cells along the longest side.
@@ -71,6 +73,7 @@ class ReconstructCommand:
     object: tuple[str, ...] = ()
     weights: str | None = None
     units: MeshUnits = None
+    deformations: Way = "auto"
     output: Path | None = None
     resolution: Cells = 128
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
@@ -118,6 +121,7 @@ class ViewCommand:
             its image next to the truth.
         weights: a shipped name or a file; by default those of the shipped frame, or none.
         units: of the object's meshes; guessed where not given.
+        deformations: how an object of meshes moves, as for `mereo scene new`: rigid, soft, stiff or articulated.
         port: where the page is; 0 takes any that is free.
         resolution: grid cells along the longest side.
         reading: how the frame is read.
@@ -129,6 +133,7 @@ class ViewCommand:
     object: tuple[str, ...] = ()
     weights: str | None = None
     units: MeshUnits = None
+    deformations: Way = "auto"
     port: Port = 8080
     resolution: Cells = 128
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
@@ -153,7 +158,7 @@ class ViewCommand:
             input = Path(self.weights)
         if self.object or self.weights is not None:
             with shown_stages():
-                known = loaded_object(self.object, self.weights, None, self.units, self.inference)
+                known = loaded_object(self.object, self.weights, None, self.units, self.inference, self.deformations)
         view(
             input,
             known,
@@ -179,6 +184,7 @@ class StreamCommand:
         object: what is looked for, as for `mereo reconstruct`: its meshes or its scene.
         weights: a shipped name or a file; with --object they start the fit, without they say what is looked for.
         units: of the object's meshes; guessed where not given.
+        deformations: how an object of meshes moves, as for `mereo scene new`: rigid, soft, stiff or articulated.
         resolution: grid cells along the longest side of the network's surfaces: fewer are faster.
         method: auto follows the registered model where it explains the frame, if the weights carry one, and else asks
             the network; network uses it alone, frame by frame; search leaves it out; modes takes the model in any case.
@@ -199,6 +205,7 @@ class StreamCommand:
     object: tuple[str, ...] = ()
     weights: str | None = None
     units: MeshUnits = None
+    deformations: Way = "auto"
     resolution: Cells = 48
     method: StreamMethod = "auto"
     uncertainty: bool = False

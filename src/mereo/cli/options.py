@@ -16,11 +16,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 from tyro.conf import Positional, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
+from mereo.geometry.conventions import LengthUnit, Way
 from mereo.io.bounds import check_values
 from mereo.io.object_storage import Place, place_of
 from mereo.models.config import InferenceConfig
@@ -80,7 +81,7 @@ InputName = Annotated[Positional[str], arg(metavar="INPUT")]
 ScanCloud = Annotated[Positional[Path], arg(metavar="SCAN")]
 AssetNames = Annotated[Positional[tuple[str, ...]], arg(metavar="[ASSET ...]", help_behavior_hint="")]
 
-MeshUnits = Literal["mm", "cm", "m", "in"] | None
+MeshUnits = LengthUnit | None
 """Unit of meshes; None guesses."""
 
 ConfigFile = Annotated[Path | None, arg(name="config")]
@@ -105,6 +106,7 @@ def loaded_object(
     scene: str | None = None,
     units: MeshUnits = None,
     inference: InferenceConfig = InferenceConfig(),  # noqa: B008 (frozen)
+    deformations: Way = "auto",
 ) -> "Object":
     """Object that options name: ``--object``, ``--weights`` and ``--scene``; raises as ``load_object`` does.
 
@@ -120,7 +122,13 @@ def loaded_object(
     if source in SCENES:
         source = load_scene(source)
     return load_object(
-        source, scene, weights=weights, units=units, device=inference.device, precision=inference.precision
+        source,
+        scene,
+        weights=weights,
+        units=units,
+        deformations=deformations,
+        device=inference.device,
+        precision=inference.precision,
     )
 
 

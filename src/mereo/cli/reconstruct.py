@@ -108,7 +108,9 @@ class FrameJob:
         """What is looked for, its weights on their device; what is carried needs a deformation model."""
         command = self.command
         inference = self.inference or command.inference
-        loaded = loaded_object(command.object, command.weights, command.scene, command.units, inference)
+        loaded = loaded_object(
+            command.object, command.weights, command.scene, command.units, inference, command.deformations
+        )
         return loaded.with_deformation_model() if self.attachments else loaded
 
     @cached_property

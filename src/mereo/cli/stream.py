@@ -355,7 +355,7 @@ def stream_reconstructions(command: StreamCommand) -> Summary:
         reading = replace(reading, intrinsics=reading.intrinsics or Path(source) / CAMERA)
         source = str(Path(source) / FRAMES)
     folder = None if command.surfaces is None else SurfaceFolder(command.surfaces, command.force)
-    known = loaded_object(command.object, command.weights, None, command.units, command.inference)
+    known = loaded_object(command.object, command.weights, None, command.units, command.inference, command.deformations)
     frames: Iterable[StreamFrame | None] = (
         watched_frames(source, reading, command.isolation)
         if command.watch

@@ -38,7 +38,8 @@ class Camera:
     center_y_px: float
 
     def __post_init__(self) -> None:
-        if not all(isinstance(n, Integral) and not isinstance(n, bool) and n > 0 for n in (self.width, self.height)):
+        sizes: tuple[object, object] = self.width, self.height
+        if not all(isinstance(n, Integral) and not isinstance(n, bool) and n > 0 for n in sizes):
             raise ValueError(
                 f"image size is {self.width} x {self.height}; both must be positive whole numbers: check the intrinsics"
             )

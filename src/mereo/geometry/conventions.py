@@ -24,8 +24,12 @@ Way = Literal["auto", "rigid", "soft", "stiff", "articulated"]
 """How an object deforms: not at all, as a soft or a stiff elastic solid, by its joints, or as its meshes suggest."""
 
 
+LengthUnit = Literal["mm", "cm", "m", "in"]
+"""Unit of length that files and options may name."""
+
+
 UNITS_M: Mapping[str, float] = MappingProxyType({"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254})
-"""Metres in each unit of length that files and options may name."""
+"""Metres in each of these units."""
 
 
 def check_real(values: Any, name: str) -> None:

@@ -83,6 +83,6 @@ class InputConfig:
     frame_index: IndexOrNone = None
 
     def __post_init__(self) -> None:
-        if self.unit_m is not None and not 0 < self.unit_m < math.inf:
+        if isinstance(self.unit_m, int | float) and not 0 < self.unit_m < math.inf:
             raise ValueError(f"the unit is {self.unit_m} m; it must be positive: give 0.001 for millimetres")
         check_bounds(self, "--")

@@ -174,6 +174,13 @@ def limited_memory(path: str | Path) -> Iterator[None]:
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
+def checked_path(value: object, name: str) -> Path:
+    """Path that an argument of this name is; ``ValueError`` for what is neither a text nor a path."""
+    if not isinstance(value, str | Path):
+        raise ValueError(f"{name} is {value!r}; it must be a path: give a text or a pathlib.Path")
+    return Path(value)
+
+
 def check_suffix(path: Path, known: Iterable[str], kind: str) -> None:
     """Raise ``ValueError`` for a file whose suffix is none of those that a kind of files has."""
     if path.exists() and path.suffix.lower() not in known:

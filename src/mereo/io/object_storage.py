@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from mereo.io.atomic_files import atomic_file, check_place, json_text, remove_abandoned, write_json
+from mereo.io.errors import checked_path
 from mereo.io.extras import library
 
 LIBRARIES = {"s3": ("s3fs", "storage"), "gs": ("gcsfs", "gcs"), "memory": ("fsspec", "storage")}
@@ -136,7 +137,7 @@ Place = Path | ObjectPath
 def place_of(given: str | Path | ObjectPath) -> Place:
     """Place that a text means: with a protocol a folder of a storage (raises as ``ObjectPath``), else a local one."""
     if not isinstance(given, str):
-        return given
+        return given if isinstance(given, ObjectPath) else checked_path(given, "the folder")
     # one letter is a drive of Windows
     return ObjectPath(given) if re.match(r"[A-Za-z][A-Za-z0-9+.-]+://", given) else Path(given)
 

@@ -2,7 +2,8 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from numbers import Real
+from typing import Any, Literal
 
 from mereo.io.bounds import NotNegative, check_bounds
 
@@ -41,6 +42,9 @@ class IsolationConfig:
 
     def __post_init__(self) -> None:
         check_bounds(self)
+        for what, values, count in (("depth range", self.depth_range, 2), ("box", self.box, 6)):
+            if values is not None and not is_numbers(values, count):
+                raise ValueError(f"the {what} is {values!r}; it must be {count} numbers: give them in metres")
         if self.depth_range is not None and not 0 <= self.depth_range[0] < self.depth_range[1] < math.inf:
             raise ValueError(
                 f"the depth range is {_numbers(self.depth_range)}; it must be the nearest and the farthest depth in "
@@ -64,6 +68,15 @@ class IsolationConfig:
     def on(self) -> bool:
         """Whether a step was asked for."""
         return replace(self, keep_all=False, extent="auto") != IsolationConfig()
+
+
+def is_numbers(values: Any, count: int) -> bool:
+    """Whether these are so many real numbers, in a tuple, list or array."""
+    try:
+        numbers = tuple(values)
+    except TypeError:
+        return False
+    return len(numbers) == count and all(isinstance(number, Real) for number in numbers)
 
 
 def _numbers(values: tuple[float, ...]) -> str:

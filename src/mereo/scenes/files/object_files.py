@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from mereo.geometry.conventions import Way
 from mereo.geometry.mesh_check import examine
 from mereo.io.mesh_formats import MESH_SUFFIXES, MeshWarning, read_object_mesh
 from mereo.io.readers import check_ply
@@ -60,8 +61,8 @@ def scene_of_folder(folder: Path) -> str | None:
     return None
 
 
-def scene_of_meshes(files: Sequence[Path], units: str | None = None) -> Scene:
-    """Scene of meshes, whose file is not kept.
+def scene_of_meshes(files: Sequence[Path], units: str | None = None, deformations: Way = "auto") -> Scene:
+    """Scene of meshes, whose file is not kept; ``units`` and ``deformations`` are those of ``write_scene_file``.
 
     Raises as ``write_scene_file`` does, and ``ValueError`` for a part without volume; a mesh that is no solid is used
     with a ``MeshWarning``.
@@ -77,7 +78,8 @@ def scene_of_meshes(files: Sequence[Path], units: str | None = None) -> Scene:
                     solid = "name a file of its whole, closed surface" + (f", or {cure}" if health.mendable else "")
                     fault = f"segment {part.name!r} of {file} {refusal}"
                     raise ValueError(f"{fault}; an object's parts are solids: {solid}")
-        path = write_scene_file(files, Path(folder) / SCENE, units, name=files[0].name.split(".")[0])
+        name = files[0].name.split(".")[0]
+        path = write_scene_file(files, Path(folder) / SCENE, units, name=name, deformations=deformations)
         scene = load_scene(path)
     for warning in caught:  # which name the file that is gone
         text = str(warning.message).replace(f"{path}: ", "")
