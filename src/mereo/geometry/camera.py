@@ -5,7 +5,6 @@ pixel (column u, row v) is at (u + 0.5, v + 0.5). ``unproject`` and ``project`` 
 """
 
 from dataclasses import dataclass
-from numbers import Integral
 from typing import Literal
 
 import numpy as np
@@ -39,7 +38,7 @@ class Camera:
 
     def __post_init__(self) -> None:
         sizes: tuple[object, object] = self.width, self.height
-        if not all(isinstance(n, Integral) and not isinstance(n, bool) and n > 0 for n in sizes):
+        if not all(isinstance(n, int | np.integer) and not isinstance(n, bool) and n > 0 for n in sizes):
             raise ValueError(
                 f"image size is {self.width} x {self.height}; both must be positive whole numbers: check the intrinsics"
             )
