@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Float32, Int, Integer, Shaped
 from scipy.ndimage import gaussian_filter
 from skimage.measure import marching_cubes
 
+from mereo.geometry.brief import listed
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
 from mereo.geometry.transforms import transform_points
 from mereo.io.config import Space
@@ -333,7 +334,7 @@ def _joined_labels(paths: Sequence[Path]) -> LabelVolume:
         volume = read_label_volume(path)
         if len(volume.values) > 1:
             raise ValueError(
-                f"{path} holds the values {', '.join(map(str, volume.values))}; of several label volumes each has one "
+                f"{path} holds the values {listed(map(str, volume.values))}; of several label volumes each has one "
                 "segment: name it alone, or write a file for each segment"
             )
         if number == 1:
@@ -395,9 +396,11 @@ NESTED = 0.95
 
 
 class ThinSegmentError(ValueError):
-    """Refusal of the segment ``name``, which is too thin for a grid."""
+    """Refusal of segments that are too thin for a grid: ``thin`` has a sentence for each."""
 
-    name = ""
+    def __init__(self, thin: dict[str, str]) -> None:
+        super().__init__(next(iter(thin.values())))
+        self.thin = thin
 
 
 def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) -> SegmentedMesh:
@@ -425,21 +428,22 @@ def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) 
     parents = _part_masks(masks)
     grid = _Grid.around(np.logical_or.reduce(masks), volume.T_world_index, cells)
     margins = _margins(_in_partition([grid.share(mask) for mask in masks], parents), parents)
-    parts, cell = list[Segment](), abs(float(np.linalg.det(volume.T_world_index[:3, :3])))
+    thin, parts, cell = dict[str, str](), list[Segment](), abs(float(np.linalg.det(volume.T_world_index[:3, :3])))
     for index, (name, margin) in enumerate(zip(segments, margins, strict=True)):
         part = grid.surface(margin, name, volume.colors.get(labels[index][0], PALETTE[index % len(PALETTE)]))
         kept = 0.0 if part is None else part.volume / (float(masks[index].sum()) * cell)
         if part is None or kept < LEAST_VOLUME:
-            error = ThinSegmentError(
+            thin[name] = (
                 f"segment {name!r} would keep {kept:.0%} of its volume on a grid of {cells} cells; it must keep "
                 f"{LEAST_VOLUME:.0%}: raise `cells`, or leave this segment out"
             )
-            error.name = name
-            raise error
+            continue
         if kept < WHOLE:
             text = f"segment {name!r} keeps {kept:.0%} of its volume on a grid of {cells} cells: raise `cells` for more"
             warnings.warn(text, LabelWarning, stacklevel=2)
         parts.append(part)
+    if thin:
+        raise ThinSegmentError(thin)
     nested = tuple((segments[i], segments[j]) for i, j in parents.items())
     order = dict.fromkeys((*parents, *range(len(parts))))
     return SegmentedMesh(tuple(parts[index] for index in order), nested)

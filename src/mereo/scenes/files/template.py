@@ -10,7 +10,6 @@ import re
 import shlex
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -351,14 +350,14 @@ def write_scene_file(
     source = _source(files, path.parent)
     if source.lost and report is None:
         raise ValueError(
-            f"{source.lost[0]}: let `mereo scene new {shlex.join(map(str, files))} --output object.yaml` write a scene "
-            "file without it, and name that"
+            f"{source.lost[0]}, or let `mereo scene new {shlex.join(map(str, files))} --output object.yaml` write a "
+            "scene file without it, and name that"
         )
     text, notes = _draft(name, source, units, aperture, deformations)
     with atomic_file(path, force=False) as temporary:
         temporary.write_text(text, encoding="utf-8")
     if report is not None:
-        for note in (*source.lost, *source.notes, *notes):
+        for note in (*(f"left out: {text}" for text in source.lost), *source.notes, *notes):
             report(note)
     return path
 
@@ -422,37 +421,47 @@ def _from_model(file: Path, relative: str, mesh: SegmentedMesh) -> _Source:
 
 
 def _from_volumes(files: Sequence[Path], relative: Sequence[str]) -> _Source:
-    with warnings.catch_warnings(record=True) as caught:
+    with warnings.catch_warnings(record=True) as empty:
         warnings.simplefilter("always", LabelWarning)
         volume = read_label_volume(*files)
-        if not volume.values:
-            raise ValueError(f"{files[0]} holds only empty space; a label volume has values above 0: export it again")
-        names = {value: _segment_name(volume.names.get(value, f"label_{value}")) for value in volume.values}
-        mesh, cells, thin = _surfaces(volume, names)
+    if not volume.values:
+        raise ValueError(f"{files[0]} holds only empty space; a label volume has values above 0: export it again")
+    names = {value: _segment_name(volume.names.get(value, f"label_{value}")) for value in volume.values}
+    thin = dict[str, str]()
+    try:
+        mesh, cells, losses = _surfaces(volume, names)
+    except ThinSegmentError as error:
+        thin = error.thin
+        kept = {value: name for value, name in names.items() if name not in thin}
+        if not kept:
+            raise
+        mesh, cells, losses = _surfaces(volume, kept)
     listed = quoted(relative[0]) if len(files) == 1 else f"[{', '.join(map(quoted, relative))}]"
     lines = [f"labels: {listed}", "names:  # of the volume's values; delete what is not wanted"]
     lines += [f"  {'# ' if name in thin else ''}{value}: {quoted(name)}" for value, name in names.items()]
     lines.append(f"cells: {cells}  # of the grid along the longest side on which surfaces are found")
-    notes = dict.fromkeys(str(warning.message) for warning in caught if warning.category is LabelWarning)
-    notes |= {f"nested: {inner} in {outer}": None for inner, outer in mesh.nested}
+    notes = [str(warning.message) for warning in (*empty, *losses)]
+    notes += [f"nested: {inner} in {outer}" for inner, outer in mesh.nested]
     facts = ("mm", "the convention of NIfTI and NRRD", 2, "z is to the head", False)
     return _Source("\n".join(lines), mesh, *facts, tuple(thin.values()), tuple(notes))
 
 
-def _surfaces(volume: LabelVolume, names: Mapping[int, str]) -> tuple[SegmentedMesh, int, dict[str, str]]:
-    """Surfaces on the coarsest grid of ``LABEL_CELLS`` that holds all, its cells, and why segments are left out."""
+def _surfaces(
+    volume: LabelVolume, names: Mapping[int, str]
+) -> tuple[SegmentedMesh, int, list[warnings.WarningMessage]]:
+    """Surfaces on the coarsest grid of ``LABEL_CELLS`` that holds all, its cells, and what is lost on it.
+
+    Raises ``ThinSegmentError`` where none does.
+    """
     thin = dict[str, str]()
     for cells in LABEL_CELLS:
-        with suppress(ThinSegmentError):
-            return segment_surfaces(volume, names, cells), cells, thin
-    while True:
-        try:
-            kept = {value: name for value, name in names.items() if name not in thin}
-            return segment_surfaces(volume, kept, cells), cells, thin
-        except ThinSegmentError as error:
-            if len(thin) + 1 == len(set(names.values())):
-                raise
-            thin[error.name] = str(error)
+        with warnings.catch_warnings(record=True) as losses:
+            warnings.simplefilter("always", LabelWarning)
+            try:
+                return segment_surfaces(volume, names, cells), cells, losses
+            except ThinSegmentError as error:
+                thin = error.thin
+    raise ThinSegmentError(thin)
 
 
 def _likely_frame(file: Path, bounds: Float[np.ndarray, "2 3"]) -> tuple[str, str, int, str]:
