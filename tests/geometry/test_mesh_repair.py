@@ -199,6 +199,17 @@ def test_holes_are_closed_as_one_by_one() -> None:
     np.testing.assert_array_equal(closed[1], faces)
 
 
+def test_closed_triangles_enclose_nothing_and_no_repair_makes_a_solid_of_loose_ones() -> None:
+    rng = np.random.default_rng(0)
+    places = (rng.random((40, 1, 3)) + 0.05 * rng.random((40, 3, 3))).reshape(-1, 3)
+    loose = Segment("loose", (1, 2, 3), places, np.arange(120).reshape(-1, 3))
+    assert examine(loose).hopeless == ("is an open surface (120 open edges) that encloses no volume",)
+    doubled = replace(loose, faces=np.concatenate([loose.faces, loose.faces[:, ::-1]]))
+    assert "encloses no volume" in examine(doubled).hopeless
+    with pytest.raises(ValueError, match="'loose' has no surface that could be repaired: export it again"):
+        repaired(loose)
+
+
 def test_a_solid_of_many_faces_is_simplified_and_how_far_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -86,8 +86,11 @@ def examine(segment: Segment, unit: str = "") -> Health:
     undecided = (surface.winding > -0.75) & (surface.winding < -0.25)
     if opened and surface.share_where(undecided) > MOST_UNDECIDED:
         hopeless.append(f"is an open surface ({opened} open edges) that encloses no volume")
-        return Health((*dirty, *edges[1:]), tuple(hopeless), notes=_notes(vertices, faces, surface, unit))
+        loose = opened > 2 * len(faces)  # triangles that do not hang together
+        return Health((*dirty, *edges[1:]), tuple(hopeless), not loose, _notes(vertices, faces, surface, unit))
     dirty += edges
+    if not opened and _encloses_nothing(vertices, faces):
+        hopeless.append("encloses no volume")
     backwards, buried = surface.winding < -0.5, surface.winding > 0.5
     turned = surface.share_where(backwards)
     if turned > MOST_BACKWARDS:
@@ -117,6 +120,14 @@ def _broken_data(vertices: Vertices, faces: Faces) -> tuple[list[str], Bool[np.n
         faults.append(text + (f", and {counted(more, 'face')} more like it" if more else ""))
     usable[usable] = finite[faces[usable]].all(axis=1)
     return faults, usable
+
+
+def _encloses_nothing(vertices: Vertices, faces: Faces) -> bool:
+    """Whether a closed mesh has hardly any volume: far less than the thinnest sheet or wire of its size."""
+    middle = vertices[faces].mean(axis=(0, 1))
+    volume = abs(Segment("", (0, 0, 0), vertices - middle, faces).volume)
+    area = np.linalg.norm(area_vectors(vertices, faces), axis=1).sum()
+    return not volume > 1e-9 * area * float(np.linalg.norm(np.ptp(vertices[np.unique(faces)], axis=0)))
 
 
 def _wrong_edges(vertices: Vertices, faces: Faces, unit: str) -> tuple[int, list[str]]:

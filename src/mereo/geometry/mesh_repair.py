@@ -50,8 +50,11 @@ def repaired(segment: Segment, unit: str = "") -> Repair:
 
     Raises ``ValueError`` where nothing is left to work with.
     """
-    if examine(segment).sound:
+    health, lost = examine(segment), f"segment {segment.name!r} has no surface that could be repaired: export it again"
+    if health.sound:
         return Repair(segment, (), segment)
+    if not health.mendable:
+        raise ValueError(lost)
     changes: list[str] = []
     vertices, faces = kept = segment.vertices, segment.faces
     for step in (_drop_unusable, _merge_near, _drop_fragments, _orient, _fill_holes, _unite, _remesh):
@@ -60,7 +63,7 @@ def repaired(segment: Segment, unit: str = "") -> Repair:
         vertices, faces, change = step(vertices, faces, unit)
         changes += [change] if change else []
         if len(faces) == 0:
-            raise ValueError(f"segment {segment.name!r} has no surface that could be repaired: export it again")
+            raise ValueError(lost)
         if step in (_drop_unusable, _drop_fragments):
             kept = vertices, faces
     whole = replace(segment, vertices=kept[0], faces=kept[1])
@@ -121,14 +124,11 @@ def _orient(vertices: Vertices, faces: Faces, unit: str) -> Step:
         return vertices, faces, ""
     turned, patch = igl.bfs_orient(faces.astype(np.int64))
     turned = turned.astype(np.int64)  # C's long long, which numpy tells apart
-    order = np.argsort(patch, kind="stable")
-    for members in np.split(order, np.flatnonzero(np.diff(patch[order])) + 1):
-        corners = vertices[turned[members]]
-        a, b, c = np.moveaxis(
-            corners - corners.mean(axis=(0, 1)), 1, 0
-        )  # about its middle, so that holes matter little
-        if np.einsum("ij,ij->", a, np.cross(b, c)) < 0:
-            turned[members] = turned[members][:, ::-1]
+    corners, count = vertices[turned], np.bincount(patch)
+    middle = np.stack([np.bincount(patch, corners[:, :, k].mean(axis=1)) for k in range(3)], axis=1) / count[:, None]
+    a, b, c = np.moveaxis(corners - middle[patch, None], 1, 0)  # about its middle, so that holes matter little
+    inwards = (np.bincount(patch, np.einsum("ij,ij->i", a, np.cross(b, c))) < 0)[patch]
+    turned[inwards] = turned[inwards, ::-1]
     same = np.any([(np.roll(turned, k, axis=1) == faces).all(axis=1) for k in range(3)], axis=0)
     changed = int((~same).sum())
     return vertices, turned, f"turned {changed} faces around" if changed else ""
@@ -149,6 +149,9 @@ def _unite(vertices: Vertices, faces: Faces, unit: str) -> Step:
     try:
         solid = solid_of(vertices, faces)
     except ValueError:
+        return vertices, faces, ""
+    area = float(np.linalg.norm(area_vectors(vertices, faces), axis=1).sum()) / 2
+    if solid.surface_area() < 0.99 * area:  # manifold3d leaves out what has no volume
         return vertices, faces, ""
     shells = solid.decompose()
     if not 1 < len(shells) <= 300:  # more are debris, and their union would take minutes
@@ -291,6 +294,8 @@ def _even_surface(body: _Body) -> manifold3d.Manifold:
         change = np.diff(inside, axis=axis)
         for side in (slice(None, -1), slice(1, None)):
             near_change[tuple(side if k == axis else slice(None) for k in range(3))] |= change
+    if not inside.any():
+        return manifold3d.Manifold()
     field = np.ones(inside.shape)
     field[near_change] = np.clip(body.distance(np.argwhere(near_change).astype(float)), 1e-3, 1)
     field[~inside] *= -1
