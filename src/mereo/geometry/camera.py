@@ -6,7 +6,7 @@ pixel (column u, row v) is at (u + 0.5, v + 0.5). ``unproject`` and ``project`` 
 
 from dataclasses import dataclass
 from numbers import Integral
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -38,7 +38,8 @@ class Camera:
     center_y_px: float
 
     def __post_init__(self) -> None:
-        if not all(isinstance(n, Integral) and not isinstance(n, bool) and n > 0 for n in (self.width, self.height)):
+        size: tuple[Any, ...] = self.width, self.height
+        if not all(isinstance(side, Integral) and not isinstance(side, bool) and side > 0 for side in size):
             raise ValueError(
                 f"image size is {self.width} x {self.height}; both must be positive whole numbers: check the intrinsics"
             )

@@ -6,6 +6,7 @@ Options that do not belong to a file's kind are refused, because ignored ones ar
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -203,7 +204,11 @@ def _is_in_view(points: Float[np.ndarray, "n 3"]) -> bool:
 def read_frames(path: Path, reading: InputConfig) -> Iterator[tuple[RecordedFrame, Callable[[], SensorFrame]]]:
     """Messages of a ROS recording's topic in their order, each with what decodes it; raises as ``read_frame``."""
     for message in recorded_frames(path, *_recording_options(reading)):
-        yield message, lambda message=message: in_camera(_recorded(message, path, reading), reading)
+        yield message, partial(_moved, message, path, reading)
+
+
+def _moved(message: RecordedFrame, path: Path, reading: InputConfig) -> SensorFrame:
+    return in_camera(_recorded(message, path, reading), reading)
 
 
 def _check_options(path: Path, kind: str, reading: InputConfig) -> None:
