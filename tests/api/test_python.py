@@ -113,8 +113,8 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "no query": (lambda: queried(np.empty((0, 3))), "0 points are queried; at least one is needed"),
     "a query of NaN": (lambda: queried(np.full((2, 3), np.nan)), "2 of 2 points are NaN or infinite"),
     "a query of pairs": (lambda: queried(np.ones((2, 2))), r"the shape \(2, 2\); they must be n x 3"),
-    "a negative id": (lambda: mereo.load_frame(seen(), mask_value=-1), "values are .-1,.; they must be whole numbers fr"),
-    "a mask's id without one": (lambda: mereo.load_frame(seen(), mask_value=1), "mask_value is given for a frame that is"),
+    "a negative id": (lambda: mereo.load_frame(seen(), mask_value=-1), "values are .-1,.; they must be whole numb"),
+    "a mask's id without one": (lambda: mereo.load_frame(seen(), mask_value=1), "mask_value is given for a frame"),
     "a negative unit": (lambda: replace(mereo.load_frame(seen()), unit_m=-1.0), "unit_m is -1.0; it must be greater"),
 }  # fmt: skip
 

@@ -5,7 +5,6 @@ pixel (column u, row v) is at (u + 0.5, v + 0.5). ``unproject`` and ``project`` 
 """
 
 from dataclasses import dataclass
-from numbers import Integral
 from typing import Any, Literal
 
 import numpy as np
@@ -39,7 +38,7 @@ class Camera:
 
     def __post_init__(self) -> None:
         size: tuple[Any, ...] = self.width, self.height
-        if not all(isinstance(side, Integral) and not isinstance(side, bool) and side > 0 for side in size):
+        if not all(isinstance(side, int | np.integer) and not isinstance(side, bool) and side > 0 for side in size):
             raise ValueError(
                 f"image size is {self.width} x {self.height}; both must be positive whole numbers: check the intrinsics"
             )

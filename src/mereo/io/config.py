@@ -83,7 +83,7 @@ class InputConfig:
             raise ValueError(f"the unit is {self.unit_m} m; it must be positive: give 0.001 for millimetres")
         if not all(isinstance(value, int) and 0 <= value < 2**16 for value in self.mask_value):
             raise ValueError(
-                f"the mask's values are {self.mask_value}; they must be whole numbers from 0 to 65535: give for example "
-                "--mask-value 3"
+                f"the mask's values are {self.mask_value}; they must be whole numbers from 0 to 65535: give for "
+                "example --mask-value 3"
             )
         check_bounds(self, "--")
