@@ -179,6 +179,8 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
         lambda: mereo.export("rope", "x", "onxx"), "^format is 'onxx'; it must be one of onnx, torch: give for"
     ),
     "a unit in words": (lambda: mereo.load_frame(seen(), unit_m="mm"), "^unit_m is 'mm'; it must be greater than 0"),
+    "a negative id": (lambda: mereo.load_frame(seen(), mask_value=-1), "values are .-1,.; they must be whole numb"),
+    "a mask's id without one": (lambda: mereo.load_frame(seen(), mask_value=1), "mask_value is given for a frame"),
     "a negative unit": (lambda: replace(mereo.load_frame(seen()), unit_m=-1.0), "unit_m is -1.0; it must be greater"),
 }  # fmt: skip
 

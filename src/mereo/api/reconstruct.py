@@ -102,8 +102,8 @@ def load_frame(
 def _frame_in_memory(
     source: object, axes: CloudAxes | None, intrinsics: Camera | str | Path | None, reading: InputConfig
 ) -> SensorFrame:
-    for name in ("mask", "topic", "frame_index"):
-        if getattr(reading, name) is not None and not (name == "mask" and intrinsics is not None):
+    for name in ("mask", "mask_value", "topic", "frame_index"):
+        if getattr(reading, name) not in (None, ()) and not (name.startswith("mask") and intrinsics is not None):
             raise ValueError(f"{name} is given for a frame that is no file's: leave it out, or name the file")
     unit_m = reading.unit_m
     if intrinsics is not None:

@@ -53,36 +53,41 @@ class InputConfig:
     Attributes:
         intrinsics: the depth camera, JSON or YAML; recordings have their own.
         depth_scale: pixel value of one metre; by default what the intrinsics say, else 1000 (floats: 1).
-        depth_along: z, or ray where the image holds distances along each pixel's ray (many renderers and simulators).
         mask: image that is not 0 on the object, or opaque there where it has transparent parts.
-        mask_value: values of the object's pixels in a mask that holds ids of several things; by default all but 0.
         frame: axes of a point cloud: camera is x right, y down, z forward; scanner is y up, z toward the scanner.
-        camera_pose: pose of the camera in the frame of a point cloud, such as a robot's base: 4 x 4 numbers (text, NPY,
-            JSON) that take camera coordinates to the cloud's, in its unit. The cloud is moved into the camera's axes,
-            in which all options count and results come out; their summary.json has it as T_input_result.
-        viewpoint: the pose in a PCD file's header: pose is used as a camera pose, ignored means that the points are in
-            the camera's axes already; auto takes what the points fit, and refuses the file where they fit both.
         drop_invalid: leave out NaN, infinite and all-zero points instead of refusing the file.
         unit_m: metres per unit of a point cloud: 0.001 for millimetres (ZDF has it). Without it lengths of options are
             in the cloud's unit, and the fit finds the unit where the object's true size is known.
         topic: of a ROS recording; by default its first depth image topic, else its first cloud topic.
         frame_index: which frame of a ROS recording, from 0, or of an intrinsics file that describes many.
+        depth_along: z, or ray where the image holds distances along each pixel's ray (many renderers and simulators).
+        mask_value: values of the object's pixels in a mask that holds ids of several things; by default all but 0.
+        camera_pose: pose of the camera in the frame of a point cloud, such as a robot's base: 4 x 4 numbers (text, NPY,
+            JSON) that take camera coordinates to the cloud's, in its unit. The cloud is moved into the camera's axes,
+            in which all options count and results come out; their summary.json has it as T_input_result.
+        viewpoint: the pose in a PCD file's header: pose is used as a camera pose, ignored means that the points are in
+            the camera's axes already; auto takes what the points fit, and refuses the file where they fit both.
     """
 
     intrinsics: Path | None = None
     depth_scale: PositiveOrUnknown = None
-    depth_along: DepthAlong = "z"
     mask: Path | None = None
-    mask_value: tuple[int, ...] = ()
     frame: CloudAxes = "camera"
-    camera_pose: Path | None = None
-    viewpoint: Viewpoint = "auto"
     drop_invalid: bool = False
     unit_m: PositiveOrUnknown = None
     topic: str | None = None
     frame_index: IndexOrNone = None
+    depth_along: DepthAlong = "z"
+    mask_value: tuple[int, ...] = ()
+    camera_pose: Path | None = None
+    viewpoint: Viewpoint = "auto"
 
     def __post_init__(self) -> None:
         if isinstance(self.unit_m, int | float) and not 0 < self.unit_m < math.inf:
             raise ValueError(f"the unit is {self.unit_m} m; it must be positive: give 0.001 for millimetres")
+        if not all(isinstance(value, int) and 0 <= value < 2**16 for value in self.mask_value):
+            raise ValueError(
+                f"the mask's values are {self.mask_value}; they must be whole numbers from 0 to 65535: give for "
+                "example --mask-value 3"
+            )
         check_bounds(self, "--")

@@ -217,7 +217,8 @@ def _check_options(path: Path, kind: str, reading: InputConfig) -> None:
     if reading.viewpoint != "auto" and path.suffix.lower() != ".pcd":
         raise ValueError(f"{path} is no PCD file, which alone states a viewpoint: leave out --viewpoint")
     if kind == "point cloud":
-        if (reading.intrinsics, reading.mask, reading.depth_scale, reading.depth_along) != (None, None, None, "z"):
+        image = reading.intrinsics, reading.mask, reading.mask_value, reading.depth_scale, reading.depth_along
+        if image != (None, None, (), None, "z"):
             raise ValueError(
                 f"{path} is read as a point cloud; leave out intrinsics, mask and depth scale or direction"
             )
