@@ -203,4 +203,4 @@ def test_with_json_nothing_of_ray_gets_to_standard_output(tmp_path: Path) -> Non
     command, busy = started(f"{line} --ray local --threads 1 --object {objects}", stdout=subprocess.PIPE)
     os.kill(busy[0], signal.SIGKILL)
     out, errors = command.communicate(timeout=500)
-    assert command.returncode in (0, 3) and len(json.loads(out)["frames"]) == 3, errors
+    assert command.returncode in (0, 3, 4) and len(json.loads(out)["frames"]) == 3, errors
