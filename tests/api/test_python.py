@@ -123,8 +123,8 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "formats": (
         lambda: Result.save(MagicMock(), "x", formats="glb"), "^formats is 'glb'; it must be a list of names: g"
     ),
-    "an object of None": (lambda: mereo.load_object([None]), "^the object's file is None; it must be a path: give"),
-    "an object of a number": (lambda: mereo.load_object(3), "^the object's file is 3; it must be a path: give"),
+    "an object of None": (lambda: mereo.load_object([None]), r"^the object is \[None\]; it must be the path of a"),
+    "an object of a number": (lambda: mereo.load_object(3), "^the object is 3; it must be the path of a file"),
     "weights": (lambda: mereo.load_object(weights=3), "^weights is 3; it must be a path"),
     "a scene": (lambda: mereo.load_object("rope", scene=3), "^scene is 3; it must be a path"),
     "units": (

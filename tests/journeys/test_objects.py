@@ -151,12 +151,10 @@ def test_a_cache_that_cannot_be_used_is_named_and_what_it_holds_is_never_waited_
     assert (tmp_path / "new/models" / kept.name).read_bytes() == kept.read_bytes()
 
 
-def test_words_that_cannot_be_meant_are_refused_before_the_work(
+def test_weights_that_are_missing_are_refused_before_the_work(
     meshes: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("mereo.api.objects.scene_of_meshes", None)
-    with pytest.raises(ValueError, match="the units are 'feet'; they must be one of mm, cm, m, in: correct"):
-        mereo.load_object(meshes, units="feet")
     with pytest.raises(FileNotFoundError, match="there are no weights 'nothing'"):
         mereo.load_object(meshes, weights="nothing")
 
@@ -433,6 +431,7 @@ def test_a_rigid_object_of_unknown_unit_is_found_with_its_size(folder: Path, tmp
     assert np.abs(answer.surfaces.merged()[0] / 3.0 - true.merged()[0]).max() < 1e-3 * np.ptp(points, axis=0).max()
 
 
+@pytest.mark.slow
 def test_what_explains_half_of_the_points_is_not_believed(folder: Path, tmp_path: Path) -> None:
     """The object, and the same cloud 1.35 times as far away behind it: neither unit nor place is certain."""
     rigid = angle_that("rigid", folder, tmp_path / "angle.yaml")

@@ -7,7 +7,7 @@ are any, start the fit at once and tell segments apart that look alike; only the
 """
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -228,8 +228,13 @@ def _scene(source: Source, units: LengthUnit | None, deformations: Way) -> Scene
         _check_meshless(source.name, units, deformations)
         return source
     assert not isinstance(source, Trained)
-    given = source if isinstance(source, Iterable) and not isinstance(source, str) else [source]
-    files = [checked_path(file, "the object's file") for file in given]
+    given: Sequence[object] = [source] if isinstance(source, str | Path) else source
+    if not isinstance(given, Sequence) or not all(isinstance(file, str | Path) and str(file) for file in given):
+        raise ValueError(
+            f"the object is {repr(source)[:80]}; it must be the path of a file or folder, a list of such paths, the "
+            "name of a scene, or a scene: name its meshes"
+        )
+    files = [Path(str(file)) for file in given]
     if len(files) == 1 and files[0].is_dir():
         folder, learned = files[0], scene_of_folder(files[0])
         files = [Path(learned)] if learned is not None else shapes_in(folder)

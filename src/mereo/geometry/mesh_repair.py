@@ -506,10 +506,11 @@ def open_edges(vertices: Vertices, faces: Faces) -> Int[np.ndarray, "_ 2"]:
 def close_holes(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
     """Mesh whose open loops are closed by fans around the mean of their vertices; a closed mesh stays as it is."""
     rim = open_edges(vertices, faces)
-    group = connected(rim.reshape(-1, 2), len(vertices))
-    owner = group[rim[:, 0]]
+    if len(rim) == 0:
+        return vertices, faces
+    owner = connected(rim.reshape(-1, 2), len(vertices))[rim[:, 0]]
     order = np.argsort(owner, kind="stable")
-    loops = np.split(rim[order], np.flatnonzero(np.diff(owner[order])) + 1) if len(rim) else []
+    loops = np.split(rim[order], np.flatnonzero(np.diff(owner[order])) + 1)
     middles = [vertices[loop[:, :1]].mean(axis=0) for loop in loops]
     tips = np.repeat(len(vertices) + np.arange(len(loops)), list(map(len, loops)))
     fans = np.stack([rim[order, 1], rim[order, 0], tips], axis=1)
