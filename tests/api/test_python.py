@@ -110,6 +110,9 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "another image's mask": (lambda: IMAGE.to_points(np.ones((3, 4), bool)), r"has the shape \(3, 4\)"),
     "a mask of numbers": (lambda: IMAGE.to_points(np.ones((32, 32), int)), "type int64; it must be .* mask > 0"),
     "a complex pose": (lambda: mereo.load_frame(seen(), camera_pose=np.eye(4) * 1j), "the pose is not of real numbers"),
+    "a far pose": (
+        lambda: mereo.load_frame(seen(), camera_pose=np.eye(4) + np.eye(4, k=3) * 1e300), "translation of 1e.12 at most"
+    ),
     "a ragged pose": (lambda: mereo.load_frame(seen(), camera_pose=[[1, 2], [3]]), "the pose is of the shape"),
     "a pose of words": (lambda: mereo.load_frame(seen(), camera_pose=[["a"] * 4] * 4), "is not of real numbers"),
     "labels of other points": (

@@ -7,6 +7,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from mereo.geometry.conventions import LARGEST
+
 
 def rigid(rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
     """Homogeneous transform from a rotation and a translation."""
@@ -38,12 +40,12 @@ def checked_pose(pose: ArrayLike) -> Float[np.ndarray, "4 4"]:
         what = "not of real numbers"
         if all(isinstance(entry, Real) for entry in entries.flat):
             T: np.ndarray = entries.astype(np.float64)
-            if is_rigid(T, 1e-3):
+            if is_rigid(T, 1e-3) and np.abs(T).max() <= LARGEST:
                 return T
             what = str(np.round(T, 3).tolist())
     raise ValueError(
-        f"the pose is {what}, and must be 4 x 4 finite numbers: a rotation and a translation, with 0 0 0 1 in the last "
-        "row"
+        f"the pose is {what}, and must be 4 x 4 finite numbers: a rotation and a translation "
+        f"of {LARGEST:g} at most, with 0 0 0 1 in the last row"
     )
 
 
