@@ -127,7 +127,7 @@ def max_bytes() -> int:
 
 
 def check_size(path: str | Path, size: int) -> None:
-    """Raise ``SizeError`` for a file whose content of ``size`` bytes is more than the limit."""
+    """Raise ``SizeError`` for a file whose ``size`` in bytes, stored or by its header in memory, is over the limit."""
     if size > max_bytes():
         raise _too_large(path)
 
@@ -138,12 +138,6 @@ def _too_large(path: str | Path) -> SizeError:
         f"{path} takes more than {limit:g} GB of memory to read: check that it is what it should be, export less, or "
         f"raise the limit with {LIMIT_VARIABLE}={math.ceil(2 * limit)}"
     )
-
-
-def check_memory(path: str | Path, needed: int) -> None:
-    """Raise ``SizeError`` for a file that takes so many bytes to read, by its header, before anything is read."""
-    if needed > max_bytes():
-        raise _too_large(path)
 
 
 @contextmanager

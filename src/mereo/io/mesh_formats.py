@@ -29,7 +29,7 @@ from mereo.geometry.radii import Radii
 from mereo.io.errors import check_count, check_size, check_suffix, readable
 from mereo.io.extras import library
 from mereo.io.progress import stage
-from mereo.io.readers import check_ply
+from mereo.io.readers import check_ply, lies_below
 
 VIEWER_ROOT = "camera_frame"
 """Name of the root node of our own GLB files; below it, vertices are in the input's camera frame."""
@@ -254,13 +254,9 @@ def _material_colors(mesh: Path, library: str) -> dict[str, Color]:
 
 
 def _neighbour(path: Path, name: str) -> Path:
-    """File that a mesh file names; raises ``ValueError`` (its reason only) unless it lies in its folder or below.
-
-    A downloaded mesh should not choose which other files, or devices, are opened.
-    """
-    folder = path.parent.resolve()
-    file = (folder / name).resolve()
-    if not (file.is_relative_to(folder) and file.is_file()):
+    """File that a mesh file names; raises ``ValueError`` (its reason only) unless it lies in its folder or below."""
+    file = path.parent / name
+    if not lies_below(path.parent, file):
         raise ValueError(f"it names {name[:100]!r}, which is no regular file in its folder or below")
     return file
 

@@ -39,6 +39,11 @@ NARROWEST = 16
 """Least number of columns of an image; with fewer an array is a list of points, or of points with something else."""
 
 
+def lies_below(folder: Path, file: Path) -> bool:
+    """Whether it is a regular file in a folder or below: a file should not choose which others or devices are read."""
+    return file.resolve().is_relative_to(folder.resolve()) and file.is_file()
+
+
 class InputWarning(UserWarning):
     """Warning that a file may be meant in two ways, and in which it was taken."""
 

@@ -23,9 +23,9 @@ from mereo.geometry.brief import listed
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
 from mereo.geometry.transforms import transform_points
 from mereo.io.config import Space
-from mereo.io.errors import check_memory, limited_memory, quiet, readable
+from mereo.io.errors import check_size, limited_memory, quiet, readable
 from mereo.io.extras import library
-from mereo.io.readers import in_memory
+from mereo.io.readers import in_memory, lies_below
 
 VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd")
 
@@ -122,7 +122,7 @@ def _nrrd(nrrd: Any, path: Path) -> Volume:
         header = nrrd.read_header(line.decode("utf-8", "replace") for line in file)
     _check_sides(path, header["sizes"], 1)
     data = header.get("data file", header.get("datafile"))
-    if data is not None and not _lies_below(path.parent, path.parent / data):
+    if data is not None and not lies_below(path.parent, path.parent / data):
         raise ValueError(f"its data file {data!r} is not a regular file in its folder or below")
     values, _ = nrrd.read(str(path))
     transform = np.eye(4)
@@ -135,16 +135,11 @@ def _nrrd(nrrd: Any, path: Path) -> Volume:
     return Volume(in_memory(values), _to_ras(str(header.get("space", ""))) @ transform, header=header)
 
 
-def _lies_below(folder: Path, file: Path) -> bool:
-    """Whether it is a regular file in a folder: a file should not choose which others are opened."""
-    return file.resolve().is_relative_to(folder.resolve()) and file.is_file()
-
-
 def _check_sides(path: Path, sizes: Iterable[Any], item_bytes: int) -> None:
     sides = [int(side) for side in sizes]
     if min(sides, default=0) < 1:
         raise ValueError(f"its header states the size {' x '.join(map(str, sides))}")
-    check_memory(path, 2 * item_bytes * math.prod(sides))  # as it is stored, and in the machine's order of bytes
+    check_size(path, 2 * item_bytes * math.prod(sides))  # as it is stored, and in the machine's order of bytes
 
 
 ANATOMICAL = re.compile("(r|l)(?:ight|eft)?-?(a|p)(?:nterior|osterior)?-?(s|i)(?:uperior|nferior)?(?:-?t(?:ime)?)?")
@@ -422,7 +417,7 @@ def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) 
             f"{', '.join(map(str, volume.values))}: correct `names`"
         )
     layers, segments = volume.labels, list(dict.fromkeys(names.values()))
-    check_memory("the label volume", (len(segments) + 3) * layers[0].size)  # a byte for each voxel of a mask
+    check_size("the label volume", (len(segments) + 3) * layers[0].size)  # a byte for each voxel of a mask
     labels = [[value for value in names if names[value] == name] for name in segments]
     masks = [np.logical_or.reduce([(layers == value).any(axis=0) for value in group]) for group in labels]
     parents = _part_masks(masks)
