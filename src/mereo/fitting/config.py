@@ -46,6 +46,7 @@ class FitConfig:
     unexplained: float = 0.3
     samples: int = 3000
     silhouette_vertices: int = 500
+    silhouette_weight: float = 0.2
     exact_steps: int = 3
     normal_length: float = 0.0
     retries: bool = True

@@ -327,3 +327,11 @@ def refit_noisy(
         fits.append((again, other, fit_modes(again)))
     best = min(fits, key=lambda fit: fit[2].misfit.without_network)
     return best if best[0].leaves_noise(best[2].surface) else start
+
+
+def settled(problem: Problem, best: ScoredFit) -> tuple[Problem, ScoredFit]:
+    """Fit once more with as many independent points as what the fit leaves over shows, if the frame is noisy."""
+    for _ in range(2 if problem.noisy else 0):
+        problem = problem.worth(best.surface)
+        best = ScoredFit.of(problem, fit_cloud(problem, best.posed, Prior.whole(problem.model), REFINE_SIGMA, 10, 0.0))
+    return problem, best

@@ -17,14 +17,13 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, ndtri
 
 from mereo.deformation.moving_least_squares import PointWeights, spread
-from mereo.fitting.config import FEW_DRAWS, MANY_DRAWS, DrawsConfig
+from mereo.fitting.config import FEW_DRAWS, MANY_DRAWS, DrawsConfig, FitConfig
 from mereo.fitting.draws.playback import Drawn, DrawnStates, as_sparse, material_moved, shares_of
 from mereo.fitting.modes import refine, robust_poses
 from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, geman_mcclure, in_space
 from mereo.fitting.problem.problem import Problem
 from mereo.fitting.problem.residuals import (
-    SILHOUETTE_WEIGHT,
     NetworkTerm,
     Surface,
     Terms,
@@ -79,7 +78,8 @@ class DrawsProblem:
         if config is None:
             config = DrawsConfig() if states.z.shape[1] <= FEW_DRAWS else MANY_DRAWS
         network_weight = config.network_weight, config.network_weight
-        fit_config = replace(base.config, cloud_weight=config.cloud_weight, network_weight=network_weight)
+        weight = config.cloud_weight * (base.config.cloud_weight / FitConfig.cloud_weight if base.noisy else 1.0)
+        fit_config = replace(base.config, cloud_weight=weight, network_weight=network_weight)
         weights = base.model.weights(correspondences.rest, correspondences.labels)
         return cls(replace(base, config=fit_config), states, correspondences, weights, config)
 
@@ -146,7 +146,7 @@ def misfit(problem: DrawsProblem, fit: DrawsFit, sigma: float) -> float:
     cloud = base.config.cloud_weight * float(robust_square(fit.distance, sigma).mean())
     network = base.config.network_weight[1] * problem.network(fit).energy(fit.posed, base.network_sigma)
     losses = silhouette_losses(fit.surface.material[base.model.silhouette_vertices], base.evidence, sigma)
-    return cloud + network + SILHOUETTE_WEIGHT * float(losses.sum()) + float(fit.z @ fit.z)
+    return cloud + network + base.config.silhouette_weight * float(losses.sum()) + float(fit.z @ fit.z)
 
 
 def by_misfit(state: "DrawsFit | StateOnShape") -> float:
@@ -187,6 +187,7 @@ def terms(problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3
             lambda rows: modes_of(spread[vertices[rows]]),
             base.evidence,
             sigma,
+            config.silhouette_weight,
         ),
     )
 

@@ -148,6 +148,20 @@ class Evidence:
         return np.where(away[:, None], -normals, normals)
 
     @cached_property
+    def nested(self) -> Int[np.ndarray, " m"]:
+        """Points, as many as a power of two, in an order in which each aligned run of a power of two is a patch."""
+        levels = int(np.log2(len(self.points)))
+        rows = np.linspace(0, len(self.points) - 1, 2**levels).astype(int)
+        toward = self.points[rows] / self.ranges[rows, None] @ rotation_along(self.points.mean(axis=0))[:, :2]
+        order = np.arange(len(rows))[None]
+        for _ in range(levels):  # halve every patch across its longer side
+            places = toward[order]
+            longer = np.ptp(places, axis=1).argmax(axis=1)[:, None, None]
+            rank = np.take_along_axis(places, longer, axis=2)[:, :, 0].argsort(axis=1, kind="stable")
+            order = np.take_along_axis(order, rank, axis=1).reshape(2 * len(order), -1)
+        return rows[order[:, 0]]
+
+    @cached_property
     def roughness(self) -> float:
         """Noise that the cloud has at most (``surface_patches.roughness``)."""
         return roughness(self.points)

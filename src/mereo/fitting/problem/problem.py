@@ -5,6 +5,7 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.optimize import isotonic_regression
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.correspondences import Correspondences
@@ -147,6 +148,12 @@ class Problem:
             return None
         return replace(self, config=config, evidence=self.evidence.with_more_samples, noisy=True)
 
+    def worth(self, surface: Surface) -> "Problem":
+        """The problem with as many independent points as what a fit leaves over shows that the cloud is worth."""
+        share = independent_share(surface.offsets(self.evidence.points), self.evidence)
+        weight, outside = SIGMAS**2 * share * len(self.evidence.points), SILHOUETTE_WEIGHT * share
+        return replace(self, config=replace(self.config, cloud_weight=weight, silhouette_weight=outside))
+
     def leaves_camera_noise(self, surface: Surface) -> bool:
         """Whether a fit with a clean frame's constants leaves a camera's noise over, to which it would bend."""
         return not self.noisy and self.residual_noise(surface) >= CAMERA
@@ -244,7 +251,7 @@ class Problem:
         """Sum with the samples of a state's surface that the frame rules out."""
         few = samples.few(self.config.silhouette_vertices)
         points, modes = few.position.astype(np.float64), few.surface.modes[:, 0]
-        return add_silhouette(normal, posed, points, lambda rows: modes[rows], self.evidence, sigma)
+        return add_silhouette(normal, posed, points, lambda rows: modes[rows], self.evidence, sigma, self.config.silhouette_weight)
 
     def cloud_rows(self, posed: Posed) -> Rows:
         """Residuals of the observed samples from the faces, as the last steps of a fit have them."""
@@ -265,7 +272,7 @@ class Problem:
 
     def silhouette_misfit(self, surface: Surface) -> float:
         """Misfit of all vertices that the frame rules out."""
-        return self._silhouette_square(surface) * SILHOUETTE_WEIGHT * SILHOUETTE_VERTICES
+        return self._silhouette_square(surface) * self.config.silhouette_weight * SILHOUETTE_VERTICES
 
     def _silhouette_square(self, surface: Surface) -> float:
         """Mean square of how far a vertex is ruled out, in standard deviations."""
@@ -280,7 +287,7 @@ class Problem:
     def total(self, cloud: float, network: float, silhouette: float, z: Float[np.ndarray, " k"]) -> Misfit:
         """Misfit from the mean squares of one observed sample, one correspondence and one silhouette vertex."""
         network = network * self.config.network_weight[1]
-        silhouette = silhouette * SILHOUETTE_WEIGHT * SILHOUETTE_VERTICES
+        silhouette = silhouette * self.config.silhouette_weight * SILHOUETTE_VERTICES
         prior, pairs = float(z @ z), PAIR_WEIGHT * self.pairs.energy(z)
         total = self.config.cloud_weight * cloud + network + silhouette + prior + pairs
         return Misfit(cloud, total, total - network)
@@ -326,6 +333,28 @@ right, from which as much is asked as from any clean frame's."""
 
 ACCEPTED = 0.75
 """Share of a camera's points that a fit must explain to be believed: nothing reveals the outliers among them."""
+
+
+WIDE = 32
+"""Number of patches of a cloud from which on down the noise that they share counts as that of the object's parts."""
+
+
+def independent_share(offset: Float[np.ndarray, " n"], evidence: Evidence) -> float:
+    """Share of the observed points that the cloud is worth in independent ones, by what a fit leaves over.
+
+    Differences between neighbouring patches of the picture, from single points to halves of the cloud, all have the
+    variance of a point where noise is white; what neighbours share adds to that of larger patches. A fit bends to what
+    large patches share, so that theirs is no less than that of smaller ones, to which it cannot.
+    """
+    most = ROBUST * TO_STD * float(np.median(np.abs(offset)))
+    means, variance = np.clip(offset, -most, most)[evidence.nested], list[float]()
+    while len(means) > 1:
+        first, second = means[::2], means[1::2]
+        variance.append(float(np.median(np.abs(first - second))) ** 2)
+        means = (first + second) / np.sqrt(2)
+    patches = 0.5 ** np.arange(len(variance)) * len(evidence.nested) / 2
+    rising = isotonic_regression(variance, weights=patches).x
+    return float(rising[0] / np.average(rising, weights=patches * (patches <= WIDE)))
 
 
 def unshared(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:

@@ -281,6 +281,7 @@ def add_silhouette(
     modes_at: Callable[[Int[np.ndarray, " r"]], Float32[np.ndarray, "r 3 k"]],
     evidence: Evidence,
     sigma: float,
+    each: float,
 ) -> NormalEquations:
     """Sum with those points of the surface that are outside the silhouette or in free space.
 
@@ -292,7 +293,7 @@ def add_silhouette(
         return normal
     rows = rows[:: max(1, -(-len(rows) // MOST_VIOLATIONS))]
     jacobian = along(posed, points[rows], modes_at(rows), direction[rows])
-    weight = SILHOUETTE_WEIGHT / sigma**2 * geman_mcclure(amount[rows], 4 * ROBUST * sigma)
+    weight = each / sigma**2 * geman_mcclure(amount[rows], 4 * ROBUST * sigma)
     return normal.add(jacobian, -amount[rows], weight)
 
 

@@ -24,6 +24,7 @@ from mereo.fitting.modes import (
     is_at_rest,
     of_rest,
     refit_noisy,
+    settled,
 )
 from mereo.fitting.modes import narrowing as modes_narrowing
 from mereo.fitting.problem.correspondences import Correspondences, NoFit, agree, estimate_unit, find_correspondences
@@ -131,6 +132,7 @@ class ModesFit:
             fit = problem, correspondences, fit_modes(problem)
             scaled = None if predict is None else lambda seen: predict(seen * unit).scaled(1 / unit)
             problem, correspondences, modes = refit_noisy(fit, cloud.points / unit, scaled)
+            problem, modes = settled(problem, modes)
             rest = fit_rest(problem, correspondences, modes.posed)
             at_rest = is_at_rest(problem, modes, rest)
         return cls(
