@@ -203,8 +203,8 @@ def test_one_piece_that_lies_apart_stays_and_is_left_open() -> None:
 def test_what_lies_before_a_gap_in_range_is_a_reading_too() -> None:
     """A mask that is far too wide lets in more than a rim: what is behind is then as much of a surface."""
     points, genuine = wall_behind_plate(rim=20, fragments=1)
-    first, nearer = readings(points)
-    assert first.dropped == 0
+    *others, nearer = readings(points)
+    assert max(other.dropped for other in others) < (~genuine).sum()
     np.testing.assert_array_equal(nearer.cloud.points, points[genuine])
 
 
