@@ -370,11 +370,11 @@ class Reading:
 def readings(
     cloud: PointCloud | Float[np.ndarray, "n 3"], axes: CloudAxes = "camera", keep_all: bool = False
 ) -> tuple[Reading, ...]:
-    """Readings of a cloud, one or two, the more likely first: take that one where nothing else is known.
+    """Readings of a cloud, one to three, the more likely first: take that one where nothing else is known.
 
     One, with every point, where the points off all surfaces do not stretch the cloud's box by more than ``STRETCH``, or
     are more than ``MOST``. Else two: without them, which comes first where they are in ``SCATTERED`` patches or more,
-    and with every point.
+    and with every point. The last is what lies before a gap in range (``nearer_layer``), where there is one.
 
     Args:
         cloud: points on the object and strays, any unit and density.
@@ -390,7 +390,26 @@ def readings(
     points = transform_points(into_camera(seen.points, axes), seen.points)
     patch, keep = surface_patches(points)
     surfaces = Reading(seen, keep)
+    layer = nearer_layer(points, patch)
+    is_layered = min((keep & layer).sum(), (keep & ~layer).sum()) >= MIN_POINTS
+    nearer = (Reading(seen, keep & layer),) if is_layered else ()
     if keep.sum() < max(MIN_POINTS, (1 - MOST) * len(points)) or surfaces.stretch <= STRETCH:
-        return (everything,)
+        return (everything, *nearer)
     scattered = len(np.unique(patch[~keep])) >= SCATTERED
-    return (surfaces, everything) if scattered else (everything, surfaces)
+    return (surfaces, everything, *nearer) if scattered else (everything, surfaces, *nearer)
+
+
+def nearer_layer(points: Float[np.ndarray, "n 3"], patch: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    """Mark the points before the largest gap in range between patches of surface; all where there is no gap.
+
+    A mask that is too wide lets in what is behind the object, which may be as many points as the object's own where it
+    is thin.
+    """
+    distance = np.linalg.norm(points, axis=1)
+    parts = [distance[patch == one] for one in np.flatnonzero(np.bincount(patch) >= MIN_POINTS)]
+    ends = np.array([np.quantile(part, (0.05, 0.95)) for part in sorted(parts, key=np.median)]).reshape(-1, 2)
+    near = np.maximum.accumulate(ends[:-1, 1])
+    gaps = ends[1:, 0] - near
+    if max(gaps, default=0.0) <= 0:
+        return np.ones(len(points), dtype=bool)
+    return distance <= (near + gaps / 2)[gaps.argmax()]

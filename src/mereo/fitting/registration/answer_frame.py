@@ -247,7 +247,7 @@ def fit_hypotheses(
     is_certain = scene_unit is not None
     if scene_unit is None and registrar is not None:
         scene_unit = registrar.stated_scene_unit(seen.frame.metres)
-    hypotheses = readings(seen.cloud, axes, keep_all)
+    hypotheses = readings(seen.cloud, axes, keep_all)[:2]
     likelier = encode_frame(hypotheses[0], model, axes)
     if registrar is None:
         return Candidate(likelier), likelier
