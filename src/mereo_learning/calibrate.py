@@ -203,8 +203,8 @@ def _most_likely(logits: Float[np.ndarray, "n c"], truth: UInt8[np.ndarray, " n"
 # --- radii ------------------------------------------------------------------------------------------------------------
 
 FIELDS = (
-    ("radius_scale", "usual_misfit", "noisy_radius_scale"),
-    ("draws_radius_scale", "draws_usual_misfit", "noisy_draws_radius_scale"),
+    ("radius_scale", "usual_misfit"),
+    ("draws_radius_scale", "draws_usual_misfit"),
 )
 """Fields of ``Calibration`` that are of fits of the modes, and of a scene's parameters."""
 
@@ -243,40 +243,30 @@ class ViewRadii:
 
     Attributes:
         full: registrar that fits the scene's parameters to what the modes were fitted to; None where there is no scene.
-        clean, noisy: measurements of fits of the modes, and of the scene's parameters.
+        clean: measurements of fits of the modes, and of the scene's parameters, to clean frames.
     """
 
     def __init__(self, full: Registrar | None = None) -> None:
         self.full = None if full is None or full.states_or_none is None else full
         self.clean: tuple[list[MeasuredRadii], list[MeasuredRadii]] = [], []
-        self.noisy: tuple[list[MeasuredRadii], list[MeasuredRadii]] = [], []
-        self._noisy_views = 0
 
     def add(self, view: CalibrationView, answer: Answer) -> None:
         """Take in a view of the object, answered by its modes."""
         candidate, registration = answer.candidate, answer.registration
-        self._noisy_views += not view.is_clean
-        if candidate is None or candidate.modes is None or registration is None:
-            return
-        if not view.is_clean and self._noisy_views > 16:  # which are enough: their fits take longest
+        if candidate is None or candidate.modes is None or registration is None or not view.is_clean:
             return
         full = None if self.full is None else self.full.finish(candidate.modes)
         for kind, fit in enumerate((registration, full)):
-            if fit is not None and fit.accepted and (kind == 0 or fit.method == "draws"):
-                (self.noisy if is_noisy(fit) else self.clean)[kind].append(MeasuredRadii.of(view, candidate, fit))
+            if fit is not None and fit.accepted and not is_noisy(fit) and (kind == 0 or fit.method == "draws"):
+                self.clean[kind].append(MeasuredRadii.of(view, candidate, fit))
 
     def fields(self) -> dict[str, Any]:
         """Fields of the ``Calibration``: factors of both kinds of fits; none where their views are too few."""
         fields: dict[str, Any] = {}
-        for (scale, misfit, noisy_scale), clean, noisy in zip(FIELDS, self.clean, self.noisy, strict=True):
+        for (scale, misfit), clean in zip(FIELDS, self.clean, strict=True):
             if len(clean) >= LEAST:
                 factors = factors_of(clean)
                 fields |= {scale: factors.scale, misfit: factors.misfit}
-            # of which half of the points are farther off, a fit has ended in a wrong state. One such view in twenty
-            # would be all that the scale is made of, and of a camera's views there are more; recognition tells them
-            right = [view.errors for view in noisy if np.median(view.errors.ratios) <= 5.0]
-            if len(right) >= LEAST:
-                fields[noisy_scale] = RegistrationErrors.together(right).scale()
         return fields
 
 

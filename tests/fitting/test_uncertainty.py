@@ -24,9 +24,8 @@ from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.tracking import Tracker
 from mereo.fitting.uncertainty import (
-    CLEAN_FACTOR,
     LEAST_RADIUS,
-    NOISY_FACTOR,
+    UNCALIBRATED,
     ModesOptimum,
     Posterior,
     Uncertainty,
@@ -129,7 +128,7 @@ def test_a_calibration_scales_radii_and_intervals(found: Registration, sure: Unc
     """The least radius, which every position has in addition, is no part of what is scaled."""
     assert sure.extra_radius == LEAST_RADIUS and (sure.material > LEAST_RADIUS).all()
     sure, found = replace(sure, extra_radius=0.0), replace(found, extra_radius=0.0)
-    wide = replace(found, radius_scale=3.0 * CLEAN_FACTOR).uncertainty
+    wide = replace(found, radius_scale=3.0 * UNCALIBRATED).uncertainty
     assert wide is not None and wide.calibrated and not sure.calibrated
     np.testing.assert_allclose(wide.material, 3.0 * sure.material)
     for one, other in zip(wide.segments, sure.segments, strict=True):
@@ -137,21 +136,6 @@ def test_a_calibration_scales_radii_and_intervals(found: Registration, sure: Unc
         assert np.ptp(one.volume95) == pytest.approx(3.0 * np.ptp(other.volume95), rel=1e-6)
     assert wide.summary()["calibrated"]
     assert wide.summary()["median"] == pytest.approx(3 * sure.summary()["median"])
-
-
-def test_radii_of_noisy_frames_are_wider_where_nothing_is_calibrated_and_by_what_is_more_than_noise(
-    sure: Uncertainty,
-) -> None:
-    optimum = sure.optimum
-    assert isinstance(optimum, ModesOptimum)
-    problem = replace(optimum.problem, noisy=True)
-    noisy = replace(sure, optimum=replace(optimum, problem=problem))
-    assert noisy.factor == NOISY_FACTOR > CLEAN_FACTOR == sure.factor and replace(noisy, scale=0.7).factor == 0.7
-    # of constants for much less noise than is left
-    narrow = replace(problem, config=replace(problem.config, cloud_sigma=0.002))
-    misfit = narrow.cloud_misfit(optimum.surface)
-    wide = replace(noisy, optimum=replace(optimum, problem=narrow))
-    assert misfit > 1.0 and wide.factor == pytest.approx(NOISY_FACTOR * misfit * 1.5**2)
 
 
 def test_radii_reach_other_states_that_explain_the_frame_alike_and_no_farther(sure: Uncertainty) -> None:

@@ -149,9 +149,8 @@ def test_a_scale_is_measured_on_all_clean_views() -> None:
     elsewhere = measured(30.0 + rng.random(200))
     views = calibration.ViewRadii()
     views.clean[0].extend(right[: calibration.LEAST - 1])
-    views.noisy[1].extend([*right[: calibration.LEAST], elsewhere])
+    assert views.fields() == {}
     alone = RegistrationErrors.together([one.errors for one in right[: calibration.LEAST]]).scale()
-    assert views.fields() == {"noisy_draws_radius_scale": pytest.approx(alone)}
     views.clean[0].extend([*right[calibration.LEAST - 1 :], elsewhere])
     fields = views.fields()
     assert fields["radius_scale"] > 2.2 > 1.96 > alone - 0.3  # 99 % and more of the right ones

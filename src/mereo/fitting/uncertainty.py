@@ -24,7 +24,7 @@ from mereo.deformation.moving_least_squares import PointWeights
 from mereo.fitting.draws.fit import DrawsFit, DrawsProblem
 from mereo.fitting.draws.fit import terms as terms_of_draws
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, rigid_motion
-from mereo.fitting.problem.problem import SIGMAS, Problem
+from mereo.fitting.problem.problem import Problem
 from mereo.fitting.problem.residuals import Prior, Surface, Terms
 from mereo.fitting.problem.segments import left_open
 from mereo.geometry.brief import counted
@@ -43,9 +43,9 @@ LEVEL = 0.95
 WITHIN = float(norm.ppf(0.5 + LEVEL / 2))
 """Standard deviations of one Gaussian number on either side that hold it with this probability: 1.96."""
 
-CLEAN_FACTOR, NOISY_FACTOR = 1.25, 1.5
-"""Factors of the posterior's radii of an object that was not calibrated, in clean frames and in noisy ones: by training
-views, of ten shipped objects without their calibrations and of soft ones (docs/experiments/071.md and 077.md)."""
+UNCALIBRATED = 1.25
+"""Factor of the posterior's radii of an object that was not calibrated, by training views of ten shipped objects
+without their calibrations and of soft ones (docs/experiments/071.md and 077.md)."""
 
 LEAST_RADIUS = 0.1
 """Radius in scene units that every position has in addition: the paper camera's noise, for facets and a fit's end."""
@@ -429,12 +429,10 @@ class Uncertainty:
         """Posterior of pose, scale and state, in scene units."""
         return self.optimum.posterior
 
-    @cached_property
+    @property
     def factor(self) -> float:
-        """Factor of the posterior's radii; in a noisy frame also by how much more than noise the fit leaves over."""
-        frame = self.optimum.frame
-        usual = self.scale or (NOISY_FACTOR if frame.noisy else CLEAN_FACTOR)
-        return usual * max(frame.cloud_misfit(self.optimum.surface) * SIGMAS**2, 1.0) if frame.noisy else usual
+        """Factor of the posterior's radii."""
+        return self.scale or UNCALIBRATED
 
     def _of(self, parts: RadiusParts) -> Float[np.ndarray, " n"]:
         return self.optimum.unit * parts.radii(self.factor, self.extra_radius)

@@ -82,9 +82,8 @@ class Calibration(BaseModel, frozen=True):
         views: how many of them.
         radius_scale: factor between the radius that a fit's posterior gives for 95 % and the one that held 95 % of the
             true positions, in frames without noise beyond the paper's.
-        noisy_radius_scale: the same of simulated depth cameras' frames.
-        draws_radius_scale, noisy_draws_radius_scale: both, of fits of a scene's own draws instead of the modes.
-        usual_misfit, draws_usual_misfit: ``RadiusFactors.misfit`` of the first and the third of these scales.
+        draws_radius_scale: the same of fits of a scene's own draws instead of the modes.
+        usual_misfit, draws_usual_misfit: ``RadiusFactors.misfit`` of these scales.
         temperature: by which logits are divided before they become probabilities (temperature scaling; Guo et al.,
             ICML 2017).
         biases: added to the divided logits of empty space and each segment (with the temperature: vector scaling, but
@@ -96,9 +95,7 @@ class Calibration(BaseModel, frozen=True):
     seed: Annotated[int, Field(ge=0)]
     views: Annotated[int, Field(ge=1)]
     radius_scale: Positive | None = None
-    noisy_radius_scale: Positive | None = None
     draws_radius_scale: Positive | None = None
-    noisy_draws_radius_scale: Positive | None = None
     usual_misfit: Positive | None = None
     draws_usual_misfit: Positive | None = None
     temperature: Positive | None = None
@@ -107,12 +104,9 @@ class Calibration(BaseModel, frozen=True):
     recognizing: Recognizing | None = None
 
     def radii(self, *, draws: bool, noisy: bool) -> RadiusFactors:
-        """What makes the radii of a fit of draws, or of the modes, to a camera's noisy frame, or to a clean one."""
-        if noisy:
-            return RadiusFactors(self.noisy_draws_radius_scale if draws else self.noisy_radius_scale)
-        if draws:
-            return RadiusFactors(self.draws_radius_scale, self.draws_usual_misfit)
-        return RadiusFactors(self.radius_scale, self.usual_misfit)
+        """What makes the radii of a fit of draws, or of the modes, to a frame; noise is in the posterior already."""
+        scale = self.draws_radius_scale if draws else self.radius_scale
+        return RadiusFactors(scale, None if noisy else self.draws_usual_misfit if draws else self.usual_misfit)
 
     @property
     def scaling(self) -> Scaling:
@@ -130,11 +124,10 @@ def calibration_rows(calibration: Calibration | None) -> list[tuple[str, str]]:
         ece = calibration.ece
         error = "" if ece is None else f"; calibration error {ece[0]:.3f}, with it {ece[1]:.3f}"
         rows.append(("probabilities", f"{kind} ({calibration.temperature:.2f}){error}"))
-    for what, noisy in (("radii", False), ("radii of noisy frames", True)):
-        modes, draws = (calibration.radii(draws=each, noisy=noisy).scale for each in (False, True))
-        if modes is not None:
-            of_draws = "" if draws is None else f", {draws:.2f} of fits of the scene's draws"
-            rows.append((what, f"the posterior's times {modes:.2f} of fits of the modes{of_draws}"))
+    if calibration.radius_scale is not None:
+        draws = calibration.draws_radius_scale
+        of_draws = "" if draws is None else f", {draws:.2f} of fits of the scene's draws"
+        rows.append(("radii", f"the posterior's times {calibration.radius_scale:.2f} of fits of the modes{of_draws}"))
     if calibration.recognizing is not None:
         rows.append(("recognition", "features are compared with those of the object's own views"))
     return rows

@@ -78,7 +78,7 @@ class DrawsProblem:
         if config is None:
             config = DrawsConfig() if states.z.shape[1] <= FEW_DRAWS else MANY_DRAWS
         network_weight = config.network_weight, config.network_weight
-        weight = config.cloud_weight * (base.config.cloud_weight / FitConfig.cloud_weight if base.noisy else 1.0)
+        weight = config.cloud_weight * base.config.cloud_weight / FitConfig.cloud_weight
         fit_config = replace(base.config, cloud_weight=weight, network_weight=network_weight)
         weights = base.model.weights(correspondences.rest, correspondences.labels)
         return cls(replace(base, config=fit_config), states, correspondences, weights, config)

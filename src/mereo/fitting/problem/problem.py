@@ -251,7 +251,9 @@ class Problem:
         """Sum with the samples of a state's surface that the frame rules out."""
         few = samples.few(self.config.silhouette_vertices)
         points, modes = few.position.astype(np.float64), few.surface.modes[:, 0]
-        return add_silhouette(normal, posed, points, lambda rows: modes[rows], self.evidence, sigma, self.config.silhouette_weight)
+        return add_silhouette(
+            normal, posed, points, lambda rows: modes[rows], self.evidence, sigma, self.config.silhouette_weight
+        )
 
     def cloud_rows(self, posed: Posed) -> Rows:
         """Residuals of the observed samples from the faces, as the last steps of a fit have them."""
