@@ -329,13 +329,11 @@ def refit_noisy(
     return best if best[0].leaves_noise(best[2].surface) else start
 
 
-SETTLINGS = 2
-"""Times that a noisy frame is fitted anew with as many independent points as the fit before has shown."""
-
-
 def settled(problem: Problem, best: ScoredFit) -> tuple[Problem, ScoredFit]:
-    """Fit once more with as many independent points as what the fit leaves over shows, if the frame is noisy."""
-    for _ in range(SETTLINGS * int(problem.noisy)):
+    """Fit a noisy frame anew with as many independent points as the fit shows that its cloud is worth; twice."""
+    if not problem.noisy:
+        return problem, best
+    for _ in range(2):
         problem = problem.worth(best.surface)
         best = ScoredFit.of(problem, fit_cloud(problem, best.posed, Prior.whole(problem.model), REFINE_SIGMA, 10, 0.0))
     return problem, best

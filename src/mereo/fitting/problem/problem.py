@@ -150,7 +150,7 @@ class Problem:
 
     def worth(self, surface: Surface) -> "Problem":
         """The problem with as many independent points as what a fit leaves over shows that the cloud is worth."""
-        share = independent_share(surface.offsets(self.evidence.points), self.evidence)
+        share = independent_share(surface.offsets(self.evidence.points), self.evidence, POSE + self.model.count)
         weight, outside = SIGMAS**2 * share * len(self.evidence.points), SILHOUETTE_WEIGHT * share
         return replace(self, config=replace(self.config, cloud_weight=weight, silhouette_weight=outside))
 
@@ -337,16 +337,13 @@ ACCEPTED = 0.75
 """Share of a camera's points that a fit must explain to be believed: nothing reveals the outliers among them."""
 
 
-WIDE = 32
-"""Number of patches of a cloud from which on down the noise that they share counts as that of the object's parts."""
-
-
-def independent_share(offset: Float[np.ndarray, " n"], evidence: Evidence) -> float:
+def independent_share(offset: Float[np.ndarray, " n"], evidence: Evidence, freedom: int) -> float:
     """Share of the observed points that the cloud is worth in independent ones, by what a fit leaves over.
 
     Differences between neighbouring patches of the picture, from single points to halves of the cloud, all have the
-    variance of a point where noise is white; what neighbours share adds to that of larger patches. A fit bends to what
-    large patches share, so that theirs is no less than that of smaller ones, to which it cannot.
+    variance of a point where noise is white; what neighbours share adds to that of larger patches. A fit with so much
+    ``freedom``, its number of parameters, bends to what as many patches share: theirs is no less than that of smaller
+    ones, to which it cannot.
     """
     most = ROBUST * TO_STD * float(np.median(np.abs(offset)))
     means, variance = np.clip(offset, -most, most)[evidence.nested], list[float]()
@@ -356,7 +353,7 @@ def independent_share(offset: Float[np.ndarray, " n"], evidence: Evidence) -> fl
         means = (first + second) / np.sqrt(2)
     patches = 0.5 ** np.arange(len(variance)) * len(evidence.nested) / 2
     rising = isotonic_regression(variance, weights=patches).x
-    return float(rising[0] / np.average(rising, weights=patches * (patches <= WIDE)))
+    return float(rising[0] / np.average(rising, weights=patches * (patches <= freedom)))
 
 
 def unshared(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:

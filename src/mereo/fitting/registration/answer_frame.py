@@ -381,8 +381,8 @@ def _most_explained(everything: Candidate, surfaces: Candidate, again: Candidate
 
 
 def better(first: Candidate, second: Candidate) -> Candidate:
-    """Choose the fit that alone is accepted, or else explains the greater share of all points; the first where equal."""
-    if first.modes is None or second.modes is None or second.is_accepted > first.is_accepted:
+    """Choose the fit that explains the greater share of all points; the first where both do."""
+    if first.modes is None or second.modes is None:
         return first if second.modes is None else second
     tolerance = min(first.modes.tolerance, second.modes.tolerance)
     return first if first.explained(tolerance) >= second.explained(tolerance) else second
