@@ -150,9 +150,11 @@ class Problem:
 
     def worth(self, surface: Surface) -> "Problem":
         """The problem with as many independent points as what a fit leaves over shows that the cloud is worth."""
-        share = independent_share(surface.offsets(self.evidence.points), self.evidence, POSE + self.model.count)
-        weight, outside = SIGMAS**2 * share * len(self.evidence.points), SILHOUETTE_WEIGHT * share
-        return replace(self, config=replace(self.config, cloud_weight=weight, silhouette_weight=outside))
+        config, offset = self.config, surface.offsets(self.evidence.points)
+        alone = (config.cloud_sigma / SIGMAS) ** 2  # variance of a point of which neighbours share nothing
+        share = min(alone / max(shared_variance(offset, self.evidence, POSE + self.model.count), CLEAN**2), 1.0)
+        weight, outside = SIGMAS**2 * share * len(offset), SILHOUETTE_WEIGHT * share
+        return replace(self, config=replace(config, cloud_weight=weight, silhouette_weight=outside))
 
     def leaves_camera_noise(self, surface: Surface) -> bool:
         """Whether a fit with a clean frame's constants leaves a camera's noise over, to which it would bend."""
@@ -337,8 +339,8 @@ ACCEPTED = 0.75
 """Share of a camera's points that a fit must explain to be believed: nothing reveals the outliers among them."""
 
 
-def independent_share(offset: Float[np.ndarray, " n"], evidence: Evidence, freedom: int) -> float:
-    """Share of the observed points that the cloud is worth in independent ones, by what a fit leaves over.
+def shared_variance(offset: Float[np.ndarray, " n"], evidence: Evidence, freedom: int) -> float:
+    """Variance of a point, of so many independent ones as there are, that leaves a fit as unsure as what it leaves over.
 
     Differences between neighbouring patches of the picture, from single points to halves of the cloud, all have the
     variance of a point where noise is white; what neighbours share adds to that of larger patches. A fit with so much
@@ -349,11 +351,11 @@ def independent_share(offset: Float[np.ndarray, " n"], evidence: Evidence, freed
     means, variance = np.clip(offset, -most, most)[evidence.nested], list[float]()
     while len(means) > 1:
         first, second = means[::2], means[1::2]
-        variance.append(float(np.median(np.abs(first - second))) ** 2)
+        variance.append((TO_STD * float(np.median(np.abs(first - second)))) ** 2 / 2)
         means = (first + second) / np.sqrt(2)
     patches = 0.5 ** np.arange(len(variance)) * len(evidence.nested) / 2
     rising = isotonic_regression(variance, weights=patches).x
-    return float(rising[0] / np.average(rising, weights=patches * (patches <= freedom)))
+    return float(np.average(rising, weights=patches * (patches <= freedom)))
 
 
 def unshared(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
