@@ -7,6 +7,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from answers import answer_to
+from scipy.spatial import cKDTree
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem import correspondences
@@ -21,6 +22,7 @@ from mereo.fitting.problem.problem import (
     is_noise,
     noise_of,
     shared,
+    shared_variance,
 )
 from mereo.fitting.problem.residuals import Surface
 from mereo.fitting.registration.answer import Answer, Candidate
@@ -265,6 +267,43 @@ def test_noise_that_neighbours_share_is_spread_evenly_and_a_wrong_state_is_not()
     windows = 0.1 * np.repeat(rng.normal(size=300), 9)
     assert is_noise(windows, around, is_shared=True) and not is_noise(10 * windows, around, is_shared=True)
     assert not is_noise(np.where(rng.random(2700) < 0.1, 0.6, windows), around, is_shared=True)
+
+
+def plate(pixels: int = 64) -> np.ndarray:
+    """Points of a plate, a pixel each, row by row."""
+    line = 0.3 * (np.arange(pixels) - pixels / 2)
+    u, v = np.meshgrid(line, line)
+    return np.stack([u.ravel(), v.ravel(), np.full(pixels**2, 100.0)], axis=1)
+
+
+def test_what_neighbours_share_leaves_a_fit_as_unsure_as_fewer_points() -> None:
+    """Of windows of 4 x 4 pixels, each off by as much as its pixels are by themselves, and twice that for what is bent."""
+    rng, evidence = np.random.default_rng(0), Evidence.of(plate())
+    pixel = cKDTree(plate()).query(evidence.points)[1]
+    for window, expected in ((1, 2.0), (4, 2 * (16.0 + 1.0))):
+        off = [np.kron(rng.normal(size=(64 // window,) * 2), np.ones((window, window))) for _ in range(8)]
+        off = [each + rng.normal(size=each.shape) for each in off]
+        found = [shared_variance(each.ravel()[pixel], evidence, 40) for each in off]
+        assert np.median(found) == pytest.approx(expected, rel=0.5)
+        flying = [np.where(rng.random(len(pixel)) < 0.05, 50.0, each.ravel()[pixel]) for each in off]
+        assert np.median([shared_variance(each, evidence, 40) for each in flying]) < 2 * np.median(found)
+
+
+def test_a_noisy_cloud_is_worth_no_more_than_its_points_and_less_where_they_share_their_errors(
+    registrar: Registrar, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    modes = fitted(registrar, points).modes
+    problem = replace(modes.problem, config=constants_for(0.4, FitConfig()), noisy=True)
+    rng, count = np.random.default_rng(0), len(problem.evidence.points)
+    own, common = rng.normal(scale=0.4, size=count), np.full(count, 0.4) * np.sign(problem.evidence.points[:, 0])
+    weights = list[float]()
+    for offset in (own, own + common):
+        monkeypatch.setattr(Surface, "offsets", lambda _, __, offset=offset: offset)
+        config = problem.worth(modes.surface).config
+        share = config.silhouette_weight / FitConfig.silhouette_weight
+        assert share == pytest.approx(config.cloud_weight / (2.25 * count))
+        weights.append(config.cloud_weight)
+    assert 0.3 * count < weights[0] <= 2.25 * count * (1 + 1e-9) and weights[1] < 0.3 * weights[0]
 
 
 def test_a_noisy_cloud_is_explained_where_only_noise_is_left(registrar: Registrar, points: np.ndarray) -> None:

@@ -152,7 +152,7 @@ class Problem:
         """The problem with as many independent points as what a fit leaves over shows that the cloud is worth."""
         config, offset = self.config, surface.offsets(self.evidence.points)
         alone = (config.cloud_sigma / SIGMAS) ** 2  # variance of a point of which neighbours share nothing
-        share = min(alone / max(shared_variance(offset, self.evidence, POSE + self.model.count), CLEAN**2), 1.0)
+        share = min(alone / shared_variance(offset, self.evidence, POSE + self.model.count), 1.0)
         weight, outside = SIGMAS**2 * share * len(offset), SILHOUETTE_WEIGHT * share
         return replace(self, config=replace(config, cloud_weight=weight, silhouette_weight=outside))
 
@@ -340,12 +340,12 @@ ACCEPTED = 0.75
 
 
 def shared_variance(offset: Float[np.ndarray, " n"], evidence: Evidence, freedom: int) -> float:
-    """Variance of a point, of so many independent ones as there are, that leaves a fit as unsure as what it leaves over.
+    """Variance of a point, were all independent, that leaves a fit as unsure as what it leaves over.
 
     Differences between neighbouring patches of the picture, from single points to halves of the cloud, all have the
     variance of a point where noise is white; what neighbours share adds to that of larger patches. A fit with so much
     ``freedom``, its number of parameters, bends to what as many patches share: theirs is no less than that of smaller
-    ones, to which it cannot.
+    ones, to which it cannot, and as many times what it leaves of it as the whole noise is that of points alone.
     """
     most = ROBUST * TO_STD * float(np.median(np.abs(offset)))
     means, variance = np.clip(offset, -most, most)[evidence.nested], list[float]()
@@ -354,8 +354,9 @@ def shared_variance(offset: Float[np.ndarray, " n"], evidence: Evidence, freedom
         variance.append((TO_STD * float(np.median(np.abs(first - second)))) ** 2 / 2)
         means = (first + second) / np.sqrt(2)
     patches = 0.5 ** np.arange(len(variance)) * len(evidence.nested) / 2
-    rising = isotonic_regression(variance, weights=patches).x
-    return float(np.average(rising, weights=patches * (patches <= freedom)))
+    rising = np.maximum(isotonic_regression(variance, weights=patches).x, CLEAN**2)
+    whole, left = np.average(rising, weights=patches), np.average(rising, weights=patches * (patches <= freedom))
+    return float(left * whole / rising[0])
 
 
 def unshared(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
