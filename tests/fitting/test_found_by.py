@@ -277,7 +277,7 @@ def plate(pixels: int = 64) -> np.ndarray:
 
 
 def test_what_neighbours_share_leaves_a_fit_as_unsure_as_fewer_points() -> None:
-    """Of windows of 4 x 4 pixels, each off by as much as its pixels are by themselves, and twice that for what is bent."""
+    """Of windows of 4 x 4 pixels, off by as much as each pixel is besides, and twice that for what a fit has bent."""
     rng, evidence = np.random.default_rng(0), Evidence.of(plate())
     pixel = cKDTree(plate()).query(evidence.points)[1]
     for window, expected in ((1, 2.0), (4, 2 * (16.0 + 1.0))):
