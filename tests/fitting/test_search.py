@@ -197,3 +197,26 @@ def test_others_explain_a_frame_alike_where_their_misfit_is_hardly_greater(
     assert said(0.9 * ALIKE) == 1  # where it is bent, it does not look the same
     others[0] = replace(others[0], surface=first.surface)
     assert said(0.9 * ALIKE) == 0
+
+
+@pytest.mark.slow
+def test_a_bank_keeps_every_candidate_and_a_chooser_by_todays_rules_names_the_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``benchmarks/bank.py``, on which numbers and rules of the fit are judged: a rigid mug, and another thing."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    bank, choosers = import_module("bank"), import_module("bank_choosers")
+    (tmp_path / "mug").mkdir()
+    assert bank.make("mug", "tool30", 0, tmp_path).startswith("made")
+    assert bank.make("mug", "tool30", 0, tmp_path) == "kept"
+    assert bank.make("mug", "other", 0, tmp_path).startswith("made")
+    own, thing = choosers.frames_of(tmp_path, ["mug"], ["tool30", "other"])[::-1]
+    assert own.is_judged and not thing.is_judged and thing.facts["kind"] == "thing"
+    stages = {row["stage"] for row in own.facts["candidates"]}
+    assert {"truth", "from truth", "screened", "bent", "fitted", "rest"} <= stages
+    answer, best, truth = (chooser(own) for chooser in (choosers.answered, choosers.best, choosers.from_truth))
+    assert choosers.today(own) == answer and own.facts["answer"]["known"] is True
+    assert own.miou[best] >= own.miou[answer] > 0.95 and own.miou[truth] > 0.95
+    offsets = own.offsets(own.rows[answer])
+    assert len(offsets) == own.problem(own.rows[answer])["points"] and np.median(np.abs(offsets)) < 0.1
+    assert len(list(choosers.table([own], choosers.CHOOSERS, "condition"))) == 2 + 2 * len(choosers.CHOOSERS)
