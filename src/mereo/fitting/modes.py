@@ -330,8 +330,9 @@ def refit_noisy(
 
 
 def settled(problem: Problem, best: ScoredFit) -> tuple[Problem, ScoredFit]:
-    """Fit a noisy frame anew with as many independent points as the fit shows that its cloud is worth; twice."""
-    if not problem.noisy:
+    """Fit a noisy frame anew, twice, with as many independent points as a fit that explains it leaves over."""
+    off = best.surface.nearest(problem.evidence.observed_samples)[0]
+    if not problem.noisy or (off <= problem.config.tolerance).mean() < problem.config.accepted:
         return problem, best
     for _ in range(2):
         problem = problem.worth(best.surface)

@@ -347,8 +347,9 @@ def shared_variance(offset: Float[np.ndarray, " n"], evidence: Evidence, freedom
     ``freedom``, its number of parameters, bends to what as many patches share: theirs is no less than that of smaller
     ones, to which it cannot, and as many times what it leaves of it as the whole noise is that of points alone.
     """
-    most = ROBUST * TO_STD * float(np.median(np.abs(offset)))
-    means, variance = np.clip(offset, -most, most)[evidence.nested], list[float]()
+    most = 2 * ROBUST * TO_STD * float(np.median(np.abs(offset)))
+    offset = np.where(np.abs(offset) > ROBUST * LARGEST, 0.0, np.clip(offset, -most, most))
+    means, variance = offset[evidence.nested], list[float]()
     while len(means) > 1:
         first, second = means[::2], means[1::2]
         variance.append((TO_STD * float(np.median(np.abs(first - second)))) ** 2 / 2)
