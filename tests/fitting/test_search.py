@@ -1,7 +1,7 @@
 """The search for pose and state without a network: what its tables hold, and what it finds."""
 
+from copy import copy
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ from mereo.fitting.registration.answer_frame import check_size, search_modes
 from mereo.fitting.registration.register import CloudToFit
 from mereo.fitting.search import ALIKE, ROUNDS, SearchRound, SightTable, Trail, medoids, rotations, search_noisy
 from mereo.geometry.camera import PointCloud, SightLines
-from mereo.geometry.mesh import area_vectors, surface_points
+from mereo.geometry.mesh import SegmentedMesh, area_vectors, surface_points
 from mereo.geometry.symmetry import Symmetry
 from mereo.models.weights import load_model
 from mereo.reconstruction.isolation import Reading
@@ -211,9 +211,10 @@ def test_others_explain_a_frame_alike_where_their_misfit_is_hardly_greater(
 
 def all_around(model: StatisticalModel, posed: Posed, std: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
     """Noisy points of a state's whole outside, as stitched scans have it, and its normals there."""
-    outside = model.mesh(posed.place(model.material(posed.z))).segments[0]
-    points, face = surface_points(outside.vertices, outside.faces, 1500)
-    normals = area_vectors(outside.vertices, outside.faces)[face]
+    mesh = model.mesh(posed.place(model.material(posed.z)))
+    vertices, faces, _ = SegmentedMesh(mesh.segments[1:]).merged()  # without the core inside
+    points, face = surface_points(vertices, faces, 1500)
+    normals = area_vectors(vertices, faces)[face]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return points + np.random.default_rng(0).normal(scale=std, size=points.shape), normals
 
@@ -263,13 +264,15 @@ def test_surfaces_without_a_camera_rule_nothing_out_and_show_all_faces(model: St
     assert len(dense.points) <= MOST_POINTS and len(dense.with_more_samples.sample_normals) > OBSERVED_SAMPLES
 
 
-def test_points_of_a_sheet_are_compared_with_the_side_whose_normals_are_theirs() -> None:
+def test_points_of_a_sheet_are_compared_with_the_side_whose_normals_are_theirs(model: StatisticalModel) -> None:
     """The nearest place of a thin sheet is on its other side, where a point's normal says that it is not."""
     sheet = np.array(
         [[0.0, 0.0, 0.0], [9.0, 0.0, 0.0], [0.0, 9.0, 0.0], [0.0, 0.0, 1.0], [9.0, 0.0, 1.0], [0.0, 9.0, 1.0]]
     )
     faces, up = np.array([[0, 2, 1], [3, 4, 5]]), np.array([[0.0, 0.0, 1.0]])
-    surface = Surface(SimpleNamespace(faces=faces), sheet, np.arange(2), np.concatenate([-up, up]))  # type: ignore[arg-type]
+    flat = copy(model)
+    vars(flat)["faces"] = faces
+    surface = Surface(flat, sheet, np.arange(2), np.concatenate([-up, up]))
     point = np.array([[2.0, 2.0, 0.1]])
     for normal, lift, distance, face in ((up, signed, 0.9, 1), (-up, signed, 0.1, 0), (up, without_sign, 0.1, 0)):
         found = surface.alike(point, Directions(lift, lift(normal), 2.0))

@@ -291,7 +291,8 @@ def test_a_surface_that_no_camera_can_have_seen_is_known_by_its_normals() -> Non
     rng = np.random.default_rng(0)
     normals = rng.normal(size=(3000, 3))
     normals /= np.linalg.norm(normals, axis=1)[:, None]
-    sphere, ahead = normals + [0.0, 0.0, 5.0], (normals * (normals + [0.0, 0.0, 5.0])).sum(axis=1) < 0
+    sphere = normals + np.array([0.0, 0.0, 5.0])
+    ahead = (normals * sphere).sum(axis=1) < 0
     whole = PointCloud(sphere, normals)
     cap, inward = whole.rows(ahead), PointCloud(sphere[ahead], -normals[ahead])
     torn = PointCloud(sphere, normals * rng.choice([-1.0, 1.0], (3000, 1)))
@@ -340,7 +341,7 @@ def test_mesh_files_are_frames_with_the_normals_of_their_faces(tmp_path: Path) -
         again = read_frame(tmp_path / name).cloud
         np.testing.assert_array_equal(cloud.points, again.points)
         assert find_object(read_frame(tmp_path / name)).extent == "surface"
-    far = trimesh.Trimesh(fine.vertices + [1e6, 0, 0], fine.faces, process=False)
+    far = trimesh.Trimesh(fine.vertices + np.array([1e6, 0, 0]), fine.faces, process=False)
     far.export(tmp_path / "far.ply")
     with pytest.warns(InputWarning, match="1000000 0 0 is taken away"):
         assert np.abs(read_frame(tmp_path / "far.ply").cloud.points).max() < 3.1

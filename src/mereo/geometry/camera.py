@@ -105,7 +105,7 @@ class PointCloud:
     """
 
     points: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"] | None = None
+    normals: Float[np.ndarray, "_ 3"] | None = None
 
     @classmethod
     def of(cls, rows: Float[np.ndarray, "n c"]) -> "PointCloud":
