@@ -314,9 +314,9 @@ MOST_AVERTED = 0.1
 """Share of the points whose normals point away from a camera from which on no camera saw them, as of ``MOST_HIDDEN``;
 fewer lie at edges, and where nearly all do, the normals point inwards."""
 
-MOST_TORN = 0.1
-"""Share of the points whose neighbour's normal points the other way up to which normals are consistent; of random signs
-it is a half."""
+MOST_TORN = 0.25
+"""Share of the points whose neighbour's normal points the other way up to which normals are consistent: of stitched
+views of thin objects it is .16 at most, of random signs a half."""
 
 
 def is_surface(frame: SensorFrame, cloud: PointCloud) -> bool:
