@@ -103,7 +103,7 @@ class Mereo:
     def radii(self, vertices: np.ndarray, frame: str, scene: str, pose: np.ndarray | None) -> np.ndarray:
         """95 % radii at the vertices of the last answer, which no file of a result has."""
         result = mereo.reconstruct(frame, str(self.place / scene), unit_m=0.001, initial_pose=pose)
-        return result.registration.radius95(vertices, at="camera")
+        return result.registered.radius95(vertices, at="camera")
 
 
 def quarter_level(rest: trimesh.Trimesh) -> float:
