@@ -9,13 +9,13 @@
 4. Where the frame is not explained, the same again from other states of the library.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import permutations
 from operator import attrgetter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32
@@ -296,6 +296,10 @@ class Normals:
         return np.einsum("npi,npi->np", self.lift(points), self.lift(normal)) > 0
 
 
+SIGHTS: Mapping[type, Callable[[Any], SightTable | Normals]] = {Evidence: SightTable.of, SurfaceEvidence: Normals.of}
+"""What samples may be observed, by each kind of evidence."""
+
+
 @dataclass(frozen=True, eq=False)
 class Screen:
     """What poses are compared with: some points that a camera saw, evenly spread, and what the frame rules out.
@@ -317,7 +321,7 @@ class Screen:
     def of(cls, tables: ShapeTables, evidence: Observed, half: float, scaled: bool = False) -> "Screen":
         """Screen of a frame."""
         points = evidence.observed_samples[:POINTS].astype(np.float32)
-        sight = SightTable.of(evidence) if isinstance(evidence, Evidence) else Normals.of(evidence)
+        sight = SIGHTS[type(evidence)](evidence)
         return cls(tables, points, sight, half, scaled, evidence.is_open)
 
     def starts(self, rotations: Float[np.ndarray, "r 3 3"]) -> Poses:

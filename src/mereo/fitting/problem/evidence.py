@@ -378,9 +378,8 @@ class SurfaceEvidence(ObservedPoints):
 
         Without ``normals`` these are estimated from the points, and their signs do not count.
         """
-        lift = without_sign if normals is None else signed
-        normals = plane_normals(points, points) if normals is None else normals
-        rows = thin_to_grid(points, most)
+        known = (plane_normals(points, points), without_sign) if normals is None else (normals, signed)
+        (normals, lift), rows = known, thin_to_grid(points, most)
         points, normals = points[rows], normals[rows]
         around = cKDTree(points).query(points, k=range(1, min(AROUND, len(points)) + 1))[1][:, 1:]
         chosen = spread(points, observed_samples)
