@@ -1,4 +1,4 @@
-"""One frame of a sensor from whatever file holds it: a depth image, a point cloud or a ROS recording.
+"""One frame of a sensor from whatever file holds it: a depth image, a point cloud, a mesh or a ROS recording.
 
 Options that do not belong to a file's kind are refused, because ignored ones are wrong results that nobody notices.
 """
@@ -112,7 +112,7 @@ def read_frame(
     reading: InputConfig = InputConfig(),  # noqa: B008 (frozen)
     T_input_camera: Float[np.ndarray, "4 4"] | None = None,
 ) -> SensorFrame:
-    """Frame that a depth image, point cloud or ROS recording holds, or that ``reading`` picks from it.
+    """Frame that a depth image, point cloud, mesh or ROS recording holds, or that ``reading`` picks from it.
 
     Depth images and recordings come in metres and camera axes; point clouds keep their file's unit and axes, unless the
     camera's pose is given, here or by the file's name, or stated in the file: then they are moved into the camera's.
