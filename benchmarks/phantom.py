@@ -9,11 +9,12 @@ FOLDER (else ``MEREO_ASSETS``/liver_phantom) holds STL files, millimetres, +y do
 
 Each row: IoU with the truth on 64^3 nodes; distance to the answer of the true surface that is 6 mm or more from A,
 median / 95 %; share of that surface within the 95 % radius of the answer's nearest vertex; change of volume; seconds.
-``mereo`` runs as a user runs it, on a cloud in the frame of a camera 500 mm away: the whole command, with what it loads
-and writes. It knows of the pose: nothing ("search"), roughly what it is ("pose given"), or that and that the lowest
-quarter did not move ("underside held"). The others start from the given pose: rigid and Gaussian process with the pairs
-of ``match``; coherent point drift by pycpd, where that is installed. The settings of the Gaussian process and its fit
-were chosen with these figures in view (docs/experiments/066.md), those of mereo partly too (docs/experiments/068.md).
+``mereo`` runs as a user runs it, on the STL files themselves, which it reads as surfaces that no single camera saw: the
+whole command, with what it loads and writes. It knows of the pose: nothing ("search"), roughly what it is ("pose
+given"), or that and that the lowest quarter did not move ("underside held"). The others start from the given pose:
+rigid and Gaussian process with the pairs of ``match``; coherent point drift by pycpd, where that is installed. The
+settings of the Gaussian process and its fit were chosen with these figures in view (docs/experiments/066.md), those of
+mereo partly too (docs/experiments/068.md).
 """
 
 import argparse
@@ -45,10 +46,7 @@ Points = tuple[np.ndarray, np.ndarray]
 
 # --- mereo ------------------------------------------------------------------------------------------------------------
 
-CAMERA = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""Rotation into the frame of a camera above the liver, which looks down (+y)."""
-
-DISTANCE_MM = 500.0
+INPUTS = {"A": "PartialDeformedSurfaceFromCT", "B": "intraoperative_auto2"}
 
 SCENE = """\
 name: phantom
@@ -78,17 +76,15 @@ class Mereo:
         scene = SCENE.format(surface=json.dumps(str((folder / "initial-surface.stl").absolute())))
         (place / "free.yaml").write_text(scene)
         (place / "held.yaml").write_text(scene + HELD.format(level=f"{level:.1f}"))
-        self.translation = -CAMERA @ (rest.bounds.mean(axis=0) - [0.0, DISTANCE_MM, 0.0])
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = CAMERA, self.translation
-        np.savetxt(place / "pose.txt", pose)
+        self.folder = folder.absolute()
+        np.savetxt(place / "pose.txt", np.eye(4))
 
-    def __call__(self, points: np.ndarray, known: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    def __call__(self, which: str, known: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
         """Vertices, faces, 95 % radii of the vertices, and seconds."""
-        np.savetxt(self.place / "cloud.xyz", points @ CAMERA.T + self.translation)
+        frame = str(self.folder / f"{INPUTS[which]}.stl")
         scene = "held.yaml" if known == "underside held" else "free.yaml"
         given = [] if known == "search" else ["--initial-pose", "pose.txt"]
-        command = ["reconstruct", "cloud.xyz", "--object", scene, "--unit-m", "0.001", *given]
+        command = ["reconstruct", frame, "--object", scene, "--unit-m", "0.001", *given]
         start = time.perf_counter()
         done = subprocess.run(
             [sys.executable, "-m", "mereo", *command, "--output", "out", "--formats", "ply", "--force"],
@@ -100,15 +96,14 @@ class Mereo:
             raise RuntimeError(done.stderr)
         seconds = time.perf_counter() - start
         surface = trimesh.load(self.place / "out" / "segments.ply", process=False)
-        vertices = (np.asarray(surface.vertices) - self.translation) @ CAMERA
-        return vertices, np.asarray(surface.faces, dtype=np.int64), self.radii(vertices, scene, known), seconds
+        vertices = np.asarray(surface.vertices)
+        radii = self.radii(vertices, frame, scene, None if known == "search" else np.eye(4))
+        return vertices, np.asarray(surface.faces, dtype=np.int64), radii, seconds
 
-    def radii(self, vertices: np.ndarray, scene: str, known: str) -> np.ndarray:
+    def radii(self, vertices: np.ndarray, frame: str, scene: str, pose: np.ndarray | None) -> np.ndarray:
         """95 % radii at the vertices of the last answer, which no file of a result has."""
-        pose = None if known == "search" else np.loadtxt(self.place / "pose.txt")
-        cloud = np.loadtxt(self.place / "cloud.xyz")
-        result = mereo.reconstruct(cloud, str(self.place / scene), unit_m=0.001, initial_pose=pose)
-        return result.registration.radius95(vertices @ CAMERA.T + self.translation, at="camera")
+        result = mereo.reconstruct(frame, str(self.place / scene), unit_m=0.001, initial_pose=pose)
+        return result.registered.radius95(vertices, at="camera")
 
 
 def quarter_level(rest: trimesh.Trimesh) -> float:
@@ -246,11 +241,11 @@ def load(folder: Path, name: str) -> trimesh.Trimesh:
 
 
 def measured(folder: Path, which: str) -> Points:
-    """2,500 points of an input; normals towards the camera, which is above."""
-    part = load(folder, {"A": "PartialDeformedSurfaceFromCT", "B": "intraoperative_auto2"}[which])
+    """2,500 points of an input, and their normals."""
+    part = load(folder, INPUTS[which])
     points, normals = np.asarray(part.vertices), np.asarray(part.vertex_normals)
     chosen = np.random.default_rng(0).permutation(len(points))[:2500]
-    return points[chosen].copy(), normals[chosen] * (-1 if np.median(normals[:, 1]) > 0 else 1)
+    return points[chosen].copy(), normals[chosen]
 
 
 def main() -> None:
@@ -280,7 +275,7 @@ def main() -> None:
                 row, spent = truth.line(coherent_point_drift(vertices, cloud), faces), time.perf_counter() - start
                 print(f"| {which} | pose given | coherent point drift | {row} | {spent:.1f} |", flush=True)
             for known in ("search", "pose given", "underside held"):
-                *surface, radii, spent = answer(cloud[0], known)
+                *surface, radii, spent = answer(which, known)
                 print(f"| {which} | {known} | mereo | {truth.line(*surface, radii)} | {spent:.1f} |", flush=True)
 
 

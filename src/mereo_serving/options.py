@@ -46,7 +46,7 @@ class FrameOptions(BaseModel):
     largest_cluster: bool = Field(False, alias="largest-cluster", description="Keep the largest group of points")
     cluster_gap: float = Field(0.0, alias="cluster-gap", description="Gap across which groups belong to it, metres")
     keep_all: bool = Field(False, alias="keep-all", description="Drop no strays")
-    extent: Extent = Field("auto", description="How much of the object the frame shows: whole, partial, auto")
+    extent: Extent = Field("auto", description="How much of the object the frame shows: whole, partial, surface, auto")
     resolution: int | None = Field(None, description="Cells along the longest side; by default the server's")
 
     def reading(self, folder: Path, intrinsics: str | None, mask: str | None) -> InputConfig:

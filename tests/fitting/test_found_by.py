@@ -208,7 +208,7 @@ def test_points_that_a_fit_explains_are_given_back_beside_strays(
         keep[lost] = False
         return Reading(cloud, keep), Reading.of_all(cloud)
 
-    monkeypatch.setattr("mereo.fitting.registration.answer_frame.readings", hasty)
+    monkeypatch.setattr("mereo.reconstruction.observation.readings", hasty)
     keep = fitted(registrar, contaminated).hypothesis.keep
     assert keep[lost].all() and not keep[len(points) :].any()
 
@@ -243,7 +243,7 @@ def test_what_a_calm_frame_cannot_have_is_no_noise(
     modes = fitted(registrar, points).modes
     problem, surface = modes.problem, Surface.through(modes.problem.model, modes.registration.material)
     offset = np.random.default_rng(1).normal(scale=0.4, size=len(points))
-    monkeypatch.setattr(Surface, "offsets", lambda _, given: offset[: len(given)])
+    monkeypatch.setattr(Surface, "offsets", lambda _, given, *how: offset[: len(given)])
     calm, rough = (replace(problem, evidence=Evidence.of(cloud)) for cloud in (points, noisy(points, 0.4)))
     assert rough.leaves_noise(surface), "every neighbour differs, and so do the points"
     assert not calm.leaves_noise(surface), "as a state that wriggles through a smooth surface does"

@@ -1,6 +1,9 @@
 """The search for pose and state without a network: what its tables hold, and what it finds."""
 
+from copy import copy
 from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,14 +12,23 @@ from scipy.spatial.transform import Rotation
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.modes import ScoredFit, fit_wide, refined
-from mereo.fitting.problem.evidence import Evidence
+from mereo.fitting.problem.evidence import (
+    MOST_POINTS,
+    OBSERVED_SAMPLES,
+    Directions,
+    Evidence,
+    SurfaceEvidence,
+    signed,
+    without_sign,
+)
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.problem import OPEN_SCALE_STD, Problem
-from mereo.fitting.problem.residuals import NetworkTerm
+from mereo.fitting.problem.residuals import NetworkTerm, Surface
 from mereo.fitting.registration.answer_frame import check_size, search_modes
 from mereo.fitting.registration.register import CloudToFit
 from mereo.fitting.search import ALIKE, ROUNDS, SearchRound, SightTable, Trail, medoids, rotations, search_noisy
 from mereo.geometry.camera import PointCloud, SightLines
+from mereo.geometry.mesh import SegmentedMesh, area_vectors, surface_points
 from mereo.geometry.symmetry import Symmetry
 from mereo.models.weights import load_model
 from mereo.reconstruction.isolation import Reading
@@ -199,12 +211,85 @@ def test_others_explain_a_frame_alike_where_their_misfit_is_hardly_greater(
     assert said(0.9 * ALIKE) == 0
 
 
+def all_around(model: StatisticalModel, posed: Posed, std: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
+    """Noisy points of a state's whole outside, as stitched scans have it, and its normals there."""
+    mesh = model.mesh(posed.place(model.material(posed.z)))
+    vertices, faces, _ = SegmentedMesh(mesh.segments[1:]).merged()  # without the core inside
+    points, face = surface_points(vertices, faces, 1500)
+    normals = area_vectors(vertices, faces)[face]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return points + np.random.default_rng(0).normal(scale=std, size=points.shape), normals
+
+
+@pytest.mark.parametrize("kind", ["whole", "half", "unknown unit", "without normals"])
+def test_a_surface_that_no_camera_saw_is_found(model: StatisticalModel, kind: str) -> None:
+    """From all sides, or from the half of them that faces no camera; the origin lies inside of it."""
+    posed = state(model, 2)
+    points, normals = all_around(model, posed)
+    keep = normals @ FAR > -0.2 * 150 if kind == "half" else np.ones(len(points), dtype=bool)
+    scale, shift = (0.01 if kind == "unknown unit" else 1.0), points.mean(axis=0)
+    cloud = CloudToFit(
+        scale * (points - shift)[keep],
+        None if kind == "unknown unit" else 1.0,
+        lines=SightLines.of_cloud("none"),
+        normals=None if kind == "without normals" else normals[keep],
+    )
+    fitted = search_modes(cloud, model)
+    found = fitted.registration
+    assert found.accepted and found.ruled_out == 0.0 and fitted.problem.evidence.other_lines == "none"
+    assert off(model, found.material / scale + shift, posed) < 0.05
+    assert found.scene_unit == pytest.approx(scale, rel=0.02)
+
+
+def test_a_surface_inside_out_is_explained_by_nothing(model: StatisticalModel) -> None:
+    """Normals decide: turned round, the same points are those of a hollow, which the object has not."""
+    points, normals = all_around(model, state(model, 2))
+    lines = SightLines.of_cloud("none")
+    assert not search_modes(CloudToFit(points, 1.0, lines=lines, normals=-normals), model).registration.accepted
+
+
+def test_surfaces_without_a_camera_rule_nothing_out_and_show_all_faces(model: StatisticalModel) -> None:
+    posed = state(model, 2)
+    points, normals = all_around(model, posed)
+    evidence = SurfaceEvidence.of(points, normals=normals)
+    direction, amount = evidence.violations(10.0 * points, 0.5)
+    assert not direction.any() and not amount.any() and evidence.unseen(points[None, :3]) == 0.0
+    assert evidence.is_open and evidence.hidden_edge == 1.0 and 0.02 < evidence.roughness < 0.3
+    surface = Surface.of(model, posed, evidence.shows)
+    assert len(surface.facing) == len(model.faces) > len(Surface.of(model, posed).facing)
+    corners = surface.material[model.faces]
+    assert evidence.area == pytest.approx(
+        np.linalg.norm(area_vectors(surface.material, model.faces), axis=1).sum() / 2, rel=0.5
+    )
+    assert corners.shape[0] and len(evidence.few(7).alike(1.0).lifted) == 7 == len(evidence.few(7).observed_samples)
+    dense = SurfaceEvidence.of(np.tile(points, (5, 1)) + np.repeat(np.arange(5), len(points))[:, None] * 1e-3)
+    assert len(dense.points) <= MOST_POINTS and len(dense.with_more_samples.sample_normals) > OBSERVED_SAMPLES
+
+
+def test_points_of_a_sheet_are_compared_with_the_side_whose_normals_are_theirs(model: StatisticalModel) -> None:
+    """The nearest place of a thin sheet is on its other side, where a point's normal says that it is not."""
+    sheet = np.array(
+        [[0.0, 0.0, 0.0], [9.0, 0.0, 0.0], [0.0, 9.0, 0.0], [0.0, 0.0, 1.0], [9.0, 0.0, 1.0], [0.0, 9.0, 1.0]]
+    )
+    faces, up = np.array([[0, 2, 1], [3, 4, 5]]), np.array([[0.0, 0.0, 1.0]])
+    flat = copy(model)
+    vars(flat)["faces"] = faces
+    surface = Surface(flat, sheet, np.arange(2), np.concatenate([-up, up]))
+    point = np.array([[2.0, 2.0, 0.1]])
+    for normal, lift, distance, face in ((up, signed, 0.9, 1), (-up, signed, 0.1, 0), (up, without_sign, 0.1, 0)):
+        found = surface.alike(point, Directions(lift, lift(normal), 2.0))
+        assert (found[0][0], found[1][0]) == (pytest.approx(distance), face)
+        np.testing.assert_allclose(found[2], [[2.0, 2.0, float(face)]])
+    across = np.array([[1.0, 0.0, 0.0]])  # a normal that no place has: the distance counts it
+    assert surface.alike(point, Directions(signed, across, 2.0))[0][0] > 2.0
+
+
 @pytest.mark.slow
 def test_a_bank_keeps_every_candidate_and_a_chooser_by_todays_rules_names_the_answer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """``benchmarks/bank.py``, on which numbers and rules of the fit are judged: a rigid mug, and another thing."""
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    monkeypatch.syspath_prepend("benchmarks")
     bank, choosers = import_module("bank"), import_module("bank_choosers")
     (tmp_path / "mug").mkdir()
     assert bank.make("mug", "tool30", 0, tmp_path).startswith("made")

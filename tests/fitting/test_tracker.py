@@ -31,7 +31,7 @@ from mereo.fitting.tracking import (
     motion_precision,
 )
 from mereo.geometry.camera import SCANNER_TO_CAMERA, Camera, PointCloud
-from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.mesh import SegmentedMesh, area_vectors, surface_points
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid
 from mereo.io.sensor_frame import SensorFrame
@@ -498,3 +498,16 @@ def test_a_scanners_frames_are_answered_in_its_frame(engine: Registrar, scene: S
         found = tracker.follow(observe(cloud, "scanner"), number / RATE_HZ, scene_unit=1.0)
     assert found.tracked
     assert np.median(Solids(found.surfaces).nearest(cloud.points).distance) < 0.2
+
+
+def test_a_surface_that_no_camera_saw_is_followed(registrar: Registrar) -> None:
+    tracker = Tracker(registrar)
+    for number in range(3):
+        mesh = mesh_of(registrar.model, 20, 0.05 * number)
+        places, faces, _ = SegmentedMesh(mesh.segments[1:]).merged()  # without the core inside
+        points, face = surface_points(places, faces, 2000)
+        cloud = PointCloud.of(np.hstack([points, area_vectors(places, faces)[face]]))
+        frame = find_object(SensorFrame(Path("a.ply"), cloud, None, "camera"))
+        answer = tracker.follow(frame, number / RATE_HZ, scene_unit=1.0)
+        assert frame.extent == "surface" and answer.tracked == (number > 0)
+        assert answer.recognition.known is True and apart(answer, mesh) < 0.3

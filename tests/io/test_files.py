@@ -15,7 +15,7 @@ import trimesh
 from PIL import Image
 from point_files import save_pcd, save_ply
 
-from mereo.geometry.camera import Camera
+from mereo.geometry.camera import Camera, PointCloud
 from mereo.io.mesh_formats import MeshWarning, read_glb, read_segmented_mesh
 from mereo.io.readers import InputWarning, is_depth_image, read_depth_image, read_mask, read_point_cloud
 
@@ -514,3 +514,23 @@ def test_arrays_are_told_apart_by_their_shape(tmp_path: Path) -> None:
     for shape, image in cases:
         np.save(tmp_path / "a.npy", np.ones(shape))
         assert is_depth_image(tmp_path / "a.npy") == image
+
+
+def test_normals_of_a_ply_file_are_read_with_its_points(tmp_path: Path) -> None:
+    normals = np.random.default_rng(1).normal(size=POINTS.shape)
+    names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
+    head = f"ply\nformat {{}} 1.0\nelement vertex {len(POINTS)}\n{names}end_header\n"
+    rows = np.hstack([POINTS, normals]).astype("<f4")
+    (tmp_path / "a.ply").write_bytes(head.format("ascii").encode() + text(rows, " ").encode())
+    (tmp_path / "b.ply").write_bytes(head.format("binary_little_endian").encode() + rows.tobytes())
+    for name in ("a.ply", "b.ply"):
+        cloud = read_point_cloud(tmp_path / name)
+        np.testing.assert_array_equal(cloud.points, POINTS.astype(np.float64))
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        np.testing.assert_allclose(cloud.normals, normals / length, atol=1e-6)
+    rows[3], rows[5, 3] = 0.0, np.nan
+    (tmp_path / "b.ply").write_bytes(head.format("binary_little_endian").encode() + rows.tobytes())
+    cloud = read_point_cloud(tmp_path / "b.ply", drop_invalid=True)
+    assert cloud.normals is not None and len(cloud.normals) == len(cloud) == 56 and np.isfinite(cloud.normals).all()
+    with pytest.raises(ValueError, match="there are 1 normals and 56 points; each point needs one"):
+        PointCloud(cloud.points, cloud.normals[:1])

@@ -187,3 +187,15 @@ def test_points_of_a_model_may_be_its_origin_and_must_be_finite() -> None:
 
 def test_what_is_no_list_of_frames() -> None:
     assert [source for source in NO_FRAME_LISTS if is_frame_list(source)] == []
+
+
+def test_normals_of_other_libraries_come_with_the_points() -> None:
+    ball = trimesh.creation.icosphere()
+    cloud, _ = points_of(ball)
+    assert isinstance(cloud, PointCloud) and cloud.normals is not None
+    np.testing.assert_allclose(cloud.normals, ball.vertices, atol=0.05)
+    longer, lost = points_of(SimpleNamespace(points=broken(POINTS), normals=3.0 * POINTS), drop_invalid=True)
+    assert isinstance(longer, PointCloud) and lost == 3
+    np.testing.assert_allclose(longer.normals, MEASURED / np.linalg.norm(MEASURED, axis=1, keepdims=True))
+    for normals in ([], POINTS[:3], np.full(POINTS.shape, np.nan), "none"):
+        assert points_of(SimpleNamespace(points=POINTS, normals=normals))[0].normals is None  # type: ignore[union-attr]

@@ -216,6 +216,34 @@ def test_an_initial_pose_takes_the_place_of_a_search(
             mereo.reconstruct(points, angle, unit_m=1.0, initial_pose=wrong)
 
 
+def test_a_mesh_file_is_a_frame_that_no_camera_saw(
+    scene: Scene, meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In millimetres around the origin, as CT has it: extent, pose and surfaces come out in the file's frame."""
+    vertices, faces, _ = scene.rest.merged()
+    assert scene.unit_m is not None
+    turn = Rotation.from_euler("xyz", [100, 20, -60], degrees=True).as_matrix()
+    moved = 1e3 * scene.unit_m * (vertices - vertices.mean(axis=0)) @ turn.T + np.array([5.0, -3.0, 2.0])
+    trimesh.Trimesh(moved, faces, process=False).export(tmp_path / "scan.stl")
+    given = ["--object", *meshes, "--units", "mm", "--resolution", "24", "--formats", "ply", "json"]
+    command = [
+        "reconstruct",
+        str(tmp_path / "scan.stl"),
+        *given,
+        "--unit-m",
+        "0.001",
+        "--output",
+        str(tmp_path / "out"),
+    ]
+    assert command_line.main(command) == 0
+    assert "it is a surface that no single camera saw" in capsys.readouterr().out
+    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    assert summary["extent"] == "surface" and summary["recognition"]["known"] is True
+    assert summary["recognition"]["signs"]["ruled_out"] == 0.0 and summary["recognition"]["signs"]["unseen"] is None
+    answer = trimesh.load(tmp_path / "out/segments.ply", process=False)
+    assert np.abs(np.asarray(answer.bounds) - [moved.min(axis=0), moved.max(axis=0)]).max() < 0.03 * np.ptp(moved)
+
+
 def test_what_is_defined_in_the_meshes_is_carried(found: mereo.Result, scene: Scene) -> None:
     corners = found.carry(scene.rest.merged()[0], files="scene")
     assert np.abs(corners - found.surfaces.merged()[0]).max() < 0.02 * np.ptp(corners, axis=0).max()

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from camera_files import write_camera
 from PIL import Image
 from point_files import save_pcd
@@ -19,7 +20,7 @@ from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.transforms import rigid, transform_points
 from mereo.io.config import InputConfig
 from mereo.io.readers import InputWarning
-from mereo.io.sensor_frame import read_frame
+from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.models.trained import checked_points
 from mereo.models.weights import load_model
 from mereo.reconstruction.config import IsolationConfig
@@ -284,3 +285,67 @@ def test_missing_extras_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         monkeypatch.setitem(sys.modules, library, None)
         with pytest.raises(ImportError, match=rf"{name} needs {library}.*: pip install 'mereo\[sensors\]'"):
             read_frame(tmp_path / name)
+
+
+def test_a_surface_that_no_camera_can_have_seen_is_known_by_its_normals() -> None:
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(3000, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    sphere = normals + np.array([0.0, 0.0, 5.0])
+    ahead = (normals * sphere).sum(axis=1) < 0
+    whole = PointCloud(sphere, normals)
+    cap, inward = whole.rows(ahead), PointCloud(sphere[ahead], -normals[ahead])
+    torn = PointCloud(sphere, normals * rng.choice([-1.0, 1.0], (3000, 1)))
+    for name, cloud, extent in (
+        ("all around", whole, "surface"),
+        ("from where the object is", PointCloud(normals, normals), "surface"),
+        ("as a camera sees it", cap, "auto"),
+        ("with normals into the surface", inward, "auto"),
+        ("with normals of random signs", torn, "auto"),
+        ("without normals", PointCloud(sphere), "auto"),
+    ):
+        assert find_object(SensorFrame(Path(name), cloud, 1.0, "camera")).extent == extent, name
+    seen = find_object(SensorFrame(Path("a.ply"), whole, 1.0, "camera"))
+    assert "it is a surface that no single camera saw" in str(seen) and "depth" not in str(seen)
+    assert seen.facts()["extent"] == "surface" and seen.facts()["depth_m"] is None and seen.doubt is None
+    assert seen.lines.other_lines == "none" and len(seen.readings()) == 1
+    stated = find_object(
+        SensorFrame(Path("a.ply"), PointCloud(sphere), 1.0, "camera"), IsolationConfig(extent="surface")
+    )
+    assert stated.extent == "surface" and stated.doubt is None
+    assert (
+        find_object(SensorFrame(Path("a.ply"), whole, 1.0, "camera"), IsolationConfig(extent="whole")).doubt is not None
+    )
+    image = DepthImage(np.full((10, 20), 2.0), CAMERA)
+    with pytest.raises(
+        ValueError, match="a surface without a camera, but a.png is a depth image, which a camera saw: l"
+    ):
+        find_object(
+            SensorFrame(Path("a.png"), image.to_points(), 1.0, "camera", image), IsolationConfig(extent="surface")
+        )
+
+
+def test_mesh_files_are_frames_with_the_normals_of_their_faces(tmp_path: Path) -> None:
+    box = trimesh.creation.box((2.0, 4.0, 6.0))
+    fine = box.subdivide_to_size(0.2)
+    for name, mesh in (("box.stl", box), ("box.ply", box), ("fine.obj", fine), ("fine.ply", fine)):
+        mesh.export(tmp_path / name)
+        cloud = read_frame(tmp_path / name).cloud
+        assert cloud.normals is not None
+        side = np.abs(cloud.points / [1.0, 2.0, 3.0]).argmax(axis=1)
+        np.testing.assert_allclose(
+            np.abs(cloud.points[np.arange(len(cloud)), side]), np.array([1, 2, 3])[side], atol=1e-6
+        )
+        assert len(cloud) == (2500 if mesh is box else len(fine.vertices))
+        assert ((cloud.normals * cloud.points).sum(axis=1) > 0).all()
+        again = read_frame(tmp_path / name).cloud
+        np.testing.assert_array_equal(cloud.points, again.points)
+        assert find_object(read_frame(tmp_path / name)).extent == "surface"
+    far = trimesh.Trimesh(fine.vertices + np.array([1e6, 0, 0]), fine.faces, process=False)
+    far.export(tmp_path / "far.ply")
+    with pytest.warns(InputWarning, match="1000000 0 0 is taken away"):
+        assert np.abs(read_frame(tmp_path / "far.ply").cloud.points).max() < 3.1
+    turned = read_frame(
+        tmp_path / "fine.ply", T_input_camera=rigid(np.diag([1.0, -1, -1]), np.array([0, 0, 9.0]))
+    ).cloud
+    assert turned.normals is not None and ((turned.normals * (turned.points - [0, 0, 9])).sum(axis=1) > 0).all()

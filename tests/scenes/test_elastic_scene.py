@@ -13,7 +13,7 @@ from shapes import box
 from mereo.deformation.elastic import build_lattice
 from mereo.deformation.tetrahedral import Tetrahedra
 from mereo.fitting.config import ELASTIC
-from mereo.fitting.problem.evidence import Evidence
+from mereo.fitting.problem.evidence import Directions, Evidence, signed
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.problem import GivenPose, Problem
 from mereo.fitting.problem.residuals import NetworkTerm, Prior, SampledSurface
@@ -249,7 +249,7 @@ def test_pairs_by_direction_tell_the_sides_of_a_thin_part_apart(model: Statistic
     across, normals = np.ptp(points[:, 2]), samples.normal[top].astype(np.float64)
     beneath = points[top] + np.array([0.0, 0.0, 0.8 * across])
     # of all samples and not of facing ones alone, the nearest are those of the other side
-    _, by_place, _ = samples.planes(beneath, normals, 0.0)
-    _, by_direction, _ = samples.planes(beneath, normals, 2.0 * across)
+    _, by_place, _ = samples.planes(beneath, Directions(signed, normals, 0.0))
+    _, by_direction, _ = samples.planes(beneath, Directions(signed, normals, 2.0 * across))
     assert (np.einsum("pi,pi->p", by_place, normals) < 0).mean() > 0.3
     assert (np.einsum("pi,pi->p", by_direction, normals) > 0.9).all()

@@ -124,13 +124,13 @@ MAY_IMPORT = {"torch": ("models/", "cli/tools.py"), "matplotlib": ("io/extras.py
 """The same of libraries that most installations lack: asked for where they are used, with the extra's name."""
 
 BUDGET = {
-    "src/mereo": (285_650, 152),
+    "src/mereo": (289_533, 152),
     "src/mereo_learning": (48_500, 22),
     "src/mereo_objects": (40_000, 28),
     "src/mereo_serving": (10_700, 13),
     "src/mereo_viewer": (10_900, 5),
     "src/mereo_experiments": (11_900, 17),
-    "tests": (275_250, 131),
+    "tests": (278_215, 131),
 }
 """Syntax nodes and files that a folder may have at most. Lines are free: fewer of them are not less to know."""
 

@@ -60,7 +60,7 @@ def load_frame(
     """Load one frame of a depth camera or scanner.
 
     Args:
-        source: a file (depth image, point cloud, ROS recording) or the name of a shipped frame (``shipped_frames``);
+        source: a file (depth image, cloud, mesh, ROS recording) or the name of a shipped frame (``shipped_frames``);
             or points as n x 3 numbers, as a cloud of Open3D or trimesh, as a structured array or a ROS ``PointCloud2``;
             or a depth image, as ``DepthImage`` or as an array of h x w pixels with ``intrinsics``.
         axes: of points: "camera" (default) is x right, y down, z forward; "scanner" is y up, z toward the scanner.

@@ -31,8 +31,10 @@ class FitConfig:
         samples: points of the surface that stand for it in most steps.
         silhouette_vertices: how many of them are compared with what the frame rules out.
         exact_steps: last steps, which use the faces themselves.
-        normal_length: distance, as a share of the same half, that a difference of unit normals by 1 is worth in the
-            search for the sample of each observed point; 0 compares places alone.
+        by_normals: whether the normals of a camera's points are compared with the surface's; of a surface that no
+            single camera saw they are in any case.
+        normal_length: distance, as a share of the same half, that a difference of unit normals by 1 is worth there in
+            the search for the sample of each observed point.
         retries: whether other states are tried, and a search is made, where a network's fit does not explain the frame.
         accepted, tolerance: a fit is believed where this share of the observed points lies as near its facing surface.
             Where network and fit give .8 of the correspondences the same segment, a share of .85 is enough.
@@ -48,7 +50,8 @@ class FitConfig:
     silhouette_vertices: int = 500
     silhouette_weight: float = 0.2
     exact_steps: int = 3
-    normal_length: float = 0.0
+    by_normals: bool = False
+    normal_length: float = 0.1
     retries: bool = True
     accepted: float = 0.95
     tolerance: float = 0.45
@@ -101,7 +104,7 @@ class DrawsConfig:
 
 
 ELASTIC = FitConfig(
-    cloud_sigma=0.12, cloud_weight=250.0, explained=0.41, unexplained=0.83, samples=10_000, normal_length=0.1
+    cloud_sigma=0.12, cloud_weight=250.0, explained=0.41, unexplained=0.83, samples=10_000, by_normals=True
 )
 """Constants for objects whose model is that of an elastic solid, which real states are near but never in.
 

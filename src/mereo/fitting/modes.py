@@ -131,7 +131,7 @@ class ScoredFit:
     @classmethod
     def of(cls, problem: Problem, posed: Posed) -> "ScoredFit":
         """Score a state."""
-        surface = Surface.of(problem.model, posed)
+        surface = problem.surface(posed)
         return cls(posed, problem.misfit(posed, surface), surface)
 
     def explains(self, problem: Problem) -> bool:

@@ -9,13 +9,13 @@
 4. Where the frame is not explained, the same again from other states of the library.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import permutations
 from operator import attrgetter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32
@@ -34,7 +34,7 @@ from mereo.fitting.modes import (
     refined,
     shaken,
 )
-from mereo.fitting.problem.evidence import Evidence
+from mereo.fitting.problem.evidence import Evidence, Observed, SurfaceEvidence
 from mereo.fitting.problem.gauss_newton import DAMPING, Posed, cross
 from mereo.fitting.problem.problem import Problem
 from mereo.fitting.problem.residuals import ROBUST, SILHOUETTE_WEIGHT, Prior, SampledSurface
@@ -43,9 +43,11 @@ from mereo.geometry.transforms import rotation_along
 from mereo.io.cores import cores
 from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
 
-# --- table of lines of sight ------------------------------------------------------------------------------------------
+# --- tables of shapes -------------------------------------------------------------------------------------------------
 
-# Notation: n poses, w positions of each, c cells.
+# A table is made once for an object. With it, thousands of poses are compared with a cloud in single array operations.
+#
+# Notation: n poses, w positions of each, q states, s samples, c cells, r of them along each side of a table.
 
 
 def clipped(position: Float32[np.ndarray, "n w d"], count: int) -> Int32[np.ndarray, "n w d"]:
@@ -53,68 +55,6 @@ def clipped(position: Float32[np.ndarray, "n w d"], count: int) -> Int32[np.ndar
     index: np.ndarray = np.fmax(np.fmin(position, np.float32(count - 1)), np.float32(0))
     return index.astype(np.int32)
 
-
-@dataclass(frozen=True, eq=False)
-class SightTable:
-    """What a frame rules out, as a table of lines of sight; the rules are those of ``Evidence.violations``.
-
-    Attributes:
-        T: rotation into the axes of the table, whose third is the direction of the cloud.
-        low, cell: corner of the table and length of a cell, as slopes across the direction.
-        toward, front, free: ``Evidence.along`` the cells.
-        pitch: angle between neighbouring lines of sight.
-    """
-
-    T: Float32[np.ndarray, "3 3"]
-    low: Float32[np.ndarray, "2"]
-    cell: float
-    toward: Float32[np.ndarray, "c 3"]
-    front: Float32[np.ndarray, " c"]
-    free: Float32[np.ndarray, " c"]
-    pitch: float
-
-    @classmethod
-    def of(cls, evidence: Evidence) -> "SightTable":
-        """Table around the cloud, three times as wide; beyond, the nearest cell of the border stands for a position."""
-        direction = evidence.sight.data[: len(evidence.points)]
-        T = rotation_along(direction.mean(axis=0) / np.linalg.norm(direction.mean(axis=0))).T
-        turned = evidence.points @ T.T
-        slope = turned[:, :2] / np.maximum(turned[:, 2:], 0.1 * np.linalg.norm(turned, axis=1, keepdims=True))
-        low, high = slope.min(axis=0), slope.max(axis=0)
-        side = 3.0 * float((high - low).max()) + 4 * evidence.pitch
-        corner = (low + high - side) / 2
-        cells = min(96, max(16, int(side / evidence.pitch)))
-        across = corner + (np.stack(np.meshgrid(*(np.arange(cells) + 0.5,) * 2, indexing="ij"), -1)) * side / cells
-        sight = np.concatenate([across.reshape(-1, 2), np.ones((cells * cells, 1))], axis=1) @ T
-        sight /= np.linalg.norm(sight, axis=1, keepdims=True)
-        toward, front, free = (part.astype(np.float32) for part in evidence.along(sight))
-        return cls(T.astype(np.float32), corner.astype(np.float32), side / cells, toward, front, free, evidence.pitch)
-
-    def violations(
-        self, position: Float32[np.ndarray, "n w 3"], slack: float
-    ) -> tuple[Float32[np.ndarray, "n w 3"], Float32[np.ndarray, "n w"]]:
-        """``Evidence.violations`` of many positions, up to a cell."""
-        cells = round(np.sqrt(len(self.front)))
-        turned = position @ self.T.T
-        slope = turned[..., :2] / np.maximum(turned[..., 2:], 1e-6)
-        index = clipped((slope - self.low) / self.cell, cells)
-        row = index[..., 0] * cells + index[..., 1]
-        distance = np.sqrt(np.einsum("nwi,nwi->nw", position, position))
-        toward, free = self.toward[row], self.free[row]
-        is_past = free > distance - slack
-        sideways = toward * distance[..., None] - position
-        length = np.sqrt(np.einsum("nwi,nwi->nw", sideways, sideways))
-        direction = np.where(is_past[..., None], sideways / np.maximum(length, 1e-9)[..., None], toward)
-        ahead = np.where(free < 0, self.front[row] - slack - distance, 0.0)
-        amount = np.where(is_past, length - self.pitch * distance, ahead)
-        return direction, np.maximum(amount, 0.0).astype(np.float32)
-
-
-# --- tables of shapes -------------------------------------------------------------------------------------------------
-
-# A table is made once for an object. With it, thousands of poses are compared with a cloud in single array operations.
-#
-# Notation: q states, s samples, r cells along each side of a table.
 
 CELLS = 32
 """Cells along each side of a table."""
@@ -217,9 +157,152 @@ class Poses:
         return cls(*(np.concatenate(part) for part in zip(*(vars(part).values() for part in parts), strict=True)))
 
 
+# --- what samples may be observed -------------------------------------------------------------------------------------
+
+# Notation: n poses, w positions of each, p points, q states, s samples, r rotations, c cells.
+
+
+@dataclass(frozen=True, eq=False)
+class SightTable:
+    """What a frame rules out, as a table of lines of sight; the rules are those of ``Evidence.violations``.
+
+    Attributes:
+        T: rotation into the axes of the table, whose third is the direction of the cloud.
+        low, cell: corner of the table and length of a cell, as slopes across the direction.
+        toward, front, free: ``Evidence.along`` the cells.
+        pitch: angle between neighbouring lines of sight.
+    """
+
+    T: Float32[np.ndarray, "3 3"]
+    low: Float32[np.ndarray, "2"]
+    cell: float
+    toward: Float32[np.ndarray, "c 3"]
+    front: Float32[np.ndarray, " c"]
+    free: Float32[np.ndarray, " c"]
+    pitch: float
+
+    @classmethod
+    def of(cls, evidence: Evidence) -> "SightTable":
+        """Table around the cloud, three times as wide; beyond, the nearest cell of the border stands for a position."""
+        direction = evidence.sight.data[: len(evidence.points)]
+        T = rotation_along(direction.mean(axis=0) / np.linalg.norm(direction.mean(axis=0))).T
+        turned = evidence.points @ T.T
+        slope = turned[:, :2] / np.maximum(turned[:, 2:], 0.1 * np.linalg.norm(turned, axis=1, keepdims=True))
+        low, high = slope.min(axis=0), slope.max(axis=0)
+        side = 3.0 * float((high - low).max()) + 4 * evidence.pitch
+        corner = (low + high - side) / 2
+        cells = min(96, max(16, int(side / evidence.pitch)))
+        across = corner + (np.stack(np.meshgrid(*(np.arange(cells) + 0.5,) * 2, indexing="ij"), -1)) * side / cells
+        sight = np.concatenate([across.reshape(-1, 2), np.ones((cells * cells, 1))], axis=1) @ T
+        sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+        toward, front, free = (part.astype(np.float32) for part in evidence.along(sight))
+        return cls(T.astype(np.float32), corner.astype(np.float32), side / cells, toward, front, free, evidence.pitch)
+
+    def violations(
+        self, position: Float32[np.ndarray, "n w 3"], slack: float
+    ) -> tuple[Float32[np.ndarray, "n w 3"], Float32[np.ndarray, "n w"]]:
+        """``Evidence.violations`` of many positions, up to a cell."""
+        cells = round(np.sqrt(len(self.front)))
+        turned = position @ self.T.T
+        slope = turned[..., :2] / np.maximum(turned[..., 2:], 1e-6)
+        index = clipped((slope - self.low) / self.cell, cells)
+        row = index[..., 0] * cells + index[..., 1]
+        distance = np.sqrt(np.einsum("nwi,nwi->nw", position, position))
+        toward, free = self.toward[row], self.free[row]
+        is_past = free > distance - slack
+        sideways = toward * distance[..., None] - position
+        length = np.sqrt(np.einsum("nwi,nwi->nw", sideways, sideways))
+        direction = np.where(is_past[..., None], sideways / np.maximum(length, 1e-9)[..., None], toward)
+        ahead = np.where(free < 0, self.front[row] - slack - distance, 0.0)
+        amount = np.where(is_past, length - self.pitch * distance, ahead)
+        return direction, np.maximum(amount, 0.0).astype(np.float32)
+
+    def shown(
+        self,
+        normals: Float32[np.ndarray, "q s 3"],
+        rotations: Float32[np.ndarray, "r 3 3"],
+        center: Float32[np.ndarray, "3"],
+    ) -> Float32[np.ndarray, "q s r"]:
+        """How much of each sample the camera sees at each rotation; ``center`` is that of the cloud."""
+        toward = (rotations.transpose(0, 2, 1) @ (center / np.linalg.norm(center))).T
+        return np.maximum(-(normals @ toward), 0.0)
+
+    def axes(self, center: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, "a 3"]:
+        """Directions in which a part may be hidden: across the line of sight."""
+        return rotation_along(center / np.linalg.norm(center))[:, :2].T.astype(np.float32)
+
+    def across(self, center: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, "3 3"]:
+        """Projection of positions onto what shows their size: across the line of sight."""
+        ahead = center / np.linalg.norm(center)
+        return np.eye(3, dtype=np.float32) - ahead[:, None] * ahead
+
+    def facing(
+        self, poses: Poses, position: Float32[np.ndarray, "n p 3"], normal: Float32[np.ndarray, "n p 3"]
+    ) -> Bool[np.ndarray, "n p"]:
+        """Whether samples can be what was observed: those that face the camera."""
+        size, inverse = np.exp(poses.log_scale)[:, None, None], poses.rotation.transpose(0, 2, 1)
+        camera = -np.matmul(inverse, poses.translation[..., None]).transpose(0, 2, 1) / size
+        return np.einsum("npi,npi->np", camera - position, normal) > 0
+
+
+@dataclass(frozen=True, eq=False)
+class Normals:
+    """In its place of a surface without a camera: nothing is ruled out, and samples are chosen by the points' normals.
+
+    Attributes:
+        normals: of the points that poses are compared with.
+        lift: of ``SurfaceEvidence``.
+    """
+
+    normals: Float32[np.ndarray, "p 3"]
+    lift: Callable[[np.ndarray], np.ndarray]
+
+    @classmethod
+    def of(cls, evidence: SurfaceEvidence) -> "Normals":
+        """Normals of a surface."""
+        return cls(evidence.sample_normals[:POINTS].astype(np.float32), evidence.lift)
+
+    def violations(
+        self, position: Float32[np.ndarray, "n w 3"], slack: float
+    ) -> tuple[Float32[np.ndarray, "n w 3"], Float32[np.ndarray, "n w"]]:
+        """Nothing is ruled out."""
+        return np.zeros_like(position), np.zeros_like(position[..., 0])
+
+    def shown(
+        self,
+        normals: Float32[np.ndarray, "q s 3"],
+        rotations: Float32[np.ndarray, "r 3 3"],
+        center: Float32[np.ndarray, "3"],
+    ) -> Float32[np.ndarray, "q s r"]:
+        """How many of the points have normals like each sample's at each rotation."""
+        points = np.matmul(self.normals, rotations)  # r p 3, in the model's frame
+        samples, lifted = self.lift(normals), self.lift(points)
+        shares = [np.maximum(each @ lifted.transpose(0, 2, 1), 0.0).mean(axis=2).T for each in samples]
+        return np.stack(shares)
+
+    def axes(self, center: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, "a 3"]:
+        """Directions in which a part may be hidden: all."""
+        return np.eye(3, dtype=np.float32)
+
+    def across(self, center: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, "3 3"]:
+        """Projection of positions onto what shows their size: as they are."""
+        return np.eye(3, dtype=np.float32)
+
+    def facing(
+        self, poses: Poses, position: Float32[np.ndarray, "n p 3"], normal: Float32[np.ndarray, "n p 3"]
+    ) -> Bool[np.ndarray, "n p"]:
+        """Whether samples can be what was observed: those whose normals agree with the points'."""
+        points = np.matmul(self.normals, poses.rotation)
+        return np.einsum("npi,npi->np", self.lift(points), self.lift(normal)) > 0
+
+
+SIGHTS: Mapping[type, Callable[[Any], SightTable | Normals]] = {Evidence: SightTable.of, SurfaceEvidence: Normals.of}
+"""What samples may be observed, by each kind of evidence."""
+
+
 @dataclass(frozen=True, eq=False)
 class Screen:
-    """What poses are compared with: some observed points, evenly spread, and what the frame rules out.
+    """What poses are compared with: some points that a camera saw, evenly spread, and what the frame rules out.
 
     Attributes:
         half: half the object's length.
@@ -229,41 +312,39 @@ class Screen:
 
     tables: ShapeTables
     points: Float32[np.ndarray, "p 3"]
-    sight: SightTable
+    sight: SightTable | Normals
     half: float
     scaled: bool
     in_part: bool
 
     @classmethod
-    def of(cls, tables: ShapeTables, evidence: Evidence, half: float, scaled: bool = False) -> "Screen":
+    def of(cls, tables: ShapeTables, evidence: Observed, half: float, scaled: bool = False) -> "Screen":
         """Screen of a frame."""
-        points, sight = evidence.observed_samples[:POINTS].astype(np.float32), SightTable.of(evidence)
+        points = evidence.observed_samples[:POINTS].astype(np.float32)
+        sight = SIGHTS[type(evidence)](evidence)
         return cls(tables, points, sight, half, scaled, evidence.is_open)
 
     def starts(self, rotations: Float[np.ndarray, "r 3 3"]) -> Poses:
         """Every state at every rotation, its visible side on the cloud; where ``scaled``, as large as the cloud.
 
-        Where something may hide a part of the object, also the four halves of its visible side.
+        Where something may hide a part of the object, also the halves of its visible side in each direction.
         """
         rotations = rotations.astype(np.float32)
         center = self.points.mean(axis=0)
-        ahead = center / np.linalg.norm(center)
-        toward = (rotations.transpose(0, 2, 1) @ ahead).T
-        visible = np.maximum(-(self.tables.normal @ toward), 0.0)  # q s r
+        visible = self.sight.shown(self.tables.normal, rotations, center)
         parts = [visible]
         if self.in_part:
             total = np.maximum(visible.sum(axis=1, keepdims=True), 1e-9)
-            for axis in rotation_along(ahead)[:, :2].T.astype(np.float32):
+            for axis in self.sight.axes(center):
                 across = self.tables.position @ (rotations.transpose(0, 2, 1) @ axis).T
                 middle = (across * visible).sum(axis=1, keepdims=True) / total
                 parts += [np.where(across > middle, visible, 0.0), np.where(across <= middle, visible, 0.0)]
-        return Poses.of_all([self._on_cloud(part, rotations, ahead) for part in parts])
+        return Poses.of_all([self._on_cloud(part, rotations) for part in parts])
 
     def _on_cloud(
         self,
         weight: Float32[np.ndarray, "q s r"],
         rotations: Float32[np.ndarray, "r 3 3"],
-        ahead: Float32[np.ndarray, "3"],
     ) -> Poses:
         """Every state at every rotation, with the centre of its weighted samples on that of the cloud."""
         center = self.points.mean(axis=0)
@@ -274,7 +355,7 @@ class Screen:
         log_scale = np.zeros(len(state), dtype=np.float32)
         if self.scaled:
             position = np.matmul(self.tables.position[state] - middle[:, None], rotation.transpose(0, 2, 1))
-            across = np.eye(3, dtype=np.float32) - ahead[:, None] * ahead
+            across = self.sight.across(center)
             spread = np.einsum("nsi,nsi,ns->n", position @ across, position, weight.transpose(0, 2, 1)[state, turn])
             seen = ((self.points - center) @ across * (self.points - center)).sum(axis=1).mean()
             log_scale = (0.5 * np.log(seen / np.maximum(spread, 1e-9))).astype(np.float32)
@@ -293,14 +374,13 @@ class Screen:
 
     def _step(self, poses: Poses, sigma: float, moves: bool) -> Poses:
         tables, state = self.tables, poses.state[:, None]
-        size, inverse = np.exp(poses.log_scale)[:, None, None], poses.rotation.transpose(0, 2, 1)
+        size = np.exp(poses.log_scale)[:, None, None]
         seen = np.matmul(self.points - poses.translation[:, None], poses.rotation) / size
         index = clipped((seen - tables.low[state]) / tables.cell[state][..., None], CELLS)
         sample = tables.nearest[state, (index[..., 0] * CELLS + index[..., 1]) * CELLS + index[..., 2]]
         position, normal = tables.position[state, sample], tables.normal[state, sample]
         offset, narrow = seen - position, sigma / size[..., 0]
-        camera = -np.matmul(inverse, poses.translation[..., None]).transpose(0, 2, 1) / size
-        facing = np.einsum("npi,npi->np", camera - position, normal) > 0
+        facing = self.sight.facing(poses, position, normal)
         squared = np.einsum("npi,npi->np", offset, offset) / narrow**2
         squared = np.where(facing, squared, squared + ROBUST**2)
         few = tables.position[poses.state, :: max(1, tables.position.shape[1] // POINTS)]

@@ -23,20 +23,17 @@ from scipy.spatial.transform import Rotation
 from mereo.fitting.config import FitConfig, LocatedBy, TrackConfig, Tracking
 from mereo.fitting.modes import ScoredFit, explored, has_many_optima, refine
 from mereo.fitting.problem.correspondences import nothing
-from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import DAMPING, POSE, NormalEquations, Posed, in_space
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem, constants_for
 from mereo.fitting.problem.residuals import NetworkTerm, Prior, are_near
 from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.answer_frame import answer_of, find, in_registered_unit, search_hypotheses
 from mereo.fitting.registration.recognition import MOST, Recognition, recognize
-from mereo.fitting.registration.register import ModesFit, Registrar
+from mereo.fitting.registration.register import CloudToFit, ModesFit, Registrar
 from mereo.fitting.search import WHOLE
 from mereo.geometry.brief import counted
-from mereo.geometry.camera import SightKind, SightLines
+from mereo.geometry.camera import SightKind
 from mereo.geometry.conventions import MIN_POINTS
-from mereo.geometry.downsampling import means_along_sight
-from mereo.geometry.transforms import transform_points
 from mereo.io.bounds import Number, PositiveOrUnknown, check_bounds
 from mereo.io.cores import limit_blas_threads
 from mereo.models.calibration import Calibration
@@ -59,7 +56,7 @@ class Track:
         noise: of the frames, smoothed, scene units.
         clean: constants of frames without noise; ``problem`` has those for ``noise``.
         other_lines: kind of the lines of sight of which a frame says nothing, as it was when the track began.
-        area: greatest area of the object that was seen (``seen_area``).
+        area: greatest area of the object that was seen (``area`` of the evidence).
         left, explored_s: misfit of the cloud that the last exploration left over (``explore``), and when.
     """
 
@@ -93,7 +90,7 @@ class Track:
             noise=base.residual_noise(fitted.surface),
             clean=clean,
             other_lines=base.evidence.other_lines,
-            area=seen_area(base.evidence),
+            area=base.evidence.area,
             calibration=fitted.calibration,
         )
 
@@ -142,27 +139,24 @@ def gated(track: Track, points: Float[np.ndarray, "n 3"], time_s: float, config:
 
 def next_fit(
     track: Track,
-    points: Float[np.ndarray, "n 3"],
-    outliers: Float[np.ndarray, "d 3"],
+    cloud: CloudToFit,
     time_s: float,
     config: TrackConfig,
-    lines: SightLines,
 ) -> tuple[ModesFit, Track]:
     """Fit the modes to a frame, and return the fit with the track that ends with it.
 
-    Points, outliers and lines of sight are in the camera frame and the clouds' unit. Where ``lines`` leave it open, the
-    object is seen whole or in part as it was when the track began; where it was seen whole and the frame rules that out
-    by more than ``WHOLE``, it is fitted as seen in part too, and the better fit is taken.
+    Where the lines of sight of ``cloud`` leave it open, the object is seen whole or in part as it was when the track
+    began; where it was seen whole and the frame rules that out by more than ``WHOLE``, it is fitted as seen in part
+    too, and the better fit is taken.
     """
-    started = time.perf_counter()
+    started, lines = time.perf_counter(), cloud.lines
     with limit_blas_threads():
-        few = means_along_sight(points / track.unit, config.points)
         start = track.expected(time_s, config)
         precision = motion_precision(track, max(time_s - track.time_s, 0.0), config)
 
         def fit(other_lines: SightKind) -> ModesFit:
-            sight_lines = replace(lines.scaled(1 / track.unit), other_lines=other_lines)
-            evidence = Evidence.of(few, outliers / track.unit, config.observed_samples, sight_lines)
+            like = replace(cloud, lines=replace(lines, other_lines=other_lines))
+            evidence = like.evidence(track.unit, config.observed_samples, config.points)
             problem = changed(track.problem, evidence=evidence)
             posed = descend(problem, start, precision, config)
             return ModesFit(problem, nothing(), track.unit, posed, 0.0, calibration=track.calibration)
@@ -209,13 +203,8 @@ def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig)
         velocity=track.velocity + config.smoothing * (between(track.posed, posed) / passed - track.velocity),
         unsure=track.unsure * (1 - config.smoothing),
         noise=noise,
-        area=max(track.area, seen_area(fitted.problem.evidence)),
+        area=max(track.area, fitted.problem.evidence.area),
     )
-
-
-def seen_area(evidence: Evidence) -> float:
-    """Area of the surface that was seen, across the lines of sight: that of a pixel for each point, scene units."""
-    return float(((evidence.pitch * evidence.ranges) ** 2).sum())
 
 
 def between(first: Posed, second: Posed) -> Float[np.ndarray, " p"]:
@@ -417,14 +406,16 @@ class Tracker:
         passed_s = time_s - track.time_s
         if not 0 <= passed_s <= longest_s:
             return None, f"it was last followed {passed_s:.1f} s before"
-        points = transform_points(self._T_camera_input, seen.cloud.points)
+        cloud = seen.cloud.transformed(self._T_camera_input)
+        points = cloud.points
         keep = np.ones(len(points), dtype=bool) if frame.keep_all else gated(track, points, time_s, self.config)
         if keep.sum() < MIN_POINTS:
             return None, f"{counted(int(keep.sum()), 'point')} of at least {MIN_POINTS} lie near where it was expected"
-        lines = seen.lines.transformed(self._T_camera_input)
+        lines, kept = seen.lines.transformed(self._T_camera_input), cloud.rows(keep)
+        near = CloudToFit(kept.points, outliers=points[~keep], lines=lines, normals=kept.normals)
 
         def fit(config: TrackConfig) -> _Tracked:
-            fitted, after = next_fit(track, points[keep], points[~keep], time_s, config, lines)
+            fitted, after = next_fit(track, near, time_s, config)
             return _Tracked(fitted, after, Reading(seen.cloud, keep))
 
         tracked = fit(self.config)
@@ -562,4 +553,4 @@ class _Tracked:
     @cached_property
     def area(self) -> float:
         """Area of the object that was seen, as a share of the greatest ever."""
-        return seen_area(self.fitted.problem.evidence) / self.track.area
+        return self.fitted.problem.evidence.area / self.track.area

@@ -263,7 +263,7 @@ class ModesOptimum:
     @cached_property
     def surface(self) -> Surface:
         """The posed surface."""
-        return Surface.of(self.problem.model, self.posed)
+        return self.problem.surface(self.posed)
 
     @cached_property
     def posterior(self) -> Posterior:
@@ -541,8 +541,7 @@ class Uncertainty:
     def unexplained(self) -> Float[np.ndarray, "k 3"]:
         """Observed points farther from the surface than the tolerance; the fit's camera frame, scene units."""
         frame = self.optimum.frame
-        points = frame.evidence.points
-        return points[self.optimum.surface.nearest(points)[0] > frame.config.tolerance]
+        return frame.evidence.points[np.abs(frame.offsets(self.optimum.surface)) > frame.config.tolerance]
 
     def centroid_motion(self, index: int) -> Float[np.ndarray, "3 p"]:
         """Motion of the centroid of a segment, as ``Posterior.motion_at``."""

@@ -96,11 +96,31 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """Observed surface points in the camera frame, in the sensor's units. Order carries no meaning."""
+    """Observed surface points in the camera frame, in the sensor's units. Order carries no meaning.
+
+    Attributes:
+        points: their positions.
+        normals: unit vectors out of the surface at each of them; None where the source has none. They matter for a
+            surface that no single camera saw, and tell that one is (``IsolationConfig.extent``).
+    """
 
     points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "_ 3"] | None = None
+
+    @classmethod
+    def of(cls, rows: Float[np.ndarray, "n c"]) -> "PointCloud":
+        """Cloud of rows with three numbers, or with six where a normal of any length follows each position."""
+        if rows.shape[1] == 3:
+            return cls(rows)
+        normals = rows[:, 3:]
+        return cls(rows[:, :3].copy(), normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30))
 
     def __post_init__(self) -> None:
+        if self.normals is not None and np.shape(self.normals) != np.shape(self.points):
+            raise ValueError(
+                f"there are {len(self.normals)} normals and {len(self.points)} points; each point needs one, of three "
+                "numbers: give arrays of the same shape"
+            )
         check_real(self.points, "the point cloud")
         if self.points.ndim != 2 or self.points.shape[1] != 3:
             raise ValueError(f"the points have the shape {self.points.shape}; they must be n x 3: give rows of x, y, z")
@@ -110,6 +130,17 @@ class PointCloud:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def rows(self, keep: Bool[np.ndarray, " n"]) -> "PointCloud":
+        """Some of the points; the cloud itself where these are all."""
+        if keep.all():
+            return self
+        return PointCloud(self.points[keep], None if self.normals is None else self.normals[keep])
+
+    def transformed(self, T_new_old: Float[np.ndarray, "4 4"]) -> "PointCloud":
+        """The same in another frame."""
+        normals = None if self.normals is None else self.normals @ T_new_old[:3, :3].T
+        return PointCloud(transform_points(T_new_old, self.points), normals)
 
     def __repr__(self) -> str:
         return f"PointCloud({counted(len(self), 'point')}, {sides(self.points)})"
@@ -177,8 +208,8 @@ class DepthImage:
 # farther away, so that the space before that is empty; or it is *unknown*: something nearer hides what is behind,
 # nothing was measured, or it lies outside the picture.
 
-SightKind = Literal["past", "unknown"]
-"""Kind of a line of sight that did not meet the object."""
+SightKind = Literal["past", "unknown", "none"]
+"""Kind of a line of sight that did not meet the object: *none* of a surface that no single camera saw."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -249,6 +249,23 @@ def surface_points(
     return a[face] + u * (b - a)[face] + v * (c - a)[face], face
 
 
+FEW_VERTICES = 2500
+"""Vertices below which places on the faces stand for a surface: corners of few large triangles do not show it."""
+
+
+def with_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "v 6"]:
+    """Vertices and their normals, outward as the faces are wound; those of vertices that no face has are 0."""
+    return np.hstack([vertices, vertex_normals(Segment("", PALETTE[0], vertices, faces))])
+
+
+def oriented_points(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "n 6"]:
+    """Points that stand for a surface: all vertices, or where these are few, points on the faces; with normals."""
+    if len(vertices) >= FEW_VERTICES:
+        return with_normals(vertices, faces)
+    points, face = surface_points(vertices, faces, FEW_VERTICES)
+    return np.hstack([points, area_vectors(vertices, faces)[face]])
+
+
 def barycentric(triangles: Float[np.ndarray, "n 3 3"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Barycentric coordinates of points in the planes of their triangles."""
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]

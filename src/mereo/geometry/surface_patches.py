@@ -131,7 +131,7 @@ def smoothed(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         return points
     near = (angle <= radius) & _on_same_surface(distance, angle, neighbor)
     weight = near * np.exp(-0.5 * (angle / (WIDTH * radius)) ** 2)
-    inverse = _fit_patches(_quadratic(sight, neighbor, radius), weight, weight / distance[neighbor], RIDGE)[:, 0]
+    inverse = _fit_patches(_quadratic(sight, sight, neighbor, radius), weight, weight / distance[neighbor], RIDGE)[:, 0]
     moved = np.where((near.sum(axis=1) >= FEWEST) & (inverse > 0), 1.0 / inverse, distance)
     return sight * moved[:, None]
 
@@ -140,11 +140,12 @@ ROUGH_NEIGHBORS, CALM = 12, 0.1
 """Points of each local patch, itself among them, and the share of a cloud that is its calmest part."""
 
 
-def roughness(points: Float[np.ndarray, "n 3"]) -> float:
+def roughness(points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"] | None = None) -> float:
     """Bound on the noise of a cloud along its lines of sight, in its unit: how rough its calmest part is.
 
-    The standard deviation from a quadratic patch of each point and its neighbours, which edges and fine relief raise:
-    the ``CALM`` quantile of it. Infinite for fewer points than say anything.
+    With ``normals`` it is that along them, of a surface that has no lines of sight. The ``CALM`` quantile of the
+    standard deviation from a quadratic patch of each point and its neighbours, which edges and fine relief raise.
+    Infinite for fewer points than say anything.
     """
     count = min(ROUGH_NEIGHBORS, len(points))
     free = count - len(RIDGE)
@@ -152,11 +153,16 @@ def roughness(points: Float[np.ndarray, "n 3"]) -> float:
         return float("inf")
     distance = np.linalg.norm(points, axis=1)
     sight = points / distance[:, None]
-    angle, neighbor = cKDTree(sight).query(sight, k=count)
-    radius = max(float(np.median(angle[:, -1])), np.finfo(float).tiny)
-    terms, inverse = _quadratic(sight, neighbor, radius), 1.0 / distance[neighbor]
-    patch = _fit_patches(terms, np.ones_like(inverse), inverse, (1e-6,) * len(RIDGE))  # rows of points leave it open
-    away = np.linalg.norm(inverse - np.einsum("nki,ni->nk", terms, patch), axis=1) * distance**2
+    places, axis = (sight, sight) if normals is None else (points, normals)
+    apart, neighbor = cKDTree(places).query(places, k=count)
+    radius = max(float(np.median(apart[:, -1])), np.finfo(float).tiny)
+    value, unit = 1.0 / distance[neighbor], distance**2
+    if normals is not None:
+        value = np.einsum("nki,ni->nk", points[neighbor] - points[:, None], normals)
+        unit = np.ones(len(points))
+    terms = _quadratic(places, axis, neighbor, radius)
+    patch = _fit_patches(terms, np.ones_like(value), value, (1e-6,) * len(RIDGE))  # rows of points leave it open
+    away = np.linalg.norm(value - np.einsum("nki,ni->nk", terms, patch), axis=1) * unit
     return float(np.quantile(away, CALM)) / float(np.sqrt(free))
 
 
@@ -182,12 +188,12 @@ def _fit_patches(
 
 
 def _quadratic(
-    sight: Float[np.ndarray, "n 3"], neighbor: Int[np.ndarray, "n k"], radius: float
+    places: Float[np.ndarray, "n 3"], axis: Float[np.ndarray, "n 3"], neighbor: Int[np.ndarray, "n k"], radius: float
 ) -> Float[np.ndarray, "n k 6"]:
-    """Terms (1, u, v, u^2, uv, v^2) of each neighbour's direction, u and v across the point's own, in radii."""
-    across = np.cross(sight, np.eye(3)[np.abs(sight).argmin(axis=1)])
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    apart = (sight[neighbor] - sight[:, None]) / radius
+    """Terms (1, u, v, u^2, uv, v^2) of each neighbour's place (or direction), u and v across the axis, in radii."""
+    across = np.cross(axis, np.eye(3)[np.abs(axis).argmin(axis=1)])
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), np.finfo(float).tiny)
+    apart = (places[neighbor] - places[:, None]) / radius
     u = np.einsum("nkj,nj->nk", apart, across)
-    v = np.einsum("nkj,nj->nk", apart, np.cross(sight, across))
+    v = np.einsum("nkj,nj->nk", apart, np.cross(axis, across))
     return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)

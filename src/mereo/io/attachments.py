@@ -212,7 +212,7 @@ def _read(path: Path) -> Content:
     if suffix == ".ply":
         with readable(path, "mesh or point cloud"):
             is_mesh = check_ply(path).get("face", 0) > 0
-    content = Surfaces(read_segmented_mesh(path)) if is_mesh else Positions(read_points(path))
+    content = Surfaces(read_segmented_mesh(path)) if is_mesh else Positions(read_points(path)[:, :3])
     if not len(content.points) or not np.isfinite(content.points).all():
         raise ValueError(f"{path} has no positions, or NaN or infinite ones; all must be finite: export it again")
     return content

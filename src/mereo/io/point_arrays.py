@@ -31,7 +31,8 @@ def points_of(source: object, drop_invalid: bool = False) -> tuple[PointCloud | 
       itself into a numpy array; masked values are points without a measurement;
     - lists or tuples of rows of three numbers;
     - structured arrays with fields x, y and z in any order among others, in one or two dimensions;
-    - objects with ``points`` or ``vertices`` (Open3D and its tensors, trimesh, PyVista);
+    - objects with ``points`` or ``vertices`` (Open3D and its tensors, trimesh, PyVista), with their ``normals`` or
+      ``vertex_normals`` where they have some;
     - messages of the type sensor_msgs/PointCloud2, of ROS 1, ROS 2 or rosbags.
 
     Args:
@@ -48,8 +49,18 @@ def points_of(source: object, drop_invalid: bool = False) -> tuple[PointCloud | 
         cure = "leave them out with drop_invalid=True"
         if organized:
             cure = "organized clouds mark pixels without a measurement so, and drop_invalid=True leaves them out"
-        kept = valid_points(points, name, drop_invalid, cure)
-    return PointCloud(kept), len(points) - len(kept)
+        kept = valid_points(_with_normals(points, source), name, drop_invalid, cure)
+    return PointCloud.of(kept), len(points) - len(kept)
+
+
+def _with_normals(points: Float[np.ndarray, "n 3"], source: Any) -> Float[np.ndarray, "n c"]:
+    """Points, with the normals that an object of Open3D or trimesh has for each of them, if it has."""
+    for name in ("normals", "vertex_normals"):
+        with suppress(Exception):  # of what else has such a name
+            normals = np.asarray(getattr(source, name), dtype=np.float64)
+            if normals.shape == points.shape and np.isfinite(normals).all():
+                return np.hstack([points, normals])
+    return points
 
 
 def model_points(source: object) -> Float[np.ndarray, "n 3"]:

@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from mereo.geometry.brief import listed
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import LARGEST
+from mereo.geometry.mesh import with_normals
 from mereo.geometry.transforms import checked_pose, rigid
 from mereo.io.errors import check_count, check_suffix, limited_memory, quiet, readable, without_output
 from mereo.io.extras import library
@@ -68,32 +69,37 @@ def read_point_cloud(path: str | Path, drop_invalid: bool = False) -> PointCloud
     Raises ``FileNotFoundError``, ``ValueError`` where it is of another format, empty, truncated or not numeric, or has
     invalid points that are not to be dropped, and ``ImportError`` for a ZDF file without the extra `sensors`.
     """
-    return PointCloud(valid_points(read_points(path), path, drop_invalid))
+    return PointCloud.of(valid_points(read_points(path), path, drop_invalid))
 
 
-def read_points(path: str | Path) -> Float[np.ndarray, "n 3"]:
-    """Points of a file as ``read_point_cloud`` reads them, those without a measurement included."""
+MESHES = (".stl", ".obj", ".glb", ".gltf", ".off", ".3mf")
+"""Suffixes of files that hold surfaces and no points."""
+
+
+def read_points(path: str | Path) -> Float[np.ndarray, "n c"]:
+    """Rows of ``PointCloud.of``: points as ``read_point_cloud`` has them, those without a measurement included."""
     path = Path(path)
-    if path.suffix.lower() in (".stl", ".obj", ".glb", ".gltf", ".off", ".3mf") and path.exists():
+    if path.suffix.lower() in MESHES and path.exists():
         raise ValueError(
             f"{path} is a mesh, not what a camera has measured, which is a depth image or a point cloud ("
             f"{', '.join(CLOUD_READERS)}): give the frame, and the mesh as the object (--object)"
         )
     check_suffix(path, CLOUD_READERS, "point cloud")
     with readable(path, "point cloud"):
-        return np.asarray(CLOUD_READERS[path.suffix.lower()](path), dtype=np.float64).reshape(-1, 3)
+        return np.asarray(CLOUD_READERS[path.suffix.lower()](path), dtype=np.float64)
 
 
 def valid_points(
-    points: Float[np.ndarray, "n 3"],
+    rows: Float[np.ndarray, "n c"],
     path: str | Path,
     drop_invalid: bool,
     cure: str = "leave them out with --drop-invalid",
-) -> Float[np.ndarray, "m 3"]:
-    """Points that are measurements, as a copy. Raises as ``read_point_cloud`` does.
+) -> Float[np.ndarray, "m c"]:
+    """Rows whose points, the first three columns, are measurements, as a copy. Raises as ``read_point_cloud`` does.
 
     ``path`` is where they come from, and ``cure`` what to do where others are not to be left out, for the sentences.
     """
+    points = rows[:, :3]
     if len(points) == 0:
         raise ValueError(f"{path} holds 0 points; the object must be visible: check where they come from")
     finite = (np.abs(points) <= LARGEST).all(axis=1)
@@ -111,7 +117,7 @@ def valid_points(
             f"{path} has {lost} of {len(points)} points without a measurement ({kind}); all must be finite positions: "
             f"{cure}"
         )
-    return points[usable]
+    return rows[usable]
 
 
 # --- depth images and masks -------------------------------------------------------------------------------------------
@@ -335,14 +341,23 @@ DEPTH_READERS: dict[str, Callable[[Path], Raw]] = {
 # --- parsers of point clouds: positions, NaN rows included ------------------------------------------------------------
 
 
-def _ply_points(path: Path) -> Float[np.ndarray, "n 3"]:
-    """Vertices of a PLY file; trimesh returns those it finds, so a file cut short is only noticed by counting them."""
+def _ply_points(path: Path) -> Float[np.ndarray, "n c"]:
+    """Vertices of a PLY file, with the normals that it states, or that its faces have.
+
+    trimesh returns those it finds, so a file cut short is only noticed by counting them.
+    """
     count = check_ply(path).get("vertex", 0)
     if count == 0:
         raise ValueError("it has 0 vertices")
     loaded: Any = trimesh.load(path, file_type="ply", resolver={}, process=False)  # no textures
     check_count(count, len(loaded.vertices), "points")
-    return np.asarray(loaded.vertices, dtype=np.float64)
+    vertices = np.asarray(loaded.vertices, dtype=np.float64)
+    with suppress(LookupError, ValueError):  # which numpy raises for a name that it has not
+        stated = loaded.metadata["_ply_raw"]["vertex"]["data"]
+        normals = np.stack([np.asarray(stated[name], dtype=np.float64).reshape(-1) for name in ("nx", "ny", "nz")], 1)
+        return np.hstack([vertices, np.nan_to_num(normals, posinf=0.0, neginf=0.0)])
+    faces = np.asarray(getattr(loaded, "faces", ()), dtype=np.int64).reshape(-1, 3)
+    return with_normals(vertices, faces) if len(faces) else vertices
 
 
 def check_ply(path: Path) -> dict[str, int]:
@@ -548,7 +563,7 @@ def _zdf_points(path: Path) -> Float[np.ndarray, "n 3"]:
     return _check_array(np.ma.filled(np.ma.asarray(cloud, dtype=np.float64), np.nan))
 
 
-CLOUD_READERS: dict[str, Callable[[Path], Float[np.ndarray, "n 3"]]] = {
+CLOUD_READERS: dict[str, Callable[[Path], Float[np.ndarray, "n c"]]] = {
     ".ply": _ply_points,
     ".pcd": _pcd_points,
     **dict.fromkeys((".xyz", ".txt", ".pts", ".asc", ".csv"), _text_points),

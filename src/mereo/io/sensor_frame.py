@@ -1,4 +1,4 @@
-"""One frame of a sensor from whatever file holds it: a depth image, a point cloud or a ROS recording.
+"""One frame of a sensor from whatever file holds it: a depth image, a point cloud, a mesh or a ROS recording.
 
 Options that do not belong to a file's kind are refused, because ignored ones are wrong results that nobody notices.
 """
@@ -15,12 +15,16 @@ from jaxtyping import Float
 from mereo.geometry.brief import counted
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.mesh import FEW_VERTICES, oriented_points
 from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
 from mereo.io.bounds import PositiveOrUnknown, check_bounds
 from mereo.io.config import InputConfig
 from mereo.io.intrinsics import read_intrinsics
+from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.readers import (
+    MESHES,
     InputWarning,
+    check_ply,
     depth_of,
     is_depth_image,
     read_points,
@@ -84,8 +88,8 @@ class SensorFrame:
                 f"a camera pose is given, but {self.path} is a depth image, or a scan that --frame turns; it is for "
                 "clouds in another frame, such as a robot's base: leave out --camera-pose"
             )
-        points = transform_points(np.linalg.inv(T_input_camera), self.cloud.points)  # its digits may be few
-        return replace(self, cloud=PointCloud(points), T_input_result=T_input_camera)
+        cloud = self.cloud.transformed(np.linalg.inv(T_input_camera))  # its digits may be few
+        return replace(self, cloud=cloud, T_input_result=T_input_camera)
 
     @property
     def metres(self) -> float:
@@ -108,7 +112,7 @@ def read_frame(
     reading: InputConfig = InputConfig(),  # noqa: B008 (frozen)
     T_input_camera: Float[np.ndarray, "4 4"] | None = None,
 ) -> SensorFrame:
-    """Frame that a depth image, point cloud or ROS recording holds, or that ``reading`` picks from it.
+    """Frame that a depth image, point cloud, mesh or ROS recording holds, or that ``reading`` picks from it.
 
     Depth images and recordings come in metres and camera axes; point clouds keep their file's unit and axes, unless the
     camera's pose is given, here or by the file's name, or stated in the file: then they are moved into the camera's.
@@ -131,9 +135,20 @@ def _as_stored(path: Path, reading: InputConfig) -> SensorFrame:
     unit_m = reading.unit_m
     if unit_m is None and path.suffix.lower() == ".zdf":  # in millimetres, by its definition
         unit_m = 0.001
-    points = read_points(path)
-    cloud = PointCloud(valid_points(points, path, reading.drop_invalid))
-    return SensorFrame(path, cloud, unit_m, reading.frame, invalid=len(points) - len(cloud))
+    rows = _cloud_rows(path)
+    usable = valid_points(rows, path, reading.drop_invalid or path.suffix.lower() in MESHES)
+    return SensorFrame(path, PointCloud.of(usable), unit_m, reading.frame, invalid=len(rows) - len(usable))
+
+
+def _cloud_rows(path: Path) -> Float[np.ndarray, "n c"]:
+    """Rows of ``PointCloud.of`` of a cloud, or of a mesh, where points on few large faces stand for it."""
+    if path.suffix.lower() not in MESHES:
+        rows = read_points(path)
+        is_coarse = path.suffix.lower() == ".ply" and rows.shape[1] == 6 and len(rows) < FEW_VERTICES
+        if not is_coarse or not check_ply(path).get("face"):
+            return rows
+    vertices, faces, _ = read_segmented_mesh(path).merged()
+    return oriented_points(vertices, faces)
 
 
 def in_camera(frame: SensorFrame, reading: InputConfig, pose: Float[np.ndarray, "4 4"] | None = None) -> SensorFrame:
@@ -154,7 +169,7 @@ def _near_origin(frame: SensorFrame) -> SensorFrame:
     if frame.depth is not None or times <= FAR:
         return frame
     where = f"the points of {frame.path} lie around ({', '.join(f'{value:.10g}' for value in np.round(middle, 3))})"
-    if frame.axes == "camera":
+    if frame.axes == "camera" and frame.cloud.normals is None:
         raise ValueError(
             f"{where}, {times:.2g} times their extent from the origin, where the camera has to be, as in a map: give "
             "the camera's pose in these coordinates with --camera-pose FILE, or --frame scanner for a scan with y up"
@@ -166,7 +181,7 @@ def _near_origin(frame: SensorFrame) -> SensorFrame:
         InputWarning,
         stacklevel=4,
     )
-    return replace(frame, cloud=PointCloud(points - offset), T_input_result=rigid(np.eye(3), offset))
+    return replace(frame, cloud=replace(frame.cloud, points=points - offset), T_input_result=rigid(np.eye(3), offset))
 
 
 def _stated_pose(frame: SensorFrame, reading: InputConfig) -> Float[np.ndarray, "4 4"] | None:

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from mereo.io.bounds import NotNegative, check_bounds
 
-Extent = Literal["auto", "whole", "partial"]
+Extent = Literal["auto", "whole", "partial", "surface"]
 """Extent of the object that a frame shows: see ``IsolationConfig.extent``."""
 
 
@@ -27,8 +27,10 @@ class IsolationConfig:
             the cloud.
         extent: how much of the object's outline the frame shows. whole: nothing hides or cuts the object, so that it
             ends where its points end. partial: something may hide or cut it anywhere, so that nothing is known around
-            its points. auto: as the depths measured around the object say; where the frame does not say it, the fit
-            decides.
+            its points. surface: no single camera saw the points, as of stitched scans, CT and an endoscope's
+            reconstruction, so that they have no lines of sight and rule nothing out; their normals are compared. auto:
+            as the depths measured around the object say; where the frame does not say it, the fit decides; surface
+            where a file has faces or normals, and no camera at the origin can have seen them.
     """
 
     depth_range: tuple[float, float] | None = None

@@ -339,7 +339,7 @@ class Reading:
     @cached_property
     def cloud(self) -> PointCloud:
         """The object's points; the whole cloud itself where nothing is dropped."""
-        return self.whole if self.keep.all() else PointCloud(self.whole.points[self.keep])
+        return self.whole.rows(self.keep)
 
     @property
     def dropped(self) -> int:

@@ -17,13 +17,13 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mereo.geometry.brief import counted
-from mereo.geometry.camera import DepthImage, PointCloud, SightLines, into_camera
+from mereo.geometry.camera import DepthImage, PointCloud, SightKind, SightLines, into_camera
 from mereo.geometry.conventions import MIN_POINTS, CloudAxes
 from mereo.geometry.downsampling import MAX_POINTS, STEEPEST, random_subset
 from mereo.geometry.transforms import transform_points
 from mereo.io.sensor_frame import SensorFrame
 from mereo.reconstruction.config import Extent, IsolationConfig
-from mereo.reconstruction.isolation import IsolationStep, Reading, Selection, clusters, select_object
+from mereo.reconstruction.isolation import IsolationStep, Reading, Selection, clusters, readings, select_object
 
 SIZE_FACTOR = 2.0
 """Times that a visible part may be smaller or larger than any in training; beyond, it is another object or unit."""
@@ -60,7 +60,8 @@ class Observation:
         cloud: the object's points, in the frame's axes and unit.
         steps: what isolation left out.
         selection: points of the frame that isolation took for the object's; None means all.
-        extent: how much of the object's outline the frame shows, see ``IsolationConfig``.
+        extent: how much of the object's outline the frame shows, see ``IsolationConfig``; of ``find_object``, "surface"
+            where "auto" has found one.
         initial_pose: rough ``T_camera_model`` from which a fit starts, as ``Result.pose``; None where a search or a
             network finds the object.
     """
@@ -79,8 +80,8 @@ class Observation:
 
     @cached_property
     def self_hidden(self) -> float:
-        """Share of the points that others would hide from the camera (``hidden_share``); 0 of a depth image."""
-        if self.frame.depth is not None:
+        """Share of the points that others would hide from the camera (``hidden_share``); 0 of an image or a surface."""
+        if self.frame.depth is not None or self.extent == "surface":
             return 0.0
         points = self.cloud.points
         return hidden_share(transform_points(into_camera(points, self.frame.axes), points))
@@ -94,6 +95,10 @@ class Observation:
             f"{self.self_hidden:.0%} of the points lie behind others, so the cloud holds surfaces that hide each other "
             "from the camera, as merged views do: give one view, as its camera saw it"
         )
+
+    def readings(self, keep_all: bool = False) -> tuple[Reading, ...]:
+        """Readings of ``cloud``; one of a surface, of which no line of sight says what is off it."""
+        return readings(self.cloud, self.frame.axes, keep_all or self.extent == "surface")
 
     def read_as(self, reading: Reading) -> "Observation":
         """The object as a reading of ``cloud`` has it: what was dropped as strays is a step of its own."""
@@ -135,6 +140,7 @@ class Observation:
             "visible_size_m": self.size_m if known else None,
             "invalid_points": self.frame.invalid,
             "T_input_result": None if self.frame.T_input_result is None else self.frame.T_input_result.tolist(),
+            "extent": self.extent,
             "isolation": [asdict(step) for step in self.steps],
         }
 
@@ -145,6 +151,8 @@ class Observation:
             lines.append(f"{counted(self.frame.invalid, 'point')} without a measurement left out")
         lines += [f"  {step}" for step in self.steps]
         lines.append(self._line("the object has", self.cloud))
+        if self.extent == "surface":
+            lines.append("it is a surface that no single camera saw (--extent partial takes it for a camera's cloud)")
         size = " x ".join(f"{side:.3g}" for side in self.size_m)
         return "\n".join([*lines, f"its visible part is {size} {self.frame.length_name}"])
 
@@ -178,13 +186,21 @@ def find_object(
             "--box"
         )
     selection = select_object(frame.cloud, isolation, frame.metres, frame.axes)
-    cloud = frame.cloud if selection.keep.all() else PointCloud(frame.cloud.points[selection.keep])
+    cloud = frame.cloud.rows(selection.keep)
     if _is_straight(cloud.points):
         raise ValueError(
             f"the {len(cloud)} points of {frame.source} lie on a line or at one place; the object's surface must be "
             "seen: check the columns of the file, and what is cropped"
         )
-    return Observation(frame, cloud, selection.steps, selection, isolation.extent)
+    extent: Extent = "surface" if isolation.extent == "auto" and is_surface(frame, cloud) else isolation.extent
+    if extent == "surface":
+        if frame.depth is not None:
+            raise ValueError(
+                f"the extent is a surface without a camera, but {frame.source} is a depth image, which a camera saw: "
+                "leave out --extent surface"
+            )
+        frame = replace(frame, axes="scanner")  # in which nobody knows where a camera was
+    return Observation(frame, cloud, selection.steps, selection, extent)
 
 
 def _is_straight(points: Float[np.ndarray, "n 3"]) -> bool:
@@ -294,6 +310,31 @@ def hidden_share(points: Float[np.ndarray, "n 3"]) -> float:
     return float((is_behind[:, 0] & is_closed).mean())
 
 
+MOST_AVERTED = 0.1
+"""Share of the points whose normals point away from a camera from which on no camera saw them, as of ``MOST_HIDDEN``;
+fewer lie at edges, and where nearly all do, the normals point inwards."""
+
+MOST_TORN = 0.25
+"""Share of the points whose neighbour's normal points the other way up to which normals are consistent: of stitched
+views of thin objects it is .16 at most, of random signs a half."""
+
+
+def is_surface(frame: SensorFrame, cloud: PointCloud) -> bool:
+    """Whether a cloud has consistent normals, and no camera at the frame's origin can have seen all of it."""
+    if frame.depth is not None or cloud.normals is None or len(cloud) < MIN_POINTS:
+        return False
+    T, some = into_camera(cloud.points, frame.axes), random_subset(np.arange(len(cloud)), MAX_POINTS)
+    seen = PointCloud(cloud.points[some], cloud.normals[some]).transformed(T)
+    points, normals = seen.points, seen.normals
+    assert normals is not None
+    near = cKDTree(points).query(points, k=[2])[1][:, 0]
+    if (np.einsum("ni,ni->n", normals, normals[near]) < 0).mean() > MOST_TORN:
+        return False
+    averted = float((np.einsum("ni,ni->n", normals, points) > 0).mean())
+    is_inward = averted > 1 - MOST_AVERTED and bool((points[:, 2] > 0).all())
+    return (averted > MOST_AVERTED and not is_inward) or hidden_share(points) > MOST_HIDDEN
+
+
 # --- lines of sight ---------------------------------------------------------------------------------------------------
 
 # Which of them went past the object, and along which nothing is known: depths around it are compared with those of its
@@ -323,6 +364,10 @@ DENSE = 3.0
 """Pixels from the object within which no line of sight is left out."""
 
 
+OTHER_LINES: Mapping[Extent, SightKind] = {"partial": "unknown", "surface": "none"}
+"""Kind of all lines of sight around the object where the extent alone says it."""
+
+
 def lines_of_frame(frame: SensorFrame, selection: Selection | None, extent: Extent = "auto") -> SightLines:
     """Lines of sight around the object of a frame, in the frame's axes and unit.
 
@@ -331,8 +376,8 @@ def lines_of_frame(frame: SensorFrame, selection: Selection | None, extent: Exte
         selection: points of ``frame.cloud`` that are the object's; None means all.
         extent: how much of the object's outline the frame shows, see ``IsolationConfig``.
     """
-    if extent == "partial":
-        return SightLines.of_cloud("unknown")
+    if extent in OTHER_LINES:
+        return SightLines.of_cloud(OTHER_LINES[extent])
     points = frame.cloud.points
     is_object = np.ones(len(points), dtype=bool) if selection is None else selection.of_object(points)
     if frame.depth is not None and frame.depth.valid.sum() == len(points):

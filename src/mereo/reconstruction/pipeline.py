@@ -137,7 +137,7 @@ class EncodedFrame:
     @cached_property
     def seen(self) -> PointCloud:
         """The object's points in the camera frame."""
-        return PointCloud(transform_points(self.T_camera_input, self.points))
+        return self.reading.cloud.transformed(self.T_camera_input)
 
 
 def encode_frame(reading: Reading, model: Trained | None, axes: CloudAxes = "camera") -> EncodedFrame:
@@ -148,7 +148,7 @@ def encode_frame(reading: Reading, model: Trained | None, axes: CloudAxes = "cam
     points = reading.cloud.points
     T_camera_input = into_camera(points, axes)
     seconds: dict[str, float] = {}
-    seen = PointCloud(transform_points(T_camera_input, points))
+    seen = reading.cloud.transformed(T_camera_input)
     if model is None:
         checked_points(seen)
         return EncodedFrame(reading, axes, T_camera_input, None, seconds)

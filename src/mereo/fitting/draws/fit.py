@@ -132,10 +132,10 @@ def score_material(
 ) -> DrawsFit | None:
     """Score material points as those of a state; None where no face of them is seen."""
     rigid = replace(posed, z=np.empty(0))
-    surface = Surface.through(problem.model, rigid.place(material))
+    surface = Surface.through(problem.model, rigid.place(material), problem.base.evidence.shows)
     if len(surface.facing) == 0:
         return None
-    met = problem.base.met(surface) if problem.by_sight else surface.nearest(problem.base.evidence.observed_samples)
+    met = problem.base.met(surface) if problem.by_sight else problem.base.nearest(surface)
     fit = DrawsFit(drawn, z, rigid, material, surface, *met, np.inf)
     return replace(fit, misfit=misfit(problem, fit, problem.base.config.cloud_sigma))
 
@@ -178,7 +178,7 @@ def terms(problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3
     return Terms(
         known=prior_of_draws(fit.z, motion, posed.log_scale, base.scale_std),
         network=network.add_to(nothing, state, base.network_sigma, config.network_weight[1], robust=True),
-        cloud=cloud_rows(posed, samples, planes, sigma, config.cloud_weight),
+        cloud=cloud_rows(posed, samples, planes, sigma, config.cloud_weight, base.alike),
         observed_samples=samples,
         ruled_out=add_silhouette(
             nothing,

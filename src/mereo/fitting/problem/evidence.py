@@ -1,22 +1,25 @@
 """The evidence of a frame: observed points, and what silhouette and free space rule out. The camera is at the origin.
 
+Of a surface that no single camera saw there are points and normals alone (``SurfaceEvidence``).
+
 A vertex of a fitted model may lie neither on a line of sight that went past the object, before what that met (outside
 the silhouette), nor in front of the observed points around its line of sight (free space). Nothing is ruled out along
 lines of sight on which nothing is known. Lines of sight are compared by their angles, so a depth image and a cloud are
 the same.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
 from mereo.deformation.moving_least_squares import spread
 from mereo.geometry.camera import SightKind, SightLines
-from mereo.geometry.downsampling import means_along_sight
+from mereo.geometry.downsampling import means_along_sight, thin_to_grid
 from mereo.geometry.surface_patches import roughness
 from mereo.geometry.transforms import rotation_along
 
@@ -50,6 +53,10 @@ RIM_PITCHES, EDGE_PITCHES, EDGE_DIRECTIONS = 2.5, 3.5, 8
 many directions: nearer lies the rim, of which nothing is known in any case (``lines_of_sight.RIM``)."""
 
 
+UNDECIDED = SightLines.of_cloud()
+"""Lines of sight of a bare cloud, of which nothing is stated."""
+
+
 @dataclass(frozen=True, eq=False)
 class PastLines:
     """Lines of sight that went past the object, each to something behind it.
@@ -76,28 +83,117 @@ class PastLines:
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
-    """An observed cloud, prepared for comparison with surfaces; lengths in scene units.
+class Directions:
+    """Normals of points, to be compared with those of a surface.
+
+    Attributes:
+        lift: makes vectors of normals, which are the same for normals that count as the same.
+        lifted: those of the points.
+        length: what a difference of 1 between two of them is worth, scene units.
+    """
+
+    lift: Callable[[np.ndarray], np.ndarray]
+    lifted: Float[np.ndarray, "p d"]
+    length: float
+
+    def nearest(
+        self,
+        points: Float[np.ndarray, "p 3"],
+        places: Float[np.ndarray, "s 3"],
+        normals: Float[np.ndarray, "s 3"],
+    ) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"]]:
+        """Distance and row of the place that is nearest to each point in position and direction."""
+        places = np.concatenate([places, self.length * self.lift(normals)], axis=1)
+        tree = cKDTree(places, balanced_tree=False, compact_nodes=False)
+        distance, near = tree.query(np.concatenate([points, self.length * self.lifted], axis=1))
+        return distance, near
+
+    def rows(self, rows: Int[np.ndarray, " r"]) -> "Directions":
+        """Those of some of the points."""
+        return replace(self, lifted=self.lifted[rows])
+
+    def agreement(self, normals: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, " p"]:
+        """How well normals of a surface, one for each point, agree with the points': 1 where they are the same."""
+        return np.clip(np.einsum("pi,pi->p", self.lift(normals), self.lifted), 0.0, 1.0)
+
+
+def signed(normals: np.ndarray) -> np.ndarray:
+    """Normals as they are."""
+    return normals
+
+
+def without_sign(normals: np.ndarray) -> np.ndarray:
+    """Vectors (... 9) that are the same for a normal and its reverse; their product is the square of the normals'."""
+    return (normals[..., :, None] * normals[..., None, :]).reshape(*normals.shape[:-1], 9)
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedPoints:
+    """Observed points, prepared for comparison with surfaces; lengths in scene units.
 
     Attributes:
         points: observed, camera frame.
         observed_samples: some of them, evenly spread.
-        sight: search tree over the unit vectors towards ``points``, and along lines of sight on which nothing is known.
-        ranges: distance of each point from the camera.
-        front: nearest of these among each line of sight and those around it; 0 where nothing is known.
-        pitch: angle between neighbouring lines of sight.
-        around: indices of each point's neighbours among the lines of sight, up to 8.
-        past: lines of sight that went past the object to something that was measured; None without any.
-        other_lines: kind of the lines of sight that are near none of all these.
+        around: indices of each point's neighbours, up to 8.
     """
 
     points: Float[np.ndarray, "n 3"]
     observed_samples: Float[np.ndarray, "p 3"]
+    around: Int[np.ndarray, "n k"]
+
+    def patch_share(self, tolerance: float) -> float:
+        """Share of the points within a tolerance of one smooth patch: a quadratic function over their best plane."""
+        centered = self.points - self.points.mean(axis=0)
+        x, y, height = (centered @ np.linalg.svd(centered, full_matrices=False)[2].T).T
+        terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+
+        def away(patch: Float[np.ndarray, "6"]) -> Float[np.ndarray, " n"]:
+            slope = np.hypot(patch[1] + 2 * patch[3] * x + patch[4] * y, patch[2] + patch[4] * x + 2 * patch[5] * y)
+            distance: np.ndarray = (height - terms @ patch) / np.hypot(1.0, slope)
+            return distance
+
+        start = np.linalg.lstsq(terms, height, rcond=None)[0]
+        patch = least_squares(away, start, loss="cauchy", f_scale=tolerance, x_scale="jac").x
+        return float((np.abs(away(patch)) <= tolerance).mean())
+
+    @cached_property
+    def nested(self) -> Int[np.ndarray, " m"]:
+        """Points, as many as a power of two, in an order in which each aligned run of a power of two is a patch."""
+        levels = int(np.log2(len(self.points)))
+        rows = np.linspace(0, len(self.points) - 1, 2**levels).astype(int)
+        order = np.arange(len(rows))[None]
+        for _ in range(levels):  # halve every patch across its longest side
+            places = self.points[rows[order]]
+            longest = np.ptp(places, axis=1).argmax(axis=1)[:, None, None]
+            rank = np.take_along_axis(places, longest, axis=2)[:, :, 0].argsort(axis=1, kind="stable")
+            order = np.take_along_axis(order, rank, axis=1).reshape(2 * len(order), -1)
+        return rows[order[:, 0]]
+
+
+def plane_normals(points: Float[np.ndarray, "n 3"], places: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
+    """Unit normals, of either sign, of the planes through the points around each place."""
+    near = cKDTree(points).query(places, k=min(NORMAL_POINTS, len(points)))[1]
+    patches = points[near] - points[near].mean(axis=1, keepdims=True)
+    return np.linalg.eigh(np.einsum("pki,pkj->pij", patches, patches))[1][:, :, 0]
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence(ObservedPoints):
+    """What one camera saw: points along lines of sight.
+
+    Attributes:
+        sight: search tree over the unit vectors towards ``points``, and along lines of sight on which nothing is known.
+        ranges: distance of each point from the camera.
+        front: nearest of these among each line of sight and those around it; 0 where nothing is known.
+        pitch: angle between neighbouring lines of sight.
+        past: lines of sight that went past the object to something that was measured; None without any.
+        other_lines: kind of the lines of sight that are near none of all these.
+    """
+
     sight: cKDTree
     ranges: Float[np.ndarray, " n"]
     front: Float[np.ndarray, " s"]
     pitch: float
-    around: Int[np.ndarray, "n k"]
     past: PastLines | None = None
     other_lines: SightKind = "past"
 
@@ -107,59 +203,70 @@ class Evidence:
         points: Float[np.ndarray, "n 3"],
         outliers: Float[np.ndarray, "d 3"] | None = None,
         observed_samples: int = OBSERVED_SAMPLES,
-        lines: SightLines | None = None,
+        lines: SightLines = UNDECIDED,
+        normals: Float[np.ndarray, "n 3"] | None = None,
+        most: int = MOST_POINTS,
     ) -> "Evidence":
         """Prepare a cloud, with so many ``observed_samples`` at most; its lines of sight start at the origin.
 
-        Those of ``outliers`` rule nothing out. ``lines`` says what is known around the cloud; without it, and where it
-        leaves that open, all lines of sight around the cloud went past the object.
+        Those of ``outliers`` rule nothing out. ``lines`` says what is known around the cloud; where it leaves that
+        open, all lines of sight around the cloud went past the object. Denser clouds are averaged to ``most`` points;
+        ``normals`` are not looked at: a camera's points have those of their neighbours.
         """
-        points = means_along_sight(points, MOST_POINTS)
+        points = means_along_sight(points, most)
         ranges = np.linalg.norm(points, axis=1)
         sight = cKDTree(points / ranges[:, None])
         angle, near = sight.query(sight.data, k=range(1, min(AROUND, len(points)) + 1))
         # the fourth neighbour of a pixel is one pitch away, as the first is; irregular clouds are not so lucky
         pitch = float(np.median(angle[:, min(4, len(points)) - 1]))
         front = np.where(angle <= AROUND_PITCHES * pitch, ranges[near], np.inf).min(axis=1)
-        unknown = [part for part in (outliers, None if lines is None else lines.unknown) if part is not None]
+        unknown = [part for part in (outliers, lines.unknown) if part is not None]
         if sum(map(len, unknown)):
             toward = np.concatenate(unknown)
             toward = toward / np.linalg.norm(toward, axis=1, keepdims=True)
             sight = cKDTree(np.concatenate([sight.data, toward]))
             front = np.concatenate([front, np.zeros(len(toward))])
         chosen, around = points[spread(points, observed_samples)], near[:, 1:]
-        if lines is None:
-            return cls(points, chosen, sight, ranges, front, pitch, around)
         past, other_lines = PastLines.of(lines.past, pitch), lines.other_lines or "past"
-        return cls(points, chosen, sight, ranges, front, pitch, around, past, other_lines)
+        return cls(points, chosen, around, sight, ranges, front, pitch, past, other_lines)
 
     @property
     def with_more_samples(self) -> "Evidence":
         """The same with as many observed samples as a noisy frame needs."""
         return replace(self, observed_samples=self.points[spread(self.points, MORE_SAMPLES)])
 
+    def few(self, count: int) -> "Evidence":
+        """The same with so many observed samples at most."""
+        return replace(self, observed_samples=self.observed_samples[:count])
+
+    def directions(self, length: float, wanted: bool) -> Directions | None:
+        """Normals of the observed samples where they are ``wanted``, for the weight of each."""
+        return Directions(signed, self.normals, length) if wanted else None
+
+    def alike(self, length: float) -> Directions | None:
+        """Normals by which the place is chosen that a sample is compared with: None, as lines of sight do."""
+        return None
+
+    def all_alike(self, length: float) -> Directions | None:
+        """The same of all points."""
+        return None
+
+    @staticmethod
+    def shows(normals: Float[np.ndarray, "f 3"], places: Float[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
+        """Which faces with these outward normals, of any length, can be compared: those that face the camera."""
+        return np.einsum("fi,fi->f", normals, places) < 0
+
+    @property
+    def area(self) -> float:
+        """Area of the surface that was seen, across the lines of sight: that of a pixel for each point."""
+        return float(((self.pitch * self.ranges) ** 2).sum())
+
     @cached_property
     def normals(self) -> Float[np.ndarray, "p 3"]:
         """Unit normals at the observed samples, toward the camera: of the planes through the points around them."""
-        near = cKDTree(self.points).query(self.observed_samples, k=min(NORMAL_POINTS, len(self.points)))[1]
-        patches = self.points[near] - self.points[near].mean(axis=1, keepdims=True)
-        normals = np.linalg.eigh(np.einsum("pki,pkj->pij", patches, patches))[1][:, :, 0]
+        normals = plane_normals(self.points, self.observed_samples)
         away = np.einsum("pi,pi->p", normals, self.observed_samples) > 0
         return np.where(away[:, None], -normals, normals)
-
-    @cached_property
-    def nested(self) -> Int[np.ndarray, " m"]:
-        """Points, as many as a power of two, in an order in which each aligned run of a power of two is a patch."""
-        levels = int(np.log2(len(self.points)))
-        rows = np.linspace(0, len(self.points) - 1, 2**levels).astype(int)
-        toward = self.points[rows] / self.ranges[rows, None] @ rotation_along(self.points.mean(axis=0))[:, :2]
-        order = np.arange(len(rows))[None]
-        for _ in range(levels):  # halve every patch across its longer side
-            places = toward[order]
-            longer = np.ptp(places, axis=1).argmax(axis=1)[:, None, None]
-            rank = np.take_along_axis(places, longer, axis=2)[:, :, 0].argsort(axis=1, kind="stable")
-            order = np.take_along_axis(order, rank, axis=1).reshape(2 * len(order), -1)
-        return rows[order[:, 0]]
 
     @cached_property
     def roughness(self) -> float:
@@ -186,21 +293,6 @@ class Evidence:
         _, front, free = self.along(around)
         is_hidden = np.where(free < 0, front == 0, free == 0)
         return float(is_hidden.mean()) if len(is_hidden) else 0.0
-
-    def patch_share(self, tolerance: float) -> float:
-        """Share of the points within a tolerance of one smooth patch: a quadratic function over their best plane."""
-        centered = self.points - self.points.mean(axis=0)
-        x, y, height = (centered @ np.linalg.svd(centered, full_matrices=False)[2].T).T
-        terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
-
-        def away(patch: Float[np.ndarray, "6"]) -> Float[np.ndarray, " n"]:
-            slope = np.hypot(patch[1] + 2 * patch[3] * x + patch[4] * y, patch[2] + patch[4] * x + 2 * patch[5] * y)
-            distance: np.ndarray = (height - terms @ patch) / np.hypot(1.0, slope)
-            return distance
-
-        start = np.linalg.lstsq(terms, height, rcond=None)[0]
-        patch = least_squares(away, start, loss="cauchy", f_scale=tolerance, x_scale="jac").x
-        return float((np.abs(away(patch)) <= tolerance).mean())
 
     def unseen(self, triangles: Float[np.ndarray, "f 3 3"]) -> float:
         """Share of what a surface shows the camera that lies where nothing was seen, and nothing says what is there.
@@ -267,3 +359,103 @@ class Evidence:
         angle, near = self.past.sight.query(toward)
         free = np.where(angle <= self.past.reach[near], self.past.ranges[near], other_lines)
         return np.where(unknown < angle, 0.0, free)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceEvidence(ObservedPoints):
+    """A surface that no single camera saw: points and normals, no lines of sight, and nothing that is ruled out.
+
+    Attributes:
+        normals: of all points, out of the surface, or of either sign.
+        sample_normals: of the observed samples.
+        lift: of ``Directions``: whether the sign counts.
+        other_lines: kind of all lines of sight.
+    """
+
+    normals: Float[np.ndarray, "n 3"]
+    sample_normals: Float[np.ndarray, "p 3"]
+    lift: Callable[[np.ndarray], np.ndarray]
+    other_lines: SightKind = "none"
+
+    @classmethod
+    def of(
+        cls,
+        points: Float[np.ndarray, "n 3"],
+        outliers: Float[np.ndarray, "d 3"] | None = None,
+        observed_samples: int = OBSERVED_SAMPLES,
+        lines: SightLines = UNDECIDED,
+        normals: Float[np.ndarray, "n 3"] | None = None,
+        most: int = MOST_POINTS,
+    ) -> "SurfaceEvidence":
+        """Prepare a surface, of which some ``most`` points are kept; ``outliers`` and ``lines`` say nothing of it.
+
+        Without ``normals`` these are estimated from the points, and their signs do not count.
+        """
+        known = (plane_normals(points, points), without_sign) if normals is None else (normals, signed)
+        (normals, lift), rows = known, thin_to_grid(points, most)
+        points, normals = points[rows], normals[rows]
+        around = cKDTree(points).query(points, k=range(1, min(AROUND, len(points)) + 1))[1][:, 1:]
+        chosen = spread(points, observed_samples)
+        return cls(points, points[chosen], around, normals, normals[chosen], lift)
+
+    @property
+    def with_more_samples(self) -> "SurfaceEvidence":
+        """As of ``Evidence``."""
+        chosen = spread(self.points, MORE_SAMPLES)
+        return replace(self, observed_samples=self.points[chosen], sample_normals=self.normals[chosen])
+
+    def few(self, count: int) -> "SurfaceEvidence":
+        """As of ``Evidence``."""
+        return replace(self, observed_samples=self.observed_samples[:count], sample_normals=self.sample_normals[:count])
+
+    def alike(self, length: float) -> Directions:
+        """Normals by which the place is chosen that a sample is compared with."""
+        return Directions(self.lift, self.lift(self.sample_normals), length)
+
+    def all_alike(self, length: float) -> Directions:
+        """The same of all points."""
+        return Directions(self.lift, self.lift(self.normals), length)
+
+    def directions(self, length: float, wanted: bool) -> Directions:
+        """The same as ``alike``, for the weight of each sample: normals always count."""
+        return self.alike(length)
+
+    @staticmethod
+    def shows(normals: Float[np.ndarray, "f 3"], places: Float[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
+        """All faces can be compared."""
+        return np.ones(len(normals), dtype=bool)
+
+    @property
+    def area(self) -> float:
+        """Area of the surface that was seen: that between neighbours for each point."""
+        gap = np.linalg.norm(self.points[self.around[:, :4]] - self.points[:, None], axis=2)
+        return float((np.median(gap, axis=1) ** 2).sum())
+
+    @cached_property
+    def roughness(self) -> float:
+        """Noise that the surface has at most."""
+        return roughness(self.points, self.normals)
+
+    @property
+    def is_open(self) -> bool:
+        """Nothing is known around the points."""
+        return True
+
+    @property
+    def hidden_edge(self) -> float:
+        """All of the silhouette: there is none."""
+        return 1.0
+
+    def unseen(self, triangles: Float[np.ndarray, "f 3 3"]) -> float:
+        """Nothing that a camera should have seen."""
+        return 0.0
+
+    def violations(
+        self, vertices: Float[np.ndarray, "n 3"], slack: float
+    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+        """Nothing is ruled out."""
+        return np.zeros_like(vertices), np.zeros(len(vertices))
+
+
+Observed = Evidence | SurfaceEvidence
+"""What a frame shows: by one camera, or a surface without any."""

@@ -9,7 +9,7 @@ from scipy.optimize import isotonic_regression
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.correspondences import Correspondences
-from mereo.fitting.problem.evidence import MORE_SAMPLES, OBSERVED_SAMPLES, Evidence
+from mereo.fitting.problem.evidence import MORE_SAMPLES, OBSERVED_SAMPLES, Directions, Observed
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, Rows, rigid_motion
 from mereo.fitting.problem.residuals import (
     ROBUST,
@@ -88,7 +88,7 @@ class Problem:
 
     model: StatisticalModel
     network: NetworkTerm
-    evidence: Evidence
+    evidence: Observed
     scale_std: float
     config: FitConfig
     noisy: bool = False
@@ -99,7 +99,7 @@ class Problem:
         cls,
         model: StatisticalModel,
         correspondences: Correspondences,
-        evidence: Evidence,
+        evidence: Observed,
         scale_std: float,
         config: FitConfig,
     ) -> "Problem":
@@ -135,14 +135,14 @@ class Problem:
 
     def residual_noise(self, surface: Surface) -> float:
         """Noise of the frame, in scene units, as a fit with this surface leaves it over."""
-        return noise_of(surface.offsets(self.evidence.points), self.evidence.around)
+        return noise_of(self.offsets(surface), self.evidence.around)
 
     def as_noisy_as(self, surface: Surface, is_shared: bool = False) -> "Problem | None":
         """The problem of a frame as noisy as what a fit leaves over; None where the constants are for one like that.
 
         What neighbours share is taken for noise too where ``is_shared``.
         """
-        noise = noise_of(surface.offsets(self.evidence.points)) if is_shared else self.residual_noise(surface)
+        noise = noise_of(self.offsets(surface)) if is_shared else self.residual_noise(surface)
         config = constants_for(noise, self.config)
         if config is self.config:
             return None
@@ -170,14 +170,14 @@ class Problem:
 
     def leaves_noise(self, surface: Surface, is_shared: bool = False) -> bool:
         """Whether what a fit leaves over is noise, and not its own error; ``is_shared`` as in ``as_noisy_as``."""
-        seen, offset = self.evidence, surface.offsets(self.evidence.points)
+        seen, offset = self.evidence, self.offsets(surface)
         return is_noise(offset, seen.around, is_shared) and (is_shared or noise_of(offset) <= ROUGHER * seen.roughness)
 
     def explained(self, cloud: float, surface: Surface, most: float) -> bool:
         """Whether a surface explains the cloud: by a misfit below ``most``, or of a noisy one all but the noise."""
         if cloud < most or not self.noisy:
             return cloud < most
-        offset = surface.offsets(self.evidence.points, self.far)
+        offset = self.offsets(surface, self.far)
         return shared(offset, self.evidence.around, self.config.cloud_sigma) < SHARED
 
     @property
@@ -186,8 +186,32 @@ class Problem:
         return ROBUST * self.config.cloud_sigma
 
     def met(self, surface: Surface) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
-        """``Surface.along_sight`` of the observed samples."""
-        return surface.along_sight(self.evidence.observed_samples, self.far)
+        """What of a surface each observed sample is compared with: ``Surface.compared``."""
+        return surface.compared(self.evidence.observed_samples, self.far, self.alike)
+
+    def nearest(
+        self, surface: Surface
+    ) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
+        """The same, without lines of sight."""
+        return surface.compared(self.evidence.observed_samples, None, self.alike)
+
+    def offsets(self, surface: Surface, far: float | None = None) -> Float[np.ndarray, " n"]:
+        """``Surface.offsets`` of all observed points."""
+        return surface.offsets(self.evidence.points, far, self.evidence.all_alike(self.normal_length))
+
+    @property
+    def normal_length(self) -> float:
+        """``FitConfig.normal_length`` in scene units."""
+        return self.config.normal_length * self.model.half
+
+    @property
+    def alike(self) -> Directions | None:
+        """``alike`` of the evidence."""
+        return self.evidence.alike(self.normal_length)
+
+    def surface(self, posed: Posed) -> Surface:
+        """Surface of a state, of the faces that can be compared."""
+        return Surface.of(self.model, posed, self.evidence.shows)
 
     def cloud_misfit(self, surface: Surface) -> float:
         """Misfit of the cloud, in squared standard deviations of an observed sample."""
@@ -211,7 +235,7 @@ class Problem:
         config = replace(self.config, samples=1000, silhouette_vertices=few, exact_steps=exact_steps)
         some = slice(None, None, COARSE)
         network = NetworkTerm(*(part[some] for part in vars(self.network).values()))
-        evidence = replace(self.evidence, observed_samples=self.evidence.observed_samples[: OBSERVED_SAMPLES // COARSE])
+        evidence = self.evidence.few(OBSERVED_SAMPLES // COARSE)
         coarse = replace(self, network=network, evidence=evidence, config=config)
         vars(coarse)["pairs"] = PairTerm(*(part[some] for part in vars(self.pairs).values()))
         return coarse
@@ -219,7 +243,7 @@ class Problem:
     def screen(self, posed: Posed, sigma: float) -> Misfit:
         """Misfit by the samples alone: good enough to choose among states, and ten times as fast."""
         samples = self.samples.posed(posed)
-        position, normal, _ = samples.planes(self.evidence.observed_samples)
+        position, normal, _ = samples.planes(self.evidence.observed_samples, self.alike)
         offset = self.evidence.observed_samples - position
         across = np.einsum("pi,pi->p", offset, normal)
         tangential = np.sqrt(np.maximum((offset**2).sum(axis=1) - across**2, 0.0))
@@ -238,13 +262,13 @@ class Problem:
     ) -> NormalEquations:
         """Sum with cloud, silhouette and correspondences; ``exact`` uses the faces and not the samples."""
         samples, observed = self.samples.posed(posed), self.evidence.observed_samples
-        normals = self.observed_normals
+        directions = self.directions
         if exact:
-            planes = Surface.of(self.model, posed).planes(observed, self.far)
+            planes = self.surface(posed).planes(observed, self.far, self.alike)
         else:
-            planes = samples.planes(observed, normals, self.config.normal_length * self.model.half)
+            planes = samples.planes(observed, directions)
         normal = self.network.add_to(normal, posed, self.network_sigma, network_weight, robust=True)
-        normal = normal.add(*cloud_rows(posed, observed, planes, sigma, self.config.cloud_weight, normals))
+        normal = normal.add(*cloud_rows(posed, observed, planes, sigma, self.config.cloud_weight, directions))
         return self.add_silhouette(normal, posed, samples, sigma)
 
     def add_silhouette(
@@ -260,17 +284,17 @@ class Problem:
     def cloud_rows(self, posed: Posed) -> Rows:
         """Residuals of the observed samples from the faces, as the last steps of a fit have them."""
         observed, config = self.evidence.observed_samples, self.config
-        planes = Surface.of(self.model, posed).planes(observed, self.far)
-        return cloud_rows(posed, observed, planes, config.cloud_sigma, config.cloud_weight, self.observed_normals)
+        planes = self.surface(posed).planes(observed, self.far, self.alike)
+        return cloud_rows(posed, observed, planes, config.cloud_sigma, config.cloud_weight, self.directions)
 
     @property
-    def observed_normals(self) -> Float[np.ndarray, "p 3"] | None:
+    def directions(self) -> Directions | None:
         """Normals of the observed samples; None where places alone are compared."""
-        return self.evidence.normals if self.config.normal_length else None
+        return self.evidence.directions(self.normal_length, self.config.by_normals)
 
     def misfit(self, posed: Posed, surface: Surface | None = None) -> Misfit:
         """Misfit of a state, whose ``surface`` may be there already."""
-        surface = surface or Surface.of(self.model, posed)
+        surface = surface or self.surface(posed)
         network = self.network.energy(posed, self.network_sigma)
         return self.total(self.cloud_misfit(surface), network, self._silhouette_square(surface), posed.z)
 

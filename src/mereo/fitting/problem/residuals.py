@@ -16,7 +16,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from mereo.fitting.problem.correspondences import Correspondences
-from mereo.fitting.problem.evidence import Evidence
+from mereo.fitting.problem.evidence import Directions, Evidence, Observed
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, Rows, along, cross, geman_mcclure, in_space
 from mereo.geometry.mesh import barycentric
 from mereo.geometry.solids import first_faces, ray_scene
@@ -88,24 +88,24 @@ class PosedSamples:
         step = max(1, len(self.position) // count)
         return PosedSamples(self.surface.every(step), self.position[::step], self.normal[::step], self.facing[::step])
 
-    def planes(
-        self, points: Float[np.ndarray, "p 3"], normals: Float[np.ndarray, "p 3"] | None = None, length: float = 0.0
-    ) -> Planes:
+    def planes(self, points: Float[np.ndarray, "p 3"], directions: Directions | None = None) -> Planes:
         """Planes of the facing samples nearest to points.
 
-        With the points' ``normals``, of the samples that are nearest in place and direction, whether they face the
-        camera yet or not: a difference of 1 counts as ``length``.
+        With the points' ``directions``, of the samples that are nearest in place and direction, whether they face the
+        camera yet or not.
         """
-        rows = np.flatnonzero(self.facing)
-        if len(rows) == 0 or normals is not None:
-            rows = np.arange(len(self.position))
-        places = self.position[rows]
-        if normals is not None:
-            places = np.concatenate([places, length * self.normal[rows]], axis=1)
-            points = np.concatenate([points, length * normals], axis=1)
-        tree = cKDTree(places, balanced_tree=False, compact_nodes=False)
-        near = rows[tree.query(points)[1]]
+        if directions is not None:
+            near = directions.nearest(points, self.position, self.normal)[1]
+        else:
+            rows = np.flatnonzero(self.facing)
+            rows = rows if len(rows) else np.arange(len(self.position))
+            tree = cKDTree(self.position[rows], balanced_tree=False, compact_nodes=False)
+            near = rows[tree.query(points)[1]]
         return self.position[near].astype(np.float64), self.normal[near].astype(np.float64), self.surface.modes[near, 0]
+
+
+Shows = Callable[[Float[np.ndarray, "f 3"], Float[np.ndarray, "f 3"]], Bool[np.ndarray, " f"]]
+"""Says which faces can be compared, by their normals and a place on each."""
 
 
 # --- residuals --------------------------------------------------------------------------------------------------------
@@ -125,7 +125,10 @@ def robust_square(residual: Float[np.ndarray, " r"], sigma: float, robust: float
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Posed material points of a model, and the faces that are seen from their outside, with their unit normals."""
+    """Posed material points of a model, and the faces that can be compared, with their unit normals.
+
+    These are the *facing* ones, seen from their outside; all of them where no camera saw the frame.
+    """
 
     model: StatisticalModel
     material: Float[np.ndarray, "m 3"]
@@ -133,16 +136,18 @@ class Surface:
     normals: Float[np.ndarray, "g 3"]
 
     @classmethod
-    def of(cls, model: StatisticalModel, posed: Posed) -> "Surface":
+    def of(cls, model: StatisticalModel, posed: Posed, shows: Shows = Evidence.shows) -> "Surface":
         """Surface of a state."""
-        return cls.through(model, posed.place(model.material(posed.z)))
+        return cls.through(model, posed.place(model.material(posed.z)), shows)
 
     @classmethod
-    def through(cls, model: StatisticalModel, material: Float[np.ndarray, "m 3"]) -> "Surface":
-        """Surface through posed material points."""
+    def through(
+        cls, model: StatisticalModel, material: Float[np.ndarray, "m 3"], shows: Shows = Evidence.shows
+    ) -> "Surface":
+        """Surface through posed material points; ``shows`` is that of the evidence."""
         a, b, c = (material[model.faces[:, i]] for i in range(3))
         normal = cross(b - a, c - a)
-        facing = np.flatnonzero(np.einsum("fi,fi->f", normal, a) < 0)
+        facing = np.flatnonzero(shows(normal, a))
         normal = normal[facing]
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
         return cls(model, material, facing, normal)
@@ -185,19 +190,45 @@ class Surface:
             distance[other], face[other], position[other] = self.nearest(points[other])
         return distance, face, position
 
+    def alike(
+        self, points: Float[np.ndarray, "p 3"], directions: Directions
+    ) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
+        """Like ``nearest``, but of a place whose normal agrees; where none is near, the distance counts normals too."""
+        distance, face, position = self.nearest(points)
+        rows = np.flatnonzero(directions.agreement(self.normals[face]) <= 0)
+        other = directions.rows(rows)
+        corners = self.material[self.model.faces[self.facing]]
+        apart, near = other.nearest(points[rows], corners.mean(axis=1), self.normals)
+        weight = np.clip(barycentric(corners[near], points[rows]), 0.0, 1.0)  # of the corner or edge where it is beyond
+        place = np.einsum("pc,pci->pi", weight / weight.sum(axis=1, keepdims=True), corners[near])
+        away = np.linalg.norm(points[rows] - place, axis=1)
+        agrees = other.agreement(self.normals[near]) > 0
+        face[rows], position[rows], distance[rows] = near, place, np.where(agrees, away, np.maximum(apart, away))
+        return distance, face, position
+
+    def compared(
+        self, points: Float[np.ndarray, "p 3"], far: float | None = None, directions: Directions | None = None
+    ) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
+        """``alike`` with directions, ``along_sight`` with ``far`` alone, else ``nearest``."""
+        if directions is not None:
+            return self.alike(points, directions)
+        return self.nearest(points) if far is None else self.along_sight(points, far)
+
     @cached_property
     def _rays(self) -> tuple[EmbreeScene, Float[np.ndarray, "3"]]:
         center: Float[np.ndarray, "3"] = self.material.mean(axis=0)
         return ray_scene(self.material - center, self.model.faces[self.facing]), center
 
-    def offsets(self, points: Float[np.ndarray, "p 3"], far: float | None = None) -> Float[np.ndarray, " p"]:
-        """Signed distance of each point from the facing surface, negative behind it; with ``far``, ``along_sight``."""
-        distance, face, position = self.nearest(points) if far is None else self.along_sight(points, far)
+    def offsets(
+        self, points: Float[np.ndarray, "p 3"], far: float | None = None, directions: Directions | None = None
+    ) -> Float[np.ndarray, " p"]:
+        """Signed distance of each point from what it is ``compared`` with, negative behind it."""
+        distance, face, position = self.compared(points, far, directions)
         return np.copysign(distance, np.einsum("pi,pi->p", points - position, self.normals[face]))
 
-    def planes(self, points: Float[np.ndarray, "p 3"], far: float) -> Planes:
-        """Planes of the facing surface along each point's line of sight."""
-        _, face, position = self.along_sight(points, far)
+    def planes(self, points: Float[np.ndarray, "p 3"], far: float, directions: Directions | None = None) -> Planes:
+        """Planes of the surface that each point is ``compared`` with."""
+        _, face, position = self.compared(points, far, directions)
         corners = self.model.faces[self.facing[face]]
         weight = barycentric(self.material[corners], position).astype(np.float32)
         modes = np.matmul(weight[:, None], self.model.modes[corners].reshape(len(points), 3, -1))
@@ -256,21 +287,21 @@ def cloud_rows(
     planes: Planes,
     sigma: float,
     total_weight: float,
-    normals: Float[np.ndarray, "p 3"] | None = None,
+    directions: Directions | None = None,
 ) -> Rows:
     """Each point's distance to its plane of the facing surface, its derivatives, and its weight.
 
-    With the points' ``normals``, a point far from its place on the plane or of another direction counts for less.
+    With the points' ``directions``, a point far from its place on the plane or of another direction counts for less.
     """
     position, across, modes = planes
     offset = position - points
     residual = np.einsum("pi,pi->p", across, offset)
     weight = np.full(len(points), total_weight / len(points) / sigma**2)
-    if normals is None:
+    if directions is None:
         weight *= geman_mcclure(residual, ROBUST * sigma)
     else:
         weight *= geman_mcclure(np.linalg.norm(offset, axis=1), ROBUST * sigma)
-        weight *= np.clip(np.einsum("pi,pi->p", across, normals), 0.0, 1.0)
+        weight *= directions.agreement(across)
     return along(posed, position, modes, across), residual, weight
 
 
@@ -279,7 +310,7 @@ def add_silhouette(
     posed: Posed,
     points: Float[np.ndarray, "n 3"],
     modes_at: Callable[[Int[np.ndarray, " r"]], Float32[np.ndarray, "r 3 k"]],
-    evidence: Evidence,
+    evidence: Observed,
     sigma: float,
     each: float,
 ) -> NormalEquations:
@@ -297,7 +328,7 @@ def add_silhouette(
     return normal.add(jacobian, -amount[rows], weight)
 
 
-def silhouette_losses(points: Float[np.ndarray, "n 3"], evidence: Evidence, sigma: float) -> Float[np.ndarray, " n"]:
+def silhouette_losses(points: Float[np.ndarray, "n 3"], evidence: Observed, sigma: float) -> Float[np.ndarray, " n"]:
     """Loss of each point of the surface by how far the frame rules it out, in squared sigmas."""
     return robust_square(evidence.violations(points, ROBUST * sigma)[1], sigma, 4 * ROBUST)
 

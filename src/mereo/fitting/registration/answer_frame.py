@@ -16,7 +16,7 @@ from mereo.fitting.problem.correspondences import NoFit, nothing
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.problem import GivenPose, Problem
-from mereo.fitting.problem.residuals import NetworkTerm, Surface
+from mereo.fitting.problem.residuals import NetworkTerm
 from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.recognition import FEATURELESS, Recognition, recognize
 from mereo.fitting.registration.register import CloudToFit, ModesFit, Registrar
@@ -28,7 +28,7 @@ from mereo.io.bounds import Cells, PositiveOrUnknown, check_value
 from mereo.io.cores import limit_blas_threads
 from mereo.io.progress import stage
 from mereo.models.trained import Trained
-from mereo.reconstruction.isolation import Reading, readings
+from mereo.reconstruction.isolation import Reading
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.pipeline import EncodedFrame, encode_frame
 from mereo.scenes.statistical_model import StatisticalModel
@@ -152,7 +152,8 @@ def find(
             "an initial pose is given, and the length of the frame's or of the object's unit is not known, or there is "
             "no model to place: state the unit of both (--unit-m, --units), and leave the method auto"
         )
-    if registrar is not None and (not registrar.asks_network or seen.initial_pose is not None):
+    is_searched = seen.initial_pose is not None or seen.extent == "surface"  # a network knows what one camera sees
+    if registrar is not None and (not registrar.asks_network or is_searched):
         return search_hypotheses(seen, registrar, keep_all, scene_unit)
     assert model is not None
     candidate, likelier = fit_hypotheses(seen, model, registrar, keep_all, scene_unit)
@@ -173,7 +174,7 @@ def is_forced(candidate: Candidate) -> bool:
     """Whether a fit explains the points only by a state that is far from usual, or lies where nothing was seen."""
     modes = candidate.modes
     assert modes is not None
-    surface = modes.surface if modes.rest is None else Surface.of(modes.problem.model, modes.posed)
+    surface = modes.surface if modes.rest is None else modes.problem.surface(modes.posed)
     return modes.problem.silhouette_misfit(surface) + float(modes.posed.z @ modes.posed.z) > FORCED
 
 
@@ -247,7 +248,7 @@ def fit_hypotheses(
     is_certain = scene_unit is not None
     if scene_unit is None and registrar is not None:
         scene_unit = registrar.stated_scene_unit(seen.frame.metres)
-    hypotheses = readings(seen.cloud, axes, keep_all)[:2]
+    hypotheses = seen.readings(keep_all)[:2]
     likelier = encode_frame(hypotheses[0], model, axes)
     if registrar is None:
         return Candidate(likelier), likelier
@@ -285,7 +286,7 @@ def search_hypotheses(
     the likelier hypothesis.
     """
     unit, axes = scene_unit_of(seen, registrar, scene_unit), seen.frame.axes
-    likelier, *others = (encode_frame(reading, None, axes) for reading in readings(seen.cloud, axes, keep_all))
+    likelier, *others = (encode_frame(reading, None, axes) for reading in seen.readings(keep_all))
     best = _searched(likelier, registrar, unit, seen)
     for other in others:
         if best.is_accepted:
@@ -326,7 +327,8 @@ def cloud_to_fit(
     """Cloud that one hypothesis takes for the object's; ``lines`` are those around it, in the frame's axes."""
     dropped = frame.reading.whole.points[~frame.reading.keep]
     outliers = transform_points(frame.T_camera_input, dropped) if len(dropped) else None
-    return CloudToFit(frame.seen.points, scene_unit, is_unit_certain, outliers, lines.transformed(frame.T_camera_input))
+    lines, seen = lines.transformed(frame.T_camera_input), frame.seen
+    return CloudToFit(seen.points, scene_unit, is_unit_certain, outliers, lines, seen.normals)
 
 
 def check_size(frame: EncodedFrame, model: StatisticalModel, scene_unit: float | None) -> None:
@@ -407,8 +409,8 @@ def search_modes(
     """
     started = time.perf_counter()
     with limit_blas_threads():
-        unit = size_of(cloud.points, model) if cloud.scene_unit is None else cloud.scene_unit
-        is_open = cloud.lines is None or cloud.lines.other_lines is None
+        unit = size_of(cloud, model) if cloud.scene_unit is None else cloud.scene_unit
+        is_open = cloud.lines.other_lines is None
         evidence = cloud.evidence(unit)
         given = None if start is None or not model.is_held else GivenPose(start, HELD_STD * model.half)
         whole = Problem(model, NetworkTerm.none(model), evidence, cloud.scale_std, config, given=given)
@@ -421,8 +423,8 @@ def search_modes(
     return ModesFit(problem, nothing(), unit, modes.posed, seconds, rest if at_rest else None, others=trail.others)
 
 
-def size_of(points: Float[np.ndarray, "n 3"], model: StatisticalModel) -> float:
-    """Guess a scene unit's length from a cloud seen from the origin: the median over rotations of the mean state."""
-    evidence = Evidence.of(points)
+def size_of(cloud: CloudToFit, model: StatisticalModel) -> float:
+    """Guess a scene unit's length from a cloud alone: the median over rotations of the mean state."""
+    evidence = cloud.kind.of(cloud.points, normals=cloud.normals)
     poses = Screen.of(tables_of(model, 0), evidence, model.half, scaled=True).starts(rotations(200))
     return float(np.exp(np.median(poses.log_scale)))

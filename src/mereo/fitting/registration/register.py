@@ -28,7 +28,14 @@ from mereo.fitting.modes import (
 )
 from mereo.fitting.modes import narrowing as modes_narrowing
 from mereo.fitting.problem.correspondences import Correspondences, NoFit, agree, estimate_unit, find_correspondences
-from mereo.fitting.problem.evidence import Evidence
+from mereo.fitting.problem.evidence import (
+    MOST_POINTS,
+    OBSERVED_SAMPLES,
+    UNDECIDED,
+    Evidence,
+    Observed,
+    SurfaceEvidence,
+)
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, OPEN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import Surface
@@ -58,20 +65,27 @@ class CloudToFit:
         is_unit_certain: whether that is known for certain; else it is believed where the network's correspondences
             agree with it.
         outliers: points that were left out: along their lines of sight nothing is known.
-        lines: what is known of the lines of sight around the cloud; None of a bare cloud.
+        lines: what is known of the lines of sight around the cloud.
+        normals: out of the surface, of a surface that no single camera saw, as ``lines`` say; None where unknown.
     """
 
     points: Float[np.ndarray, "n 3"]
     scene_unit: float | None = None
     is_unit_certain: bool = True
     outliers: Float[np.ndarray, "o 3"] | None = None
-    lines: SightLines | None = None
+    lines: SightLines = UNDECIDED
+    normals: Float[np.ndarray, "n 3"] | None = None
 
-    def evidence(self, unit: float) -> Evidence:
-        """Evidence in scene units, of which one has this length in the cloud's unit."""
+    @property
+    def kind(self) -> type[Observed]:
+        """Kind of evidence that the lines of sight make of the points."""
+        return SurfaceEvidence if self.lines.other_lines == "none" else Evidence
+
+    def evidence(self, unit: float, observed_samples: int = OBSERVED_SAMPLES, most: int = MOST_POINTS) -> Observed:
+        """Evidence in scene units, of which one has this length in the cloud's unit; the numbers are its most."""
         outliers = None if self.outliers is None else self.outliers / unit
-        lines = None if self.lines is None else self.lines.scaled(1 / unit)
-        return Evidence.of(self.points / unit, outliers, lines=lines)
+        lines = self.lines.scaled(1 / unit)
+        return self.kind.of(self.points / unit, outliers, observed_samples, lines, self.normals, most)
 
     @property
     def scale_std(self) -> float:
@@ -154,8 +168,8 @@ class ModesFit:
         """The posed model in scene units: by its modes, or at rest where the frame speaks for that."""
         model = self.problem.model
         if self.rest is None:
-            return Surface.of(model, self.posed)
-        return Surface.through(model, self.rest.posed.place(model.rest_points))
+            return self.problem.surface(self.posed)
+        return Surface.through(model, self.rest.posed.place(model.rest_points), self.problem.evidence.shows)
 
     @cached_property
     def registration(self) -> Registration:
@@ -191,7 +205,7 @@ class ModesFit:
     def _registration(
         self, method: Method, z: Float[np.ndarray, " k"], optimum: Optimum, posed: Posed, surface: Surface
     ) -> Registration:
-        distance = surface.nearest(self.problem.evidence.observed_samples)[0]
+        distance = self.problem.nearest(surface)[0]
         explained = float((distance <= self.tolerance).mean())
         factors = RadiusFactors()
         if self.calibration is not None:
