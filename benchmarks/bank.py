@@ -31,6 +31,7 @@ from jaxtyping import Float
 from mereo.fitting import modes, search
 from mereo.fitting.draws import fit as draws_fit
 from mereo.fitting.modes import ScoredFit, refine
+from mereo.fitting.problem.evidence import SILHOUETTE_PITCHES, Evidence
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed
 from mereo.fitting.problem.problem import Misfit, Problem
 from mereo.fitting.problem.residuals import Surface
@@ -38,7 +39,9 @@ from mereo.fitting.registration import answer_frame as answering
 from mereo.fitting.registration import register
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import CloudToFit, Registrar
+from mereo.geometry.camera import PointCloud
 from mereo.geometry.metrics import TruthGrid, grid_confusion, intersection_over_union, labels_on, truth_grid
+from mereo.geometry.transforms import transform_points
 from mereo.io.cores import use_threads
 from mereo.models.weights_place import statistical_model_in
 from mereo.scenes.random_states import kept_model
@@ -206,11 +209,14 @@ def information(problem: Problem, posed: Posed) -> tuple[float, Float[np.ndarray
 def terms_of(candidate: Candidate) -> dict[str, Any]:
     """Terms of a fitted candidate: offsets of all observed points, and how far each vertex is ruled out."""
     problem, posed = candidate.problem, candidate.posed
-    surface = candidate.surface if candidate.surface is not None else Surface.of(problem.model, posed)
+    surface = candidate.surface
+    assert surface is not None
     vertices = surface.material[problem.model.silhouette_vertices]
     _, amount = problem.evidence.violations(vertices, 0.0)
-    angle = problem.evidence.sight.query(vertices / np.linalg.norm(vertices, axis=1, keepdims=True))[0]
-    is_past = angle > 1.2 * problem.evidence.pitch
+    is_past = np.zeros(len(vertices), dtype=bool)
+    if isinstance(problem.evidence, Evidence):
+        angle = problem.evidence.sight.query(vertices / np.linalg.norm(vertices, axis=1, keepdims=True))[0]
+        is_past = angle > SILHOUETTE_PITCHES * problem.evidence.pitch
     is_modes = len(posed.z) == problem.model.count and candidate.stage != "draws"
     pose_part, eigenvalues = information(problem, posed) if is_modes else (np.nan, np.full(problem.model.count, np.nan))
     return {
@@ -271,8 +277,9 @@ def record(frame: BankView) -> dict[str, Any]:
         seconds = time.perf_counter() - started
     truth, material, factor = None, None, 1.0
     if frame.view is not None:
-        factor = size_of(frame)
-        truth, material = truth_grid(frame.view.mesh, CELLS), factor * true_material(frame.view, model)
+        factor, T = size_of(frame), np.eye(4) if answer is None else answer.T_camera_input
+        truth = truth_grid(frame.view.mesh.transformed(T), CELLS)
+        material = transform_points(T, factor * true_material(frame.view, model))
         from_truth(recorder, material, model)
     return packed(frame, recorder, answer, refused, seconds, truth, material, factor)
 
@@ -375,7 +382,6 @@ def packed(
                 "samples": len(each.evidence.observed_samples),
                 "points": len(each.evidence.points),
                 "evidence": next(n for n, one in enumerate(evidences) if one.points is each.evidence.points),
-                "pitch": each.evidence.pitch,
                 "roughness": each.evidence.roughness,
                 "hidden_edge": each.evidence.hidden_edge,
                 "modes": each.model.count,
@@ -401,7 +407,7 @@ def answer_facts(
         return facts
     facts["iou"], facts["miou"] = scored(truth, fit.model, fit.material / factor)
     positions = nearest_truth(fit.model, fit.material, material)
-    seen = seen_points(positions, frame.seen.cloud, factor)
+    seen = seen_points(positions, PointCloud(transform_points(answer.T_camera_input, frame.seen.cloud.points)), factor)
     errors = RegistrationErrors.of(fit, positions, seen, factor)
     assert fit.uncertainty is not None
     radii = np.sqrt(errors.gaussian**2 + errors.other**2) + errors.reach

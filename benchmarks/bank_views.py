@@ -151,7 +151,7 @@ def masked(whole: DepthImage, mask: Bool[np.ndarray, "h w"] | None) -> Observati
 
 
 def stitched(view: View, rng: np.random.Generator, cameras: int = 3, points: int = 2500) -> PointCloud:
-    """Surface as a scanner stitches it from several sides, without one camera; noise is a tenth of a unit."""
+    """Surface with normals, as a scanner stitches it from several sides, no camera's; noise is a tenth of a unit."""
     middle, size = view.mesh.bounds.mean(axis=0), float(np.ptp(view.mesh.bounds, axis=0).max())
     seen = list[np.ndarray]()
     for _ in range(cameras):
@@ -161,7 +161,9 @@ def stitched(view: View, rng: np.random.Generator, cameras: int = 3, points: int
         image = observe(solids, Camera.from_fov(96, 96, 0.5), 0.1, SensorConfig(), rng).image
         seen.append(image.to_points().points @ T[:3, :3].T + T[:3, 3])
     every = np.concatenate(seen)
-    return PointCloud(every[rng.permutation(len(every))[:points]])
+    chosen, solids = every[rng.permutation(len(every))[:points]], Solids(view.mesh)
+    normals = solids.face_normals(solids.nearest(chosen).face)
+    return PointCloud(chosen, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30))
 
 
 # --- a stereo camera --------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from scipy.optimize import isotonic_regression
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.correspondences import Correspondences
-from mereo.fitting.problem.evidence import MORE_SAMPLES, OBSERVED_SAMPLES, Directions, Observed
+from mereo.fitting.problem.evidence import MORE_SAMPLES, OBSERVED_SAMPLES, Directions, Observed, ObservedPoints
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, Rows, rigid_motion
 from mereo.fitting.problem.residuals import (
     ROBUST,
@@ -363,7 +363,7 @@ ACCEPTED = 0.75
 """Share of a camera's points that a fit must explain to be believed: nothing reveals the outliers among them."""
 
 
-def shared_variance(offset: Float[np.ndarray, " n"], evidence: Evidence, freedom: int) -> float:
+def shared_variance(offset: Float[np.ndarray, " n"], observed: ObservedPoints, freedom: int) -> float:
     """Variance of a point, were all independent, that leaves a fit as unsure as what it leaves over.
 
     Differences between neighbouring patches of the picture, from single points to halves of the cloud, all have the
@@ -373,12 +373,12 @@ def shared_variance(offset: Float[np.ndarray, " n"], evidence: Evidence, freedom
     """
     most = 2 * ROBUST * TO_STD * float(np.median(np.abs(offset)))
     offset = np.where(np.abs(offset) > ROBUST * LARGEST, 0.0, np.clip(offset, -most, most))
-    means, variance = offset[evidence.nested], list[float]()
+    means, variance = offset[observed.nested], list[float]()
     while len(means) > 1:
         first, second = means[::2], means[1::2]
         variance.append((TO_STD * float(np.median(np.abs(first - second)))) ** 2 / 2)
         means = (first + second) / np.sqrt(2)
-    patches = 0.5 ** np.arange(len(variance)) * len(evidence.nested) / 2
+    patches = 0.5 ** np.arange(len(variance)) * len(observed.nested) / 2
     rising = np.maximum(isotonic_regression(variance, weights=patches).x, CLEAN**2)
     whole, left = np.average(rising, weights=patches), np.average(rising, weights=patches * (patches <= freedom))
     return float(left * whole / rising[0])
