@@ -196,7 +196,9 @@ def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig)
     noise = track.noise + config.smoothing * (fitted.problem.residual_noise(fitted.surface) - track.noise)
     return replace(
         track,
-        problem=changed(fitted.problem, config=constants_for(noise, track.clean)),
+        problem=changed(
+            fitted.problem, config=constants_for(noise, track.clean, fitted.problem.evidence.largest_noise)
+        ),
         unit=track.unit * scale,
         posed=posed,
         time_s=time_s,

@@ -48,6 +48,9 @@ UNSEEN_PITCHES = 2.0
 NORMAL_POINTS = 12
 """Points by which the surface's direction at an observed one is estimated."""
 
+NOISE_SHARE = 0.01
+"""Largest noise of a depth camera, as a share of its distance: two to five times that of the usual ones."""
+
 RIM_PITCHES, EDGE_PITCHES, EDGE_DIRECTIONS = 2.5, 3.5, 8
 """Angles from the observed points, in pixels, between which lines of sight around the object are sampled, and in how
 many directions: nearer lies the rim, of which nothing is known in any case (``lines_of_sight.RIM``)."""
@@ -156,6 +159,16 @@ class ObservedPoints:
         patch = least_squares(away, start, loss="cauchy", f_scale=tolerance, x_scale="jac").x
         return float((np.abs(away(patch)) <= tolerance).mean())
 
+    @property
+    def distance(self) -> float:
+        """Distance of the camera, scene units; of a surface without one, as that of the nearest that scenes have."""
+        return 100.0
+
+    @property
+    def largest_noise(self) -> float:
+        """Largest standard deviation of a camera's noise."""
+        return NOISE_SHARE * self.distance
+
     @cached_property
     def nested(self) -> Int[np.ndarray, " m"]:
         """Points, as many as a power of two, in an order in which each aligned run of a power of two is a patch."""
@@ -229,6 +242,11 @@ class Evidence(ObservedPoints):
         chosen, around = points[spread(points, observed_samples)], near[:, 1:]
         past, other_lines = PastLines.of(lines.past, pitch), lines.other_lines or "past"
         return cls(points, chosen, around, sight, ranges, front, pitch, past, other_lines)
+
+    @property
+    def distance(self) -> float:
+        """Distance of the camera, scene units."""
+        return float(np.median(self.ranges))
 
     @property
     def with_more_samples(self) -> "Evidence":

@@ -143,7 +143,7 @@ class Problem:
         What neighbours share is taken for noise too where ``is_shared``.
         """
         noise = noise_of(self.offsets(surface)) if is_shared else self.residual_noise(surface)
-        config = constants_for(noise, self.config)
+        config = constants_for(noise, self.config, self.evidence.largest_noise)
         if config is self.config:
             return None
         return replace(self, config=config, evidence=self.evidence.with_more_samples, noisy=True)
@@ -171,7 +171,8 @@ class Problem:
     def leaves_noise(self, surface: Surface, is_shared: bool = False) -> bool:
         """Whether what a fit leaves over is noise, and not its own error; ``is_shared`` as in ``as_noisy_as``."""
         seen, offset = self.evidence, self.offsets(surface)
-        return is_noise(offset, seen.around, is_shared) and (is_shared or noise_of(offset) <= ROUGHER * seen.roughness)
+        limit = seen.largest_noise if is_shared else ROUGHER * seen.roughness
+        return noise_of(offset) <= limit and is_noise(offset, seen.around, is_shared)
 
     def explained(self, cloud: float, surface: Surface, most: float) -> bool:
         """Whether a surface explains the cloud: by a misfit below ``most``, or of a noisy one all but the noise."""
@@ -349,8 +350,6 @@ SIGMAS = 1.5
 NOISES = 3.0
 """Distance, in noises, that counts as a standard deviation of a clean frame does where a fit is to be believed."""
 
-LARGEST = 1.0
-"""Largest standard deviation of the cloud, in scene units."""
 
 SHARED = 1.05
 """Misfit of a noisy cloud, in misfits of what neighbours do not share, up to which nothing more is to be explained."""
@@ -372,7 +371,7 @@ def shared_variance(offset: Float[np.ndarray, " n"], observed: ObservedPoints, f
     ones, to which it cannot, and as many times what it leaves of it as the whole noise is that of points alone.
     """
     most = 2 * ROBUST * TO_STD * float(np.median(np.abs(offset)))
-    offset = np.where(np.abs(offset) > ROBUST * LARGEST, 0.0, np.clip(offset, -most, most))
+    offset = np.where(np.abs(offset) > ROBUST * SIGMAS * observed.largest_noise, 0.0, np.clip(offset, -most, most))
     means, variance = offset[observed.nested], list[float]()
     while len(means) > 1:
         first, second = means[::2], means[1::2]
@@ -409,7 +408,7 @@ def is_noise(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"], is
     if not is_shared:
         return noise_of(offset) <= COHERENT * noise_of(offset, around)
     far, middle = float(np.quantile(np.abs(offset), 0.95)), float(np.median(np.abs(offset)))
-    return noise_of(offset) * SIGMAS <= LARGEST and far <= NORMAL * middle
+    return far <= NORMAL * middle
 
 
 def shared(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"], sigma: float) -> float:
@@ -418,11 +417,11 @@ def shared(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"], sigm
     return float(robust_square(offset, sigma).mean() / max(alone, 1e-12))
 
 
-def constants_for(noise: float, config: FitConfig) -> FitConfig:
-    """Constants for a frame of this noise in scene units; the same where it is as on clean frames."""
+def constants_for(noise: float, config: FitConfig, largest: float) -> FitConfig:
+    """Constants for a frame of this noise in scene units, ``largest`` at most; the same where it is as on clean frames."""
     if noise <= CLEAN:
         return config
-    sigma = min(max(SIGMAS * noise, config.cloud_sigma), LARGEST)
-    tolerance = config.tolerance * min(max(NOISES * noise, config.cloud_sigma), LARGEST) / config.cloud_sigma
+    sigma = max(SIGMAS * min(noise, largest), config.cloud_sigma)
+    tolerance = config.tolerance * max(min(NOISES * noise, SIGMAS * largest), config.cloud_sigma) / config.cloud_sigma
     accepted = config.accepted if noise < CAMERA else min(config.accepted, ACCEPTED)
     return replace(config, cloud_sigma=sigma, tolerance=tolerance, accepted=accepted)
