@@ -16,8 +16,8 @@ from mereo.fitting.problem.problem import (
     ACCEPTED,
     CAMERA,
     CLEAN,
-    LARGEST,
     SHARED,
+    SIGMAS,
     constants_for,
     is_noise,
     noise_of,
@@ -230,7 +230,8 @@ def test_a_noisy_frame_is_fitted_by_its_own_noise(registrar: Registrar, points: 
     clean, found = (fitted(registrar, cloud).modes for cloud in (points, noisy(points, 0.4)))
     assert clean.problem.config == FitConfig()
     config = found.problem.config
-    assert 0.3 < config.cloud_sigma <= LARGEST and config.tolerance == pytest.approx(4.5 * config.cloud_sigma, rel=0.5)
+    assert 0.3 < config.cloud_sigma <= SIGMAS * found.problem.evidence.largest_noise
+    assert config.tolerance == pytest.approx(4.5 * config.cloud_sigma, rel=0.5)
     assert len(found.problem.evidence.observed_samples) > len(clean.problem.evidence.observed_samples)
     assert found.registration.accepted
     metres = fitted(registrar, noisy(points, 0.4) * 0.005, unit=0.005).modes
@@ -265,7 +266,7 @@ def test_what_neighbours_share_is_no_noise(points: np.ndarray) -> None:
 def test_noise_that_neighbours_share_is_spread_evenly_and_a_wrong_state_is_not() -> None:
     rng, around = np.random.default_rng(0), np.zeros((2700, 8), dtype=int)
     windows = 0.1 * np.repeat(rng.normal(size=300), 9)
-    assert is_noise(windows, around, is_shared=True) and not is_noise(10 * windows, around, is_shared=True)
+    assert is_noise(windows, around, is_shared=True)
     assert not is_noise(np.where(rng.random(2700) < 0.1, 0.6, windows), around, is_shared=True)
 
 
@@ -293,7 +294,7 @@ def test_a_noisy_cloud_is_worth_no_more_than_its_points_and_less_where_they_shar
     registrar: Registrar, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     modes = fitted(registrar, points).modes
-    problem = replace(modes.problem, config=constants_for(0.4, FitConfig()), noisy=True)
+    problem = replace(modes.problem, config=constants_for(0.4, FitConfig(), 1.0), noisy=True)
     rng, count = np.random.default_rng(0), len(problem.evidence.points)
     own, common = rng.normal(scale=0.4, size=count), np.full(count, 0.4) * np.sign(problem.evidence.points[:, 0])
     weights = list[float]()
@@ -317,16 +318,29 @@ def test_a_noisy_cloud_is_explained_where_only_noise_is_left(registrar: Registra
 
 def test_constants_follow_the_noise_and_end() -> None:
     config = FitConfig()
-    assert constants_for(CLEAN, config) is config
-    found = constants_for(0.2, config)
+    assert constants_for(CLEAN, config, 1.0) is config
+    found = constants_for(0.2, config, 1.0)
     assert (found.cloud_sigma, found.tolerance, found.accepted) == pytest.approx((0.3, 1.35, ACCEPTED))
     clean = replace(found, cloud_sigma=config.cloud_sigma, tolerance=config.tolerance, accepted=config.accepted)
     assert clean == config
-    assert constants_for(0.2, replace(config, accepted=0.5)).accepted == 0.5
-    assert constants_for(0.9 * CAMERA, config).accepted == config.accepted, (
+    assert constants_for(0.2, replace(config, accepted=0.5), 1.0).accepted == 0.5
+    assert constants_for(0.9 * CAMERA, config, 1.0).accepted == config.accepted, (
         "a clean frame's fit that is not quite right"
     )
-    assert constants_for(9.0, config).cloud_sigma == LARGEST
+    assert constants_for(9.0, config, 1.0).cloud_sigma == SIGMAS
+
+
+def test_a_cameras_noise_is_at_most_a_hundredth_of_its_distance(
+    registrar: Registrar, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the object's size is: a bottle is thinner than the noise that a stereo camera's pixels share."""
+    modes = fitted(registrar, points).modes
+    far = np.median(np.linalg.norm(points, axis=1))
+    assert modes.problem.evidence.largest_noise == pytest.approx(0.01 * far, rel=0.02)
+    offset = np.random.default_rng(0).choice([-1.0, 1.0], len(points)) + 0.2 * np.sin(points[:, 0])
+    for share, is_plausible in ((0.005, True), (0.02, False)):
+        monkeypatch.setattr(Surface, "offsets", lambda _, given, noise=share * far: noise * offset[: len(given)])
+        assert modes.problem.leaves_noise(modes.surface, is_shared=True) is is_plausible
 
 
 def test_doubtful_points_rule_nothing_out(points: np.ndarray) -> None:

@@ -171,7 +171,7 @@ class Problem:
     def leaves_noise(self, surface: Surface, is_shared: bool = False) -> bool:
         """Whether what a fit leaves over is noise, and not its own error; ``is_shared`` as in ``as_noisy_as``."""
         seen, offset = self.evidence, self.offsets(surface)
-        limit = seen.largest_noise if is_shared else ROUGHER * seen.roughness
+        limit = max(ROUGHER * seen.roughness, is_shared * seen.largest_noise)
         return noise_of(offset) <= limit and is_noise(offset, seen.around, is_shared)
 
     def explained(self, cloud: float, surface: Surface, most: float) -> bool:
@@ -418,7 +418,7 @@ def shared(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"], sigm
 
 
 def constants_for(noise: float, config: FitConfig, largest: float) -> FitConfig:
-    """Constants for a frame of this noise in scene units, ``largest`` at most; the same where it is as on clean frames."""
+    """Constants for a frame of this noise, scene units, ``largest`` at most; the same where it is as on clean frames."""
     if noise <= CLEAN:
         return config
     sigma = max(SIGMAS * min(noise, largest), config.cloud_sigma)
