@@ -418,7 +418,7 @@ def shared(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"], sigm
 
 
 def constants_for(noise: float, config: FitConfig, largest: float) -> FitConfig:
-    """Constants for a frame of this noise, ``largest`` at most, scene units; the same where it is that of a clean one."""
+    """Constants for a frame of this noise, ``largest`` at most, in scene units; the same where it is clean."""
     if noise <= CLEAN:
         return config
     sigma = max(SIGMAS * min(noise, largest), config.cloud_sigma)
