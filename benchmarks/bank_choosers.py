@@ -115,7 +115,7 @@ def least(frame: Frame, numbers: Sequence[int], handicap: Callable[[dict[str, An
 
 
 def today(frame: Frame) -> int | None:
-    """The fit's own rules (``search.search``, ``modes.is_at_rest``, ``register.is_drawn``), from the terms alone."""
+    """The fit's own rules (``search.search``, ``modes.resting``, ``register.is_drawn``), from the terms alone."""
     rows, problems = frame.rows, frame.facts["problems"]
     fits = [n for n in frame.of_stages(FITTED) if frame.problem(rows[n])["modes"] == problems[0]["modes"]]
     clean = [n for n in fits if not frame.problem(rows[n])["noisy"] and rows[n]["stage"] != "heavier"]

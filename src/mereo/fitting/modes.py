@@ -288,9 +288,11 @@ def of_rest(problem: Problem, correspondences: Correspondences) -> Problem:
     return replace(problem, model=rigid, network=NetworkTerm.of(rigid, correspondences))
 
 
-def is_at_rest(problem: Problem, modes: ScoredFit, rest: ScoredFit) -> bool:
-    """Whether the evidence of the rest model is greater than that of the modes; a rigid object is always at rest."""
-    return problem.model.count == 0 or rest.misfit.total - modes.misfit.total < narrowing(problem, modes.posed)
+def resting(problem: Problem, correspondences: Correspondences, modes: ScoredFit) -> ScoredFit | None:
+    """Fit of the rest model where its evidence is greater than that of the modes; a rigid object is always at rest."""
+    rest = fit_rest(problem, correspondences, modes.posed)
+    is_rigid = problem.model.count == 0
+    return rest if is_rigid or rest.misfit.total - modes.misfit.total < narrowing(problem, modes.posed) else None
 
 
 def narrowing(problem: Problem, modes: Posed) -> float:
@@ -330,10 +332,7 @@ def refit_noisy(
 
 
 def settled(problem: Problem, best: ScoredFit) -> tuple[Problem, ScoredFit]:
-    """Fit a noisy frame anew, twice, with as many independent points as a fit that explains it leaves over."""
-    off = best.surface.nearest(problem.evidence.observed_samples)[0]
-    if not problem.noisy or (off <= problem.config.tolerance).mean() < problem.config.accepted:
-        return problem, best
+    """Fit a noisy frame anew, twice, with as many independent points as the fit shows that its cloud is worth."""
     for _ in range(2):
         problem = problem.worth(best.surface)
         best = ScoredFit.of(problem, fit_cloud(problem, best.posed, Prior.whole(problem.model), REFINE_SIGMA, 10, 0.0))

@@ -104,9 +104,17 @@ class Calibration(BaseModel, frozen=True):
     recognizing: Recognizing | None = None
 
     def radii(self, *, draws: bool, noisy: bool) -> RadiusFactors:
-        """What makes the radii of a fit of draws, or of the modes, to a frame; noise is in the posterior already."""
-        scale = self.draws_radius_scale if draws else self.radius_scale
-        return RadiusFactors(scale, None if noisy else self.draws_usual_misfit if draws else self.usual_misfit)
+        """What makes the radii of a fit of draws, or of the modes, to a frame.
+
+        A clean frame's fit may be surer than its fixed weights say. Of a noisy one the weights follow the noise, so that
+        no scale makes radii shorter.
+        """
+        scale, misfit = self.radius_scale, self.usual_misfit
+        if draws:
+            scale, misfit = self.draws_radius_scale, self.draws_usual_misfit
+        if noisy:
+            return RadiusFactors(None if scale is None else max(scale, 1.0))
+        return RadiusFactors(scale, misfit)
 
     @property
     def scaling(self) -> Scaling:

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, ndtri
 
 from mereo.deformation.moving_least_squares import PointWeights, spread
-from mereo.fitting.config import FEW_DRAWS, MANY_DRAWS, DrawsConfig, FitConfig
+from mereo.fitting.config import FEW_DRAWS, MANY_DRAWS, DrawsConfig
 from mereo.fitting.draws.playback import Drawn, DrawnStates, as_sparse, material_moved, shares_of
 from mereo.fitting.modes import refine, robust_poses
 from mereo.fitting.problem.correspondences import Correspondences
@@ -78,8 +78,7 @@ class DrawsProblem:
         if config is None:
             config = DrawsConfig() if states.z.shape[1] <= FEW_DRAWS else MANY_DRAWS
         network_weight = config.network_weight, config.network_weight
-        weight = config.cloud_weight * base.config.cloud_weight / FitConfig.cloud_weight
-        fit_config = replace(base.config, cloud_weight=weight, network_weight=network_weight)
+        fit_config = replace(base.config, cloud_weight=config.cloud_weight, network_weight=network_weight)
         weights = base.model.weights(correspondences.rest, correspondences.labels)
         return cls(replace(base, config=fit_config), states, correspondences, weights, config)
 
@@ -406,6 +405,14 @@ def refine_by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     end = simulate(sighted, fit.drawn, fit.z, fit.posed)
     assert end is not None  # it was played before
     return replace(end, motion=fit.motion, misfit=fit.misfit)
+
+
+def settled(problem: DrawsProblem, fit: DrawsFit) -> tuple[DrawsProblem, DrawsFit]:
+    """Fit a noisy frame anew with as many independent points as its cloud is worth, where the fit explains it."""
+    if not problem.base.explains_noise(fit.surface):
+        return problem, fit
+    worth = replace(problem, base=problem.base.worth(fit.surface))
+    return worth, refine_by_sight(worth, fit)
 
 
 def fit_near_modes(

@@ -148,6 +148,11 @@ class Problem:
             return None
         return replace(self, config=config, evidence=self.evidence.with_more_samples, noisy=True)
 
+    def explains_noise(self, surface: Surface) -> bool:
+        """Whether the frame is noisy, and as many of its points on a surface as are asked for to believe it."""
+        off = surface.nearest(self.evidence.observed_samples)[0]
+        return self.noisy and float((off <= self.config.tolerance).mean()) >= self.config.accepted
+
     def worth(self, surface: Surface) -> "Problem":
         """The problem with as many independent points as what a fit leaves over shows that the cloud is worth."""
         config, offset = self.config, surface.offsets(self.evidence.points)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mereo.fitting.config import FitConfig, LocatedBy
-from mereo.fitting.modes import fit_rest, is_at_rest, settled
+from mereo.fitting.modes import resting
 from mereo.fitting.problem.correspondences import NoFit, nothing
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.gauss_newton import Posed
@@ -416,11 +416,10 @@ def search_modes(
         whole = Problem(model, NetworkTerm.none(model), evidence, cloud.scale_std, config, given=given)
         partial = replace(whole, evidence=replace(evidence, other_lines="unknown")) if is_open else None
         trail = search(whole, partial, start)
-        problem, modes = settled(trail.problem, trail.best)
-        rest = fit_rest(problem, nothing(), modes.posed)
-        at_rest = is_at_rest(problem, modes, rest)
+        problem, modes = trail.problem, trail.best
+        rest = resting(problem, nothing(), modes)
     seconds = time.perf_counter() - started
-    return ModesFit(problem, nothing(), unit, modes.posed, seconds, rest if at_rest else None, others=trail.others)
+    return ModesFit(problem, nothing(), unit, modes.posed, seconds, rest, others=trail.others)
 
 
 def size_of(cloud: CloudToFit, model: StatisticalModel) -> float:

@@ -15,15 +15,15 @@ from jaxtyping import Float
 from mereo.fitting.config import ELASTIC, AnswerMethod, FitConfig
 from mereo.fitting.draws.fit import DrawsFit, DrawsProblem, fit_draws
 from mereo.fitting.draws.fit import narrowing as draws_narrowing
+from mereo.fitting.draws.fit import settled as settled_draws
 from mereo.fitting.draws.playback import MOST_DRAWS, STATES_SEED, Drawn, DrawnStates
 from mereo.fitting.modes import (
     PredictCorrespondences,
     ScoredFit,
     fit_modes,
-    fit_rest,
-    is_at_rest,
     of_rest,
     refit_noisy,
+    resting,
     settled,
 )
 from mereo.fitting.modes import narrowing as modes_narrowing
@@ -146,12 +146,8 @@ class ModesFit:
             fit = problem, correspondences, fit_modes(problem)
             scaled = None if predict is None else lambda seen: predict(seen * unit).scaled(1 / unit)
             problem, correspondences, modes = refit_noisy(fit, cloud.points / unit, scaled)
-            problem, modes = settled(problem, modes)
-            rest = fit_rest(problem, correspondences, modes.posed)
-            at_rest = is_at_rest(problem, modes, rest)
-        return cls(
-            problem, correspondences, unit, modes.posed, time.perf_counter() - started, rest if at_rest else None
-        )
+            rest = resting(problem, correspondences, modes)
+        return cls(problem, correspondences, unit, modes.posed, time.perf_counter() - started, rest)
 
     @property
     def may_take_draws(self) -> bool:
@@ -182,6 +178,15 @@ class ModesFit:
         end = ModesOptimum(self.problem, self.posed, self.unit, self.others)
         return self._registration("modes", self.posed.z, end, self.posed, self.surface)
 
+    def settled(self) -> "ModesFit":
+        """The same with as many independent points as the cloud of a noisy frame is worth, where it is explained."""
+        if not self.problem.explains_noise(self.surface):
+            return self
+        with limit_blas_threads():
+            problem, modes = settled(self.problem, ScoredFit.of(self.problem, self.posed))
+            rest = resting(problem, self.correspondences, modes)
+        return replace(self, problem=problem, posed=modes.posed, rest=rest)
+
     def with_draws(self, states: DrawnStates) -> Registration:
         """Fit the scene's draws too, and return them where their misfit is lower or their evidence greater.
 
@@ -197,7 +202,9 @@ class ModesFit:
             taken = drawn is not None and is_drawn(problem, drawn, self.posed, self.rest)
         seconds = self.seconds + time.perf_counter() - started
         if drawn is None or not taken:
-            return replace(self.registration, seconds=seconds)
+            return replace(self.settled().registration, seconds=seconds)
+        with limit_blas_threads():
+            problem, drawn = settled_draws(problem, drawn)
         end = DrawsOptimum(problem, drawn, self.unit, self.others)
         registration = self._registration("draws", drawn.z, end, drawn.posed, drawn.surface)
         return replace(registration, drawn=replace(drawn.drawn, z=drawn.z), seconds=seconds)
@@ -450,7 +457,7 @@ class Registrar:
         modes = fitted.registration
         hopeless = self.method != "full" and not modes.accepted
         states = None if not self.fits_draws or hopeless or not fitted.may_take_draws else self.states_or_none
-        return modes if states is None else fitted.with_draws(states)
+        return fitted.settled().registration if states is None else fitted.with_draws(states)
 
     def takes(self, registration: Registration) -> bool:
         """Whether a registration is the answer: one that explains its frame; any where nobody else can answer."""
