@@ -106,8 +106,8 @@ class Calibration(BaseModel, frozen=True):
     def radii(self, *, draws: bool, noisy: bool) -> RadiusFactors:
         """What makes the radii of a fit of draws, or of the modes, to a frame.
 
-        A clean frame's fit may be surer than its fixed weights say. Of a noisy one the weights follow the noise, so that
-        no scale makes radii shorter.
+        A clean frame's fit may be surer than its fixed weights say. A noisy one's weights follow the noise, so that no
+        scale makes radii shorter.
         """
         scale, misfit = self.radius_scale, self.usual_misfit
         if draws:
