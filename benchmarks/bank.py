@@ -220,7 +220,7 @@ def terms_of(candidate: Candidate) -> dict[str, Any]:
     is_modes = len(posed.z) == problem.model.count and candidate.stage != "draws"
     pose_part, eigenvalues = information(problem, posed) if is_modes else (np.nan, np.full(problem.model.count, np.nan))
     return {
-        "offsets": surface.offsets(problem.evidence.points, FAR).astype(np.float16),
+        "offsets": problem.offsets(surface, FAR).astype(np.float16),
         "ruled_out": np.where(is_past, -amount, amount).astype(np.float16),
         "pose_information": pose_part,
         "information": eigenvalues.astype(np.float32),

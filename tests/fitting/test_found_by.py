@@ -299,7 +299,7 @@ def test_a_noisy_cloud_is_worth_no_more_than_its_points_and_less_where_they_shar
     own, common = rng.normal(scale=0.4, size=count), np.full(count, 0.4) * np.sign(problem.evidence.points[:, 0])
     weights = list[float]()
     for offset in (own, own + common):
-        monkeypatch.setattr(Surface, "offsets", lambda _, __, offset=offset: offset)
+        monkeypatch.setattr(Surface, "offsets", lambda *_, offset=offset: offset)
         config = problem.worth(modes.surface).config
         share = config.silhouette_weight / FitConfig.silhouette_weight
         assert share == pytest.approx(config.cloud_weight / (2.25 * count))
@@ -339,7 +339,7 @@ def test_a_cameras_noise_is_at_most_a_hundredth_of_its_distance(
     assert modes.problem.evidence.largest_noise == pytest.approx(0.01 * far, rel=0.02)
     offset = np.random.default_rng(0).choice([-1.0, 1.0], len(points)) + 0.2 * np.sin(points[:, 0])
     for share, is_plausible in ((0.005, True), (0.02, False)):
-        monkeypatch.setattr(Surface, "offsets", lambda _, given, noise=share * far: noise * offset[: len(given)])
+        monkeypatch.setattr(Surface, "offsets", lambda *_, noise=share * far: noise * offset)
         assert modes.problem.leaves_noise(modes.surface, is_shared=True) is is_plausible
 
 

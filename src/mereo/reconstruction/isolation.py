@@ -406,7 +406,7 @@ def nearer_layer(points: Float[np.ndarray, "n 3"], patch: Int[np.ndarray, " n"])
     is thin.
     """
     distance = np.linalg.norm(points, axis=1)
-    parts = [distance[patch == one] for one in np.flatnonzero(np.bincount(patch) >= MIN_POINTS)]
+    parts = [distance[patch == number] for number in np.flatnonzero(np.bincount(patch) >= MIN_POINTS)]
     ends = np.array([np.quantile(part, (0.05, 0.95)) for part in sorted(parts, key=np.median)]).reshape(-1, 2)
     near = np.maximum.accumulate(ends[:-1, 1])
     gaps = ends[1:, 0] - near

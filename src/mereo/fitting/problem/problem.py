@@ -150,12 +150,12 @@ class Problem:
 
     def explains_noise(self, surface: Surface) -> bool:
         """Whether the frame is noisy, and as many of its points on a surface as are asked for to believe it."""
-        off = surface.nearest(self.evidence.observed_samples)[0]
+        off = self.nearest(surface)[0]
         return self.noisy and float((off <= self.config.tolerance).mean()) >= self.config.accepted
 
     def worth(self, surface: Surface) -> "Problem":
         """The problem with as many independent points as what a fit leaves over shows that the cloud is worth."""
-        config, offset = self.config, surface.offsets(self.evidence.points)
+        config, offset = self.config, self.offsets(surface)
         alone = (config.cloud_sigma / SIGMAS) ** 2  # variance of a point of which neighbours share nothing
         share = min(alone / shared_variance(offset, self.evidence, POSE + self.model.count), 1.0)
         weight, outside = SIGMAS**2 * share * len(offset), SILHOUETTE_WEIGHT * share
