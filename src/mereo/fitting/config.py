@@ -30,6 +30,7 @@ class FitConfig:
         unexplained: the same, above which a fit is likely wrong.
         samples: points of the surface that stand for it in most steps.
         silhouette_vertices: how many of them are compared with what the frame rules out.
+        silhouette_weight: how many independent points one of them is worth, of ``SILHOUETTE_VERTICES``.
         exact_steps: last steps, which use the faces themselves.
         by_normals: whether the normals of a camera's points are compared with the surface's; of a surface that no
             single camera saw they are in any case.

@@ -23,6 +23,7 @@ from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from mereo.fitting.config import FitConfig
 from mereo.fitting.modes import (
     BENT_APART,
     ScoredFit,
@@ -37,7 +38,7 @@ from mereo.fitting.modes import (
 from mereo.fitting.problem.evidence import Evidence, Observed, SurfaceEvidence
 from mereo.fitting.problem.gauss_newton import DAMPING, Posed, cross
 from mereo.fitting.problem.problem import Problem
-from mereo.fitting.problem.residuals import ROBUST, SILHOUETTE_WEIGHT, Prior, SampledSurface
+from mereo.fitting.problem.residuals import ROBUST, Prior, SampledSurface
 from mereo.fitting.problem.segments import diverse_rows, rms_distance
 from mereo.geometry.transforms import rotation_along
 from mereo.io.cores import cores
@@ -122,7 +123,7 @@ POINTS = 128
 BLOCK = 150
 """Poses in one array operation: their arrays fit a core's cache, where 3,600 at once take seven times as long each."""
 
-OUTSIDE = SILHOUETTE_WEIGHT * SILHOUETTE_VERTICES / 3000.0
+OUTSIDE = FitConfig.silhouette_weight * SILHOUETTE_VERTICES / FitConfig.cloud_weight
 """Weight of what the frame rules out relative to that of the cloud: as in the fit."""
 
 FARTHEST = 0.5

@@ -13,7 +13,6 @@ from mereo.fitting.problem.evidence import MORE_SAMPLES, OBSERVED_SAMPLES, Direc
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, Rows, rigid_motion
 from mereo.fitting.problem.residuals import (
     ROBUST,
-    SILHOUETTE_WEIGHT,
     NetworkTerm,
     PairTerm,
     PosedSamples,
@@ -158,7 +157,7 @@ class Problem:
         config, offset = self.config, self.offsets(surface)
         alone = (config.cloud_sigma / SIGMAS) ** 2  # variance of a point of which neighbours share nothing
         share = min(alone / shared_variance(offset, self.evidence, POSE + self.model.count), 1.0)
-        weight, outside = SIGMAS**2 * share * len(offset), SILHOUETTE_WEIGHT * share
+        weight, outside = SIGMAS**2 * share * len(offset), FitConfig.silhouette_weight * share
         return replace(self, config=replace(config, cloud_weight=weight, silhouette_weight=outside))
 
     def leaves_camera_noise(self, surface: Surface) -> bool:

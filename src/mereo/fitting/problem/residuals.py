@@ -114,7 +114,6 @@ ROBUST = 2.5
 """Residuals beyond this many sigma count for little."""
 
 MOST_VIOLATIONS = 400
-SILHOUETTE_WEIGHT = 0.2
 
 
 def robust_square(residual: Float[np.ndarray, " r"], sigma: float, robust: float = ROBUST) -> Float[np.ndarray, " r"]:
