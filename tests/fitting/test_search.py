@@ -295,7 +295,7 @@ def test_a_bank_keeps_every_candidate_and_a_chooser_by_todays_rules_names_the_an
     assert bank.make("mug", "tool30", 0, tmp_path).startswith("made")
     assert bank.make("mug", "tool30", 0, tmp_path) == "kept"
     assert bank.make("mug", "other", 0, tmp_path).startswith("made")
-    own, thing = choosers.frames_of(tmp_path, ["mug"], ["tool30", "other"])[::-1]
+    thing, own = choosers.frames_of(tmp_path, ["mug"], ["tool30", "other"])
     assert own.is_judged and not thing.is_judged and thing.facts["kind"] == "thing"
     stages = {row["stage"] for row in own.facts["candidates"]}
     assert {"truth", "from truth", "screened", "bent", "fitted", "rest"} <= stages
