@@ -40,7 +40,14 @@ from mereo.fitting.registration import register
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import CloudToFit, Registrar
 from mereo.geometry.camera import PointCloud
-from mereo.geometry.metrics import TruthGrid, grid_confusion, intersection_over_union, labels_on, truth_grid
+from mereo.geometry.metrics import (
+    TruthGrid,
+    grid_confusion,
+    intersection_over_union,
+    labels_on,
+    truth_grid,
+    with_segments_exchanged,
+)
 from mereo.geometry.transforms import transform_points
 from mereo.io.cores import use_threads
 from mereo.models.weights_place import statistical_model_in
@@ -57,7 +64,8 @@ FAR = 2.5
 
 FITTED = ("fitted", "shaken", "explored", "noisy", "heavier")
 """Stages of the fits of the modes. Besides there are "screened" and "bent", which are kept and not measured, "rest" and
-"draws", and "truth", the model's own nearest to the true state, with "from truth", the fit that starts there."""
+"draws", "settled" and "draws settled", the ends under noise, and "truth", the model's own nearest to the true state,
+with "from truth", the fit that starts there."""
 
 WITHIN: dict[str, str] = {
     "shaken": "shaken",
@@ -66,6 +74,7 @@ WITHIN: dict[str, str] = {
     "again": "noisy",
     "with_heavier_cloud": "heavier",
     "fit_rest": "rest",
+    "settled": "settled",
 }
 """Stage of what is scored within a function of the fit."""
 
@@ -145,13 +154,14 @@ def recording() -> Iterator[Recorder]:
             recorder.add("screened", problem, posed)
         return poses
 
-    def recorded_evidence(cloud: CloudToFit, unit: float) -> Any:
+    def recorded_evidence(cloud: CloudToFit, unit: float, *most: int) -> Any:
         recorder.unit = unit
-        return evidence(cloud, unit)
+        return evidence(cloud, unit, *most)
 
     def recorded_descent(problem: Any, fit: Any, fresh: int, motion: Any = None) -> Any:
         drawn = descend(problem, fit, fresh, motion)
-        recorder.add("draws", problem.base, drawn.posed, drawn.surface, Misfit(np.nan, drawn.misfit, drawn.misfit))
+        stage = "draws settled" if stage_of_caller() == "settled" else "draws"
+        recorder.add(stage, problem.base, drawn.posed, drawn.surface, Misfit(np.nan, drawn.misfit, drawn.misfit))
         return drawn
 
     def recorded_choice(problem: Any, drawn: Any, posed: Posed, rest: ScoredFit | None = None) -> bool:
@@ -183,13 +193,9 @@ def recording() -> Iterator[Recorder]:
 
 def scored(truth: TruthGrid, model: StatisticalModel, material: Float[np.ndarray, "m 3"]) -> tuple[float, float]:
     """IoU and mIoU of posed material points; where segments may be exchanged, the best."""
-    labels = labels_on(model.mesh(material), truth.grid)
-    best = (0.0, 0.0)
-    for order in [tuple(range(len(model.rest.names))), *model.swaps]:
-        exchanged = np.array([0, *(place + 1 for place in order)], dtype=np.uint8)[labels]
-        found = intersection_over_union(grid_confusion(truth, exchanged, len(model.rest.names)))
-        best = max(best, (found.miou, found.iou))
-    return best[1], best[0]
+    confusion = grid_confusion(truth, labels_on(model.mesh(material), truth.grid), len(model.rest.names))
+    found = intersection_over_union(with_segments_exchanged(confusion, model.swaps))
+    return found.iou, found.miou
 
 
 def information(problem: Problem, posed: Posed) -> tuple[float, Float[np.ndarray, " k"]]:
@@ -217,7 +223,7 @@ def terms_of(candidate: Candidate) -> dict[str, Any]:
     if isinstance(problem.evidence, Evidence):
         angle = problem.evidence.sight.query(vertices / np.linalg.norm(vertices, axis=1, keepdims=True))[0]
         is_past = angle > SILHOUETTE_PITCHES * problem.evidence.pitch
-    is_modes = len(posed.z) == problem.model.count and candidate.stage != "draws"
+    is_modes = len(posed.z) == problem.model.count and not candidate.stage.startswith("draws")
     pose_part, eigenvalues = information(problem, posed) if is_modes else (np.nan, np.full(problem.model.count, np.nan))
     return {
         "offsets": problem.offsets(surface, FAR).astype(np.float16),
@@ -330,7 +336,7 @@ def packed(
             ruled.append(terms.pop("ruled_out"))
             eigenvalues.append(terms.pop("information"))
             posed_material = terms.pop("material") * candidate.unit
-            if candidate.stage in ("draws", "rest"):
+            if candidate.stage in ("draws", "draws settled", "rest"):
                 row["material"] = len(places)
                 places.append(posed_material.astype(np.float32))
             row |= terms
@@ -342,19 +348,7 @@ def packed(
                 and np.abs(final.material - posed_material).max() < 1e-6 * candidate.unit
             )
         rows.append(row)
-    width = max(map(len, offsets), default=0)
-    arrays["offsets"] = (
-        np.stack([np.pad(each, (0, width - len(each)), constant_values=np.nan) for each in offsets])
-        if offsets
-        else np.empty((0, 0))
-    )
-    arrays["ruled_out"] = np.stack(ruled) if ruled else np.empty((0, 0))
-    modes_most = max(map(len, eigenvalues), default=0)
-    arrays["information"] = (
-        np.stack([np.pad(each, (0, modes_most - len(each)), constant_values=np.nan) for each in eigenvalues])
-        if eigenvalues
-        else np.empty((0, 0))
-    )
+    arrays |= {"offsets": stacked(offsets), "ruled_out": stacked(ruled), "information": stacked(eigenvalues)}
     for number, each in enumerate(places):
         arrays[f"material{number}"] = each
     for number, evidence in enumerate(evidences):
@@ -392,6 +386,13 @@ def packed(
     }
     arrays["facts"] = np.frombuffer(json.dumps(facts, default=float).encode(), dtype=np.uint8)
     return arrays
+
+
+def stacked(rows: Sequence[Float[np.ndarray, " _"]]) -> Float[np.ndarray, "r w"]:
+    """Rows of an array, the shorter ones with NaN at their ends."""
+    width = max(map(len, rows), default=0)
+    ends = [np.pad(row, (0, width - len(row)), constant_values=np.nan) for row in rows]
+    return np.stack(ends) if ends else np.empty((0, 0))
 
 
 def answer_facts(
@@ -436,6 +437,7 @@ def make(name: str, condition: str, number: int, folder: Path) -> str:
     with partial.open("wb") as file:
         np.savez_compressed(file, **arrays)
     partial.replace(kept)
+    kept.with_suffix(".error").unlink(missing_ok=True)  # of an earlier run
     return f"made in {time.perf_counter() - started:.1f} s"
 
 

@@ -93,7 +93,8 @@ Chooser = Callable[[Frame], int | None]
 
 def best(frame: Frame) -> int | None:
     """The candidate of the greatest true mIoU."""
-    return max(frame.of_stages((*FITTED, "rest", "draws")), key=lambda number: frame.miou[number], default=None)
+    stages = (*FITTED, "settled", "rest", "draws", "draws settled")
+    return max(frame.of_stages(stages), key=lambda number: frame.miou[number], default=None)
 
 
 def from_truth(frame: Frame) -> int | None:
@@ -136,13 +137,16 @@ def today(frame: Frame) -> int | None:
             chosen = least(frame, heavier)
         elif leaving and rows[chosen]["cloud"] >= 0.3:
             chosen = least(frame, leaving, handicap)
-    rest = frame.of_stages(["rest"])
-    if rest and rows[rest[-1]]["total"] - rows[chosen]["total"] < rows[chosen]["narrowing"]:
+    settled, rest = frame.of_stages(["settled"]), frame.of_stages(["rest"])
+    chosen = settled[-1] if settled else chosen
+    is_rigid = problems[0]["modes"] == 0
+    if rest and (is_rigid or rows[rest[-1]]["total"] - rows[chosen]["total"] < rows[chosen]["narrowing"]):
         chosen = rest[-1]
     drawn, draws = frame.facts["drawn"], frame.of_stages(["draws"])
     if drawn is not None and draws:
         number = min(draws, key=lambda n: abs(rows[n]["total"] - drawn["misfit"]))
-        chosen = number if drawn["taken"] else chosen
+        ends = frame.of_stages(["draws settled"])
+        chosen = [number, *ends][-1] if drawn["taken"] else chosen
     return chosen
 
 
@@ -174,11 +178,11 @@ class Score:
 
 def score(frame: Frame, chooser: Chooser) -> Score | None:
     """Score of a chooser in a frame; None where it names nothing."""
-    number, limit, given = chooser(frame), best(frame), answered(frame)
+    number, limit = chooser(frame), best(frame)
     if number is None or limit is None:
         return None
     lost = float(frame.miou[limit] - frame.miou[number])
-    return Score(frame.rows[number]["iou"], frame.rows[number]["miou"], lost, number == given)
+    return Score(frame.rows[number]["iou"], frame.rows[number]["miou"], lost, frame.rows[number]["chosen"])
 
 
 def table(frames: Sequence[Frame], choosers: Mapping[str, Chooser], by: str) -> Iterator[str]:

@@ -14,9 +14,11 @@ import numpy as np
 import trimesh
 from bank_objects import OWN, own_scene, things
 from jaxtyping import Bool, Float, Int
-from occluded_views import Cut, occlude
+from occluded_views import occlude
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
+from search import CUTS as EVERY_CUT
+from search import OBJECTS as SHIPPED
 
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import MIN_POINTS
@@ -33,15 +35,9 @@ from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
 from mereo.synthesis.depth_sensor import observe
 from mereo.synthesis.examples import View, sample_view
 
-SHIPPED = ("bunny", "engine", "human", "liver", "lizard", "robot", "rope", "shapes", "sheet", "skull", "tumor")
-
 OBJECTS = (*SHIPPED, *OWN)
 
-CUTS: dict[str, tuple[Cut, float]] = {
-    "tool30": ("tool", 0.3),
-    "screen50": ("screen", 0.5),
-    "picture50": ("picture", 0.5),
-}
+CUTS = {name: EVERY_CUT[name] for name in ("tool30", "screen50", "picture50")}
 
 CAMERAS = ("structured-light", "time-of-flight", "stereo")
 

@@ -331,9 +331,9 @@ def refit_noisy(
     return best if best[0].leaves_noise(best[2].surface) else start
 
 
-def settled(problem: Problem, best: ScoredFit) -> tuple[Problem, ScoredFit]:
-    """Fit a noisy frame anew, twice, with as many independent points as the fit shows that its cloud is worth."""
+def settled(problem: Problem, posed: Posed) -> tuple[Problem, ScoredFit]:
+    """Fit a noisy frame again, twice, with as many independent points as the fit shows that its cloud is worth."""
     for _ in range(2):
-        problem = problem.worth(best.surface)
-        best = ScoredFit.of(problem, fit_cloud(problem, best.posed, Prior.whole(problem.model), REFINE_SIGMA, 10, 0.0))
-    return problem, best
+        problem = problem.worth(problem.surface(posed))
+        posed = fit_cloud(problem, posed, Prior.whole(problem.model), REFINE_SIGMA, 10, 0.0)
+    return problem, ScoredFit.of(problem, posed)

@@ -408,7 +408,7 @@ def refine_by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
 
 
 def settled(problem: DrawsProblem, fit: DrawsFit) -> tuple[DrawsProblem, DrawsFit]:
-    """Fit a noisy frame anew with as many independent points as its cloud is worth, where the fit explains it."""
+    """Fit a noisy frame again with as many independent points as its cloud is worth, where the fit explains it."""
     if not problem.base.explains_noise(fit.surface):
         return problem, fit
     worth = replace(problem, base=problem.base.worth(fit.surface))

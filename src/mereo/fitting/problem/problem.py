@@ -148,7 +148,7 @@ class Problem:
         return replace(self, config=config, evidence=self.evidence.with_more_samples, noisy=True)
 
     def explains_noise(self, surface: Surface) -> bool:
-        """Whether the frame is noisy, and as many of its points on a surface as are asked for to believe it."""
+        """Whether the frame is noisy, and enough of its points lie on a surface for a fit to be believed."""
         off = self.nearest(surface)[0]
         return self.noisy and float((off <= self.config.tolerance).mean()) >= self.config.accepted
 
@@ -353,7 +353,6 @@ SIGMAS = 1.5
 
 NOISES = 3.0
 """Distance, in noises, that counts as a standard deviation of a clean frame does where a fit is to be believed."""
-
 
 SHARED = 1.05
 """Misfit of a noisy cloud, in misfits of what neighbours do not share, up to which nothing more is to be explained."""

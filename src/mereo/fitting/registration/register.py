@@ -183,7 +183,7 @@ class ModesFit:
         if not self.problem.explains_noise(self.surface):
             return self
         with limit_blas_threads():
-            problem, modes = settled(self.problem, ScoredFit.of(self.problem, self.posed))
+            problem, modes = settled(self.problem, self.posed)
             rest = resting(problem, self.correspondences, modes)
         return replace(self, problem=problem, posed=modes.posed, rest=rest)
 
