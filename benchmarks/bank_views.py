@@ -140,9 +140,7 @@ def own_view(scene: Scene, view: View, condition: str, rng: np.random.Generator)
 def masked(whole: DepthImage, mask: Bool[np.ndarray, "h w"] | None) -> Observation:
     """A depth image, and what a mask leaves of it."""
     depth = whole if mask is None else DepthImage(np.where(mask, whole.depth, 0.0), whole.camera)
-    frame = SensorFrame(
-        Path("simulated"), depth.to_points(), None, "camera", depth, whole=None if mask is None else whole
-    )
+    frame = SensorFrame(Path("simulated"), depth.to_points(), None, "camera", depth, whole=whole)
     return find_object(frame, IsolationConfig())
 
 

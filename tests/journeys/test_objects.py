@@ -300,7 +300,7 @@ def test_a_mesh_without_volume_is_a_sentence(tmp_path: Path) -> None:
 def test_two_objects_in_a_cloud_are_warned_of(
     angle: mereo.Object, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mereo.api.reconstruct.answer_frame", None)  # which would search long
+    monkeypatch.setattr("mereo.api.reconstruct.answer_observation", None)  # which would search long
     both, sentence = np.concatenate([points, points + np.array([0.5, 0.0, 0.0])]), "two separate clusters of like size"
     with pytest.raises(TypeError), pytest.warns(ClustersWarning, match=f"{sentence} .* if they are two, crop to one"):
         mereo.reconstruct(both, angle)

@@ -96,6 +96,7 @@ ROOMS = (
     "models",
     "reconstruction",
     "fitting",
+    "locating",
     "visualization",
     "api",
     "cli",
@@ -124,7 +125,7 @@ MAY_IMPORT = {"torch": ("models/", "cli/tools.py"), "matplotlib": ("io/extras.py
 """The same of libraries that most installations lack: asked for where they are used, with the extra's name."""
 
 BUDGET = {
-    "src/mereo": (290_900, 152),
+    "src/mereo": (295_500, 156),
     "src/mereo_learning": (47_900, 22),
     "src/mereo_objects": (40_000, 28),
     "src/mereo_serving": (10_700, 13),
@@ -134,7 +135,7 @@ BUDGET = {
 }
 """Syntax nodes and files that a folder may have at most. Lines are free: fewer of them are not less to know."""
 
-CHOICES = {"src/mereo/fitting": (375, 213)}
+CHOICES = {"src/mereo/fitting": (375, 213), "src/mereo/locating": (20, 28)}
 """Decisions (``if`` statements and expressions) and numbers in module constants that a folder may have at most.
 
 They choose among fits, and they only fall."""

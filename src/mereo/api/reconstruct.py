@@ -1,6 +1,6 @@
 """Find an object in frames, each by itself or one after the other: ``mereo reconstruct`` and ``mereo stream``.
 
-    source -load_frame-> SensorFrame -find_object-> Observation -answer_frame-> Result
+    source -load_frame-> SensorFrame -find_object-> Observation -answer_observation-> Result
     frame, time -Tracker.follow-> Result (found, followed or lost)
 
 A source is whatever holds a frame: a file, a shipped name, arrays, the clouds and messages of other libraries.
@@ -21,7 +21,6 @@ from mereo.api.result import Result
 from mereo.api.words import in_callers_words, python_words
 from mereo.fitting import tracking
 from mereo.fitting.config import AnswerMethod
-from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import CloudAxes, check_real
 from mereo.geometry.transforms import checked_pose
@@ -31,6 +30,7 @@ from mereo.io.point_arrays import is_frame_list, points_of
 from mereo.io.readers import depth_of, read_pose, usable_depth
 from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame, along_z, in_camera, read_frame
+from mereo.locating.whole_frame import answer_observation, is_whole
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import (
     CLOUD,
@@ -241,12 +241,14 @@ def reconstruct_observation(
 
     Takes its arguments, raises and warns as it does. Of ``isolation`` it matters whether every point is kept.
     """
-    if object.network is None and (warning := clusters_warning(seen)) is not None:
+    registrar = object.registrar(method)
+    is_alone = registrar is None or not is_whole(seen, registrar)
+    if object.network is None and is_alone and (warning := clusters_warning(seen)) is not None:
         warnings.warn(in_callers_words(warning), ClustersWarning, stacklevel=3)
-    answer = answer_frame(
+    answer = answer_observation(
         seen,
         object.network,
-        object.registrar(method),
+        registrar,
         keep_all=isolation.keep_all,
         resolution=resolution,
         label_points=label_points,

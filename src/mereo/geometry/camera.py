@@ -217,7 +217,7 @@ class SightLines:
     """Lines of sight around the object, in the frame, axes and unit of its points.
 
     Attributes:
-        past: points that were measured behind the object; the space between the camera and each is empty.
+        past: points beside the object, in front of it or behind; the space between the camera and each is empty.
         unknown: points anywhere on lines of sight along which nothing is known.
         other_lines: kind of all lines of sight that none of these points, and none of the object's, is near; None where
             the frame does not say, as a bare cloud does not, and then a fit has to decide.

@@ -12,8 +12,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mereo.geometry.brief import counted
@@ -337,9 +335,9 @@ def is_surface(frame: SensorFrame, cloud: PointCloud) -> bool:
 
 # --- lines of sight ---------------------------------------------------------------------------------------------------
 
-# Which of them went past the object, and along which nothing is known: depths around it are compared with those of its
-# pixels nearest in the picture (docs/registration.md). A depth image states a line of sight for each pixel, a point
-# cloud for each point that isolation left out.
+# Each that met something beside the object is free up to there, whatever that is; along the others nothing is known
+# (docs/registration.md). A depth image states a line of sight for each pixel, a point cloud for each point that
+# isolation left out.
 
 MOST_LINES = 10_000
 """Number of lines of sight that are kept, at most, unless the outline alone has more."""
@@ -348,17 +346,9 @@ RIM = 1.5
 """Pixels from the object within which a line of sight is unknown: masks are wrong by one, and cameras mix both sides of
 an edge."""
 
-AROUND = 49
-"""Object points nearest to a line of sight, with whose median depth its own is compared; a mask that is too wide leaves
-a rim of background among them, which are the fewer."""
-
-ALIKE, AGREEING = 0.25, 3
-"""Pixels that went past are a surface's: of the 8 around each, so many agree in how far behind the object they are, to
-this share. A pixel at an edge that mixes two depths has neighbours at either."""
-
 SILENT = 0.02
-"""Share of the pixels around the object below which those that went past are too few: then a depth of zero may as well
-mean that the image was cut out or rendered."""
+"""Share of the pixels around the object below which those that met something are too few: then a depth of zero may as
+well mean that the image was cut out or rendered."""
 
 DENSE = 3.0
 """Pixels from the object within which no line of sight is left out."""
@@ -397,8 +387,8 @@ def lines_of_frame(frame: SensorFrame, selection: Selection | None, extent: Exte
 def lines_of_image(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SightLines:
     """Lines of sight around the object in a depth image, in the camera frame and the image's unit.
 
-    They are those of pixels within one size of the object around its box. Where hardly any of them went past, zeros do
-    not say that nothing was measured, and the rest is left open.
+    They are those of pixels within one size of the object around its box. Where hardly any of them met something, zeros
+    do not say that nothing was measured, and the rest is left open.
 
     Args:
         whole: the depth image with all that was measured.
@@ -413,67 +403,16 @@ def lines_of_image(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SightLi
     depth, is_object, inside = (np.pad(image, reach)[part] for image in (whole.depth, shown, np.ones_like(shown)))
     # nothing of the object lies outside the picture unless it reaches the edge
     cut = min(rows[0], columns[0], shown.shape[0] - 1 - rows[-1], shown.shape[1] - 1 - columns[-1]) < RIM
-    distance, nearest = ndimage.distance_transform_edt(~is_object, return_indices=True)
-    near = _outline_depth(depth, is_object)[nearest[0], nearest[1]]
-    step = STEEPEST / min(whole.camera.focal_x_px, whole.camera.focal_y_px)
-    past = (depth - near > step * near) & (distance > RIM)
-    past &= _agrees(np.where(past, depth - near, 0.0))
-    hides = (depth > 0) & ~is_object & (distance <= RIM) & (near - depth > step * near)
-    past &= (depth > (1 + step) * near.max()) | ~_surfaces_with(hides, np.where(is_object, 0.0, depth), step)
+    distance = ndimage.distance_transform_edt(~is_object)
+    past = (depth > 0) & (distance > RIM)
     silent = past.sum() < max(SILENT * (inside & (distance > RIM)).sum(), 1)
     unknown = ~is_object & ~past & ((inside & ((depth > 0) | (not silent))) | (~inside & cut))
     v, u = np.nonzero(past | unknown)
     kept = _evenly(u, v, distance[v, u], MOST_LINES)
     u, v = u[kept], v[kept]
-    went = past[v, u]
-    places = whole.camera.unproject(
-        np.stack([u + left + 0.5, v + top + 0.5], axis=1), np.where(went, depth[v, u], near[v, u])
-    )
-    return SightLines(places[went], places[~went], None if silent else "unknown")
-
-
-def _outline_depth(depth: Float[np.ndarray, "h w"], is_object: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Median depth of the object around each pixel of its outline, 0 elsewhere."""
-    pixels = np.argwhere(is_object)
-    outline = np.argwhere(is_object & ~ndimage.binary_erosion(is_object))
-    nearest = cKDTree(pixels).query(outline, k=range(1, min(AROUND, len(pixels)) + 1))[1]
-    around = np.zeros(depth.shape)
-    around[tuple(outline.T)] = np.median(depth[tuple(pixels.T)][nearest], axis=1)
-    return around
-
-
-def _surfaces_with(
-    marked: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"], step: float
-) -> Bool[np.ndarray, "h w"]:
-    """Pixels of all surfaces that have ``AGREEING`` marked pixels or more; a depth of 0 is no surface.
-
-    A surface goes on from pixel to pixel as long as depth changes by less than ``step`` times itself.
-    """
-    if marked.sum() < AGREEING:
-        return np.zeros(depth.shape, dtype=bool)
-    number = np.arange(depth.size).reshape(depth.shape)
-    pairs = []
-    for first, second in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        near, far = depth[first], depth[second]
-        joined = (near > 0) & (far > 0) & (np.abs(near - far) < step * np.minimum(near, far))
-        pairs.append(np.stack([number[first][joined], number[second][joined]]))
-    row, column = np.concatenate(pairs, axis=1)
-    edges = coo_matrix((np.ones(len(row), dtype=np.int8), (row, column)), shape=(depth.size, depth.size))
-    label = connected_components(edges, directed=False)[1].reshape(depth.shape)
-    return np.asarray(np.bincount(label[marked], minlength=label.max() + 1)[label] >= AGREEING)
-
-
-def _agrees(behind: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels with enough neighbours that are as far behind the object, see ``ALIKE``; 0 is not behind."""
-    padded = np.pad(behind, 1)
-    height, width = behind.shape
-    count = np.zeros(behind.shape, dtype=np.int8)
-    for row in range(3):
-        for column in range(3):
-            if (row, column) != (1, 1):
-                around = padded[row : row + height, column : column + width]
-                count += np.abs(around - behind) <= ALIKE * behind
-    return (count >= AGREEING) & (behind > 0)
+    met = past[v, u]
+    places = whole.camera.unproject(np.stack([u + left + 0.5, v + top + 0.5], axis=1), np.where(met, depth[v, u], 1.0))
+    return SightLines(places[met], places[~met], None if silent else "unknown")
 
 
 def _evenly(
@@ -522,17 +461,15 @@ def lines_of_points(points: Float[np.ndarray, "n 3"], is_object: Bool[np.ndarray
     others = np.flatnonzero(~is_object & (points[:, 2] > 0))
     if len(others) == 0 or not is_object.any():
         return SightLines.of_cloud()
-    tree, depth = cKDTree(sight[is_object]), points[is_object, 2]
+    tree = cKDTree(sight[is_object])
     # the fourth neighbour of a pixel is one pitch away, as the first is
-    pitch = float(np.median(tree.query(tree.data, k=[min(len(depth), 5)])[0]))
+    pitch = float(np.median(tree.query(tree.data, k=[min(len(tree.data), 5)])[0]))
     size = float(np.ptp(tree.data, axis=0).max())
     angle = tree.query(sight[others], distance_upper_bound=max(size, pitch))[0]
     # along a line that met the object, nothing else is said
     is_free = (angle > 0.5 * pitch) & np.isfinite(angle)
     others, angle = others[is_free], angle[is_free]
-    nearest = tree.query(sight[others], k=range(1, min(len(depth), AROUND) + 1))[1]
-    near = np.median(depth[nearest], axis=1)
-    past = (points[others, 2] - near > STEEPEST * pitch * near) & (angle > RIM * pitch)
+    past = angle > RIM * pitch
     ahead = tree.data.mean(axis=0)
     across = np.linalg.svd(ahead[None])[2][1:]
     u, v = np.floor((sight[others] - ahead) @ across.T / max(pitch, 1e-12)).astype(np.int64).T

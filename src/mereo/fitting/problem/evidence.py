@@ -307,9 +307,10 @@ class Evidence(ObservedPoints):
         steps = EDGE_PITCHES * self.pitch * np.stack([np.cos(turns), np.sin(turns)], axis=1) @ across
         around = (toward[:, None] + steps).reshape(-1, 3)
         around = around / np.linalg.norm(around, axis=1, keepdims=True)
-        around = around[cKDTree(toward).query(around)[0] > RIM_PITCHES * self.pitch]
-        _, front, free = self.along(around)
-        is_hidden = np.where(free < 0, front == 0, free == 0)
+        is_around = cKDTree(toward).query(around)[0] > RIM_PITCHES * self.pitch
+        _, front, free = self.along(around[is_around])
+        nearest = (1 - self.pitch) * np.repeat(self.ranges, EDGE_DIRECTIONS)[is_around]
+        is_hidden = np.where(free < 0, front == 0, free < nearest)
         return float(is_hidden.mean()) if len(is_hidden) else 0.0
 
     def unseen(self, triangles: Float[np.ndarray, "f 3 3"]) -> float:

@@ -1,0 +1,119 @@
+"""Regions of a depth image that may be an object: connected surfaces off all planes that are larger than it.
+
+DepthImage, length of the object -thinned-> DepthImage -regions-> masks, the likeliest first
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.conventions import MIN_POINTS
+from mereo.geometry.downsampling import STEEPEST
+from mereo.reconstruction.isolation import largest_plane
+
+ACROSS = 60
+"""Pixels along an object at the middle distance in a thinned image, in which blurred edges are a pixel wide."""
+
+PLANES, PLANE_SHARE = 6, 0.03
+"""Planes at most, and the share of the points that each must hold: a table, walls, a floor."""
+
+PLANE_STD = 6.0
+"""Deviations from a plane, in the median one, up to which a point is on it."""
+
+SIZES = 0.1, 1.3
+"""Length of a region, in those of the object: a part of the object, or the object and a rim."""
+
+GAPS = 4.0, 1.0, 0.5, 0.25
+"""Gaps at which surfaces are parted, in that of ``steepest``: the first leaves together what folds over itself; the
+last two are for what is too large."""
+
+SAME = 0.9
+"""Share of a region that a part of it is the same from."""
+
+
+def thinned(image: DepthImage, length: float) -> tuple[DepthImage, int]:
+    """Every so many pixels of an image, where an object of this ``length`` has more than ``ACROSS``; and how many."""
+    camera = image.camera
+    focal = min(camera.focal_x_px, camera.focal_y_px)
+    every = max(1, round(length * focal / float(np.median(image.depth[image.valid])) / ACROSS))
+    if every == 1:
+        return image, 1
+    first = every // 2
+    depth = image.depth[first::every, first::every]
+    center = ((each - first - 0.5) / every + 0.5 for each in (camera.center_x_px, camera.center_y_px))
+    height, width = depth.shape
+    thin = Camera(width, height, camera.focal_x_px / every, camera.focal_y_px / every, *center)
+    return DepthImage(depth, thin), every
+
+
+def steepest(image: DepthImage) -> float:
+    """Gap in depth between neighbouring pixels, as a share of it, from which on there are two surfaces."""
+    return STEEPEST / min(image.camera.focal_x_px, image.camera.focal_y_px)
+
+
+def extent(points: Float[np.ndarray, "n 3"]) -> float:
+    """Length of the box of some points, without the outermost hundredths."""
+    return float(np.ptp(np.quantile(points, (0.01, 0.99), axis=0), axis=0).max())
+
+
+def off_planes(image: DepthImage, length: float) -> Bool[np.ndarray, "h w"]:
+    """Pixels that are measured, and on no plane that reaches farther than an object of this ``length``."""
+    off, camera = image.valid.copy(), image.camera
+    points = camera.directions()[off] * image.depth[off][:, None]
+    left, rng = np.ones(len(points), dtype=bool), np.random.default_rng(0)
+    pixel = points[:, 2] / min(camera.focal_x_px, camera.focal_y_px)
+    for _ in range(PLANES):
+        plane = largest_plane(points[left], pixel[left], rng)
+        if plane is None:
+            break
+        distance = plane.distance(points)
+        near = left & (distance <= pixel)
+        if near.sum() < PLANE_SHARE * len(points) or extent(points[near]) < SIZES[1] * length:
+            break
+        away = distance / points[:, 2] ** 2  # as the noise of depth cameras grows
+        left &= away > PLANE_STD * np.median(away[near])
+    off[off] = left
+    return off
+
+
+def connected_pixels(depth: Float[np.ndarray, "h w"], step: float) -> Int[np.ndarray, "h w"]:
+    """Number of the surface of each pixel, which goes on where depth changes by less than ``step`` times itself.
+
+    A depth of 0 is no surface: such pixels have numbers of their own.
+    """
+    number = np.arange(depth.size).reshape(depth.shape)
+    pairs = []
+    for first, second in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        near, far = depth[first], depth[second]
+        joined = (near > 0) & (far > 0) & (np.abs(near - far) < step * np.minimum(near, far))
+        pairs.append(np.stack([number[first][joined], number[second][joined]]))
+    row, column = np.concatenate(pairs, axis=1)
+    edges = coo_matrix((np.ones(len(row), dtype=np.int8), (row, column)), shape=(depth.size, depth.size))
+    return np.asarray(connected_components(edges, directed=False)[1].reshape(depth.shape))
+
+
+def regions(image: DepthImage, length: float, area: float) -> list[Bool[np.ndarray, "h w"]]:
+    """Connected surfaces of an image that may be an object of this ``length``, the nearest in ``area`` first.
+
+    ``length`` is in the image's unit, and ``area``, which a whole object covers, in its square.
+    """
+    points = image.camera.directions() * image.depth[..., None]
+    pixel = image.depth**2 / (image.camera.focal_x_px * image.camera.focal_y_px)
+    parts = list[tuple[float, Bool[np.ndarray, "h w"]]]()
+
+    def part(whole: Bool[np.ndarray, "h w"], gaps: tuple[float, ...], size: float) -> None:
+        label = connected_pixels(np.where(whole, image.depth, 0.0), gaps[0] * steepest(image))
+        sizes = np.bincount(label[whole])
+        for number in np.flatnonzero(sizes >= MIN_POINTS):
+            mask, longest = whole & (label == number), 0.0
+            if sizes[number] < SAME * size:
+                longest = extent(points[mask])
+                if SIZES[0] * length <= longest <= SIZES[1] * length:
+                    parts.append((abs(float(np.log(pixel[mask].sum() / area))), mask))
+            if len(gaps) > 1 and (gaps[0] > 1 or longest > SIZES[1] * length):
+                part(mask, gaps[1:], float(sizes[number]))
+
+    part(off_planes(image, length), GAPS, np.inf)
+    return [mask for _, mask in sorted(parts, key=lambda each: each[0])]
