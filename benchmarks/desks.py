@@ -20,9 +20,9 @@ from bank import CELLS, registrar_of, scored
 from bank_views import OBJECTS, desk_view, scene_of
 
 from mereo.geometry.metrics import truth_grid
-from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.cores import use_threads
-from mereo.locating.whole_frame import PlacedAnswer, WholeFrame, answers_in
+from mereo.locating.outline import Outline
+from mereo.locating.whole_frame import PlacedAnswer, WholeFrame, answers_in, chance
 from mereo.synthesis.examples import View
 
 FOUND = 0.75
@@ -35,10 +35,9 @@ def answer_desk(name: str, kind: str, number: int, seed: int, all_places: bool) 
     seen, view = desk_view(scene_of(name), kind, number, rng)
     registrar, started = registrar_of(name), time.perf_counter()
     places = list[dict[str, Any]]()
-    for placed in answers_in(WholeFrame.of(seen, registrar, 1.0), None, scene_unit=1.0):
+    frame = WholeFrame.of(seen, registrar, 1.0)
+    for placed in answers_in(frame, None, scene_unit=1.0, all_places=all_places):
         places.append({**facts_of(placed, view), "seconds": time.perf_counter() - started})
-        if placed.nats > 0 and not all_places:
-            break
     seconds = time.perf_counter() - started
     return {"object": name, "kind": kind, "number": number, "seed": seed, "seconds": seconds, "places": places}
 
@@ -50,6 +49,8 @@ def facts_of(placed: PlacedAnswer, view: View | None) -> dict[str, Any]:
     facts = {
         "nats": placed.nats,
         "outline": placed.outline._asdict(),
+        "chance": chance(registration.model),
+        "quick": placed.place.outline.nats,
         "known": said.known,
         "strangeness": said.strangeness,
         "signs": said.facts()["signs"],
@@ -59,8 +60,7 @@ def facts_of(placed: PlacedAnswer, view: View | None) -> dict[str, Any]:
         "modes": registration.model.count,
     }
     if view is not None:
-        material = transform_points(inverse_rigid(placed.answer.T_camera_input), registration.material)
-        facts["iou"], facts["miou"] = scored(truth_grid(view.mesh, CELLS), registration.model, material)
+        facts["iou"], facts["miou"] = scored(truth_grid(view.mesh, CELLS), registration.model, registration.material)
     return facts
 
 
@@ -89,7 +89,7 @@ def show(frames: list[dict[str, Any]]) -> None:
 
 def is_known(place: dict[str, Any]) -> bool:
     """Whether a place is believed to show the object."""
-    return place.get("known") is True and place["nats"] > 0
+    return place.get("known") is True and place["chance"] + Outline(**place["outline"]).nats > 0
 
 
 def main() -> None:
@@ -98,6 +98,7 @@ def main() -> None:
     parser.add_argument("file", type=Path)
     parser.add_argument("--objects", nargs="+", default=list(OBJECTS), choices=OBJECTS)
     parser.add_argument("--frames", type=int, default=4)
+    parser.add_argument("--first", type=int, default=0, help="number of the first frame")
     parser.add_argument("--seed", type=int, default=2000)
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--all-places", action="store_true", help="answer at each place, also where one is evident")
@@ -106,7 +107,7 @@ def main() -> None:
     made = {(frame["object"], frame["kind"], frame["number"], frame["seed"]) for frame in frames}
     wanted = [
         (name, kind, number, given.seed)
-        for number in range(given.frames)
+        for number in range(given.first, given.first + given.frames)
         for name in given.objects
         for kind in ("desk-whole", "desk-empty")
     ]

@@ -18,13 +18,13 @@ from mereo.cli.training import Generate, Train
 EXAMPLES = Path(__file__).parents[2] / "examples"
 EXPECTED = {
     "desk_lamp.py": "mereo learn lamp/lamp.yaml --output learned",
-    "isolate_object.py": "isolated",
     "loop.py": "wrote loop.webp: 9 frames",
     "query_points.py": "to the nearest surface",
     "reconstruct_cloud.py": "report.html",
     "sensors.py": "wrote",
     "shipped_weights.py": "wrote objects.png",
     "simulate_liver.py": "3 states of 98 nodes",
+    "whole_frame.py": "wrote whole_frame.png",
     "wrong_answers.py": "wrote wrong_answers.png",
 }
 OPTIONS = {"loop.py": ("--fps", "1"), "shipped_weights.py": ("--weights", "rope", "--cells", "24")}

@@ -43,6 +43,7 @@ from mereo.io.readers import read_pose
 from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.io.writers.formats import chosen_formats
+from mereo.locating.whole_frame import is_whole
 from mereo.models.config import InferenceConfig
 from mereo.models.trained import Trained
 from mereo.reconstruction.observation import FrameWarning, find_object
@@ -154,7 +155,8 @@ def reconstruct_frame(frame: SensorFrame, directory: Path, job: FrameJob, path: 
     """
     command = job.command
     seen = replace(find_object(frame, command.isolation), initial_pose=job.initial_pose)
-    print(seen)
+    is_looked_through = job.registrar is not None and is_whole(seen, job.registrar)
+    print(f"the object is looked for in all {len(seen.cloud)} points of the frame" if is_looked_through else seen)
     placed = job.placed  # what is carried is refused before the work
     result = reconstruct_observation(
         seen,
@@ -164,6 +166,8 @@ def reconstruct_frame(frame: SensorFrame, directory: Path, job: FrameJob, path: 
         isolation=command.isolation,
         label_points="points" in chosen_formats(command.files.formats),
     )
+    if is_looked_through:
+        print(result.seen)
     if result.hypothesis.dropped:
         print(result.hypothesis)
     unit = Unit(result.unit_m)

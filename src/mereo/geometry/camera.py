@@ -4,7 +4,7 @@ Notation: the camera frame is OpenCV/ROS optical, x right, y down, z forward. De
 pixel (column u, row v) is at (u + 0.5, v + 0.5). ``unproject`` and ``project`` are each other's inverse.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -221,11 +221,14 @@ class SightLines:
         unknown: points anywhere on lines of sight along which nothing is known.
         other_lines: kind of all lines of sight that none of these points, and none of the object's, is near; None where
             the frame does not say, as a bare cloud does not, and then a fit has to decide.
+        noise: standard deviation of the camera's noise at the object's distance, by what was measured around it, what
+            neighbours share included; None where the frame does not say.
     """
 
     past: Float[np.ndarray, "p 3"]
     unknown: Float[np.ndarray, "u 3"]
     other_lines: SightKind | None = None
+    noise: float | None = None
 
     @classmethod
     def of_cloud(cls, other_lines: SightKind | None = None) -> "SightLines":
@@ -235,11 +238,12 @@ class SightLines:
     def transformed(self, T_new_old: Float[np.ndarray, "4 4"]) -> "SightLines":
         """Lines of sight in another frame, whose origin is the camera as well."""
         past, unknown = (transform_points(T_new_old, points) for points in (self.past, self.unknown))
-        return SightLines(past, unknown, self.other_lines)
+        return replace(self, past=past, unknown=unknown)
 
     def scaled(self, factor: float) -> "SightLines":
         """Lines of sight in another unit."""
-        return SightLines(self.past * factor, self.unknown * factor, self.other_lines)
+        noise = None if self.noise is None else self.noise * factor
+        return replace(self, past=self.past * factor, unknown=self.unknown * factor, noise=noise)
 
 
 # --- scanners' axes ---------------------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@
 
 A smooth thing explains the points of a smooth surface as well as the object does, so agreement inside says little. What
 the object alone predicts is where the surface ends: along its outline, and where it folds over itself, the image has a
-jump in depth, and inside it has none; and no pixel has seen past it.
+jump in depth; and no pixel has seen past it.
 """
 
 from typing import NamedTuple
@@ -12,10 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
+from scipy.stats import median_abs_deviation
 
-from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.camera import DepthImage
 from mereo.geometry.downsampling import STEEPEST
-from mereo.geometry.solids import first_faces, ray_scene, toward
+from mereo.locating.regions import off_planes
 
 EDGE_OFF = 3
 """Pixels by which a camera's edges may be off; what so many pixels say is not independent."""
@@ -26,34 +27,29 @@ GAP = 30
 NOISE_STD = 5.0
 """Standard deviations of a camera's noise from which on a gap between neighbours is a jump."""
 
-HIT, MISS, EXTRA, PAST, HIDDEN = 0.39, -2.17, -0.5, -1.0, -0.2
-"""Nats of independent pixels: of the outline with a jump, and without; inside with one; seen past, and covered."""
+HIT, CREASE, MISS, PAST, SEEN = 0.29, -0.7, -1.5, -3.2, 2.0
+"""Nats of independent pixels: of the outline with a jump, with a crease alone, and without either. Of the root of the
+number of those inside that have seen past the object, which lie together; and of the logarithm of the share that
+nothing hides. By a logistic regression of training desks, but for the last (docs/experiments/082.md)."""
+
+CREASE_STD = 6.0
+"""Standard deviations of a camera's noise from which on a second difference is a crease, as where a thing stands."""
 
 
-def rendered_depth(camera: Camera, triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "h w"]:
-    """Depth of the nearest of some triangles along the ray of each pixel, 0 where there is none; any unit."""
-    rays, vertices = camera.directions().reshape(-1, 3), triangles.reshape(-1, 3)
-    depth, center = np.zeros(len(rays)), vertices.mean(axis=0)
-    near = toward(rays, vertices.min(axis=0), vertices.max(axis=0))
-    if len(near):
-        scene = ray_scene(vertices - center, np.arange(len(vertices)).reshape(-1, 3))
-        rows, face = first_faces(scene, center, rays[near])
-        corner, ray = triangles[face], rays[near[rows]]
-        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        along, ahead = (np.einsum("ni,ni->n", normal, each) for each in (ray, corner[:, 0]))
-        depth[near[rows]] = np.divide(ahead, along, out=np.zeros_like(ahead), where=along * ahead > 0)
-    return depth.reshape(camera.height, camera.width)
+def second_differences(inverse: Float[np.ndarray, "h w"], lag: int) -> list[Float[np.ndarray, "h w"]]:
+    """Second differences of inverse depth over so many pixels of rows and columns, 0 on planes; NaN where unknown."""
+    results = list[np.ndarray]()
+    for each in (inverse, inverse.T):
+        second = np.full(each.shape, np.nan)
+        second[:, lag:-lag] = each[:, : -2 * lag] - 2 * each[:, lag:-lag] + each[:, 2 * lag :]
+        results.append(second)
+    return [results[0], results[1].T]
 
 
-def noise_share(image: DepthImage) -> float:
-    """Standard deviation of a depth image's noise over the square of the depth, as it grows: by second differences."""
-    parts = list[np.ndarray]()
-    for depth in (image.depth, image.depth.T):
-        first, middle, last = depth[:, :-2], depth[:, 1:-1], depth[:, 2:]
-        known = (first > 0) & (middle > 0) & (last > 0)
-        parts.append((first - 2 * middle + last)[known] / middle[known] ** 2)
-    every = np.concatenate(parts)
-    return 1.4826 * float(np.median(np.abs(every))) / np.sqrt(6) if len(every) else 0.0
+def typical(second: list[Float[np.ndarray, "h w"]]) -> float:
+    """Standard deviation of second differences, of which most are noise."""
+    every = np.concatenate([part[np.isfinite(part)] for part in second])
+    return float(median_abs_deviation(every, scale="normal")) if len(every) else 0.0
 
 
 class Jumps(NamedTuple):
@@ -64,22 +60,37 @@ class Jumps(NamedTuple):
         step: gap from which on there is a jump, in the image's unit, at each pixel.
         nearer: pixels on the nearer side of a jump.
         known: pixels where a jump would have been seen.
+        creased: pixels beside a large plane where there is a crease, or where none could be told from noise.
     """
 
     image: DepthImage
     step: Float[np.ndarray, "h w"]
     nearer: Bool[np.ndarray, "h w"]
     known: Bool[np.ndarray, "h w"]
+    creased: Bool[np.ndarray, "h w"]
 
     @classmethod
-    def of(cls, image: DepthImage) -> "Jumps":
-        """Jumps of an image, by more than a slope or noise explains."""
-        depth = image.depth
-        slope = STEEPEST / min(image.camera.focal_x_px, image.camera.focal_y_px)
-        step = np.maximum(slope * depth, NOISE_STD * noise_share(image) * depth**2)
+    def of(cls, image: DepthImage, length: float) -> "Jumps":
+        """Jumps of an image, by more than a slope or noise explains; an object of this ``length`` stands on planes."""
+        depth, focal = image.depth, min(image.camera.focal_x_px, image.camera.focal_y_px)
+        inverse = np.full(depth.shape, np.nan)
+        np.divide(1.0, depth, out=inverse, where=image.valid)
+        noise = typical(second_differences(inverse, 1)) / np.sqrt(6.0)
+        step = np.maximum(STEEPEST / focal * depth, NOISE_STD * noise * depth**2)
         rows = _along_rows(depth, step)
         columns = _along_rows(np.ascontiguousarray(depth.T), np.ascontiguousarray(step.T))
-        return cls(image, step, *(first | second.T for first, second in zip(rows, columns, strict=True)))
+        nearer, known = (first | second.T for first, second in zip(rows, columns, strict=True))
+        lag = EDGE_OFF + 1
+        second = second_differences(inverse, lag)
+        least = CREASE_STD * typical(second)
+        sharpest = np.fmax(*(np.abs(part) for part in second))
+        # a crease of a right angle changes inverse depth by so much
+        creased = (np.nan_to_num(sharpest) > least) | (lag / focal * inverse < least)
+        planes = image.valid & ~off_planes(image, length)
+        creased, planes = (
+            ndimage.maximum_filter(each, 2 * reach + 1) for each, reach in ((creased, EDGE_OFF), (planes, lag))
+        )
+        return cls(image, step, nearer, known, creased & planes)
 
 
 def _along_rows(
@@ -104,16 +115,16 @@ class Outline(NamedTuple):
     """What a depth image says of a posed object's outline, in pixels.
 
     Attributes:
-        hits, misses: of the outline, folds included, with a jump of the image beside them, and without one.
-        extra: inside, with a jump where the object has none.
+        hits, creases, misses: of the outline, folds included, with a jump of the image beside them; with a crease
+            alone, as where the object stands on something; and without either.
         past: inside, that saw something behind the object.
         hidden: inside, that saw something before the object.
         shown: all that the object would cover.
     """
 
     hits: int = 0
+    creases: int = 0
     misses: int = 0
-    extra: int = 0
     past: int = 0
     hidden: int = 0
     shown: int = 0
@@ -121,8 +132,10 @@ class Outline(NamedTuple):
     @property
     def nats(self) -> float:
         """Logarithm of how much likelier that is of the object than of something else that was taken for it."""
-        weights = (HIT, MISS, EXTRA, PAST / (EDGE_OFF + 1), HIDDEN / (EDGE_OFF + 1))
-        return sum(weight * count for weight, count in zip(weights, self, strict=False)) / (EDGE_OFF + 1)
+        independent = EDGE_OFF + 1
+        edge = (HIT * self.hits + CREASE * self.creases + MISS * self.misses) / independent
+        seen = SEEN * np.log1p(-self.hidden / (self.shown + 1))
+        return float(edge + PAST * np.sqrt(self.past) / independent + seen)
 
 
 def compare_outline(jumps: Jumps, depth: Float[np.ndarray, "h w"]) -> Outline:
@@ -147,17 +160,15 @@ def compare_outline(jumps: Jumps, depth: Float[np.ndarray, "h w"]) -> Outline:
             if max(abs(down), abs(right)) <= EDGE_OFF:
                 hit |= jumps.nearer[at] & (np.abs(measured[at] - depth[v, u]) < off)
     known = ndimage.uniform_filter(jumps.known.astype(np.float64), 2 * EDGE_OFF + 1)[v, u] > 0.5
+    creased = jumps.creased[v, u]
     in_picture = (u >= EDGE_OFF) & (v >= EDGE_OFF) & (u < width - EDGE_OFF) & (v < height - EDGE_OFF)
     counts = known & in_picture & ~covered
-    flat = ndimage.binary_erosion(shown, iterations=EDGE_OFF + 1) & ~ndimage.binary_dilation(
-        edge, iterations=EDGE_OFF + 1
-    )
     core = ndimage.binary_erosion(shown, iterations=EDGE_OFF) & (measured > 0)
     behind = measured - depth
     return Outline(
         hits=int((counts & hit).sum()),
-        misses=int((counts & ~hit).sum()),
-        extra=int((flat & jumps.nearer).sum()),
+        creases=int((counts & ~hit & creased).sum()),
+        misses=int((counts & ~hit & ~creased).sum()),
         past=int((core & (behind > 1.5 * step)).sum()),
         hidden=int((core & (behind < -1.5 * step)).sum()),
         shown=int(shown.sum()),

@@ -8,39 +8,51 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
-from scipy.spatial import ConvexHull
+from jaxtyping import Bool
+from scipy.spatial import ConvexHull, cKDTree
 
-from mereo.fitting.modes import bend_by_few
+from mereo.fitting.modes import bend_by_few, fit_wide, refined
 from mereo.fitting.problem.correspondences import NoFit
+from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.problem import Problem
 from mereo.fitting.problem.residuals import NetworkTerm
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.answer_frame import answer_frame, cloud_to_fit, scene_unit_of
-from mereo.fitting.registration.recognition import Recognition
+from mereo.fitting.registration.recognition import Known
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.search import SearchRound, screen_poses
 from mereo.geometry.camera import DepthImage
 from mereo.geometry.conventions import MIN_POINTS
-from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.bounds import Cells, check_value
 from mereo.io.cores import limit_blas_threads
 from mereo.io.progress import stage
-from mereo.locating.outline import Jumps, Outline, compare_outline, rendered_depth
+from mereo.locating.outline import Jumps, Outline, compare_outline
 from mereo.locating.regions import SIZES, extent, regions, steepest, thinned
 from mereo.models.trained import Trained
-from mereo.reconstruction.isolation import IsolationStep, Reading
+from mereo.reconstruction.isolation import IsolationStep, Reading, Selection
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.pipeline import encode_frame
+from mereo.scenes.statistical_model import StatisticalModel
+from mereo.synthesis.depth_sensor import render_depth
 
 QUICK = SearchRound(0, 400, 6, 3)
 """Round of the search by which a region is looked at."""
 
-LOOKS, ANSWERS = 12, 3
-"""Regions that are looked at, and of these how many are answered, at most."""
+LOOKS, ANSWERS, HOPELESS = 12, 3, 0.0
+"""Regions that are looked at, and of these how many are answered, at most; nats of a quick look below which only the
+best is."""
 
-NEAR = 0.1
-"""Distance in half lengths from the state of a quick look up to which pixels are taken for the object's."""
+CHANCE, PER_MODE, MOST_MODES, BY_MASK = -3.0, -0.5, 6, 5.0
+"""Nats of an object at a place of a frame before its outline is compared; those of each mode, up to so many, by which
+it can follow another thing's outline; and how many a mask adds."""
+
+UNLIKELY = -5.0
+"""Nats below which a frame does not show the object at a place; up to 0 it may."""
+
+NEAR, REGION_NEAR = 0.1, 3.0
+"""Distance along a ray from a state, in half lengths, up to which pixels are taken for the object's, and in that the
+distance from its surface up to which those of its region are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +61,14 @@ class Place:
 
     Attributes:
         mask: pixels of a region, in the thinned image.
-        triangles: of the state that a quick look has found there, camera frame, the image's unit.
+        posed: state there, scene units.
+        mesh: of that state, in the image's unit.
         outline: of that state.
     """
 
     mask: Bool[np.ndarray, "h w"]
-    triangles: Float[np.ndarray, "f 3 3"]
+    posed: Posed
+    mesh: SegmentedMesh
     outline: Outline
 
 
@@ -81,8 +95,9 @@ class WholeFrame:
         """The image of a frame that has one, where a scene unit has this length, or as both state their units."""
         unit = scene_unit_of(seen, registrar, scene_unit)
         assert seen.frame.whole is not None and unit is not None
-        thin, every = thinned(seen.frame.whole, 2 * registrar.model.half * unit)
-        return cls(seen, registrar, unit, Jumps.of(thin), every)
+        length = 2 * registrar.model.half * unit
+        thin, every = thinned(seen.frame.whole, length)
+        return cls(seen, registrar, unit, Jumps.of(thin, length), every)
 
     @property
     def whole(self) -> DepthImage:
@@ -90,37 +105,37 @@ class WholeFrame:
         assert self.seen.frame.whole is not None
         return self.seen.frame.whole
 
-    def observed(self, image: DepthImage, mask: Bool[np.ndarray, "h w"], whole: DepthImage) -> Observation:
-        """The object as a mask has it."""
-        depth = DepthImage(np.where(mask, image.depth, 0.0), image.camera)
-        cloud = depth.to_points()
-        step = IsolationStep("whole frame", int(whole.valid.sum()), len(cloud), "a region that may be the object")
-        frame = replace(self.seen.frame, cloud=cloud, depth=depth, whole=whole)
-        return replace(self.seen, frame=frame, cloud=cloud, selection=None, steps=(*self.seen.steps, step))
+    def observed(self, image: DepthImage, mask: Bool[np.ndarray, "h w"]) -> Observation:
+        """The object as a mask of an image has it."""
+        keep, step = mask[image.valid], "where the object is likeliest"
+        steps = (IsolationStep("whole frame", len(keep), int(keep.sum()), step),)
+        selection = Selection(keep, np.ones_like(keep), np.zeros_like(keep), steps)
+        frame = replace(self.seen.frame, cloud=image.to_points(), depth=image, whole=image)
+        return replace(self.seen, frame=frame, cloud=frame.cloud.rows(keep), selection=selection, steps=steps)
+
+    def problem(self, seen: Observation) -> Problem:
+        """What a fit to the object in the frame works on; raises ``ValueError`` for what none can start from."""
+        frame = encode_frame(Reading.of_all(seen.cloud), None, seen.frame.axes)
+        cloud, registrar = cloud_to_fit(frame, seen.lines, self.unit), self.registrar
+        evidence, nothing = cloud.evidence(self.unit), NetworkTerm.none(registrar.model)
+        return Problem(registrar.model, nothing, evidence, cloud.scale_std, registrar.config)
+
+    def place(self, mask: Bool[np.ndarray, "h w"], posed: Posed) -> Place:
+        """Place of a state."""
+        model = self.registrar.model
+        mesh = model.mesh(self.unit * posed.place(model.material(posed.z)))
+        return Place(mask, posed, mesh, self.outline(mesh))
+
+    def outline(self, mesh: SegmentedMesh) -> Outline:
+        """What the thinned image says of a mesh's outline."""
+        return compare_outline(self.jumps, render_depth(mesh, self.jumps.image.camera).depth)
 
     def look(self, mask: Bool[np.ndarray, "h w"]) -> Place:
-        """Place of a region: the most evident of some states, quickly fitted to it.
-
-        Raises ``NoFit`` and ``ValueError`` where the region is none that a fit can start from.
-        """
-        registrar, image = self.registrar, self.jumps.image
-        model, seen = registrar.model, self.observed(image, mask, image)
-        frame = encode_frame(Reading.of_all(seen.cloud), None, seen.frame.axes)
-        cloud = cloud_to_fit(frame, seen.lines, self.unit)
-        places = list[Place]()
-        with limit_blas_threads():
-            evidence = cloud.evidence(self.unit)
-            problem = Problem(model, NetworkTerm.none(model), evidence, cloud.scale_std, registrar.config)
-            for _, posed in bend_by_few(problem, screen_poses(problem, QUICK), QUICK.fitted):
-                material = self.unit * posed.place(model.material(posed.z))
-                places.append(self.place(mask, transform_points(inverse_rigid(frame.T_camera_input), material)))
-        return max(places, key=lambda place: place.outline.nats)
-
-    def place(self, mask: Bool[np.ndarray, "h w"], material: Float[np.ndarray, "m 3"]) -> Place:
-        """Place of a state, given by its material points."""
-        triangles = material[self.registrar.model.faces]
-        outline = compare_outline(self.jumps, rendered_depth(self.jumps.image.camera, triangles))
-        return Place(mask, triangles, outline)
+        """Place of a region: the most evident of some states, quickly fitted to it; raises as ``problem``."""
+        image = self.jumps.image
+        problem = self.problem(self.observed(image, mask))
+        states = bend_by_few(problem, screen_poses(problem, QUICK), QUICK.fitted)
+        return max((self.place(mask, posed) for _, posed in states), key=lambda place: place.outline.nats)
 
     def places(self) -> list[Place]:
         """Places where the object may be, the most evident first."""
@@ -134,19 +149,26 @@ class WholeFrame:
         return sorted(places, key=lambda place: -place.outline.nats)
 
     def chosen(self, place: Place) -> Observation:
-        """The object with the pixels of the whole image that a place explains, or its region has."""
-        image, mask = self.whole, place.mask
-        depth = rendered_depth(image.camera, place.triangles)
-        explained = (depth > 0) & (np.abs(image.depth - depth) < NEAR * self.registrar.model.half * self.unit)
+        """The object with the pixels of the whole image that a place explains, and those of its region near it."""
+        image, mask, reach = self.whole, place.mask, NEAR * self.registrar.model.half * self.unit
+        depth = render_depth(place.mesh, image.camera).depth
+        explained = (depth > 0) & (np.abs(image.depth - depth) < reach)
         # pixels between those of the thinned image are the region's where they go on with its surface
-        height, width = image.depth.shape
         rows, columns = (
             np.minimum(np.arange(size) // self.every, most - 1)
-            for size, most in zip((height, width), mask.shape, strict=True)
+            for size, most in zip(image.depth.shape, mask.shape, strict=True)
         )
         thin = np.where(mask, self.jumps.image.depth, 0.0)[np.ix_(rows, columns)]
-        goes_on = (thin > 0) & (np.abs(image.depth - thin) <= steepest(self.jumps.image) * thin)
-        return self.observed(image, image.valid & (explained | goes_on), image)
+        region = (thin > 0) & (np.abs(image.depth - thin) <= steepest(self.jumps.image) * thin)
+        points = image.camera.directions()[region] * image.depth[region][:, None]
+        distance = cKDTree(np.concatenate([part.vertices for part in place.mesh.segments])).query(points)[0]
+        region[region] = distance < REGION_NEAR * reach
+        return self.observed(image, image.valid & (explained | region))
+
+    def sharpened(self, place: Place) -> Place:
+        """The same by a fit to the pixels that are chosen by it."""
+        problem = self.problem(self.chosen(place))
+        return self.place(place.mask, refined(problem, fit_wide(problem, place.posed)).posed)
 
 
 def is_whole(seen: Observation, registrar: Registrar) -> bool:
@@ -158,32 +180,58 @@ def is_whole(seen: Observation, registrar: Registrar) -> bool:
     return is_all and extent(seen.cloud.points) > SIZES[1] * 2 * registrar.model.half * unit
 
 
+def chance(model: StatisticalModel) -> float:
+    """Nats of an object at a place of a frame before its outline is compared."""
+    return CHANCE + PER_MODE * min(model.count, MOST_MODES)
+
+
 @dataclass(frozen=True, eq=False)
 class PlacedAnswer:
-    """Answer at one place, and the logarithm of how much likelier it is than something else that was taken for it."""
+    """Answer at one place, and the logarithm of how much likelier it is than something else that was taken for it.
 
+    Attributes:
+        place: of the quick look.
+        answer: of the fit to the pixels that are chosen there.
+        outline: of that.
+    """
+
+    place: Place
     answer: Answer
     outline: Outline
 
     @property
     def nats(self) -> float:
         """By the outline, and by how strange the state and what is left over are."""
-        return self.outline.nats - 0.5 * self.answer.recognition.strangeness**2
+        registration = self.answer.registration
+        assert registration is not None
+        return chance(registration.model) + self.outline.nats - 0.5 * self.answer.recognition.strangeness**2
 
 
 def answers_in(
-    frame: WholeFrame, model: Trained | None, keep_all: bool = False, scene_unit: float | None = None
+    frame: WholeFrame,
+    model: Trained | None,
+    keep_all: bool = False,
+    scene_unit: float | None = None,
+    all_places: bool = False,
 ) -> Iterator[PlacedAnswer]:
-    """Answers at the most evident places of a whole frame, without those where a fit finds nothing."""
-    for place in frame.places()[:ANSWERS]:
+    """Answers at the most evident places of a whole frame, up to the first that is likelier than something else.
+
+    Places where a fit finds nothing have none. With ``all_places`` the others are answered as well.
+    """
+    places = frame.places()
+    hopeful = [place for place in places[:ANSWERS] if place.outline.nats > HOPELESS]
+    for place in hopeful or places[:1]:
         try:
-            seen = frame.chosen(place)
+            seen = frame.chosen(frame.sharpened(place))
             answer = answer_frame(seen, model, frame.registrar, keep_all=keep_all, scene_unit=scene_unit)
         except ValueError:
             continue
-        if answer.registration is not None:
-            material = transform_points(inverse_rigid(answer.T_camera_input), answer.registration.material)
-            yield PlacedAnswer(answer, frame.place(place.mask, material).outline)
+        if answer.registration is None:
+            continue
+        placed = PlacedAnswer(place, answer, frame.outline(answer.registration.mesh))
+        yield placed
+        if placed.nats > 0 and not all_places:
+            break
 
 
 def answer_observation(
@@ -198,29 +246,57 @@ def answer_observation(
     """Answer a frame that shows the object alone, or a whole depth image in which it is one thing among others.
 
     Takes the arguments of ``answer_frame`` and raises as it does. Of a whole image that is the answer at the most
-    evident place; where something else is likelier there, it is not known.
+    evident place. It is not known where something else is likelier there, as the image's jumps say, mask or none.
     """
     if registrar is None or not is_whole(seen, registrar):
-        return answer_frame(seen, model, registrar, keep_all=keep_all, resolution=resolution, label_points=label_points)
+        answer = answer_frame(
+            seen, model, registrar, keep_all=keep_all, resolution=resolution, label_points=label_points
+        )
+        return doubted(answer, outline_of(answer), BY_MASK)
     check_value("resolution", resolution, Cells, 128)
-    started, best = time.perf_counter(), None
-    with stage("look through the whole frame"):
-        for placed in answers_in(WholeFrame.of(seen, registrar), model, keep_all):
-            best = placed if best is None or placed.nats > best.nats else best
-            if best.nats > 0:
-                break
-    if best is None:
+    started = time.perf_counter()
+    with stage("look through the whole frame"), limit_blas_threads():
+        answers = list(answers_in(WholeFrame.of(seen, registrar), model, keep_all))
+    if not answers:
         raise NoFit(
             "nothing in the whole frame is of the object's size and shape: check both units (--depth-scale, --units), "
             "or say where it is (--mask, --box)"
         )
-    answer, seconds = best.answer, time.perf_counter() - started
-    recognition = answer.recognition if best.nats > 0 else absent(best)
-    return replace(answer, recognition=recognition, resolution=resolution, label_points=label_points, seconds=seconds)
+    best = max(answers, key=lambda placed: placed.nats)
+    answer = absent(best) if best.nats < UNLIKELY else doubted(best.answer, best.outline, 0.0)
+    seconds = time.perf_counter() - started
+    return replace(answer, resolution=resolution, label_points=label_points, seconds=seconds)
 
 
-def absent(best: PlacedAnswer) -> Recognition:
-    """Recognition of a frame in which nothing is likelier to be the object than something else."""
+def outline_of(answer: Answer) -> Outline | None:
+    """What a depth image says of the outline of an answer in a part of it; None where nothing is around that part."""
+    seen, registration = answer.seen, answer.registration
+    whole = seen.frame.whole
+    if registration is None or whole is None or seen.initial_pose is not None or seen.lines.other_lines is None:
+        return None
+    length = 2 * registration.model.half * registration.scene_unit
+    jumps = Jumps.of(thinned(whole, length)[0], length)
+    return compare_outline(jumps, render_depth(registration.mesh, jumps.image.camera).depth)
+
+
+def doubted(answer: Answer, outline: Outline | None, stated: float) -> Answer:
+    """The same, unsure or not known where an outline speaks against it; ``stated`` are the nats of who says where."""
+    if outline is None or answer.registration is None or answer.recognition.known is False:
+        return answer
+    nats = chance(answer.registration.model) + stated + outline.nats
+    if nats > 0:
+        return answer
+    reason = (
+        f"its outline is not clearly that of what was seen ({outline.hits} of {outline.hits + outline.misses} pixels "
+        f"of it have an edge, {outline.past} inside have seen past it): look at the result before you rely on it, or "
+        "take a frame that shows more of its outline"
+    )
+    known: Known = False if nats < UNLIKELY else "unsure"
+    return replace(answer, recognition=replace(answer.recognition, known=known, reason=reason))
+
+
+def absent(best: PlacedAnswer) -> Answer:
+    """Answer to a frame in which nothing is likelier to be the object than something else."""
     answer = best.answer
     x, y, z = answer.seen.cloud.points.mean(axis=0) * answer.seen.frame.metres
     reason = (
@@ -228,4 +304,4 @@ def absent(best: PlacedAnswer) -> Recognition:
         f"{answer.seen.frame.length_name}, has another outline or shape: take a frame that shows more of it, or say "
         "where it is (--mask, --box)"
     )
-    return replace(answer.recognition, known=False, reason=reason)
+    return replace(answer, recognition=replace(answer.recognition, known=False, reason=reason))

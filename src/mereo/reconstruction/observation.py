@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.spatial import cKDTree
+from scipy.stats import median_abs_deviation
 
 from mereo.geometry.brief import counted
 from mereo.geometry.camera import DepthImage, PointCloud, SightKind, SightLines, into_camera
@@ -350,6 +351,9 @@ SILENT = 0.02
 """Share of the pixels around the object below which those that met something are too few: then a depth of zero may as
 well mean that the image was cut out or rendered."""
 
+LAGS = (1, 2, 4, 8)
+"""Pixels between those whose differences show a camera's noise: over more, desks are no planes."""
+
 DENSE = 3.0
 """Pixels from the object within which no line of sight is left out."""
 
@@ -378,7 +382,7 @@ def lines_of_frame(frame: SensorFrame, selection: Selection | None, extent: Exte
         T_camera_input = into_camera(points[is_object], frame.axes)
         lines = lines_of_points(transform_points(T_camera_input, points), is_object)
         lines = lines.transformed(np.linalg.inv(T_camera_input))
-    return SightLines(lines.past, np.empty((0, 3)), "past") if extent == "whole" else lines
+    return replace(lines, unknown=np.empty((0, 3)), other_lines="past") if extent == "whole" else lines
 
 
 # --- depth images ----------------------------------------------------------------------------------------------------
@@ -412,7 +416,26 @@ def lines_of_image(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SightLi
     u, v = u[kept], v[kept]
     met = past[v, u]
     places = whole.camera.unproject(np.stack([u + left + 0.5, v + top + 0.5], axis=1), np.where(met, depth[v, u], 1.0))
-    return SightLines(places[met], places[~met], None if silent else "unknown")
+    noise = noise_around(whole, shown)
+    return SightLines(places[met], places[~met], None if silent else "unknown", noise)
+
+
+def noise_around(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> float | None:
+    """Standard deviation of a camera's noise at the distance of ``shown`` pixels, by all others; None with too few.
+
+    Along planes inverse depth is linear in the picture, so its second differences are noise, which grows as the square
+    of the depth; over several pixels they have what neighbours share as well.
+    """
+    inverse = np.full(shown.shape, np.nan)
+    np.divide(1.0, whole.depth, out=inverse, where=whole.valid & ~shown)
+    noises = list[float]()
+    for lag in LAGS:
+        parts = (each[:, : -2 * lag] - 2 * each[:, lag:-lag] + each[:, 2 * lag :] for each in (inverse, inverse.T))
+        second = np.concatenate([part[np.isfinite(part)] for part in parts])
+        if len(second) >= MOST_LINES:
+            noises.append(float(median_abs_deviation(second, scale="normal")) / np.sqrt(6.0))
+    middle = np.median(whole.depth[shown & whole.valid]) if noises else 0.0
+    return float(max(noises) * middle**2) if noises else None
 
 
 def _evenly(

@@ -1,0 +1,217 @@
+"""An object among other things, in a whole depth image: where it is, and that it is not there."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from angle import write_angle
+from scipy.spatial.transform import Rotation
+
+import mereo
+from mereo.__main__ import main
+from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.transforms import rigid, transform_points
+from mereo.locating.outline import Jumps, compare_outline
+from mereo.locating.regions import connected_pixels, off_planes, regions, thinned
+from mereo.locating.whole_frame import is_whole
+from mereo.reconstruction.observation import find_object, noise_around
+from mereo.synthesis.depth_sensor import add_depth_noise, render_depth
+
+CAMERA = Camera(240, 180, 260.0, 260.0, 120.0, 90.0)
+NOISE = 2e-4
+"""Metres."""
+
+SLOPE = Rotation.from_euler("x", 35, degrees=True)
+"""From a desk with y down into the camera frame."""
+
+
+def on_desk(x: float, height: float, away: float) -> np.ndarray:
+    """Place above the desk, metres."""
+    return SLOPE.apply([x, -height, away]) + np.array([0.0, 0.05, 0.6])
+
+
+PLACED = rigid((SLOPE * Rotation.from_euler("xyz", [70, 20, 100], degrees=True)).as_matrix(), on_desk(-0.02, 0.06, 0.0))
+"""Pose of the angle, about its middle: a corner touches the desk."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("angle")
+    write_angle(made)
+    return made
+
+
+@pytest.fixture(scope="module")
+def angle(folder: Path) -> mereo.Object:
+    meshes = [str(folder / "long.stl"), str(folder / "short.stl")]
+    return mereo.load_object(meshes, units="mm", deformations="rigid")
+
+
+@pytest.fixture(scope="module")
+def rest(folder: Path) -> SegmentedMesh:
+    """The angle about its middle, metres."""
+    meshes = {name: trimesh.load(folder / f"{name}.stl") for name in ("long", "short")}
+    middle = np.concatenate([mesh.vertices for mesh in meshes.values()]).mean(axis=0)
+    return SegmentedMesh(tuple(segment(name, mesh, (mesh.vertices - middle) / 1000) for name, mesh in meshes.items()))
+
+
+def segment(name: str, mesh: trimesh.Trimesh, vertices: np.ndarray) -> Segment:
+    return Segment(name, (0, 0, 0), vertices, np.asarray(mesh.faces))
+
+
+def things() -> list[Segment]:
+    """A table, a wall behind it, and a ball, a can and a box on the table; metres."""
+    table = trimesh.creation.box((3.0, 0.02, 3.0))
+    table.apply_transform(rigid(SLOPE.as_matrix(), on_desk(0.0, -0.01, 0.0)))
+    wall = trimesh.creation.box((6.0, 6.0, 0.02))
+    wall.apply_translation([0.0, 0.0, 1.6])
+    ball, can = trimesh.creation.icosphere(3, 0.03), trimesh.creation.cylinder(0.025, 0.1)
+    box = trimesh.creation.box((0.08, 0.05, 0.06))
+    for thing, place in ((ball, (0.12, 0.03, 0.0)), (can, (-0.16, 0.025, 0.08)), (box, (0.05, 0.025, 0.2))):
+        thing.apply_transform(rigid(SLOPE.as_matrix(), on_desk(*place)))
+    every = {"table": table, "wall": wall, "ball": ball, "can": can, "box": box}
+    return [segment(name, mesh, np.asarray(mesh.vertices)) for name, mesh in every.items()]
+
+
+def desk(*parts: Segment) -> DepthImage:
+    """Depth image of the desk, and of what else is there."""
+    return add_depth_noise(render_depth(SegmentedMesh((*things(), *parts)), CAMERA), NOISE, np.random.default_rng(0))
+
+
+@pytest.fixture(scope="module")
+def placed(rest: SegmentedMesh) -> SegmentedMesh:
+    return rest.transformed(PLACED)
+
+
+@pytest.fixture(scope="module")
+def image(placed: SegmentedMesh) -> DepthImage:
+    return desk(*placed.segments)
+
+
+def test_an_object_among_others_is_known_at_its_place(
+    image: DepthImage, rest: SegmentedMesh, folder: Path, angle: mereo.Object
+) -> None:
+    found = mereo.reconstruct(image, angle, unit_m=1.0)
+    assert found.known is True and found.pose is not None
+    assert found.seen.steps[-1].name == "whole frame" and found.seen.steps[-1].before == image.valid.sum()
+    long = np.asarray(trimesh.load(folder / "long.stl").vertices) / 1000
+    true = transform_points(PLACED, rest.segments[0].vertices)
+    np.testing.assert_allclose(transform_points(found.pose, long), true, atol=2e-3)
+    assert found.seen.cloud.points[:, 2].max() < 0.65, "neither the desk behind it nor the wall is taken for it"
+
+
+def test_what_is_not_in_the_frame_is_not_known_and_the_likeliest_place_is_stated(angle: mereo.Object) -> None:
+    found = mereo.reconstruct(desk(), angle, unit_m=1.0)
+    assert found.known is False and found.recognition.reason is not None
+    assert "the object is not in this frame; what is most like it, at " in found.recognition.reason
+
+
+def test_the_command_looks_through_the_frame_and_says_so(
+    image: DepthImage, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.save(tmp_path / "depth.npy", image.depth)
+    intrinsics = {"width": 240, "height": 180, "fx": 260.0, "fy": 260.0, "cx": 119.5, "cy": 89.5}
+    (tmp_path / "camera.json").write_text(json.dumps(intrinsics), encoding="utf-8")
+    given = [str(tmp_path / "depth.npy"), "--intrinsics", str(tmp_path / "camera.json"), "--object"]
+    meshes = [str(folder / "long.stl"), str(folder / "short.stl"), "--units", "mm", "--deformations", "rigid"]
+    main(["reconstruct", *given, *meshes, "--output", str(tmp_path / "result")])
+    printed = capsys.readouterr().out
+    assert f"the object is looked for in all {image.valid.sum()} points of the frame" in printed
+    assert "whole frame: " in printed and "where the object is likeliest" in printed
+    summary = json.loads((tmp_path / "result" / "summary.json").read_text(encoding="utf-8"))
+    assert summary["isolation"][-1]["name"] == "whole frame" and summary["recognition"]["known"] is True
+
+
+def test_a_mask_or_an_object_alone_is_not_looked_through(
+    image: DepthImage, placed: SegmentedMesh, angle: mereo.Object
+) -> None:
+    registrar = angle.registrar("auto")
+    assert registrar is not None
+    whole = find_object(mereo.load_frame(image, unit_m=1.0))
+    assert is_whole(whole, registrar)
+    alone = find_object(mereo.load_frame(render_depth(placed, CAMERA), unit_m=1.0))
+    assert not is_whole(alone, registrar)
+    masked = replace(whole, cloud=whole.cloud.rows(np.arange(len(whole.cloud)) < 500))
+    assert not is_whole(masked, registrar)
+    assert not is_whole(replace(whole, initial_pose=np.eye(4)), registrar)
+    assert not is_whole(find_object(mereo.load_frame(image)), registrar), "of no known unit"
+
+
+def test_a_frame_of_one_plane_holds_nothing_and_that_is_a_sentence(angle: mereo.Object) -> None:
+    wall = DepthImage(np.full((180, 240), 1.0), CAMERA)
+    with pytest.raises(ValueError, match="nothing in the whole frame is of the object's size and shape: check both"):
+        mereo.reconstruct(wall, angle, unit_m=1.0)
+
+
+# --- regions ----------------------------------------------------------------------------------------------------------
+
+
+def test_each_thing_is_a_region_and_no_plane_is(image: DepthImage, placed: SegmentedMesh) -> None:
+    shown = (lambda depth: (depth > 0) & (np.abs(depth - image.depth) < 2e-3))(render_depth(placed, CAMERA).depth)
+    off = off_planes(image, 0.12)
+    assert off[shown].mean() > 0.95 and off.mean() < 0.2
+    masks = regions(image, 0.12, 4e-3)
+    overlap = [(mask & shown).sum() / (mask | shown).sum() for mask in masks]
+    assert 3 <= len(masks) <= 8 and max(overlap) > 0.9
+
+
+def test_surfaces_end_at_gaps_in_depth() -> None:
+    depth = np.ones((4, 6))
+    depth[:, 3:] = 1.5
+    depth[0] = 0.0
+    label = connected_pixels(depth, 0.1)
+    assert len(np.unique(label[1:, :3])) == len(np.unique(label[1:, 3:])) == 1
+    assert len(np.unique(label)) == 2 + 6, "a pixel that is not measured is alone"
+
+
+def test_a_large_image_is_thinned_to_pixels_that_are_its_own() -> None:
+    camera = Camera(900, 700, 1000.0, 1100.0, 440.0, 360.0)
+    depth = np.random.default_rng(0).uniform(0.9, 1.1, (700, 900))
+    thin, every = thinned(DepthImage(depth, camera), 0.3)
+    assert every == 5 and thin.depth.shape == (140, 180)
+    points, places = depth[2::5, 2::5, None] * camera.directions()[2::5, 2::5], thin.camera.directions()
+    np.testing.assert_allclose(thin.depth[..., None] * places, points, atol=1e-12)
+    assert thinned(DepthImage(depth, camera), 0.05)[1] == 1
+
+
+# --- outlines ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_true_pose_has_its_outline_and_others_have_not(image: DepthImage, placed: SegmentedMesh) -> None:
+    jumps = Jumps.of(image, 0.12)
+
+    def outline_at(shift: list[float]) -> tuple[float, float]:
+        moved = placed.transformed(rigid(np.eye(3), np.array(shift)))
+        outline = compare_outline(jumps, render_depth(moved, CAMERA).depth)
+        return outline.nats, outline.misses / max(outline.hits + outline.misses, 1)
+
+    nats, missed = outline_at([0.0, 0.0, 0.0])
+    assert nats > 3 and missed < 0.05
+    shifted = [outline_at(shift)[0] for shift in ([0.03, 0, 0], [0, 0.03, 0.02], [0.12, 0.02, 0.0], [0, -0.05, -0.1])]
+    assert max(shifted) < 0, "elsewhere, in front of other things, and on other things"
+    assert compare_outline(jumps, np.zeros((180, 240))).nats == 0
+
+
+def test_what_an_occluder_hides_of_the_outline_does_not_count(image: DepthImage, placed: SegmentedMesh) -> None:
+    depth = render_depth(placed, CAMERA).depth
+    columns = np.flatnonzero((depth > 0).any(axis=0))
+    hidden = image.depth.copy()
+    hidden[:, : int(np.median(columns))] = 0.25
+    outline, whole = (
+        compare_outline(Jumps.of(DepthImage(each, CAMERA), 0.12), depth) for each in (hidden, image.depth)
+    )
+    assert outline.hits < 0.7 * whole.hits and outline.misses <= whole.misses and outline.hidden > 0.2 * outline.shown
+
+
+@pytest.mark.parametrize("std", [2e-4, 1e-3])
+def test_noise_is_measured_on_what_is_around_the_object(placed: SegmentedMesh, std: float) -> None:
+    clean, depth = desk(*placed.segments), render_depth(placed, CAMERA).depth
+    noisy = add_depth_noise(clean, std, np.random.default_rng(1))
+    level = np.sqrt(std**2 + NOISE**2) * float(np.median(depth[depth > 0] ** 2)) / np.median(noisy.depth) ** 2
+    assert noise_around(noisy, depth > 0) == pytest.approx(level, rel=0.8)
+    shown = np.ones(depth.shape, dtype=bool)
+    assert noise_around(noisy, shown) is None, "nothing is around it"
