@@ -15,9 +15,9 @@ from mereo.__main__ import main
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import rigid, transform_points
-from mereo.locating.outline import Jumps, compare_outline
+from mereo.locating.outline import Jumps, Outline, compare_outline
 from mereo.locating.regions import connected_pixels, off_planes, regions, thinned
-from mereo.locating.whole_frame import is_whole
+from mereo.locating.whole_frame import BY_MASK, doubted, is_whole
 from mereo.reconstruction.observation import find_object, noise_around
 from mereo.synthesis.depth_sensor import add_depth_noise, render_depth
 
@@ -92,10 +92,14 @@ def image(placed: SegmentedMesh) -> DepthImage:
     return desk(*placed.segments)
 
 
+@pytest.fixture(scope="module")
+def found(image: DepthImage, angle: mereo.Object) -> mereo.Result:
+    return mereo.reconstruct(image, angle, unit_m=1.0)
+
+
 def test_an_object_among_others_is_known_at_its_place(
-    image: DepthImage, rest: SegmentedMesh, folder: Path, angle: mereo.Object
+    found: mereo.Result, image: DepthImage, rest: SegmentedMesh, folder: Path
 ) -> None:
-    found = mereo.reconstruct(image, angle, unit_m=1.0)
     assert found.known is True and found.pose is not None
     assert found.seen.steps[-1].name == "whole frame" and found.seen.steps[-1].before == image.valid.sum()
     long = np.asarray(trimesh.load(folder / "long.stl").vertices) / 1000
@@ -145,6 +149,15 @@ def test_a_frame_of_one_plane_holds_nothing_and_that_is_a_sentence(angle: mereo.
     wall = DepthImage(np.full((180, 240), 1.0), CAMERA)
     with pytest.raises(ValueError, match="nothing in the whole frame is of the object's size and shape: check both"):
         mereo.reconstruct(wall, angle, unit_m=1.0)
+
+
+def test_an_outline_that_is_not_the_images_makes_an_answer_unsure_or_refuses_it(found: mereo.Result) -> None:
+    assert doubted(found, None, 0.0) is found, "nothing is around it"
+    assert doubted(found, Outline(hits=100), 0.0) is found
+    few, wrong = (doubted(found, each, 0.0).recognition for each in (Outline(hits=20), Outline(hits=20, misses=40)))
+    assert few.known == "unsure" and wrong.known is False
+    assert wrong.reason is not None and "20 of 60 pixels of it have an edge" in wrong.reason
+    assert doubted(found, Outline(hits=20), BY_MASK) is found, "a mask says where it is"
 
 
 # --- regions ----------------------------------------------------------------------------------------------------------

@@ -191,7 +191,8 @@ def reconstruct(
     """Find all segments of an object in a frame, hidden side included: what ``mereo reconstruct`` does.
 
     Args:
-        frame: whatever ``load_frame`` takes, or what it has returned; a list of frames is answered as a list.
+        frame: whatever ``load_frame`` takes, or what it has returned; a list of frames is answered as a list. In a
+            whole depth image, which plainly shows more than an object of this size, the object is looked for.
         object: from ``load_object``, or whatever that takes.
         method: "auto" takes the registered model where it explains the frame, else the network's surfaces; "network"
             leaves the network alone; "search" leaves it out; "modes" and "full" take the registered model in any case,

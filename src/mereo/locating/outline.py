@@ -12,11 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
-from scipy.stats import median_abs_deviation
 
 from mereo.geometry.camera import DepthImage
-from mereo.geometry.downsampling import STEEPEST
-from mereo.locating.regions import off_planes
+from mereo.geometry.surface_patches import noise_of_differences, second_differences
+from mereo.locating.regions import off_planes, steepest
 
 EDGE_OFF = 3
 """Pixels by which a camera's edges may be off; what so many pixels say is not independent."""
@@ -33,23 +32,7 @@ number of those inside that have seen past the object, which lie together; and o
 nothing hides. By a logistic regression of training desks, but for the last (docs/experiments/082.md)."""
 
 CREASE_STD = 6.0
-"""Standard deviations of a camera's noise from which on a second difference is a crease, as where a thing stands."""
-
-
-def second_differences(inverse: Float[np.ndarray, "h w"], lag: int) -> list[Float[np.ndarray, "h w"]]:
-    """Second differences of inverse depth over so many pixels of rows and columns, 0 on planes; NaN where unknown."""
-    results = list[np.ndarray]()
-    for each in (inverse, inverse.T):
-        second = np.full(each.shape, np.nan)
-        second[:, lag:-lag] = each[:, : -2 * lag] - 2 * each[:, lag:-lag] + each[:, 2 * lag :]
-        results.append(second)
-    return [results[0], results[1].T]
-
-
-def typical(second: list[Float[np.ndarray, "h w"]]) -> float:
-    """Standard deviation of second differences, of which most are noise."""
-    every = np.concatenate([part[np.isfinite(part)] for part in second])
-    return float(median_abs_deviation(every, scale="normal")) if len(every) else 0.0
+"""Standard deviations of their noise from which on second differences show a crease, as where a thing stands."""
 
 
 class Jumps(NamedTuple):
@@ -73,19 +56,17 @@ class Jumps(NamedTuple):
     def of(cls, image: DepthImage, length: float) -> "Jumps":
         """Jumps of an image, by more than a slope or noise explains; an object of this ``length`` stands on planes."""
         depth, focal = image.depth, min(image.camera.focal_x_px, image.camera.focal_y_px)
-        inverse = np.full(depth.shape, np.nan)
-        np.divide(1.0, depth, out=inverse, where=image.valid)
-        noise = typical(second_differences(inverse, 1)) / np.sqrt(6.0)
-        step = np.maximum(STEEPEST / focal * depth, NOISE_STD * noise * depth**2)
+        noise = noise_of_differences(second_differences(depth, 1))
+        step = np.maximum(steepest(image) * depth, NOISE_STD * noise * depth**2)
         rows = _along_rows(depth, step)
         columns = _along_rows(np.ascontiguousarray(depth.T), np.ascontiguousarray(step.T))
         nearer, known = (first | second.T for first, second in zip(rows, columns, strict=True))
         lag = EDGE_OFF + 1
-        second = second_differences(inverse, lag)
-        least = CREASE_STD * typical(second)
+        second = second_differences(depth, lag)
+        least = CREASE_STD * np.sqrt(6.0) * noise_of_differences(second)
         sharpest = np.fmax(*(np.abs(part) for part in second))
         # a crease of a right angle changes inverse depth by so much
-        creased = (np.nan_to_num(sharpest) > least) | (lag / focal * inverse < least)
+        creased = (np.nan_to_num(sharpest) > least) | (lag / focal < least * depth)
         planes = image.valid & ~off_planes(image, length)
         creased, planes = (
             ndimage.maximum_filter(each, 2 * reach + 1) for each, reach in ((creased, EDGE_OFF), (planes, lag))
@@ -144,7 +125,7 @@ def compare_outline(jumps: Jumps, depth: Float[np.ndarray, "h w"]) -> Outline:
     shown = depth > 0
     if not shown.any():
         return Outline()
-    step = np.maximum(jumps.step, STEEPEST / jumps.image.camera.focal_x_px * depth)
+    step = np.maximum(jumps.step, steepest(jumps.image) * depth)
     edge = shown & ~ndimage.binary_erosion(shown)
     for first, second in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
         near, far = depth[first], depth[second]

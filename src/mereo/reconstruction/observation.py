@@ -13,12 +13,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.spatial import cKDTree
-from scipy.stats import median_abs_deviation
 
 from mereo.geometry.brief import counted
 from mereo.geometry.camera import DepthImage, PointCloud, SightKind, SightLines, into_camera
 from mereo.geometry.conventions import MIN_POINTS, CloudAxes
 from mereo.geometry.downsampling import MAX_POINTS, STEEPEST, random_subset
+from mereo.geometry.surface_patches import noise_of_differences, second_differences
 from mereo.geometry.transforms import transform_points
 from mereo.io.sensor_frame import SensorFrame
 from mereo.reconstruction.config import Extent, IsolationConfig
@@ -351,8 +351,9 @@ SILENT = 0.02
 """Share of the pixels around the object below which those that met something are too few: then a depth of zero may as
 well mean that the image was cut out or rendered."""
 
-LAGS = (1, 2, 4, 8)
-"""Pixels between those whose differences show a camera's noise: over more, desks are no planes."""
+LAGS, FEWEST = (1, 2, 4, 8), 4000
+"""Pixels between those whose differences show a camera's noise, as over more desks are no planes; fewer pixels around
+the object show none."""
 
 DENSE = 3.0
 """Pixels from the object within which no line of sight is left out."""
@@ -423,19 +424,13 @@ def lines_of_image(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SightLi
 def noise_around(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> float | None:
     """Standard deviation of a camera's noise at the distance of ``shown`` pixels, by all others; None with too few.
 
-    Along planes inverse depth is linear in the picture, so its second differences are noise, which grows as the square
-    of the depth; over several pixels they have what neighbours share as well.
+    It grows as the square of the depth; over several pixels it has what neighbours share as well.
     """
-    inverse = np.full(shown.shape, np.nan)
-    np.divide(1.0, whole.depth, out=inverse, where=whole.valid & ~shown)
-    noises = list[float]()
-    for lag in LAGS:
-        parts = (each[:, : -2 * lag] - 2 * each[:, lag:-lag] + each[:, 2 * lag :] for each in (inverse, inverse.T))
-        second = np.concatenate([part[np.isfinite(part)] for part in parts])
-        if len(second) >= MOST_LINES:
-            noises.append(float(median_abs_deviation(second, scale="normal")) / np.sqrt(6.0))
-    middle = np.median(whole.depth[shown & whole.valid]) if noises else 0.0
-    return float(max(noises) * middle**2) if noises else None
+    around = np.where(shown, 0.0, whole.depth)
+    if (around > 0).sum() < FEWEST or not (shown & whole.valid).any():
+        return None
+    noise = max(noise_of_differences(second_differences(around, lag)) for lag in LAGS)
+    return float(noise * np.median(whole.depth[shown & whole.valid]) ** 2)
 
 
 def _evenly(
