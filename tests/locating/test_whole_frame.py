@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import mereo
 from mereo.__main__ import main
+from mereo.fitting.tracking import SynchronousExecutor
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import rigid, transform_points
@@ -228,3 +229,22 @@ def test_noise_is_measured_on_what_is_around_the_object(placed: SegmentedMesh, s
     assert noise_around(noisy, depth > 0) == pytest.approx(level, rel=0.8)
     shown = np.ones(depth.shape, dtype=bool)
     assert noise_around(noisy, shown) is None, "nothing is around it"
+
+
+# --- sequences --------------------------------------------------------------------------------------------------------
+
+
+def test_an_object_is_followed_through_whole_frames_lost_and_seen_again(
+    image: DepthImage, rest: SegmentedMesh, folder: Path, angle: mereo.Object
+) -> None:
+    long = np.asarray(trimesh.load(folder / "long.stl").vertices) / 1000
+    with mereo.Tracker(angle, executor=SynchronousExecutor()) as tracker:
+        for number in range(4):
+            turn = Rotation.from_euler("y", 2 * number, degrees=True).as_matrix()
+            moved = PLACED @ rigid(turn, np.array([0.003 * number, 0.0, 0.0]))
+            found = tracker.follow(desk(*rest.transformed(moved).segments), number / 15, unit_m=1.0)
+            assert found.tracking == ("followed" if number else "found") and found.pose is not None
+            off = transform_points(found.pose, long) - transform_points(moved, rest.segments[0].vertices)
+            assert np.linalg.norm(off, axis=1).max() < 0.006, "a pixel is 2.2 mm wide"
+        assert tracker.follow(desk(), 5 / 15, unit_m=1.0).tracking == "lost"
+        assert tracker.follow(image, 20 / 15, unit_m=1.0).tracking == "found"

@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike
 from mereo.api.objects import Object, Source, object_of
 from mereo.api.result import Result
 from mereo.api.words import in_callers_words, python_words
-from mereo.fitting import tracking
 from mereo.fitting.config import AnswerMethod
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import CloudAxes, check_real
@@ -30,6 +29,7 @@ from mereo.io.point_arrays import is_frame_list, points_of
 from mereo.io.readers import depth_of, read_pose, usable_depth
 from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame, along_z, in_camera, read_frame
+from mereo.locating import following
 from mereo.locating.whole_frame import answer_observation, is_whole
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import (
@@ -314,7 +314,7 @@ class Tracker:
                 f'the method is {method!r}, and only the modes of a deformation model can be followed: take "auto" '
                 "with weights that carry one"
             )
-        self._tracker = tracking.Tracker(registrar, executor=executor)
+        self._tracker = following.Tracker(registrar, executor=executor)
 
     def follow(self, frame: Any, time_s: float, *, isolation: IsolationConfig | None = None, **options: Any) -> Result:
         """Find the object in the next frame.

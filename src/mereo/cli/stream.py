@@ -31,7 +31,7 @@ from mereo.cli.options import check_named, loaded_object
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.register import Registrar
-from mereo.fitting.tracking import SynchronousExecutor, Tracker
+from mereo.fitting.tracking import SynchronousExecutor
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import owned_centroids
@@ -42,6 +42,7 @@ from mereo.io.readers import CLOUD_READERS, DEPTH_READERS
 from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame, read_frame, read_frames
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
+from mereo.locating.following import Tracker
 from mereo.models.trained import Trained
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import Observation, find_object

@@ -9,6 +9,7 @@ state, fitted to the newest frame, begins a new track.
 """
 
 import time
+from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -273,6 +274,10 @@ class SynchronousExecutor(Executor):
         return future
 
 
+Search = Callable[[Observation, Registrar, bool, float | None], tuple[Candidate, Any]]
+"""What finds the object in a frame, as ``search_hypotheses`` does."""
+
+
 class BackgroundSearch:
     """Searches of one object, one at a time; used by one thread.
 
@@ -280,11 +285,13 @@ class BackgroundSearch:
         registrar: of the object.
         executor: what does the searches, the caller's to end; None for a thread of its own, which starts when the
             first search does and ends with ``close``.
+        search: what finds the object in a frame; None is ``search_hypotheses``.
     """
 
-    def __init__(self, registrar: Registrar, executor: Executor | None = None) -> None:
+    def __init__(self, registrar: Registrar, executor: Executor | None = None, search: Search | None = None) -> None:
         self.registrar = registrar
         self.executor = executor
+        self.search = search
         self._thread = ThreadPoolExecutor(1, "mereo-search")
         self._running: tuple[TrackedFrame, Future[Candidate]] | None = None
 
@@ -293,7 +300,8 @@ class BackgroundSearch:
         if self._running is None:
             executor = self._thread if self.executor is None else self.executor
             arguments = frame.seen, self.registrar, frame.keep_all, frame.scene_unit
-            self._running = frame, executor.submit(lambda: search_hypotheses(*arguments)[0])
+            search = self.search or search_hypotheses
+            self._running = frame, executor.submit(lambda: search(*arguments)[0])
 
     def take(self) -> tuple[TrackedFrame, Candidate] | None:
         """The searched frame and its best candidate, which may not explain it; None where there is none, or not yet.
@@ -334,6 +342,7 @@ class Tracker:
         registrar: Registrar,
         config: TrackConfig = TrackConfig(),  # noqa: B008 (frozen)
         executor: Executor | None = None,
+        search: Search | None = None,
     ) -> None:
         """Follow an object.
 
@@ -342,11 +351,12 @@ class Tracker:
                 taken.
             config: constants.
             executor: what searches for a lost object (``BackgroundSearch``); None for a thread of its own.
+            search: what finds it; None is ``search_hypotheses``.
         """
         # a frame that nothing explains comes 30 times a second while the object is away
         self.registrar = registrar.without_retries
         self.config = config
-        self._search = BackgroundSearch(registrar, executor)
+        self._search = BackgroundSearch(registrar, executor, search)
         self.forget()
 
     def __enter__(self) -> "Tracker":
@@ -388,7 +398,7 @@ class Tracker:
         if tracked is not None and self._is_believed(tracked):
             return self._gone_on(frame, tracked, started)
         alone = None
-        if self.registrar.asks_network or not self._has_begun:
+        if self._is_fitted_alone(seen):
             alone = self._by_itself(frame, tracked, started)
             if alone.tracking != "lost":
                 return alone
@@ -399,6 +409,10 @@ class Tracker:
         if again is not None:
             return self._gone_on(frame, again, started, "found")
         return self._lost(frame, alone, why if tracked is None else self._doubt(tracked), started)
+
+    def _is_fitted_alone(self, seen: Observation) -> bool:
+        """Whether a frame that no track leads to is fitted by itself at once: the first is, and all by a network."""
+        return self.registrar.asks_network or not self._has_begun
 
     def _tracked(self, track: Track | None, frame: TrackedFrame, longest_s: float) -> "tuple[_Tracked | None, str]":
         """Fit the frame from an earlier state; None, and why, without one that leads to it."""

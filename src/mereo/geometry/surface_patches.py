@@ -203,22 +203,18 @@ def _quadratic(
 # --- noise of depth images --------------------------------------------------------------------------------------------
 
 
-def second_differences(
-    depth: Float[np.ndarray, "h w"], lag: int
-) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
-    """Second differences of inverse depth over so many pixels of rows, and of columns; NaN where one is not measured.
+def second_differences(depth: Float[np.ndarray, "h w"], lag: int) -> Float[np.ndarray, "h w"]:
+    """Second differences of inverse depth over so many pixels of each row; NaN where one is not measured.
 
     Along planes inverse depth is linear in the picture, so that they are 0 but for noise.
     """
-    inverse = np.full(depth.shape, np.nan)
+    inverse, second = np.full(depth.shape, np.nan), np.full(depth.shape, np.nan)
     np.divide(1.0, depth, out=inverse, where=depth > 0)
-    results = np.full((2, *depth.shape), np.nan)
-    for result, each in ((results[0], inverse), (results[1].T, inverse.T)):
-        result[:, lag:-lag] = each[:, : -2 * lag] - 2 * each[:, lag:-lag] + each[:, 2 * lag :]
-    return results[0], results[1]
+    second[:, lag:-lag] = inverse[:, : -2 * lag] - 2 * inverse[:, lag:-lag] + inverse[:, 2 * lag :]
+    return second
 
 
-def noise_of_differences(second: tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]) -> float:
+def noise_of_differences(*second: Float[np.ndarray, "_ _"]) -> float:
     """Standard deviation of a camera's noise in inverse depth, by second differences of which most are of planes."""
     every = np.concatenate([part[np.isfinite(part)] for part in second])
     return float(median_abs_deviation(every, scale="normal")) / np.sqrt(6.0) if len(every) else 0.0

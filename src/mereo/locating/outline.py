@@ -56,14 +56,14 @@ class Jumps(NamedTuple):
     def of(cls, image: DepthImage, length: float) -> "Jumps":
         """Jumps of an image, by more than a slope or noise explains; an object of this ``length`` stands on planes."""
         depth, focal = image.depth, min(image.camera.focal_x_px, image.camera.focal_y_px)
-        noise = noise_of_differences(second_differences(depth, 1))
+        noise = noise_of_differences(second_differences(depth, 1), second_differences(depth.T, 1))
         step = np.maximum(steepest(image) * depth, NOISE_STD * noise * depth**2)
         rows = _along_rows(depth, step)
         columns = _along_rows(np.ascontiguousarray(depth.T), np.ascontiguousarray(step.T))
         nearer, known = (first | second.T for first, second in zip(rows, columns, strict=True))
         lag = EDGE_OFF + 1
-        second = second_differences(depth, lag)
-        least = CREASE_STD * np.sqrt(6.0) * noise_of_differences(second)
+        second = second_differences(depth, lag), second_differences(depth.T, lag).T
+        least = CREASE_STD * np.sqrt(6.0) * noise_of_differences(*second)
         sharpest = np.fmax(*(np.abs(part) for part in second))
         # a crease of a right angle changes inverse depth by so much
         creased = (np.nan_to_num(sharpest) > least) | (lag / focal < least * depth)

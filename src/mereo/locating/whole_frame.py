@@ -50,9 +50,30 @@ it can follow another thing's outline; and how many a mask adds."""
 UNLIKELY = -5.0
 """Nats below which a frame does not show the object at a place; up to 0 it may."""
 
+NOWHERE = (
+    "nothing in the whole frame is of the object's size and shape: check both units (--depth-scale, --units), or say "
+    "where it is (--mask, --box)"
+)
+"""Sentence about a frame without any place."""
+
 NEAR, REGION_NEAR = 0.1, 3.0
 """Distance along a ray from a state, in half lengths, up to which pixels are taken for the object's, and in that the
 distance from its surface up to which those of its region are."""
+
+
+def part_of(seen: Observation, image: DepthImage, mask: Bool[np.ndarray, "h w"]) -> Observation:
+    """The object in a frame as a mask of an image has it."""
+    keep = mask[image.valid]
+    steps = (IsolationStep("whole frame", len(keep), int(keep.sum()), "where the object is likeliest"),)
+    frame = replace(seen.frame, cloud=image.to_points(), depth=image, whole=image)
+    selection = Selection(keep, np.ones_like(keep), np.zeros_like(keep), steps)
+    return replace(seen, frame=frame, cloud=frame.cloud.rows(keep), selection=selection, steps=steps)
+
+
+def pixels_near(image: DepthImage, mesh: SegmentedMesh, reach: float) -> Bool[np.ndarray, "h w"]:
+    """Pixels that see what lies as far away as a mesh does there, up to a ``reach`` in the image's unit."""
+    depth = render_depth(mesh, image.camera).depth
+    return image.valid & (depth > 0) & (np.abs(image.depth - depth) < reach)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,14 +126,6 @@ class WholeFrame:
         assert self.seen.frame.whole is not None
         return self.seen.frame.whole
 
-    def observed(self, image: DepthImage, mask: Bool[np.ndarray, "h w"]) -> Observation:
-        """The object as a mask of an image has it."""
-        keep, step = mask[image.valid], "where the object is likeliest"
-        steps = (IsolationStep("whole frame", len(keep), int(keep.sum()), step),)
-        selection = Selection(keep, np.ones_like(keep), np.zeros_like(keep), steps)
-        frame = replace(self.seen.frame, cloud=image.to_points(), depth=image, whole=image)
-        return replace(self.seen, frame=frame, cloud=frame.cloud.rows(keep), selection=selection, steps=steps)
-
     def problem(self, seen: Observation) -> Problem:
         """What a fit to the object in the frame works on; raises ``ValueError`` for what none can start from."""
         frame = encode_frame(Reading.of_all(seen.cloud), None, seen.frame.axes)
@@ -133,7 +146,7 @@ class WholeFrame:
     def look(self, mask: Bool[np.ndarray, "h w"]) -> Place:
         """Place of a region: the most evident of some states, quickly fitted to it; raises as ``problem``."""
         image = self.jumps.image
-        problem = self.problem(self.observed(image, mask))
+        problem = self.problem(part_of(self.seen, image, mask))
         states = bend_by_few(problem, screen_poses(problem, QUICK), QUICK.fitted)
         return max((self.place(mask, posed) for _, posed in states), key=lambda place: place.outline.nats)
 
@@ -151,8 +164,6 @@ class WholeFrame:
     def chosen(self, place: Place) -> Observation:
         """The object with the pixels of the whole image that a place explains, and those of its region near it."""
         image, mask, reach = self.whole, place.mask, NEAR * self.registrar.model.half * self.unit
-        depth = render_depth(place.mesh, image.camera).depth
-        explained = (depth > 0) & (np.abs(image.depth - depth) < reach)
         # pixels between those of the thinned image are the region's where they go on with its surface
         rows, columns = (
             np.minimum(np.arange(size) // self.every, most - 1)
@@ -163,12 +174,20 @@ class WholeFrame:
         points = image.camera.directions()[region] * image.depth[region][:, None]
         distance = cKDTree(np.concatenate([part.vertices for part in place.mesh.segments])).query(points)[0]
         region[region] = distance < REGION_NEAR * reach
-        return self.observed(image, image.valid & (explained | region))
+        return part_of(self.seen, image, pixels_near(image, place.mesh, reach) | (image.valid & region))
 
     def sharpened(self, place: Place) -> Place:
         """The same by a fit to the pixels that are chosen by it."""
         problem = self.problem(self.chosen(place))
         return self.place(place.mask, refined(problem, fit_wide(problem, place.posed)).posed)
+
+
+def located(frame: WholeFrame) -> Observation:
+    """The object at the most evident place of a frame; raises ``NoFit`` where there is none."""
+    places = frame.places()
+    if not places:
+        raise NoFit(NOWHERE)
+    return frame.chosen(frame.sharpened(places[0]))
 
 
 def is_whole(seen: Observation, registrar: Registrar) -> bool:
@@ -258,10 +277,7 @@ def answer_observation(
     with stage("look through the whole frame"), limit_blas_threads():
         answers = list(answers_in(WholeFrame.of(seen, registrar), model, keep_all))
     if not answers:
-        raise NoFit(
-            "nothing in the whole frame is of the object's size and shape: check both units (--depth-scale, --units), "
-            "or say where it is (--mask, --box)"
-        )
+        raise NoFit(NOWHERE)
     best = max(answers, key=lambda placed: placed.nats)
     answer = absent(best) if best.nats < UNLIKELY else doubted(best.answer, best.outline, 0.0)
     seconds = time.perf_counter() - started

@@ -1,0 +1,57 @@
+"""Follow an object through whole depth images, in which everything else is seen as well.
+
+frame, time -located, the first time and where it is lost-> part of the frame -Tracker.follow-> Answer
+"""
+
+from concurrent.futures import Executor
+from dataclasses import replace
+from typing import Any
+
+from mereo.fitting import tracking
+from mereo.fitting.config import TrackConfig
+from mereo.fitting.registration.answer import Answer, Candidate
+from mereo.fitting.registration.answer_frame import search_hypotheses
+from mereo.fitting.registration.register import Registrar
+from mereo.fitting.tracking import Track, TrackedFrame
+from mereo.locating.whole_frame import NEAR, WholeFrame, is_whole, located, part_of, pixels_near
+from mereo.reconstruction.observation import Observation
+
+
+def search_frame(
+    seen: Observation, registrar: Registrar, keep_all: bool, scene_unit: float | None
+) -> tuple[Candidate, Any]:
+    """Search the object, as ``search_hypotheses``, where a whole frame has it."""
+    if is_whole(seen, registrar):
+        seen = located(WholeFrame.of(seen, registrar, scene_unit))
+    return search_hypotheses(seen, registrar, keep_all, scene_unit)
+
+
+class Tracker(tracking.Tracker):
+    """Tracker that takes whole frames as well: of these it follows the pixels near where the object is expected."""
+
+    def __init__(
+        self,
+        registrar: Registrar,
+        config: TrackConfig = TrackConfig(),  # noqa: B008 (frozen)
+        executor: Executor | None = None,
+    ) -> None:
+        """Follow an object; the arguments are those of ``tracking.Tracker``."""
+        super().__init__(registrar, config, executor, search_frame)
+
+    def _is_fitted_alone(self, seen: Observation) -> bool:
+        # to look through a whole frame takes seconds, which frames of a lost object do not wait for
+        return not self._has_begun if is_whole(seen, self.registrar) else super()._is_fitted_alone(seen)
+
+    def _by_itself(self, frame: TrackedFrame, tracked: Any, started: float) -> Answer:
+        if is_whole(frame.seen, self.registrar):
+            frame = replace(frame, seen=located(WholeFrame.of(frame.seen, self.registrar, frame.scene_unit)))
+        return super()._by_itself(frame, tracked, started)
+
+    def _tracked(self, track: Track | None, frame: TrackedFrame, longest_s: float) -> Any:
+        whole = frame.seen.frame.whole
+        if track is not None and whole is not None and is_whole(frame.seen, self.registrar):
+            model, posed = track.problem.model, track.expected(frame.time_s, self.config)
+            mesh = model.mesh(track.unit * posed.place(model.material(posed.z)))
+            mask = pixels_near(whole, mesh, NEAR * model.half * track.unit)
+            frame = replace(frame, seen=part_of(frame.seen, whole, mask))
+        return super()._tracked(track, frame, longest_s)
