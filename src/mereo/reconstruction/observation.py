@@ -355,6 +355,9 @@ LAGS, FEWEST, ENOUGH = (1, 2, 4, 8), 4000, 100_000
 """Pixels between those whose differences show a camera's noise, as over more desks are no planes; fewer pixels around
 the object show none, and of images with more than enough some rows and columns do."""
 
+NOISIER = 2.0
+"""Largest noise on the object, in that around it: dark and slanted surfaces have more."""
+
 DENSE = 3.0
 """Pixels from the object within which no line of sight is left out."""
 
@@ -417,18 +420,17 @@ def lines_of_image(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SightLi
     u, v = u[kept], v[kept]
     met = past[v, u]
     places = whole.camera.unproject(np.stack([u + left + 0.5, v + top + 0.5], axis=1), np.where(met, depth[v, u], 1.0))
-    noise = noise_around(whole, shown)
-    return SightLines(places[met], places[~met], None if silent else "unknown", noise)
+    return SightLines(places[met], places[~met], None if silent else "unknown", NOISIER * noise_around(whole, shown))
 
 
-def noise_around(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> float | None:
-    """Standard deviation of a camera's noise at the distance of ``shown`` pixels, by all others; None with too few.
+def noise_around(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> float:
+    """Standard deviation of a camera's noise at the distance of ``shown`` pixels, by all others; infinite by too few.
 
     It grows as the square of the depth; over several pixels it has what neighbours share as well.
     """
     around = np.where(shown, 0.0, whole.depth)
     if (around > 0).sum() < FEWEST or not (shown & whole.valid).any():
-        return None
+        return np.inf
     step = 1 + around.size // ENOUGH
     lines = around[::step], around.T[::step]
     noise = max(noise_of_differences(*(second_differences(each, lag) for each in lines)) for lag in LAGS)

@@ -51,9 +51,6 @@ NORMAL_POINTS = 12
 NOISE_SHARE = 0.01
 """Largest noise of a depth camera, as a share of its distance: two to five times that of the usual ones."""
 
-NOISIER = 2.0
-"""Largest noise on the object, in that of what was measured around it: dark and slanted surfaces have more."""
-
 RIM_PITCHES, EDGE_PITCHES, EDGE_DIRECTIONS = 2.5, 3.5, 8
 """Angles from the observed points, in pixels, between which lines of sight around the object are sampled, and in how
 many directions: nearer lies the rim, of which nothing is known in any case (``lines_of_sight.RIM``)."""
@@ -204,7 +201,7 @@ class Evidence(ObservedPoints):
         pitch: angle between neighbouring lines of sight.
         past: lines of sight that went past the object to something that was measured; None without any.
         other_lines: kind of the lines of sight that are near none of all these.
-        noise: ``SightLines.noise``.
+        most_noise: ``SightLines.most_noise``.
     """
 
     sight: cKDTree
@@ -213,7 +210,7 @@ class Evidence(ObservedPoints):
     pitch: float
     past: PastLines | None = None
     other_lines: SightKind = "past"
-    noise: float | None = None
+    most_noise: float = np.inf
 
     @classmethod
     def of(
@@ -246,7 +243,7 @@ class Evidence(ObservedPoints):
             front = np.concatenate([front, np.zeros(len(toward))])
         chosen, around = points[spread(points, observed_samples)], near[:, 1:]
         past, other_lines = PastLines.of(lines.past, pitch), lines.other_lines or "past"
-        return cls(points, chosen, around, sight, ranges, front, pitch, past, other_lines, lines.noise)
+        return cls(points, chosen, around, sight, ranges, front, pitch, past, other_lines, lines.most_noise)
 
     @property
     def distance(self) -> float:
@@ -256,8 +253,7 @@ class Evidence(ObservedPoints):
     @property
     def largest_noise(self) -> float:
         """Largest standard deviation of the camera's noise."""
-        most = NOISE_SHARE * self.distance
-        return most if self.noise is None else min(most, NOISIER * self.noise)
+        return min(NOISE_SHARE * self.distance, self.most_noise)
 
     @property
     def with_more_samples(self) -> "Evidence":
