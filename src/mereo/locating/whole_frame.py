@@ -233,7 +233,7 @@ def answers_in(
     scene_unit: float | None = None,
     all_places: bool = False,
 ) -> Iterator[PlacedAnswer]:
-    """Answers at the most evident places of a whole frame, up to the first that is likelier than something else.
+    """Answers at the most evident places of a whole frame, up to the first that is known and no likelier another thing.
 
     Places where a fit finds nothing have none. With ``all_places`` the others are answered as well.
     """
@@ -249,7 +249,7 @@ def answers_in(
             continue
         placed = PlacedAnswer(place, answer, frame.outline(answer.registration.mesh))
         yield placed
-        if placed.nats > 0 and not all_places:
+        if placed.nats > 0 and answer.recognition.known is True and not all_places:
             break
 
 
