@@ -53,5 +53,5 @@ class Tracker(tracking.Tracker):
             model, posed = track.problem.model, track.expected(frame.time_s, self.config)
             mesh = model.mesh(track.unit * posed.place(model.material(posed.z)))
             mask = pixels_near(whole, mesh, NEAR * model.half * track.unit)
-            frame = replace(frame, seen=part_of(frame.seen, whole, mask))
+            frame = replace(frame, seen=part_of(frame.seen, mask))
         return super()._tracked(track, frame, longest_s)

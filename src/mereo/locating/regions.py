@@ -12,6 +12,7 @@ from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.downsampling import STEEPEST
 from mereo.reconstruction.isolation import largest_plane
+from mereo.reconstruction.observation import main_length
 
 ACROSS = 60
 """Pixels along an object at the middle distance in a thinned image, in which blurred edges are a pixel wide."""
@@ -53,11 +54,6 @@ def steepest(image: DepthImage) -> float:
     return STEEPEST / min(image.camera.focal_x_px, image.camera.focal_y_px)
 
 
-def extent(points: Float[np.ndarray, "n 3"]) -> float:
-    """Length of the box of some points, without the outermost hundredths."""
-    return float(np.ptp(np.quantile(points, (0.01, 0.99), axis=0), axis=0).max())
-
-
 def off_planes(image: DepthImage, length: float) -> Bool[np.ndarray, "h w"]:
     """Pixels that are measured, and on no plane that reaches farther than an object of this ``length``."""
     off, camera = image.valid.copy(), image.camera
@@ -70,7 +66,7 @@ def off_planes(image: DepthImage, length: float) -> Bool[np.ndarray, "h w"]:
             break
         distance = plane.distance(points)
         near = left & (distance <= pixel)
-        if near.sum() < PLANE_SHARE * len(points) or extent(points[near]) < SIZES[1] * length:
+        if near.sum() < PLANE_SHARE * len(points) or main_length(points[near]) < SIZES[1] * length:
             break
         away = distance / points[:, 2] ** 2  # as the noise of depth cameras grows
         left &= away > PLANE_STD * np.median(away[near])
@@ -109,7 +105,7 @@ def regions(image: DepthImage, length: float, area: float) -> list[Bool[np.ndarr
         for number in np.flatnonzero(sizes >= MIN_POINTS):
             mask, longest = whole & (label == number), 0.0
             if sizes[number] < SAME * size:
-                longest = extent(points[mask])
+                longest = main_length(points[mask])
                 if SIZES[0] * length <= longest <= SIZES[1] * length:
                     parts.append((abs(float(np.log(pixel[mask].sum() / area))), mask))
             if len(gaps) > 1 and (gaps[0] > 1 or longest > SIZES[1] * length):

@@ -28,7 +28,7 @@ from mereo.io.bounds import Cells, check_value
 from mereo.io.cores import limit_blas_threads
 from mereo.io.progress import stage
 from mereo.locating.outline import Jumps, Outline, compare_outline
-from mereo.locating.regions import SIZES, extent, regions, steepest, thinned
+from mereo.locating.regions import SIZES, regions, steepest, thinned
 from mereo.models.trained import Trained
 from mereo.reconstruction.isolation import IsolationStep, Reading, Selection
 from mereo.reconstruction.observation import Observation
@@ -61,13 +61,13 @@ NEAR, REGION_NEAR = 0.1, 3.0
 distance from its surface up to which those of its region are."""
 
 
-def part_of(seen: Observation, image: DepthImage, mask: Bool[np.ndarray, "h w"]) -> Observation:
-    """The object in a frame as a mask of an image has it."""
-    keep = mask[image.valid]
+def part_of(seen: Observation, mask: Bool[np.ndarray, "h w"]) -> Observation:
+    """The object in a frame as a mask of its whole image has it."""
+    assert seen.frame.whole is not None
+    keep = mask[seen.frame.whole.valid]
     steps = (IsolationStep("whole frame", len(keep), int(keep.sum()), "where the object is likeliest"),)
-    frame = replace(seen.frame, cloud=image.to_points(), depth=image, whole=image)
     selection = Selection(keep, np.ones_like(keep), np.zeros_like(keep), steps)
-    return replace(seen, frame=frame, cloud=frame.cloud.rows(keep), selection=selection, steps=steps)
+    return replace(seen, cloud=seen.frame.cloud.rows(keep), selection=selection, steps=steps)
 
 
 def pixels_near(image: DepthImage, mesh: SegmentedMesh, reach: float) -> Bool[np.ndarray, "h w"]:
@@ -99,6 +99,7 @@ class WholeFrame:
 
     Attributes:
         seen: all of the frame.
+        thin: the same with the thinned image.
         registrar: of the object.
         unit: length of a scene unit in the frame's unit.
         jumps: of the thinned image.
@@ -106,6 +107,7 @@ class WholeFrame:
     """
 
     seen: Observation
+    thin: Observation
     registrar: Registrar
     unit: float
     jumps: Jumps
@@ -117,8 +119,9 @@ class WholeFrame:
         unit = scene_unit_of(seen, registrar, scene_unit)
         assert seen.frame.whole is not None and unit is not None
         length = 2 * registrar.model.half * unit
-        thin, every = thinned(seen.frame.whole, length)
-        return cls(seen, registrar, unit, Jumps.of(thin, length), every)
+        image, every = thinned(seen.frame.whole, length)
+        thin = replace(seen, frame=replace(seen.frame, cloud=image.to_points(), depth=image, whole=image))
+        return cls(seen, thin, registrar, unit, Jumps.of(image, length), every)
 
     @property
     def whole(self) -> DepthImage:
@@ -145,8 +148,7 @@ class WholeFrame:
 
     def look(self, mask: Bool[np.ndarray, "h w"]) -> Place:
         """Place of a region: the most evident of some states, quickly fitted to it; raises as ``problem``."""
-        image = self.jumps.image
-        problem = self.problem(part_of(self.seen, image, mask))
+        problem = self.problem(part_of(self.thin, mask))
         states = bend_by_few(problem, screen_poses(problem, QUICK), QUICK.fitted)
         return max((self.place(mask, posed) for _, posed in states), key=lambda place: place.outline.nats)
 
@@ -174,7 +176,7 @@ class WholeFrame:
         points = image.camera.directions()[region] * image.depth[region][:, None]
         distance = cKDTree(np.concatenate([part.vertices for part in place.mesh.segments])).query(points)[0]
         region[region] = distance < REGION_NEAR * reach
-        return part_of(self.seen, image, pixels_near(image, place.mesh, reach) | (image.valid & region))
+        return part_of(self.seen, pixels_near(image, place.mesh, reach) | (image.valid & region))
 
     def sharpened(self, place: Place) -> Place:
         """The same by a fit to the pixels that are chosen by it."""
@@ -196,7 +198,7 @@ def is_whole(seen: Observation, registrar: Registrar) -> bool:
     if unit is None or seen.initial_pose is not None or frame.whole is None or frame.depth is None:
         return False
     is_all = len(seen.cloud) == int(frame.whole.valid.sum()) >= 4 * MIN_POINTS
-    return is_all and extent(seen.cloud.points) > SIZES[1] * 2 * registrar.model.half * unit
+    return is_all and seen.main_length > SIZES[1] * 2 * registrar.model.half * unit
 
 
 def chance(model: StatisticalModel) -> float:

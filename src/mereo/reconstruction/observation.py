@@ -78,6 +78,11 @@ class Observation:
         return lines_of_frame(self.frame, self.selection, self.extent)
 
     @cached_property
+    def main_length(self) -> float:
+        """``main_length`` of the object's points, which takes long to find for a whole image."""
+        return main_length(self.cloud.points)
+
+    @cached_property
     def self_hidden(self) -> float:
         """Share of the points that others would hide from the camera (``hidden_share``); 0 of an image or a surface."""
         if self.frame.depth is not None or self.extent == "surface":
@@ -161,6 +166,11 @@ class Observation:
         if self.frame.axes == "scanner":
             return points
         return f"{points}, depth {near:.3g} to {far:.3g} {unit} (middle {middle:.3g} {unit})"
+
+
+def main_length(points: Float[np.ndarray, "n 3"]) -> float:
+    """Length of the box of some points, without the outermost hundredths."""
+    return float(np.ptp(np.quantile(points, (0.01, 0.99), axis=0), axis=0).max())
 
 
 def depths(cloud: PointCloud, factor: float) -> tuple[float, float, float]:

@@ -29,7 +29,7 @@ from mereo.io.cores import limit_blas_threads
 from mereo.io.progress import stage
 from mereo.models.trained import Trained
 from mereo.reconstruction.isolation import Reading
-from mereo.reconstruction.observation import Observation
+from mereo.reconstruction.observation import Observation, main_length
 from mereo.reconstruction.pipeline import EncodedFrame, encode_frame
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -338,7 +338,7 @@ def check_size(frame: EncodedFrame, model: StatisticalModel, scene_unit: float |
     seen, whole = float(np.ptp(frame.points, axis=0).max()), 2 * model.half * scene_unit
     if SMALLEST <= seen / whole <= LARGEST:
         return
-    most = float(np.ptp(np.quantile(frame.points, [0.01, 0.99], axis=0), axis=0).max())
+    most = main_length(frame.points)
     unit = (
         "correct the unit of the frame (--unit-m 0.001 for millimetres, --depth-scale for images) or that of the "
         "object's files (--units)"
