@@ -34,10 +34,10 @@ def answer_desk(name: str, kind: str, number: int, seed: int, all_places: bool) 
     rng = np.random.default_rng([seed, *map(ord, f"{name} {kind}"), number])
     seen, view = desk_view(scene_of(name), kind, number, rng)
     registrar, started = registrar_of(name), (time.perf_counter(), time.process_time())
-    places = list[dict[str, Any]]()
     frame = WholeFrame.of(seen, registrar, 1.0)
-    for placed in answers_in(frame, None, all_places=all_places):
-        places.append({**facts_of(placed, view), "seconds": time.perf_counter() - started[0]})
+    answers = sorted(answers_in(frame, None, all_places=all_places), key=lambda placed: -placed.nats)
+    answers[:1] = map(frame.finished, answers[:1])
+    places = [facts_of(placed, view) for placed in answers]
     spent = {"seconds": time.perf_counter() - started[0], "processor_s": time.process_time() - started[1]}
     return {"object": name, "kind": kind, "number": number, "seed": seed, **spent, "places": places}
 

@@ -20,6 +20,7 @@ from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.answer_frame import (
     answer_found,
     answer_frame,
+    answer_of,
     cloud_to_fit,
     fit_states,
     scene_unit_of,
@@ -203,12 +204,22 @@ class WholeFrame:
             seen = self.chosen(place)
             encoded = encode_frame(seen.readings(keep_all)[0], model, seen.frame.axes)
             candidate = fit_states(encoded, registrar, self.unit, seen, states, rounds)
-            answer = answer_found(seen, model, registrar, candidate, encoded)
         except ValueError:
             return None
-        if answer.registration is None:
+        if candidate.modes is None:
             return None
-        return PlacedAnswer(place, answer, self.outline(answer.registration.mesh))
+        answer = answer_of(seen, model, registrar, candidate, encoded, candidate.modes.registration)
+        return PlacedAnswer(place, seen, answer, self.outline(candidate.modes.registration.mesh))
+
+    def finished(self, placed: "PlacedAnswer") -> "PlacedAnswer":
+        """The same with the parameters of the object's scene, where it may be the object."""
+        answer = placed.answer
+        if placed.nats < UNLIKELY:
+            return placed
+        assert answer.candidate is not None and answer.likelier is not None
+        answer = answer_found(placed.seen, answer.model, self.registrar, answer.candidate, answer.likelier)
+        assert answer.registration is not None
+        return replace(placed, answer=answer, outline=self.outline(answer.registration.mesh))
 
 
 def located(frame: WholeFrame) -> Observation:
@@ -239,11 +250,13 @@ class PlacedAnswer:
 
     Attributes:
         place: by a fit to the pixels that the quick look's state explains.
-        answer: of the fit to the pixels that are chosen by that.
+        seen: the pixels that are chosen by that.
+        answer: of the fit to them.
         outline: of that.
     """
 
     place: Place
+    seen: Observation
     answer: Answer
     outline: Outline
 
@@ -267,6 +280,7 @@ def answers_in(
 
     First from the states of the quick looks, in a second each, then, where none of these is known, by a search, which
     takes several. With ``all_places`` the others are answered as well. Places where a fit finds nothing have none.
+    Parameters of the object's scene are not fitted yet (``WholeFrame.finished``).
     """
     places = frame.places()
     hopeful = [place for place in places[:ANSWERS] if place.outline.nats > HOPELESS]
@@ -307,10 +321,11 @@ def answer_observation(
     check_value("resolution", resolution, Cells, 128)
     started = time.perf_counter()
     with stage("look through the whole frame"), limit_blas_threads():
-        answers = list(answers_in(WholeFrame.of(seen, registrar), model, keep_all))
-    if not answers:
-        raise NoFit(NOWHERE)
-    best = max(answers, key=lambda placed: placed.nats)
+        frame = WholeFrame.of(seen, registrar)
+        answers = list(answers_in(frame, model, keep_all))
+        if not answers:
+            raise NoFit(NOWHERE)
+        best = frame.finished(max(answers, key=lambda placed: placed.nats))
     answer = absent(best) if best.nats < UNLIKELY else doubted(best.answer, best.outline, 0.0)
     seconds = time.perf_counter() - started
     return replace(answer, resolution=resolution, label_points=label_points, seconds=seconds)
