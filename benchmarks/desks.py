@@ -36,7 +36,7 @@ def answer_desk(name: str, kind: str, number: int, seed: int, all_places: bool) 
     registrar, started = registrar_of(name), (time.perf_counter(), time.process_time())
     frame = WholeFrame.of(seen, registrar, 1.0)
     answers = sorted(answers_in(frame, None, all_places=all_places), key=lambda placed: -placed.nats)
-    answers[:1] = map(frame.finished, answers[:1])
+    answers[:1] = [frame.finished(placed, False) for placed in answers[:1]]
     places = [facts_of(placed, view) for placed in answers]
     spent = {"seconds": time.perf_counter() - started[0], "processor_s": time.process_time() - started[1]}
     return {"object": name, "kind": kind, "number": number, "seed": seed, **spent, "places": places}

@@ -211,12 +211,16 @@ class WholeFrame:
         answer = answer_of(seen, model, registrar, candidate, encoded, candidate.modes.registration)
         return PlacedAnswer(place, seen, answer, self.outline(candidate.modes.registration.mesh))
 
-    def finished(self, placed: "PlacedAnswer") -> "PlacedAnswer":
-        """The same with the parameters of the object's scene, where it may be the object and has them not yet."""
+    def finished(self, placed: "PlacedAnswer", keep_all: bool) -> "PlacedAnswer":
+        """The same where it may be the object: by pixels that are chosen once more, and with the scene's parameters."""
         answer = placed.answer
         assert answer.candidate is not None and answer.candidate.modes is not None and answer.likelier is not None
         if placed.nats < UNLIKELY or answer.registration is not answer.candidate.modes.registration:
             return placed
+        place = self.place(placed.place.mask, [answer.candidate.modes.posed])
+        again = self.answered(place, answer.model, keep_all, ())
+        if again is not None and again.nats > placed.nats:
+            placed, answer = again, again.answer
         answer = answer_found(placed.seen, answer.model, self.registrar, answer.candidate, answer.likelier)
         assert answer.registration is not None
         return replace(placed, answer=answer, outline=self.outline(answer.registration.mesh))
@@ -291,7 +295,7 @@ def answers_in(
             placed = frame.answered(place, model, keep_all, rounds)
             if placed is None:
                 continue
-            placed = frame.finished(placed) if placed.is_evident else placed
+            placed = frame.finished(placed, keep_all) if placed.is_evident else placed
             yield placed
             if placed.is_evident and not all_places:
                 return
@@ -326,7 +330,7 @@ def answer_observation(
         answers = list(answers_in(frame, model, keep_all))
         if not answers:
             raise NoFit(NOWHERE)
-        best = frame.finished(max(answers, key=lambda placed: placed.nats))
+        best = frame.finished(max(answers, key=lambda placed: placed.nats), keep_all)
     answer = absent(best) if best.nats < UNLIKELY else doubted(best.answer, best.outline, 0.0)
     seconds = time.perf_counter() - started
     return replace(answer, resolution=resolution, label_points=label_points, seconds=seconds)
