@@ -30,7 +30,7 @@ from mereo.io.readers import depth_of, read_pose, usable_depth
 from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame, along_z, in_camera, read_frame
 from mereo.locating import following
-from mereo.locating.whole_frame import answer_observation, is_whole
+from mereo.locating.whole_frame import answer_observation, at_point, is_whole
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import (
     CLOUD,
@@ -203,8 +203,8 @@ def reconstruct(
         initial_pose: rough pose of the object, as ``Result.pose``, from which the fit starts instead of a search or a
             network; what the scene holds (``held``) stays there. Both units must be known.
         options: fields of ``isolation`` by themselves, ``extent="partial"`` where a part of the object is hidden or cut
-            off, ``box``, ``remove_plane``, ``keep_all`` and others; and arguments of ``load_frame``, ``axes``,
-            ``unit_m``, ``intrinsics``, ``drop_invalid`` and others.
+            off, ``point=(u, v)``, the column and row of a pixel of the object, ``box``, ``remove_plane`` and others; and
+            arguments of ``load_frame``, ``axes``, ``unit_m``, ``intrinsics``, ``mask`` and others.
 
     Warns with ``SizeWarning`` where the visible part cannot be the object of the weights, and without weights with
     ``ClustersWarning`` where the cloud may be two objects. Raises ``ValueError`` for unusable frames,
@@ -243,6 +243,7 @@ def reconstruct_observation(
     Takes its arguments, raises and warns as it does. Of ``isolation`` it matters whether every point is kept.
     """
     registrar = object.registrar(method)
+    seen = at_point(seen, registrar)
     is_alone = registrar is None or not is_whole(seen, registrar)
     if object.network is None and is_alone and (warning := clusters_warning(seen)) is not None:
         warnings.warn(in_callers_words(warning), ClustersWarning, stacklevel=3)

@@ -6,6 +6,7 @@ DepthImage -regions-> masks -quick look-> places, the most evident first -choose
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 from jaxtyping import Bool
@@ -28,10 +29,10 @@ from mereo.io.bounds import Cells, check_value
 from mereo.io.cores import limit_blas_threads
 from mereo.io.progress import stage
 from mereo.locating.outline import Jumps, Outline, compare_outline
-from mereo.locating.regions import SIZES, regions, steepest, thinned
+from mereo.locating.regions import GAPS, SIZES, connected_pixels, regions, steepest, thinned
 from mereo.models.trained import Trained
 from mereo.reconstruction.isolation import IsolationStep, Reading, Selection
-from mereo.reconstruction.observation import Observation
+from mereo.reconstruction.observation import Observation, kept_pixels
 from mereo.reconstruction.pipeline import encode_frame
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.depth_sensor import render_depth
@@ -52,9 +53,21 @@ UNLIKELY = -5.0
 
 NOWHERE = (
     "nothing in the whole frame is of the object's size and shape: check both units (--depth-scale, --units), or say "
-    "where it is (--mask, --box)"
+    "where it is (--point, --mask, --box)"
 )
 """Sentence about a frame without any place."""
+
+NOT_AT_POINT = (
+    "nothing at the point {} {} is of the object's size and shape: check both units (--depth-scale, --units), give a "
+    "point nearer to its middle, or cut it out (--mask)"
+)
+"""The same where a point says where the object is: its column and row."""
+
+CROPS = ("depth range", "box")
+"""Steps of isolation that leave a part of the image, in which the object is one thing among others."""
+
+AT_POINT = 2
+"""Pixels of a thinned image around a point that are taken for it."""
 
 NEAR, REGION_NEAR = 0.1, 3.0
 """Distance along a ray from a state, in half lengths, up to which pixels are taken for the object's, and in that the
@@ -64,8 +77,9 @@ distance from its surface up to which those of its region are."""
 def part_of(seen: Observation, mask: Bool[np.ndarray, "h w"]) -> Observation:
     """The object in a frame as a mask of its whole image has it."""
     assert seen.frame.whole is not None
-    keep = mask[seen.frame.whole.valid]
-    steps = (IsolationStep("whole frame", len(keep), int(keep.sum()), "where the object is likeliest"),)
+    keep = (mask & kept_pixels(seen.frame, seen.selection))[seen.frame.whole.valid]
+    step = IsolationStep("whole frame", len(seen.cloud), int(keep.sum()), "where the object is likeliest")
+    steps = (*seen.steps, step)
     selection = Selection(keep, np.ones_like(keep), np.zeros_like(keep), steps)
     return replace(seen, cloud=seen.frame.cloud.rows(keep), selection=selection, steps=steps)
 
@@ -98,8 +112,8 @@ class WholeFrame:
     """Whole depth image, in which an object of a known size is looked for.
 
     Attributes:
-        seen: all of the frame.
-        thin: the same with the thinned image.
+        seen: all of the frame, or what is in a box.
+        thin: all of it with the thinned image.
         registrar: of the object.
         unit: length of a scene unit in the frame's unit.
         jumps: of the thinned image.
@@ -120,7 +134,9 @@ class WholeFrame:
         assert seen.frame.whole is not None and unit is not None
         length = 2 * registrar.model.half * unit
         image, every = thinned(seen.frame.whole, length)
-        thin = replace(seen, frame=replace(seen.frame, cloud=image.to_points(), depth=image, whole=image))
+        cloud = image.to_points()
+        frame = replace(seen.frame, cloud=cloud, depth=image, whole=image)
+        thin = replace(seen, frame=frame, cloud=cloud, selection=None)
         return cls(seen, thin, registrar, unit, Jumps.of(image, length), every)
 
     @property
@@ -128,6 +144,19 @@ class WholeFrame:
         """Image with all that was measured."""
         assert self.seen.frame.whole is not None
         return self.seen.frame.whole
+
+    @property
+    def nowhere(self) -> str:
+        """Sentence about the frame without any place."""
+        return NOWHERE if self.seen.point is None else NOT_AT_POINT.format(*self.seen.point)
+
+    def is_at_point(self, pixels: Bool[np.ndarray, "h w"]) -> bool:
+        """Whether pixels of the thinned image are at the frame's point, or it has none."""
+        if self.seen.point is None:
+            return True
+        column, row = (number // self.every for number in self.seen.point)
+        near = np.s_[max(row - AT_POINT, 0) : row + AT_POINT + 1, max(column - AT_POINT, 0) : column + AT_POINT + 1]
+        return bool(pixels[near].any())
 
     def problem(self, seen: Observation) -> Problem:
         """What a fit to the object in the frame works on; raises ``ValueError`` for what none can start from."""
@@ -156,7 +185,10 @@ class WholeFrame:
         """Places where the object may be, the most evident first."""
         model, places = self.registrar.model, list[Place]()
         area = self.unit**2 * ConvexHull(model.rest_points).area / 4  # of its shadow, over all directions
-        for mask in regions(self.jumps.image, 2 * model.half * self.unit, area)[:LOOKS]:
+        image, part = self.jumps.image, np.s_[self.every // 2 :: self.every, self.every // 2 :: self.every]
+        kept = DepthImage(np.where(kept_pixels(self.seen.frame, self.seen.selection)[part], image.depth, 0), image.camera)
+        masks = filter(self.is_at_point, regions(kept, 2 * model.half * self.unit, area))
+        for mask in islice(masks, LOOKS):
             try:
                 places.append(self.look(mask))
             except ValueError:
@@ -188,17 +220,45 @@ def located(frame: WholeFrame) -> Observation:
     """The object at the most evident place of a frame; raises ``NoFit`` where there is none."""
     places = frame.places()
     if not places:
-        raise NoFit(NOWHERE)
+        raise NoFit(frame.nowhere)
     return frame.chosen(frame.sharpened(places[0]))
 
 
 def is_whole(seen: Observation, registrar: Registrar) -> bool:
-    """Whether a frame is a depth image that plainly shows more than the object, whose size is known."""
+    """Whether a frame is a depth image that plainly shows more than the object, whose size is known.
+
+    So may be a part of the image in a box, or a range of depths. A mask is of the object alone.
+    """
     frame, unit = seen.frame, scene_unit_of(seen, registrar, None)
     if unit is None or seen.initial_pose is not None or frame.whole is None or frame.depth is None:
         return False
-    is_all = len(seen.cloud) == int(frame.whole.valid.sum()) >= 4 * MIN_POINTS
+    crops = [step.kept for step in seen.steps if step.name in CROPS]
+    is_all = len(frame.cloud) == int(frame.whole.valid.sum()) and len(crops) == len(seen.steps)
+    is_all &= len(seen.cloud) == [len(frame.cloud), *crops][-1] >= 4 * MIN_POINTS
     return is_all and seen.main_length > SIZES[1] * 2 * registrar.model.half * unit
+
+
+def at_point(seen: Observation, registrar: Registrar | None) -> Observation:
+    """The object as the connected surface at its point, where the frame is not looked through; else the same.
+
+    Raises ``ValueError`` for a surface of too few pixels.
+    """
+    if seen.point is None or seen.frame.depth is None or (registrar is not None and is_whole(seen, registrar)):
+        return seen
+    image, (column, row) = seen.frame.depth, seen.point
+    label = connected_pixels(
+        np.where(kept_pixels(seen.frame, seen.selection), image.depth, 0.0), GAPS[0] * steepest(image)
+    )
+    keep = (label == label[row, column])[image.valid]
+    count = int(keep.sum())
+    if count < MIN_POINTS:
+        raise ValueError(
+            f"the surface at the point {column} {row} has {count} pixels, and the object needs at least {MIN_POINTS}: "
+            "give a point on a larger part of it, or a mask (--mask)"
+        )
+    steps = (*seen.steps, IsolationStep("point", len(seen.cloud), count, f"the surface at {column} {row}"))
+    selection = Selection(keep, np.ones_like(keep), np.zeros_like(keep), steps)
+    return replace(seen, cloud=seen.frame.cloud.rows(keep), selection=selection, steps=steps, point=None)
 
 
 def chance(model: StatisticalModel) -> float:
@@ -249,7 +309,10 @@ def answers_in(
             continue
         if answer.registration is None:
             continue
-        placed = PlacedAnswer(place, answer, frame.outline(answer.registration.mesh))
+        mesh = answer.registration.mesh
+        if not frame.is_at_point(pixels_near(frame.jumps.image, mesh, NEAR * frame.registrar.model.half * frame.unit)):
+            continue
+        placed = PlacedAnswer(place, answer, frame.outline(mesh))
         yield placed
         if placed.nats > 0 and answer.recognition.known is True and not all_places:
             break
@@ -277,9 +340,10 @@ def answer_observation(
     check_value("resolution", resolution, Cells, 128)
     started = time.perf_counter()
     with stage("look through the whole frame"), limit_blas_threads():
-        answers = list(answers_in(WholeFrame.of(seen, registrar), model, keep_all))
+        frame = WholeFrame.of(seen, registrar)
+        answers = list(answers_in(frame, model, keep_all))
     if not answers:
-        raise NoFit(NOWHERE)
+        raise NoFit(frame.nowhere)
     best = max(answers, key=lambda placed: placed.nats)
     answer = absent(best) if best.nats < UNLIKELY else doubted(best.answer, best.outline, 0.0)
     seconds = time.perf_counter() - started
@@ -317,9 +381,10 @@ def absent(best: PlacedAnswer) -> Answer:
     """Answer to a frame in which nothing is likelier to be the object than something else."""
     answer = best.answer
     x, y, z = answer.seen.cloud.points.mean(axis=0) * answer.seen.frame.metres
+    where = "in this frame" if answer.seen.point is None else "at the point {} {}".format(*answer.seen.point)
     reason = (
-        f"the object is not in this frame; what is most like it, at {x:.3g} {y:.3g} {z:.3g} "
+        f"the object is not {where}; what is most like it, at {x:.3g} {y:.3g} {z:.3g} "
         f"{answer.seen.frame.length_name}, has another outline or shape: take a frame that shows more of it, or say "
-        "where it is (--mask, --box)"
+        "where it is (--point, --mask, --box)"
     )
     return replace(answer, recognition=replace(answer.recognition, known=False, reason=reason))

@@ -38,6 +38,10 @@ LIKE_SIZE, APART = 0.4, 0.25
 may be objects."""
 
 
+HOLE_PX = 5
+"""Pixels from a point that is stated up to which the object is measured: cameras leave holes, and hands are unsure."""
+
+
 class FrameWarning(UserWarning):
     """Warning that what is seen may not be the object, or not the object alone."""
 
@@ -63,6 +67,7 @@ class Observation:
             where "auto" has found one.
         initial_pose: rough ``T_camera_model`` from which a fit starts, as ``Result.pose``; None where a search or a
             network finds the object.
+        point: column and row of a measured pixel that shows the object; None where nothing says so.
     """
 
     frame: SensorFrame
@@ -71,6 +76,7 @@ class Observation:
     selection: Selection | None = None
     extent: Extent = "auto"
     initial_pose: Float[np.ndarray, "4 4"] | None = None
+    point: tuple[int, int] | None = None
 
     @cached_property
     def lines(self) -> SightLines:
@@ -187,7 +193,8 @@ def find_object(
 
     A frame whose unit is not known is taken to be in metres.
 
-    Raises ``ValueError`` where too little is left, and for a range of depths in a scanner's axes.
+    Raises ``ValueError`` where too little is left, for a range of depths in a scanner's axes, and for a point without a
+    measurement.
     """
     if isolation.depth_range is not None and frame.axes == "scanner":
         raise ValueError(
@@ -209,7 +216,44 @@ def find_object(
                 "leave out --extent surface"
             )
         frame = replace(frame, axes="scanner")  # in which nobody knows where a camera was
-    return Observation(frame, cloud, selection.steps, selection, extent)
+    point = None if isolation.point is None else measured_pixel(frame, selection, isolation.point)
+    return Observation(frame, cloud, selection.steps, selection, extent, point=point)
+
+
+def kept_pixels(frame: SensorFrame, selection: Selection | None) -> Bool[np.ndarray, "h w"]:
+    """Measured pixels of a frame's depth image that isolation keeps; None keeps all."""
+    assert frame.depth is not None
+    kept = frame.depth.valid.copy()
+    kept[kept] = selection is None or selection.of_object(frame.cloud.points)
+    return kept
+
+
+def measured_pixel(frame: SensorFrame, selection: Selection, point: tuple[float, float]) -> tuple[int, int]:
+    """Column and row of the pixel that isolation keeps which is nearest to a point of a depth image.
+
+    Raises ``ValueError`` for a frame without pixels, a point outside of them, and one more than ``HOLE_PX`` from all.
+    """
+    column, row = map(int, point)
+    if frame.depth is None:
+        raise ValueError(
+            f"the point {column} {row} is given, but {frame.path} is a point cloud, which has no pixels: crop with --box"
+        )
+    height, width = frame.depth.depth.shape
+    if column >= width or row >= height:
+        raise ValueError(
+            f"the point {column} {row} lies outside {frame.source}, which is {width} x {height} pixels: give the column, "
+            "then the row, of a pixel on the object, both from 0 at the upper left"
+        )
+    rows, columns = np.nonzero(kept_pixels(frame, selection))
+    distance = np.hypot(columns - column, rows - row)
+    nearest = int(distance.argmin())
+    if distance[nearest] > HOLE_PX:
+        raise ValueError(
+            f"nothing of the object is measured within {HOLE_PX} pixels of the point {column} {row}; the nearest "
+            f"measured pixel that is kept is {distance[nearest]:.0f} away: give one on the object that has a depth, in "
+            f"this direction --point {columns[nearest]} {rows[nearest]}"
+        )
+    return int(columns[nearest]), int(rows[nearest])
 
 
 def _is_straight(points: Float[np.ndarray, "n 3"]) -> bool:
