@@ -148,7 +148,7 @@ def test_a_mask_or_an_object_alone_is_not_looked_through(
 
 def test_a_frame_of_one_plane_holds_nothing_and_that_is_a_sentence(angle: mereo.Object) -> None:
     wall = DepthImage(np.full((180, 240), 1.0), CAMERA)
-    with pytest.raises(ValueError, match="nothing in the whole frame is of the object's size and shape: check both"):
+    with pytest.raises(ValueError, match="nothing in this frame is of the object's size and shape: check both"):
         mereo.reconstruct(wall, angle, unit_m=1.0)
 
 

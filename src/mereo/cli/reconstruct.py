@@ -156,9 +156,8 @@ def reconstruct_frame(frame: SensorFrame, directory: Path, job: FrameJob, path: 
     command = job.command
     seen = at_point(replace(find_object(frame, command.isolation), initial_pose=job.initial_pose), job.registrar)
     is_looked_through = job.registrar is not None and is_whole(seen, job.registrar)
-    where = "" if seen.point is None else ", at the pixel {} {}".format(*seen.point)
-    within = f"{len(seen.cloud)} points {'that are kept' if seen.steps else 'of the frame'}{where}"
-    print(f"the object is looked for in all {within}" if is_looked_through else seen)
+    within = f"all {len(seen.cloud)} points {'that are kept' if seen.steps else 'of the frame'}"
+    print(f"the object is looked for in {within}" if is_looked_through else seen)
     placed = job.placed  # what is carried is refused before the work
     result = reconstruct_observation(
         seen,

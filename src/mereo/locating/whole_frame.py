@@ -32,7 +32,7 @@ from mereo.locating.outline import Jumps, Outline, compare_outline
 from mereo.locating.regions import GAPS, SIZES, connected_pixels, regions, steepest, thinned
 from mereo.models.trained import Trained
 from mereo.reconstruction.isolation import IsolationStep, Reading, Selection
-from mereo.reconstruction.observation import Observation, kept_pixels
+from mereo.reconstruction.observation import HOLE_PX, Observation
 from mereo.reconstruction.pipeline import encode_frame
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.depth_sensor import render_depth
@@ -52,22 +52,13 @@ UNLIKELY = -5.0
 """Nats below which a frame does not show the object at a place; up to 0 it may."""
 
 NOWHERE = (
-    "nothing in the whole frame is of the object's size and shape: check both units (--depth-scale, --units), or say "
+    "nothing {} is of the object's size and shape: check both units (--depth-scale, --units), or say "
     "where it is (--point, --mask, --box)"
 )
-"""Sentence about a frame without any place."""
-
-NOT_AT_POINT = (
-    "nothing at the point {} {} is of the object's size and shape: check both units (--depth-scale, --units), give a "
-    "point nearer to its middle, or cut it out (--mask)"
-)
-"""The same where a point says where the object is: its column and row."""
+"""Sentence about a frame without any place, which has a word for where."""
 
 CROPS = ("depth range", "box")
 """Steps of isolation that leave a part of the image, in which the object is one thing among others."""
-
-AT_POINT = 2
-"""Pixels of a thinned image around a point that are taken for it."""
 
 NEAR, REGION_NEAR = 0.1, 3.0
 """Distance along a ray from a state, in half lengths, up to which pixels are taken for the object's, and in that the
@@ -77,7 +68,7 @@ distance from its surface up to which those of its region are."""
 def part_of(seen: Observation, mask: Bool[np.ndarray, "h w"]) -> Observation:
     """The object in a frame as a mask of its whole image has it."""
     assert seen.frame.whole is not None
-    keep = (mask & kept_pixels(seen.frame, seen.selection))[seen.frame.whole.valid]
+    keep = (mask & seen.kept_pixels())[seen.frame.whole.valid]
     step = IsolationStep("whole frame", len(seen.cloud), int(keep.sum()), "where the object is likeliest")
     steps = (*seen.steps, step)
     selection = Selection(keep, np.ones_like(keep), np.zeros_like(keep), steps)
@@ -145,18 +136,17 @@ class WholeFrame:
         assert self.seen.frame.whole is not None
         return self.seen.frame.whole
 
-    @property
-    def nowhere(self) -> str:
-        """Sentence about the frame without any place."""
-        return NOWHERE if self.seen.point is None else NOT_AT_POINT.format(*self.seen.point)
+    def thinned(self, pixels: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "i j"]:
+        """Pixels of the whole image that the thinned one has as well."""
+        return pixels[self.every // 2 :: self.every, self.every // 2 :: self.every]
 
     def is_at_point(self, pixels: Bool[np.ndarray, "h w"]) -> bool:
-        """Whether pixels of the thinned image are at the frame's point, or it has none."""
-        if self.seen.point is None:
-            return True
-        column, row = (number // self.every for number in self.seen.point)
-        near = np.s_[max(row - AT_POINT, 0) : row + AT_POINT + 1, max(column - AT_POINT, 0) : column + AT_POINT + 1]
-        return bool(pixels[near].any())
+        """Whether some pixels of the thinned image are at the frame's point; any are where it has none."""
+        return bool(pixels[self.thinned(self.seen.near_point(HOLE_PX * self.every))].any())
+
+    def explained(self, mesh: SegmentedMesh) -> Bool[np.ndarray, "h w"]:
+        """Pixels of the thinned image that see what lies as far away as a mesh does there."""
+        return pixels_near(self.jumps.image, mesh, NEAR * self.registrar.model.half * self.unit)
 
     def problem(self, seen: Observation) -> Problem:
         """What a fit to the object in the frame works on; raises ``ValueError`` for what none can start from."""
@@ -185,10 +175,9 @@ class WholeFrame:
         """Places where the object may be, the most evident first."""
         model, places = self.registrar.model, list[Place]()
         area = self.unit**2 * ConvexHull(model.rest_points).area / 4  # of its shadow, over all directions
-        image, part = self.jumps.image, np.s_[self.every // 2 :: self.every, self.every // 2 :: self.every]
-        kept = DepthImage(np.where(kept_pixels(self.seen.frame, self.seen.selection)[part], image.depth, 0), image.camera)
-        masks = filter(self.is_at_point, regions(kept, 2 * model.half * self.unit, area))
-        for mask in islice(masks, LOOKS):
+        image, kept = self.jumps.image, self.thinned(self.seen.kept_pixels())
+        part = DepthImage(np.where(kept, image.depth, 0.0), image.camera)
+        for mask in islice(filter(self.is_at_point, regions(part, 2 * model.half * self.unit, area)), LOOKS):
             try:
                 places.append(self.look(mask))
             except ValueError:
@@ -220,7 +209,7 @@ def located(frame: WholeFrame) -> Observation:
     """The object at the most evident place of a frame; raises ``NoFit`` where there is none."""
     places = frame.places()
     if not places:
-        raise NoFit(frame.nowhere)
+        raise NoFit(NOWHERE.format(frame.seen.where))
     return frame.chosen(frame.sharpened(places[0]))
 
 
@@ -246,9 +235,7 @@ def at_point(seen: Observation, registrar: Registrar | None) -> Observation:
     if seen.point is None or seen.frame.depth is None or (registrar is not None and is_whole(seen, registrar)):
         return seen
     image, (column, row) = seen.frame.depth, seen.point
-    label = connected_pixels(
-        np.where(kept_pixels(seen.frame, seen.selection), image.depth, 0.0), GAPS[0] * steepest(image)
-    )
+    label = connected_pixels(np.where(seen.kept_pixels(), image.depth, 0.0), GAPS[0] * steepest(image))
     keep = (label == label[row, column])[image.valid]
     count = int(keep.sum())
     if count < MIN_POINTS:
@@ -307,12 +294,9 @@ def answers_in(
             answer = answer_frame(seen, model, frame.registrar, keep_all=keep_all, scene_unit=scene_unit)
         except ValueError:
             continue
-        if answer.registration is None:
+        if answer.registration is None or not frame.is_at_point(frame.explained(answer.registration.mesh)):
             continue
-        mesh = answer.registration.mesh
-        if not frame.is_at_point(pixels_near(frame.jumps.image, mesh, NEAR * frame.registrar.model.half * frame.unit)):
-            continue
-        placed = PlacedAnswer(place, answer, frame.outline(mesh))
+        placed = PlacedAnswer(place, answer, frame.outline(answer.registration.mesh))
         yield placed
         if placed.nats > 0 and answer.recognition.known is True and not all_places:
             break
@@ -340,10 +324,9 @@ def answer_observation(
     check_value("resolution", resolution, Cells, 128)
     started = time.perf_counter()
     with stage("look through the whole frame"), limit_blas_threads():
-        frame = WholeFrame.of(seen, registrar)
-        answers = list(answers_in(frame, model, keep_all))
+        answers = list(answers_in(WholeFrame.of(seen, registrar), model, keep_all))
     if not answers:
-        raise NoFit(frame.nowhere)
+        raise NoFit(NOWHERE.format(seen.where))
     best = max(answers, key=lambda placed: placed.nats)
     answer = absent(best) if best.nats < UNLIKELY else doubted(best.answer, best.outline, 0.0)
     seconds = time.perf_counter() - started
@@ -381,9 +364,8 @@ def absent(best: PlacedAnswer) -> Answer:
     """Answer to a frame in which nothing is likelier to be the object than something else."""
     answer = best.answer
     x, y, z = answer.seen.cloud.points.mean(axis=0) * answer.seen.frame.metres
-    where = "in this frame" if answer.seen.point is None else "at the point {} {}".format(*answer.seen.point)
     reason = (
-        f"the object is not {where}; what is most like it, at {x:.3g} {y:.3g} {z:.3g} "
+        f"the object is not {answer.seen.where}; what is most like it, at {x:.3g} {y:.3g} {z:.3g} "
         f"{answer.seen.frame.length_name}, has another outline or shape: take a frame that shows more of it, or say "
         "where it is (--point, --mask, --box)"
     )

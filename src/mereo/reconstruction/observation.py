@@ -88,6 +88,47 @@ class Observation:
         """``main_length`` of the object's points, which takes long to find for a whole image."""
         return main_length(self.cloud.points)
 
+    @property
+    def where(self) -> str:
+        """Phrase for where the object is looked for."""
+        return "in this frame" if self.point is None else "at the point {} {}".format(*self.point)
+
+    def near_point(self, distance: float) -> Bool[np.ndarray, "h w"]:
+        """Pixels of the depth image up to this many from the point; all where there is none."""
+        assert self.frame.depth is not None
+        column, row, most = (0, 0, np.inf) if self.point is None else (*self.point, distance)
+        rows, columns = np.indices(self.frame.depth.depth.shape)
+        return np.asarray(np.hypot(columns - column, rows - row) <= most)
+
+    def kept_pixels(self) -> Bool[np.ndarray, "h w"]:
+        """Measured pixels of the depth image that isolation keeps."""
+        assert self.frame.depth is not None
+        kept = self.frame.depth.valid.copy()
+        kept[kept] = self.selection is None or self.selection.of_object(self.frame.cloud.points)
+        return kept
+
+    def at_point(self, point: tuple[float, float]) -> "Observation":
+        """The object with the measured pixel that is nearest to a point, its column and row.
+
+        Raises ``ValueError`` for a frame without pixels, a point outside of them, and one ``HOLE_PX`` away from all.
+        """
+        (column, row), image = map(int, point), self.frame.depth
+        if image is None or column >= image.camera.width or row >= image.camera.height:
+            size = "no depth image" if image is None else f"{image.camera.width} x {image.camera.height} pixels"
+            raise ValueError(
+                f"the point {column} {row} is given, but {self.frame.source} is {size}; it must be the column and the "
+                "row of a pixel on the object, from 0 at the upper left: correct it, or crop with --box"
+            )
+        rows, columns = np.nonzero(self.kept_pixels())
+        distance = np.hypot(columns - column, rows - row)
+        nearest = int(distance.argmin())
+        if distance[nearest] > HOLE_PX:
+            raise ValueError(
+                f"nothing is measured within {HOLE_PX} pixels of the point {column} {row} (the nearest pixel that is "
+                f"kept is {columns[nearest]} {rows[nearest]}); a depth of the object is needed: give another point on it"
+            )
+        return replace(self, point=(int(columns[nearest]), int(rows[nearest])))
+
     @cached_property
     def self_hidden(self) -> float:
         """Share of the points that others would hide from the camera (``hidden_share``); 0 of an image or a surface."""
@@ -216,44 +257,8 @@ def find_object(
                 "leave out --extent surface"
             )
         frame = replace(frame, axes="scanner")  # in which nobody knows where a camera was
-    point = None if isolation.point is None else measured_pixel(frame, selection, isolation.point)
-    return Observation(frame, cloud, selection.steps, selection, extent, point=point)
-
-
-def kept_pixels(frame: SensorFrame, selection: Selection | None) -> Bool[np.ndarray, "h w"]:
-    """Measured pixels of a frame's depth image that isolation keeps; None keeps all."""
-    assert frame.depth is not None
-    kept = frame.depth.valid.copy()
-    kept[kept] = selection is None or selection.of_object(frame.cloud.points)
-    return kept
-
-
-def measured_pixel(frame: SensorFrame, selection: Selection, point: tuple[float, float]) -> tuple[int, int]:
-    """Column and row of the pixel that isolation keeps which is nearest to a point of a depth image.
-
-    Raises ``ValueError`` for a frame without pixels, a point outside of them, and one more than ``HOLE_PX`` from all.
-    """
-    column, row = map(int, point)
-    if frame.depth is None:
-        raise ValueError(
-            f"the point {column} {row} is given, but {frame.path} is a point cloud, which has no pixels: crop with --box"
-        )
-    height, width = frame.depth.depth.shape
-    if column >= width or row >= height:
-        raise ValueError(
-            f"the point {column} {row} lies outside {frame.source}, which is {width} x {height} pixels: give the column, "
-            "then the row, of a pixel on the object, both from 0 at the upper left"
-        )
-    rows, columns = np.nonzero(kept_pixels(frame, selection))
-    distance = np.hypot(columns - column, rows - row)
-    nearest = int(distance.argmin())
-    if distance[nearest] > HOLE_PX:
-        raise ValueError(
-            f"nothing of the object is measured within {HOLE_PX} pixels of the point {column} {row}; the nearest "
-            f"measured pixel that is kept is {distance[nearest]:.0f} away: give one on the object that has a depth, in "
-            f"this direction --point {columns[nearest]} {rows[nearest]}"
-        )
-    return int(columns[nearest]), int(rows[nearest])
+    seen = Observation(frame, cloud, selection.steps, selection, extent)
+    return seen if isolation.point is None else seen.at_point(isolation.point)
 
 
 def _is_straight(points: Float[np.ndarray, "n 3"]) -> bool:
