@@ -58,7 +58,10 @@ class FrameOptions(BaseModel):
 
     def isolation(self) -> IsolationConfig:
         """What of the frame is left out; raises ``Refused`` (422)."""
-        counted = {name: _of(getattr(self, name), count, name) for name, count in (("depth_range", 2), ("box", 6), ("point", 2))}
+        counted = {
+            name: _of(getattr(self, name), count, name)
+            for name, count in (("depth_range", 2), ("box", 6), ("point", 2))
+        }
         return self._config(IsolationConfig, counted)
 
     def _config(self, kind: type[Config], changed: dict[str, Any]) -> Config:

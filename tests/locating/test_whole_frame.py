@@ -18,7 +18,7 @@ from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import rigid, transform_points
 from mereo.locating.outline import Jumps, Outline, compare_outline
 from mereo.locating.regions import connected_pixels, off_planes, regions, thinned
-from mereo.locating.whole_frame import BY_MASK, doubted, is_whole
+from mereo.locating.whole_frame import BY_MASK, Place, WholeFrame, at_point, doubted, is_whole
 from mereo.reconstruction.observation import find_object, noise_around
 from mereo.synthesis.depth_sensor import add_depth_noise, render_depth
 
@@ -159,6 +159,107 @@ def test_an_outline_that_is_not_the_images_makes_an_answer_unsure_or_refuses_it(
     assert few.known == "unsure" and wrong.known is False
     assert wrong.reason is not None and "20 of 60 pixels of it have an edge" in wrong.reason
     assert doubted(found, Outline(hits=20), BY_MASK) is found, "a mask says where it is"
+
+
+# --- where it is ------------------------------------------------------------------------------------------------------
+
+
+def pixel_of(place: np.ndarray) -> tuple[int, int]:
+    column, row = np.floor(CAMERA.project(place[None])[0]).astype(int)
+    return int(column), int(row)
+
+
+CAN = pixel_of(on_desk(-0.16, 0.04, 0.05))
+BOX = (-0.11, -0.2, 0.4, 0.1, 0.2, 0.75)
+"""Metres: the angle and the desk around it, without the ball, the can and the wall."""
+
+
+@pytest.fixture(scope="module")
+def on_angle(placed: SegmentedMesh) -> tuple[int, int]:
+    """Pixel in the middle of the angle."""
+    rows, columns = np.nonzero(render_depth(placed, CAMERA).valid)
+    middle = np.hypot(rows - rows.mean(), columns - columns.mean()).argmin()
+    return int(columns[middle]), int(rows[middle])
+
+
+def looked_at(image: DepthImage, angle: mereo.Object, config: mereo.IsolationConfig) -> list[np.ndarray]:
+    """Regions that would be looked at; none of them is."""
+    registrar, looked = angle.registrar("auto"), list[np.ndarray]()
+    assert registrar is not None
+
+    def look(frame: WholeFrame, mask: np.ndarray) -> Place:
+        looked.append(mask)
+        raise ValueError
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(WholeFrame, "look", look)
+        seen = find_object(mereo.load_frame(image, unit_m=1.0), config)
+        assert is_whole(seen, registrar) and not WholeFrame.of(seen, registrar).places()
+    return looked
+
+
+def test_only_what_is_seen_at_a_point_is_looked_at(
+    image: DepthImage, angle: mereo.Object, on_angle: tuple[int, int]
+) -> None:
+    every = looked_at(image, angle, mereo.IsolationConfig())
+    (column, row), at_it = on_angle, looked_at(image, angle, mereo.IsolationConfig(point=on_angle))
+    assert 0 < len(at_it) < len(every) and all(mask[row - 2 : row + 3, column].any() for mask in at_it)
+    (can,) = looked_at(image, angle, mereo.IsolationConfig(point=CAN))
+    assert can[CAN[1], CAN[0]] and not can[row, column]
+
+
+def test_a_box_is_looked_through_where_it_shows_more_than_the_object(
+    image: DepthImage, placed: SegmentedMesh, angle: mereo.Object
+) -> None:
+    frame, registrar, (low, high) = mereo.load_frame(image, unit_m=1.0), angle.registrar("auto"), placed.bounds
+    assert registrar is not None
+    tight = mereo.IsolationConfig(box=(*low, *high))
+    for config in (tight, mereo.IsolationConfig(box=BOX, remove_plane=True)):
+        assert not is_whole(find_object(frame, config), registrar)
+    places = CAMERA.directions() * image.depth[..., None]
+    for mask in (masks := looked_at(image, angle, mereo.IsolationConfig(box=BOX))):
+        assert (places[mask] >= BOX[:3]).all() and (places[mask] <= BOX[3:]).all()
+    assert masks
+    with pytest.raises(ValueError, match=f"the point {CAN[0]} {CAN[1]} lies outside .* or more than 5 pixels from any"):
+        find_object(frame, mereo.IsolationConfig(box=BOX, point=CAN))
+
+
+@pytest.mark.slow
+def test_a_point_or_a_box_has_the_answer_of_the_whole_frame_and_another_point_none(
+    found: mereo.Result, image: DepthImage, angle: mereo.Object, on_angle: tuple[int, int]
+) -> None:
+    frame = mereo.load_frame(image, unit_m=1.0)
+    for options in ({"point": on_angle}, {"box": BOX}, {"box": BOX, "point": on_angle}):
+        narrowed = mereo.reconstruct(frame, angle, **options)
+        assert narrowed.known is True and narrowed.seen.steps[-1].name == "whole frame"
+        np.testing.assert_allclose(narrowed.pose, found.pose, atol=2e-3)
+    wrong = mereo.reconstruct(frame, angle, point=CAN).recognition
+    assert wrong.known is False and f"the object is not at the point {CAN[0]} {CAN[1]}; " in str(wrong.reason)
+
+
+def test_without_a_known_size_a_point_keeps_the_connected_surface(image: DepthImage) -> None:
+    frame = mereo.load_frame(image)
+    seen = find_object(frame, mereo.IsolationConfig(remove_plane=True, depth_range=(0.3, 1.2), point=CAN))
+    kept = at_point(seen, None)
+    assert [step.name for step in kept.steps] == ["depth range", "plane", "point"] and at_point(kept, None) is kept
+    assert np.linalg.norm(kept.cloud.points - on_desk(-0.16, 0.025, 0.08), axis=1).max() < 0.08 < seen.size_m[0]
+
+
+@pytest.mark.parametrize(
+    ("point", "message"),
+    [
+        ((400, 20), "the point 400 20 lies outside the 240 x 180 pixels of"),
+        ((3, 3), r"more than 5 pixels from any that is measured and kept \(the nearest is "),
+        ((-1, 3), r"the point is \(-1, 3\); it must be the column and the row .* give for example point=\(320, 240\)"),
+        ((np.nan, 2.0), "it must be the column and the row"),
+    ],
+)
+def test_a_point_that_shows_nothing_is_refused(point: tuple[float, ...], message: str, angle: mereo.Object) -> None:
+    image = DepthImage(np.pad(np.full((150, 210), 0.8), 15), CAMERA)
+    with pytest.raises(ValueError, match=message):
+        mereo.reconstruct(image, angle, unit_m=1.0, point=point)
+    with pytest.raises(ValueError, match="is no depth image, and has no pixel at a point: crop with box"):
+        mereo.reconstruct(image.to_points(), angle, point=(20, 20))
 
 
 # --- regions ----------------------------------------------------------------------------------------------------------

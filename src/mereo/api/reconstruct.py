@@ -212,7 +212,7 @@ def reconstruct(
         initial_pose: rough pose of the object, as ``Result.pose``, from which the fit starts instead of a search or a
             network; what the scene holds (``held``) stays there. Both units must be known.
         options: fields of ``isolation`` by themselves, ``extent="partial"`` where a part of the object is hidden or cut
-            off, ``point=(u, v)``, the column and row of a pixel of the object, ``box``, ``remove_plane`` and others; and
+            off, ``point=(u, v)``, the column and row of a pixel of the object, ``box`` and others; and
             arguments of ``load_frame``, ``axes``, ``unit_m``, ``intrinsics``, ``mask`` and others.
 
     Warns with ``SizeWarning`` where the visible part cannot be the object of the weights, and without weights with

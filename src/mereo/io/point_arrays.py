@@ -184,25 +184,23 @@ def mask_image(mask: Any) -> Image.Image:
     """
     if isinstance(mask, Image.Image):
         return mask
-    values = _array(mask, f"the mask, a {type(mask).__name__},", "pixels are needed: give an array of h x w truth values")
+    values = _array(mask, f"the mask, a {type(mask).__name__},", "pixels are needed: give h x w truth values")
     name = f"the mask of shape {values.shape}"
     if values.dtype != np.bool_:
         check_real(values, name)
     while values.ndim > 2 and len(values) == 1:
         values = values[0]
-    if values.ndim == 3 and values.shape[-1] not in (3, 4):
-        raise ValueError(
-            f"{name} is {len(values)} masks; one of them is the object's: choose it, as masks[scores.argmax()]"
-        )
     if values.ndim != 2 or not values.size:
-        raise ValueError(f"{name} is no picture; it must have a value for each pixel: give h x w values")
+        raise ValueError(
+            f"{name} is not one mask of h x w pixels; of several one is needed: choose it, as masks[scores.argmax()]"
+        )
     if values.dtype.kind != "f":
         return Image.fromarray(values if values.dtype in (np.bool_, np.uint8) else values.astype(np.int32))
     low, high = float(values.min()), float(values.max())
     if not (low < 0 or high <= 1):
         raise ValueError(
-            f"{name} has floats from {low:g} to {high:g}; they must be logits, or probabilities from 0 to 1: give truth "
-            "values, as mask > 127"
+            f"{name} has floats from {low:g} to {high:g}; they must be logits, or probabilities from 0 to 1: give "
+            "truth values, as mask > 127"
         )
     return Image.fromarray(values > 0 if low < 0 else values >= 0.5)
 
@@ -221,9 +219,7 @@ def _array(
     except Exception as error:  # whatever the library says of values that it does not hand over
         ragged = isinstance(source, list | tuple) and isinstance(error, ValueError)
         why = "its rows differ in length" if ragged else reason(error)
-        raise ValueError(
-            f"{kind} is no array ({why}); {cure}"
-        ) from error
+        raise ValueError(f"{kind} is no array ({why}); {cure}") from error
 
 
 def _floats(values: np.ndarray) -> Float[np.ndarray, "..."]:

@@ -65,12 +65,16 @@ NEAR, REGION_NEAR = 0.1, 3.0
 distance from its surface up to which those of its region are."""
 
 
-def part_of(seen: Observation, mask: Bool[np.ndarray, "h w"]) -> Observation:
-    """The object in a frame as a mask of its whole image has it."""
-    assert seen.frame.whole is not None
-    keep = (mask & seen.kept_pixels())[seen.frame.whole.valid]
-    step = IsolationStep("whole frame", len(seen.cloud), int(keep.sum()), "where the object is likeliest")
-    steps = (*seen.steps, step)
+def part_of(
+    seen: Observation,
+    mask: Bool[np.ndarray, "h w"],
+    name: str = "whole frame",
+    detail: str = "where the object is likeliest",
+) -> Observation:
+    """The object in a frame as a mask of its image has it, by a step of this name."""
+    assert seen.frame.depth is not None
+    keep = (mask & seen.kept_pixels())[seen.frame.depth.valid]
+    steps = (*seen.steps, IsolationStep(name, len(seen.cloud), int(keep.sum()), detail))
     selection = Selection(keep, np.ones_like(keep), np.zeros_like(keep), steps)
     return replace(seen, cloud=seen.frame.cloud.rows(keep), selection=selection, steps=steps)
 
@@ -228,24 +232,12 @@ def is_whole(seen: Observation, registrar: Registrar) -> bool:
 
 
 def at_point(seen: Observation, registrar: Registrar | None) -> Observation:
-    """The object as the connected surface at its point, where the frame is not looked through; else the same.
-
-    Raises ``ValueError`` for a surface of too few pixels.
-    """
+    """The object as the connected surface at its point, where the frame is not looked through; else the same."""
     if seen.point is None or seen.frame.depth is None or (registrar is not None and is_whole(seen, registrar)):
         return seen
     image, (column, row) = seen.frame.depth, seen.point
     label = connected_pixels(np.where(seen.kept_pixels(), image.depth, 0.0), GAPS[0] * steepest(image))
-    keep = (label == label[row, column])[image.valid]
-    count = int(keep.sum())
-    if count < MIN_POINTS:
-        raise ValueError(
-            f"the surface at the point {column} {row} has {count} pixels, and the object needs at least {MIN_POINTS}: "
-            "give a point on a larger part of it, or a mask (--mask)"
-        )
-    steps = (*seen.steps, IsolationStep("point", len(seen.cloud), count, f"the surface at {column} {row}"))
-    selection = Selection(keep, np.ones_like(keep), np.zeros_like(keep), steps)
-    return replace(seen, cloud=seen.frame.cloud.rows(keep), selection=selection, steps=steps, point=None)
+    return replace(part_of(seen, label == label[row, column], "point", "the connected surface at it"), point=None)
 
 
 def chance(model: StatisticalModel) -> float:

@@ -112,20 +112,17 @@ class Observation:
 
         Raises ``ValueError`` for a frame without pixels, a point outside of them, and one ``HOLE_PX`` away from all.
         """
-        (column, row), image = map(int, point), self.frame.depth
-        if image is None or column >= image.camera.width or row >= image.camera.height:
-            size = "no depth image" if image is None else f"{image.camera.width} x {image.camera.height} pixels"
-            raise ValueError(
-                f"the point {column} {row} is given, but {self.frame.source} is {size}; it must be the column and the "
-                "row of a pixel on the object, from 0 at the upper left: correct it, or crop with --box"
-            )
-        rows, columns = np.nonzero(self.kept_pixels())
+        if self.frame.depth is None:
+            raise ValueError(f"{self.frame.source} is no depth image, and has no pixel at a point: crop with --box")
+        (column, row), kept = map(int, point), self.kept_pixels()
+        rows, columns = np.nonzero(kept)
         distance = np.hypot(columns - column, rows - row)
         nearest = int(distance.argmin())
-        if distance[nearest] > HOLE_PX:
+        if distance[nearest] > HOLE_PX or row >= len(kept) or column >= len(kept[0]):
             raise ValueError(
-                f"nothing is measured within {HOLE_PX} pixels of the point {column} {row} (the nearest pixel that is "
-                f"kept is {columns[nearest]} {rows[nearest]}); a depth of the object is needed: give another point on it"
+                f"the point {column} {row} lies outside the {len(kept[0])} x {len(kept)} pixels of {self.frame.source} "
+                f"or more than {HOLE_PX} pixels from any that is measured and kept (the nearest is {columns[nearest]} "
+                f"{rows[nearest]}): give column and row, from 0 at the upper left, of a pixel on the object"
             )
         return replace(self, point=(int(columns[nearest]), int(rows[nearest])))
 
