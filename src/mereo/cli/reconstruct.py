@@ -157,7 +157,8 @@ def reconstruct_frame(frame: SensorFrame, directory: Path, job: FrameJob, path: 
     seen = at_point(replace(find_object(frame, command.isolation), initial_pose=job.initial_pose), job.registrar)
     is_looked_through = job.registrar is not None and is_whole(seen, job.registrar)
     within = f"all {len(seen.cloud)} points {'that are kept' if seen.steps else 'of the frame'}"
-    print(f"the object is looked for in {within}" if is_looked_through else seen)
+    at = "" if seen.point is None else f", {seen.where}"
+    print(f"the object is looked for in {within}{at}" if is_looked_through else seen)
     placed = job.placed  # what is carried is refused before the work
     result = reconstruct_observation(
         seen,

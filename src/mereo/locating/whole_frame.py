@@ -140,13 +140,12 @@ class WholeFrame:
         assert self.seen.frame.whole is not None
         return self.seen.frame.whole
 
-    def thinned(self, pixels: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "i j"]:
-        """Pixels of the whole image that the thinned one has as well."""
-        return pixels[self.every // 2 :: self.every, self.every // 2 :: self.every]
-
     def is_at_point(self, pixels: Bool[np.ndarray, "h w"]) -> bool:
         """Whether some pixels of the thinned image are at the frame's point; any are where it has none."""
-        return bool(pixels[self.thinned(self.seen.near_point(HOLE_PX * self.every))].any())
+        column, row = self.seen.point or (0, 0)
+        rows, columns = np.nonzero(pixels)
+        distance = np.hypot(columns - column // self.every, rows - row // self.every)
+        return self.seen.point is None or bool(distance.min(initial=np.inf) <= HOLE_PX)
 
     def explained(self, mesh: SegmentedMesh) -> Bool[np.ndarray, "h w"]:
         """Pixels of the thinned image that see what lies as far away as a mesh does there."""
@@ -179,7 +178,8 @@ class WholeFrame:
         """Places where the object may be, the most evident first."""
         model, places = self.registrar.model, list[Place]()
         area = self.unit**2 * ConvexHull(model.rest_points).area / 4  # of its shadow, over all directions
-        image, kept = self.jumps.image, self.thinned(self.seen.kept_pixels())
+        image, first = self.jumps.image, self.every // 2
+        kept = self.seen.kept_pixels()[first :: self.every, first :: self.every]
         part = DepthImage(np.where(kept, image.depth, 0.0), image.camera)
         for mask in islice(filter(self.is_at_point, regions(part, 2 * model.half * self.unit, area)), LOOKS):
             try:
@@ -225,9 +225,8 @@ def is_whole(seen: Observation, registrar: Registrar) -> bool:
     frame, unit = seen.frame, scene_unit_of(seen, registrar, None)
     if unit is None or seen.initial_pose is not None or frame.whole is None or frame.depth is None:
         return False
-    crops = [step.kept for step in seen.steps if step.name in CROPS]
-    is_all = len(frame.cloud) == int(frame.whole.valid.sum()) and len(crops) == len(seen.steps)
-    is_all &= len(seen.cloud) == [len(frame.cloud), *crops][-1] >= 4 * MIN_POINTS
+    is_part = len(frame.cloud) == int(frame.whole.valid.sum()) and all(step.name in CROPS for step in seen.steps)
+    is_all = is_part and len(seen.cloud) == int(seen.kept_pixels().sum()) >= 4 * MIN_POINTS
     return is_all and seen.main_length > SIZES[1] * 2 * registrar.model.half * unit
 
 

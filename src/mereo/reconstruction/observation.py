@@ -93,13 +93,6 @@ class Observation:
         """Phrase for where the object is looked for."""
         return "in this frame" if self.point is None else "at the point {} {}".format(*self.point)
 
-    def near_point(self, distance: float) -> Bool[np.ndarray, "h w"]:
-        """Pixels of the depth image up to this many from the point; all where there is none."""
-        assert self.frame.depth is not None
-        column, row, most = (0, 0, np.inf) if self.point is None else (*self.point, distance)
-        rows, columns = np.indices(self.frame.depth.depth.shape)
-        return np.asarray(np.hypot(columns - column, rows - row) <= most)
-
     def kept_pixels(self) -> Bool[np.ndarray, "h w"]:
         """Measured pixels of the depth image that isolation keeps."""
         assert self.frame.depth is not None
