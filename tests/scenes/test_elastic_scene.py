@@ -225,7 +225,7 @@ def test_a_given_pose_starts_the_fit_and_holds_what_is_held(held: tuple[Scene, S
     start = initial_state(T_files, model, 1.0)
     np.testing.assert_allclose(start.place(model.mean), transform_points(IN_FRONT, model.mean), atol=1e-6)
     wrong = Posed(Rotation.from_rotvec([0.0, 0.0, 0.02]).as_matrix() @ start.rotation, start.translation, start.z)
-    fitted = search_modes(CloudToFit(cloud, 1.0), model, ELASTIC, wrong)
+    fitted = search_modes(CloudToFit(cloud, 1.0), model, ELASTIC, [wrong])
     assert fitted.problem.given is not None
     assert off(model, fitted.surface.material, true) < 0.5 * off(model, transform_points(IN_FRONT, model.mean), true)
 

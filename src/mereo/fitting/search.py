@@ -611,19 +611,24 @@ class Trail:
         return tuple(others)
 
 
-def search(whole: Problem, partial: Problem | None = None, start: Posed | None = None) -> Trail:
-    """Search for the state that explains a frame without correspondences, or fit it from ``start``.
+def search(
+    whole: Problem,
+    partial: Problem | None = None,
+    starts: Sequence[Posed] = (),
+    rounds: Sequence[SearchRound] = ROUNDS,
+) -> Trail:
+    """Search for the state that explains a frame without correspondences, or fit it from ``starts``.
 
     ``partial`` is the same where it is open whether the object is seen whole: with nothing known around the cloud. It
     is taken where it explains the frame better by more than ``WHOLE``.
     """
     trails = [Trail(whole)] if partial is None else [Trail(whole), Trail(partial, WHOLE)]
-    if start is not None:
+    if starts:
         for trail in trails:
-            trail.fitted.append(refined(trail.problem, fit_wide(trail.problem, start)))
+            trail.fitted += [refined(trail.problem, fit_wide(trail.problem, start)) for start in starts]
         chosen = min(trails, key=lambda trail: trail.best.misfit.total + trail.handicap)
         return chosen.with_heavier_cloud() or search_noisy(trails, chosen, False) or chosen
-    for stage in ROUNDS:
+    for stage in rounds:
         for trail in trails:
             trail.go_on(stage)
         for trail, other in permutations(trails, 2):  # either may have found what the other has missed
@@ -632,7 +637,7 @@ def search(whole: Problem, partial: Problem | None = None, start: Posed | None =
         chosen.shake()
         if chosen.is_explained:
             break
-        better, is_last = chosen.with_heavier_cloud(), stage is ROUNDS[-1]
+        better, is_last = chosen.with_heavier_cloud(), stage is rounds[-1]
         if better is None and chosen.best.misfit.cloud >= whole.config.unexplained:
             better = search_noisy(trails, chosen, not is_last)
         if better is not None and (is_last or better.is_sure):

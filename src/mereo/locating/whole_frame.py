@@ -4,7 +4,7 @@ DepthImage -regions-> masks -quick look-> places, the most evident first -choose
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 
@@ -18,10 +18,17 @@ from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.problem import Problem
 from mereo.fitting.problem.residuals import NetworkTerm
 from mereo.fitting.registration.answer import Answer
-from mereo.fitting.registration.answer_frame import answer_frame, cloud_to_fit, scene_unit_of
+from mereo.fitting.registration.answer_frame import (
+    answer_found,
+    answer_frame,
+    answer_of,
+    cloud_to_fit,
+    fit_states,
+    scene_unit_of,
+)
 from mereo.fitting.registration.recognition import Known
 from mereo.fitting.registration.register import Registrar
-from mereo.fitting.search import SearchRound, screen_poses
+from mereo.fitting.search import ROUNDS, SearchRound, screen_poses
 from mereo.geometry.camera import DepthImage
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
@@ -37,7 +44,7 @@ from mereo.reconstruction.pipeline import encode_frame
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.depth_sensor import render_depth
 
-QUICK = SearchRound(0, 400, 6, 3)
+QUICK = SearchRound(0, 200, 4, 3)
 """Round of the search by which a region is looked at."""
 
 LOOKS, ANSWERS, HOPELESS = 12, 3, 0.0
@@ -91,13 +98,13 @@ class Place:
 
     Attributes:
         mask: pixels of a region, in the thinned image.
-        posed: state there, scene units.
+        states: of the object there, scene units, the most evident first.
         mesh: of that state, in the image's unit.
         outline: of that state.
     """
 
     mask: Bool[np.ndarray, "h w"]
-    posed: Posed
+    states: tuple[Posed, ...]
     mesh: SegmentedMesh
     outline: Outline
 
@@ -158,21 +165,22 @@ class WholeFrame:
         evidence, nothing = cloud.evidence(self.unit), NetworkTerm.none(registrar.model)
         return Problem(registrar.model, nothing, evidence, cloud.scale_std, registrar.config)
 
-    def place(self, mask: Bool[np.ndarray, "h w"], posed: Posed) -> Place:
-        """Place of a state."""
-        model = self.registrar.model
+    def place(self, mask: Bool[np.ndarray, "h w"], states: Sequence[Posed]) -> Place:
+        """Place of some states."""
+        model, (posed, *_) = self.registrar.model, states
         mesh = model.mesh(self.unit * posed.place(model.material(posed.z)))
-        return Place(mask, posed, mesh, self.outline(mesh))
+        return Place(mask, tuple(states), mesh, self.outline(mesh))
 
     def outline(self, mesh: SegmentedMesh) -> Outline:
         """What the thinned image says of a mesh's outline."""
         return compare_outline(self.jumps, render_depth(mesh, self.jumps.image.camera).depth)
 
     def look(self, mask: Bool[np.ndarray, "h w"]) -> Place:
-        """Place of a region: the most evident of some states, quickly fitted to it; raises as ``problem``."""
+        """Place of a region, with some states that are quickly fitted to it; raises as ``problem``."""
         problem = self.problem(part_of(self.thin, mask))
         states = bend_by_few(problem, screen_poses(problem, QUICK), QUICK.fitted)
-        return max((self.place(mask, posed) for _, posed in states), key=lambda place: place.outline.nats)
+        ranked = sorted((self.place(mask, [posed]) for _, posed in states), key=lambda place: -place.outline.nats)
+        return replace(ranked[0], states=tuple(place.states[0] for place in ranked))
 
     def places(self) -> list[Place]:
         """Places where the object may be, the most evident first."""
@@ -204,9 +212,39 @@ class WholeFrame:
         return part_of(self.seen, pixels_near(image, place.mesh, reach) | (image.valid & region))
 
     def sharpened(self, place: Place) -> Place:
-        """The same by a fit to the pixels that are chosen by it."""
-        problem = self.problem(self.chosen(place))
-        return self.place(place.mask, refined(problem, fit_wide(problem, place.posed)).posed)
+        """The same by a fit of its first state to the pixels that are chosen by it."""
+        problem, (first, *others) = self.problem(self.chosen(place)), place.states
+        return self.place(place.mask, [refined(problem, fit_wide(problem, first)).posed, *others])
+
+    def answered(
+        self, place: Place, model: Trained | None, keep_all: bool, rounds: Sequence[SearchRound]
+    ) -> "PlacedAnswer | None":
+        """Answer to the pixels of a place, by a search in ``rounds``, or without any by a fit from the place's states.
+
+        None where that finds nothing, or something that is not at the frame's point.
+        """
+        registrar = self.registrar
+        try:
+            place, states = (place, ()) if rounds else (self.sharpened(place), place.states)
+            seen = self.chosen(place)
+            encoded = encode_frame(seen.readings(keep_all)[0], model, seen.frame.axes)
+            candidate = fit_states(encoded, registrar, self.unit, seen, states, rounds)
+        except ValueError:
+            return None
+        if candidate.modes is None or not self.is_at_point(self.explained(candidate.modes.registration.mesh)):
+            return None
+        answer = answer_of(seen, model, registrar, candidate, encoded, candidate.modes.registration)
+        return PlacedAnswer(place, seen, answer, self.outline(candidate.modes.registration.mesh))
+
+    def finished(self, placed: "PlacedAnswer") -> "PlacedAnswer":
+        """The same with the parameters of the object's scene, where it may be the object."""
+        answer = placed.answer
+        if placed.nats < UNLIKELY:
+            return placed
+        assert answer.candidate is not None and answer.likelier is not None
+        answer = answer_found(placed.seen, answer.model, self.registrar, answer.candidate, answer.likelier)
+        assert answer.registration is not None
+        return replace(placed, answer=answer, outline=self.outline(answer.registration.mesh))
 
 
 def located(frame: WholeFrame) -> Observation:
@@ -249,12 +287,14 @@ class PlacedAnswer:
     """Answer at one place, and the logarithm of how much likelier it is than something else that was taken for it.
 
     Attributes:
-        place: of the quick look.
-        answer: of the fit to the pixels that are chosen there.
+        place: by a fit to the pixels that the quick look's state explains.
+        seen: the pixels that are chosen by that.
+        answer: of the fit to them.
         outline: of that.
     """
 
     place: Place
+    seen: Observation
     answer: Answer
     outline: Outline
 
@@ -265,32 +305,36 @@ class PlacedAnswer:
         assert registration is not None
         return chance(registration.model) + self.outline.nats - 0.5 * self.answer.recognition.strangeness**2
 
+    @property
+    def is_evident(self) -> bool:
+        """Whether the object is known there, and no other thing is likelier."""
+        return self.nats > 0 and self.answer.recognition.known is True
+
 
 def answers_in(
-    frame: WholeFrame,
-    model: Trained | None,
-    keep_all: bool = False,
-    scene_unit: float | None = None,
-    all_places: bool = False,
+    frame: WholeFrame, model: Trained | None, keep_all: bool = False, all_places: bool = False
 ) -> Iterator[PlacedAnswer]:
     """Answers at the most evident places of a whole frame, up to the first that is known and no likelier another thing.
 
-    Places where a fit finds nothing have none. With ``all_places`` the others are answered as well.
+    First from the states of the quick looks, in a second each, then, where none of these is known, by a search, which
+    takes several. With ``all_places`` the others are answered as well. Places where a fit finds nothing have none.
+    Parameters of the object's scene are not fitted yet (``WholeFrame.finished``).
     """
     places = frame.places()
     hopeful = [place for place in places[:ANSWERS] if place.outline.nats > HOPELESS]
-    for place in hopeful or places[:1]:
-        try:
-            seen = frame.chosen(frame.sharpened(place))
-            answer = answer_frame(seen, model, frame.registrar, keep_all=keep_all, scene_unit=scene_unit)
-        except ValueError:
-            continue
-        if answer.registration is None or not frame.is_at_point(frame.explained(answer.registration.mesh)):
-            continue
-        placed = PlacedAnswer(place, answer, frame.outline(answer.registration.mesh))
-        yield placed
-        if placed.nats > 0 and answer.recognition.known is True and not all_places:
-            break
+    waiting = hopeful or places[:1]
+    for rounds in ((), ROUNDS[:1]):
+        unknown = list[Place]()
+        for place in waiting:
+            placed = frame.answered(place, model, keep_all, rounds)
+            if placed is None:
+                continue
+            yield placed
+            if placed.is_evident and not all_places:
+                return
+            if placed.answer.recognition.known is not True:
+                unknown.append(placed.place)
+        waiting = unknown if hopeful else []
 
 
 def answer_observation(
@@ -315,10 +359,11 @@ def answer_observation(
     check_value("resolution", resolution, Cells, 128)
     started = time.perf_counter()
     with stage("look through the whole frame"), limit_blas_threads():
-        answers = list(answers_in(WholeFrame.of(seen, registrar), model, keep_all))
-    if not answers:
-        raise NoFit(NOWHERE.format(seen.where))
-    best = max(answers, key=lambda placed: placed.nats)
+        frame = WholeFrame.of(seen, registrar)
+        answers = list(answers_in(frame, model, keep_all))
+        if not answers:
+            raise NoFit(NOWHERE.format(seen.where))
+        best = frame.finished(max(answers, key=lambda placed: placed.nats))
     answer = absent(best) if best.nats < UNLIKELY else doubted(best.answer, best.outline, 0.0)
     seconds = time.perf_counter() - started
     return replace(answer, resolution=resolution, label_points=label_points, seconds=seconds)

@@ -5,6 +5,7 @@ Observation -find-> Candidate (by network, by search, or the better of both) -fi
 """
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +22,7 @@ from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.recognition import FEATURELESS, Recognition, recognize
 from mereo.fitting.registration.register import CloudToFit, ModesFit, Registrar
 from mereo.fitting.registration.registration import Registration
-from mereo.fitting.search import WHOLE, Screen, rotations, search, tables_of
+from mereo.fitting.search import ROUNDS, WHOLE, Screen, SearchRound, rotations, search, tables_of
 from mereo.geometry.camera import SightLines
 from mereo.geometry.transforms import fit_rigid, transform_points
 from mereo.io.bounds import Cells, PositiveOrUnknown, check_value
@@ -77,6 +78,17 @@ def answer_frame(
     started = time.perf_counter()
     with stage("register the model"):
         candidate, likelier = find(seen, model, registrar, keep_all, scene_unit)
+    answer = answer_found(seen, model, registrar, candidate, likelier)
+    return replace(answer, resolution=resolution, label_points=label_points, seconds=time.perf_counter() - started)
+
+
+def answer_found(
+    seen: Observation, model: Trained | None, registrar: Registrar | None, candidate: Candidate, likelier: EncodedFrame
+) -> Answer:
+    """Answer a frame by what ``find`` or ``fit_states`` has found, with the parameters of the object's scene.
+
+    Takes the arguments of ``answer_frame``, and raises ``NoFit`` where nothing is found and no network can answer.
+    """
     if model is not None and candidate.modes is not None and candidate.located_by != "network":
         candidate = replace(candidate, modes=replace(candidate.modes, calibration=model.calibration))
     if candidate.error is not None and model is None:
@@ -89,7 +101,7 @@ def answer_frame(
             registration = registrar.finish(modes)
         if registration is not modes.registration:
             answer = answer_of(seen, model, registrar, candidate, likelier, registration)
-    return replace(answer, resolution=resolution, label_points=label_points, seconds=time.perf_counter() - started)
+    return answer
 
 
 def answer_of(
@@ -302,16 +314,29 @@ def scene_unit_of(seen: Observation, registrar: Registrar, certain: float | None
 
 def _searched(frame: EncodedFrame, registrar: Registrar, scene_unit: float | None, seen: Observation) -> Candidate:
     """Candidate of one hypothesis by a search, or from the initial pose that is given."""
-    model, start = registrar.model, None
     by: LocatedBy = "search" if seen.initial_pose is None else "pose"
+    starts = list[Posed]()
+    if seen.initial_pose is not None and scene_unit is not None:
+        starts.append(initial_state(frame.T_camera_input @ seen.initial_pose, registrar.model, scene_unit))
+    return replace(fit_states(frame, registrar, scene_unit, seen, starts), located_by=by)
+
+
+def fit_states(
+    frame: EncodedFrame,
+    registrar: Registrar,
+    scene_unit: float | None,
+    seen: Observation,
+    states: Sequence[Posed],
+    rounds: Sequence[SearchRound] = ROUNDS,
+) -> Candidate:
+    """Candidate of one hypothesis by a fit that begins at some states, or where there are none, by a search."""
+    cloud = cloud_to_fit(frame, seen.lines, scene_unit)
     try:
-        check_size(frame, model, scene_unit)
-        if seen.initial_pose is not None and scene_unit is not None:
-            start = initial_state(frame.T_camera_input @ seen.initial_pose, model, scene_unit)
-        modes = search_modes(cloud_to_fit(frame, seen.lines, scene_unit), model, registrar.config, start)
+        check_size(frame, registrar.model, scene_unit)
+        modes = search_modes(cloud, registrar.model, registrar.config, states, rounds)
     except NoFit as error:
-        return Candidate(frame, error=error, located_by=by)
-    return Candidate(frame, modes, located_by=by)
+        return Candidate(frame, error=error, located_by="search")
+    return Candidate(frame, modes, located_by="search")
 
 
 def initial_state(T_camera_model: Float[np.ndarray, "4 4"], model: StatisticalModel, scene_unit: float) -> Posed:
@@ -401,21 +426,23 @@ def search_modes(
     cloud: CloudToFit,
     model: StatisticalModel,
     config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
-    start: Posed | None = None,
+    starts: Sequence[Posed] = (),
+    rounds: Sequence[SearchRound] = ROUNDS,
 ) -> ModesFit:
-    """Fit the modes to a cloud by search; where it leaves open what lies around it, the fits decide.
+    """Fit the modes to a cloud by a search of some rounds; where it leaves open what lies around it, the fits decide.
 
-    With a ``start`` that is known roughly, the fit begins there, and keeps its pose where the object is held.
+    With ``starts`` that are known roughly, the fit begins there, and keeps the first one's pose where the object is
+    held.
     """
     started = time.perf_counter()
     with limit_blas_threads():
         unit = size_of(cloud, model) if cloud.scene_unit is None else cloud.scene_unit
         is_open = cloud.lines.other_lines is None
         evidence = cloud.evidence(unit)
-        given = None if start is None or not model.is_held else GivenPose(start, HELD_STD * model.half)
+        given = GivenPose(starts[0], HELD_STD * model.half) if starts and model.is_held else None
         whole = Problem(model, NetworkTerm.none(model), evidence, cloud.scale_std, config, given=given)
         partial = replace(whole, evidence=replace(evidence, other_lines="unknown")) if is_open else None
-        trail = search(whole, partial, start)
+        trail = search(whole, partial, starts, rounds)
         problem, modes = trail.problem, trail.best
         rest = resting(problem, nothing(), modes)
     seconds = time.perf_counter() - started
