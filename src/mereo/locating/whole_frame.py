@@ -269,7 +269,11 @@ def is_whole(seen: Observation, registrar: Registrar) -> bool:
 
 
 def at_point(seen: Observation, registrar: Registrar | None) -> Observation:
-    """The object as the connected surface at its point, where the frame is not looked through; else the same."""
+    """The object at its point, if it has one: where the frame is not looked through, the connected surface.
+
+    Raises ``ValueError`` where nothing is measured at it.
+    """
+    seen = seen.at_measurement()
     if seen.point is None or seen.frame.depth is None or (registrar is not None and is_whole(seen, registrar)):
         return seen
     image, (column, row) = seen.frame.depth, seen.point

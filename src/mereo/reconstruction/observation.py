@@ -67,7 +67,7 @@ class Observation:
             where "auto" has found one.
         initial_pose: rough ``T_camera_model`` from which a fit starts, as ``Result.pose``; None where a search or a
             network finds the object.
-        point: column and row of a measured pixel that shows the object; None where nothing says so.
+        point: column and row of a pixel that shows the object; None where nothing says so.
     """
 
     frame: SensorFrame
@@ -100,14 +100,16 @@ class Observation:
         kept[kept] = self.selection is None or self.selection.of_object(self.frame.cloud.points)
         return kept
 
-    def at_point(self, point: tuple[float, float]) -> "Observation":
-        """The object with the measured pixel that is nearest to a point, its column and row.
+    def at_measurement(self) -> "Observation":
+        """The object whose point, if it has one, is the nearest measured pixel.
 
         Raises ``ValueError`` for a frame without pixels, a point outside of them, and one ``HOLE_PX`` away from all.
         """
-        if self.frame.depth is None:
-            raise ValueError(f"{self.frame.source} is no depth image, and has no pixel at a point: crop with --box")
-        (column, row), kept = map(int, point), self.kept_pixels()
+        if self.point is None:
+            return self
+        if self.frame.depth is None or not len(self.cloud):
+            raise ValueError(f"{self.frame.source} has no pixels with a depth, of which a point is: crop with --box")
+        (column, row), kept = self.point, self.kept_pixels()
         rows, columns = np.nonzero(kept)
         distance = np.hypot(columns - column, rows - row)
         nearest = int(distance.argmin())
@@ -224,8 +226,7 @@ def find_object(
 
     A frame whose unit is not known is taken to be in metres.
 
-    Raises ``ValueError`` where too little is left, for a range of depths in a scanner's axes, and for a point without a
-    measurement.
+    Raises ``ValueError`` where too little is left, and for a range of depths in a scanner's axes.
     """
     if isolation.depth_range is not None and frame.axes == "scanner":
         raise ValueError(
@@ -247,8 +248,8 @@ def find_object(
                 "leave out --extent surface"
             )
         frame = replace(frame, axes="scanner")  # in which nobody knows where a camera was
-    seen = Observation(frame, cloud, selection.steps, selection, extent)
-    return seen if isolation.point is None else seen.at_point(isolation.point)
+    point = None if isolation.point is None else (int(isolation.point[0]), int(isolation.point[1]))
+    return Observation(frame, cloud, selection.steps, selection, extent, point=point)
 
 
 def _is_straight(points: Float[np.ndarray, "n 3"]) -> bool:
