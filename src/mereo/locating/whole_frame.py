@@ -237,11 +237,11 @@ class WholeFrame:
         return PlacedAnswer(place, seen, answer, self.outline(candidate.modes.registration.mesh))
 
     def finished(self, placed: "PlacedAnswer") -> "PlacedAnswer":
-        """The same with the parameters of the object's scene, where it may be the object."""
+        """The same with the parameters of the object's scene, where it may be the object and has them not yet."""
         answer = placed.answer
-        if placed.nats < UNLIKELY:
+        assert answer.candidate is not None and answer.candidate.modes is not None and answer.likelier is not None
+        if placed.nats < UNLIKELY or answer.registration is not answer.candidate.modes.registration:
             return placed
-        assert answer.candidate is not None and answer.likelier is not None
         answer = answer_found(placed.seen, answer.model, self.registrar, answer.candidate, answer.likelier)
         assert answer.registration is not None
         return replace(placed, answer=answer, outline=self.outline(answer.registration.mesh))
@@ -322,7 +322,7 @@ def answers_in(
 
     First from the states of the quick looks, in a second each, then, where none of these is known, by a search, which
     takes several. With ``all_places`` the others are answered as well. Places where a fit finds nothing have none.
-    Parameters of the object's scene are not fitted yet (``WholeFrame.finished``).
+    Parameters of the object's scene are fitted where these are known (``WholeFrame.finished``).
     """
     places = frame.places()
     hopeful = [place for place in places[:ANSWERS] if place.outline.nats > HOPELESS]
@@ -333,6 +333,7 @@ def answers_in(
             placed = frame.answered(place, model, keep_all, rounds)
             if placed is None:
                 continue
+            placed = frame.finished(placed) if placed.is_evident else placed
             yield placed
             if placed.is_evident and not all_places:
                 return
