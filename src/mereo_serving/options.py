@@ -46,6 +46,7 @@ class FrameOptions(BaseModel):
     largest_cluster: bool = Field(False, alias="largest-cluster", description="Keep the largest group of points")
     cluster_gap: float = Field(0.0, alias="cluster-gap", description="Gap across which groups belong to it, metres")
     keep_all: bool = Field(False, alias="keep-all", description="Drop no strays")
+    point: Numbers | None = Field(None, description="Column and row of a pixel of the object, in a depth image: u,v")
     extent: Extent = Field("auto", description="How much of the object the frame shows: whole, partial, surface, auto")
     resolution: int | None = Field(None, description="Cells along the longest side; by default the server's")
 
@@ -57,7 +58,10 @@ class FrameOptions(BaseModel):
 
     def isolation(self) -> IsolationConfig:
         """What of the frame is left out; raises ``Refused`` (422)."""
-        counted = {name: _of(getattr(self, name), count, name) for name, count in (("depth_range", 2), ("box", 6))}
+        counted = {
+            name: _of(getattr(self, name), count, name)
+            for name, count in (("depth_range", 2), ("box", 6), ("point", 2))
+        }
         return self._config(IsolationConfig, counted)
 
     def _config(self, kind: type[Config], changed: dict[str, Any]) -> Config:
@@ -90,7 +94,7 @@ def _of(numbers: list[float] | None, count: int, name: str) -> Any:
     return tuple(numbers)
 
 
-EXAMPLES = {"depth-range": "0.4,0.9", "box": "-0.2,-0.2,0.4,0.2,0.2,0.9"}
+EXAMPLES = {"depth-range": "0.4,0.9", "box": "-0.2,-0.2,0.4,0.2,0.2,0.9", "point": "320,240"}
 
 
 def sentence_of(error: ErrorDetails | dict[str, Any]) -> str:

@@ -25,6 +25,7 @@ from mereo.geometry.mesh import Color, SegmentedMesh
 from mereo.geometry.radii import Radii
 from mereo.geometry.solids import Solids, signed_distance_and_direction
 from mereo.geometry.transforms import inverse_rigid, rigid, rotation_along, transform_points
+from mereo.io.errors import words_of
 from mereo.io.mesh_formats import GlbScene, is_glb, read_glb
 from mereo.io.writers.formats import WRITERS
 from mereo.io.writers.glb import viewer_rotation
@@ -142,6 +143,14 @@ def _with_surface(
     return np.where(on_surface, nearest_labels(solids, points), label).astype(np.uint8)
 
 
+def nearest_to_ray(
+    points: Float[np.ndarray, "n 3"], origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "3"]:
+    """The point that is nearest to a ray by the angle at its origin."""
+    away = points - origin
+    return points[(away @ direction / np.linalg.norm(away, axis=1)).argmax()]
+
+
 def first_point(
     mesh: SegmentedMesh, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"], shown: list[bool]
 ) -> Float[np.ndarray, "3"] | None:
@@ -196,6 +205,9 @@ SEGMENT, VERTEX, SURE = "segment", "own", "how sure"
 Colors = list[UInt8[np.ndarray, "_ 3"]]
 """Colours of the vertices of each segment."""
 
+Picks = tuple[PointCloud, Callable[[Float[np.ndarray, "3"]], Answer]]
+"""All that a camera saw, and what answers the frame at a point of it."""
+
 Coloring = Callable[[], tuple[Colors, ColorScale | None]]
 """Function that colours the vertices, and says by which scale."""
 
@@ -216,6 +228,7 @@ class Content:
         ask: what is known of places; None where there is nothing to probe.
         is_doubtful: whether the verdict is that the surfaces are not to be trusted.
         first_view: name of the view from ahead.
+        picks: what a click can say where the object is in; None where nothing is looked for.
     """
 
     title: str
@@ -230,6 +243,7 @@ class Content:
     ask: Callable[[Float[np.ndarray, "n 3"]], Probed] | None = None
     is_doubtful: bool = False
     first_view: str = "camera"
+    picks: Picks | None = None
 
     @property
     def bounds(self) -> Float[np.ndarray, "2 3"]:
@@ -239,13 +253,13 @@ class Content:
         return np.stack([joint.min(axis=0), joint.max(axis=0)])
 
 
-def open_answer(answer: Answer, port: int) -> OpenPage:
-    """Open the page of an answer.
+def open_answer(answer: Answer, port: int, picks: Picks | None = None) -> OpenPage:
+    """Open the page of an answer, which a click may have answered again.
 
     Raises ``ImportError`` without the extra `view`, and ``OSError`` for a port that is taken.
     """
     import_viser()
-    return _opened(content_of_answer(answer), port)
+    return _opened(replace(content_of_answer(answer), picks=picks), port)
 
 
 def open_files(path: Path, port: int) -> OpenPage:
@@ -391,7 +405,7 @@ class ResultPage:
 
     def __init__(self, server: Any, content: Content) -> None:
         self.server, self.content = server, content
-        self._drawing = threading.Lock()
+        self._drawing, self._answering = threading.Lock(), threading.Lock()
         self._known_colors: dict[str, tuple[Colors, ColorScale | None]] = {}
         self.stage = Display(server, content.bounds, content.rotation.T @ [0.0, 1.0, 0.0])
         self.layer = SegmentLayer(self.stage, "/segments")
@@ -400,9 +414,9 @@ class ResultPage:
 
     def _build(self) -> None:
         gui, content = self.server.gui, self.content
-        gui.add_html(heading(content.title, content.facts))
+        self.heading = gui.add_html(heading(content.title, content.facts))
         if content.verdict:
-            gui.add_html(message(content.verdict, bad=content.is_doubtful))
+            self.verdict = gui.add_html(message(content.verdict, bad=content.is_doubtful))
         gui.add_html(chips(content.mesh.names, content.mesh.colors))
         colorings = (SEGMENT, *content.colorings)
         first = VERTEX if VERTEX in colorings else SEGMENT
@@ -411,12 +425,15 @@ class ResultPage:
         self.coloring.on_update(lambda _: self._draw())
         self.controls = SegmentControls(gui, content.mesh, self._draw)
         if content.cloud is not None:
-            points = PointLayer(self.stage)
-            points.show(content.cloud)
+            self.points = PointLayer(self.stage)
+            self.points.show(content.cloud)
             # white points would hide the colours that are looked at
-            self.coloring.on_update(lambda _: setattr(points.box, "value", self.coloring.value == SEGMENT))
+            self.coloring.on_update(lambda _: setattr(self.points.box, "value", self.coloring.value == SEGMENT))
+        if content.picks is not None:
+            self.picking = gui.add_checkbox("Find what I click", False)
+            self.picking.on_update(lambda _: self._show_points())
         toward = content.rotation.T @ [0.0, 0.0, 1.0]
-        self.stage.add_views(lambda: toward, lambda: content.bounds, content.first_view)
+        self._look = self.stage.add_views(lambda: toward, lambda: self.content.bounds, content.first_view)
         if content.ask is not None:
             self._build_probe()
         if content.depth is not None:
@@ -449,10 +466,42 @@ class ResultPage:
             self.legend.visible = scale is not None
             self.layer.show(self.content.mesh, self.controls, colors)
 
+    # --- picking ------------------------------------------------------------------------------------------------------
+
+    def _show_points(self) -> None:
+        """Show all that the camera saw where the object is picked in it, else the object's points."""
+        picks, cloud = self.content.picks, self.content.cloud
+        shown = picks[0] if picks is not None and self.picking.value else cloud
+        if shown is not None:
+            self.points.show(shown)
+
+    def answer_at(self, point: Float[np.ndarray, "3"]) -> None:
+        """Show the answer at a point that the camera saw, or why there is none; clicks meanwhile do nothing."""
+        picks = self.content.picks
+        if picks is None or not self._answering.acquire(blocking=False):
+            return
+        try:
+            self.verdict.content = message("looking there; the first time takes longest")
+            self.content = replace(content_of_answer(picks[1](point)), picks=picks)
+            self._known_colors.clear()
+            self.coloring.options, self.coloring.value = (SEGMENT, *self.content.colorings), SEGMENT
+            self.picking.value = False
+            self._look(self.content.first_view)
+            self._draw()
+            self.heading.content = heading(self.content.title, self.content.facts)
+            self.verdict.content = message(self.content.verdict)
+        except Exception as error:  # whatever it is, the page must live on and say it
+            self.verdict.content = message(words_of(error), bad=True)
+        finally:
+            self._answering.release()
+
     # --- probing ------------------------------------------------------------------------------------------------------
 
     def _clicked(self, event: Any) -> None:
         origin, direction = (np.array(ray, dtype=float) for ray in (event.ray_origin, event.ray_direction))
+        if self.content.picks is not None and self.picking.value:
+            self.answer_at(nearest_to_ray(self.content.picks[0].points, self.stage.back(origin), direction))
+            return
         point = first_point(self.content.mesh, self.stage.back(origin), direction, self.controls.visible())
         if point is not None:
             self.move_probe(point)

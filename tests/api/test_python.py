@@ -17,6 +17,7 @@ from unittest.mock import MagicMock
 import jaxtyping
 import numpy as np
 import pytest
+import torch
 from analytic import untrained
 from angle import write_angle
 from answers import answer_to
@@ -69,6 +70,11 @@ def result() -> Result:
 LINE = np.linspace(0.1, 1.0, 99)[:, None] * [1.0, 0.5, 2.0]
 CAMERA = Camera(32, 32, 40.0, 40.0, 16.0, 16.0)
 IMAGE = DepthImage(np.ones((32, 32)), CAMERA)
+
+
+def masked(mask: object, **options: object) -> SensorFrame:
+    """The image of ones within a mask."""
+    return mereo.load_frame(IMAGE, mask=mask, **options)
 
 
 def queried(points: np.ndarray) -> object:
@@ -184,6 +190,14 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "a unit in words": (lambda: mereo.load_frame(seen(), unit_m="mm"), "^unit_m is 'mm'; it must be greater than 0"),
     "a negative id": (lambda: mereo.load_frame(seen(), mask_value=-1), "values are .-1,.; they must be whole numb"),
     "a mask's id without one": (lambda: mereo.load_frame(seen(), mask_value=1), "mask_value is given for a frame"),
+    "three masks": (lambda: masked(np.ones((3, 32, 32), bool)), r"\(3, 32, 32\) .* masks\[scores.argmax\(\)\]"),
+    "floats of a byte": (lambda: masked(np.eye(32) * 255), "from 0 to 255; they must be logits, or probabilities from"),
+    "a small mask": (lambda: masked(np.eye(16, dtype=bool)), "^the mask is 16 x 16 pixels but the depth image is 32 x"),
+    "an empty mask": (lambda: masked(np.zeros((32, 32))), "measures 0 pixels inside the mask"),
+    "ids": (lambda: masked(np.arange(1024).reshape(32, 32)), "^the mask has the values 0, .* give mask_value=1023 or"),
+    "a mask that is none": (lambda: masked([[1], [1, 0]]), "^the mask, a list, is no array .*: give h x w truth"),
+    "a mask of a cloud": (lambda: mereo.load_frame(seen(), mask=np.eye(32)), "is a point cloud, which has no pixels"),
+    "a point in space": (lambda: IsolationConfig(point=(1, 2, 3)), "it must be the column and the row of a pixel"),
     "a negative unit": (lambda: replace(mereo.load_frame(seen()), unit_m=-1.0), "unit_m is -1.0; it must be greater"),
 }  # fmt: skip
 
@@ -195,6 +209,22 @@ def test_wrong_arguments_are_refused_in_a_sentence(case: str, monkeypatch: pytes
     with pytest.raises(ValueError, match=sentence) as caught:
         call()
     assert len(str(caught.value).splitlines()) == 1
+
+
+def test_masks_of_all_kinds_in_memory_agree() -> None:
+    truth = np.zeros((32, 32), bool)
+    truth[4:20, 6:17] = True
+    logits = np.where(truth, 3.5, -8.0).astype(np.float32)
+    for mask in (
+        *(truth, truth[None], truth.astype(np.uint8), 255 * truth.astype(np.uint8), 7 * truth.astype(np.int64)),
+        *(logits, logits[None, None], torch.tensor(logits[None]), truth.astype(np.float32), 0.9 * truth + 0.05),
+        *(Image.fromarray(truth), Image.fromarray(truth).convert("RGB"), truth.tolist()),
+    ):
+        frame = masked(mask)
+        assert frame.depth is not None and np.array_equal(frame.depth.valid, truth)
+        assert frame.whole is IMAGE and len(frame.cloud) == truth.sum()
+    ids = masked(np.where(truth, 3, 5), mask_value=3)
+    assert ids.depth is not None and np.array_equal(ids.depth.valid, truth)
 
 
 def test_a_result_says_that_it_cannot_be_sent(result: Result) -> None:

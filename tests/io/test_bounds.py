@@ -27,7 +27,7 @@ COMMANDS = [
     for found in vars(module).values()
     if is_dataclass(found) and found.__module__ == module.__name__
 ]
-OWN_RULES = {"depth_range", "box", "frame_index", "unit_m", "mask_value"}
+OWN_RULES = {"depth_range", "box", "point", "frame_index", "unit_m", "mask_value"}
 """Options whose rule is more than an interval."""
 
 

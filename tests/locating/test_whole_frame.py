@@ -18,7 +18,7 @@ from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import rigid, transform_points
 from mereo.locating.outline import Jumps, Outline, compare_outline
 from mereo.locating.regions import connected_pixels, off_planes, regions, thinned
-from mereo.locating.whole_frame import BY_MASK, doubted, is_whole
+from mereo.locating.whole_frame import BY_MASK, Place, WholeFrame, at_point, doubted, is_whole
 from mereo.reconstruction.observation import find_object, noise_around
 from mereo.synthesis.depth_sensor import add_depth_noise, render_depth
 
@@ -116,16 +116,18 @@ def test_what_is_not_in_the_frame_is_not_known_and_the_likeliest_place_is_stated
 
 
 def test_the_command_looks_through_the_frame_and_says_so(
-    image: DepthImage, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    image: DepthImage, on_angle: tuple[int, int], folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     np.save(tmp_path / "depth.npy", image.depth)
     intrinsics = {"width": 240, "height": 180, "fx": 260.0, "fy": 260.0, "cx": 119.5, "cy": 89.5}
     (tmp_path / "camera.json").write_text(json.dumps(intrinsics), encoding="utf-8")
     given = [str(tmp_path / "depth.npy"), "--intrinsics", str(tmp_path / "camera.json"), "--object"]
     meshes = [str(folder / "long.stl"), str(folder / "short.stl"), "--units", "mm", "--deformations", "rigid"]
-    main(["reconstruct", *given, *meshes, "--output", str(tmp_path / "result")])
+    point = ["--point", *map(str, on_angle), "--output", str(tmp_path / "result")]
+    main(["reconstruct", *given, *meshes, *point])
     printed = capsys.readouterr().out
-    assert f"the object is looked for in all {image.valid.sum()} points of the frame" in printed
+    where = "at the point {} {}".format(*on_angle)
+    assert f"the object is looked for in all {image.valid.sum()} points of the frame, {where}" in printed
     assert "whole frame: " in printed and "where the object is likeliest" in printed
     summary = json.loads((tmp_path / "result" / "summary.json").read_text(encoding="utf-8"))
     assert summary["isolation"][-1]["name"] == "whole frame" and summary["recognition"]["known"] is True
@@ -148,7 +150,7 @@ def test_a_mask_or_an_object_alone_is_not_looked_through(
 
 def test_a_frame_of_one_plane_holds_nothing_and_that_is_a_sentence(angle: mereo.Object) -> None:
     wall = DepthImage(np.full((180, 240), 1.0), CAMERA)
-    with pytest.raises(ValueError, match="nothing in the whole frame is of the object's size and shape: check both"):
+    with pytest.raises(ValueError, match="nothing in this frame is of the object's size and shape: check both"):
         mereo.reconstruct(wall, angle, unit_m=1.0)
 
 
@@ -159,6 +161,106 @@ def test_an_outline_that_is_not_the_images_makes_an_answer_unsure_or_refuses_it(
     assert few.known == "unsure" and wrong.known is False
     assert wrong.reason is not None and "20 of 60 pixels of it have an edge" in wrong.reason
     assert doubted(found, Outline(hits=20), BY_MASK) is found, "a mask says where it is"
+
+
+# --- where it is ------------------------------------------------------------------------------------------------------
+
+
+def pixel_of(place: np.ndarray) -> tuple[int, int]:
+    column, row = np.floor(CAMERA.project(place[None])[0]).astype(int)
+    return int(column), int(row)
+
+
+CAN = pixel_of(on_desk(-0.16, 0.04, 0.05))
+BOX = (-0.11, -0.2, 0.4, 0.1, 0.2, 0.75)
+"""Metres: the angle and the desk around it, without the ball, the can and the wall."""
+
+
+@pytest.fixture(scope="module")
+def on_angle(placed: SegmentedMesh) -> tuple[int, int]:
+    """Pixel in the middle of the angle."""
+    rows, columns = np.nonzero(render_depth(placed, CAMERA).valid)
+    middle = np.hypot(rows - rows.mean(), columns - columns.mean()).argmin()
+    return int(columns[middle]), int(rows[middle])
+
+
+def looked_at(image: DepthImage, angle: mereo.Object, config: mereo.IsolationConfig) -> list[np.ndarray]:
+    """Regions that would be looked at; none of them is."""
+    registrar, looked = angle.registrar("auto"), list[np.ndarray]()
+    assert registrar is not None
+
+    def look(frame: WholeFrame, mask: np.ndarray) -> Place:
+        looked.append(mask)
+        raise ValueError
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(WholeFrame, "look", look)
+        seen = find_object(mereo.load_frame(image, unit_m=1.0), config)
+        assert is_whole(seen, registrar) and not WholeFrame.of(seen, registrar).places()
+    return looked
+
+
+def test_only_what_is_seen_at_a_point_is_looked_at(
+    image: DepthImage, angle: mereo.Object, on_angle: tuple[int, int]
+) -> None:
+    every = looked_at(image, angle, mereo.IsolationConfig())
+    (column, row), at_it = on_angle, looked_at(image, angle, mereo.IsolationConfig(point=on_angle))
+    assert 0 < len(at_it) < len(every) and all(mask[row - 2 : row + 3, column].any() for mask in at_it)
+    (can,) = looked_at(image, angle, mereo.IsolationConfig(point=CAN))
+    assert can[CAN[1], CAN[0]] and not can[row, column]
+
+
+def test_a_box_is_looked_through_where_it_shows_more_than_the_object(
+    image: DepthImage, placed: SegmentedMesh, angle: mereo.Object
+) -> None:
+    frame, registrar, (low, high) = mereo.load_frame(image, unit_m=1.0), angle.registrar("auto"), placed.bounds
+    assert registrar is not None
+    tight = mereo.IsolationConfig(box=(*low, *high))
+    for config in (tight, mereo.IsolationConfig(box=BOX, remove_plane=True)):
+        assert not is_whole(find_object(frame, config), registrar)
+    places = CAMERA.directions() * image.depth[..., None]
+    for mask in (masks := looked_at(image, angle, mereo.IsolationConfig(box=BOX))):
+        assert (places[mask] >= BOX[:3]).all() and (places[mask] <= BOX[3:]).all()
+    assert masks
+    with pytest.raises(ValueError, match=f"the point {CAN[0]} {CAN[1]} lies outside .* or more than 5 pixels from any"):
+        at_point(find_object(frame, mereo.IsolationConfig(box=BOX, point=CAN)), registrar)
+
+
+@pytest.mark.slow
+def test_a_point_or_a_box_has_the_answer_of_the_whole_frame_and_another_point_none(
+    found: mereo.Result, image: DepthImage, angle: mereo.Object, on_angle: tuple[int, int]
+) -> None:
+    frame = mereo.load_frame(image, unit_m=1.0)
+    narrowed = mereo.reconstruct(frame, angle, point=on_angle, box=BOX)
+    assert narrowed.known is True and [step.name for step in narrowed.seen.steps] == ["box", "whole frame"]
+    np.testing.assert_allclose(narrowed.pose, found.pose, atol=2e-3)
+    wrong = mereo.reconstruct(frame, angle, point=CAN).recognition
+    assert wrong.known is False and f"the object is not at the point {CAN[0]} {CAN[1]}; " in str(wrong.reason)
+
+
+def test_without_a_known_size_a_point_keeps_the_connected_surface(image: DepthImage) -> None:
+    frame = mereo.load_frame(image)
+    seen = find_object(frame, mereo.IsolationConfig(remove_plane=True, depth_range=(0.3, 1.2), point=CAN))
+    kept = at_point(seen, None)
+    assert [step.name for step in kept.steps] == ["depth range", "plane", "point"] and at_point(kept, None) is kept
+    assert np.linalg.norm(kept.cloud.points - on_desk(-0.16, 0.025, 0.08), axis=1).max() < 0.08 < seen.size_m[0]
+
+
+@pytest.mark.parametrize(
+    ("point", "message"),
+    [
+        ((400, 20), "the point 400 20 lies outside the 240 x 180 pixels of"),
+        ((3, 3), r"more than 5 pixels from any that is measured and kept \(the nearest is "),
+        ((-1, 3), r"the point is \(-1, 3\); it must be the column and the row .* give for example point=\(320, 240\)"),
+        ((np.nan, 2.0), "it must be the column and the row"),
+    ],
+)
+def test_a_point_that_shows_nothing_is_refused(point: tuple[float, ...], message: str, angle: mereo.Object) -> None:
+    image = DepthImage(np.pad(np.full((150, 210), 0.8), 15), CAMERA)
+    with pytest.raises(ValueError, match=message):
+        mereo.reconstruct(image, angle, unit_m=1.0, point=point)
+    with pytest.raises(ValueError, match="has no pixels with a depth, of which a point is: crop with box"):
+        mereo.reconstruct(image.to_points(), angle, point=(20, 20))
 
 
 # --- regions ----------------------------------------------------------------------------------------------------------
@@ -235,16 +337,18 @@ def test_noise_is_measured_on_what_is_around_the_object(placed: SegmentedMesh, s
 
 
 def test_an_object_is_followed_through_whole_frames_lost_and_seen_again(
-    image: DepthImage, rest: SegmentedMesh, folder: Path, angle: mereo.Object
+    image: DepthImage, rest: SegmentedMesh, folder: Path, angle: mereo.Object, on_angle: tuple[int, int]
 ) -> None:
+    """Its point is where it is in the first frame."""
     long = np.asarray(trimesh.load(folder / "long.stl").vertices) / 1000
     with mereo.Tracker(angle, executor=SynchronousExecutor()) as tracker:
         for number in range(4):
             turn = Rotation.from_euler("y", 2 * number, degrees=True).as_matrix()
             moved = PLACED @ rigid(turn, np.array([0.003 * number, 0.0, 0.0]))
-            found = tracker.follow(desk(*rest.transformed(moved).segments), number / 15, unit_m=1.0)
+            seen = desk(*rest.transformed(moved).segments)
+            found = tracker.follow(seen, number / 15, unit_m=1.0, point=on_angle)
             assert found.tracking == ("followed" if number else "found") and found.pose is not None
             off = transform_points(found.pose, long) - transform_points(moved, rest.segments[0].vertices)
             assert np.linalg.norm(off, axis=1).max() < 0.006, "a pixel is 2.2 mm wide"
-        assert tracker.follow(desk(), 5 / 15, unit_m=1.0).tracking == "lost"
-        assert tracker.follow(image, 20 / 15, unit_m=1.0).tracking == "found"
+        assert tracker.follow(desk(), 5 / 15, unit_m=1.0, point=(0, 9999)).tracking == "lost"
+        assert tracker.follow(image, 20 / 15, unit_m=1.0, point=CAN).tracking == "found"

@@ -15,7 +15,8 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from mereo.api.objects import load_object
-from mereo.api.reconstruct import reconstruct
+from mereo.api.reconstruct import load_frame, reconstruct
+from mereo.fitting.problem.correspondences import NoFit
 from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import Way
 from mereo.geometry.mesh import Segment, SegmentedMesh
@@ -103,6 +104,21 @@ def masked_bottle(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
         json.dumps({"width": 848, "height": 480, "fx": 425.773, "fy": 425.773, "cx": 427.702, "cy": 238.162}), "utf-8"
     )
     return vertices, placed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("point, known", [((400, 238), {True}), ((600, 150), {False, "unsure", None})])
+def test_a_point_on_the_bottle_is_believed_and_one_on_the_monitor_is_not(
+    tmp_path: Path, point: tuple[int, int], known: set[object]
+) -> None:
+    masked_bottle(tmp_path, "200")
+    bottle = load_object(STEREO / "schauma.obj", units="m", deformations="rigid")
+    frame = load_frame(STEREO / "depth_camera_image_200.png", intrinsics=tmp_path / "camera.json")
+    try:
+        answer = reconstruct(frame, bottle, point=point).known
+    except NoFit:
+        answer = None
+    assert answer in known
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ import urllib.request
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -37,6 +38,7 @@ from mereo.synthesis.sample_views import load_view
 from mereo.visualization.color_scales import ColorScale
 from mereo.visualization.reconstruction_report import Report, read_report
 from mereo.visualization.units import UNKNOWN, Unit
+from mereo_viewer import result_page
 from mereo_viewer import server as viewer_server
 from mereo_viewer.display import chips, heading, message
 from mereo_viewer.laboratory import CameraPlace, Laboratory, LabPage, Trial, slider_range
@@ -114,6 +116,30 @@ def test_points_give_way_to_colours_and_a_probe_is_shown(server: object) -> None
     page.move_probe(np.array([0.0, 0.0, 148.0]))
     assert "box_1" in page.facts.content and "2 mm inside the nearest surface" in page.facts.content
     assert nodes["/probe"].visible and nodes["/arrow"].visible
+
+
+@needs_viser
+def test_a_click_on_what_the_camera_saw_has_it_answered_there(server: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    around, clicked = PointCloud(np.array([[-40.0, 0, 170], [0, 0, 150], [60, 20, 160]])), list[np.ndarray]()
+    contents = [replace(toy_content(), title="again", verdict="as clicked", colorings={}), ValueError("nothing there")]
+
+    def content_of(_: object) -> Content:
+        if isinstance(content := contents.pop(0), Exception):
+            raise content
+        return content
+
+    monkeypatch.setattr(result_page, "content_of_answer", content_of)
+    page = ResultPage(server, replace(toy_content(), picks=(around, lambda point: clicked.append(point))))  # type: ignore[arg-type]
+    cloud = server.scene._handle_from_node_name  # type: ignore[attr-defined]
+    page.coloring.value, page.picking.value = "depth", True
+    assert len(cloud["/cloud"].points) == 3, "all that the camera saw"
+    ray = page.stage.place(np.zeros(3)), (60.0, 21.0, 161.0)
+    page._clicked(SimpleNamespace(ray_origin=ray[0], ray_direction=ray[1]))
+    assert clicked[0].tolist() == [60, 20, 160] and "as clicked" in page.verdict.content and not page.picking.value
+    assert page.content.title == "again" and "again" in page.heading.content and page.coloring.value == "segment"
+    assert len(cloud["/cloud"].points) == len(page.content.cloud.points)  # type: ignore[union-attr]
+    page.answer_at(around.points[0])
+    assert len(clicked) == 2 and "nothing there" in page.verdict.content and page.content.title == "again"
 
 
 def first_message(port: int, host: str, origin: str | None) -> bytes:

@@ -25,12 +25,12 @@ from mereo.geometry.conventions import CloudAxes, check_real
 from mereo.geometry.transforms import checked_pose
 from mereo.io.config import InputConfig
 from mereo.io.intrinsics import read_intrinsics
-from mereo.io.point_arrays import is_frame_list, points_of
-from mereo.io.readers import depth_of, read_pose, usable_depth
+from mereo.io.point_arrays import is_frame_list, mask_image, points_of
+from mereo.io.readers import depth_of, mask_of_image, masked_depth, read_pose, usable_depth
 from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame, along_z, in_camera, read_frame
 from mereo.locating import following
-from mereo.locating.whole_frame import answer_observation, is_whole
+from mereo.locating.whole_frame import answer_observation, at_point, is_whole
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import (
     CLOUD,
@@ -52,7 +52,7 @@ def load_frame(
     *,
     axes: CloudAxes | None = None,
     intrinsics: Camera | str | Path | None = None,
-    mask: str | Path | None = None,
+    mask: Any = None,
     mask_value: int | tuple[int, ...] = (),
     camera_pose: ArrayLike | str | Path | None = None,
     **options: Any,
@@ -65,7 +65,8 @@ def load_frame(
             or a depth image, as ``DepthImage`` or as an array of h x w pixels with ``intrinsics``.
         axes: of points: "camera" (default) is x right, y down, z forward; "scanner" is y up, z toward the scanner.
         intrinsics: of a depth image: a camera, or a file of one.
-        mask: file of an image that is not 0 where the object is.
+        mask: file of an image that is not 0 where the object is; or that image, of Pillow or an array of h x w (or
+            1 x h x w) truth values, whole numbers, logits or probabilities, as segmentation networks return them.
         mask_value: of the object in a mask that holds ids of several things, or its values.
         camera_pose: of points in another frame, such as a robot's base: 4 x 4 numbers, or a file of them, that take
             camera coordinates to theirs. The points are moved, and results come out in the camera's axes.
@@ -78,8 +79,16 @@ def load_frame(
     Raises ``FileNotFoundError`` where there is no such file or name; ``ValueError`` for what is damaged or no frame,
     and for options that do not belong to this kind of frame; ``TypeError`` for an option that there is none of.
     """
-    mask, axes_or_camera = None if mask is None else Path(mask), "camera" if axes is None else axes
     values = (mask_value,) if isinstance(mask_value, int) else mask_value
+    if mask is not None and not isinstance(mask, str | Path):
+        image = mask_image(mask)
+        frame = load_frame(source, axes=axes, intrinsics=intrinsics, camera_pose=camera_pose, **options)
+        if frame.whole is None:
+            raise ValueError(f"a mask is given, but {frame.path} is a point cloud, which has no pixels: leave it out")
+        size = frame.whole.camera.width, frame.whole.camera.height
+        depth = masked_depth(frame.whole, frame.path, mask_of_image(image, size, values))
+        return replace(frame, depth=depth, cloud=depth.to_points())
+    mask, axes_or_camera = None if mask is None else Path(mask), "camera" if axes is None else axes
     reading, pose = InputConfig(frame=axes_or_camera, mask=mask, mask_value=values, **options), None
     if camera_pose is not None:
         pose = read_pose(Path(camera_pose)) if isinstance(camera_pose, str | Path) else checked_pose(camera_pose)
@@ -203,8 +212,8 @@ def reconstruct(
         initial_pose: rough pose of the object, as ``Result.pose``, from which the fit starts instead of a search or a
             network; what the scene holds (``held``) stays there. Both units must be known.
         options: fields of ``isolation`` by themselves, ``extent="partial"`` where a part of the object is hidden or cut
-            off, ``box``, ``remove_plane``, ``keep_all`` and others; and arguments of ``load_frame``, ``axes``,
-            ``unit_m``, ``intrinsics``, ``drop_invalid`` and others.
+            off, ``point=(u, v)``, the column and row of a pixel of the object, ``box`` and others; and
+            arguments of ``load_frame``, ``axes``, ``unit_m``, ``intrinsics``, ``mask`` and others.
 
     Warns with ``SizeWarning`` where the visible part cannot be the object of the weights, and without weights with
     ``ClustersWarning`` where the cloud may be two objects. Raises ``ValueError`` for unusable frames,
@@ -243,6 +252,7 @@ def reconstruct_observation(
     Takes its arguments, raises and warns as it does. Of ``isolation`` it matters whether every point is kept.
     """
     registrar = object.registrar(method)
+    seen = at_point(seen, registrar)
     is_alone = registrar is None or not is_whole(seen, registrar)
     if object.network is None and is_alone and (warning := clusters_warning(seen)) is not None:
         warnings.warn(in_callers_words(warning), ClustersWarning, stacklevel=3)

@@ -1,6 +1,10 @@
 """Pages of the viewer, from Python: a result, a frame with its answer, or the laboratory of an object."""
 
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
 
 from mereo.api.objects import Object, Source, object_of
 from mereo.api.reconstruct import reconstruct_observation
@@ -32,6 +36,8 @@ def view(
     block: bool | None = None,
 ) -> OpenPage:
     """Look at a result, at a frame and what is found in it, or at the laboratory of an object: ``mereo view``.
+
+    On the page of a depth image a click on what the camera saw says where the object is, and it is answered there.
 
     Args:
         input: a point cloud or depth image; a result of `mereo reconstruct` (its folder); a GLB file, whose meshes are
@@ -75,9 +81,17 @@ def view(
         else:
             is_shipped = str(path) in shipped_frames() and not path.exists()
             frame = shipped_frame(str(path)) if is_shipped else read_frame(path, reading or InputConfig())
-            isolation = isolation or IsolationConfig()
-            answer = reconstruct_observation(
-                find_object(frame, isolation), known, resolution=resolution, isolation=isolation
-            )
-            page = open_answer(answer, port)
+            stated, image = isolation or IsolationConfig(), frame.depth
+
+            def answer(isolation: IsolationConfig) -> Answer:
+                seen = find_object(frame, isolation)
+                return reconstruct_observation(seen, known, resolution=resolution, isolation=isolation)
+
+            def answer_at(place: Float[np.ndarray, "3"]) -> Answer:
+                assert image is not None
+                column, row = image.camera.project(place[None])[0].tolist()
+                return answer(replace(stated, point=(column, row)))
+
+            picks = None if image is None else (frame.cloud, answer_at)
+            page = open_answer(answer(stated), port, picks)
     return page.stay(block)

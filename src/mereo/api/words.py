@@ -21,6 +21,7 @@ ARGUMENTS = {
     "--remove-outliers": "remove_outliers=True",
     "--largest-cluster": "largest_cluster=True",
     "--depth-range 0.4 0.9": "depth_range=(0.4, 0.9)",
+    "--point 320 240": "point=(320, 240)",
     **{f"--extent {extent}": f'extent="{extent}"' for extent in get_args(Extent)},
     "--frame": "axes",
     "--carry-frame": "files",

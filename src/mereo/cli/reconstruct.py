@@ -43,7 +43,7 @@ from mereo.io.readers import read_pose
 from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame, read_frame
 from mereo.io.writers.formats import chosen_formats
-from mereo.locating.whole_frame import is_whole
+from mereo.locating.whole_frame import at_point, is_whole
 from mereo.models.config import InferenceConfig
 from mereo.models.trained import Trained
 from mereo.reconstruction.observation import FrameWarning, find_object
@@ -154,9 +154,11 @@ def reconstruct_frame(frame: SensorFrame, directory: Path, job: FrameJob, path: 
     ``path`` is the frame's own, for the options. Raises and warns as ``reconstruct_file``.
     """
     command = job.command
-    seen = replace(find_object(frame, command.isolation), initial_pose=job.initial_pose)
+    seen = at_point(replace(find_object(frame, command.isolation), initial_pose=job.initial_pose), job.registrar)
     is_looked_through = job.registrar is not None and is_whole(seen, job.registrar)
-    print(f"the object is looked for in all {len(seen.cloud)} points of the frame" if is_looked_through else seen)
+    within = f"all {len(seen.cloud)} points {'that are kept' if seen.steps else 'of the frame'}"
+    at = "" if seen.point is None else f", {seen.where}"
+    print(f"the object is looked for in {within}{at}" if is_looked_through else seen)
     placed = job.placed  # what is carried is refused before the work
     result = reconstruct_observation(
         seen,

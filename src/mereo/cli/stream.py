@@ -43,6 +43,7 @@ from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame, read_frame, read_frames
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.locating.following import Tracker
+from mereo.locating.whole_frame import at_point
 from mereo.models.trained import Trained
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import Observation, find_object
@@ -488,7 +489,7 @@ class Answering:
         """Answer to a frame; raises ``ValueError`` for unusable clouds, and where nothing is found."""
         seen: Observation = frame.load()
         if self.tracker is None:
-            answer = answer_frame(seen, self.model, None, keep_all=self.keep_all)
+            answer = answer_frame(at_point(seen, None), self.model, None, keep_all=self.keep_all)
         else:
             answer = self.tracker.follow(seen, frame.time_s, keep_all=self.keep_all)
         return FrameAnswer.of(replace(answer, resolution=self.resolution), self.uncertainty)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from PIL import Image
 
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import DepthImage, PointCloud
@@ -172,7 +173,41 @@ def _structured_points(records: np.ndarray, name: str) -> Float[np.ndarray, "n 3
     return np.stack([_floats(records[axis]).reshape(-1) for axis in "xyz"], axis=1)
 
 
-def _array(source: Any, kind: str) -> np.ndarray:
+def mask_image(mask: Any) -> Image.Image:
+    """Image of a mask in memory: of truth values or whole numbers, as they are, or of a segmentation network's floats.
+
+    Args:
+        mask: an image of Pillow; or h x w numbers, or 1 x h x w, of whatever library. Floats with negative ones are
+            logits, and show the object where they are positive; from 0 to 1 they are probabilities, and do from 0.5.
+
+    Raises ``ValueError`` for several masks, other shapes, and floats that are neither.
+    """
+    if isinstance(mask, Image.Image):
+        return mask
+    values = _array(mask, f"the mask, a {type(mask).__name__},", "pixels are needed: give h x w truth values")
+    name = f"the mask of shape {values.shape}"
+    if values.dtype != np.bool_:
+        check_real(values, name)
+    while values.ndim > 2 and len(values) == 1:
+        values = values[0]
+    if values.ndim != 2 or not values.size:
+        raise ValueError(
+            f"{name} is not one mask of h x w pixels; of several one is needed: choose it, as masks[scores.argmax()]"
+        )
+    if values.dtype.kind != "f":
+        return Image.fromarray(values if values.dtype in (np.bool_, np.uint8) else values.astype(np.int32))
+    low, high = float(values.min()), float(values.max())
+    if not (low < 0 or high <= 1):
+        raise ValueError(
+            f"{name} has floats from {low:g} to {high:g}; they must be logits, or probabilities from 0 to 1: give "
+            "truth values, as mask > 127"
+        )
+    return Image.fromarray(values > 0 if low < 0 else values >= 0.5)
+
+
+def _array(
+    source: Any, kind: str, cure: str = "n x 3 numbers are needed: make it a numpy array of rows of x, y and z"
+) -> np.ndarray:
     if isinstance(source, np.ma.MaskedArray):
         return source
     try:
@@ -184,9 +219,7 @@ def _array(source: Any, kind: str) -> np.ndarray:
     except Exception as error:  # whatever the library says of values that it does not hand over
         ragged = isinstance(source, list | tuple) and isinstance(error, ValueError)
         why = "its rows differ in length" if ragged else reason(error)
-        raise ValueError(
-            f"{kind} is no array ({why}); n x 3 numbers are needed: make it a numpy array of rows of x, y and z"
-        ) from error
+        raise ValueError(f"{kind} is no array ({why}); {cure}") from error
 
 
 def _floats(values: np.ndarray) -> Float[np.ndarray, "..."]:

@@ -187,6 +187,15 @@ def depth_of(path: Path, raw: Raw, depth_scale: float | None, camera: Camera) ->
         raise ValueError(f"{path} cannot be used: {error}") from None
 
 
+def masked_depth(image: DepthImage, path: str | Path, mask: Bool[np.ndarray, "h w"]) -> DepthImage:
+    """Depth image without what a mask leaves out; raises ``ValueError`` where nothing is left."""
+    depth = np.where(mask, image.depth, 0.0)
+    if not (depth > 0).any():
+        where = "inside the mask" if image.valid.any() else "in the image"
+        raise ValueError(f"{path} measures 0 pixels {where}; the object must be visible: check the image and the mask")
+    return DepthImage(depth, image.camera)
+
+
 def usable_depth(
     image: DepthImage, path: str | Path, mask_path: str | Path | None = None, mask_values: tuple[int, ...] = ()
 ) -> DepthImage:
@@ -194,23 +203,20 @@ def usable_depth(
 
     ``mask_values`` are as in ``read_mask``.
     """
-    depth = image.depth
+    mask = np.ones(image.depth.shape, dtype=bool)
     if mask_path is None and np.size(mask_values):
         raise ValueError("--mask-value says which pixels of a mask are the object, and none is given: give --mask FILE")
     if mask_path is not None:
         mask = read_mask(mask_path, (image.camera.width, image.camera.height), mask_values)
-        depth = np.where(mask, depth, 0.0)
-    if not (depth > 0).any():
-        where = "inside the mask" if image.valid.any() else "in the image"
-        raise ValueError(f"{path} measures 0 pixels {where}; the object must be visible: check the image and the mask")
-    median_m = float(np.median(depth[depth > 0]))
+    image = masked_depth(image, path, mask)
+    median_m = float(np.median(image.depth[image.valid]))
     least_m, most_m = PLAUSIBLE_DEPTH_M
     if not least_m <= median_m <= most_m:
         raise ValueError(
             f"the median depth of {path} is {median_m:.4g} m; it must be between {least_m:g} and {most_m:g} m: give "
             "the pixel value of one metre with --depth-scale (1000 for millimetres)"
         )
-    return DepthImage(depth, image.camera)
+    return image
 
 
 FULL = (1, 255, 65535)
@@ -234,11 +240,32 @@ def read_mask(
     """
     path = Path(path)
     with readable(path, "mask image"), open_image(path) as image:
-        is_lossy = image.format in LOSSY
-        opacity = np.asarray(image.convert("RGBA").getchannel("A")) if image.has_transparency_data else np.zeros(1)
-        # a 1-bit or palette image is taken by what it shows, anything else by its stored values
-        shown = np.asarray(image.convert("RGB") if image.mode in ("1", "P", "PA", "RGBA", "LA", "CMYK") else image)
-        stored = np.asarray(image) if image.mode == "P" else shown
+        layers = _mask_layers(image)
+    return _chosen_pixels(layers, f"the mask {path}", size, values)
+
+
+def mask_of_image(
+    image: Image.Image, size: tuple[int, int] | None = None, values: tuple[int, ...] = ()
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels of an image in memory that show the object; takes the arguments of ``read_mask`` and raises as it does."""
+    return _chosen_pixels(_mask_layers(image), "the mask", size, values)
+
+
+MaskLayers = tuple[bool, np.ndarray, np.ndarray, np.ndarray]
+"""Whether an image's format may have changed its values; its opacity, what it shows, and its stored values."""
+
+
+def _mask_layers(image: Image.Image) -> MaskLayers:
+    opacity = np.asarray(image.convert("RGBA").getchannel("A")) if image.has_transparency_data else np.zeros(1)
+    # a 1-bit or palette image is taken by what it shows, anything else by its stored values
+    shown = np.asarray(image.convert("RGB") if image.mode in ("1", "P", "PA", "RGBA", "LA", "CMYK") else image)
+    return image.format in LOSSY, opacity, shown, np.asarray(image) if image.mode == "P" else shown
+
+
+def _chosen_pixels(
+    layers: MaskLayers, name: str, size: tuple[int, int] | None, values: tuple[int, ...]
+) -> Bool[np.ndarray, "h w"]:
+    is_lossy, opacity, shown, stored = layers
     channels = stored.reshape(*stored.shape[:2], -1)
     ids, has_ids = channels.max(axis=-1), bool((channels == channels[..., :1]).all())
     mask = np.asarray(shown.reshape(*shown.shape[:2], -1).any(axis=-1))
@@ -251,26 +278,26 @@ def read_mask(
         if is_lossy or not has_ids or not np.isin(values, present).all():
             kind = "is in a lossy format" if is_lossy else f"has the values {seen}" if has_ids else "has colours"
             raise ValueError(
-                f"the mask {path} {kind}, and the object's are to be {np.atleast_1d(values).tolist()}; ids are needed: "
+                f"{name} {kind}, and the object's are to be {np.atleast_1d(values).tolist()}; ids are needed: "
                 "save them as a grey PNG, or correct --mask-value"
             )
         mask = np.isin(ids, values)
     elif is_soft:
         mask = ids >= 0.5 * present.max(initial=1)
         warnings.warn(
-            f"the mask {path} has grey edges{' (a lossy format makes them)' if is_lossy else ''}; its pixels from half "
+            f"{name} has grey edges{' (a lossy format makes them)' if is_lossy else ''}; its pixels from half "
             "of white are taken for the object's: save masks as PNG, in black and white",
             InputWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
     elif has_ids and len(present) > 1:
         raise ValueError(
-            f"the mask {path} has the values {seen}, which may be ids of several things; the object's are needed: give "
+            f"{name} has the values {seen}, which may be ids of several things; the object's are needed: give "
             f"--mask-value {present[-1]:g} or others"
         )
     if size is not None and mask.shape != (size[1], size[0]):
         raise ValueError(
-            f"the mask {path} is {mask.shape[1]} x {mask.shape[0]} pixels but the depth image is "
+            f"{name} is {mask.shape[1]} x {mask.shape[0]} pixels but the depth image is "
             f"{size[0]} x {size[1]}; they must agree: export the mask at the depth image's size"
         )
     return mask

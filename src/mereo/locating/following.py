@@ -13,7 +13,7 @@ from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.answer_frame import search_hypotheses
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.tracking import Track, TrackedFrame
-from mereo.locating.whole_frame import NEAR, WholeFrame, is_whole, located, part_of, pixels_near
+from mereo.locating.whole_frame import NEAR, WholeFrame, at_point, is_whole, located, part_of, pixels_near
 from mereo.reconstruction.observation import Observation
 
 
@@ -37,6 +37,13 @@ class Tracker(tracking.Tracker):
     ) -> None:
         """Follow an object; the arguments are those of ``tracking.Tracker``."""
         super().__init__(registrar, config, executor, search_frame)
+
+    def follow(
+        self, seen: Observation, time_s: float, *, scene_unit: float | None = None, keep_all: bool = False
+    ) -> Answer:
+        """Answer the next frame, as ``tracking.Tracker``; a point is where the object is in the first one."""
+        seen = replace(seen, point=None) if self._has_begun else at_point(seen, self.registrar)
+        return super().follow(seen, time_s, scene_unit=scene_unit, keep_all=keep_all)
 
     def _is_fitted_alone(self, seen: Observation) -> bool:
         # to look through a whole frame takes seconds, which frames of a lost object do not wait for

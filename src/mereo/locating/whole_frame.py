@@ -6,6 +6,7 @@ DepthImage -regions-> masks -quick look-> places, the most evident first -choose
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 from jaxtyping import Bool
@@ -16,9 +17,9 @@ from mereo.fitting.problem.correspondences import NoFit
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.problem import Problem
 from mereo.fitting.problem.residuals import NetworkTerm
-from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.answer_frame import (
-    answer_found,
+    answer_candidate,
     answer_frame,
     answer_of,
     cloud_to_fit,
@@ -35,10 +36,10 @@ from mereo.io.bounds import Cells, check_value
 from mereo.io.cores import limit_blas_threads
 from mereo.io.progress import stage
 from mereo.locating.outline import Jumps, Outline, compare_outline
-from mereo.locating.regions import SIZES, regions, steepest, thinned
+from mereo.locating.regions import GAPS, SIZES, connected_pixels, regions, steepest, thinned
 from mereo.models.trained import Trained
 from mereo.reconstruction.isolation import IsolationStep, Reading, Selection
-from mereo.reconstruction.observation import Observation
+from mereo.reconstruction.observation import HOLE_PX, Observation
 from mereo.reconstruction.pipeline import encode_frame
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.depth_sensor import render_depth
@@ -54,25 +55,36 @@ CHANCE, PER_MODE, MOST_MODES, BY_MASK = -3.0, -0.5, 6, 5.0
 """Nats of an object at a place of a frame before its outline is compared; those of each mode, up to so many, by which
 it can follow another thing's outline; and how many a mask adds."""
 
+WORTH = 1.0
+"""Nats that a better state must win at a place to be searched for."""
+
 UNLIKELY = -5.0
 """Nats below which a frame does not show the object at a place; up to 0 it may."""
 
 NOWHERE = (
-    "nothing in the whole frame is of the object's size and shape: check both units (--depth-scale, --units), or say "
-    "where it is (--mask, --box)"
+    "nothing {} is of the object's size and shape: check both units (--depth-scale, --units), or say "
+    "where it is (--point, --mask, --box)"
 )
-"""Sentence about a frame without any place."""
+"""Sentence about a frame without any place, which has a word for where."""
+
+CROPS = ("depth range", "box")
+"""Steps of isolation that leave a part of the image, in which the object is one thing among others."""
 
 NEAR, REGION_NEAR = 0.1, 3.0
 """Distance along a ray from a state, in half lengths, up to which pixels are taken for the object's, and in that the
 distance from its surface up to which those of its region are."""
 
 
-def part_of(seen: Observation, mask: Bool[np.ndarray, "h w"]) -> Observation:
-    """The object in a frame as a mask of its whole image has it."""
-    assert seen.frame.whole is not None
-    keep = mask[seen.frame.whole.valid]
-    steps = (IsolationStep("whole frame", len(keep), int(keep.sum()), "where the object is likeliest"),)
+def part_of(
+    seen: Observation,
+    mask: Bool[np.ndarray, "h w"],
+    name: str = "whole frame",
+    detail: str = "where the object is likeliest",
+) -> Observation:
+    """The object in a frame as a mask of its image has it, by a step of this name."""
+    assert seen.frame.depth is not None
+    keep = (mask & seen.kept_pixels())[seen.frame.depth.valid]
+    steps = (*seen.steps, IsolationStep(name, len(seen.cloud), int(keep.sum()), detail))
     selection = Selection(keep, np.ones_like(keep), np.zeros_like(keep), steps)
     return replace(seen, cloud=seen.frame.cloud.rows(keep), selection=selection, steps=steps)
 
@@ -105,8 +117,8 @@ class WholeFrame:
     """Whole depth image, in which an object of a known size is looked for.
 
     Attributes:
-        seen: all of the frame.
-        thin: the same with the thinned image.
+        seen: all of the frame, or what is in a box.
+        thin: all of it with the thinned image.
         registrar: of the object.
         unit: length of a scene unit in the frame's unit.
         jumps: of the thinned image.
@@ -127,7 +139,9 @@ class WholeFrame:
         assert seen.frame.whole is not None and unit is not None
         length = 2 * registrar.model.half * unit
         image, every = thinned(seen.frame.whole, length)
-        thin = replace(seen, frame=replace(seen.frame, cloud=image.to_points(), depth=image, whole=image))
+        cloud = image.to_points()
+        frame = replace(seen.frame, cloud=cloud, depth=image, whole=image)
+        thin = replace(seen, frame=frame, cloud=cloud, selection=None)
         return cls(seen, thin, registrar, unit, Jumps.of(image, length), every)
 
     @property
@@ -135,6 +149,17 @@ class WholeFrame:
         """Image with all that was measured."""
         assert self.seen.frame.whole is not None
         return self.seen.frame.whole
+
+    def is_at_point(self, pixels: Bool[np.ndarray, "h w"]) -> bool:
+        """Whether some pixels of the thinned image are at the frame's point; any are where it has none."""
+        column, row = self.seen.point or (0, 0)
+        rows, columns = np.nonzero(pixels)
+        distance = np.hypot(columns - column // self.every, rows - row // self.every)
+        return self.seen.point is None or bool(distance.min(initial=np.inf) <= HOLE_PX)
+
+    def explained(self, mesh: SegmentedMesh) -> Bool[np.ndarray, "h w"]:
+        """Pixels of the thinned image that see what lies as far away as a mesh does there."""
+        return pixels_near(self.jumps.image, mesh, NEAR * self.registrar.model.half * self.unit)
 
     def problem(self, seen: Observation) -> Problem:
         """What a fit to the object in the frame works on; raises ``ValueError`` for what none can start from."""
@@ -164,7 +189,10 @@ class WholeFrame:
         """Places where the object may be, the most evident first."""
         model, places = self.registrar.model, list[Place]()
         area = self.unit**2 * ConvexHull(model.rest_points).area / 4  # of its shadow, over all directions
-        for mask in regions(self.jumps.image, 2 * model.half * self.unit, area)[:LOOKS]:
+        image, first = self.jumps.image, self.every // 2
+        kept = self.seen.kept_pixels()[first :: self.every, first :: self.every]
+        part = DepthImage(np.where(kept, image.depth, 0.0), image.camera)
+        for mask in islice(filter(self.is_at_point, regions(part, 2 * model.half * self.unit, area)), LOOKS):
             try:
                 places.append(self.look(mask))
             except ValueError:
@@ -196,51 +224,66 @@ class WholeFrame:
     ) -> "PlacedAnswer | None":
         """Answer to the pixels of a place, by a search in ``rounds``, or without any by a fit from the place's states.
 
-        None where that finds nothing.
+        None where that finds nothing, or something that is not at the frame's point.
         """
         registrar = self.registrar
         try:
-            place, states = (place, ()) if rounds else (self.sharpened(place), place.states)
+            place = place if rounds else self.sharpened(place)
             seen = self.chosen(place)
             encoded = encode_frame(seen.readings(keep_all)[0], model, seen.frame.axes)
+            states = () if rounds else place.states
             candidate = fit_states(encoded, registrar, self.unit, seen, states, rounds)
         except ValueError:
             return None
-        if candidate.modes is None:
+        if candidate.modes is None or not self.is_at_point(self.explained(candidate.modes.registration.mesh)):
             return None
         answer = answer_of(seen, model, registrar, candidate, encoded, candidate.modes.registration)
-        return PlacedAnswer(place, seen, answer, self.outline(candidate.modes.registration.mesh))
+        return PlacedAnswer(place, seen, candidate, answer, self.outline(candidate.modes.registration.mesh))
 
     def finished(self, placed: "PlacedAnswer", keep_all: bool) -> "PlacedAnswer":
         """The same where it may be the object: by pixels that are chosen once more, and with the scene's parameters."""
-        answer = placed.answer
-        assert answer.candidate is not None and answer.candidate.modes is not None and answer.likelier is not None
-        if placed.nats < UNLIKELY or answer.registration is not answer.candidate.modes.registration:
+        modes, model = placed.candidate.modes, placed.answer.model
+        if modes is None or placed.nats < UNLIKELY or placed.answer.registration is not modes.registration:
             return placed
-        place = self.place(placed.place.mask, [answer.candidate.modes.posed])
-        again = self.answered(place, answer.model, keep_all, ())
-        if again is not None and again.nats > placed.nats:
-            placed, answer = again, again.answer
-        answer = answer_found(placed.seen, answer.model, self.registrar, answer.candidate, answer.likelier)
+        again = self.answered(self.place(placed.place.mask, [modes.posed]), model, keep_all, ())
+        best = placed if again is None else max(placed, again, key=lambda each: each.nats)
+        answer = answer_candidate(best.seen, model, self.registrar, best.candidate, best.candidate.encoded)
         assert answer.registration is not None
-        return replace(placed, answer=answer, outline=self.outline(answer.registration.mesh))
+        return replace(best, answer=answer, outline=self.outline(answer.registration.mesh))
 
 
 def located(frame: WholeFrame) -> Observation:
     """The object at the most evident place of a frame; raises ``NoFit`` where there is none."""
     places = frame.places()
     if not places:
-        raise NoFit(NOWHERE)
+        raise NoFit(NOWHERE.format(frame.seen.where))
     return frame.chosen(frame.sharpened(places[0]))
 
 
 def is_whole(seen: Observation, registrar: Registrar) -> bool:
-    """Whether a frame is a depth image that plainly shows more than the object, whose size is known."""
+    """Whether a frame is a depth image that plainly shows more than the object, whose size is known.
+
+    So may be a part of the image in a box, or a range of depths. A mask is of the object alone.
+    """
     frame, unit = seen.frame, scene_unit_of(seen, registrar, None)
     if unit is None or seen.initial_pose is not None or frame.whole is None or frame.depth is None:
         return False
-    is_all = len(seen.cloud) == int(frame.whole.valid.sum()) >= 4 * MIN_POINTS
+    is_part = len(frame.cloud) == int(frame.whole.valid.sum()) and all(step.name in CROPS for step in seen.steps)
+    is_all = is_part and len(seen.cloud) == int(seen.kept_pixels().sum()) >= 4 * MIN_POINTS
     return is_all and seen.main_length > SIZES[1] * 2 * registrar.model.half * unit
+
+
+def at_point(seen: Observation, registrar: Registrar | None) -> Observation:
+    """The object at its point, if it has one: where the frame is not looked through, the connected surface.
+
+    Raises ``ValueError`` where nothing is measured at it.
+    """
+    seen = seen.at_measurement()
+    if seen.point is None or seen.frame.depth is None or (registrar is not None and is_whole(seen, registrar)):
+        return seen
+    image, (column, row) = seen.frame.depth, seen.point
+    label = connected_pixels(np.where(seen.kept_pixels(), image.depth, 0.0), GAPS[0] * steepest(image))
+    return replace(part_of(seen, label == label[row, column], "point", "the connected surface at it"), point=None)
 
 
 def chance(model: StatisticalModel) -> float:
@@ -255,12 +298,14 @@ class PlacedAnswer:
     Attributes:
         place: by a fit to the pixels that the quick look's state explains.
         seen: the pixels that are chosen by that.
-        answer: of the fit to them.
+        candidate: the fit to them.
+        answer: of that.
         outline: of that.
     """
 
     place: Place
     seen: Observation
+    candidate: Candidate
     answer: Answer
     outline: Outline
 
@@ -269,28 +314,33 @@ class PlacedAnswer:
         """By the outline, and by how strange the state and what is left over are."""
         registration = self.answer.registration
         assert registration is not None
-        return chance(registration.model) + self.outline.nats - 0.5 * self.answer.recognition.strangeness**2
+        return chance(registration.model) + self.outline.nats - self.lost
+
+    @property
+    def lost(self) -> float:
+        """Nats that the state's strangeness costs, and that a better state may win."""
+        return 0.5 * self.answer.recognition.strangeness**2
 
     @property
     def is_evident(self) -> bool:
-        """Whether the object is known there, and no other thing is likelier."""
-        return self.nats > 0 and self.answer.recognition.known is True
+        """Whether the object is known there, no other thing is likelier, and no state is much better."""
+        return self.nats > 0 and self.answer.recognition.known is True and self.lost < WORTH
 
 
 def answers_in(
     frame: WholeFrame, model: Trained | None, keep_all: bool = False, all_places: bool = False
 ) -> Iterator[PlacedAnswer]:
-    """Answers at the most evident places of a whole frame, up to the first that is known and no likelier another thing.
+    """Answers at the most evident places of a whole frame, up to the first that is evident itself.
 
-    First from the states of the quick looks, in a second each, then, where none of these is known, by a search, which
-    takes several. With ``all_places`` the others are answered as well. Places where a fit finds nothing have none.
-    Parameters of the object's scene are fitted where these are known (``WholeFrame.finished``).
+    First from the states of the quick looks, in a second each, then by a search, which takes several, where a better
+    state may win more than the best has. With ``all_places`` the others are answered as well. Places where a fit finds
+    nothing have none. Parameters of the object's scene are fitted where it is evident (``WholeFrame.finished``).
     """
     places = frame.places()
     hopeful = [place for place in places[:ANSWERS] if place.outline.nats > HOPELESS]
     waiting = hopeful or places[:1]
     for rounds in ((), ROUNDS[:1]):
-        unknown = list[Place]()
+        answers = list[PlacedAnswer]()
         for place in waiting:
             placed = frame.answered(place, model, keep_all, rounds)
             if placed is None:
@@ -299,9 +349,9 @@ def answers_in(
             yield placed
             if placed.is_evident and not all_places:
                 return
-            if placed.answer.recognition.known is not True:
-                unknown.append(placed.place)
-        waiting = unknown if hopeful else []
+            answers.append(placed)
+        best = max((placed.nats for placed in answers), default=0.0)
+        waiting = [each.place for each in answers if hopeful and each.lost >= WORTH and each.nats + each.lost > best]
 
 
 def answer_observation(
@@ -329,7 +379,7 @@ def answer_observation(
         frame = WholeFrame.of(seen, registrar)
         answers = list(answers_in(frame, model, keep_all))
         if not answers:
-            raise NoFit(NOWHERE)
+            raise NoFit(NOWHERE.format(seen.where))
         best = frame.finished(max(answers, key=lambda placed: placed.nats), keep_all)
     answer = absent(best) if best.nats < UNLIKELY else doubted(best.answer, best.outline, 0.0)
     seconds = time.perf_counter() - started
@@ -368,8 +418,8 @@ def absent(best: PlacedAnswer) -> Answer:
     answer = best.answer
     x, y, z = answer.seen.cloud.points.mean(axis=0) * answer.seen.frame.metres
     reason = (
-        f"the object is not in this frame; what is most like it, at {x:.3g} {y:.3g} {z:.3g} "
+        f"the object is not {answer.seen.where}; what is most like it, at {x:.3g} {y:.3g} {z:.3g} "
         f"{answer.seen.frame.length_name}, has another outline or shape: take a frame that shows more of it, or say "
-        "where it is (--mask, --box)"
+        "where it is (--point, --mask, --box)"
     )
     return replace(answer, recognition=replace(answer.recognition, known=False, reason=reason))

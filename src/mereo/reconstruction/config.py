@@ -31,6 +31,9 @@ class IsolationConfig:
             reconstruction, so that they have no lines of sight and rule nothing out; their normals are compared. auto:
             as the depths measured around the object say; where the frame does not say it, the fit decides; surface
             where a file has faces or normals, and no camera at the origin can have seen them.
+        point: column and row of a pixel of the depth image that shows the object, from 0 at the upper left. Of a whole
+            image only what is seen there is looked at; where the size is not known, or other options leave the object
+            alone, it keeps the connected surface there.
     """
 
     depth_range: tuple[float, float] | None = None
@@ -41,6 +44,7 @@ class IsolationConfig:
     cluster_gap: NotNegative = 0.0
     keep_all: bool = False
     extent: Extent = "auto"
+    point: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -59,6 +63,11 @@ class IsolationConfig:
             raise ValueError(
                 f"the box is {_numbers(self.box)}; each of x0 y0 z0 must be less than its x1 y1 z1: give the lower "
                 "corner, then the upper one, in metres"
+            )
+        if self.point is not None and not (is_numbers(self.point, 2) and all(0 <= k < math.inf for k in self.point)):
+            raise ValueError(
+                f"the point is {self.point!r}; it must be the column and the row of a pixel, from 0 at the upper left: "
+                "give for example --point 320 240"
             )
         if self.cluster_gap > 0 and not self.largest_cluster:
             raise ValueError(

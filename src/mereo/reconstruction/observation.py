@@ -38,6 +38,10 @@ LIKE_SIZE, APART = 0.4, 0.25
 may be objects."""
 
 
+HOLE_PX = 5
+"""Pixels from a point that is stated up to which the object is measured: cameras leave holes, and hands are unsure."""
+
+
 class FrameWarning(UserWarning):
     """Warning that what is seen may not be the object, or not the object alone."""
 
@@ -63,6 +67,7 @@ class Observation:
             where "auto" has found one.
         initial_pose: rough ``T_camera_model`` from which a fit starts, as ``Result.pose``; None where a search or a
             network finds the object.
+        point: column and row of a pixel that shows the object; None where nothing says so.
     """
 
     frame: SensorFrame
@@ -71,6 +76,7 @@ class Observation:
     selection: Selection | None = None
     extent: Extent = "auto"
     initial_pose: Float[np.ndarray, "4 4"] | None = None
+    point: tuple[int, int] | None = None
 
     @cached_property
     def lines(self) -> SightLines:
@@ -81,6 +87,39 @@ class Observation:
     def main_length(self) -> float:
         """``main_length`` of the object's points, which takes long to find for a whole image."""
         return main_length(self.cloud.points)
+
+    @property
+    def where(self) -> str:
+        """Phrase for where the object is looked for."""
+        return "in this frame" if self.point is None else "at the point {} {}".format(*self.point)
+
+    def kept_pixels(self) -> Bool[np.ndarray, "h w"]:
+        """Measured pixels of the depth image that isolation keeps."""
+        assert self.frame.depth is not None
+        kept = self.frame.depth.valid.copy()
+        kept[kept] = self.selection is None or self.selection.of_object(self.frame.cloud.points)
+        return kept
+
+    def at_measurement(self) -> "Observation":
+        """The object whose point, if it has one, is the nearest measured pixel.
+
+        Raises ``ValueError`` for a frame without pixels, a point outside of them, and one ``HOLE_PX`` away from all.
+        """
+        if self.point is None:
+            return self
+        if self.frame.depth is None or not len(self.cloud):
+            raise ValueError(f"{self.frame.source} has no pixels with a depth, of which a point is: crop with --box")
+        (column, row), kept = self.point, self.kept_pixels()
+        rows, columns = np.nonzero(kept)
+        distance = np.hypot(columns - column, rows - row)
+        nearest = int(distance.argmin())
+        if distance[nearest] > HOLE_PX or row >= len(kept) or column >= len(kept[0]):
+            raise ValueError(
+                f"the point {column} {row} lies outside the {len(kept[0])} x {len(kept)} pixels of {self.frame.source} "
+                f"or more than {HOLE_PX} pixels from any that is measured and kept (the nearest is {columns[nearest]} "
+                f"{rows[nearest]}): give column and row, from 0 at the upper left, of a pixel on the object"
+            )
+        return replace(self, point=(int(columns[nearest]), int(rows[nearest])))
 
     @cached_property
     def self_hidden(self) -> float:
@@ -209,7 +248,8 @@ def find_object(
                 "leave out --extent surface"
             )
         frame = replace(frame, axes="scanner")  # in which nobody knows where a camera was
-    return Observation(frame, cloud, selection.steps, selection, extent)
+    point = None if isolation.point is None else (int(isolation.point[0]), int(isolation.point[1]))
+    return Observation(frame, cloud, selection.steps, selection, extent, point=point)
 
 
 def _is_straight(points: Float[np.ndarray, "n 3"]) -> bool:

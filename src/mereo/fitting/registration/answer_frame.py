@@ -78,11 +78,11 @@ def answer_frame(
     started = time.perf_counter()
     with stage("register the model"):
         candidate, likelier = find(seen, model, registrar, keep_all, scene_unit)
-    answer = answer_found(seen, model, registrar, candidate, likelier)
+    answer = answer_candidate(seen, model, registrar, candidate, likelier)
     return replace(answer, resolution=resolution, label_points=label_points, seconds=time.perf_counter() - started)
 
 
-def answer_found(
+def answer_candidate(
     seen: Observation, model: Trained | None, registrar: Registrar | None, candidate: Candidate, likelier: EncodedFrame
 ) -> Answer:
     """Answer a frame by what ``find`` or ``fit_states`` has found, with the parameters of the object's scene.
