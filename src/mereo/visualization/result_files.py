@@ -23,6 +23,7 @@ from mereo.io.config import DEFAULT_FILES, FilesConfig
 from mereo.io.writers.formats import WRITERS, Results, chosen_formats, write_formats
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.scenes.rest_pose import rest_digest
+from mereo.visualization.joints import measure_joints
 from mereo.visualization.previews import render_cloud_and_segments
 from mereo.visualization.reconstruction_report import REPORT, Report, cluster, trust
 from mereo.visualization.units import Unit
@@ -60,6 +61,7 @@ def summary_of(
         "verdict": trust(facts).level,
         **facts,
         **radii,
+        "joints": {name: joint.facts() for name, joint in measure_joints(answer).items()},
         "pose": None if registered is None else registered.pose().tolist(),
         "nested": [list(pair) for pair in result.surfaces.nested],
         "spacing": float(result.labels.spacing[0]),
