@@ -79,8 +79,9 @@ def read_segmented_mesh(*paths: str | Path) -> SegmentedMesh:
 def read_object_mesh(path: str | Path) -> SegmentedMesh:
     """Segments of a file, or of a folder's files, for an object that is to be found; raises as ``read_segmented_mesh``.
 
-    Those of a robot's file are its links where all joints are zero, see ``io.robots``. Solids of more than ``mesh_repair.MOST_FACES`` faces are simplified, and a ``MeshWarning`` says how far. What was
-    read before is kept, as long as its files are the same.
+    Those of a robot's file are its links where all joints are zero, see ``io.robots``. Solids of more than
+    ``mesh_repair.MOST_FACES`` faces are simplified, and a ``MeshWarning`` says how far. What was read before is kept,
+    as long as its files are the same.
     """
     path = Path(path)
     if path.suffix.lower() in ROBOT_SUFFIXES:

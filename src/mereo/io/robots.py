@@ -1,13 +1,11 @@
 """Robots of URDF and SDF files: their links as segments where all joints are zero, and the joints that move them.
 
-file -_read_urdf, _read_sdf-> _Tree -read_robot-> Robot
+file -yourdfpy, _read_sdf-> yourdfpy's Robot (links, joints) -_assembled-> Robot (segments, joints between them)
 
-Links that no joint moves against each other are one segment. Lengths are metres and angles radians, as both formats
-have them; positions are in the frame of the base, or of the SDF file's model.
+Lengths are metres and angles radians, as both formats have them; positions are in the frame of the base.
 """
 
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from io import BytesIO
@@ -19,22 +17,16 @@ import trimesh
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from mereo.geometry.brief import listed
 from mereo.geometry.conventions import LARGEST
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.mesh_check import united
-from mereo.geometry.transforms import rigid, transform_points
+from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
 from mereo.io.errors import readable
 from mereo.io.extras import library
 from mereo.io.mesh_formats import ROBOT_SUFFIXES, read_object_mesh
 
-FULL_TURN = (-np.pi, np.pi)
-"""Range of a joint that turns without limits, or by more than a turn."""
-
-MOVING = {"revolute": True, "continuous": True, "prismatic": False}
-"""Kinds of joints that move a link, and whether they turn it."""
-
-KINDS = (*MOVING, "fixed")
+KINDS = ("revolute", "continuous", "prismatic", "fixed")
+"""Kinds of joints that are known."""
 
 Matrix = Float[np.ndarray, "4 4"]
 Vector = Float[np.ndarray, "3"]
@@ -60,7 +52,7 @@ class RobotJoint:
     axis: Vector
     limits: tuple[float, float]
     moved: tuple[str, ...]
-    follows: str = ""
+    follows: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,392 +79,300 @@ def is_robot(path: Path) -> bool:
 def read_robot(path: str | Path) -> Robot:
     """Read a robot from a URDF or SDF file, with the meshes that it names.
 
-    Shapes are those of the visual elements, where the file has any, else of the collision elements: meshes (with their
-    scale), boxes, cylinders and spheres. ``package://NAME/...`` and ``model://NAME/...`` are looked for in the folders
-    above the file.
+    Shapes are those of the visual elements, where the file has any, else of the collision elements.
+    ``package://NAME/...`` and ``model://NAME/...`` are looked for in the folders above the file.
 
     Raises ``FileNotFoundError`` for a missing file or mesh; ``ValueError`` for a damaged file, a joint that is neither
     revolute, continuous, prismatic nor fixed, links that form no tree, and a robot without shapes; ``ImportError``
     without the extra `robot`.
     """
     path = Path(path)
-    tree = (_read_urdf if path.suffix.lower() == ".urdf" else _read_sdf)(path)
-    files = sorted({shape.file for shapes in tree.shapes.values() for shape in shapes if shape.file is not None})
-    states = [(str(file), file.stat()) for file in (path, *files)]
-    known = tuple((name, state.st_ino, state.st_size, state.st_mtime_ns) for name, state in states)
-    return _assembled(_Known(tree, known))
-
-
-# --- links and joints of a file ---------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class _Shape:
-    """Shape of a link: a solid, or a mesh's ``file`` in its own frame, scaled and then moved by ``T_robot_shape``."""
-
-    T_robot_shape: Matrix
-    solid: trimesh.Trimesh | None = None
-    file: Path | None = None
-    scale: Vector = field(default_factory=lambda: np.ones(3))
-
-    def pieces(self) -> Iterable[tuple[np.ndarray, np.ndarray]]:
-        """Vertices and faces of the shape's parts in the robot's frame."""
-        if self.file is None:
-            assert self.solid is not None
-            parts: Sequence[Any] = [self.solid]
-        else:
-            parts = read_object_mesh(self.file).segments
-        turn = -1 if np.prod(self.scale) < 0 else 1  # a mirrored surface faces inwards
-        for part in parts:
-            vertices = transform_points(self.T_robot_shape, np.asarray(part.vertices) * self.scale)
-            yield vertices, np.asarray(part.faces, dtype=np.int64)[:, ::turn]
-
-
-@dataclass(frozen=True, eq=False)
-class _Joint:
-    """Joint of a file; ``T_robot_joint`` is its frame, in which ``axis`` is given, ``mimic`` leader, factor, offset."""
-
-    name: str
-    kind: str
-    parent: str
-    child: str
-    T_robot_joint: Matrix
-    axis: Vector
-    limits: tuple[float | None, float | None]
-    mimic: tuple[str, float, float] | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class _Tree:
-    """Links of a file with their shapes, from the base on, and the joints between them in the same order."""
-
-    path: Path
-    shapes: Mapping[str, Sequence[_Shape]]
-    joints: Sequence[_Joint]
-
-
-@dataclass(frozen=True)
-class _Known:
-    """Content of a file, with the states on the disk of all files that it comes from."""
-
-    tree: _Tree = field(compare=False)
-    states: tuple[tuple[str, int, int, int], ...]
-
-
-def _parsed(path: Path, tag: str, kind: str) -> Any:
-    """Root of an XML file, which is ``tag``; entities are not resolved, and nothing else is opened."""
-    etree = library("lxml.etree", "robot", path)
+    kind = f"{path.suffix[1:].upper()} file"
+    yourdfpy, etree = library("yourdfpy", "robot", path), library("lxml.etree", "robot", path)
     with readable(path, kind):
         parser = etree.XMLParser(resolve_entities=False, remove_comments=True, remove_pis=True)
         root = etree.parse(BytesIO(path.read_bytes()), parser).getroot()
-        if root.tag != tag:
-            raise ValueError(f"its first element is <{root.tag}>, not <{tag}>")
-    if any("xacro" in str(element.tag) for element in root.iter()):
-        raise ValueError(f"{path} is a macro file; its links are known once it is expanded: run `xacro` on it first")
-    return root
+        if any("xacro" in element.tag for element in root.iter(etree.Element)):
+            raise ValueError("it is a macro file, whose links are known once `xacro` has expanded it")
+        if kind == "URDF file":
+            described = _read_urdf(yourdfpy, root, etree.tostring(root))
+        else:
+            described = _read_sdf(yourdfpy, root)
+    drawn = any(link.visuals for link in described.links)
+    shapes = [(link.name, each) for link in described.links for each in (link.visuals if drawn else link.collisions)]
+    files = {each.geometry.mesh.filename: link for link, each in shapes if each.geometry.mesh is not None}
+    meshes = {name: _mesh_file(path, link, name) for name, link in files.items()}
+    states = [(file, file.stat()) for file in (path, *meshes.values())]
+    known = tuple((str(file), state.st_ino, state.st_size, state.st_mtime_ns) for file, state in states)
+    return _assembled(_Described(path, described, shapes, meshes, known))
 
 
-def _checked_tree(path: Path, links: Sequence[str], ends: Sequence[tuple[str, str, str]]) -> list[int]:
-    """Indices of joints (name, parent, child), each after those that carry it; ``ValueError`` where they are no tree."""
-    for kind, names in (("links", links), ("joints", [name for name, _, _ in ends])):
-        if twice := [name for name, count in Counter(names).items() if count > 1]:
-            raise ValueError(f"{path}: two {kind} are called {twice[0]!r}; names tell them apart: rename one of them")
-    above = dict[str, str]()
-    for name, parent, child in ends:
-        for link in (parent, child):
-            if link not in links:
-                raise ValueError(f"{path}: joint {name!r} names the link {link!r}, which is not in the file: correct it")
-        if child in above:
-            raise ValueError(
-                f"{path}: link {child!r} is carried by the joints {above[child]!r} and {name!r}; each link is carried "
-                "by one, for loops are not known: leave one of them out"
-            )
-        above[child] = name
-    roots = [link for link in links if link not in above]
-    reached, order = set(roots[:1]), list[int]()
-    while new := [k for k, (_, parent, _) in enumerate(ends) if parent in reached and k not in order]:
-        order += new
-        reached |= {ends[k][2] for k in new}
-    if lost := [link for link in links if link not in reached]:
-        base = f"the base {roots[0]!r}" if roots else "any base, as the joints form a loop"
-        raise ValueError(f"{path}: no joint leads from {base} to the link {lost[0]!r}: add one, or leave the link out")
-    return order
+def _read_urdf(yourdfpy: Any, root: Any, content: bytes) -> Any:
+    for joint in root.iterfind("joint"):  # which the library takes for granted
+        if joint.find("parent") is None or joint.find("child") is None:
+            raise ValueError(f"its joint {joint.get('name')!r} has no <parent> or no <child>")
+    return yourdfpy.URDF.load(BytesIO(content), build_scene_graph=False, load_meshes=False).robot
 
 
-def _read_urdf(path: Path) -> _Tree:
-    root = _parsed(path, "robot", "URDF file")
-    yourdfpy, etree = library("yourdfpy", "robot", path), library("lxml.etree", "robot", path)
-    with readable(path, "URDF file"):
-        for joint in root.iterfind("joint"):  # what the library does not look at
-            for part in ("parent", "child"):
-                if joint.find(part) is None:
-                    raise ValueError(f"its joint {joint.get('name')!r} has no <{part}>")
-        content = BytesIO(etree.tostring(root))
-        robot = yourdfpy.URDF.load(content, build_scene_graph=False, load_meshes=False).robot
-    names = [link.name for link in robot.links]
-    order = _checked_tree(path, names, [(joint.name, joint.parent, joint.child) for joint in robot.joints])
-    poses, joints = {name: np.eye(4) for name in names}, list[_Joint]()
-    for joint in (robot.joints[index] for index in order):
-        frame = poses[joint.parent] @ _origin(joint)
-        poses[joint.child] = frame
-        limits = (None, None) if joint.limit is None else (joint.limit.lower or 0.0, joint.limit.upper or 0.0)
-        mimic = None if joint.mimic is None else (joint.mimic.joint, joint.mimic.multiplier, joint.mimic.offset)
-        ends = joint.type, joint.parent, joint.child
-        joints.append(_Joint(joint.name, *ends, frame, np.asarray(joint.axis, dtype=np.float64), limits, mimic))
-    seen = any(link.visuals for link in robot.links)
-    shapes = dict[str, list[_Shape]]()
-    for link in robot.links:
-        shapes[link.name] = []
-        for element in link.visuals if seen else link.collisions:
-            place, what = poses[link.name] @ _origin(element), element.geometry
-            if what.mesh is not None:
-                scale = 1.0 if what.mesh.scale is None else what.mesh.scale
-                file = _mesh_file(path, link.name, what.mesh.filename)
-                shapes[link.name].append(_Shape(place, None, file, np.broadcast_to(scale, 3).astype(np.float64)))
-            else:
-                (kind, solid), *_ = ((key, value) for key, value in vars(what).items() if value is not None)
-                shapes[link.name].append(_solid(path, link.name, kind, place, vars(solid)))
-    return _Tree(path, {name: shapes[name] for name in _from_base(names, joints)}, joints)
+def _read_sdf(yourdfpy: Any, root: Any) -> Any:
+    """Robot of an SDF file's only model, as yourdfpy would have it from a URDF file: links in the frames of joints."""
+    models = [*root.iterfind("model"), *root.iterfind("world/model")]
+    if len(models) != 1 or models[0].find("include") is not None or models[0].find("model") is not None:
+        raise ValueError(f"it has {len(models)} models; it must have one, without others in it")
+    (model,) = models
+    elements = {each.get("name"): each for kind in ("frame", "joint", "link") for each in model.iterfind(kind)}
+    names = {"link": "", "joint": "child", "frame": "attached_to"}
+    poses, pending = {"": np.eye(4), "__model__": np.eye(4)}, set[str]()
+
+    def pose_of(name: str) -> Matrix:
+        """Pose of a link, joint or frame in the model."""
+        if name not in poses:
+            if name in pending or name not in elements:
+                raise ValueError(f"a pose is relative to {name!r}, which is no other link, joint or frame")
+            pending.add(name)
+            element = elements[name]
+            base = names[element.tag]
+            poses[name] = pose(element, (element.findtext(base) or element.get(base, "")) if base else "")
+        return poses[name]
+
+    def pose(element: Any, base: str) -> Matrix:
+        place = element.find("pose")
+        if place is None:
+            return pose_of(base.strip())
+        x, y, z, *angles = _numbers(place.text, 6)
+        turn = Rotation.from_euler("xyz", angles, degrees=place.get("degrees") == "true").as_matrix()
+        return pose_of(place.get("relative_to", base.strip())) @ rigid(turn, np.array([x, y, z]))
+
+    joints, frames = list[Any](), {link.get("name"): pose_of(link.get("name")) for link in model.iterfind("link")}
+    for element in model.iterfind("joint"):
+        name, parent, child = element.get("name"), *(element.findtext(key, "").strip() for key in ("parent", "child"))
+        if parent != "world":  # the camera may see it from anywhere
+            frames[child] = pose_of(name)
+            joint = yourdfpy.Joint(name, element.get("type"), parent, child, axis=np.zeros(3))
+            joints.append(_with_axis(yourdfpy, joint, element.find("axis"), pose_of))
+    for joint in joints:
+        joint.origin = inverse_rigid(frames.get(joint.parent, np.eye(4))) @ frames[joint.child]
+    links = list[Any]()
+    for element in model.iterfind("link"):
+        link = yourdfpy.Link(element.get("name"))
+        for kind, shapes in (("visual", link.visuals), ("collision", link.collisions)):
+            for each in element.iterfind(kind):
+                place = inverse_rigid(frames[link.name]) @ pose(each, link.name)
+                shapes += [yourdfpy.Visual(None, place @ shift, what) for shift, what in _geometries(yourdfpy, each)]
+        links.append(link)
+    return yourdfpy.Robot(model.get("name"), links, joints)
+
+
+def _with_axis(yourdfpy: Any, joint: Any, axis: Any, pose_of: Any) -> Any:
+    """Joint of an SDF file with its axis, limits and leader."""
+    if axis is None:
+        return joint
+    base = axis.find("xyz").get("expressed_in") or joint.name
+    if axis.findtext("use_parent_model_frame", "").strip() in ("1", "true"):
+        base = "__model__"
+    turn = pose_of(joint.name)[:3, :3].T @ pose_of(base)[:3, :3]
+    joint.axis = turn @ _numbers(axis.findtext("xyz"), 3)
+    lower, upper = (_numbers(axis.findtext(f"limit/{key}") or value, 1)[0] for key, value in LIMITS.items())
+    joint.limit = yourdfpy.Limit(lower=lower, upper=upper)
+    if (leader := axis.find("mimic")) is not None:
+        factor, offset, start = (
+            _numbers(leader.findtext(key) or value, 1)[0]
+            for key, value in (("multiplier", "1"), ("offset", "0"), ("reference", "0"))
+        )
+        joint.mimic = yourdfpy.Mimic(leader.get("joint"), factor, offset - factor * start)
+    return joint
+
+
+LIMITS = {"lower": "-inf", "upper": "inf"}
+"""Limits of a joint of an SDF file that states none."""
+
+
+def _geometries(yourdfpy: Any, element: Any) -> Iterator[tuple[Matrix, Any]]:
+    """Shapes of a visual or collision element of an SDF file, and where they are in it."""
+    shape = element.find("geometry/*")
+    if shape is None:
+        raise ValueError(f"its <{element.tag}> {element.get('name')!r} has no geometry")
+    sizes = {each.tag: each.text for each in shape}
+    round_sizes = [_numbers(sizes[key], 1)[0] for key in ("radius", "length") if key in sizes]
+    if shape.tag == "mesh":
+        mesh = yourdfpy.Mesh((sizes["uri"] or "").strip(), np.array(_numbers(sizes.get("scale", "1 1 1"), 3)))
+        yield np.eye(4), yourdfpy.Geometry(mesh=mesh)
+    elif shape.tag == "box":
+        yield np.eye(4), yourdfpy.Geometry(box=yourdfpy.Box(np.array(_numbers(sizes["size"], 3))))
+    elif shape.tag == "sphere":
+        yield np.eye(4), yourdfpy.Geometry(sphere=yourdfpy.Sphere(*round_sizes))
+    elif shape.tag in ("cylinder", "capsule"):
+        radius, length = round_sizes
+        yield np.eye(4), yourdfpy.Geometry(cylinder=yourdfpy.Cylinder(radius, length))
+        for end in (-length / 2, length / 2) if shape.tag == "capsule" else ():
+            yield rigid(np.eye(3), np.array([0.0, 0.0, end])), yourdfpy.Geometry(sphere=yourdfpy.Sphere(radius))
+    else:
+        raise ValueError(f"its <{element.tag}> {element.get('name')!r} is a {shape.tag}, which is not known")
+
+
+def _numbers(text: str | None, count: int) -> list[float]:
+    numbers = [float(word) for word in (text or "").split()]
+    if len(numbers) != count:
+        raise ValueError(f"{text!r} is not {count} numbers")
+    return numbers
+
+
+def _mesh_file(path: Path, link: str, name: str) -> Path:
+    """File of a mesh that a link names: relative to the robot's file, or in a package in the folders above it."""
+    scheme, _, rest = name.rpartition("://")
+    folder, tries = path.resolve().parent, [path.resolve().parent / rest]
+    if scheme in ("package", "model"):
+        package, _, inside = rest.partition("/")
+        above = (folder, *folder.parents)
+        tries = [base / rest for base in above]
+        tries += [base / inside for base in above if base.name == package or (base / "package.xml").is_file()]
+    for file in tries:
+        if file.is_file():
+            return file
+    where = "no folder above the file has it" if len(tries) > 1 else f"{tries[0]} does not exist"
+    raise FileNotFoundError(
+        f"{path}: link {link!r} names the mesh {name!r}, and {where}: put it there, or correct the path"
+    )
+
+
+# --- the robot of links and joints ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Described:
+    """Content of a file: yourdfpy's robot, its shapes by link, and files of meshes; equal where ``states`` are."""
+
+    path: Path = field(compare=False)
+    robot: Any = field(compare=False)
+    shapes: Any = field(compare=False)
+    meshes: Any = field(compare=False)
+    states: tuple[tuple[str, int, int, int], ...]
+
+
+@lru_cache(maxsize=16)
+def _assembled(content: _Described) -> Robot:
+    path, joints = content.path, _from_base(content.path, content.robot)
+    limits = _limits(path, joints)
+    poses = {link.name: np.eye(4) for link in content.robot.links}
+    carriers: dict[str, tuple[str, ...]] = dict.fromkeys(poses, ())
+    for joint in joints:
+        poses[joint.child] = poses[joint.parent] @ _origin(joint)
+        carriers[joint.child] = carriers[joint.parent] + ((joint.name,) if joint.name in limits else ())
+    names, parts = dict[tuple[str, ...], str](), dict[str, list[Segment]]()
+    order = [*(link for link in poses if not carriers[link]), *(joint.child for joint in joints)]
+    for link, shape in sorted(content.shapes, key=lambda pair: order.index(pair[0])):
+        pieces = parts.setdefault(names.setdefault(carriers[link], link), [])
+        for vertices, faces in _surfaces(shape.geometry, content.meshes):
+            vertices = transform_points(poses[link] @ _origin(shape), vertices)
+            if not (np.abs(vertices) <= LARGEST).all():
+                raise ValueError(f"{path}: a pose or size of link {link!r} is no finite number: correct it")
+            pieces.append(Segment(str(len(pieces)), PALETTE[0], vertices, faces))
+    if not parts:
+        raise ValueError(f"{path} has no link with a shape, of which a camera could see something: add meshes")
+    colors = (PALETTE[index % len(PALETTE)] for index in range(len(parts)))
+    segments = (Segment(name, color, *united(each)) for (name, each), color in zip(parts.items(), colors, strict=True))
+    moved = {joint: tuple(name for chain, name in names.items() if joint in chain) for joint in limits}
+    kept = {joint: each for joint, each in moved.items() if 0 < len(each) < len(names)}
+    notes = (f"joint {name!r} is left out, for it moves no segment against others" for name in limits.keys() - kept)
+    found_joints = []
+    for joint in reversed(joints):
+        if joint.name in kept:
+            leader, *ends = limits[joint.name]
+            ends = ends if leader in kept else sorted(ends)
+            axis = poses[joint.child][:3, :3] @ (joint.axis / np.linalg.norm(joint.axis))
+            place = joint.type != "prismatic", poses[joint.child][:3, 3], axis, (ends[0], ends[1])
+            found_joints.append(RobotJoint(joint.name, *place, kept[joint.name], leader if leader in kept else ""))
+    return Robot(SegmentedMesh(tuple(segments)), tuple(found_joints), tuple(sorted(notes)))
 
 
 def _origin(element: Any) -> Matrix:
     return np.eye(4) if element.origin is None else np.asarray(element.origin)
 
 
-def _from_base(names: Sequence[str], joints: Sequence[_Joint]) -> list[str]:
-    """Links in the order in which the joints reach them."""
-    children = [joint.child for joint in joints]
-    return [*(name for name in names if name not in children), *children]
+def _surfaces(geometry: Any, meshes: Any) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Vertices and faces of the parts of a shape in its own frame."""
+    if geometry.mesh is not None:
+        scale = np.ones(3) if geometry.mesh.scale is None else geometry.mesh.scale * np.ones(3)
+        for part in read_object_mesh(meshes[geometry.mesh.filename]).segments:
+            # a mirrored surface faces inwards
+            yield part.vertices * scale, part.faces[:, :: -1 if np.prod(scale) < 0 else 1]
+        return
+    if geometry.box is not None:
+        solid = trimesh.creation.box(geometry.box.size)
+    elif geometry.cylinder is not None:
+        solid = trimesh.creation.cylinder(geometry.cylinder.radius, geometry.cylinder.length)
+    else:
+        solid = trimesh.creation.icosphere(3, geometry.sphere.radius)
+    yield np.asarray(solid.vertices), np.asarray(solid.faces, dtype=np.int64)
 
 
-def _read_sdf(path: Path) -> _Tree:
-    root = _parsed(path, "sdf", "SDF file")
-    models = [*root.iterfind("model"), *root.iterfind("world/model")]
-    if len(models) != 1:
-        raise ValueError(f"{path} has {len(models)} models; it must have one, which is the object: leave out the others")
-    (model,) = models
-    if nested := [each.tag for each in model if each.tag in ("model", "include")]:
-        raise ValueError(f"{path}: its model has a <{nested[0]}>, which is not known: write its links in its place")
-    with readable(path, "SDF file"):
-        links = {link.attrib["name"]: link for link in model.iterfind("link")}
-        children = {joint.attrib["name"]: joint.findtext("child", "").strip() for joint in model.iterfind("joint")}
-    poses, pending = dict[str, Matrix](), set[str]()
-
-    def pose(element: Any, base: str) -> Matrix:
-        """Pose of an element of ``base`` in the model; "" is the model itself."""
-        if (seen := element.find("pose")) is not None:
-            base = seen.get("relative_to", base).replace("__model__", "")
-        numbers = [0.0] * 6 if seen is None else _numbers(path, "a <pose>", seen.text, 6)
-        degrees = seen is not None and seen.get("degrees") == "true"
-        return link_pose(base) @ rigid(Rotation.from_euler("xyz", numbers[3:], degrees).as_matrix(), numbers[:3])
-
-    def link_pose(name: str) -> Matrix:
-        if name == "":
-            return np.eye(4)
-        if name not in links or (name in pending and name not in poses):
+def _from_base(path: Path, robot: Any) -> list[Any]:
+    """Joints, each after those that carry it; raises ``ValueError`` where links and joints form no tree."""
+    links, above = [link.name for link in robot.links], dict[str, str]()
+    for joint in robot.joints:
+        if joint.parent not in links or joint.child not in links:
+            raise ValueError(f"{path}: joint {joint.name!r} names a link that is not in the file: correct it")
+        if joint.child in above:
             raise ValueError(
-                f"{path}: a <pose> is relative to {name!r}; it must be another link of the model: write it relative to one"
+                f"{path}: link {joint.child!r} is carried by the joints {above[joint.child]!r} and {joint.name!r}; a "
+                "robot is a tree without loops: leave one of them out"
             )
-        if name not in poses:
-            pending.add(name)
-            poses[name] = pose(links[name], "")
-        return poses[name]
-
-    joints = list[_Joint]()
-    for element in model.iterfind("joint"):
-        name, child, parent = element.get("name"), children[element.get("name")], element.findtext("parent", "").strip()
-        if parent == "world":  # the camera may see it from anywhere
-            continue
-        frame, axis = pose(element, child), element.find("axis")
-        direction, limits, mimic = np.zeros(3), (None, None), None
-        if axis is not None:
-            xyz = axis.find("xyz")
-            direction = np.array(_numbers(path, f"the axis of joint {name!r}", None if xyz is None else xyz.text, 3))
-            base = "" if xyz is None else xyz.get("expressed_in", "")
-            if axis.findtext("use_parent_model_frame", "").strip() in ("1", "true") or base == "__model__":
-                direction = frame[:3, :3].T @ direction
-            elif base:
-                direction = frame[:3, :3].T @ link_pose(base)[:3, :3] @ direction
-            limits = tuple(  # type: ignore[assignment]
-                None if text is None else _numbers(path, f"a limit of joint {name!r}", text, 1)[0]
-                for text in (axis.findtext("limit/lower"), axis.findtext("limit/upper"))
-            )
-            if (follow := axis.find("mimic")) is not None:
-                factor, offset, start = (
-                    _numbers(path, f"the <mimic> of joint {name!r}", follow.findtext(key, default), 1)[0]
-                    for key, default in (("multiplier", "1"), ("offset", "0"), ("reference", "0"))
-                )
-                mimic = (follow.get("joint", ""), factor, offset - factor * start)
-        joints.append(_Joint(name, element.get("type", ""), parent, child, frame, direction, limits, mimic))
-    order = _checked_tree(path, list(links), [(joint.name, joint.parent, joint.child) for joint in joints])
-    joints = [joints[index] for index in order]
-    kind = "visual" if any(link.find("visual") is not None for link in links.values()) else "collision"
-    shapes = dict[str, list[_Shape]]()
-    for name in _from_base(list(links), joints):
-        shapes[name] = []
-        for element in links[name].iterfind(kind):
-            geometry = element.find("geometry")
-            if geometry is None or len(geometry) == 0:
-                raise ValueError(f"{path}: a <{kind}> of link {name!r} has no <geometry>: add it, or leave it out")
-            place, what = pose(element, name), geometry[0]
-            if what.tag == "mesh":
-                scale = np.array(_numbers(path, f"the scale of a mesh of {name!r}", what.findtext("scale", "1 1 1"), 3))
-                shapes[name].append(_Shape(place, None, _mesh_file(path, name, what.findtext("uri", "")), scale))
-            else:
-                sizes = {each.tag: np.array(_numbers(path, f"a <{each.tag}>", each.text, None)) for each in what}
-                shapes[name].append(_solid(path, name, what.tag, place, sizes))
-    return _Tree(path, shapes, joints)
-
-
-def _numbers(path: Path, what: str, text: str | None, count: int | None) -> list[float]:
-    try:
-        numbers = [float(word) for word in (text or "").split()]
-    except ValueError:
-        numbers = []
-    if not numbers or count not in (None, len(numbers)):
-        raise ValueError(f"{path}: {what} is {str(text)[:60]!r}; it must be {count or 'some'} numbers: correct it")
-    return numbers
-
-
-def _solid(path: Path, link: str, kind: str, place: Matrix, sizes: Mapping[str, Any]) -> _Shape:
-    """Box, cylinder, capsule or sphere by its sizes, which are lengths above 0."""
-    needed = {"box": ("size",), **dict.fromkeys(("cylinder", "capsule"), ("radius", "length")), "sphere": ("radius",)}
-    if kind not in needed:
-        raise ValueError(f"{path}: link {link!r} has a <{kind}>; it must be one of {listed(needed)}, or a mesh: make one")
-    values = [np.ravel(sizes.get(key, np.nan)) for key in needed[kind]]
-    if [len(value) for value in values] != ([3] if kind == "box" else [1] * len(values)) or not all(
-        (value > 0).all() for value in values
-    ):
-        raise ValueError(f"{path}: a {kind} of link {link!r} needs the {listed(needed[kind])}, above 0: correct it")
-    if kind == "box":
-        return _Shape(place, trimesh.creation.box(values[0]))
-    if kind == "sphere":
-        return _Shape(place, trimesh.creation.icosphere(3, float(values[0][0])))
-    radius, length = (float(value[0]) for value in values)
-    if kind == "cylinder":
-        return _Shape(place, trimesh.creation.cylinder(radius, length))
-    solid = trimesh.creation.capsule(length, radius)
-    return _Shape(place, solid.apply_translation(-solid.bounds.mean(axis=0)))  # releases differ in where it begins
-
-
-def _mesh_file(path: Path, link: str, name: str | None) -> Path:
-    """File of a mesh that a link names: relative to the robot's file, or in a package in the folders above it."""
-    scheme, _, rest = (name or "").strip().rpartition("://")
-    folder = path.resolve().parent
-    if scheme in ("package", "model"):
-        package, _, inside = rest.partition("/")
-        tries = [
-            base / part
-            for base in (folder, *folder.parents)
-            for part in (rest, *([inside] if base.name == package or (base / "package.xml").is_file() else []))
-        ]
-        if file := next((file for file in tries if file.is_file()), None):
-            return file
-        raise FileNotFoundError(
-            f"{path}: link {link!r} names the mesh {name!r}, and no folder above the file holds {rest!r}: put the "
-            "package there, or write paths relative to the file"
+        above[joint.child] = joint.name
+    reached, joints = {link for link in links if link not in above}, list[Any]()
+    if len(reached) != 1 or len(set(links)) < len(links):
+        raise ValueError(
+            f"{path} has {len(reached)} links that no joint carries ({', '.join(sorted(reached))}); it must be one, "
+            "the base, and each link has a name for itself: correct its joints"
         )
-    if scheme not in ("", "file") or not rest:
-        raise ValueError(f"{path}: link {link!r} names the mesh {name!r}; it must be a path or package://...: correct it")
-    if not (file := folder / rest).is_file():
-        raise FileNotFoundError(
-            f"{path}: link {link!r} names the mesh {name!r}, and {file} does not exist: copy it there, or correct the path"
-        )
-    return file
+    while new := [joint for joint in robot.joints if joint.parent in reached and joint not in joints]:
+        joints += new
+        reached |= {joint.child for joint in new}
+    if len(reached) < len(links):
+        raise ValueError(f"{path}: joints of {min(set(links) - reached)!r} form a loop, and no tree: correct them")
+    return joints
 
 
-# --- the robot of links and joints ------------------------------------------------------------------------------------
-
-
-@lru_cache(maxsize=16)
-def _assembled(known: _Known) -> Robot:
-    tree = known.tree
-    limits, notes = _limits(tree), list[str]()
-    carriers: dict[str, tuple[str, ...]] = {name: () for name in tree.shapes}
-    for joint in tree.joints:  # from the base on
-        carriers[joint.child] = carriers[joint.parent] + ((joint.name,) if joint.name in limits else ())
-    names = dict[tuple[str, ...], str]()
-    shapes = dict[str, list[tuple[np.ndarray, np.ndarray]]]()
-    for link, each in tree.shapes.items():
-        for shape in each:
-            name = names.setdefault(carriers[link], link)
-            shapes.setdefault(name, []).extend(shape.pieces())
-    if not shapes:
-        raise ValueError(f"{tree.path} has no link with a shape, of which a camera could see something: add meshes")
-    for name, pieces in shapes.items():
-        if not all((np.abs(vertices) <= LARGEST).all() for vertices, _ in pieces):
-            raise ValueError(f"{tree.path}: a pose or size of link {name!r} is NaN, infinite or too large: correct it")
-    segments = list[Segment]()
-    for name, pieces in shapes.items():
-        color = PALETTE[len(segments) % len(PALETTE)]
-        segments.append(
-            Segment(name, color, *united([Segment(str(k), color, *piece) for k, piece in enumerate(pieces)]))
-        )
-    joints = list[RobotJoint]()
-    for joint in reversed(tree.joints):
-        moved = tuple(name for chain, name in names.items() if joint.name in chain)
-        if joint.name in limits and not 0 < len(moved) < len(names):
-            what = "nothing that has a shape" if not moved else "the whole object, as its pose does"
-            notes.append(f"joint {joint.name!r} is left out, for it moves {what}")
-        elif joint.name in limits:
-            frame, axis = joint.T_robot_joint, joint.axis / np.linalg.norm(joint.axis)
-            leader, least, most = limits[joint.name]
-            parts = MOVING[joint.kind], frame[:3, 3], frame[:3, :3] @ axis, (least, most), moved, leader
-            joints.append(RobotJoint(joint.name, *parts))
-    return Robot(SegmentedMesh(tuple(segments)), _with_leaders(joints), tuple(notes))
-
-
-def _with_leaders(joints: Sequence[RobotJoint]) -> tuple[RobotJoint, ...]:
-    """Joints, of which those whose leader was left out have a value of their own."""
-    names = {joint.name for joint in joints}
-    alone = {
-        joint.name: RobotJoint(
-            joint.name, joint.turns, joint.pivot, joint.axis, (min(joint.limits), max(joint.limits)), joint.moved
-        )
-        for joint in joints
-        if joint.follows and joint.follows not in names
-    }
-    return tuple(alone.get(joint.name, joint) for joint in joints)
-
-
-def _limits(tree: _Tree) -> dict[str, tuple[str, float, float]]:
+def _limits(path: Path, joints: Sequence[Any]) -> dict[str, tuple[str, float, float]]:
     """Of each joint that moves: the joint that it follows or "", and its range, as ``RobotJoint`` has them."""
-    by_name, ranges = {joint.name: joint for joint in tree.joints}, dict[str, tuple[str, float, float]]()
-    for joint in tree.joints:
-        if joint.kind not in KINDS:
+    by_name, ranges = {joint.name: joint for joint in joints}, dict[str, tuple[str, float, float]]()
+    for joint in joints:
+        if joint.type not in KINDS:
             raise ValueError(
-                f"{tree.path}: joint {joint.name!r} is of the kind {joint.kind!r}; it must be {', '.join(KINDS)}: make "
-                "it fixed, or two joints with a link between them"
+                f"{path}: joint {joint.name!r} is of the kind {joint.type!r}; it must be {', '.join(KINDS)}: make it "
+                "fixed, or several joints with links between them"
             )
-        if joint.kind == "fixed":
-            continue
-        if not (np.isfinite(joint.axis).all() and np.linalg.norm(joint.axis) > 0):
-            raise ValueError(f"{tree.path}: the axis of joint {joint.name!r} must be a direction: correct it")
-        factor, offset, leader, passed = 1.0, 0.0, joint, list[str]()
+        factor, offset, leader, passed = 1.0, 0.0, joint, [joint.name]
         while leader.mimic is not None:
-            name, multiplier, shift = leader.mimic
-            if name not in by_name or by_name[name].kind == "fixed" or name in (joint.name, *passed) or not multiplier:
+            name = leader.mimic.joint
+            if name not in by_name or by_name[name].type == "fixed" or name in passed or leader.mimic.multiplier == 0:
                 raise ValueError(
-                    f"{tree.path}: joint {joint.name!r} mimics {name!r} by the multiplier {multiplier:g}; it must be "
-                    "another joint that moves, by other than 0: correct it"
+                    f"{path}: joint {joint.name!r} mimics {name!r}; it must be another one that moves it: correct it"
                 )
             passed.append(name)
-            factor, offset, leader = factor * multiplier, offset + factor * shift, by_name[name]
-        least, most = _range(tree.path, leader)
-        if most > least:  # else it is as fixed
-            follows = "" if leader is joint else leader.name
-            ranges[joint.name] = follows, factor * least + offset, factor * most + offset
+            factor, offset, leader = (
+                factor * leader.mimic.multiplier,
+                offset + factor * leader.mimic.offset,
+                by_name[name],
+            )
+        least, most = _range(path, leader)
+        if joint.type != "fixed" and most > least:
+            if not 0 < np.linalg.norm(joint.axis) < LARGEST:
+                raise ValueError(
+                    f"{path}: joint {joint.name!r} has the axis {joint.axis}; it must be a direction: correct it"
+                )
+            ranges[joint.name] = "" if leader is joint else leader.name, factor * least + offset, factor * most + offset
     return ranges
 
 
-def _range(path: Path, joint: _Joint) -> tuple[float, float]:
-    """Least and greatest value of a joint that follows none."""
-    if joint.kind == "continuous":
-        return FULL_TURN
-    least, most = ((sign * np.inf) if limit is None else limit for sign, limit in zip((-1, 1), joint.limits, strict=True))
-    if least > most or np.isnan(least + most) or (joint.kind == "prismatic" and not most - least < LARGEST):
+def _range(path: Path, joint: Any) -> tuple[float, float]:
+    """Least and greatest value of a joint that follows none: of one that turns, at most a turn."""
+    limit = joint.limit
+    least, most = (0.0, 0.0) if limit is None else (limit.lower or 0.0, limit.upper or 0.0)
+    if joint.type == "continuous" or (joint.type == "revolute" and most - least > 2 * np.pi):
+        return -np.pi, np.pi
+    if joint.type != "fixed" and not 0 <= most - least < LARGEST:
         raise ValueError(
             f"{path}: joint {joint.name!r} has the limits {least:g} and {most:g}; it must have two, the lower first: "
-            "correct its <limit>"
+            "correct them"
         )
-    return FULL_TURN if joint.kind == "revolute" and most - least > FULL_TURN[1] - FULL_TURN[0] else (least, most)
+    return least, most

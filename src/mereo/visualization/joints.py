@@ -1,12 +1,12 @@
-"""Values of a mechanism's joints in a registered state, with their intervals.
+"""Values of a mechanism's joints in an answer, with their intervals.
 
 The material points of a registration are those of the mechanism in some pose, so its joint values are a least squares
 problem of few unknowns. The Jacobian at its end says how the values follow the points, whose uncertainty is known.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -16,8 +16,12 @@ from scipy.special import ndtr
 from mereo.deformation.samplers import RandomMotion
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.registration import Registration
-from mereo.fitting.uncertainty import WITHIN, Uncertainty
+from mereo.fitting.uncertainty import WITHIN
 from mereo.geometry.transforms import fit_rigid, transform_points
+from mereo.visualization.units import as_exact_as
+
+SHOWN = {"rad": (180 / np.pi, "°"), "m": (1000.0, " mm"), "": (1.0, " units")}
+"""Factor and name of the units in which people read values."""
 
 
 @dataclass(frozen=True)
@@ -25,15 +29,13 @@ class JointValue:
     """Value of a joint that has a name.
 
     Attributes:
-        name: of the joint.
         value: radians of one that turns, metres of one that slides; scene units where the object's size is not known.
         interval: values between which the true one is with probability 0.95; None where the registration was read from
-            a file.
+            a file. Like a radius, it does not cover a fit that ended in a wrong state.
         unit: of the value: "rad", "m", or "" of scene units.
         limits: least and greatest value that the object's definition allows.
     """
 
-    name: str
     value: float
     interval: tuple[float, float] | None
     unit: Literal["rad", "m", ""]
@@ -41,14 +43,16 @@ class JointValue:
 
     def __str__(self) -> str:
         """Value and interval for people, in degrees or millimetres."""
-        factor, unit = {"rad": (180 / np.pi, "°"), "m": (1000.0, " mm"), "": (1.0, " units")}[self.unit]
-        between = " ({:.1f} to {:.1f})".format(*(factor * end for end in self.interval)) if self.interval else ""
-        return f"{factor * self.value:.1f}{unit}{between}"
+        factor, unit = SHOWN[self.unit]
+        if self.interval is None:
+            return f"{factor * self.value:.4g}{unit}"
+        ends = [factor * end for end in self.interval]
+        value, least, most = as_exact_as(ends[1] - ends[0], factor * self.value, *ends)
+        return f"{value}{unit} ({least} to {most})"
 
-    def facts(self) -> dict[str, object]:
+    def facts(self) -> dict[str, Any]:
         """Content for ``summary.json``."""
-        interval = self.interval and list(self.interval)
-        return {"value": self.value, "interval": interval, "unit": self.unit, "limits": list(self.limits)}
+        return asdict(self)
 
 
 def measure_joints(answer: Answer) -> dict[str, JointValue]:
@@ -60,28 +64,28 @@ def measure_joints(answer: Answer) -> dict[str, JointValue]:
     motion = None if scene is None else scene.sample_deformations
     if registration is None or scene is None or not isinstance(motion, RandomMotion) or not motion.joints:
         return {}
-    leaders = list(dict.fromkeys(joint.follows or joint.name for joint, _ in motion.joints.values()))
+    leaders = list(dict.fromkeys(joint.follows or joint.name for joint, _ in motion.joints.values()))  # as drawn
     rows = np.unique(np.concatenate([anchors[:: 1 + len(anchors) // 64] for anchors in registration.model.anchors]))
-    end = _fitted_shares(registration, motion, leaders, rows)
-    off = _off(registration, end, rows)
+    fit = _fit_shares(registration, motion, leaders, rows)
+    reach = _reach(registration, fit, rows)
     values = dict[str, JointValue]()
     for name, (joint, _) in motion.joints.items():
         index = leaders.index(joint.follows or name)
         unit, factor = ("rad", 1.0) if joint.turns else ("m", scene.unit_m) if scene.unit_m else ("", 1.0)
-        least, most = (factor * limit for limit in joint.limits)
-        value = least + float(end.x[index]) * (most - least)
+        first, second = (factor * limit for limit in joint.limits)
+        value = first + float(fit.x[index]) * (second - first)
         if joint.turns:  # a whole turn more is the same state
-            value -= 2 * np.pi * np.round((value - (least + most) / 2) / (2 * np.pi))
-        reach = None if off is None else abs(most - least) * float(off[index])
-        interval = None if reach is None else (value - reach, value + reach)
-        values[name] = JointValue(name, value, interval, unit, (min(least, most), max(least, most)))
+            value -= 2 * np.pi * float(np.round((value - (first + second) / 2) / (2 * np.pi)))
+        off = None if reach is None else abs(second - first) * float(reach[index])
+        interval = None if off is None else (value - off, value + off)
+        values[name] = JointValue(value, interval, unit, (min(first, second), max(first, second)))  # type: ignore[arg-type]
     return values
 
 
-def _fitted_shares(
+def _fit_shares(
     registration: Registration, motion: RandomMotion, leaders: Sequence[str], rows: Int[np.ndarray, " n"]
 ) -> OptimizeResult:
-    """Shares of the joints' ranges that bring the object's points at rest nearest to the registered ones, in any pose."""
+    """Shares of the joints' ranges that bring the object's points at rest nearest to the registered ones."""
     model, drawn = registration.model, registration.drawn
     rest, labels = model.rest_points[rows], model.labels[rows]
     goal = registration.material[rows] / registration.scene_unit
@@ -92,33 +96,29 @@ def _fitted_shares(
             moved[labels == label] = deform(rest[labels == label])
         return np.ravel(transform_points(fit_rigid(moved, goal), moved) - goal)
 
-    zero = [-joint.limits[0] / np.ptp(joint.limits) for joint, _ in map(motion.joints.get, leaders)]  # type: ignore[misc]
-    starts = [np.full(len(leaders), 0.5), np.array(zero)]
+    limits = np.array([motion.joints[name][0].limits for name in leaders])
+    starts = [np.full(len(leaders), 0.5), limits[:, 0] / (limits[:, 0] - limits[:, 1])]  # the middle, and rest
     if drawn is not None and len(drawn.z) == len(leaders):
         starts = [ndtr(drawn.z)]
-    return min((least_squares(misfit, start, method="lm") for start in starts), key=lambda end: float(end.cost))
+    return min((least_squares(misfit, start, method="lm") for start in starts), key=lambda fit: float(fit.cost))
 
 
-def _off(
-    registration: Registration, end: OptimizeResult, rows: Int[np.ndarray, " n"]
+def _reach(
+    registration: Registration, fit: OptimizeResult, rows: Int[np.ndarray, " n"]
 ) -> Float[np.ndarray, " j"] | None:
     """How far off shares may be with probability 0.95; None where the uncertainty of the points is not known.
 
-    By the same parts as a radius (``RadiusParts``); the extra one moves a typical point by ``extra_radius``.
+    The parts are those of a radius (``RadiusParts``), without what each point has in addition: it averages out.
     """
-    sure: Uncertainty | None = registration.uncertainty
+    sure = registration.uncertainty
     if sure is None:
         return None
-    posterior = sure.posterior
-    T_registration_fit = fit_rigid(sure.optimum.unit * posterior.material, registration.material)
-    follow = np.linalg.pinv(end.jac).reshape(len(end.x), len(rows), 3) @ T_registration_fit[:3, :3]
-    gradient = np.zeros((len(end.x), len(posterior.material), 3))
-    gradient[:, rows] = follow * (sure.optimum.unit / registration.scene_unit)
-    gaussian, far = (
-        WITHIN * np.linalg.norm(each, axis=1)
-        for each in (posterior.motion_of(gradient), np.tensordot(gradient, posterior.open, axes=2))
-    )
-    reach = np.abs(np.tensordot(gradient, posterior.ways, axes=2)).max(axis=1, initial=0.0)
-    extra = sure.extra_radius * np.sqrt(len(rows)) / np.linalg.norm(end.jac, axis=0)
-    result: np.ndarray = reach + np.sqrt((sure.factor * gaussian) ** 2 + far**2 + extra**2)
-    return result
+    posterior, unit = sure.posterior, sure.optimum.unit
+    T_registration_fit = fit_rigid(unit * posterior.material, registration.material)
+    follow = np.linalg.pinv(fit.jac).reshape(len(fit.x), len(rows), 3) @ T_registration_fit[:3, :3]
+    gradient = np.zeros((len(fit.x), len(posterior.material), 3))
+    gradient[:, rows] = follow * (unit / registration.scene_unit)
+    far = np.tensordot(gradient, posterior.open, axes=2)
+    spread = np.hypot(sure.factor * np.linalg.norm(posterior.motion_of(gradient), axis=1), np.linalg.norm(far, axis=1))
+    away: np.ndarray = np.abs(np.tensordot(gradient, posterior.ways, axes=2)).max(axis=1, initial=0.0)
+    return away + WITHIN * spread

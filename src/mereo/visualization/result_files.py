@@ -54,14 +54,14 @@ def summary_of(
         radii["radius95"] = {**sure.summary(), "unit_m": frame.unit_m}
         for row, segment in zip(segments, sure.segments, strict=True):
             row |= {"centroid_radius95": segment.centroid_radius95, "volume95": list(segment.volume95)}
-    facts = frame_facts(answer, carried)
+    facts, joints = frame_facts(answer, carried), measure_joints(answer)
     return {
         "frame": frame.axes,
         "unit_m": frame.unit_m,
         "verdict": trust(facts).level,
         **facts,
         **radii,
-        "joints": {name: joint.facts() for name, joint in measure_joints(answer).items()},
+        **({"joints": {name: joint.facts() for name, joint in joints.items()}} if joints else {}),
         "pose": None if registered is None else registered.pose().tolist(),
         "nested": [list(pair) for pair in result.surfaces.nested],
         "spacing": float(result.labels.spacing[0]),

@@ -7,7 +7,7 @@ units and radians.
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -18,8 +18,6 @@ from pydantic import (
     ConfigDict,
     Field,
     FiniteFloat,
-    SerializerFunctionWrapHandler,
-    ValidationInfo,
     field_validator,
     model_serializer,
     model_validator,
@@ -278,7 +276,7 @@ class JointBlock(DeformationBlock):
 
     @field_validator("angle", "slide")
     @classmethod
-    def _ascends(cls, value: tuple[float, float], info: ValidationInfo) -> tuple[float, float]:
+    def _ascends(cls, value: tuple[float, float], info: Any) -> tuple[float, float]:
         return value if info.data.get("follows") else _ascending(value)
 
     @model_validator(mode="after")
@@ -291,7 +289,7 @@ class JointBlock(DeformationBlock):
         return self
 
     @model_serializer(mode="wrap")
-    def _written(self, write: SerializerFunctionWrapHandler) -> dict[str, object]:
+    def _written(self, write: Any) -> dict[str, object]:
         """Without the names that it lacks: an object's identity in datasets is made of it."""
         return {key: value for key, value in write(self).items() if value is not None or key not in ("name", "follows")}
 

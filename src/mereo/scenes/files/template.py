@@ -12,7 +12,8 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from textwrap import indent
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -426,7 +427,10 @@ def _overlap_note(mesh: SegmentedMesh) -> list[str]:
 
 
 def _from_model(file: Path, relative: str, mesh: SegmentedMesh, what: str = "") -> _Source:
-    lines = [f"model: {quoted(relative)}{what and f'  # {what}'}", "parts:  # delete what is not wanted; their order is that of the labels"]
+    lines = [
+        f"model: {quoted(relative)}{what and f'  # {what}'}",
+        "parts:  # delete what is not wanted; their order is that of the labels",
+    ]
     names = _segment_names(mesh.names, "parts")
     for number, (part, name) in enumerate(zip(mesh.names, names, strict=True)):
         lines.append(f"  - name: {quoted(name)}")
@@ -486,7 +490,11 @@ def _likely_frame(file: Path, bounds: Float[np.ndarray, "2 3"]) -> tuple[str, st
     kind, guess = file.suffix.lower().lstrip("."), likely_unit(bounds)
     longest_m = float((bounds[1] - bounds[0]).max()) * UNITS_M[guess]
     robots = dict.fromkeys(("urdf", "sdf"), ("m", "the rule of URDF and SDF"))
-    known = robots | {"glb": ("m", "the rule of glTF"), "gltf": ("m", "the rule of glTF"), "3mf": ("mm", "the default of 3MF")}
+    known = robots | {
+        "glb": ("m", "the rule of glTF"),
+        "gltf": ("m", "the rule of glTF"),
+        "3mf": ("mm", "the default of 3MF"),
+    }
     unit, reason = known.get(kind, (guess, f"guessed: the object would be {longest_m:.3g} m long"))
     up = 1 if kind in ("glb", "gltf", "obj") else 2
     return unit, reason, up, f"{'xyz'[up]} is up, as in most files of the kind .{kind}"
@@ -500,7 +508,7 @@ def _draft(name: str, source: _Source, units: str | None, aperture: float, way: 
     sides = np.ptp(source.mesh.bounds, axis=0)
     size = rounded(min(SIZE, LONGEST * float(sides.min() / sides.max())), 3)
     placement = placed(source.mesh, size)
-    robot = _robot_blocks(source.robot)
+    robot = [_robot_block(joint) for joint in source.robot]
     joints = proposed_joints(source.mesh) if source.assembly and not robot else ()
     way, why = _chosen(way, joints) if not robot or way != "auto" else ("articulated", "as the file says")
     motion = {"soft": SOFT, "stiff": STIFF}.get(way)
@@ -550,7 +558,7 @@ class _Moves(NamedTuple):
     way: Way
     joints: Sequence[Joint]
     blocks: Blocks
-    robot: Sequence[JointBlock] = ()
+    robot: Sequence[dict[str, Any]] = ()
 
     def describe(self) -> str:
         if not self.blocks:
@@ -566,8 +574,9 @@ class _Moves(NamedTuple):
         target = Target(rest, rest.bounds, placement)
         if self.robot:
             index = {name: number for number, name in enumerate(rest.names)}
-            steps = ((block.sampler(target), [index[name] for name in block.segments or ()]) for block in self.robot)
-            return RandomMotion(rest, tuple((sampler, tuple(members)) for sampler, members in steps))
+            samplers = (JointBlock.model_validate(block).sampler(target) for block in self.robot)
+            moved = (tuple(index[name] for name in block["segments"]) for block in self.robot)
+            return RandomMotion(rest, tuple(zip(samplers, moved, strict=True)))
         return RandomMotion(rest, tuple((_joint_block(joint).sampler(target), joint.moved) for joint in self.joints))
 
 
@@ -577,38 +586,17 @@ def _joint_block(joint: Joint) -> JointBlock:
     return JointBlock(type="joint", pivot=(x, y, z), axis=(u, v, w), angle=angle, slide=slide)
 
 
-def _robot_blocks(joints: Sequence[RobotJoint]) -> list[JointBlock]:
-    """Blocks of the joints of a robot's file."""
-    blocks = list[JointBlock]()
-    for joint in joints:
-        limits = np.rad2deg(joint.limits) if joint.turns else np.array(joint.limits)
-        values = {
-            "name": _segment_name(joint.name),
-            "follows": _segment_name(joint.follows) or None,
-            "segments": [_segment_name(name) for name in joint.moved],
-            "pivot": [rounded(value, EXACT) for value in joint.pivot.tolist()],
-            "axis": [rounded(value, EXACT) for value in joint.axis.tolist()],
-            "angle" if joint.turns else "slide": [rounded(value, EXACT) for value in limits.tolist()],
-        }
-        blocks.append(JointBlock.model_validate({"type": "joint", **values}))
-    return blocks
-
-
-def _robot_text(blocks: Sequence[JointBlock]) -> str:
-    """Lines of the joints of a robot's file, of each what it has."""
-    lines = list[str]()
-    for block in blocks:
-        values = block.model_dump(exclude_unset=True)
-        keys = [key for key in ROBOT_KEYS if values.get(key) is not None]
-        for mark, key in zip(("  - ", *["    "] * len(keys)), keys, strict=False):
-            value = values[key]
-            text = quoted(value) if isinstance(value, str) else f"[{', '.join(map(_exact, value))}]"
-            lines.append(f"{mark}{key}: {text}\n")
-    return "".join(lines)
-
-
-def _exact(value: str | float) -> str:
-    return quoted(value) if isinstance(value, str) else f"{value:.{EXACT}g}"
+def _robot_block(joint: RobotJoint) -> dict[str, Any]:
+    """Block of a joint of a robot's file."""
+    limits = np.rad2deg(joint.limits) if joint.turns else np.array(joint.limits)
+    numbers = {"pivot": joint.pivot, "axis": joint.axis, "angle" if joint.turns else "slide": limits}
+    names = {"name": joint.name, "follows": joint.follows}
+    return {
+        "type": "joint",
+        **{key: _segment_name(name) for key, name in names.items() if name},
+        "segments": [_segment_name(name) for name in joint.moved],
+        **{key: [rounded(value, EXACT) for value in values.tolist()] for key, values in numbers.items()},
+    }
 
 
 def _notes(mesh: SegmentedMesh, moves: _Moves) -> list[str]:
@@ -641,7 +629,7 @@ def _deformations(mesh: SegmentedMesh, moves: _Moves) -> str:
     if moves.way == "rigid":
         return f"deformations: rigid\n{joints}{further}"
     if moves.way == "articulated" and moves.robot:
-        return f"{ROBOT}\ndeformations:\n{_robot_text(moves.robot)}{ELASTIC_COMMENT}{further}"
+        return f"{ROBOT}\ndeformations:\n{indent(_yaml(moves.robot), '  ')}{ELASTIC_COMMENT}{further}"
     if moves.way == "articulated":
         lines = [line.removeprefix("#") for line in joints.splitlines(keepends=True)[1:]]
         return f"{ARTICULATED}\ndeformations:\n{''.join(lines)}{ELASTIC_COMMENT}{further}"
@@ -690,6 +678,13 @@ def _range(values: tuple[float, float]) -> str:
     return f"[{values[0]:.4g}, {values[1]:.4g}]"
 
 
+def _yaml(blocks: Sequence[Mapping[str, Any]]) -> str:
+    """Blocks as YAML, their lists on a line each."""
+    return yaml.safe_dump(
+        list(blocks), sort_keys=False, allow_unicode=True, default_flow_style=None, width=float("inf")
+    )
+
+
 def quoted(text: str) -> str:
     """Text as a YAML value on one line, also within a list: quoted and escaped where it would not be this text."""
     listed = yaml.safe_dump([text], default_flow_style=True, allow_unicode=True, width=float("inf"))
@@ -706,8 +701,6 @@ JOINTS = "# Joints that the contacts suggest, in ranges without collisions; remo
 ARTICULATED = "# Joints that the contacts suggest, in ranges without collisions. The tip comes first."
 
 ROBOT = "# Joints of the robot's file, by its names and within its limits. The tip comes first."
-
-ROBOT_KEYS = ("type", "name", "follows", "segments", "pivot", "axis", "angle", "slide")
 
 EXACT = 8
 """Digits of numbers that a robot's file gives exactly."""
