@@ -87,14 +87,14 @@ def read_robot(path: str | Path) -> Robot:
     without the extra `robot`.
     """
     path = Path(path)
-    kind = f"{path.suffix[1:].upper()} file"
+    kind = path.suffix[1:].upper()
     yourdfpy, etree = library("yourdfpy", "robot", path), library("lxml.etree", "robot", path)
-    with readable(path, kind):
+    with readable(path, f"robot in {kind}"):
         parser = etree.XMLParser(resolve_entities=False, remove_comments=True, remove_pis=True)
         root = etree.parse(BytesIO(path.read_bytes()), parser).getroot()
         if any("xacro" in element.tag for element in root.iter(etree.Element)):
             raise ValueError("it is a macro file, whose links are known once `xacro` has expanded it")
-        if kind == "URDF file":
+        if kind == "URDF":
             described = _read_urdf(yourdfpy, root, etree.tostring(root))
         else:
             described = _read_sdf(yourdfpy, root)
@@ -139,7 +139,7 @@ def _read_sdf(yourdfpy: Any, root: Any) -> Any:
         place = element.find("pose")
         if place is None:
             return pose_of(base.strip())
-        x, y, z, *angles = _numbers(place.text, 6)
+        x, y, z, *angles = _numbers((place.text or "").strip() or "0 0 0 0 0 0", 6)
         turn = Rotation.from_euler("xyz", angles, degrees=place.get("degrees") == "true").as_matrix()
         return pose_of(place.get("relative_to", base.strip())) @ rigid(turn, np.array([x, y, z]))
 
@@ -274,15 +274,15 @@ def _assembled(content: _Described) -> Robot:
     moved = {joint: tuple(name for chain, name in names.items() if joint in chain) for joint in limits}
     kept = {joint: each for joint, each in moved.items() if 0 < len(each) < len(names)}
     notes = (f"joint {name!r} is left out, for it moves no segment against others" for name in limits.keys() - kept)
-    found_joints = []
+    joined = []
     for joint in reversed(joints):
         if joint.name in kept:
             leader, *ends = limits[joint.name]
             ends = ends if leader in kept else sorted(ends)
             axis = poses[joint.child][:3, :3] @ (joint.axis / np.linalg.norm(joint.axis))
             place = joint.type != "prismatic", poses[joint.child][:3, 3], axis, (ends[0], ends[1])
-            found_joints.append(RobotJoint(joint.name, *place, kept[joint.name], leader if leader in kept else ""))
-    return Robot(SegmentedMesh(tuple(segments)), tuple(found_joints), tuple(sorted(notes)))
+            joined.append(RobotJoint(joint.name, *place, kept[joint.name], leader if leader in kept else ""))
+    return Robot(SegmentedMesh(tuple(segments)), tuple(joined), tuple(sorted(notes)))
 
 
 def _origin(element: Any) -> Matrix:
