@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from page_blocks import blocks
-from robot_files import GRIPPER, LAPTOP, write_gripper
+from robot_files import LAPTOP, LAPTOP_SDF, write_gripper
 
 import mereo
 import mereo.__main__ as command_line
@@ -75,6 +75,19 @@ def test_both_formats_give_links_in_metres_and_joints_by_name(gripper: Path, suf
     assert robot.notes == (left_out if suffix == ".urdf" else ())
 
 
+def test_shapes_of_collisions_stand_in_where_none_are_visual(tmp_path: Path) -> None:
+    for suffix, text in ((".urdf", LAPTOP.replace("visual", "collision")), (".sdf", LAPTOP_SDF)):
+        path = tmp_path / f"laptop{suffix}"
+        path.write_text(text)
+        robot, (joint,) = read_robot(path), read_robot(path).joints
+        assert robot.mesh.names == ("base", "lid") and joint.turns and joint.moved == ("lid",)
+        np.testing.assert_allclose([joint.pivot, joint.axis], [[0, -0.1, 0.016], [1, 0, 0]], atol=1e-9)
+        np.testing.assert_allclose(joint.limits, (0.3, 2.2))
+        low, high = robot.mesh.bounds
+        np.testing.assert_allclose([*low, *high[:2]], [-0.15, -0.1, -0.01, 0.15, 0.1], atol=1e-9)
+        assert high[2] == pytest.approx(0.041, abs=1e-4)  # a round part that is joined to the lid
+
+
 def test_a_scene_file_has_the_joints_and_one_number_moves_both_fingers(
     gripper: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -136,7 +149,7 @@ FAULTS = {
         '<joint name="again" type="fixed"><parent link="lid"/><child link="base"/></joint></robot>',
     ),
     "has 2 links that no joint carries (base, loose)": ("</robot>", '<link name="loose"/></robot>'),
-    "no finite number": ('size="0.3 0.2 0.02"', 'size="0.3 nan 0.02"'),
+    "size or limit of 'base' is NaN, infinite or beyond 1e+12": ('size="0.3 0.2 0.02"', 'size="0.3 nan 0.02"'),
 }
 
 

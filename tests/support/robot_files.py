@@ -8,7 +8,9 @@ GRIPPER = """\
 <robot name="gripper">
   <link name="world"/>
   <link name="palm">
-    <visual><geometry><mesh filename="package://grasping/meshes/palm.stl" scale="0.001 0.001 0.001"/></geometry></visual>
+    <visual><geometry>
+      <mesh filename="package://grasping/meshes/palm.stl" scale="0.001 0.001 0.001"/>
+    </geometry></visual>
   </link>
   <link name="knob"><visual><geometry><cylinder radius="0.012" length="0.05"/></geometry></visual></link>
   <link name="left">
@@ -76,6 +78,21 @@ LAPTOP = """\
     <limit lower="0.3" upper="2.2" effort="1" velocity="1"/>
   </joint>
 </robot>
+"""
+
+LAPTOP_SDF = """\
+<sdf version="1.7"><world name="w"><model name="laptop">
+  <frame name="back" attached_to="base"><pose>0 -0.1 0.016 0 0 0</pose></frame>
+  <link name="base"><collision name="a"><geometry><box><size>0.3 0.2 0.02</size></box></geometry></collision></link>
+  <link name="lid"><pose relative_to="back">0 0.1 0 0 0 0</pose>
+    <collision name="a"><geometry><box><size>0.3 0.2 0.01</size></box></geometry></collision>
+    <collision name="b"><pose>0.1 0.05 0.01 0 1.5707963 0</pose>
+      <geometry><capsule><radius>0.015</radius><length>0.02</length></capsule></geometry></collision>
+  </link>
+  <joint name="hinge" type="revolute"><parent>base</parent><child>lid</child><pose>0 -0.1 0 0 0 0</pose>
+    <axis><xyz>1 0 0</xyz><limit><lower>0.3</lower><upper>2.2</upper></limit></axis>
+  </joint>
+</model></world></sdf>
 """
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -95,16 +95,36 @@ def read_robot(path: str | Path) -> Robot:
         if any("xacro" in element.tag for element in root.iter(etree.Element)):
             raise ValueError("it is a macro file, whose links are known once `xacro` has expanded it")
         if kind == "URDF":
-            described = _read_urdf(yourdfpy, root, etree.tostring(root))
+            described = _read_urdf(yourdfpy, root, etree.tostring(root, encoding="utf-8"))
         else:
             described = _read_sdf(yourdfpy, root)
-    drawn = any(link.visuals for link in described.links)
-    shapes = [(link.name, each) for link in described.links for each in (link.visuals if drawn else link.collisions)]
-    files = {each.geometry.mesh.filename: link for link, each in shapes if each.geometry.mesh is not None}
-    meshes = {name: _mesh_file(path, link, name) for name, link in files.items()}
-    states = [(file, file.stat()) for file in (path, *meshes.values())]
-    known = tuple((str(file), state.st_ino, state.st_size, state.st_mtime_ns) for file, state in states)
-    return _assembled(_Described(path, described, shapes, meshes, known))
+        for joint in described.joints:
+            joint.axis = np.reshape(joint.axis, 3)
+        drawn = any(link.visuals for link in described.links)
+        every = [(link.name, each) for link in described.links for each in (link.visuals if drawn else link.collisions)]
+        solids = [_solid(each.geometry) for _, each in every]
+    shapes, states = list[_Shape](), [(str(path), path.stat())]
+    for (link, each), solid in zip(every, solids, strict=True):
+        mesh = each.geometry.mesh
+        file = None if mesh is None else _mesh_file(path, link, mesh.filename or "")
+        states += [] if file is None else [(str(file), file.stat())]
+        shapes.append(
+            _Shape(link, _origin(each), solid if file is None else file, None if mesh is None else mesh.scale)
+        )
+    known = tuple((name, state.st_ino, state.st_size, state.st_mtime_ns) for name, state in states)
+    return _assembled(_Described(path, described, shapes, known))
+
+
+def _solid(geometry: Any) -> trimesh.Trimesh | None:
+    """Solid of a box, cylinder or sphere; None of a mesh, whose scale gets three numbers."""
+    if geometry.mesh is not None:
+        geometry.mesh.scale = np.ones(3) * (1.0 if geometry.mesh.scale is None else geometry.mesh.scale)
+        return None
+    if geometry.box is not None:
+        return trimesh.creation.box(geometry.box.size)
+    if geometry.cylinder is not None:
+        return trimesh.creation.cylinder(geometry.cylinder.radius, geometry.cylinder.length)
+    return trimesh.creation.icosphere(3, geometry.sphere.radius)
 
 
 def _read_urdf(yourdfpy: Any, root: Any, content: bytes) -> Any:
@@ -238,14 +258,32 @@ def _mesh_file(path: Path, link: str, name: str) -> Path:
 # --- the robot of links and joints ------------------------------------------------------------------------------------
 
 
+class _Shape(NamedTuple):
+    """Shape of a link: a solid, or a mesh's file with its scale."""
+
+    link: str
+    T_link_shape: Matrix
+    content: trimesh.Trimesh | Path
+    scale: Vector | None
+
+    def surfaces(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Vertices and faces of its parts in its own frame."""
+        if isinstance(self.content, Path):
+            assert self.scale is not None
+            for part in read_object_mesh(self.content).segments:
+                # a mirrored surface faces inwards
+                yield part.vertices * self.scale, part.faces[:, :: -1 if np.prod(self.scale) < 0 else 1]
+        else:
+            yield np.asarray(self.content.vertices), np.asarray(self.content.faces, dtype=np.int64)
+
+
 @dataclass(frozen=True)
 class _Described:
-    """Content of a file: yourdfpy's robot, its shapes by link, and files of meshes; equal where ``states`` are."""
+    """Content of a file: yourdfpy's robot and its shapes; equal where the ``states`` of all its files are."""
 
     path: Path = field(compare=False)
     robot: Any = field(compare=False)
-    shapes: Any = field(compare=False)
-    meshes: Any = field(compare=False)
+    shapes: list[_Shape] = field(compare=False)
     states: tuple[tuple[str, int, int, int], ...]
 
 
@@ -260,12 +298,11 @@ def _assembled(content: _Described) -> Robot:
         carriers[joint.child] = carriers[joint.parent] + ((joint.name,) if joint.name in limits else ())
     names, parts = dict[tuple[str, ...], str](), dict[str, list[Segment]]()
     order = [*(link for link in poses if not carriers[link]), *(joint.child for joint in joints)]
-    for link, shape in sorted(content.shapes, key=lambda pair: order.index(pair[0])):
-        pieces = parts.setdefault(names.setdefault(carriers[link], link), [])
-        for vertices, faces in _surfaces(shape.geometry, content.meshes):
-            vertices = transform_points(poses[link] @ _origin(shape), vertices)
-            if not (np.abs(vertices) <= LARGEST).all():
-                raise ValueError(f"{path}: a pose or size of link {link!r} is no finite number: correct it")
+    for shape in sorted(content.shapes, key=lambda shape: order.index(shape.link)):
+        pieces = parts.setdefault(names.setdefault(carriers[shape.link], shape.link), [])
+        for vertices, faces in shape.surfaces():
+            vertices = transform_points(poses[shape.link] @ shape.T_link_shape, vertices)
+            _check_numbers(path, shape.link, vertices)
             pieces.append(Segment(str(len(pieces)), PALETTE[0], vertices, faces))
     if not parts:
         raise ValueError(f"{path} has no link with a shape, of which a camera could see something: add meshes")
@@ -281,29 +318,20 @@ def _assembled(content: _Described) -> Robot:
             ends = ends if leader in kept else sorted(ends)
             axis = poses[joint.child][:3, :3] @ (joint.axis / np.linalg.norm(joint.axis))
             place = joint.type != "prismatic", poses[joint.child][:3, 3], axis, (ends[0], ends[1])
+            _check_numbers(path, joint.name, np.array([*poses[joint.child][:3, 3], *axis, *np.rad2deg(ends)]))
             joined.append(RobotJoint(joint.name, *place, kept[joint.name], leader if leader in kept else ""))
     return Robot(SegmentedMesh(tuple(segments)), tuple(joined), tuple(sorted(notes)))
 
 
+def _check_numbers(path: Path, name: str, values: np.ndarray) -> None:
+    if not (np.abs(values) <= LARGEST).all():
+        raise ValueError(
+            f"{path}: a pose, size or limit of {name!r} is NaN, infinite or beyond {LARGEST:g}: correct it"
+        )
+
+
 def _origin(element: Any) -> Matrix:
     return np.eye(4) if element.origin is None else np.asarray(element.origin)
-
-
-def _surfaces(geometry: Any, meshes: Any) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Vertices and faces of the parts of a shape in its own frame."""
-    if geometry.mesh is not None:
-        scale = np.ones(3) if geometry.mesh.scale is None else geometry.mesh.scale * np.ones(3)
-        for part in read_object_mesh(meshes[geometry.mesh.filename]).segments:
-            # a mirrored surface faces inwards
-            yield part.vertices * scale, part.faces[:, :: -1 if np.prod(scale) < 0 else 1]
-        return
-    if geometry.box is not None:
-        solid = trimesh.creation.box(geometry.box.size)
-    elif geometry.cylinder is not None:
-        solid = trimesh.creation.cylinder(geometry.cylinder.radius, geometry.cylinder.length)
-    else:
-        solid = trimesh.creation.icosphere(3, geometry.sphere.radius)
-    yield np.asarray(solid.vertices), np.asarray(solid.faces, dtype=np.int64)
 
 
 def _from_base(path: Path, robot: Any) -> list[Any]:
