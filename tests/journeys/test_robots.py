@@ -135,6 +135,7 @@ FAULTS = {
         'lower="0.3" upper="2.2"',
         'lower="2.2" upper="0.3"',
     ),
+    "has the limits nan and nan; it must have two": ("<limit", "<safety_controller"),
     "mimics 'hinge'; it must be another one": ("<limit", '<mimic joint="hinge"/><limit'),
     "it must be a direction": ("1 0 0", "0 0 0"),
     "has no link with a shape": ("visual", "drawn"),

@@ -394,13 +394,13 @@ def _limits(path: Path, joints: Sequence[Any]) -> dict[str, tuple[str, float, fl
 
 def _range(path: Path, joint: Any) -> tuple[float, float]:
     """Least and greatest value of a joint that follows none: of one that turns, at most a turn."""
-    limit = joint.limit
-    least, most = (0.0, 0.0) if limit is None else (limit.lower or 0.0, limit.upper or 0.0)
+    limits = (None, None) if joint.limit is None else (joint.limit.lower, joint.limit.upper)
+    least, most = (np.nan, np.nan) if limits == (None, None) else (limits[0] or 0.0, limits[1] or 0.0)
     if joint.type == "continuous" or (joint.type == "revolute" and most - least > 2 * np.pi):
         return -np.pi, np.pi
     if joint.type != "fixed" and not 0 <= most - least < LARGEST:
         raise ValueError(
             f"{path}: joint {joint.name!r} has the limits {least:g} and {most:g}; it must have two, the lower first: "
-            "correct them"
+            "write them as <limit>"
         )
     return least, most

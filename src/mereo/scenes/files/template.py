@@ -303,7 +303,7 @@ class _Source(NamedTuple):
     """Segments of files in their unit, the lines that name them, and the likely unit and upward axis, with reasons.
 
     ``assembly`` is whether the segments are parts, which may have joints, and not regions of one body; ``lost`` are
-    sentences about segments that are left out, ``notes`` about what others lose; ``robot`` are joints that a file has.
+    sentences about segments that are left out, ``notes`` about what others lose; ``robot`` are a robot's joints.
     """
 
     block: str
@@ -315,7 +315,7 @@ class _Source(NamedTuple):
     assembly: bool = True
     lost: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    robot: tuple[RobotJoint, ...] = ()
+    robot: tuple[RobotJoint, ...] | None = None
 
 
 def write_scene_file(
@@ -508,9 +508,12 @@ def _draft(name: str, source: _Source, units: str | None, aperture: float, way: 
     sides = np.ptp(source.mesh.bounds, axis=0)
     size = rounded(min(SIZE, LONGEST * float(sides.min() / sides.max())), 3)
     placement = placed(source.mesh, size)
-    robot = [_robot_block(joint) for joint in source.robot]
-    joints = proposed_joints(source.mesh) if source.assembly and not robot else ()
-    way, why = _chosen(way, joints) if not robot or way != "auto" else ("articulated", "as the file says")
+    robot = [_robot_block(joint) for joint in source.robot or ()]
+    joints = proposed_joints(source.mesh) if source.assembly and source.robot is None else ()
+    if source.robot is not None and way in ("auto", "articulated"):
+        way, why = ("articulated" if robot else "rigid"), "as the file says"
+    else:
+        way, why = _chosen(way, joints)
     motion = {"soft": SOFT, "stiff": STIFF}.get(way)
     moves = _Moves(way, joints, () if motion is None else default_deformations(source.mesh, motion), robot)
     rest = source.mesh.with_vertices([placement.apply(segment.vertices) for segment in source.mesh.segments])
