@@ -25,6 +25,8 @@ from mereo.scenes.seeds import example_rng
 from mereo.synthesis.depth_sensor import add_depth_noise, render_depth
 from mereo.visualization.joints import JointValue
 
+pytest.importorskip("yourdfpy", reason="yourdfpy is not installed: pip install 'mereo[robot]'")
+
 PAGE = Path(__file__).parents[2] / "docs/own-object.md"
 
 

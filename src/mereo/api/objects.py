@@ -142,8 +142,8 @@ def load_object(
     """Load an object that can be found in frames.
 
     Args:
-        source: its meshes, one file for each segment, one file of named parts, a folder of either, or label volumes,
-            one or one for each segment; a scene file, a built-in scene's name or a scene; the folder that
+        source: its meshes, one file for each segment, one file of named parts, a robot's URDF or SDF file, a folder of
+            any of these, or label volumes, one or one for each segment; a scene file, a built-in scene's name or a scene; the folder that
             ``mereo learn`` has written; or weights: a shipped name, a file, or some that are loaded already. A name
             that both weights and a scene have means the weights, which know that scene; without PyTorch the object is
             searched by the model that they carry, with a ``WithoutWeightsWarning``.
