@@ -131,6 +131,7 @@ FAULTS = {
     "cannot be read as a robot in URDF": ("</robot>", ""),
     "macro file": ('<robot name="laptop">', '<robot xmlns:xacro="http://ros.org/xacro"><xacro:include/>'),
     "has no <parent> or no <child>": ('<parent link="base"/>', ""),
+    "a <visual> of its link 'base' has no geometry": ('<box size="0.3 0.2 0.02"/>', ""),
     "names a link that is not in the file": ('<child link="lid"/>', '<child link="cover"/>'),
     "of the kind 'floating'; it must be revolute, continuous, prismatic, fixed": ("revolute", "floating"),
     "has the limits 2.2 and 0.3; it must have two, the lower first": (

@@ -131,6 +131,9 @@ def _read_urdf(yourdfpy: Any, root: Any, content: bytes) -> Any:
     for joint in root.iterfind("joint"):  # which the library takes for granted
         if joint.find("parent") is None or joint.find("child") is None:
             raise ValueError(f"its joint {joint.get('name')!r} has no <parent> or no <child>")
+    for shape in root.iterfind("link/*"):
+        if shape.tag in ("visual", "collision") and shape.find("geometry/*") is None:
+            raise ValueError(f"a <{shape.tag}> of its link {shape.getparent().get('name')!r} has no geometry")
     return yourdfpy.URDF.load(BytesIO(content), build_scene_graph=False, load_meshes=False).robot
 
 
