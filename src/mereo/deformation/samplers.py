@@ -217,12 +217,12 @@ class RandomMotion:
                 if leader not in shares:
                     with part(rng, leader):
                         shares[leader] = self.joints[leader][0].sample_share(rng)
-                drawn = (sampler.at(shares[leader]),)
+                drawn: Deformation = sampler.at(shares[leader])
             else:
                 with part(rng, self.title(number, sampler, members)):
-                    drawn = (sampler(rng, surface),)
+                    drawn = sampler(rng, surface)
             for index in members:
-                chains[index] += drawn
+                chains[index] = (*chains[index], drawn)
         return _shared(chains)
 
     @cached_property

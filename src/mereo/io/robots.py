@@ -105,12 +105,13 @@ def read_robot(path: str | Path) -> Robot:
         solids = [_solid(each.geometry) for _, each in every]
     shapes, states = list[_Shape](), [(str(path), path.stat())]
     for (link, each), solid in zip(every, solids, strict=True):
-        mesh = each.geometry.mesh
-        file = None if mesh is None else _mesh_file(path, link, mesh.filename or "")
-        states += [] if file is None else [(str(file), file.stat())]
-        shapes.append(
-            _Shape(link, _origin(each), solid if file is None else file, None if mesh is None else mesh.scale)
-        )
+        if solid is None:
+            mesh = each.geometry.mesh
+            file = _mesh_file(path, link, mesh.filename or "")
+            states.append((str(file), file.stat()))
+            shapes.append(_Shape(link, _origin(each), file, mesh.scale))
+        else:
+            shapes.append(_Shape(link, _origin(each), solid))
     known = tuple((name, state.st_ino, state.st_size, state.st_mtime_ns) for name, state in states)
     return _assembled(_Described(path, described, shapes, known))
 
@@ -267,7 +268,7 @@ class _Shape(NamedTuple):
     link: str
     T_link_shape: Matrix
     content: trimesh.Trimesh | Path
-    scale: Vector | None
+    scale: Vector | None = None
 
     def surfaces(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Vertices and faces of its parts in its own frame."""
