@@ -38,6 +38,7 @@ from camera_files import write_camera
 from lattice import pvd_text, xdmf_text
 from PIL import Image
 from point_files import save_pcd, save_ply
+from robot_files import LAPTOP, LAPTOP_SDF
 from scene_code import EVERYTHING
 from scene_files import write_bar
 from shapes import ball
@@ -63,6 +64,7 @@ from mereo.io.writers.volumes import write_labels_nifti, write_labels_seg_nrrd
 from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.models.weights import load_model, save_model
+from mereo.scenes.files.object_files import scene_of_meshes
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.statistical_model import StatisticalModel, load_statistical_model, save_statistical_model
@@ -485,6 +487,8 @@ ALL: dict[str, Target] = {
     "scene_camera.json": Target(text(json.dumps(BOP)), lambda p: read_intrinsics(p, (16, 12), index=1)),
     **{f"mesh.{kind}": Target(exported(kind), read_segmented_mesh) for kind in ("stl", "glb", "off")},
     "mesh.3mf": Target(exported("3mf"), read_segmented_mesh, "lxml"),
+    "laptop.urdf": Target(text(LAPTOP), lambda p: scene_of_meshes([p]), "yourdfpy"),
+    "laptop.sdf": Target(text(LAPTOP_SDF), lambda p: scene_of_meshes([p]), "yourdfpy"),
     "text.stl": Target(exported("stl_ascii"), lambda p: read_attachments([p])),
     "own.glb": Target(lambda p: write_segments_glb(p, segments()), lambda p: read_attachments([p])),
     "own.obj": Target(lambda p: write_segments_obj(p, segments()), lambda p: read_attachments([p])),

@@ -36,6 +36,7 @@ from mereo.io.sensor_frame import SensorFrame
 from mereo.io.writers.formats import chosen_formats
 from mereo.io.writers.glb import viewer_rotation
 from mereo.io.writers.volumes import MM_PER_M
+from mereo.visualization.joints import JointValue, measure_joints
 from mereo.visualization.reconstruction_report import result_html
 from mereo.visualization.result_files import write_answer, write_answer_file
 from mereo.visualization.units import Unit
@@ -159,6 +160,11 @@ class Result(Answer):
         the weights do not know the files.
         """
         return None if self.registered is None else self.registered.pose()
+
+    @cached_property
+    def joints(self) -> dict[str, JointValue]:
+        """Value of each joint that the object's definition has by name, as a robot's file has; empty without a fit."""
+        return measure_joints(self)
 
     @property
     def model_scale(self) -> float | None:

@@ -176,6 +176,8 @@ def reconstruct_frame(frame: SensorFrame, directory: Path, job: FrameJob, path: 
     if job.registrar is not None:
         print_source(result)
         print_uncertainty(result.registered, unit)
+        for name, joint in result.joints.items():
+            print(f"joint {name}: {joint}")
     carried = tuple(carry(each, registration_of(result)) for each in placed)
     for each in carried:
         print(each.description)

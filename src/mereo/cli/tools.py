@@ -222,6 +222,7 @@ PURPOSES: dict[str, str] = {
     "onnx": "networks for other runtimes",
     "cad": "3MF files",
     "medical": "NIfTI and NRRD volumes",
+    "robot": "robots of URDF and SDF files",
     "sensors": "ROS bags, EXR depth images and Zivid clouds",
     "simulation": "states from finite elements, in VTK's formats too",
     "storage": "datasets in S3 and what speaks it",

@@ -8,8 +8,9 @@ Every map that can be drawn has a positive Jacobian throughout the object: each 
 after the other multiply. Lengths are in scene units, angles in radians.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -129,13 +130,19 @@ class SquashSampler:
 
 @dataclass(frozen=True, eq=False)
 class JointSampler:
-    """Rigid motions: a turn about an axis, a slide along it, and a shift of at most ``shift`` along x, y, z."""
+    """Rigid motions: a turn about an axis, a slide along it, and a shift of at most ``shift`` along x, y, z.
+
+    A joint with a ``name`` either turns or slides, by one number, and those that follow it move by the same share of
+    their ranges, which may go either way.
+    """
 
     pivot: Vector
     axis: Vector
     angle_rad: Range
     slide: Range
     shift: Vector
+    name: str = ""
+    follows: str = ""
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
         """A random rigid motion."""
@@ -143,6 +150,27 @@ class JointSampler:
         rotation = axis * named(rng, "angle", "rad").uniform(*self.angle_rad)
         slide = axis * named(rng, "slide").uniform(*self.slide)
         return Rigid(rotation, slide + named(rng, "shift").uniform(-self.shift, self.shift), self.pivot)
+
+    @property
+    def turns(self) -> bool:
+        """Whether a joint with a name turns, else it slides."""
+        return self.angle_rad[0] != self.angle_rad[1]
+
+    @property
+    def limits(self) -> Range:
+        """Values of a joint with a name at the shares 0 and 1: radians, or scene units."""
+        return self.angle_rad if self.turns else self.slide
+
+    def sample_share(self, rng: np.random.Generator) -> float:
+        """Random share of the range of a joint with a name: 0 at its least value, 1 at its greatest."""
+        least, most = self.limits
+        value = (named(rng, "angle", "rad") if self.turns else named(rng, "slide")).uniform(least, most)
+        return float((value - least) / (most - least))
+
+    def at(self, share: float) -> Rigid:
+        """Motion of a joint with a name at a share of its range."""
+        motion = unit(self.axis) * (self.limits[0] + share * (self.limits[1] - self.limits[0]))
+        return Rigid(motion, np.zeros(3), self.pivot) if self.turns else Rigid(np.zeros(3), motion, self.pivot)
 
 
 @dataclass(frozen=True)
@@ -178,23 +206,56 @@ class RandomMotion:
     def __call__(self, rng: np.random.Generator) -> tuple[Deformation, ...]:
         """One deformation for each segment, as ``Scene.sample_deformations`` draws them."""
         chains: list[tuple[Deformation, ...]] = [()] * len(self.rest.segments)
+        shares = dict[str, float]()
         for number, (sampler, members) in enumerate(self.steps, start=1):
 
             def surface(members: tuple[int, ...] = members) -> tuple[np.ndarray, np.ndarray]:
                 return _surface(self.rest, chains, members)
 
-            with part(rng, self.title(number, sampler, members)):
-                drawn = sampler(rng, surface)
+            if isinstance(sampler, JointSampler) and sampler.name:
+                leader = sampler.follows or sampler.name
+                if leader not in shares:
+                    with part(rng, leader):
+                        shares[leader] = self.joints[leader][0].sample_share(rng)
+                drawn: Deformation = sampler.at(shares[leader])
+            else:
+                with part(rng, self.title(number, sampler, members)):
+                    drawn = sampler(rng, surface)
             for index in members:
                 chains[index] = (*chains[index], drawn)
-        shared: dict[tuple[int, ...], Compose] = {}
-        return tuple(shared.setdefault(tuple(id(part) for part in chain), Compose(chain)) for chain in chains)
+        return _shared(chains)
+
+    @cached_property
+    def joints(self) -> dict[str, tuple[JointSampler, tuple[int, ...]]]:
+        """Joints with a name, by it, and indices of the segments that each moves; in the order of the steps."""
+        joints = ((sampler, members) for sampler, members in self.steps if isinstance(sampler, JointSampler))
+        return {sampler.name: (sampler, members) for sampler, members in joints if sampler.name}
+
+    def at(self, shares: Mapping[str, float]) -> tuple[Deformation, ...]:
+        """One deformation for each segment by the joints with a name alone, at these shares of their ranges.
+
+        ``shares`` has those of the joints that follow no other one.
+        """
+        chains: list[tuple[Deformation, ...]] = [()] * len(self.rest.segments)
+        for joint, members in self.joints.values():
+            motion = joint.at(shares[joint.follows or joint.name])
+            for index in members:
+                chains[index] = (*chains[index], motion)
+        return _shared(chains)
 
     def title(self, number: int, sampler: DeformationSampler, members: tuple[int, ...]) -> str:
         """Step ``number``, counted from 1, as people know it from their file, for example "2 joint of hand, arm"."""
+        if isinstance(sampler, JointSampler) and sampler.name:
+            return sampler.name
         kind = type(sampler).__name__.removesuffix("Sampler").lower()
         whole = len(members) == len(self.rest.names)
         return f"{number} {kind}" + ("" if whole else f" of {', '.join(self.rest.names[i] for i in members)}")
+
+
+def _shared(chains: Sequence[tuple[Deformation, ...]]) -> tuple[Compose, ...]:
+    """Chains as maps, one for all segments of the same chain."""
+    maps: dict[tuple[int, ...], Compose] = {}
+    return tuple(maps.setdefault(tuple(id(part) for part in chain), Compose(chain)) for chain in chains)
 
 
 def _factor(rng: np.random.Generator, bounds: Range) -> float:

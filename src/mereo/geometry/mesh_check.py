@@ -1,6 +1,6 @@
 """What is wrong with a user's meshes: each segment by itself, and the volume that segments share."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from functools import cached_property
 from itertools import combinations
 from typing import NamedTuple
@@ -265,6 +265,19 @@ def mesh_of(solid: manifold3d.Manifold) -> tuple[Vertices, Faces]:
     """Vertices and faces of a solid."""
     mesh = solid.to_mesh64()
     return np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts, dtype=np.int64)
+
+
+def united(pieces: Sequence[Segment]) -> tuple[Vertices, Faces]:
+    """Union of pieces, as vertices and faces, where each is a solid that faces outwards; else all of their faces."""
+    if len(pieces) == 1:
+        return pieces[0].vertices, pieces[0].faces
+    try:
+        solids = [solid_of(piece.vertices, piece.faces) for piece in pieces]
+        if min(solid.volume() for solid in solids) <= 0:
+            raise ValueError("a piece is inside out, and would be cut off the others")
+        return mesh_of(manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add))
+    except ValueError:
+        return SegmentedMesh(tuple(pieces)).merged()[:2]
 
 
 # --- segments with each other -----------------------------------------------------------------------------------------

@@ -45,7 +45,11 @@ DEFAULT_GB = 8.0
 PAGES = Path("/proc/self/statm")
 """Where Linux, which alone holds a process to such a limit, says how much it has."""
 
-for _name in ("trimesh", "nibabel.global"):  # they log tracebacks and repairs, which Python shows where nobody listens
+for _name in (
+    "trimesh",
+    "nibabel.global",
+    "yourdfpy",
+):  # they log tracebacks and repairs, which Python shows where nobody listens
     logging.getLogger(_name).setLevel(logging.CRITICAL + 1)
 
 

@@ -47,9 +47,8 @@ from mereo.synthesis.depth_sensor import render_depth
 QUICK = SearchRound(0, 200, 4, 3)
 """Round of the search by which a region is looked at."""
 
-LOOKS, ANSWERS, HOPELESS = 12, 3, 0.0
-"""Regions that are looked at, and of these how many are answered, at most; nats of a quick look below which only the
-best is."""
+LOOKS, ANSWERS = 12, 3
+"""Regions that are looked at, and of these how many are answered, at most."""
 
 CHANCE, PER_MODE, MOST_MODES, BY_MASK = -3.0, -0.5, 6, 5.0
 """Nats of an object at a place of a frame before its outline is compared; those of each mode, up to so many, by which
@@ -337,7 +336,7 @@ def answers_in(
     nothing have none. Parameters of the object's scene are fitted where it is evident (``WholeFrame.finished``).
     """
     places = frame.places()
-    hopeful = [place for place in places[:ANSWERS] if place.outline.nats > HOPELESS]
+    hopeful = [place for place in places[:ANSWERS] if place.outline.nats > 0]
     waiting = hopeful or places[:1]
     for rounds in ((), ROUNDS[:1]):
         answers = list[PlacedAnswer]()

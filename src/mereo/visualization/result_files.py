@@ -23,6 +23,7 @@ from mereo.io.config import DEFAULT_FILES, FilesConfig
 from mereo.io.writers.formats import WRITERS, Results, chosen_formats, write_formats
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.scenes.rest_pose import rest_digest
+from mereo.visualization.joints import measure_joints
 from mereo.visualization.previews import render_cloud_and_segments
 from mereo.visualization.reconstruction_report import REPORT, Report, cluster, trust
 from mereo.visualization.units import Unit
@@ -53,13 +54,14 @@ def summary_of(
         radii["radius95"] = {**sure.summary(), "unit_m": frame.unit_m}
         for row, segment in zip(segments, sure.segments, strict=True):
             row |= {"centroid_radius95": segment.centroid_radius95, "volume95": list(segment.volume95)}
-    facts = frame_facts(answer, carried)
+    facts, joints = frame_facts(answer, carried), measure_joints(answer)
     return {
         "frame": frame.axes,
         "unit_m": frame.unit_m,
         "verdict": trust(facts).level,
         **facts,
         **radii,
+        **({"joints": {name: joint.facts() for name, joint in joints.items()}} if joints else {}),
         "pose": None if registered is None else registered.pose().tolist(),
         "nested": [list(pair) for pair in result.surfaces.nested],
         "spacing": float(result.labels.spacing[0]),

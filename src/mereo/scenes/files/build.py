@@ -13,13 +13,12 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
-from manifold3d import Manifold, OpType
 
 from mereo.deformation.elastic import ElasticSampler
 from mereo.deformation.maps import Deformation
 from mereo.deformation.samplers import RandomMotion
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
-from mereo.geometry.mesh_check import examine, mesh_of, solid_of
+from mereo.geometry.mesh_check import examine, united
 from mereo.geometry.subdivision import TooManyFaces, split_edges
 from mereo.geometry.transforms import Normalizer
 from mereo.io.config import Space
@@ -30,6 +29,7 @@ from mereo.io.yaml_document import Document, similar
 from mereo.scenes.files.deformation_blocks import (
     AnyDeformation,
     ElasticBlock,
+    JointBlock,
     Misfit,
     ModelPart,
     PartLook,
@@ -218,6 +218,7 @@ def _random_motion(
 ) -> RandomMotion:
     """All deformations of the file in their order."""
     steps, names = [], list(rest.names)
+    _check_joints(document, blocks)
     for index, block in enumerate(blocks):
         for name in block.segments or ():
             if name not in names:
@@ -231,6 +232,19 @@ def _random_motion(
         except Misfit as misfit:
             raise document.error(("deformations", index, misfit.key), str(misfit)) from None
     return RandomMotion(rest, tuple(steps))
+
+
+def _check_joints(document: Document, blocks: Sequence[AnyDeformation]) -> None:
+    """Raise ``ValueError`` where two joints have one name, or one follows what is no joint with a value of its own."""
+    joints = {index: block for index, block in enumerate(blocks) if isinstance(block, JointBlock) and block.name}
+    leaders = [str(joint.name) for joint in joints.values() if joint.follows is None]
+    for index, joint in joints.items():
+        if any(joint.name == other.name for before, other in joints.items() if before < index):
+            message = f"two joints are called {joint.name!r}; results have their values by name: rename one of them"
+            raise document.error(("deformations", index, "name"), message)
+        if joint.follows is not None and joint.follows not in leaders:
+            message = f"no joint that follows none is called {joint.follows!r}: {similar(joint.follows, leaders)}"
+            raise document.error(("deformations", index, "follows"), message)
 
 
 # --- segments ---------------------------------------------------------------------------------------------------------
@@ -280,16 +294,7 @@ def _from_model(document: Document, parts: Sequence[ModelPart], model: Segmented
 
 def _joined(part: PartLook, pieces: Sequence[Segment]) -> Segment:
     """One segment of all pieces: their union where each is a solid that faces outwards, else all of their faces."""
-    if len(pieces) == 1:
-        return Segment(part.name, pieces[0].color, pieces[0].vertices, pieces[0].faces)
-    try:
-        solids = [solid_of(piece.vertices, piece.faces) for piece in pieces]
-        if min(solid.volume() for solid in solids) <= 0:
-            raise ValueError("a piece is inside out, and would be cut off the others")
-        vertices, faces = mesh_of(Manifold.batch_boolean(solids, OpType.Add))
-    except ValueError:
-        vertices, faces, _ = SegmentedMesh(tuple(pieces)).merged()
-    return Segment(part.name, pieces[0].color, vertices, faces)
+    return Segment(part.name, pieces[0].color, *united(pieces))
 
 
 def _assembled(document: Document, key: str, parts: Sequence[PartLook], segments: Sequence[Segment]) -> SegmentedMesh:

@@ -22,6 +22,7 @@ from mereo.geometry.transforms import inverse_rigid
 from mereo.io.atomic_files import atomic_file, check_file_place, remove_abandoned
 from mereo.io.yaml_document import Document
 from mereo.scenes.files.build import build, read, read_segments
+from mereo.scenes.files.deformation_blocks import is_robot_joint
 from mereo.scenes.files.template import flat_base, measure_motion
 from mereo.scenes.registry import is_yaml, load_scene
 from mereo.scenes.scene import SCENES, Scene, Workspace
@@ -47,7 +48,7 @@ def check_scene(name: str, repair: bool = False) -> None:
         mesh = read_segments(document, file)
         unit = next((key for key, value in UNITS_M.items() if value == file.units), "unit")
         health = [examine(segment, unit) for segment in mesh.segments]
-        faults = _report(mesh, health, f"{unit}³")
+        faults = _report(mesh, health, f"{unit}³", is_mechanism := any(map(is_robot_joint, file.deformations or ())))
         sides = np.ptp(mesh.bounds, axis=0)
         longest_m = float(sides.max()) * file.units
         print(f"size: {' x '.join(f'{side:.4g}' for side in sides)} {unit}; the longest side is {longest_m:.3g} m")
@@ -55,7 +56,7 @@ def check_scene(name: str, repair: bool = False) -> None:
             guess = likely_unit(mesh.bounds)
             print(f"  note: that is unlikely for a depth camera's object; the unit may be {guess}")
         if faults and repair:
-            _check_repaired(document, mesh, health, unit)
+            _check_repaired(document, mesh, health, unit, is_mechanism)
             return
         if repair:
             print("no mesh needs a repair")
@@ -69,7 +70,8 @@ def check_scene(name: str, repair: bool = False) -> None:
     if faults + collisions:
         raise _refusal(name, faults, collisions)
     nested = "".join(f", {inner} nested in {outer}" for inner, outer in scene.rest.nested)
-    print(f"{scene.name}: {len(scene.rest.segments)} segments, closed, outward oriented, without overlap{nested}")
+    apart = "" if _is_mechanism(scene) else ", without overlap"
+    print(f"{scene.name}: {len(scene.rest.segments)} segments, closed, outward oriented{apart}{nested}")
     print(f"source: {scene.source}")
 
 
@@ -80,8 +82,13 @@ def _refusal(name: str, faults: int, collisions: int = 0) -> ValueError:
     return ValueError(f"{name} has {counted(faults + collisions, 'fault')}, listed above: {', and '.join(cures)}")
 
 
-def _report(mesh: SegmentedMesh, health: list[Health], unit: str) -> int:
-    """Print each segment and each overlap; returns the number of faults."""
+def _is_mechanism(scene: Scene) -> bool:
+    """Whether a scene has joints with names, as robots do: their links may overlap."""
+    return isinstance(scene.sample_deformations, RandomMotion) and bool(scene.sample_deformations.joints)
+
+
+def _report(mesh: SegmentedMesh, health: list[Health], unit: str, is_mechanism: bool = False) -> int:
+    """Print each segment and each overlap, which is no fault of a mechanism; returns the number of faults."""
     faults, usable = 0, not any(condition.hopeless for condition in health)
     volumes = mesh.owned_volumes if usable else [np.nan] * len(health)
     for segment, condition, volume in zip(mesh.segments, health, volumes, strict=True):
@@ -96,10 +103,10 @@ def _report(mesh: SegmentedMesh, health: list[Health], unit: str) -> int:
             print(f"  cure: no repair makes a solid of it; export {segment.name} again as a closed surface")
     if usable:
         shared, count = overlaps(_marked(mesh, health)), len(health)
-        faults += len(shared)
+        faults += 0 if is_mechanism else len(shared)
         for overlap in shared:
-            print(f"  fault: {overlap}")
-        if count > 2 and len(shared) > count * (count - 1) / 4:
+            print(f"  {'note' if is_mechanism else 'fault'}: {overlap}")
+        if count > 2 and not is_mechanism and len(shared) > count * (count - 1) / 4:
             print("  note: most pairs overlap; the files may each have a frame of their own: export them assembled")
     return faults
 
@@ -116,10 +123,14 @@ NOTABLE = 1e-3
 """Distance of two surfaces, in longest sides, from which on the place is printed."""
 
 
-def _check_repaired(document: Document, mesh: SegmentedMesh, health: list[Health], unit: str) -> None:
+def _check_repaired(
+    document: Document, mesh: SegmentedMesh, health: list[Health], unit: str, is_mechanism: bool
+) -> None:
     """Repair, say what was changed, write it, and check what was written."""
     fixed = [repaired(segment, unit) for segment in mesh.segments]
-    whole, cuts = without_overlaps(replace(mesh, segments=tuple(fix.segment for fix in fixed)))
+    whole, cuts = replace(mesh, segments=tuple(fix.segment for fix in fixed)), dict[str, list[str]]()
+    if not is_mechanism:
+        whole, cuts = without_overlaps(whole)
     changed = set[str]()
     for before, condition, fix, after in zip(mesh.segments, health, fixed, whole.segments, strict=True):
         if changes := [*fix.changes, *cuts.get(after.name, ())]:
@@ -254,11 +265,13 @@ def _report_states(scene: Scene) -> int:
         views.append(_view(scene.workspace, mesh, rng))
     seen, middle = min(share for share, _ in views), np.median([count for _, count in views])
     print(f"picture: a typical view shows it in {middle:.0f} of {WIDTH**2:,} pixels ({middle / WIDTH**2:.1%})")
+    is_mechanism = _is_mechanism(scene)
     for overlap in worst.values():
-        print(f"  fault: in random states {overlap}: {_cure(scene, overlap)}")
+        text = f"in random states {overlap}"
+        print(f"  note: {text}" if is_mechanism else f"  fault: {text}: {_cure(scene, overlap)}")
     if seen < 0.98:
         print(f"  note: in a random view only {seen:.0%} of the object is in the picture: widen `field_of_view`")
-    return len(worst)
+    return 0 if is_mechanism else len(worst)
 
 
 def _direction(workspace: Workspace) -> str:

@@ -7,7 +7,7 @@ units and radians.
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -18,6 +18,7 @@ from pydantic import (
     ConfigDict,
     Field,
     FiniteFloat,
+    field_validator,
     model_serializer,
     model_validator,
 )
@@ -258,21 +259,51 @@ class JointBlock(DeformationBlock):
     """Rigid motion: a turn by ``angle`` about ``axis`` through ``pivot``, a ``slide`` along it, a ``shift`` anywhere.
 
     Attributes:
+        name: by which results have its value; then it has either an angle or a slide.
+        follows: name of the joint that moves it: where that is at its least value, this one is at the first of its own,
+            and at its second where that is at its greatest. They may come in either order.
         shift: largest displacement to either side along x, y and z.
     """
 
     type: Literal["joint"]
+    name: Name | None = None
+    follows: Name | None = None
     pivot: Point
     axis: Direction
-    angle: Range = (0.0, 0.0)
-    slide: Range = (0.0, 0.0)
+    angle: tuple[Number, Number] = (0.0, 0.0)
+    slide: tuple[Number, Number] = (0.0, 0.0)
     shift: tuple[Annotated[Number, Field(ge=0)], ...] = Field(default=(0.0, 0.0, 0.0), min_length=3, max_length=3)
+
+    @field_validator("angle", "slide")
+    @classmethod
+    def _ascends(cls, value: tuple[float, float], info: Any) -> tuple[float, float]:
+        return value if info.data.get("follows") else _ascending(value)
+
+    @model_validator(mode="after")
+    def _has_single_value(self) -> "JointBlock":
+        ranges = [each for each in (self.angle, self.slide) if each[0] != each[1]]
+        if self.name is not None and (len(ranges) != 1 or any(self.shift)):
+            raise ValueError("a joint with a name has one value, of its angle or of its slide: give one range alone")
+        if self.follows is not None and self.name is None:
+            raise ValueError("it follows a joint and has no name; results have its value by that: add one")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _written(self, write: Any) -> dict[str, object]:
+        """Without the names that it lacks: an object's identity in datasets is made of it."""
+        return {key: value for key, value in write(self).items() if value is not None or key not in ("name", "follows")}
 
     def sampler(self, target: Target) -> DeformationSampler:
         """Sampler of rigid motions about the pivot, in scene units and radians."""
         slide, shift = _lengths(self.slide, target), np.array(self.shift) * target.unit
         axis = np.array(self.axis)
-        return samplers.JointSampler(target.point(self.pivot), axis, _radians(self.angle), slide, shift)
+        names = self.name or "", self.follows or ""
+        return samplers.JointSampler(target.point(self.pivot), axis, _radians(self.angle), slide, shift, *names)
+
+
+def is_robot_joint(block: DeformationBlock) -> bool:
+    """Whether a block is a joint with a name, as those of a robot's file are."""
+    return isinstance(block, JointBlock) and block.name is not None
 
 
 class PushBlock(DeformationBlock):

@@ -13,6 +13,7 @@ from mereo.geometry.conventions import Way
 from mereo.geometry.mesh_check import examine
 from mereo.io.mesh_formats import MESH_SUFFIXES, MeshWarning, read_object_mesh
 from mereo.io.readers import check_ply
+from mereo.io.robots import is_robot
 from mereo.io.volume_files import is_volume
 from mereo.scenes.files.template import write_scene_file
 from mereo.scenes.registry import is_yaml, load_scene
@@ -26,9 +27,13 @@ SEARCH = "search.json"
 
 
 def shapes_in(folder: Path) -> list[Path]:
-    """Meshes and label volumes that lie in a folder, in the order of their names; clouds are neither."""
-    files = (file for file in folder.glob("[!.]*") if file.suffix.lower() in MESH_SUFFIXES or is_volume(file))
-    return sorted(file for file in files if not _is_cloud(file))
+    """Meshes and label volumes that lie in a folder, in the order of their names; clouds are neither.
+
+    Where a robot's file is among them, the meshes are its own: that alone.
+    """
+    files = sorted(folder.glob("[!.]*"))
+    shapes = [file for file in files if file.suffix.lower() in MESH_SUFFIXES or is_volume(file)]
+    return [file for file in files if is_robot(file)] or [file for file in shapes if not _is_cloud(file)]
 
 
 def _is_cloud(file: Path) -> bool:

@@ -12,7 +12,8 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from textwrap import indent
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -22,13 +23,14 @@ from scipy.spatial import ConvexHull, QhullError
 
 from mereo.deformation.maps import Deformation, unit
 from mereo.deformation.samplers import RandomMotion, distance_from_line
-from mereo.geometry.brief import counted
+from mereo.geometry.brief import counted, listed
 from mereo.geometry.conventions import UNITS_M, Way
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, surface_points
-from mereo.geometry.mesh_check import likely_unit
+from mereo.geometry.mesh_check import examine, likely_unit, overlaps
 from mereo.geometry.transforms import Normalizer, fit_rigid, inverse_rigid, transform_points
 from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.io.mesh_formats import read_object_mesh
+from mereo.io.robots import RobotJoint, is_robot, read_robot
 from mereo.io.volume_files import (
     LabelVolume,
     LabelWarning,
@@ -301,7 +303,7 @@ class _Source(NamedTuple):
     """Segments of files in their unit, the lines that name them, and the likely unit and upward axis, with reasons.
 
     ``assembly`` is whether the segments are parts, which may have joints, and not regions of one body; ``lost`` are
-    sentences about segments that are left out, ``notes`` about what others lose.
+    sentences about segments that are left out, ``notes`` about what others lose; ``robot`` are a robot's joints.
     """
 
     block: str
@@ -313,6 +315,7 @@ class _Source(NamedTuple):
     assembly: bool = True
     lost: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    robot: tuple[RobotJoint, ...] | None = None
 
 
 def write_scene_file(
@@ -327,7 +330,8 @@ def write_scene_file(
     """Write a commented YAML file that names ``files`` relative to itself; returns its path.
 
     Args:
-        files: one mesh for each segment, one file of named parts, one label volume, or one for each segment.
+        files: one mesh for each segment, one file of named parts, a robot's file, one label volume, or one for each
+            segment.
         output: by default ``NAME.yaml`` in the working directory, after the first file.
         units: a key of ``geometry.conventions.UNITS_M``; None guesses.
         name: of the scene; by default that of ``output``.
@@ -380,6 +384,14 @@ def _source(files: Sequence[Path], folder: Path) -> _Source:
                 "alone, or meshes alone"
             )
         return _from_volumes(files, relative)
+    if robots := [file for file in files if is_robot(file)]:
+        if len(files) > 1:
+            raise ValueError(f"{robots[0]} is a whole robot, and other files are named too: name it alone")
+        robot = read_robot(files[0])
+        links = "the links of a robot, where all of its joints are zero"
+        notes = (*robot.notes, *_overlap_note(robot.mesh))
+        source = _from_model(files[0], relative[0], robot.mesh, links)
+        return source._replace(robot=robot.joints, notes=notes)
     meshes = [read_object_mesh(file) for file in files]
     if len(files) == 1 and len(meshes[0].segments) > 1:
         return _from_model(files[0], relative[0], meshes[0])
@@ -408,8 +420,17 @@ def _segment_name(text: str) -> str:
     return "".join(each if each.isprintable() and each not in "/\\" else "_" for each in text)
 
 
-def _from_model(file: Path, relative: str, mesh: SegmentedMesh) -> _Source:
-    lines = [f"model: {quoted(relative)}", "parts:  # delete what is not wanted; their order is that of the labels"]
+def _overlap_note(mesh: SegmentedMesh) -> list[str]:
+    """Sentence about links that overlap at rest, as the links of mechanisms may; none where they do not."""
+    pairs = overlaps(mesh) if all(examine(segment).sound for segment in mesh.segments) else ()
+    return [f"overlap: where all joints are zero, {listed(map(str, pairs))}; links may"] if pairs else []
+
+
+def _from_model(file: Path, relative: str, mesh: SegmentedMesh, what: str = "") -> _Source:
+    lines = [
+        f"model: {quoted(relative)}{what and f'  # {what}'}",
+        "parts:  # delete what is not wanted; their order is that of the labels",
+    ]
     names = _segment_names(mesh.names, "parts")
     for number, (part, name) in enumerate(zip(mesh.names, names, strict=True)):
         lines.append(f"  - name: {quoted(name)}")
@@ -468,7 +489,12 @@ def _likely_frame(file: Path, bounds: Float[np.ndarray, "2 3"]) -> tuple[str, st
     """Unit of a mesh file, and why; the axis that points upwards in it, and why."""
     kind, guess = file.suffix.lower().lstrip("."), likely_unit(bounds)
     longest_m = float((bounds[1] - bounds[0]).max()) * UNITS_M[guess]
-    known = {"glb": ("m", "the rule of glTF"), "gltf": ("m", "the rule of glTF"), "3mf": ("mm", "the default of 3MF")}
+    robots = dict.fromkeys(("urdf", "sdf"), ("m", "the rule of URDF and SDF"))
+    known = robots | {
+        "glb": ("m", "the rule of glTF"),
+        "gltf": ("m", "the rule of glTF"),
+        "3mf": ("mm", "the default of 3MF"),
+    }
     unit, reason = known.get(kind, (guess, f"guessed: the object would be {longest_m:.3g} m long"))
     up = 1 if kind in ("glb", "gltf", "obj") else 2
     return unit, reason, up, f"{'xyz'[up]} is up, as in most files of the kind .{kind}"
@@ -482,10 +508,14 @@ def _draft(name: str, source: _Source, units: str | None, aperture: float, way: 
     sides = np.ptp(source.mesh.bounds, axis=0)
     size = rounded(min(SIZE, LONGEST * float(sides.min() / sides.max())), 3)
     placement = placed(source.mesh, size)
-    joints = proposed_joints(source.mesh) if source.assembly else ()
-    way, why = _chosen(way, joints)
+    robot = [_robot_block(joint) for joint in source.robot or ()]
+    joints = proposed_joints(source.mesh) if source.assembly and source.robot is None else ()
+    if source.robot is not None and way in ("auto", "articulated"):
+        way, why = ("articulated" if robot else "rigid"), "as the file says"
+    else:
+        way, why = _chosen(way, joints)
     motion = {"soft": SOFT, "stiff": STIFF}.get(way)
-    moves = _Moves(way, joints, () if motion is None else default_deformations(source.mesh, motion))
+    moves = _Moves(way, joints, () if motion is None else default_deformations(source.mesh, motion), robot)
     rest = source.mesh.with_vertices([placement.apply(segment.vertices) for segment in source.mesh.segments])
     x, y, z = np.eye(3)[source.up].tolist()
     up_reason, base = source.up_reason, flat_base(source.mesh, (x, y, z)) if source.assembly else None
@@ -531,6 +561,7 @@ class _Moves(NamedTuple):
     way: Way
     joints: Sequence[Joint]
     blocks: Blocks
+    robot: Sequence[dict[str, Any]] = ()
 
     def describe(self) -> str:
         if not self.blocks:
@@ -544,6 +575,11 @@ class _Moves(NamedTuple):
         if self.way != "articulated":
             return random_motion(rest, self.blocks, placement)
         target = Target(rest, rest.bounds, placement)
+        if self.robot:
+            index = {name: number for number, name in enumerate(rest.names)}
+            samplers = (JointBlock.model_validate(block).sampler(target) for block in self.robot)
+            moved = (tuple(index[name] for name in block["segments"]) for block in self.robot)
+            return RandomMotion(rest, tuple(zip(samplers, moved, strict=True)))
         return RandomMotion(rest, tuple((_joint_block(joint).sampler(target), joint.moved) for joint in self.joints))
 
 
@@ -551,6 +587,19 @@ def _joint_block(joint: Joint) -> JointBlock:
     (x, y, z), (u, v, w) = joint.contact.point.tolist(), joint.axis.tolist()
     angle, slide = (joint.most, (0.0, 0.0)) if joint.hinge else ((0.0, 0.0), joint.most)
     return JointBlock(type="joint", pivot=(x, y, z), axis=(u, v, w), angle=angle, slide=slide)
+
+
+def _robot_block(joint: RobotJoint) -> dict[str, Any]:
+    """Block of a joint of a robot's file."""
+    limits = np.rad2deg(joint.limits) if joint.turns else np.array(joint.limits)
+    numbers = {"pivot": joint.pivot, "axis": joint.axis, "angle" if joint.turns else "slide": limits}
+    names = {"name": joint.name, "follows": joint.follows}
+    return {
+        "type": "joint",
+        **{key: _segment_name(name) for key, name in names.items() if name},
+        "segments": [_segment_name(name) for name in joint.moved],
+        **{key: [rounded(value, EXACT) for value in values.tolist()] for key, values in numbers.items()},
+    }
 
 
 def _notes(mesh: SegmentedMesh, moves: _Moves) -> list[str]:
@@ -582,6 +631,8 @@ def _deformations(mesh: SegmentedMesh, moves: _Moves) -> str:
     further = FURTHER.format(end=end, axis=axis, length=length, push=push, reach=reach)
     if moves.way == "rigid":
         return f"deformations: rigid\n{joints}{further}"
+    if moves.way == "articulated" and moves.robot:
+        return f"{ROBOT}\ndeformations:\n{indent(_yaml(moves.robot), '  ')}{ELASTIC_COMMENT}{further}"
     if moves.way == "articulated":
         lines = [line.removeprefix("#") for line in joints.splitlines(keepends=True)[1:]]
         return f"{ARTICULATED}\ndeformations:\n{''.join(lines)}{ELASTIC_COMMENT}{further}"
@@ -630,6 +681,13 @@ def _range(values: tuple[float, float]) -> str:
     return f"[{values[0]:.4g}, {values[1]:.4g}]"
 
 
+def _yaml(blocks: Sequence[Mapping[str, Any]]) -> str:
+    """Blocks as YAML, their lists on a line each."""
+    return yaml.safe_dump(
+        list(blocks), sort_keys=False, allow_unicode=True, default_flow_style=None, width=float("inf")
+    )
+
+
 def quoted(text: str) -> str:
     """Text as a YAML value on one line, also within a list: quoted and escaped where it would not be this text."""
     listed = yaml.safe_dump([text], default_flow_style=True, allow_unicode=True, width=float("inf"))
@@ -644,6 +702,11 @@ def _numbers(values: Float[np.ndarray, "3"]) -> str:
 JOINTS = "# Joints that the contacts suggest, in ranges without collisions; remove the '#'. The tip comes first:"
 
 ARTICULATED = "# Joints that the contacts suggest, in ranges without collisions. The tip comes first."
+
+ROBOT = "# Joints of the robot's file, by its names and within its limits. The tip comes first."
+
+EXACT = 8
+"""Digits of numbers that a robot's file gives exactly."""
 
 EXAMPLE_JOINT = """\
 #  - type: joint  # rigid, and before what bends the whole; in a chain, the joint at the tip comes first

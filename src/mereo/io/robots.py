@@ -1,0 +1,410 @@
+"""Robots of URDF and SDF files: their links as segments where all joints are zero, and the joints that move them.
+
+file -yourdfpy, _read_sdf-> yourdfpy's Robot (links, joints) -_assembled-> Robot (segments, joints between them)
+
+Lengths are metres and angles radians, as both formats have them; positions are in the frame of the base.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from io import BytesIO
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from mereo.geometry.conventions import LARGEST
+from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.mesh_check import united
+from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
+from mereo.io.errors import readable
+from mereo.io.extras import library
+from mereo.io.mesh_formats import ROBOT_SUFFIXES, read_object_mesh
+
+KINDS = ("revolute", "continuous", "prismatic", "fixed")
+"""Kinds of joints that are known."""
+
+Matrix = Float[np.ndarray, "4 4"]
+Vector = Float[np.ndarray, "3"]
+
+
+@dataclass(frozen=True, eq=False)
+class RobotJoint:
+    """Joint of a robot.
+
+    Attributes:
+        name: in the file.
+        turns: whether it turns about ``axis``, else it slides along it.
+        pivot, axis: point of the axis and its unit vector, where all joints are zero.
+        limits: least and greatest value; of a joint that follows another one, its values where that is at its least
+            and greatest, in either order.
+        moved: names of the segments that it moves.
+        follows: name of the joint that it mimics; "" of one with a value of its own.
+    """
+
+    name: str
+    turns: bool
+    pivot: Vector
+    axis: Vector
+    limits: tuple[float, float]
+    moved: tuple[str, ...]
+    follows: str
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """Robot of a file.
+
+    Attributes:
+        mesh: a segment for each link that moves, with all links fixed to it, called after the first of them that has a
+            shape; where all joints are zero.
+        joints: those that move some of the segments against others, the tip of each chain first.
+        notes: sentences about joints that are left out.
+    """
+
+    mesh: SegmentedMesh
+    joints: tuple[RobotJoint, ...]
+    notes: tuple[str, ...]
+
+
+def is_robot(path: Path) -> bool:
+    """Whether a path names a URDF or SDF file."""
+    return path.suffix.lower() in ROBOT_SUFFIXES
+
+
+def read_robot(path: str | Path) -> Robot:
+    """Read a robot from a URDF or SDF file, with the meshes that it names.
+
+    Shapes are those of the visual elements, where the file has any, else of the collision elements.
+    ``package://NAME/...`` and ``model://NAME/...`` are looked for in the folders above the file.
+
+    Raises ``FileNotFoundError`` for a missing file or mesh; ``ValueError`` for a damaged file, a joint that is neither
+    revolute, continuous, prismatic nor fixed, links that form no tree, and a robot without shapes; ``ImportError``
+    without the extra `robot`.
+    """
+    path = Path(path)
+    kind = path.suffix[1:].upper()
+    yourdfpy, etree = library("yourdfpy", "robot", path), library("lxml.etree", "robot", path)
+    with readable(path, f"robot in {kind}"):
+        parser = etree.XMLParser(resolve_entities=False, remove_comments=True, remove_pis=True)
+        root = etree.parse(BytesIO(path.read_bytes()), parser).getroot()
+        if any("xacro" in element.tag for element in root.iter(etree.Element)):
+            raise ValueError("it is a macro file, whose links are known once `xacro` has expanded it")
+        if kind == "URDF":
+            described = _read_urdf(yourdfpy, root, etree.tostring(root, encoding="utf-8"))
+        else:
+            described = _read_sdf(yourdfpy, root)
+        for joint in described.joints:
+            joint.axis = np.reshape(joint.axis, 3)
+        drawn = any(link.visuals for link in described.links)
+        every = [(link.name, each) for link in described.links for each in (link.visuals if drawn else link.collisions)]
+        solids = [_solid(each.geometry) for _, each in every]
+    shapes, states = list[_Shape](), [(str(path), path.stat())]
+    for (link, each), solid in zip(every, solids, strict=True):
+        if solid is None:
+            mesh = each.geometry.mesh
+            file = _mesh_file(path, link, mesh.filename or "")
+            states.append((str(file), file.stat()))
+            shapes.append(_Shape(link, _origin(each), file, mesh.scale))
+        else:
+            shapes.append(_Shape(link, _origin(each), solid))
+    known = tuple((name, state.st_ino, state.st_size, state.st_mtime_ns) for name, state in states)
+    return _assembled(_Described(path, described, shapes, known))
+
+
+def _solid(geometry: Any) -> trimesh.Trimesh | None:
+    """Solid of a box, cylinder or sphere; None of a mesh, whose scale gets three numbers."""
+    if geometry.mesh is not None:
+        geometry.mesh.scale = np.ones(3) * (1.0 if geometry.mesh.scale is None else geometry.mesh.scale)
+        return None
+    if geometry.box is not None:
+        return trimesh.creation.box(geometry.box.size)
+    if geometry.cylinder is not None:
+        return trimesh.creation.cylinder(geometry.cylinder.radius, geometry.cylinder.length)
+    return trimesh.creation.icosphere(3, geometry.sphere.radius)
+
+
+def _read_urdf(yourdfpy: Any, root: Any, content: bytes) -> Any:
+    for joint in root.iterfind("joint"):  # which the library takes for granted
+        if joint.find("parent") is None or joint.find("child") is None:
+            raise ValueError(f"its joint {joint.get('name')!r} has no <parent> or no <child>")
+    for shape in root.iterfind("link/*"):
+        if shape.tag in ("visual", "collision") and shape.find("geometry/*") is None:
+            raise ValueError(f"a <{shape.tag}> of its link {shape.getparent().get('name')!r} has no geometry")
+    return yourdfpy.URDF.load(BytesIO(content), build_scene_graph=False, load_meshes=False).robot
+
+
+def _read_sdf(yourdfpy: Any, root: Any) -> Any:
+    """Robot of an SDF file's only model, as yourdfpy would have it from a URDF file: links in the frames of joints."""
+    models = [*root.iterfind("model"), *root.iterfind("world/model")]
+    if len(models) != 1 or models[0].find("include") is not None or models[0].find("model") is not None:
+        raise ValueError(f"it has {len(models)} models; it must have one, without others in it")
+    (model,) = models
+    elements = {each.get("name"): each for kind in ("frame", "joint", "link") for each in model.iterfind(kind)}
+    names = {"link": "", "joint": "child", "frame": "attached_to"}
+    poses, pending = {"": np.eye(4), "__model__": np.eye(4)}, set[str]()
+
+    def pose_of(name: str) -> Matrix:
+        """Pose of a link, joint or frame in the model."""
+        if name not in poses:
+            if name in pending or name not in elements:
+                raise ValueError(f"a pose is relative to {name!r}, which is no other link, joint or frame")
+            pending.add(name)
+            element = elements[name]
+            base = names[element.tag]
+            poses[name] = pose(element, (element.findtext(base) or element.get(base, "")) if base else "")
+        return poses[name]
+
+    def pose(element: Any, base: str) -> Matrix:
+        place = element.find("pose")
+        if place is None:
+            return pose_of(base.strip())
+        x, y, z, *angles = _numbers((place.text or "").strip() or "0 0 0 0 0 0", 6)
+        turn = Rotation.from_euler("xyz", angles, degrees=place.get("degrees") == "true").as_matrix()
+        return pose_of(place.get("relative_to", base.strip())) @ rigid(turn, np.array([x, y, z]))
+
+    joints, frames = list[Any](), {link.get("name"): pose_of(link.get("name")) for link in model.iterfind("link")}
+    for element in model.iterfind("joint"):
+        name, parent, child = element.get("name"), *(element.findtext(key, "").strip() for key in ("parent", "child"))
+        if parent != "world":  # the camera may see it from anywhere
+            frames[child] = pose_of(name)
+            joint = yourdfpy.Joint(name, element.get("type"), parent, child, axis=np.zeros(3))
+            joints.append(_with_axis(yourdfpy, joint, element.find("axis"), pose_of))
+    for joint in joints:
+        joint.origin = inverse_rigid(frames.get(joint.parent, np.eye(4))) @ frames[joint.child]
+    links = list[Any]()
+    for element in model.iterfind("link"):
+        link = yourdfpy.Link(element.get("name"))
+        for kind, shapes in (("visual", link.visuals), ("collision", link.collisions)):
+            for each in element.iterfind(kind):
+                place = inverse_rigid(frames[link.name]) @ pose(each, link.name)
+                shapes += [yourdfpy.Visual(None, place @ shift, what) for shift, what in _geometries(yourdfpy, each)]
+        links.append(link)
+    return yourdfpy.Robot(model.get("name"), links, joints)
+
+
+def _with_axis(yourdfpy: Any, joint: Any, axis: Any, pose_of: Any) -> Any:
+    """Joint of an SDF file with its axis, limits and leader."""
+    if axis is None:
+        return joint
+    base = axis.find("xyz").get("expressed_in") or joint.name
+    if axis.findtext("use_parent_model_frame", "").strip() in ("1", "true"):
+        base = "__model__"
+    turn = pose_of(joint.name)[:3, :3].T @ pose_of(base)[:3, :3]
+    joint.axis = turn @ _numbers(axis.findtext("xyz"), 3)
+    lower, upper = (_numbers(axis.findtext(f"limit/{key}") or value, 1)[0] for key, value in LIMITS.items())
+    joint.limit = yourdfpy.Limit(lower=lower, upper=upper)
+    if (leader := axis.find("mimic")) is not None:
+        factor, offset, start = (
+            _numbers(leader.findtext(key) or value, 1)[0]
+            for key, value in (("multiplier", "1"), ("offset", "0"), ("reference", "0"))
+        )
+        joint.mimic = yourdfpy.Mimic(leader.get("joint"), factor, offset - factor * start)
+    return joint
+
+
+LIMITS = {"lower": "-inf", "upper": "inf"}
+"""Limits of a joint of an SDF file that states none."""
+
+
+def _geometries(yourdfpy: Any, element: Any) -> Iterator[tuple[Matrix, Any]]:
+    """Shapes of a visual or collision element of an SDF file, and where they are in it."""
+    shape = element.find("geometry/*")
+    if shape is None:
+        raise ValueError(f"its <{element.tag}> {element.get('name')!r} has no geometry")
+    sizes = {each.tag: each.text for each in shape}
+    round_sizes = [_numbers(sizes[key], 1)[0] for key in ("radius", "length") if key in sizes]
+    if shape.tag == "mesh":
+        mesh = yourdfpy.Mesh((sizes["uri"] or "").strip(), np.array(_numbers(sizes.get("scale", "1 1 1"), 3)))
+        yield np.eye(4), yourdfpy.Geometry(mesh=mesh)
+    elif shape.tag == "box":
+        yield np.eye(4), yourdfpy.Geometry(box=yourdfpy.Box(np.array(_numbers(sizes["size"], 3))))
+    elif shape.tag == "sphere":
+        yield np.eye(4), yourdfpy.Geometry(sphere=yourdfpy.Sphere(*round_sizes))
+    elif shape.tag in ("cylinder", "capsule"):
+        radius, length = round_sizes
+        yield np.eye(4), yourdfpy.Geometry(cylinder=yourdfpy.Cylinder(radius, length))
+        for end in (-length / 2, length / 2) if shape.tag == "capsule" else ():
+            yield rigid(np.eye(3), np.array([0.0, 0.0, end])), yourdfpy.Geometry(sphere=yourdfpy.Sphere(radius))
+    else:
+        raise ValueError(f"its <{element.tag}> {element.get('name')!r} is a {shape.tag}, which is not known")
+
+
+def _numbers(text: str | None, count: int) -> list[float]:
+    numbers = [float(word) for word in (text or "").split()]
+    if len(numbers) != count:
+        raise ValueError(f"{text!r} is not {count} numbers")
+    return numbers
+
+
+def _mesh_file(path: Path, link: str, name: str) -> Path:
+    """File of a mesh that a link names: relative to the robot's file, or in a package in the folders above it."""
+    scheme, _, rest = name.rpartition("://")
+    folder, tries = path.resolve().parent, [path.resolve().parent / rest]
+    if scheme in ("package", "model"):
+        package, _, inside = rest.partition("/")
+        above = (folder, *folder.parents)
+        tries = [base / rest for base in above]
+        tries += [base / inside for base in above if base.name == package or (base / "package.xml").is_file()]
+    for file in tries:
+        if file.is_file():
+            return file
+    where = "no folder above the file has it" if len(tries) > 1 else f"{tries[0]} does not exist"
+    raise FileNotFoundError(
+        f"{path}: link {link!r} names the mesh {name!r}, and {where}: put it there, or correct the path"
+    )
+
+
+# --- the robot of links and joints ------------------------------------------------------------------------------------
+
+
+class _Shape(NamedTuple):
+    """Shape of a link: a solid, or a mesh's file with its scale."""
+
+    link: str
+    T_link_shape: Matrix
+    content: trimesh.Trimesh | Path
+    scale: Vector | None = None
+
+    def surfaces(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Vertices and faces of its parts in its own frame."""
+        if isinstance(self.content, Path):
+            assert self.scale is not None
+            for part in read_object_mesh(self.content).segments:
+                # a mirrored surface faces inwards
+                yield part.vertices * self.scale, part.faces[:, :: -1 if np.prod(self.scale) < 0 else 1]
+        else:
+            yield np.asarray(self.content.vertices), np.asarray(self.content.faces, dtype=np.int64)
+
+
+@dataclass(frozen=True)
+class _Described:
+    """Content of a file: yourdfpy's robot and its shapes; equal where the ``states`` of all its files are."""
+
+    path: Path = field(compare=False)
+    robot: Any = field(compare=False)
+    shapes: list[_Shape] = field(compare=False)
+    states: tuple[tuple[str, int, int, int], ...]
+
+
+@lru_cache(maxsize=16)
+def _assembled(content: _Described) -> Robot:
+    path, joints = content.path, _from_base(content.path, content.robot)
+    limits = _limits(path, joints)
+    poses = {link.name: np.eye(4) for link in content.robot.links}
+    carriers: dict[str, tuple[str, ...]] = dict.fromkeys(poses, ())
+    for joint in joints:
+        poses[joint.child] = poses[joint.parent] @ _origin(joint)
+        carriers[joint.child] = carriers[joint.parent] + ((joint.name,) if joint.name in limits else ())
+    names, parts = dict[tuple[str, ...], str](), dict[str, list[Segment]]()
+    order = [*(link for link in poses if not carriers[link]), *(joint.child for joint in joints)]
+    for shape in sorted(content.shapes, key=lambda shape: order.index(shape.link)):
+        pieces = parts.setdefault(names.setdefault(carriers[shape.link], shape.link), [])
+        for vertices, faces in shape.surfaces():
+            vertices = transform_points(poses[shape.link] @ shape.T_link_shape, vertices)
+            _check_numbers(path, shape.link, vertices)
+            pieces.append(Segment(str(len(pieces)), PALETTE[0], vertices, faces))
+    if not parts:
+        raise ValueError(f"{path} has no link with a shape, of which a camera could see something: add meshes")
+    colors = (PALETTE[index % len(PALETTE)] for index in range(len(parts)))
+    segments = (Segment(name, color, *united(each)) for (name, each), color in zip(parts.items(), colors, strict=True))
+    moved = {joint: tuple(name for chain, name in names.items() if joint in chain) for joint in limits}
+    kept = {joint: each for joint, each in moved.items() if 0 < len(each) < len(names)}
+    notes = (f"joint {name!r} is left out, for it moves no segment against others" for name in limits.keys() - kept)
+    joined = []
+    for joint in reversed(joints):
+        if joint.name in kept:
+            leader, *ends = limits[joint.name]
+            ends = ends if leader in kept else sorted(ends)
+            axis = poses[joint.child][:3, :3] @ (joint.axis / np.linalg.norm(joint.axis))
+            place = joint.type != "prismatic", poses[joint.child][:3, 3], axis, (ends[0], ends[1])
+            _check_numbers(path, joint.name, np.array([*poses[joint.child][:3, 3], *axis, *np.rad2deg(ends)]))
+            joined.append(RobotJoint(joint.name, *place, kept[joint.name], leader if leader in kept else ""))
+    return Robot(SegmentedMesh(tuple(segments)), tuple(joined), tuple(sorted(notes)))
+
+
+def _check_numbers(path: Path, name: str, values: np.ndarray) -> None:
+    if not (np.abs(values) <= LARGEST).all():
+        raise ValueError(
+            f"{path}: a pose, size or limit of {name!r} is NaN, infinite or beyond {LARGEST:g}: correct it"
+        )
+
+
+def _origin(element: Any) -> Matrix:
+    return np.eye(4) if element.origin is None else np.asarray(element.origin)
+
+
+def _from_base(path: Path, robot: Any) -> list[Any]:
+    """Joints, each after those that carry it; raises ``ValueError`` where links and joints form no tree."""
+    links, above = [link.name for link in robot.links], dict[str, str]()
+    for joint in robot.joints:
+        if joint.parent not in links or joint.child not in links:
+            raise ValueError(f"{path}: joint {joint.name!r} names a link that is not in the file: correct it")
+        if joint.child in above:
+            raise ValueError(
+                f"{path}: link {joint.child!r} is carried by the joints {above[joint.child]!r} and {joint.name!r}; a "
+                "robot is a tree without loops: leave one of them out"
+            )
+        above[joint.child] = joint.name
+    reached, joints = {link for link in links if link not in above}, list[Any]()
+    if len(reached) != 1 or len(set(links)) < len(links):
+        raise ValueError(
+            f"{path} has {len(reached)} links that no joint carries ({', '.join(sorted(reached))}); it must be one, "
+            "the base, and each link has a name for itself: correct its joints"
+        )
+    while new := [joint for joint in robot.joints if joint.parent in reached and joint not in joints]:
+        joints += new
+        reached |= {joint.child for joint in new}
+    if len(reached) < len(links):
+        raise ValueError(f"{path}: joints of {min(set(links) - reached)!r} form a loop, and no tree: correct them")
+    return joints
+
+
+def _limits(path: Path, joints: Sequence[Any]) -> dict[str, tuple[str, float, float]]:
+    """Of each joint that moves: the joint that it follows or "", and its range, as ``RobotJoint`` has them."""
+    by_name, ranges = {joint.name: joint for joint in joints}, dict[str, tuple[str, float, float]]()
+    for joint in joints:
+        if joint.type not in KINDS:
+            raise ValueError(
+                f"{path}: joint {joint.name!r} is of the kind {joint.type!r}; it must be {', '.join(KINDS)}: make it "
+                "fixed, or several joints with links between them"
+            )
+        factor, offset, leader, passed = 1.0, 0.0, joint, [joint.name]
+        while leader.mimic is not None:
+            name = leader.mimic.joint
+            if name not in by_name or by_name[name].type == "fixed" or name in passed or leader.mimic.multiplier == 0:
+                raise ValueError(
+                    f"{path}: joint {joint.name!r} mimics {name!r}; it must be another one that moves it: correct it"
+                )
+            passed.append(name)
+            factor, offset, leader = (
+                factor * leader.mimic.multiplier,
+                offset + factor * leader.mimic.offset,
+                by_name[name],
+            )
+        least, most = _range(path, leader)
+        if joint.type != "fixed" and most > least:
+            if not 0 < np.linalg.norm(joint.axis) < LARGEST:
+                raise ValueError(
+                    f"{path}: joint {joint.name!r} has the axis {joint.axis}; it must be a direction: correct it"
+                )
+            ranges[joint.name] = "" if leader is joint else leader.name, factor * least + offset, factor * most + offset
+    return ranges
+
+
+def _range(path: Path, joint: Any) -> tuple[float, float]:
+    """Least and greatest value of a joint that follows none: of one that turns, at most a turn."""
+    limits = (None, None) if joint.limit is None else (joint.limit.lower, joint.limit.upper)
+    least, most = (np.nan, np.nan) if limits == (None, None) else (limits[0] or 0.0, limits[1] or 0.0)
+    if joint.type == "continuous" or (joint.type == "revolute" and most - least > 2 * np.pi):
+        return -np.pi, np.pi
+    if joint.type != "fixed" and not 0 <= most - least < LARGEST:
+        raise ValueError(
+            f"{path}: joint {joint.name!r} has the limits {least:g} and {most:g}; it must have two, the lower first: "
+            "write them as <limit>"
+        )
+    return least, most
