@@ -22,7 +22,7 @@ from bank_views import OBJECTS, desk_view, scene_of
 from mereo.geometry.metrics import truth_grid
 from mereo.io.cores import use_threads
 from mereo.locating.outline import Outline
-from mereo.locating.whole_frame import PlacedAnswer, WholeFrame, answers_in, chance
+from mereo.locating.whole_frame import LOOKS, PlacedAnswer, WholeFrame, answers_in, chance, instances_in
 from mereo.synthesis.examples import View
 
 FOUND = 0.75
@@ -35,9 +35,9 @@ def answer_desk(name: str, kind: str, number: int, seed: int, all_places: bool) 
     seen, view = desk_view(scene_of(name), kind, number, rng)
     registrar, started = registrar_of(name), (time.perf_counter(), time.process_time())
     frame = WholeFrame.of(seen, registrar, 1.0)
-    answers = sorted(answers_in(frame, None, all_places=all_places), key=lambda placed: -placed.nats)
-    answers[:1] = [frame.finished(placed, False) for placed in answers[:1]]
-    places = [facts_of(placed, view) for placed in answers]
+    answers = list(answers_in(frame, None, most=LOOKS if all_places else 1))
+    best = instances_in(frame, answers, False)[:1] if answers else []
+    places = [facts_of(placed, view) for placed in (*best, *answers)]
     spent = {"seconds": time.perf_counter() - started[0], "processor_s": time.process_time() - started[1]}
     return {"object": name, "kind": kind, "number": number, "seed": seed, **spent, "places": places}
 
@@ -65,8 +65,8 @@ def facts_of(placed: PlacedAnswer, view: View | None) -> dict[str, Any]:
 
 
 def best_of(frame: dict[str, Any]) -> dict[str, Any] | None:
-    """The most evident place of a frame."""
-    return max(frame["places"], key=lambda place: place["nats"], default=None)
+    """The answer to a frame, before those of all places."""
+    return next(iter(frame["places"]), None)
 
 
 def show(frames: list[dict[str, Any]]) -> None:

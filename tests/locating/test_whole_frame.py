@@ -115,6 +115,39 @@ def test_what_is_not_in_the_frame_is_not_known_and_the_likeliest_place_is_stated
     assert "the object is not in this frame; what is most like it, at " in found.recognition.reason
 
 
+SECOND = rigid(
+    (SLOPE * Rotation.from_euler("xyz", [20, 60, 10], degrees=True)).as_matrix(), on_desk(-0.15, 0.06, -0.08)
+)
+
+
+def test_each_instance_is_at_its_place_and_has_a_folder(
+    placed: SegmentedMesh, rest: SegmentedMesh, angle: mereo.Object, folder: Path, tmp_path: Path
+) -> None:
+    both = desk(*placed.segments, *(replace(each, name=f"{each.name} 2") for each in rest.transformed(SECOND).segments))
+    found = mereo.reconstruct(both, angle, unit_m=1.0, instances="all")
+    assert [each.known for each in found.instances] == [True, True] and found.instances[0] is found
+    long = np.asarray(trimesh.load(folder / "long.stl").vertices) / 1000
+    places = [transform_points(each.pose, long) for each in found.instances if each.pose is not None]
+    for T in (PLACED, SECOND):
+        true = transform_points(T, rest.segments[0].vertices)
+        assert min(np.abs(place - true).max() for place in places) < 3e-3
+    found.save(tmp_path / "result")
+    summary = json.loads((tmp_path / "result" / "summary.json").read_text(encoding="utf-8"))
+    (further,) = summary["further_instances"]
+    alone = json.loads((tmp_path / "result" / "instance2" / "summary.json").read_text(encoding="utf-8"))
+    assert further["pose"] == alone["pose"] != summary["pose"]
+    every = trimesh.load_scene(tmp_path / "result" / "instances.glb")
+    assert set(every.geometry) == {"1 long", "1 short", "2 long", "2 short"}
+
+
+def test_several_instances_are_of_a_whole_frame(placed: SegmentedMesh, angle: mereo.Object) -> None:
+    alone = render_depth(placed, CAMERA)
+    with pytest.raises(ValueError, match="instances is 2, which a whole depth image alone may show"):
+        mereo.reconstruct(alone, angle, unit_m=1.0, instances=2)
+    with pytest.raises(ValueError, match="instances is 0; it must be a whole number, at least 1"):
+        mereo.reconstruct(alone, angle, unit_m=1.0, instances=0)
+
+
 def test_the_command_looks_through_the_frame_and_says_so(
     image: DepthImage, on_angle: tuple[int, int], folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -123,7 +156,7 @@ def test_the_command_looks_through_the_frame_and_says_so(
     (tmp_path / "camera.json").write_text(json.dumps(intrinsics), encoding="utf-8")
     given = [str(tmp_path / "depth.npy"), "--intrinsics", str(tmp_path / "camera.json"), "--object"]
     meshes = [str(folder / "long.stl"), str(folder / "short.stl"), "--units", "mm", "--deformations", "rigid"]
-    point = ["--point", *map(str, on_angle), "--output", str(tmp_path / "result")]
+    point = ["--point", *map(str, on_angle), "--instances", "all", "--output", str(tmp_path / "result")]
     main(["reconstruct", *given, *meshes, *point])
     printed = capsys.readouterr().out
     where = "at the point {} {}".format(*on_angle)

@@ -23,6 +23,7 @@ from mereo.fitting.config import AnswerMethod
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import CloudAxes, check_real
 from mereo.geometry.transforms import checked_pose
+from mereo.io.bounds import Instances
 from mereo.io.config import InputConfig
 from mereo.io.intrinsics import read_intrinsics
 from mereo.io.point_arrays import is_frame_list, mask_image, points_of
@@ -195,6 +196,7 @@ def reconstruct(
     isolation: IsolationConfig | None = None,
     label_points: bool = False,
     initial_pose: ArrayLike | None = None,
+    instances: Instances = 1,
     **options: Any,
 ) -> Result | list[Result]:
     """Find all segments of an object in a frame, hidden side included: what ``mereo reconstruct`` does.
@@ -211,6 +213,8 @@ def reconstruct(
         label_points: also say on which segment each observed point lies (``Result.reconstruction.observed``).
         initial_pose: rough pose of the object, as ``Result.pose``, from which the fit starts instead of a search or a
             network; what the scene holds (``held``) stays there. Both units must be known.
+        instances: how many of the object are looked for in a whole depth image, or "all": the result is that of the
+            most evident, and its ``instances`` are those of all that are known.
         options: fields of ``isolation`` by themselves, ``extent="partial"`` where a part of the object is hidden or cut
             off, ``point=(u, v)``, the column and row of a pixel of the object, ``box`` and others; and
             arguments of ``load_frame``, ``axes``, ``unit_m``, ``intrinsics``, ``mask`` and others.
@@ -232,7 +236,13 @@ def reconstruct(
                 observation = replace(observation, initial_pose=checked_pose(initial_pose))
             results.append(
                 reconstruct_observation(
-                    observation, known, method, resolution=resolution, isolation=isolation, label_points=label_points
+                    observation,
+                    known,
+                    method,
+                    resolution=resolution,
+                    isolation=isolation,
+                    label_points=label_points,
+                    instances=instances,
                 )
             )
     return results if are_many else results[0]
@@ -246,6 +256,7 @@ def reconstruct_observation(
     resolution: int = 128,
     isolation: IsolationConfig = IsolationConfig(),  # noqa: B008 (frozen)
     label_points: bool = False,
+    instances: Instances = 1,
 ) -> Result:
     """Find all segments of an object that was observed: ``reconstruct`` once the frame is read and isolated.
 
@@ -263,6 +274,7 @@ def reconstruct_observation(
         keep_all=isolation.keep_all,
         resolution=resolution,
         label_points=label_points,
+        instances=instances,
     )
     if answer.error is not None and method != "auto":
         raise answer.error

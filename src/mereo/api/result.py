@@ -122,6 +122,11 @@ class Result(Answer):
         """Result of an answer."""
         return cls(**{item.name: getattr(answer, item.name) for item in fields(Answer)})
 
+    @cached_property
+    def instances(self) -> "tuple[Result, ...]":
+        """This result, and those of further instances of the object in the same frame, the most evident first."""
+        return self, *map(Result.of, self.further)
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the segments, in the order of their labels."""

@@ -11,7 +11,7 @@ from tyro.conf import UseAppendAction, arg
 from mereo.cli.options import ConfigFile, InputName, InputOrNone, Inputs, MeshUnits, Outcome, loaded_object
 from mereo.fitting.config import AnswerMethod, StreamMethod
 from mereo.geometry.conventions import Way
-from mereo.io.bounds import Cells, Port, Positive, Threads, Workers
+from mereo.io.bounds import Cells, Instances, Port, Positive, Threads, Workers
 from mereo.io.config import CarryFrame, FilesConfig, InputConfig
 from mereo.models.config import InferenceConfig
 from mereo.reconstruction.config import IsolationConfig
@@ -56,6 +56,8 @@ class ReconstructCommand:
         initial_pose: file of the object's rough pose, from which the fit starts instead of a search or a network: 4 x 4
             numbers (text, NPY, or the summary.json of a result) that take the object's own files, in the frame's unit,
             to the frame. Parts that the scene holds stay there.
+        instances: how many of the object are looked for in a whole depth image, or all; further ones that are known get
+            folders of their own in the output.
         carry: file to bring to where the object is, its inside included; once for each: mesh (STL, PLY, OBJ, GLB),
             points (PLY, XYZ, NPY), CSV (x, y, z; qx, qy, qz, qw for poses) or volume (NIfTI, NRRD), which is
             resampled around the object.
@@ -85,6 +87,7 @@ class ReconstructCommand:
     method: AnswerMethod = "auto"
     scene: str | None = None
     initial_pose: Path | None = None
+    instances: Instances = 1
     carry: UseAppendAction[tuple[Path, ...]] = ()
     carry_frame: CarryFrame = "source"
     force: bool = False

@@ -49,7 +49,7 @@ from mereo.models.trained import Trained
 from mereo.reconstruction.observation import FrameWarning, find_object
 from mereo.scenes.registry import files_of
 from mereo.visualization.reconstruction_report import confidence_title, trust
-from mereo.visualization.result_files import summary_of, write_answer
+from mereo.visualization.result_files import INSTANCE, summary_of, write_answer
 from mereo.visualization.units import Unit, rounded
 from mereo.workers.spread import Cluster, spread
 
@@ -167,6 +167,7 @@ def reconstruct_frame(frame: SensorFrame, directory: Path, job: FrameJob, path: 
         resolution=command.resolution,
         isolation=command.isolation,
         label_points="points" in chosen_formats(command.files.formats),
+        instances=command.instances,
     )
     if is_looked_through:
         print(result.seen)
@@ -181,6 +182,8 @@ def reconstruct_frame(frame: SensorFrame, directory: Path, job: FrameJob, path: 
     carried = tuple(carry(each, registration_of(result)) for each in placed)
     for each in carried:
         print(each.description)
+    for number, other in enumerate(result.instances[1:], start=2):
+        print(f"instance {number} of {len(result.instances)}, in its folder {INSTANCE.format(number)}: {other.seen}")
     with stage("write the files"):
         write_answer(directory, result, command.files, carried)
     write_json(directory / CONFIG, {**options_of(command, "reconstruct"), "inputs": [str(path)]})

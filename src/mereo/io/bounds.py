@@ -83,6 +83,7 @@ Probability = Annotated[float, *_within(0, 1)]
 ProperFraction = Annotated[float, *_within(0, 1, below=True)]
 Share = Annotated[float, *_within(0, 1, above=True)]
 ShareRange = Annotated[tuple[float, float], *_within(0, 1, above=True)]
+Instances = int | Literal["all"]  # of an object in a whole frame
 
 
 _kinds = lru_cache(maxsize=64)(partial(get_type_hints, include_extras=True))

@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
@@ -32,7 +33,7 @@ from mereo.fitting.search import ROUNDS, SearchRound, screen_poses
 from mereo.geometry.camera import DepthImage
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.io.bounds import Cells, check_value
+from mereo.io.bounds import Cells, Count, Instances, check_value
 from mereo.io.cores import limit_blas_threads
 from mereo.io.progress import stage
 from mereo.locating.outline import Jumps, Outline, compare_outline
@@ -160,6 +161,11 @@ class WholeFrame:
         """Pixels of the thinned image that see what lies as far away as a mesh does there."""
         return pixels_near(self.jumps.image, mesh, NEAR * self.registrar.model.half * self.unit)
 
+    def is_among(self, taken: Bool[np.ndarray, "h w"], mesh: SegmentedMesh) -> bool:
+        """Whether most of the pixels that a mesh explains are taken."""
+        explained = self.explained(mesh)
+        return 2 * int((explained & taken).sum()) > int(explained.sum())
+
     def problem(self, seen: Observation) -> Problem:
         """What a fit to the object in the frame works on; raises ``ValueError`` for what none can start from."""
         frame = encode_frame(Reading.of_all(seen.cloud), None, seen.frame.axes)
@@ -242,13 +248,13 @@ class WholeFrame:
     def finished(self, placed: "PlacedAnswer", keep_all: bool) -> "PlacedAnswer":
         """The same where it may be the object: by pixels that are chosen once more, and with the scene's parameters."""
         modes, model = placed.candidate.modes, placed.answer.model
-        if modes is None or placed.nats < UNLIKELY or placed.answer.registration is not modes.registration:
+        if modes is None or placed.nats < UNLIKELY or placed.is_finished:
             return placed
         again = self.answered(self.place(placed.place.mask, [modes.posed]), model, keep_all, ())
         best = placed if again is None else max(placed, again, key=lambda each: each.nats)
         answer = answer_candidate(best.seen, model, self.registrar, best.candidate, best.candidate.encoded)
         assert answer.registration is not None
-        return replace(best, answer=answer, outline=self.outline(answer.registration.mesh))
+        return replace(best, answer=answer, outline=self.outline(answer.registration.mesh), is_finished=True)
 
 
 def located(frame: WholeFrame) -> Observation:
@@ -300,6 +306,7 @@ class PlacedAnswer:
         candidate: the fit to them.
         answer: of that.
         outline: of that.
+        is_finished: whether ``WholeFrame.finished`` has made it.
     """
 
     place: Place
@@ -307,6 +314,7 @@ class PlacedAnswer:
     candidate: Candidate
     answer: Answer
     outline: Outline
+    is_finished: bool = False
 
     @property
     def nats(self) -> float:
@@ -316,41 +324,56 @@ class PlacedAnswer:
         return chance(registration.model) + self.outline.nats - self.lost
 
     @property
+    def mesh(self) -> SegmentedMesh:
+        """Registered mesh, in the image's unit."""
+        assert self.answer.registration is not None
+        return self.answer.registration.mesh
+
+    @property
     def lost(self) -> float:
         """Nats that the state's strangeness costs, and that a better state may win."""
         return 0.5 * self.answer.recognition.strangeness**2
 
     @property
+    def is_believed(self) -> bool:
+        """Whether the object is known there, and the outline is none of another thing, as ``doubted`` has it."""
+        return self.nats + self.lost > 0 and self.answer.recognition.known is True
+
+    @property
     def is_evident(self) -> bool:
-        """Whether the object is known there, no other thing is likelier, and no state is much better."""
-        return self.nats > 0 and self.answer.recognition.known is True and self.lost < WORTH
+        """Whether it is believed, and no state is much better."""
+        return self.is_believed and self.nats > 0 and self.lost < WORTH
 
 
 def answers_in(
-    frame: WholeFrame, model: Trained | None, keep_all: bool = False, all_places: bool = False
+    frame: WholeFrame, model: Trained | None, keep_all: bool = False, most: int = 1
 ) -> Iterator[PlacedAnswer]:
-    """Answers at the most evident places of a whole frame, up to the first that is evident itself.
+    """Answers at the most evident places of a whole frame, until so many at ``most`` are evident themselves.
 
-    First from the states of the quick looks, in a second each, then by a search, which takes several, where a better
-    state may win more than the best has. With ``all_places`` the others are answered as well. Places where a fit finds
-    nothing have none. Parameters of the object's scene are fitted where it is evident (``WholeFrame.finished``).
+    First from the states of the quick looks, in a second each, then, where a better state may win more than the best
+    has, by a round of the search, which takes several. Places where an evident answer explains most of the pixels are
+    left out, and so are those where a fit finds nothing. Parameters of the object's scene are fitted where it is
+    evident (``WholeFrame.finished``).
     """
     places = frame.places()
-    hopeful = [place for place in places[:ANSWERS] if place.outline.nats > 0]
-    waiting = hopeful or places[:1]
+    hopeful = [place for place in places[: ANSWERS + most - 1] if place.outline.nats > 0]
+    waiting, taken = hopeful or places[:1], np.zeros_like(frame.jumps.image.valid)
     for rounds in ((), ROUNDS[:1]):
         answers = list[PlacedAnswer]()
         for place in waiting:
-            placed = frame.answered(place, model, keep_all, rounds)
+            placed = None if frame.is_among(taken, place.mesh) else frame.answered(place, model, keep_all, rounds)
             if placed is None:
                 continue
             placed = frame.finished(placed, keep_all) if placed.is_evident else placed
             yield placed
-            if placed.is_evident and not all_places:
+            if placed.is_evident:
+                taken |= frame.explained(placed.mesh)
+                most -= 1
+            if most == 0:
                 return
             answers.append(placed)
-        best = max((placed.nats for placed in answers), default=0.0)
-        waiting = [each.place for each in answers if hopeful and each.lost >= WORTH and each.nats + each.lost > best]
+        least = min(0.0, max((placed.nats for placed in answers), default=0.0))
+        waiting = [each.place for each in answers if hopeful and each.lost >= WORTH and each.nats + each.lost > least]
 
 
 def answer_observation(
@@ -361,13 +384,22 @@ def answer_observation(
     keep_all: bool = False,
     resolution: int = 128,
     label_points: bool = False,
+    instances: Instances = 1,
 ) -> Answer:
     """Answer a frame that shows the object alone, or a whole depth image in which it is one thing among others.
 
     Takes the arguments of ``answer_frame`` and raises as it does. Of a whole image that is the answer at the most
-    evident place. It is not known where something else is likelier there, as the image's jumps say, mask or none.
+    evident place, with further ones where several ``instances`` are looked for. It is not known where something else is
+    likelier there, as the image's jumps say, mask or none.
     """
+    most = LOOKS if instances == "all" else instances
+    check_value("instances", most, Count, 1)
     if registrar is None or not is_whole(seen, registrar):
+        if instances != 1:
+            raise ValueError(
+                f"instances is {instances!r}, which a whole depth image alone may show of an object of a known size: "
+                "state both units, leave mask and --remove-plane out, or leave it 1"
+            )
         answer = answer_frame(
             seen, model, registrar, keep_all=keep_all, resolution=resolution, label_points=label_points
         )
@@ -376,13 +408,29 @@ def answer_observation(
     started = time.perf_counter()
     with stage("look through the whole frame"), limit_blas_threads():
         frame = WholeFrame.of(seen, registrar)
-        answers = list(answers_in(frame, model, keep_all))
-        if not answers:
-            raise NoFit(NOWHERE.format(seen.where))
-        best = frame.finished(max(answers, key=lambda placed: placed.nats), keep_all)
+        best, *others = instances_in(frame, list(answers_in(frame, model, keep_all, most)), keep_all, most)
     answer = absent(best) if best.nats < UNLIKELY else doubted(best.answer, best.outline, 0.0)
-    seconds = time.perf_counter() - started
-    return replace(answer, resolution=resolution, label_points=label_points, seconds=seconds)
+    stated: dict[str, Any] = {"resolution": resolution, "label_points": label_points}
+    further = tuple(replace(each.answer, **stated) for each in others)
+    return replace(answer, **stated, further=further, seconds=time.perf_counter() - started)
+
+
+def instances_in(
+    frame: WholeFrame, answers: Sequence[PlacedAnswer], keep_all: bool, most: int = 1
+) -> list[PlacedAnswer]:
+    """The most evident answer, and those that are believed where no better one explains the same pixels.
+
+    Raises ``NoFit`` where there are none.
+    """
+    instances, taken = list[PlacedAnswer](), np.zeros_like(frame.jumps.image.valid)
+    for placed in sorted(answers, key=lambda placed: -placed.nats):
+        is_further = len(instances) < most and placed.is_believed and not frame.is_among(taken, placed.mesh)
+        if is_further or not instances:
+            instances.append(frame.finished(placed, keep_all))
+            taken |= frame.explained(instances[-1].mesh)
+    if not instances:
+        raise NoFit(NOWHERE.format(frame.seen.where))
+    return instances
 
 
 def outline_of(answer: Answer) -> Outline | None:

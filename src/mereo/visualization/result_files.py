@@ -28,6 +28,9 @@ from mereo.visualization.previews import render_cloud_and_segments
 from mereo.visualization.reconstruction_report import REPORT, Report, cluster, trust
 from mereo.visualization.units import Unit
 
+INSTANCE = "instance{}"
+"""Folder of each further instance of the object, from the second on, in that of a result."""
+
 
 def summary_of(
     answer: Answer, carried: Sequence[Carried] = (), timings_s: Mapping[str, float] | None = None
@@ -70,6 +73,7 @@ def summary_of(
         "calibrated": result.calibrated,
         "segments": segments,
         "timings_s": dict(result.timings_s if timings_s is None else timings_s),
+        **({"further_instances": [summary_of(each) for each in answer.further]} if answer.further else {}),
     }
 
 
@@ -110,7 +114,8 @@ def write_answer(
     it is not known.
 
     What is carried goes into ``carried/`` under its files' own names; its surfaces also into pictures and report, and
-    together with the segments into ``carried.glb``, where GLB is asked for.
+    together with the segments into ``carried.glb``, where GLB is asked for. Further instances get folders of their own,
+    ``INSTANCE``, and all surfaces of all of them are in ``instances.glb``.
 
     Raises ``ValueError`` where the network answers and finds no segment, ``ImportError`` where a format's extra is
     missing.
@@ -133,6 +138,16 @@ def write_answer(
     report_of(answer, drawn, {**summary, "segments": rows}).write(directory / REPORT)
     write_formats(directory, [name for name in formats if name == "json"], replace(results, summary=summary))
     write_state(directory, answer)
+    for number, each in enumerate(answer.further, start=2):
+        (directory / INSTANCE.format(number)).mkdir()
+        write_answer(directory / INSTANCE.format(number), each, files)
+    if answer.further and "glb" in formats:
+        every = [
+            replace(segment, name=f"{number} {segment.name}")
+            for number, each in enumerate((answer, *answer.further), start=1)
+            for segment in each.reconstruction.surfaces.segments
+        ]
+        write_segments_glb(directory / "instances.glb", SegmentedMesh(tuple(every)), to_viewer, frame.metres)
 
 
 def write_answer_file(path: Path, suffix: str, answer: Answer, files: FilesConfig) -> None:

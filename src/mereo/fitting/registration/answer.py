@@ -122,6 +122,7 @@ class Answer:
         seconds: that it took, without ``reconstruction``.
         located_by: who found the object; of a tracked answer, when it began to be followed.
         tracking: of a tracked object; a lost one has no pose, and ``recognition`` has the reason.
+        further: answers to further instances of the object in the same frame, the most evident first.
     """
 
     seen: Observation
@@ -139,6 +140,7 @@ class Answer:
     seconds: float = 0.0
     located_by: LocatedBy = "network"
     tracking: Tracking = "found"
+    further: "tuple[Answer, ...]" = ()
 
     def __reduce_ex__(self, protocol: SupportsIndex) -> Any:
         raise TypeError(
