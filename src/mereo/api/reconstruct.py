@@ -196,7 +196,6 @@ def reconstruct(
     isolation: IsolationConfig | None = None,
     label_points: bool = False,
     initial_pose: ArrayLike | None = None,
-    instances: Instances = 1,
     **options: Any,
 ) -> Result | list[Result]:
     """Find all segments of an object in a frame, hidden side included: what ``mereo reconstruct`` does.
@@ -213,9 +212,9 @@ def reconstruct(
         label_points: also say on which segment each observed point lies (``Result.reconstruction.observed``).
         initial_pose: rough pose of the object, as ``Result.pose``, from which the fit starts instead of a search or a
             network; what the scene holds (``held``) stays there. Both units must be known.
-        instances: how many of the object are looked for in a whole depth image, or "all": the result is that of the
-            most evident, and its ``instances`` are those of all that are known.
-        options: fields of ``isolation`` by themselves, ``extent="partial"`` where a part of the object is hidden or cut
+        options: ``instances``, how many of the object are looked for in a whole depth image, or "all", of which the
+            result is the most evident one's, and its ``instances`` are those of all that are known; fields of
+            ``isolation`` by themselves, ``extent="partial"`` where a part of the object is hidden or cut
             off, ``point=(u, v)``, the column and row of a pixel of the object, ``box`` and others; and
             arguments of ``load_frame``, ``axes``, ``unit_m``, ``intrinsics``, ``mask`` and others.
 
@@ -227,6 +226,7 @@ def reconstruct(
     are_many = is_frame_list(frame) or (
         isinstance(frame, list | tuple) and any(isinstance(each, SensorFrame | Observation) for each in frame)
     )
+    instances: Instances = options.pop("instances", 1)
     with python_words():
         isolation, reading = split_options(isolation, options)
         known = object_of(object)
