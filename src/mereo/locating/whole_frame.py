@@ -4,7 +4,7 @@ DepthImage -regions-> masks -quick look-> places, the most evident first -choose
 """
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
@@ -220,8 +220,12 @@ class WholeFrame:
         return part_of(self.seen, pixels_near(image, place.mesh, reach) | (image.valid & region))
 
     def sharpened(self, place: Place) -> Place:
-        """The same by a fit of its first state to the pixels that are chosen by it."""
-        problem, (first, *others) = self.problem(self.chosen(place)), place.states
+        """The same by a fit of its first state to the pixels that are chosen by it, if a fit can start from these."""
+        first, *others = place.states
+        try:
+            problem = self.problem(self.chosen(place))
+        except ValueError:
+            return place
         return self.place(place.mask, [refined(problem, fit_wide(problem, first)).posed, *others])
 
     def answered(
@@ -233,7 +237,6 @@ class WholeFrame:
         """
         registrar = self.registrar
         try:
-            place = place if rounds else self.sharpened(place)
             seen = self.chosen(place)
             encoded = encode_frame(seen.readings(keep_all)[0], model, seen.frame.axes)
             states = () if rounds else place.states
@@ -301,8 +304,8 @@ class PlacedAnswer:
     """Answer at one place, and the logarithm of how much likelier it is than something else that was taken for it.
 
     Attributes:
-        place: by a fit to the pixels that the quick look's state explains.
-        seen: the pixels that are chosen by that.
+        place: whose pixels were chosen.
+        seen: these pixels.
         candidate: the fit to them.
         answer: of that.
         outline: of that.
@@ -350,14 +353,15 @@ def answers_in(
 ) -> Iterator[PlacedAnswer]:
     """Answers at the most evident places of a whole frame, until so many at ``most`` are evident themselves.
 
-    First from the states of the quick looks, in a second each, then, where a better state may win more than the best
-    has, by a round of the search, which takes several. Places where an evident answer explains most of the pixels are
-    left out, and so are those where a fit finds nothing. Parameters of the object's scene are fitted where it is
-    evident (``WholeFrame.finished``).
+    First from the states of the quick looks, then, where a better state may win more than the best has, by a round of
+    the search, which takes longer. Places where an evident answer explains most of the pixels are left out, and so are
+    those where a fit finds nothing. Parameters of the object's scene are fitted where it is evident
+    (``WholeFrame.finished``).
     """
     places = frame.places()
     hopeful = [place for place in places[: ANSWERS + most - 1] if place.outline.nats > 0]
-    waiting, taken = hopeful or places[:1], np.zeros_like(frame.jumps.image.valid)
+    waiting: Iterable[Place] = map(frame.sharpened, hopeful or places[:1])  # each once it is its turn
+    taken = np.zeros_like(frame.jumps.image.valid)
     for rounds in ((), ROUNDS[:1]):
         answers = list[PlacedAnswer]()
         for place in waiting:
