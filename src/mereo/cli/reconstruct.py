@@ -183,7 +183,7 @@ def reconstruct_frame(frame: SensorFrame, directory: Path, job: FrameJob, path: 
     for each in carried:
         print(each.description)
     for number, other in enumerate(result.instances[1:], start=2):
-        print(f"instance {number} of {len(result.instances)}, in its folder {INSTANCE.format(number)}: {other.seen}")
+        print(f"instance {number} of {len(result.instances)}, in the folder {INSTANCE.format(number)}:\n{other.seen}")
     with stage("write the files"):
         write_answer(directory, result, command.files, carried)
     write_json(directory / CONFIG, {**options_of(command, "reconstruct"), "inputs": [str(path)]})

@@ -415,7 +415,7 @@ def answer_observation(
         best, *others = instances_in(frame, list(answers_in(frame, model, keep_all, most)), keep_all, most)
     answer = absent(best) if best.nats < UNLIKELY else doubted(best.answer, best.outline, 0.0)
     stated: dict[str, Any] = {"resolution": resolution, "label_points": label_points}
-    further = tuple(replace(each.answer, **stated) for each in others)
+    further = tuple(replace(each.answer, **stated) for each in others if best.nats >= UNLIKELY)
     return replace(answer, **stated, further=further, seconds=time.perf_counter() - started)
 
 
