@@ -83,7 +83,7 @@ Probability = Annotated[float, *_within(0, 1)]
 ProperFraction = Annotated[float, *_within(0, 1, below=True)]
 Share = Annotated[float, *_within(0, 1, above=True)]
 ShareRange = Annotated[tuple[float, float], *_within(0, 1, above=True)]
-Instances = int | Literal["all"]  # of an object in a whole frame
+Instances = Annotated[int | Literal["all"], *_within(1)]  # of an object in a whole frame
 
 
 _kinds = lru_cache(maxsize=64)(partial(get_type_hints, include_extras=True))
@@ -123,7 +123,8 @@ def _broken_rule(kind: Any, value: Any) -> str | None:
         return None if isinstance(value, bool) else "true or false"
     bounds = next((extra for extra in getattr(kind, "__metadata__", ()) if isinstance(extra, Bounds)), None)
     plain = get_args(kind)[0] if bounds else None
-    if bounds is None or (value is None and NoneType in get_args(plain)):
+    words = [word for part in get_args(plain) if get_origin(part) is Literal for word in get_args(part)]
+    if bounds is None or (value is None and NoneType in get_args(plain)) or value in words:
         return None
     many = get_origin(plain) is tuple
     whole = plain is int or int in get_args(plain)

@@ -33,7 +33,7 @@ from mereo.fitting.search import ROUNDS, SearchRound, screen_poses
 from mereo.geometry.camera import DepthImage
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.io.bounds import Cells, Count, Instances, check_value
+from mereo.io.bounds import Cells, Instances, check_value
 from mereo.io.cores import limit_blas_threads
 from mereo.io.progress import stage
 from mereo.locating.outline import Jumps, Outline, compare_outline
@@ -396,8 +396,8 @@ def answer_observation(
     evident place, with further ones where several ``instances`` are looked for. It is not known where something else is
     likelier there, as the image's jumps say, mask or none.
     """
+    check_value("instances", instances, Instances, 1)
     most = LOOKS if instances == "all" else instances
-    check_value("instances", most, Count, 1)
     if registrar is None or not is_whole(seen, registrar):
         if instances != 1:
             raise ValueError(
