@@ -36,7 +36,7 @@ def answer_desk(name: str, kind: str, number: int, seed: int, all_places: bool) 
     registrar, started = registrar_of(name), (time.perf_counter(), time.process_time())
     frame = WholeFrame.of(seen, registrar, 1.0)
     answers = list(answers_in(frame, None, most=LOOKS if all_places else 1))
-    best = instances_in(frame, answers, False)[:1] if answers else []
+    best = instances_in(frame, answers, False) if answers else []
     places = [facts_of(placed, view) for placed in (*best, *answers)]
     spent = {"seconds": time.perf_counter() - started[0], "processor_s": time.process_time() - started[1]}
     return {"object": name, "kind": kind, "number": number, "seed": seed, **spent, "places": places}

@@ -489,7 +489,7 @@ class ResultPage:
             self._look(self.content.first_view)
             self._draw()
             self.heading.content = heading(self.content.title, self.content.facts)
-            self.verdict.content = message(self.content.verdict)
+            self.verdict.content = message(self.content.verdict, bad=self.content.is_doubtful)
         except Exception as error:  # whatever it is, the page must live on and say it
             self.verdict.content = message(words_of(error), bad=True)
         finally:

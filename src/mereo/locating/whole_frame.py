@@ -150,6 +150,11 @@ class WholeFrame:
         assert self.seen.frame.whole is not None
         return self.seen.frame.whole
 
+    @property
+    def reach(self) -> float:
+        """``NEAR`` in the image's unit."""
+        return NEAR * self.registrar.model.half * self.unit
+
     def is_at_point(self, pixels: Bool[np.ndarray, "h w"]) -> bool:
         """Whether some pixels of the thinned image are at the frame's point; any are where it has none."""
         column, row = self.seen.point or (0, 0)
@@ -159,12 +164,11 @@ class WholeFrame:
 
     def explained(self, mesh: SegmentedMesh) -> Bool[np.ndarray, "h w"]:
         """Pixels of the thinned image that see what lies as far away as a mesh does there."""
-        return pixels_near(self.jumps.image, mesh, NEAR * self.registrar.model.half * self.unit)
+        return pixels_near(self.jumps.image, mesh, self.reach)
 
     def is_among(self, taken: Bool[np.ndarray, "h w"], mesh: SegmentedMesh) -> bool:
         """Whether most of the pixels that a mesh explains are taken."""
-        explained = self.explained(mesh)
-        return 2 * int((explained & taken).sum()) > int(explained.sum())
+        return bool(taken.any()) and 2 * int((each := taken[self.explained(mesh)]).sum()) > len(each)
 
     def problem(self, seen: Observation) -> Problem:
         """What a fit to the object in the frame works on; raises ``ValueError`` for what none can start from."""
@@ -206,7 +210,7 @@ class WholeFrame:
 
     def chosen(self, place: Place) -> Observation:
         """The object with the pixels of the whole image that a place explains, and those of its region near it."""
-        image, mask, reach = self.whole, place.mask, NEAR * self.registrar.model.half * self.unit
+        image, mask, reach = self.whole, place.mask, self.reach
         # pixels between those of the thinned image are the region's where they go on with its surface
         rows, columns = (
             np.minimum(np.arange(size) // self.every, most - 1)
@@ -365,8 +369,7 @@ def answers_in(
     for rounds in ((), ROUNDS[:1]):
         answers = list[PlacedAnswer]()
         for place in waiting:
-            placed = None if frame.is_among(taken, place.mesh) else frame.answered(place, model, keep_all, rounds)
-            if placed is None:
+            if frame.is_among(taken, place.mesh) or not (placed := frame.answered(place, model, keep_all, rounds)):
                 continue
             placed = frame.finished(placed, keep_all) if placed.is_evident else placed
             yield placed

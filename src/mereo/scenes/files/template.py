@@ -29,7 +29,7 @@ from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, surface_points
 from mereo.geometry.mesh_check import examine, likely_unit, overlaps
 from mereo.geometry.transforms import Normalizer, fit_rigid, inverse_rigid, transform_points
 from mereo.io.atomic_files import atomic_file, check_file_place
-from mereo.io.mesh_formats import read_object_mesh
+from mereo.io.mesh_formats import ROBOT_SUFFIXES, read_object_mesh
 from mereo.io.robots import RobotJoint, is_robot, read_robot
 from mereo.io.volume_files import (
     LabelVolume,
@@ -489,7 +489,7 @@ def _likely_frame(file: Path, bounds: Float[np.ndarray, "2 3"]) -> tuple[str, st
     """Unit of a mesh file, and why; the axis that points upwards in it, and why."""
     kind, guess = file.suffix.lower().lstrip("."), likely_unit(bounds)
     longest_m = float((bounds[1] - bounds[0]).max()) * UNITS_M[guess]
-    robots = dict.fromkeys(("urdf", "sdf"), ("m", "the rule of URDF and SDF"))
+    robots = dict.fromkeys((suffix[1:] for suffix in ROBOT_SUFFIXES), ("m", "the rule of URDF and SDF"))
     known = robots | {
         "glb": ("m", "the rule of glTF"),
         "gltf": ("m", "the rule of glTF"),
