@@ -221,14 +221,14 @@ class SightLines:
         unknown: points anywhere on lines of sight along which nothing is known.
         other_lines: kind of all lines of sight that none of these points, and none of the object's, is near; None where
             the frame does not say, as a bare cloud does not, and then a fit has to decide.
-        most_noise: largest standard deviation that the camera's noise may have at the object, by what was measured
-            around it, what neighbours share included; infinite where the frame does not say.
+        shared_noise: largest standard deviation, at the object, of what neighbours share of the camera's noise, by what
+            was measured around it; infinite where the frame does not say.
     """
 
     past: Float[np.ndarray, "p 3"]
     unknown: Float[np.ndarray, "u 3"]
     other_lines: SightKind | None = None
-    most_noise: float = np.inf
+    shared_noise: float = np.inf
 
     @classmethod
     def of_cloud(cls, other_lines: SightKind | None = None) -> "SightLines":
@@ -242,8 +242,8 @@ class SightLines:
 
     def scaled(self, factor: float) -> "SightLines":
         """Lines of sight in another unit."""
-        past, unknown, most_noise = self.past * factor, self.unknown * factor, self.most_noise * factor
-        return replace(self, past=past, unknown=unknown, most_noise=most_noise)
+        past, unknown, shared_noise = self.past * factor, self.unknown * factor, self.shared_noise * factor
+        return replace(self, past=past, unknown=unknown, shared_noise=shared_noise)
 
 
 # --- scanners' axes ---------------------------------------------------------------------------------------------------

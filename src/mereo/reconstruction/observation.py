@@ -22,7 +22,15 @@ from mereo.geometry.surface_patches import noise_of_differences, second_differen
 from mereo.geometry.transforms import transform_points
 from mereo.io.sensor_frame import SensorFrame
 from mereo.reconstruction.config import Extent, IsolationConfig
-from mereo.reconstruction.isolation import IsolationStep, Reading, Selection, clusters, readings, select_object
+from mereo.reconstruction.isolation import (
+    IsolationStep,
+    Reading,
+    Selection,
+    clusters,
+    largest_plane,
+    readings,
+    select_object,
+)
 
 SIZE_FACTOR = 2.0
 """Times that a visible part may be smaller or larger than any in training; beyond, it is another object or unit."""
@@ -401,12 +409,14 @@ SILENT = 0.02
 """Share of the pixels around the object below which those that met something are too few: then a depth of zero may as
 well mean that the image was cut out or rendered."""
 
-LAGS, FEWEST, ENOUGH = (1, 2, 4, 8), 4000, 100_000
-"""Pixels between those whose differences show a camera's noise, as over more desks are no planes; fewer pixels around
-the object show none, and of images with more than enough some rows and columns do."""
+FEWEST, ENOUGH = 4000, 20_000
+"""Pixels of a plane around the object that show a camera's noise, at least; and pixels by which the plane is found."""
+
+ON_PLANE, FITS = 3.0, 8
+"""Standard deviations from a plane up to which a pixel is on it, and fits to those that are."""
 
 NOISIER = 2.0
-"""Largest noise on the object, in that around it: dark and slanted surfaces have more."""
+"""Largest noise on the object that neighbours share, in that around it: dark and slanted surfaces have more."""
 
 DENSE = 3.0
 """Pixels from the object within which no line of sight is left out."""
@@ -470,21 +480,43 @@ def lines_of_image(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SightLi
     u, v = u[kept], v[kept]
     met = past[v, u]
     places = whole.camera.unproject(np.stack([u + left + 0.5, v + top + 0.5], axis=1), np.where(met, depth[v, u], 1.0))
-    return SightLines(places[met], places[~met], None if silent else "unknown", NOISIER * noise_around(whole, shown))
+    return SightLines(places[met], places[~met], None if silent else "unknown", NOISIER * shared_noise(whole, shown))
 
 
-def noise_around(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> float:
-    """Standard deviation of a camera's noise at the distance of ``shown`` pixels, by all others; infinite by too few.
+def shared_noise(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> float:
+    """Standard deviation of a camera's noise that neighbours share, at the distance of ``shown`` pixels.
 
-    It grows as the square of the depth; over several pixels it has what neighbours share as well.
+    What the largest plane around them leaves over beyond the noise of single pixels; infinite without such a plane. As
+    a share of the distance it is no less up close: there a camera's error stops to fall with its square.
     """
-    around = np.where(shown, 0.0, whole.depth)
-    if (around > 0).sum() < FEWEST or not (shown & whole.valid).any():
+    others = np.flatnonzero(np.where(shown, 0.0, whole.depth))
+    if len(others) < FEWEST or not (shown & whole.valid).any():
         return np.inf
-    step = 1 + around.size // ENOUGH
-    lines = around[::step], around.T[::step]
-    noise = max(noise_of_differences(*(second_differences(each, lag) for each in lines)) for lag in LAGS)
-    return float(noise * np.median(whole.depth[shown & whole.valid]) ** 2)
+    v, u = np.indices(shown.shape)
+    terms = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) / shown.shape[1]
+    inverse = 1.0 / np.where(whole.valid, whole.depth, np.inf).ravel()
+    some = others[:: 1 + len(others) // ENOUGH]
+    points = whole.camera.directions().reshape(-1, 3)[some] / inverse[some, None]
+    pixel = points[:, 2] / min(whole.camera.focal_x_px, whole.camera.focal_y_px)
+    plane = largest_plane(points, pixel, np.random.default_rng(0))
+    if plane is None:
+        return np.inf
+    is_on = plane.distance(points) <= pixel
+    for _ in range(FITS):  # along planes inverse depth is linear in the picture
+        linear = np.linalg.lstsq(terms[some[is_on]], inverse[some[is_on]])[0]
+        off = inverse[some] - terms[some] @ linear
+        noise = float(np.sqrt(np.mean(off[is_on] ** 2)))
+        is_on = np.abs(off) <= ON_PLANE * noise
+    flat = np.zeros_like(whole.depth)
+    rows = others[np.abs(inverse[others] - terms[others] @ linear) <= ON_PLANE * noise]
+    if len(rows) < FEWEST:
+        return np.inf
+    flat.ravel()[rows] = whole.depth.ravel()[rows]
+    alone = noise_of_differences(second_differences(flat, 1), second_differences(flat.T, 1))
+    distance = float(np.median(whole.depth[shown & whole.valid]))
+    return (
+        float(np.sqrt(max(noise**2 - alone**2, 0.0))) * distance * max(distance, float(np.median(flat.ravel()[rows])))
+    )
 
 
 def _evenly(

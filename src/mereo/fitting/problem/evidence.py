@@ -51,6 +51,10 @@ NORMAL_POINTS = 12
 NOISE_SHARE = 0.01
 """Largest noise of a depth camera, as a share of its distance: two to five times that of the usual ones."""
 
+ROUGHER = 1.8
+"""Largest noise of points alone, in the roughness of the cloud's calmest part; right fits of noisy frames have 0.6 to
+1.4, and a fit to another object up to 4.6 (docs/experiments/072.md)."""
+
 RIM_PITCHES, EDGE_PITCHES, EDGE_DIRECTIONS = 2.5, 3.5, 8
 """Angles from the observed points, in pixels, between which lines of sight around the object are sampled, and in how
 many directions: nearer lies the rim, of which nothing is known in any case (``lines_of_sight.RIM``)."""
@@ -201,7 +205,7 @@ class Evidence(ObservedPoints):
         pitch: angle between neighbouring lines of sight.
         past: lines of sight that went past the object to something that was measured; None without any.
         other_lines: kind of the lines of sight that are near none of all these.
-        most_noise: ``SightLines.most_noise``.
+        shared_noise: ``SightLines.shared_noise``.
     """
 
     sight: cKDTree
@@ -210,7 +214,7 @@ class Evidence(ObservedPoints):
     pitch: float
     past: PastLines | None = None
     other_lines: SightKind = "past"
-    most_noise: float = np.inf
+    shared_noise: float = np.inf
 
     @classmethod
     def of(
@@ -243,7 +247,7 @@ class Evidence(ObservedPoints):
             front = np.concatenate([front, np.zeros(len(toward))])
         chosen, around = points[spread(points, observed_samples)], near[:, 1:]
         past, other_lines = PastLines.of(lines.past, pitch), lines.other_lines or "past"
-        return cls(points, chosen, around, sight, ranges, front, pitch, past, other_lines, lines.most_noise)
+        return cls(points, chosen, around, sight, ranges, front, pitch, past, other_lines, lines.shared_noise)
 
     @property
     def distance(self) -> float:
@@ -252,8 +256,8 @@ class Evidence(ObservedPoints):
 
     @property
     def largest_noise(self) -> float:
-        """Largest standard deviation of the camera's noise."""
-        return min(NOISE_SHARE * self.distance, self.most_noise)
+        """Largest standard deviation of the camera's noise: that of points alone, and what neighbours share."""
+        return min(NOISE_SHARE * self.distance, float(np.hypot(ROUGHER * self.roughness, self.shared_noise)))
 
     @property
     def with_more_samples(self) -> "Evidence":

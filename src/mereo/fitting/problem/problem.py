@@ -9,7 +9,14 @@ from scipy.optimize import isotonic_regression
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.correspondences import Correspondences
-from mereo.fitting.problem.evidence import MORE_SAMPLES, OBSERVED_SAMPLES, Directions, Observed, ObservedPoints
+from mereo.fitting.problem.evidence import (
+    MORE_SAMPLES,
+    OBSERVED_SAMPLES,
+    ROUGHER,
+    Directions,
+    Observed,
+    ObservedPoints,
+)
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, Rows, rigid_motion
 from mereo.fitting.problem.residuals import (
     ROBUST,
@@ -340,10 +347,6 @@ CLEAN = 0.1
 
 COHERENT = 1.3
 """What a fit leaves over, in noises, from which on it is wrong; right ones have 0.8 to 1.1."""
-
-ROUGHER = 1.8
-"""The same, in the roughness of the cloud's calmest part; right fits of noisy frames have 0.6 to 1.4, and a fit to
-another object up to 4.6 (docs/experiments/072.md)."""
 
 NORMAL = 4.3
 """The 95 % quantile of what a fit leaves over, in its median, up to which it looks like normal numbers, with 2.9."""
