@@ -18,7 +18,6 @@ from jaxtyping import Float, UInt8
 
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.registration import nearest_labels
-from mereo.fitting.registration.state import STATE
 from mereo.geometry.brief import counted
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color, SegmentedMesh
@@ -30,6 +29,7 @@ from mereo.io.mesh_formats import GlbScene, is_glb, read_glb
 from mereo.io.writers.formats import WRITERS
 from mereo.io.writers.glb import viewer_rotation
 from mereo.models.trained import Answer as NetworkAnswer
+from mereo.results.state import STATE
 from mereo.visualization.color_scales import (
     CONFIDENCE,
     ColorScale,

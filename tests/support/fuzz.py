@@ -46,7 +46,6 @@ from toy_data import write_toy_dataset
 from toy_scene import toy_scene
 from written_results import COLORS, cloud, grid, segments
 
-from mereo.fitting.registration.state import load_state, save_state, state_of
 from mereo.geometry.camera import Camera
 from mereo.io.atomic_files import check_new_directory, new_directory, write_json
 from mereo.io.attachments import read_attachments, read_pose_table
@@ -64,6 +63,7 @@ from mereo.io.writers.volumes import write_labels_nifti, write_labels_seg_nrrd
 from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.models.weights import load_model, save_model
+from mereo.results.state import load_state, save_state, state_of
 from mereo.scenes.files.object_files import scene_of_meshes
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene

@@ -24,7 +24,6 @@ from reported_scenes import ball, example, wall
 from toy_scene import rest_mesh, toy_scene
 
 from mereo.__main__ import main
-from mereo.fitting.registration.state import STATE
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.metrics import Scores
@@ -33,6 +32,7 @@ from mereo.geometry.transforms import transform_points
 from mereo.io.mesh_formats import read_glb
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION, write_segments_glb
 from mereo.models.model import Model
+from mereo.results.state import STATE
 from mereo.scenes.parameters import parameters, random_state, set_value
 from mereo.synthesis.sample_views import load_view
 from mereo.visualization.color_scales import ColorScale

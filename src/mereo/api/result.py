@@ -20,7 +20,6 @@ from jaxtyping import Float
 
 from mereo.api.words import python_words
 from mereo.fitting.registration.answer import Answer
-from mereo.fitting.registration.carry import carry, place
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import camera_axes
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
@@ -36,6 +35,7 @@ from mereo.io.sensor_frame import SensorFrame
 from mereo.io.writers.formats import chosen_formats
 from mereo.io.writers.glb import viewer_rotation
 from mereo.io.writers.volumes import MM_PER_M
+from mereo.results.carry import carry, place
 from mereo.visualization.joints import JointValue, measure_joints
 from mereo.visualization.reconstruction_report import result_html
 from mereo.visualization.result_files import write_answer, write_answer_file

@@ -30,7 +30,6 @@ from mereo.cli.answers import ReconstructCommand
 from mereo.cli.options import Outcome, check_named, files_read, loaded_object, options_of
 from mereo.cli.stream import frame_error, frames_in
 from mereo.fitting.registration.answer import Answer
-from mereo.fitting.registration.carry import Placed, carry, place
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.radii import describe_level
@@ -47,6 +46,7 @@ from mereo.locating.whole_frame import at_point, is_whole
 from mereo.models.config import InferenceConfig
 from mereo.models.trained import Trained
 from mereo.reconstruction.observation import FrameWarning, find_object
+from mereo.results.carry import Placed, carry, place
 from mereo.scenes.registry import files_of
 from mereo.visualization.reconstruction_report import confidence_title, trust
 from mereo.visualization.result_files import INSTANCE, summary_of, write_answer

@@ -10,10 +10,8 @@ from typing import Any
 import numpy as np
 
 from mereo.fitting.registration.answer import Answer
-from mereo.fitting.registration.carry import Carried
 from mereo.fitting.registration.register import describe
 from mereo.fitting.registration.registration import Registration
-from mereo.fitting.registration.state import write_state
 from mereo.geometry.camera import PointCloud, camera_axes
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.radii import Radii
@@ -22,6 +20,8 @@ from mereo.io.attachments import Surfaces, write_attachment
 from mereo.io.config import DEFAULT_FILES, FilesConfig
 from mereo.io.writers.formats import WRITERS, Results, chosen_formats, write_formats
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
+from mereo.results.carry import Carried
+from mereo.results.state import write_state
 from mereo.scenes.rest_pose import rest_digest
 from mereo.visualization.joints import measure_joints
 from mereo.visualization.previews import render_cloud_and_segments

@@ -99,7 +99,7 @@ class Registration:
     def __reduce_ex__(self, protocol: SupportsIndex) -> Any:
         raise TypeError(
             "a registration cannot be pickled or copied, as it holds search structures of compiled libraries: store "
-            "it with mereo.fitting.registration.state.save_state, or keep its material and mesh"
+            "it with mereo.results.state.save_state, or keep its material and mesh"
         )
 
     def __repr__(self) -> str:

@@ -12,7 +12,9 @@ from registered_states import SCENE, T, by_modes, placed
 
 from mereo.fitting.draws.playback import Drawn, material_moved
 from mereo.fitting.registration.registration import Registration
-from mereo.fitting.registration.state import (
+from mereo.models.model import Model
+from mereo.models.weights import load_model, save_model
+from mereo.results.state import (
     STATE,
     RegistrationState,
     load_state,
@@ -22,8 +24,6 @@ from mereo.fitting.registration.state import (
     save_state,
     state_of,
 )
-from mereo.models.model import Model
-from mereo.models.weights import load_model, save_model
 from mereo.scenes.random_states import scene_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene

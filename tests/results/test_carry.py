@@ -16,8 +16,6 @@ from toy_scene import Lift, Shear, toy_scene
 from mereo import __main__ as command_line
 from mereo.api.words import python_words
 from mereo.deformation.maps import Deformation
-from mereo.fitting.registration import carry as carrying
-from mereo.fitting.registration.carry import CarriedVolume, Placed, carry, local_rotations, place, resampled
 from mereo.fitting.registration.register import CloudToFit, Registrar, fit_frame
 from mereo.fitting.registration.registration import Registration, nearest_labels
 from mereo.geometry.mesh import Segment, SegmentedMesh
@@ -38,6 +36,8 @@ from mereo.io.volume_files import Volume, is_labels, read_label_volume, read_vol
 from mereo.io.writers.volumes import write_volume
 from mereo.models.model import Model
 from mereo.models.weights import load_model, save_model
+from mereo.results import carry as carrying
+from mereo.results.carry import CarriedVolume, Placed, carry, local_rotations, place, resampled
 from mereo.scenes.random_states import scene_model, state_points
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SourceFrame, State
