@@ -221,8 +221,8 @@ class SightLines:
         unknown: points anywhere on lines of sight along which nothing is known.
         other_lines: kind of all lines of sight that none of these points, and none of the object's, is near; None where
             the frame does not say, as a bare cloud does not, and then a fit has to decide.
-        shared_noise: largest standard deviation, at the object, of what neighbours share of the camera's noise, by what
-            was measured around it; infinite where the frame does not say.
+        shared_noise: standard deviation, at the object, of what neighbours share of the camera's noise, by what was
+            measured around it; infinite where the frame does not say.
     """
 
     past: Float[np.ndarray, "p 3"]

@@ -415,9 +415,6 @@ FEWEST, ENOUGH = 4000, 20_000
 ON_PLANE, FITS = 3.0, 8
 """Standard deviations from a plane up to which a pixel is on it, and fits to those that are."""
 
-NOISIER = 2.0
-"""Largest noise on the object that neighbours share, in that around it: dark and slanted surfaces have more."""
-
 DENSE = 3.0
 """Pixels from the object within which no line of sight is left out."""
 
@@ -480,7 +477,7 @@ def lines_of_image(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SightLi
     u, v = u[kept], v[kept]
     met = past[v, u]
     places = whole.camera.unproject(np.stack([u + left + 0.5, v + top + 0.5], axis=1), np.where(met, depth[v, u], 1.0))
-    return SightLines(places[met], places[~met], None if silent else "unknown", NOISIER * shared_noise(whole, shown))
+    return SightLines(places[met], places[~met], None if silent else "unknown", shared_noise(whole, shown))
 
 
 def shared_noise(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> float:

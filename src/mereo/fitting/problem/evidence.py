@@ -55,6 +55,9 @@ ROUGHER = 1.8
 """Largest noise of points alone, in the roughness of the cloud's calmest part; right fits of noisy frames have 0.6 to
 1.4, and a fit to another object up to 4.6 (docs/experiments/072.md)."""
 
+NOISIER = 2.0
+"""Largest noise that neighbours share on the object, in that around it: dark and slanted surfaces have more."""
+
 RIM_PITCHES, EDGE_PITCHES, EDGE_DIRECTIONS = 2.5, 3.5, 8
 """Angles from the observed points, in pixels, between which lines of sight around the object are sampled, and in how
 many directions: nearer lies the rim, of which nothing is known in any case (``lines_of_sight.RIM``)."""
@@ -173,6 +176,11 @@ class ObservedPoints:
         """Largest standard deviation of a camera's noise."""
         return NOISE_SHARE * self.distance
 
+    @property
+    def expected_noise(self) -> float:
+        """Standard deviation of the noise that neighbours are known to share; 0 where none is known."""
+        return 0.0
+
     @cached_property
     def nested(self) -> Int[np.ndarray, " m"]:
         """Points, as many as a power of two, in an order in which each aligned run of a power of two is a patch."""
@@ -257,7 +265,12 @@ class Evidence(ObservedPoints):
     @property
     def largest_noise(self) -> float:
         """Largest standard deviation of the camera's noise: that of points alone, and what neighbours share."""
-        return min(NOISE_SHARE * self.distance, float(np.hypot(ROUGHER * self.roughness, self.shared_noise)))
+        return min(NOISE_SHARE * self.distance, float(np.hypot(ROUGHER * self.roughness, NOISIER * self.shared_noise)))
+
+    @property
+    def expected_noise(self) -> float:
+        """As of ``ObservedPoints``."""
+        return float(np.nan_to_num(self.shared_noise, posinf=0.0))
 
     @property
     def with_more_samples(self) -> "Evidence":

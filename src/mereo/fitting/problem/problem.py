@@ -186,11 +186,15 @@ class Problem:
         return noise_of(offset) <= limit and is_noise(offset, seen.around, is_shared)
 
     def explained(self, cloud: float, surface: Surface, most: float) -> bool:
-        """Whether a surface explains the cloud: by a misfit below ``most``, or of a noisy one all but the noise."""
+        """Whether a surface explains the cloud: by a misfit below ``most``, or of a noisy one all but the noise.
+
+        Of that neighbours may share as much as they do around the object.
+        """
         if cloud < most or not self.noisy:
             return cloud < most
         offset = self.offsets(surface, self.far)
-        return shared(offset, self.evidence.around, self.config.cloud_sigma) < SHARED
+        evidence = self.evidence
+        return shared(offset, evidence.around, self.config.cloud_sigma, evidence.expected_noise) < SHARED
 
     @property
     def far(self) -> float:
@@ -417,10 +421,12 @@ def is_noise(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"], is
     return far <= NORMAL * middle
 
 
-def shared(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"], sigma: float) -> float:
-    """Misfit of a cloud, in misfits of what its points' offsets do not share with those around them."""
-    alone = robust_square(unshared(offset, around), sigma).mean()
-    return float(robust_square(offset, sigma).mean() / max(alone, 1e-12))
+def shared(
+    offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"], sigma: float, expected: float = 0.0
+) -> float:
+    """Misfit of a cloud, in misfits of noise: what points do not share with those around them, and what is expected."""
+    noise = robust_square(np.hypot(unshared(offset, around), expected), sigma).mean()
+    return float(robust_square(offset, sigma).mean() / max(noise, 1e-12))
 
 
 def constants_for(noise: float, config: FitConfig, largest: float) -> FitConfig:
