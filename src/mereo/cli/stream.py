@@ -48,6 +48,7 @@ from mereo.models.trained import Trained
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import Observation, find_object
 from mereo.synthesis.recording import CAMERA, FRAMES, is_recording_folder
+from mereo.visualization.joints import measure_joints
 
 STANDARD_INPUT = "-"
 """Source that means names of files on standard input."""
@@ -421,8 +422,9 @@ class FrameAnswer:
     Attributes:
         surfaces: of all segments; None where the object is lost and no network answers.
         facts: what is printed: who answers (``method``), how it was tracked, the share of points that the registered
-            model explains, whether the frame shows the object, points that were dropped, and each segment's
-            ``centroid`` and ``volume``, with the network's ``confidence`` where the answer is the network's.
+            model explains, whether the frame shows the object, ``pose`` and ``joints`` as of ``Result``, points that
+            were dropped, and each segment's ``centroid`` and ``volume``, with its ``pose`` where the registered model
+            answers, and the network's ``confidence`` where that does.
     """
 
     surfaces: SegmentedMesh | None
@@ -430,7 +432,7 @@ class FrameAnswer:
 
     @classmethod
     def of(cls, answer: Answer, uncertainty: bool = False) -> "FrameAnswer":
-        """Facts of an answer; with ``uncertainty`` also how sure the registered model is, where that is known."""
+        """Facts of an answer; with ``uncertainty`` also how sure each segment of the registered model is."""
         registration, is_missing = answer.registration, answer.is_missing
         facts: dict[str, Any] = {
             "method": None if is_missing else "network",
@@ -439,26 +441,37 @@ class FrameAnswer:
             "explained": None if registration is None or is_missing else round(registration.explained, 4),
             "known": answer.recognition.known,
             "reason": answer.recognition.reason,
+            "pose": None,
+            "joints": {},
         }
         strays, segments = answer.hypothesis.dropped, dict[str, dict[str, Any]]()
         if is_missing:
             return cls(None, {**facts, "strays": strays, "segments": segments})
         mesh = answer.surfaces
-        if registration is None or not answer.taken:
+        registered = answer.registered
+        if registered is None:
             for segment in answer.reconstruction.segments:
                 if segment.voxels:
                     segments[segment.name] = _facts(segment.centroid, float(segment.volume))
                     segments[segment.name]["confidence"] = round(float(segment.confidence), 3)
             return cls(mesh, {**facts, "strays": strays, "segments": segments})
-        facts |= {"method": registration.method, "located_by": answer.located_by}
-        for name, centroid, volume in zip(mesh.names, owned_centroids(mesh), mesh.owned_volumes, strict=True):
-            segments[name] = _facts(centroid, float(volume))
-        if uncertainty and (sure := registration.uncertainty) is not None:
-            for each in sure.segments:
+        joints = {name: joint.facts() for name, joint in measure_joints(answer).items()}
+        facts |= {"method": registered.method, "located_by": answer.located_by}
+        facts |= {"pose": _rows(registered.pose()), "joints": joints}
+        figures = zip(mesh.names, owned_centroids(mesh), mesh.owned_volumes, strict=True)
+        for label, (name, centroid, volume) in enumerate(figures, start=1):
+            pose = registered.pose(registered.model.labels == label)
+            segments[name] = {**_facts(centroid, float(volume)), "pose": _rows(pose)}
+        if (sure := registered.uncertainty) is not None:
+            facts["radius95"] = sure.summary(sure.outline)
+            for each in sure.segments if uncertainty else ():
                 radius = round(each.centroid_radius95, DIGITS)
                 segments[each.name] |= {"centroid_radius95": radius, "volume95": each.volume95}
-            facts["radius95"] = sure.summary(sure.outline)
         return cls(mesh, {**facts, "strays": strays, "segments": segments})
+
+
+def _rows(pose: Float[np.ndarray, "4 4"]) -> list[list[float]]:
+    return [[round(value, DIGITS) for value in row] for row in pose.tolist()]
 
 
 def _facts(centroid: Float[np.ndarray, "3"], volume: float) -> dict[str, Any]:
