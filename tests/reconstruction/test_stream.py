@@ -14,6 +14,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from PIL import Image
 from written_results import segments
 
 from mereo import __main__ as command_line
@@ -196,7 +197,7 @@ def test_the_cache_of_products_is_small_before_torch_is_loaded(given: str | None
         "        if name == 'torch': sys.exit(os.environ.get('ONEDNN_PRIMITIVE_CACHE_CAPACITY'))\n"
         "sys.meta_path.insert(0, Finder())\n"
         "from mereo.__main__ import main\n"
-        "main(['stream', 'folder', '--weights', 'rope'])"
+        "main(['stream', '-', '--weights', 'rope'])"
     )
     variables = {name: value for name, value in os.environ.items() if not name.startswith("ONEDNN")}
     variables |= {} if given is None else {"ONEDNN_PRIMITIVE_CACHE_CAPACITY": given}
@@ -238,6 +239,22 @@ def test_every_frame_is_answered_but_the_bad_one(
     assert f"{COUNT - 1} frames answered at" in err and "1 bad" in err
 
 
+def test_an_image_of_another_size_is_not_read_by_the_first_ones_camera(
+    sequence: tuple[Path, InputConfig], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera = json.loads((sequence[0].parent / CAMERA).read_text())
+    known = {name: value for name, value in camera.items() if name not in ("width", "height")}
+    (tmp_path / CAMERA).write_text(json.dumps(known))  # which would be that of any size
+    (tmp_path / FRAMES).mkdir()
+    for name, side in (("0.png", 96), ("1.png", 90), ("2.png", 96)):
+        with Image.open(sequence[0] / "0000.png") as image:
+            image.crop((0, 0, side, side)).save(tmp_path / FRAMES / name)
+    reading = InputConfig(intrinsics=tmp_path / CAMERA)
+    _, lines, _ = streamed(capsys, tmp_path / FRAMES, every_frame=True, reading=reading)
+    assert ["error" in row for row in lines] == [False, True, False]
+    assert lines[1]["error"].startswith("1.png has 90 x 90 pixels, and the frames before it had 96 x 96; a stream has")
+
+
 def test_names_on_standard_input_are_frames(
     sequence: tuple[Path, InputConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -248,7 +265,7 @@ def test_names_on_standard_input_are_frames(
     assert len(frames[1].load().cloud) > 32
 
 
-def test_sources_that_are_none_are_refused(tmp_path: Path) -> None:
+def test_sources_that_are_none_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     reading, isolation = InputConfig(), IsolationConfig()
     with pytest.raises(FileNotFoundError, match="does not exist; a folder that can be watched is needed: make it"):
         watched_frames(str(tmp_path / "nowhere"), reading, isolation)
@@ -264,6 +281,9 @@ def test_sources_that_are_none_are_refused(tmp_path: Path) -> None:
             watched_frames(source, reading, isolation)
     with pytest.raises(ValueError, match="none of the 1 frames could be answered"):
         stream_reconstructions(StreamCommand(str(tmp_path), weights="rope"))
+    monkeypatch.setattr(sys, "stdin", io.StringIO("\n"))
+    with pytest.raises(ValueError, match="^no frame came from -; a stream needs one: check that anything writes it$"):
+        stream_reconstructions(StreamCommand("-", weights="rope"))
     # before the weights are loaded and any frame is answered
     with pytest.raises(FileExistsError, match="ply is a file; surfaces are written into a folder: choose another"):
         stream_reconstructions(StreamCommand(str(tmp_path), weights="none", surfaces=tmp_path / "a.ply"))

@@ -1,6 +1,6 @@
 """``mereo stream``: a reconstruction of the latest frame, again and again, printed and written.
 
-    folder, recording, names -frames_of, watched_frames-> StreamFrame -stream, Answering-> Outcome
+    folder, recording, camera, names -frames_of, watched_frames-> StreamFrame -stream, Answering-> Outcome
     Outcome -> a line of JSON, surfaces as a GLB file
 
 A reading thread waits for frames; the caller's thread answers. Between them there is room for one frame: a newer one
@@ -39,8 +39,9 @@ from mereo.io.atomic_files import atomic_file, check_place, remove_abandoned, to
 from mereo.io.config import InputConfig
 from mereo.io.errors import is_foreseen, words_of
 from mereo.io.readers import CLOUD_READERS, DEPTH_READERS
-from mereo.io.ros_recordings import is_recording
-from mereo.io.sensor_frame import SensorFrame, read_frame, read_frames
+from mereo.io.realsense import camera_frames, is_camera, is_live, resized
+from mereo.io.ros_recordings import RecordedFrame, is_recording
+from mereo.io.sensor_frame import SensorFrame, message_frame, read_frame, read_messages
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.locating.following import Tracker
 from mereo.locating.whole_frame import at_point
@@ -263,23 +264,32 @@ class WatchedFolder:
 
 
 def frames_of(
-    source: str, reading: InputConfig, isolation: IsolationConfig, rate_hz: float = 30.0
-) -> Iterator[StreamFrame]:
+    source: str,
+    reading: InputConfig,
+    isolation: IsolationConfig,
+    rate_hz: float = 30.0,
+    align_color: bool = False,
+) -> Iterator[StreamFrame | None]:
     """Frames of a source, in order; each is decoded when it is answered.
 
     A source is a folder of depth images or point clouds (in the order of their names, recorded at ``rate_hz``), a ROS
-    recording, or ``-`` for names of files, one a line, as they are written.
+    recording, a RealSense camera (``camera_frames``, which also has ``align_color``), or ``-`` for names of files, one
+    a line, as they are written.
 
-    Raises ``FileNotFoundError``, or ``ValueError`` for a folder without frames.
+    Raises ``FileNotFoundError``, or ``ValueError`` for a folder without frames, and what a camera raises.
     """
+    if is_camera(source):
+        images = camera_frames(source, reading, align_color)
+        return (None if image is None else _of_message(image, source, reading, isolation) for image in images)
+    if align_color:
+        raise ValueError(f"--align-color is given for {source}; it is for RealSense cameras alone: leave it out")
     if source == STANDARD_INPUT:
         return _named(reading, isolation)
     path = Path(source)
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; a folder of frames or a ROS recording is needed, or -")
     if is_recording(path):
-        messages = read_frames(path, reading)
-        return (StreamFrame(message.name, message.time_s, _loader(read, isolation)) for message, read in messages)
+        return (_of_message(message, source, reading, isolation) for message in read_messages(path, reading))
     if not path.is_dir():
         raise ValueError(f"{path} is a single file; for one frame use `mereo reconstruct`, here name its folder")
     return (
@@ -305,7 +315,7 @@ def watched_frames(source: str, reading: InputConfig, isolation: IsolationConfig
     Raises ``FileNotFoundError``, or ``ValueError`` for what is no folder; ``OSError`` where it is removed meanwhile.
     """
     path = Path(source)
-    if source != STANDARD_INPUT and not path.exists():
+    if source != STANDARD_INPUT and not is_camera(source) and not path.exists():
         raise FileNotFoundError(f"{path} does not exist; a folder that can be watched is needed: make it first")
     if not path.is_dir() or is_recording(path):
         raise ValueError(f"{source} is no folder of frames; only such a folder can be watched: leave out --watch")
@@ -339,6 +349,11 @@ def _named(reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamF
             yield StreamFrame(name, time.perf_counter() - start, load)
 
 
+def _of_message(message: RecordedFrame, source: str, reading: InputConfig, isolation: IsolationConfig) -> StreamFrame:
+    read = partial(message_frame, message, Path(source), reading)
+    return StreamFrame(message.name, message.time_s, _loader(read, isolation))
+
+
 def _loader(read: Callable[[], SensorFrame], isolation: IsolationConfig) -> Callable[[], Any]:
     return lambda: find_object(read(), isolation)
 
@@ -357,13 +372,17 @@ def stream_reconstructions(command: StreamCommand) -> Summary:
     if source != STANDARD_INPUT and is_recording_folder(Path(source)):  # of ``mereo scene record``
         reading = replace(reading, intrinsics=reading.intrinsics or Path(source) / CAMERA)
         source = str(Path(source) / FRAMES)
+    if every_frame and is_live(source):
+        raise ValueError(
+            f"{source} is a camera, which waits for no answer: leave out --every-frame, or record it first"
+        )
     folder = None if command.surfaces is None else SurfaceFolder(command.surfaces, command.force)
-    known = loaded_object(command.object, command.weights, None, command.units, command.inference, command.deformations)
     frames: Iterable[StreamFrame | None] = (
         watched_frames(source, reading, command.isolation)
         if command.watch
-        else frames_of(source, reading, command.isolation, command.rate)
+        else frames_of(source, reading, command.isolation, command.rate, command.align_color)
     )
+    known = loaded_object(command.object, command.weights, None, command.units, command.inference, command.deformations)
     answer = Answering(
         known.network,
         known.registrar(command.method),
@@ -372,9 +391,9 @@ def stream_reconstructions(command: StreamCommand) -> Summary:
         command.uncertainty,
         every_frame,
     )
-    # what is written to standard input or into a watched folder arrives when it does
-    pace = not every_frame and not command.watch and source != STANDARD_INPUT
-    summary, last_error = Summary(), ""
+    # what a camera delivers, or is written to standard input or into a watched folder, arrives when it does
+    pace = not (every_frame or command.watch or source == STANDARD_INPUT or is_live(source))
+    summary, last_error, is_stopped = Summary(), "", False
     broken_off: Exception | None = None
     with closing(answer):
         try:
@@ -384,6 +403,7 @@ def stream_reconstructions(command: StreamCommand) -> Summary:
                 last_error = outcome.error or last_error
                 print(json.dumps(to_json(line(outcome))), flush=True)
         except KeyboardInterrupt:
+            is_stopped = True
             print("stopped", file=sys.stderr)
         except BrokenPipeError:  # nobody reads the answers any more
             raise
@@ -392,6 +412,10 @@ def stream_reconstructions(command: StreamCommand) -> Summary:
         print(summary, file=sys.stderr)
     if not summary.answered and broken_off is None and last_error:
         broken_off = ValueError(f"none of the {summary.failed} frames could be answered; the last one: {last_error}")
+    elif not summary.answered and broken_off is None and not is_stopped:
+        broken_off = ValueError(
+            f"no frame came from {command.input}; a stream needs one: check that anything writes it"
+        )
     if broken_off is not None:
         raise broken_off
     return summary
@@ -497,10 +521,16 @@ class Answering:
         self.model, self.resolution, self.keep_all, self.uncertainty = model, resolution, keep_all, uncertainty
         executor = SynchronousExecutor() if waits else None
         self.tracker = None if registrar is None else Tracker(registrar, executor=executor)
+        self._size: tuple[int, int] | None = None
 
     def __call__(self, frame: StreamFrame) -> FrameAnswer:
-        """Answer to a frame; raises ``ValueError`` for unusable clouds, and where nothing is found."""
+        """Answer to a frame; raises ``ValueError`` for unusable ones and other sizes, and where nothing is found."""
         seen: Observation = frame.load()
+        if (image := seen.frame.whole) is not None:  # intrinsics that state no size would be those of any
+            size = image.camera.width, image.camera.height
+            self._size = self._size or size
+            if size != self._size:
+                raise ValueError(resized(frame.name, size, self._size))
         if self.tracker is None:
             answer = answer_frame(at_point(seen, None), self.model, None, keep_all=self.keep_all)
         else:
