@@ -112,11 +112,13 @@ class ObjectTracker(Node):
 
     def _answer_newest(self) -> None:
         while (message := self.newest.get()) is not None:
-            try:
-                self.answer(message)
-            except Exception as error:  # a bad frame stops nothing but itself
-                if not rclpy.ok():  # nothing can be published any more
-                    return
+            self._answer_or_say(message)
+
+    def _answer_or_say(self, message: Any) -> None:
+        try:
+            self.answer(message)
+        except Exception as error:  # a bad frame stops nothing but itself
+            if rclpy.ok():  # else nothing can be published any more
                 self._publish_status(message.header, DiagnosticStatus.ERROR, " ".join(str(error).split()), {})
                 self._clear(message.header)
 
@@ -128,7 +130,7 @@ class ObjectTracker(Node):
         frame, reading = message, {"drop_invalid": True}
         if self.stated["input"] == "depth":
             if self.info is None:
-                raise ValueError("no camera_info has come; a depth image needs its intrinsics: remap camera_info")
+                raise ValueError("no camera_info has come; a depth image needs it: remap camera_info")
             frame, reading = messages.depth_frame(message, self.info, self.stated["rectified"]), {}
         time_s, begun = messages.seconds(header), time.perf_counter()
         if time_s < self.last_s:  # a recording that starts again
