@@ -8,9 +8,6 @@ import numpy as np
 import pytest
 import trimesh
 from angle import write_angle
-from camera_files import write_camera
-from PIL import Image
-from robot_files import write_gripper
 from scipy.spatial.transform import Rotation
 
 import mereo
@@ -20,7 +17,6 @@ from mereo.fitting.uncertainty import radius95
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import rigid, transform_points
-from mereo.io.robots import read_robot
 from mereo.locating.outline import Jumps, Outline, compare_outline
 from mereo.locating.regions import connected_pixels, off_planes, regions, thinned
 from mereo.locating.whole_frame import BY_MASK, Place, WholeFrame, at_point, doubted, is_whole
@@ -119,9 +115,8 @@ def test_the_covariance_of_a_rigid_objects_pose_is_that_of_its_points(found: mer
     registered, covariance = found.registered, measure_pose_covariance(found)
     assert registered is not None and registered.uncertainty is not None and covariance is not None
     arms = registered.material - registered.pose()[:3, 3]
-    follow = np.zeros((len(arms), 3, 6))
-    follow[:, :, :3] = np.eye(3)
-    follow[:, :, 3:] = np.cross(np.eye(3), arms[:, None]).swapaxes(1, 2)  # of a turn about each axis
+    turns = np.cross(np.eye(3), arms[:, None]).swapaxes(1, 2)  # by a turn about each axis
+    follow = np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns], axis=2)
     radii = radius95(follow @ covariance @ follow.swapaxes(1, 2))
     np.testing.assert_allclose(radii, registered.uncertainty.material, rtol=0.02)
 
@@ -402,41 +397,3 @@ def test_an_object_is_followed_through_whole_frames_lost_and_seen_again(
             assert np.linalg.norm(off, axis=1).max() < 0.006, "a pixel is 2.2 mm wide"
         assert tracker.follow(desk(), 5 / 15, unit_m=1.0, point=(0, 9999)).tracking == "lost"
         assert tracker.follow(image, 20 / 15, unit_m=1.0, point=CAN).tracking == "found"
-
-
-@pytest.mark.slow
-def test_a_stream_of_whole_frames_has_pose_and_joints_until_the_object_is_lost_and_found_again(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A gripper on the desk that closes, is taken away, and put where it was not before."""
-    pytest.importorskip("yourdfpy", reason="yourdfpy is not installed: pip install 'mereo[robot]'")
-    robot = write_gripper(tmp_path)
-    gripper = read_robot(robot).mesh  # both fingers at 0
-    turned = (SLOPE * Rotation.from_euler("xyz", [160, 30, 200], degrees=True)).as_matrix()
-    first, other = (rigid(turned, on_desk(x, 0.08, 0.0)) for x in (-0.02, -0.16))
-    poses, opened = [first, first, first, other], [0.02, 0.019, 0.018, 0.012]
-    frames = tmp_path / "frames"
-    frames.mkdir()
-    palm, left, right = gripper.segments
-    images = [desk()]  # between the third and the last
-    for T, value in zip(poses, opened, strict=True):
-        fingers = (moved(left, [-value, 0, 0]), moved(right, [0.5 * value + 0.002, 0, 0]))
-        images.insert(-1 if T is first else 9, desk(*SegmentedMesh((palm, *fingers)).transformed(T).segments))
-    for number, image in enumerate(images):
-        Image.fromarray(np.rint(10_000 * image.depth).astype(np.uint16)).save(frames / f"{number}.png")
-    write_camera(tmp_path / "camera.json", CAMERA)
-    options = ("--intrinsics", str(tmp_path / "camera.json"), "--depth-scale", "10000", "--every-frame", "--rate", "15")
-    assert main(["stream", str(frames), "--object", str(robot), *options]) == 0
-    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [line["tracking"] for line in lines] == ["found", "followed", "followed", "lost", "found"]
-    lost = lines.pop(3)
-    assert lost["pose"] is None and lost["joints"] == {} and lost["known"] is False
-    for line, T, value in zip(lines, poses, opened, strict=True):
-        joint = line["joints"]["finger"]
-        assert joint["value"] == pytest.approx(value, abs=0.001) and joint["unit"] == "m"
-        np.testing.assert_allclose(line["segments"]["palm"]["pose"], T, atol=0.01)
-        assert line["known"] is True and line["radius95"]["median"] < 0.001
-
-
-def moved(part: Segment, step: list[float]) -> Segment:
-    return replace(part, vertices=part.vertices + np.array(step))

@@ -14,7 +14,6 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from PIL import Image
 from written_results import segments
 
 from mereo import __main__ as command_line
@@ -22,6 +21,7 @@ from mereo.cli import stream as stream_module
 from mereo.cli.answers import StreamCommand
 from mereo.cli.stream import (
     PATIENCE_S,
+    Answering,
     FrameAnswer,
     Outcome,
     StreamFrame,
@@ -239,20 +239,15 @@ def test_every_frame_is_answered_but_the_bad_one(
     assert f"{COUNT - 1} frames answered at" in err and "1 bad" in err
 
 
-def test_an_image_of_another_size_is_not_read_by_the_first_ones_camera(
-    sequence: tuple[Path, InputConfig], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    camera = json.loads((sequence[0].parent / CAMERA).read_text())
-    known = {name: value for name, value in camera.items() if name not in ("width", "height")}
-    (tmp_path / CAMERA).write_text(json.dumps(known))  # which would be that of any size
-    (tmp_path / FRAMES).mkdir()
-    for name, side in (("0.png", 96), ("1.png", 90), ("2.png", 96)):
-        with Image.open(sequence[0] / "0000.png") as image:
-            image.crop((0, 0, side, side)).save(tmp_path / FRAMES / name)
-    reading = InputConfig(intrinsics=tmp_path / CAMERA)
-    _, lines, _ = streamed(capsys, tmp_path / FRAMES, every_frame=True, reading=reading)
-    assert ["error" in row for row in lines] == [False, True, False]
-    assert lines[1]["error"].startswith("1.png has 90 x 90 pixels, and the frames before it had 96 x 96; a stream has")
+def test_an_image_of_another_size_is_not_read_by_the_first_ones_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stream_module, "at_point", Mock(side_effect=StopIteration))
+    answering = Answering(None, None, 24)
+    for width, error in ((96, StopIteration), (90, ValueError), (96, StopIteration)):
+        camera = SimpleNamespace(width=width, height=72)
+        seen = Mock(point=None, **{"frame.whole.camera": camera})
+        with pytest.raises(error) as raised:
+            answering(StreamFrame("a.png", 0.0, lambda seen=seen: seen))  # type: ignore[misc]
+        assert (error is ValueError) == ("a.png has 90 x 72 pixels, and the frames before it" in str(raised.value))
 
 
 def test_names_on_standard_input_are_frames(
