@@ -65,8 +65,8 @@ class Node:
     destroy_node = create_timer = MagicMock()
 
     def __init__(self, name: str) -> None:
-        self.sent, self.create_subscription, self.get_clock, self.values = list[Any](), MagicMock(), MagicMock(), {}
-        self.get_clock().now().to_msg.return_value = header(99).stamp
+        self.sent, self.create_subscription, self.values = list[Any](), MagicMock(), {}
+        self.get_clock = MagicMock(**{"return_value.now.return_value.to_msg.return_value": header(99).stamp})
 
     def declare_parameter(self, name: str, value: Any, descriptor: Any) -> None:
         assert type(descriptor) is message("rcl_interfaces/msg/ParameterDescriptor") and descriptor.description
