@@ -1,6 +1,5 @@
 """RealSense: what a camera does by a stand-in of its library, and a recording by the library where it is installed."""
 
-import importlib
 import json
 import sys
 from pathlib import Path
@@ -59,14 +58,15 @@ def connect(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 def test_a_camera_gives_metres_its_intrinsics_and_times_of_one_clock(connect: Any) -> None:
     shared = image(5000, 3e6, "system_time")
-    sdk = connect(shared, image(0, 70.0), image(5001, 103.0))
+    connect(shared, image(0, 70.0), image(5001, 103.0))
     source = camera_frames("realsense")
     first, second, third = frames = [next(source) for _ in range(3)]
     shared.get_data()[:] = 0  # the library uses the memory of an image again
     np.testing.assert_allclose([each.read().depth[0, 0] for each in frames], [0.5, 0, 0.5001])
     assert first.read().camera == CAMERA and first.name == f"realsense {SERIAL} at 0.000 s"
-    assert third.time_s - second.time_s == pytest.approx(0.033) and second.time_s < 60, "no time lies between clocks"
-    sdk.config().enable_device.assert_called_once_with(SERIAL)
+    assert (
+        third.time_s - second.time_s == pytest.approx(0.033) and second.time_s < 60
+    )  # what is between clocks is no time
 
 
 def test_depth_as_the_colour_camera_sees_it(connect: Any) -> None:
@@ -74,7 +74,6 @@ def test_depth_as_the_colour_camera_sees_it(connect: Any) -> None:
     sdk.align().process().get_depth_frame.return_value = image(5000, 0.0)
     assert next(camera_frames("realsense:12", align_color=True)).read().depth.max() == pytest.approx(0.5)
     sdk.config().enable_stream.assert_called_with(sdk.stream.color)
-    sdk.align.assert_called_with(sdk.stream.color)
 
 
 BROKEN = {
@@ -99,9 +98,9 @@ def test_a_camera_that_breaks_off_ends_the_stream_with_one_sentence(
 
 
 REFUSED = {
-    "no RealSense camera is connected: plug it in (USB 3), and check the cable": ("realsense", "--threads", "0"),
-    "no RealSense camera with the serial number 7 is connected; connected: 12": ("realsense:7", "--threads", "0"),
-    "no.bag is no file; a recording of the RealSense SDK is needed": ("realsense:no.bag", "--threads", "0"),
+    "no RealSense camera is connected: plug it in (USB 3), and check the cable": ("realsense",),
+    "no RealSense camera with the serial number 7 is connected; connected: 12": ("realsense:7",),
+    "no.bag is no file; a recording of the RealSense SDK is needed": ("realsense:no.bag",),
     "a RealSense states its intrinsics, unit and axes itself: leave out": ("realsense", "--depth-scale", "1000"),
     "realsense is a camera, which waits for no answer: leave out --every-frame": ("realsense", "--every-frame"),
     "realsense is no folder of frames; only such a folder can be watched": ("realsense", "--watch"),
@@ -118,12 +117,7 @@ def test_what_cannot_be_is_said_before_anything_is_loaded(
     assert sentence in " ".join(capsys.readouterr().err.split())
 
 
-def test_a_library_that_is_missing_or_cannot_be_loaded_is_one_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    with pytest.raises(ImportError, match=r"needs pyrealsense2, which is not installed: pip install"):
-        camera_frames("realsense")
+def test_a_library_that_cannot_be_loaded_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "of_the_system.py").write_text("raise ImportError('libusb-1.0.so.0: cannot open shared object file')")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(ImportError, match="x needs of_the_system, which cannot be loaded .libusb-1.0.so.0: cannot"):
@@ -135,10 +129,7 @@ RECORDED = Path(__file__).parents[1] / "golden" / "realsense.bag"
 
 
 def test_a_recording_has_the_images_that_were_recorded_or_is_one_sentence(tmp_path: Path) -> None:
-    try:
-        importlib.import_module("pyrealsense2")
-    except ImportError as error:
-        pytest.skip(f"pyrealsense2 cannot be loaded ({error}): pip install 'mereo[realsense]'")
+    pytest.importorskip("pyrealsense2", reason="pip install 'mereo[realsense]'", exc_type=ImportError)
     frames = [frame for frame in camera_frames(f"realsense:{RECORDED}") if frame is not None]
     assert [frame.time_s for frame in frames] == pytest.approx([0, 1 / 30, 2 / 30], abs=1e-6)
     for number, frame in enumerate(frames, start=1):

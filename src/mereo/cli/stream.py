@@ -390,6 +390,7 @@ def stream_reconstructions(command: StreamCommand) -> Summary:
         command.isolation.keep_all,
         command.uncertainty,
         every_frame,
+        command.radius,
     )
     # what a camera delivers, or is written to standard input or into a watched folder, arrives when it does
     pace = not (every_frame or command.watch or source == STANDARD_INPUT or is_live(source))
@@ -455,8 +456,8 @@ class FrameAnswer:
     facts: dict[str, Any]
 
     @classmethod
-    def of(cls, answer: Answer, uncertainty: bool = False) -> "FrameAnswer":
-        """Facts of an answer; with ``uncertainty`` also how sure each segment of the registered model is."""
+    def of(cls, answer: Answer, uncertainty: bool = False, radius: bool = True) -> "FrameAnswer":
+        """Facts of an answer, with the error ``radius`` of its surface; by ``uncertainty`` also those of segments."""
         registration, is_missing = answer.registration, answer.is_missing
         facts: dict[str, Any] = {
             "method": None if is_missing else "network",
@@ -486,11 +487,11 @@ class FrameAnswer:
         for label, (name, centroid, volume) in enumerate(figures, start=1):
             pose = registered.pose(registered.model.labels == label)
             segments[name] = {**_facts(centroid, float(volume)), "pose": _rows(pose)}
-        if (sure := registered.uncertainty) is not None:
+        if (radius or uncertainty) and (sure := registered.uncertainty) is not None:
             facts["radius95"] = sure.summary(sure.outline)
             for each in sure.segments if uncertainty else ():
-                radius = round(each.centroid_radius95, DIGITS)
-                segments[each.name] |= {"centroid_radius95": radius, "volume95": each.volume95}
+                sure_of = {"centroid_radius95": round(each.centroid_radius95, DIGITS), "volume95": each.volume95}
+                segments[each.name] |= sure_of
         return cls(mesh, {**facts, "strays": strays, "segments": segments})
 
 
@@ -513,12 +514,14 @@ class Answering:
         keep_all: bool = False,
         uncertainty: bool = False,
         waits: bool = False,
+        radius: bool = True,
     ) -> None:
         """Without a registrar the network alone answers each frame; one of both there must be.
 
         ``waits`` lets each frame of a lost object wait for its search, so that answers do not depend on their speed.
         """
-        self.model, self.resolution, self.keep_all, self.uncertainty = model, resolution, keep_all, uncertainty
+        self.model, self.resolution, self.keep_all = model, resolution, keep_all
+        self.uncertainty, self.radius = uncertainty, radius
         executor = SynchronousExecutor() if waits else None
         self.tracker = None if registrar is None else Tracker(registrar, executor=executor)
         self._size: tuple[int, int] | None = None
@@ -535,7 +538,7 @@ class Answering:
             answer = answer_frame(at_point(seen, None), self.model, None, keep_all=self.keep_all)
         else:
             answer = self.tracker.follow(seen, frame.time_s, keep_all=self.keep_all)
-        return FrameAnswer.of(replace(answer, resolution=self.resolution), self.uncertainty)
+        return FrameAnswer.of(replace(answer, resolution=self.resolution), self.uncertainty, self.radius)
 
     def close(self) -> None:
         """End the search for a lost object, where one goes on."""

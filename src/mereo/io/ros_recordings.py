@@ -79,7 +79,8 @@ def recorded_frames(
         topic: by default the first depth image topic by name, else the first of clouds.
         camera: by default the first CameraInfo of the topic nearest by name, for ``image_rect`` topics with its matrix
             P. It is taken to hold for the whole recording.
-        depth_scale: value of one metre in integer images; by default 1000.
+        depth_scale: value of one metre in integer images; by default what a recording of the RealSense SDK states,
+            else 1000.
 
     Raises ``ImportError`` without the extra `sensors`, ``FileNotFoundError``, and ``ValueError`` where the bag cannot
     be read, has no such topic, or no CameraInfo.
@@ -99,7 +100,8 @@ def recorded_frames(
         decode: Callable[[Any], Content] = cloud_points
         if connections[0].msgtype != CLOUD:
             image = depth_image if connections[0].msgtype == IMAGE else _compressed_depth
-            decode = partial(image, camera=camera or _camera(reader, topic, path), depth_scale=depth_scale)
+            scale = depth_scale or _realsense_scale(reader, topic)
+            decode = partial(image, camera=camera or _camera(reader, topic, path), depth_scale=scale)
         store, ros2 = reader.typestore, reader.is2  # a frame may be read when the bag is closed
         for connection, stamp_ns, data in _messages(reader, connections, path):
             message = partial(store.deserialize_cdr if ros2 else store.deserialize_ros1, data, connection.msgtype)
@@ -172,6 +174,13 @@ def _first(reader: Any, topic: str) -> Any:
     connections = [c for c in reader.connections if c.topic == topic]
     connection, _, data = next(_messages(reader, connections, topic))
     return reader.deserialize(data, connection.msgtype)
+
+
+def _realsense_scale(reader: Any, topic: str) -> float | None:
+    """Value of one metre by the option of the sensor, which the RealSense SDK records beside its images, if it has."""
+    option = f"{topic.partition('/Depth_')[0]}/option/Depth_Units/value"
+    is_stated = any(c.topic == option and c.msgcount for c in reader.connections)
+    return 1.0 / float(_first(reader, option).data) if is_stated else None
 
 
 def _camera(reader: Any, topic: str, path: Path) -> Camera:
