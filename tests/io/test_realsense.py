@@ -57,8 +57,8 @@ def connect(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def test_a_camera_gives_metres_its_intrinsics_and_times_of_one_clock(connect: Any) -> None:
-    shared = image(5000, 3e6, "system_time")
-    connect(shared, image(0, 70.0), image(5001, 103.0))
+    shared = image(5000, 70.0, "hardware_clock")
+    connect(shared, image(0, 9e7), image(5001, 90000033.0))
     source = camera_frames("realsense")
     first, second, third = frames = [next(source) for _ in range(3)]
     shared.get_data()[:] = 0  # the library uses the memory of an image again

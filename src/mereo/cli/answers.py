@@ -195,8 +195,7 @@ class StreamCommand:
         resolution: grid cells along the longest side of the network's surfaces: fewer are faster.
         method: auto follows the registered model where it explains the frame, if the weights carry one, and else asks
             the network; network uses it alone, frame by frame; search leaves it out; modes takes the model in any case.
-        radius: say how sure the registered model is of the object's surface, which takes a quarter to a third of the
-            work on a frame.
+        radius: say how sure the registered model is of the object's surface, which takes some 30 ms.
         uncertainty: say how sure the registered model is of each segment, too: the radius, in the input's unit, that
             holds the true place of its centroid with probability 0.95, and the interval of its volume.
         rate: frames per second at which a folder was recorded.
