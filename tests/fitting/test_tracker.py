@@ -295,6 +295,7 @@ def test_a_stream_says_that_an_object_is_lost(
         lines.append(line(folder.written(outcome, "camera")))
     answering.close()
     assert [one["tracking"] for one in lines] == ["found", "lost"] and lines[1]["segments"] == {}
+    assert np.linalg.det(lines[0]["pose"]) == pytest.approx(1) and lines[1]["pose"] is None  # no earlier pose
     assert lines[1]["reason"].startswith("the object is lost: only")
     # surfaces of the frame that was there by this name before it was lost are gone
     assert not list((tmp_path / "out").iterdir())

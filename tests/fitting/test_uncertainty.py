@@ -320,13 +320,14 @@ def test_points_that_the_model_does_not_explain_are_red(liver: Model, cloud: Poi
     assert tuple(explain_centroids(registration)) == liver.names
 
 
-def test_a_stream_says_it_where_it_is_asked_to(liver: Model, cloud: PointCloud) -> None:
+def test_a_stream_says_it_of_the_whole_and_of_segments_where_it_is_asked_to(liver: Model, cloud: PointCloud) -> None:
     tracker = Tracker(Registrar.of(liver, "modes"))
     followed = [tracker.follow(observe(cloud), 0.05 * number) for number in range(2)]
     assert followed[1].tracked
     silent, told = FrameAnswer.of(followed[1]), FrameAnswer.of(followed[1], True)
     words = line(Outcome("frame", 0.0, told, "", 0.0, 0.0, 0))
-    assert "radius95" not in line(Outcome("frame", 0.0, silent, "", 0.0, 0.0, 0))
+    assert silent.facts["radius95"] == words["radius95"]  # of the whole, in each line
+    assert "radius95" not in FrameAnswer.of(followed[1], radius=False).facts
     assert set(words["radius95"]) == {"median", "max", "calibrated"} and words["radius95"]["median"] > 0
     for name in liver.names:
         assert "volume95" not in silent.facts["segments"][name]

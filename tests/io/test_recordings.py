@@ -49,6 +49,15 @@ def test_a_recording_that_is_damaged_anywhere_is_a_sentence_after_its_whole_fram
     assert farther and all(text.endswith("record or copy it again") for text in farther)
 
 
+def test_the_unit_is_that_which_the_sdk_of_a_realsense_records(tmp_path: Path) -> None:
+    def topics(make: Messages) -> dict[str, list[Any]]:
+        depth, unit = make.image(DEPTH_MM[0], "16UC1"), make.types["std_msgs/msg/String"](data="0.000100")
+        return {"/a/Depth_0": [depth], "/b": [make.info()], "/a/option/Depth_Units/value": [unit]}
+
+    read: Any = recorded_frame(write_bag(tmp_path / "a.mcap", 2, topics)).read()
+    np.testing.assert_allclose(read.depth, DEPTH_MM[0] / 10_000)
+
+
 def test_floats_are_metres_in_either_byte_order(tmp_path: Path) -> None:
     metres = (DEPTH_MM / np.float32(1000)).astype(np.float32)
     metres[DEPTH_MM == 0] = np.nan

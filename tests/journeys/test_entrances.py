@@ -12,10 +12,8 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 from camera_files import write_camera
-from memory_frames import message
 from page_blocks import ROOT, blocks
 from PIL import Image
-from scipy.spatial.transform import Rotation
 from toy_frames import MODEL, NAMES, seen
 from two_balls import scene
 
@@ -23,7 +21,6 @@ import mereo
 from mereo.fitting.registration.answer import Answer
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import CloudAxes
-from mereo.geometry.transforms import rigid
 from mereo.io.atomic_files import to_json
 from mereo.io.readers import read_mask
 from mereo.io.writers.meshes import write_positions_ply
@@ -158,34 +155,6 @@ def test_slicer(run: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
     np.testing.assert_allclose(points[0], [-20, 30, 600], atol=8)
     np.testing.assert_allclose(names["from_ras_mm"](names["to_ras_mm"](seen(), 0.5), 0.5), seen())
     assert names["to_ras_mm"]([[1, 2, 3]], 0.001).tolist() == [[-1, -2, 3]]
-
-
-def test_ros(run: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
-    T = rigid(Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix(), np.array([1.0, 2, 3]))
-    answers = [SimpleNamespace(tracking="found", pose=T), SimpleNamespace(tracking="lost", pose=None)]
-    tracker, cloud = MagicMock(**{"follow.side_effect": answers}), message(seen())
-    cloud.header = SimpleNamespace(stamp=SimpleNamespace(sec=5, nanosec=500_000_000))
-
-    class Node:
-        create_publisher, create_subscription = MagicMock(), MagicMock()
-
-        def __init__(self, name: str) -> None:
-            pass
-
-    modules = ("rclpy", "geometry_msgs", "geometry_msgs.msg", "sensor_msgs", "sensor_msgs.msg")
-    stand_ins = {**{name: MagicMock() for name in modules}, "rclpy.node": SimpleNamespace(Node=Node)}
-    monkeypatch.setattr(mereo, "Tracker", {"bunny": tracker}.get, raising=False)
-    run("import rclpy", stand_ins)
-    for _ in answers:
-        Node.create_subscription.call_args[0][2](cloud)
-        (given, time_s), reading = tracker.follow.call_args
-        np.testing.assert_allclose(mereo.load_frame(given, **reading).cloud.points, seen(), atol=1e-6)
-        assert time_s == 5.5
-    pose = stand_ins["geometry_msgs.msg"].PoseStamped().pose
-    (sent,) = Node.create_publisher.return_value.publish.call_args_list
-    assert sent.args[0].pose is pose and (pose.position.x, pose.position.y, pose.position.z) == (1.0, 2.0, 3.0)
-    turn = pose.orientation
-    np.testing.assert_allclose([turn.x, turn.y, turn.z, turn.w], [0, 0, 0.5**0.5, 0.5**0.5], atol=1e-12)
 
 
 def test_the_table_of_distances_follows_the_formulas() -> None:

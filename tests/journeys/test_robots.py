@@ -11,6 +11,7 @@ from robot_files import LAPTOP, LAPTOP_SDF, write_gripper
 
 import mereo
 import mereo.__main__ as command_line
+from mereo.cli.stream import FrameAnswer
 from mereo.deformation.samplers import RandomMotion
 from mereo.geometry.camera import Camera
 from mereo.geometry.transforms import inverse_rigid
@@ -184,7 +185,11 @@ def test_the_angle_of_a_hinge_is_found_with_its_interval(tmp_path: Path) -> None
     assert laptop.scene is not None
     true = write_frame(tmp_path / "frame.ply", laptop.scene, 0.6, 0)
     assert true == pytest.approx(0.3 + 0.6 * 1.9)  # the file's angle, although its rest pose is closed
-    joint = mereo.reconstruct(tmp_path / "frame.ply", laptop, unit_m=1.0).joints["hinge"]
+    result = mereo.reconstruct(tmp_path / "frame.ply", laptop, unit_m=1.0)
+    joint = result.joints["hinge"]
+    facts = FrameAnswer.of(result).facts  # what a line of a stream has
+    assert facts["joints"] == {"hinge": joint.facts()}
+    np.testing.assert_allclose(facts["segments"]["lid"]["pose"], result["lid"].pose, atol=1e-6)
     assert joint.interval is not None and joint.interval[0] < true < joint.interval[1]
     assert abs(np.rad2deg(joint.value - true)) < 1.0 and joint.unit == "rad"
     np.testing.assert_allclose(joint.limits, (0.3, 2.2))

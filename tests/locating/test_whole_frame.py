@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 import mereo
 from mereo.__main__ import main
 from mereo.fitting.tracking import SynchronousExecutor
+from mereo.fitting.uncertainty import radius95
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import rigid, transform_points
@@ -22,6 +23,7 @@ from mereo.locating.regions import connected_pixels, off_planes, regions, thinne
 from mereo.locating.whole_frame import BY_MASK, Place, WholeFrame, at_point, doubted, is_whole
 from mereo.reconstruction.observation import find_object, shared_noise
 from mereo.synthesis.depth_sensor import add_depth_noise, render_depth
+from mereo.visualization.joints import measure_pose_covariance
 
 CAMERA = Camera(240, 180, 260.0, 260.0, 120.0, 90.0)
 NOISE = 2e-4
@@ -108,6 +110,16 @@ def test_an_object_among_others_is_known_at_its_place(
     true = transform_points(PLACED, rest.segments[0].vertices)
     np.testing.assert_allclose(transform_points(found.pose, long), true, atol=2e-3)
     assert found.seen.cloud.points[:, 2].max() < 0.65, "neither the desk behind it nor the wall is taken for it"
+
+
+def test_the_covariance_of_a_rigid_objects_pose_is_that_of_its_points(found: mereo.Result) -> None:
+    registered, covariance = found.registered, measure_pose_covariance(found)
+    assert registered is not None and registered.uncertainty is not None and covariance is not None
+    arms = registered.material - registered.pose()[:3, 3]
+    turns = np.cross(np.eye(3), arms[:, None]).swapaxes(1, 2)  # by a turn about each axis
+    follow = np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns], axis=2)
+    radii = radius95(follow @ covariance @ follow.swapaxes(1, 2))
+    np.testing.assert_allclose(radii, registered.uncertainty.material, rtol=0.02)
 
 
 def test_what_is_not_in_the_frame_is_not_known_and_the_likeliest_place_is_stated(angle: mereo.Object) -> None:

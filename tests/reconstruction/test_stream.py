@@ -21,6 +21,7 @@ from mereo.cli import stream as stream_module
 from mereo.cli.answers import StreamCommand
 from mereo.cli.stream import (
     PATIENCE_S,
+    Answering,
     FrameAnswer,
     Outcome,
     StreamFrame,
@@ -196,7 +197,7 @@ def test_the_cache_of_products_is_small_before_torch_is_loaded(given: str | None
         "        if name == 'torch': sys.exit(os.environ.get('ONEDNN_PRIMITIVE_CACHE_CAPACITY'))\n"
         "sys.meta_path.insert(0, Finder())\n"
         "from mereo.__main__ import main\n"
-        "main(['stream', 'folder', '--weights', 'rope'])"
+        "main(['stream', '-', '--weights', 'rope'])"
     )
     variables = {name: value for name, value in os.environ.items() if not name.startswith("ONEDNN")}
     variables |= {} if given is None else {"ONEDNN_PRIMITIVE_CACHE_CAPACITY": given}
@@ -238,6 +239,17 @@ def test_every_frame_is_answered_but_the_bad_one(
     assert f"{COUNT - 1} frames answered at" in err and "1 bad" in err
 
 
+def test_an_image_of_another_size_is_not_read_by_the_first_ones_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stream_module, "at_point", Mock(side_effect=StopIteration))
+    answering = Answering(None, None, 24)
+    for width, error in ((96, StopIteration), (90, ValueError), (96, StopIteration)):
+        camera = SimpleNamespace(width=width, height=72)
+        seen = Mock(point=None, **{"frame.whole.camera": camera})
+        with pytest.raises(error) as raised:
+            answering(StreamFrame("a.png", 0.0, lambda seen=seen: seen))  # type: ignore[misc]
+        assert (error is ValueError) == ("a.png has 90 x 72 pixels, and the frames before it" in str(raised.value))
+
+
 def test_names_on_standard_input_are_frames(
     sequence: tuple[Path, InputConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -248,7 +260,7 @@ def test_names_on_standard_input_are_frames(
     assert len(frames[1].load().cloud) > 32
 
 
-def test_sources_that_are_none_are_refused(tmp_path: Path) -> None:
+def test_sources_that_are_none_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     reading, isolation = InputConfig(), IsolationConfig()
     with pytest.raises(FileNotFoundError, match="does not exist; a folder that can be watched is needed: make it"):
         watched_frames(str(tmp_path / "nowhere"), reading, isolation)
@@ -264,6 +276,9 @@ def test_sources_that_are_none_are_refused(tmp_path: Path) -> None:
             watched_frames(source, reading, isolation)
     with pytest.raises(ValueError, match="none of the 1 frames could be answered"):
         stream_reconstructions(StreamCommand(str(tmp_path), weights="rope"))
+    monkeypatch.setattr(sys, "stdin", io.StringIO("\n"))
+    with pytest.raises(ValueError, match="^no frame came from -; a stream needs one: check that anything writes it$"):
+        stream_reconstructions(StreamCommand("-", weights="rope"))
     # before the weights are loaded and any frame is answered
     with pytest.raises(FileExistsError, match="ply is a file; surfaces are written into a folder: choose another"):
         stream_reconstructions(StreamCommand(str(tmp_path), weights="none", surfaces=tmp_path / "a.ply"))

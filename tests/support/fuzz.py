@@ -54,7 +54,7 @@ from mereo.io.errors import LIMIT_VARIABLE, is_foreseen, words_of
 from mereo.io.intrinsics import read_intrinsics
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.readers import read_mask, read_point_cloud
-from mereo.io.sensor_frame import read_frame, read_frames
+from mereo.io.sensor_frame import message_frame, read_frame, read_messages
 from mereo.io.simulation_states import read_states
 from mereo.io.volume_files import read_label_volume
 from mereo.io.writers.glb import write_segments_glb
@@ -432,8 +432,8 @@ def depth(path: Path) -> object:
 
 
 def every_frame(path: Path) -> None:
-    for _, read in read_frames(path, InputConfig()):
-        read()
+    for message in read_messages(path, InputConfig()):
+        message_frame(message, path, InputConfig())
 
 
 exactly_read = partial(read_point_cloud, drop_invalid=True)

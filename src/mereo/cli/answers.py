@@ -185,7 +185,9 @@ class StreamCommand:
     0 where any frame was answered and the sequence was whole, else 2.
 
     Attributes:
-        input: a folder of depth images or point clouds, a ROS recording, or - for file names on standard input.
+        input: a folder of depth images or point clouds, a ROS recording, or - for file names on standard input;
+            realsense for a camera that is connected, realsense:SERIAL for a certain one, realsense:FILE for a recording
+            of its SDK: these need the extra `realsense`.
         object: what is looked for, as for `mereo reconstruct`: its meshes or its scene.
         weights: a shipped name or a file; with --object they start the fit, without they say what is looked for.
         units: of the object's meshes; guessed where not given.
@@ -193,11 +195,13 @@ class StreamCommand:
         resolution: grid cells along the longest side of the network's surfaces: fewer are faster.
         method: auto follows the registered model where it explains the frame, if the weights carry one, and else asks
             the network; network uses it alone, frame by frame; search leaves it out; modes takes the model in any case.
-        uncertainty: say how sure the registered model is: radii, in the input's unit, that hold the true places of the
-            surface and of each segment's centroid with probability 0.95, and intervals of its volume; takes some 30 ms.
+        radius: say how sure the registered model is of the object's surface, which takes some 30 ms.
+        uncertainty: say how sure the registered model is of each segment, too: the radius, in the input's unit, that
+            holds the true place of its centroid with probability 0.95, and the interval of its volume.
         rate: frames per second at which a folder was recorded.
         every_frame: answer all frames, however long it takes, instead of the latest.
         watch: the folder is still filled: answer its files as they arrive or are written again, until Ctrl-C.
+        align_color: of a RealSense, take depth as its colour camera sees it: results are in the axes of that.
         surfaces: folder for the surfaces of each answered frame, one GLB file each; one with content is refused.
         force: write into a folder with content, and replace the files of the same names in it.
         reading: how a frame is read.
@@ -213,10 +217,12 @@ class StreamCommand:
     deformations: Way = "auto"
     resolution: Cells = 48
     method: StreamMethod = "auto"
+    radius: bool = True
     uncertainty: bool = False
     rate: Positive = 30.0
     every_frame: bool = False
     watch: bool = False
+    align_color: bool = False
     surfaces: Path | None = None
     force: bool = False
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)

@@ -1,6 +1,6 @@
 """``mereo stream``: a reconstruction of the latest frame, again and again, printed and written.
 
-    folder, recording, names -frames_of, watched_frames-> StreamFrame -stream, Answering-> Outcome
+    folder, recording, camera, names -frames_of, watched_frames-> StreamFrame -stream, Answering-> Outcome
     Outcome -> a line of JSON, surfaces as a GLB file
 
 A reading thread waits for frames; the caller's thread answers. Between them there is room for one frame: a newer one
@@ -39,8 +39,9 @@ from mereo.io.atomic_files import atomic_file, check_place, remove_abandoned, to
 from mereo.io.config import InputConfig
 from mereo.io.errors import is_foreseen, words_of
 from mereo.io.readers import CLOUD_READERS, DEPTH_READERS
-from mereo.io.ros_recordings import is_recording
-from mereo.io.sensor_frame import SensorFrame, read_frame, read_frames
+from mereo.io.realsense import camera_frames, is_camera, is_live, resized
+from mereo.io.ros_recordings import RecordedFrame, is_recording
+from mereo.io.sensor_frame import SensorFrame, message_frame, read_frame, read_messages
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.locating.following import Tracker
 from mereo.locating.whole_frame import at_point
@@ -48,6 +49,7 @@ from mereo.models.trained import Trained
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import Observation, find_object
 from mereo.synthesis.recording import CAMERA, FRAMES, is_recording_folder
+from mereo.visualization.joints import measure_joints
 
 STANDARD_INPUT = "-"
 """Source that means names of files on standard input."""
@@ -262,23 +264,32 @@ class WatchedFolder:
 
 
 def frames_of(
-    source: str, reading: InputConfig, isolation: IsolationConfig, rate_hz: float = 30.0
-) -> Iterator[StreamFrame]:
+    source: str,
+    reading: InputConfig,
+    isolation: IsolationConfig,
+    rate_hz: float = 30.0,
+    align_color: bool = False,
+) -> Iterator[StreamFrame | None]:
     """Frames of a source, in order; each is decoded when it is answered.
 
     A source is a folder of depth images or point clouds (in the order of their names, recorded at ``rate_hz``), a ROS
-    recording, or ``-`` for names of files, one a line, as they are written.
+    recording, a RealSense camera (``camera_frames``, which also has ``align_color``), or ``-`` for names of files, one
+    a line, as they are written.
 
-    Raises ``FileNotFoundError``, or ``ValueError`` for a folder without frames.
+    Raises ``FileNotFoundError``, or ``ValueError`` for a folder without frames, and what a camera raises.
     """
+    if is_camera(source):
+        images = camera_frames(source, reading, align_color)
+        return (None if image is None else _of_message(image, source, reading, isolation) for image in images)
+    if align_color:
+        raise ValueError(f"--align-color is given for {source}; it is for RealSense cameras alone: leave it out")
     if source == STANDARD_INPUT:
         return _named(reading, isolation)
     path = Path(source)
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; a folder of frames or a ROS recording is needed, or -")
     if is_recording(path):
-        messages = read_frames(path, reading)
-        return (StreamFrame(message.name, message.time_s, _loader(read, isolation)) for message, read in messages)
+        return (_of_message(message, source, reading, isolation) for message in read_messages(path, reading))
     if not path.is_dir():
         raise ValueError(f"{path} is a single file; for one frame use `mereo reconstruct`, here name its folder")
     return (
@@ -304,7 +315,7 @@ def watched_frames(source: str, reading: InputConfig, isolation: IsolationConfig
     Raises ``FileNotFoundError``, or ``ValueError`` for what is no folder; ``OSError`` where it is removed meanwhile.
     """
     path = Path(source)
-    if source != STANDARD_INPUT and not path.exists():
+    if source != STANDARD_INPUT and not is_camera(source) and not path.exists():
         raise FileNotFoundError(f"{path} does not exist; a folder that can be watched is needed: make it first")
     if not path.is_dir() or is_recording(path):
         raise ValueError(f"{source} is no folder of frames; only such a folder can be watched: leave out --watch")
@@ -338,6 +349,11 @@ def _named(reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamF
             yield StreamFrame(name, time.perf_counter() - start, load)
 
 
+def _of_message(message: RecordedFrame, source: str, reading: InputConfig, isolation: IsolationConfig) -> StreamFrame:
+    read = partial(message_frame, message, Path(source), reading)
+    return StreamFrame(message.name, message.time_s, _loader(read, isolation))
+
+
 def _loader(read: Callable[[], SensorFrame], isolation: IsolationConfig) -> Callable[[], Any]:
     return lambda: find_object(read(), isolation)
 
@@ -356,13 +372,17 @@ def stream_reconstructions(command: StreamCommand) -> Summary:
     if source != STANDARD_INPUT and is_recording_folder(Path(source)):  # of ``mereo scene record``
         reading = replace(reading, intrinsics=reading.intrinsics or Path(source) / CAMERA)
         source = str(Path(source) / FRAMES)
+    if every_frame and is_live(source):
+        raise ValueError(
+            f"{source} is a camera, which waits for no answer: leave out --every-frame, or record it first"
+        )
     folder = None if command.surfaces is None else SurfaceFolder(command.surfaces, command.force)
-    known = loaded_object(command.object, command.weights, None, command.units, command.inference, command.deformations)
     frames: Iterable[StreamFrame | None] = (
         watched_frames(source, reading, command.isolation)
         if command.watch
-        else frames_of(source, reading, command.isolation, command.rate)
+        else frames_of(source, reading, command.isolation, command.rate, command.align_color)
     )
+    known = loaded_object(command.object, command.weights, None, command.units, command.inference, command.deformations)
     answer = Answering(
         known.network,
         known.registrar(command.method),
@@ -370,10 +390,11 @@ def stream_reconstructions(command: StreamCommand) -> Summary:
         command.isolation.keep_all,
         command.uncertainty,
         every_frame,
+        command.radius,
     )
-    # what is written to standard input or into a watched folder arrives when it does
-    pace = not every_frame and not command.watch and source != STANDARD_INPUT
-    summary, last_error = Summary(), ""
+    # what a camera delivers, or is written to standard input or into a watched folder, arrives when it does
+    pace = not (every_frame or command.watch or source == STANDARD_INPUT or is_live(source))
+    summary, last_error, is_stopped = Summary(), "", False
     broken_off: Exception | None = None
     with closing(answer):
         try:
@@ -383,6 +404,7 @@ def stream_reconstructions(command: StreamCommand) -> Summary:
                 last_error = outcome.error or last_error
                 print(json.dumps(to_json(line(outcome))), flush=True)
         except KeyboardInterrupt:
+            is_stopped = True
             print("stopped", file=sys.stderr)
         except BrokenPipeError:  # nobody reads the answers any more
             raise
@@ -391,6 +413,10 @@ def stream_reconstructions(command: StreamCommand) -> Summary:
         print(summary, file=sys.stderr)
     if not summary.answered and broken_off is None and last_error:
         broken_off = ValueError(f"none of the {summary.failed} frames could be answered; the last one: {last_error}")
+    elif not summary.answered and broken_off is None and not is_stopped:
+        broken_off = ValueError(
+            f"no frame came from {command.input}; a stream needs one: check that anything writes it"
+        )
     if broken_off is not None:
         raise broken_off
     return summary
@@ -421,16 +447,17 @@ class FrameAnswer:
     Attributes:
         surfaces: of all segments; None where the object is lost and no network answers.
         facts: what is printed: who answers (``method``), how it was tracked, the share of points that the registered
-            model explains, whether the frame shows the object, points that were dropped, and each segment's
-            ``centroid`` and ``volume``, with the network's ``confidence`` where the answer is the network's.
+            model explains, whether the frame shows the object, ``pose`` and ``joints`` as of ``Result``, points that
+            were dropped, and each segment's ``centroid`` and ``volume``, with its ``pose`` where the registered model
+            answers, and the network's ``confidence`` where that does.
     """
 
     surfaces: SegmentedMesh | None
     facts: dict[str, Any]
 
     @classmethod
-    def of(cls, answer: Answer, uncertainty: bool = False) -> "FrameAnswer":
-        """Facts of an answer; with ``uncertainty`` also how sure the registered model is, where that is known."""
+    def of(cls, answer: Answer, uncertainty: bool = False, radius: bool = True) -> "FrameAnswer":
+        """Facts of an answer, with the error ``radius`` of its surface; by ``uncertainty`` also those of segments."""
         registration, is_missing = answer.registration, answer.is_missing
         facts: dict[str, Any] = {
             "method": None if is_missing else "network",
@@ -439,26 +466,37 @@ class FrameAnswer:
             "explained": None if registration is None or is_missing else round(registration.explained, 4),
             "known": answer.recognition.known,
             "reason": answer.recognition.reason,
+            "pose": None,
+            "joints": {},
         }
         strays, segments = answer.hypothesis.dropped, dict[str, dict[str, Any]]()
         if is_missing:
             return cls(None, {**facts, "strays": strays, "segments": segments})
         mesh = answer.surfaces
-        if registration is None or not answer.taken:
+        registered = answer.registered
+        if registered is None:
             for segment in answer.reconstruction.segments:
                 if segment.voxels:
                     segments[segment.name] = _facts(segment.centroid, float(segment.volume))
                     segments[segment.name]["confidence"] = round(float(segment.confidence), 3)
             return cls(mesh, {**facts, "strays": strays, "segments": segments})
-        facts |= {"method": registration.method, "located_by": answer.located_by}
-        for name, centroid, volume in zip(mesh.names, owned_centroids(mesh), mesh.owned_volumes, strict=True):
-            segments[name] = _facts(centroid, float(volume))
-        if uncertainty and (sure := registration.uncertainty) is not None:
-            for each in sure.segments:
-                radius = round(each.centroid_radius95, DIGITS)
-                segments[each.name] |= {"centroid_radius95": radius, "volume95": each.volume95}
+        joints = {name: joint.facts() for name, joint in measure_joints(answer).items()}
+        facts |= {"method": registered.method, "located_by": answer.located_by}
+        facts |= {"pose": _rows(registered.pose()), "joints": joints}
+        figures = zip(mesh.names, owned_centroids(mesh), mesh.owned_volumes, strict=True)
+        for label, (name, centroid, volume) in enumerate(figures, start=1):
+            pose = registered.pose(registered.model.labels == label)
+            segments[name] = {**_facts(centroid, float(volume)), "pose": _rows(pose)}
+        if (radius or uncertainty) and (sure := registered.uncertainty) is not None:
             facts["radius95"] = sure.summary(sure.outline)
+            for each in sure.segments if uncertainty else ():
+                sure_of = {"centroid_radius95": round(each.centroid_radius95, DIGITS), "volume95": each.volume95}
+                segments[each.name] |= sure_of
         return cls(mesh, {**facts, "strays": strays, "segments": segments})
+
+
+def _rows(pose: Float[np.ndarray, "4 4"]) -> list[list[float]]:
+    return [[round(value, DIGITS) for value in row] for row in pose.tolist()]
 
 
 def _facts(centroid: Float[np.ndarray, "3"], volume: float) -> dict[str, Any]:
@@ -476,23 +514,31 @@ class Answering:
         keep_all: bool = False,
         uncertainty: bool = False,
         waits: bool = False,
+        radius: bool = True,
     ) -> None:
         """Without a registrar the network alone answers each frame; one of both there must be.
 
         ``waits`` lets each frame of a lost object wait for its search, so that answers do not depend on their speed.
         """
-        self.model, self.resolution, self.keep_all, self.uncertainty = model, resolution, keep_all, uncertainty
+        self.model, self.resolution, self.keep_all = model, resolution, keep_all
+        self.uncertainty, self.radius = uncertainty, radius
         executor = SynchronousExecutor() if waits else None
         self.tracker = None if registrar is None else Tracker(registrar, executor=executor)
+        self._size: tuple[int, int] | None = None
 
     def __call__(self, frame: StreamFrame) -> FrameAnswer:
-        """Answer to a frame; raises ``ValueError`` for unusable clouds, and where nothing is found."""
+        """Answer to a frame; raises ``ValueError`` for unusable ones and other sizes, and where nothing is found."""
         seen: Observation = frame.load()
+        if (image := seen.frame.whole) is not None:  # intrinsics that state no size would be those of any
+            size = image.camera.width, image.camera.height
+            self._size = self._size or size
+            if size != self._size:
+                raise ValueError(resized(frame.name, size, self._size))
         if self.tracker is None:
             answer = answer_frame(at_point(seen, None), self.model, None, keep_all=self.keep_all)
         else:
             answer = self.tracker.follow(seen, frame.time_s, keep_all=self.keep_all)
-        return FrameAnswer.of(replace(answer, resolution=self.resolution), self.uncertainty)
+        return FrameAnswer.of(replace(answer, resolution=self.resolution), self.uncertainty, self.radius)
 
     def close(self) -> None:
         """End the search for a lost object, where one goes on."""

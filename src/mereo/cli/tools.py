@@ -224,6 +224,7 @@ PURPOSES: dict[str, str] = {
     "medical": "NIfTI and NRRD volumes",
     "robot": "robots of URDF and SDF files",
     "sensors": "ROS bags, EXR depth images and Zivid clouds",
+    "realsense": "cameras of this kind, in `mereo stream realsense`",
     "simulation": "states from finite elements, in VTK's formats too",
     "storage": "datasets in S3 and what speaks it",
     "gcs": "datasets in Google Cloud Storage",

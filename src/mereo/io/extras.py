@@ -35,7 +35,11 @@ def library(name: str, extra: str, user: object) -> Any:
     """Library that an extra brings; ``ImportError`` says that ``user``, a file or a purpose, needs it."""
     try:
         return import_module(name)
-    except ImportError:
+    except ImportError as error:
+        if not isinstance(error, ModuleNotFoundError):  # a library of the system that it needs
+            raise ImportError(
+                f"{user} needs {name}, which cannot be loaded ({error}): install what it lacks"
+            ) from error
         raise ImportError(f"{user} needs {name}, which is not installed: pip install 'mereo[{extra}]'") from None
 
 

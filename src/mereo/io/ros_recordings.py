@@ -79,7 +79,8 @@ def recorded_frames(
         topic: by default the first depth image topic by name, else the first of clouds.
         camera: by default the first CameraInfo of the topic nearest by name, for ``image_rect`` topics with its matrix
             P. It is taken to hold for the whole recording.
-        depth_scale: value of one metre in integer images; by default 1000.
+        depth_scale: value of one metre in integer images; by default what a recording of the RealSense SDK states,
+            else 1000.
 
     Raises ``ImportError`` without the extra `sensors`, ``FileNotFoundError``, and ``ValueError`` where the bag cannot
     be read, has no such topic, or no CameraInfo.
@@ -98,8 +99,9 @@ def recorded_frames(
             raise ValueError(f"{path} has no images or clouds on topic {topic!r}; those it has are on: {known}")
         decode: Callable[[Any], Content] = cloud_points
         if connections[0].msgtype != CLOUD:
-            image = _depth_image if connections[0].msgtype == IMAGE else _compressed_depth
-            decode = partial(image, camera=camera or _camera(reader, topic, path), depth_scale=depth_scale)
+            image = depth_image if connections[0].msgtype == IMAGE else _compressed_depth
+            scale = depth_scale or _realsense_scale(reader, topic)
+            decode = partial(image, camera=camera or _camera(reader, topic, path), depth_scale=scale)
         store, ros2 = reader.typestore, reader.is2  # a frame may be read when the bag is closed
         for connection, stamp_ns, data in _messages(reader, connections, path):
             message = partial(store.deserialize_cdr if ros2 else store.deserialize_ros1, data, connection.msgtype)
@@ -174,6 +176,13 @@ def _first(reader: Any, topic: str) -> Any:
     return reader.deserialize(data, connection.msgtype)
 
 
+def _realsense_scale(reader: Any, topic: str) -> float | None:
+    """Value of one metre by the option of the sensor, which the RealSense SDK records beside its images, if it has."""
+    option = f"{topic.partition('/Depth_')[0]}/option/Depth_Units/value"
+    is_stated = any(c.topic == option and c.msgcount for c in reader.connections)
+    return 1.0 / float(_first(reader, option).data) if is_stated else None
+
+
 def _camera(reader: Any, topic: str, path: Path) -> Camera:
     """Camera from the CameraInfo topic that shares the most leading names with ``topic``."""
     infos = sorted({c.topic for c in reader.connections if c.msgtype == INFO and c.msgcount})
@@ -181,20 +190,30 @@ def _camera(reader: Any, topic: str, path: Path) -> Camera:
         raise ValueError(f"{path} has no CameraInfo; the intrinsics of {topic} are needed: give --intrinsics FILE")
     nearest = max(infos, key=lambda info: len(commonpath([f"/{info}", f"/{topic}"])))
     try:
-        info = _first(reader, nearest)
-        # ROS 1 has capital letters
-        stated = {name.lower(): np.asarray(getattr(info, name)) for name in "KkPpDd" if hasattr(info, name)}
-        rectified = "image_rect" in topic
-        matrix = stated["p"].reshape(3, 4)[:, :3] if rectified else stated["k"]
-        camera = camera_from_fields({"width": info.width, "height": info.height, "K": matrix})
-        if not rectified:
-            lens = {"d": stated["d"], "distortion_model": info.distortion_model}
-            warn_of_distortion(camera, lens, f"{path}, {topic}")
-        return camera
+        return camera_of_info(_first(reader, nearest), "image_rect" in topic, f"{path}, {topic}")
     except Exception as error:  # whatever a broken message makes of the parser
         raise ValueError(
             f"{path}, {nearest} is no camera ({reason(error)}): give --intrinsics FILE, or record it again"
         ) from error
+
+
+def camera_of_info(info: Any, rectified: bool, source: str) -> Camera:
+    """Camera of a CameraInfo message of ROS 1 or 2, for images of its size.
+
+    Args:
+        info: anything with the fields of sensor_msgs/CameraInfo.
+        rectified: take its matrix P, of the rectified image, else K.
+        source: the image, for a warning where K is taken and the lens distorts (``CameraWarning``).
+
+    A broken message raises whatever it makes of the parser.
+    """
+    # ROS 1 has capital letters
+    stated = {name.lower(): np.asarray(getattr(info, name)) for name in "KkPpDd" if hasattr(info, name)}
+    matrix = stated["p"].reshape(3, 4)[:, :3] if rectified else stated["k"]
+    camera = camera_from_fields({"width": info.width, "height": info.height, "K": matrix})
+    if not rectified:
+        warn_of_distortion(camera, {"d": stated["d"], "distortion_model": info.distortion_model}, source)
+    return camera
 
 
 def _read(decode: Callable[[Any], Content], message: Callable[[], Any], source: str) -> Content:
@@ -204,7 +223,16 @@ def _read(decode: Callable[[Any], Content], message: Callable[[], Any], source: 
         raise ValueError(f"{source} cannot be read ({reason(error)}): take another frame") from error
 
 
-def _depth_image(message: Any, camera: Camera, depth_scale: float | None) -> DepthImage:
+def depth_image(message: Any, camera: Camera, depth_scale: float | None = None) -> DepthImage:
+    """Depth in metres of an Image message of ROS 1 or 2, 16UC1 (or mono16) and 32FC1, of either byte order.
+
+    Args:
+        message: anything with the fields of sensor_msgs/Image; ``data`` may be bytes, an array or a list.
+        camera: its intrinsics.
+        depth_scale: value of one metre in integer images; by default 1000.
+
+    Raises ``ValueError``, whose text is a reason only, and for a broken message whatever it makes of the parser.
+    """
     kind = DEPTH_ENCODINGS.get(message.encoding)
     if kind is None:
         raise ValueError(f"its encoding is {message.encoding!r}, not one of {', '.join(DEPTH_ENCODINGS)}")

@@ -4,9 +4,8 @@ Options that do not belong to a file's kind are refused, because ignored ones ar
 """
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -216,13 +215,13 @@ def _is_in_view(points: Float[np.ndarray, "n 3"]) -> bool:
     return bool((points[:, 2] > IN_VIEW * np.linalg.norm(points, axis=1)).mean() >= MOST_IN_VIEW)
 
 
-def read_frames(path: Path, reading: InputConfig) -> Iterator[tuple[RecordedFrame, Callable[[], SensorFrame]]]:
-    """Messages of a ROS recording's topic in their order, each with what decodes it; raises as ``read_frame``."""
-    for message in recorded_frames(path, *_recording_options(reading)):
-        yield message, partial(_of_message, message, path, reading)
+def read_messages(path: Path, reading: InputConfig) -> Iterator[RecordedFrame]:
+    """Messages of a ROS recording's topic in their order, for ``message_frame``; raises as ``read_frame``."""
+    return recorded_frames(path, *_recording_options(reading))
 
 
-def _of_message(message: RecordedFrame, path: Path, reading: InputConfig) -> SensorFrame:
+def message_frame(message: RecordedFrame, path: Path, reading: InputConfig) -> SensorFrame:
+    """Frame that a message of a recording or of a camera holds; raises ``ValueError`` as ``read_frame``."""
     return in_camera(_recorded(message, path, reading), reading)
 
 

@@ -1,4 +1,4 @@
-"""Values of a mechanism's joints in an answer, with their intervals.
+"""Values of a mechanism's joints in an answer, with their intervals, and how sure its pose is.
 
 The material points of a registration are those of the mechanism in some pose, so its joint values are a least squares
 problem of few unknowns. The Jacobian at its end says how the values follow the points, whose uncertainty is known.
@@ -10,13 +10,14 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.linalg import norm
 from scipy.optimize import OptimizeResult, least_squares
-from scipy.special import ndtr
+from scipy.special import chdtri, ndtr
 
 from mereo.deformation.samplers import RandomMotion
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.registration import Registration
-from mereo.fitting.uncertainty import WITHIN
+from mereo.fitting.uncertainty import LEVEL, WITHIN
 from mereo.geometry.transforms import fit_rigid, transform_points
 from mereo.visualization.units import as_exact_as
 
@@ -110,15 +111,59 @@ def _reach(
 
     The parts are those of a radius (``RadiusParts``), without what each point has in addition: it averages out.
     """
+    follow = np.zeros((len(fit.x), len(registration.material), 3))
+    follow[:, rows] = np.linalg.pinv(fit.jac).reshape(len(fit.x), len(rows), 3) / registration.scene_unit
+    spread = _spread(registration, follow)
+    return None if spread is None else np.abs(spread[1]).max(axis=1, initial=0.0) + WITHIN * norm(spread[0], axis=1)
+
+
+# --- pose -------------------------------------------------------------------------------------------------------------
+
+
+def measure_pose_covariance(answer: Answer) -> Float[np.ndarray, "6 6"] | None:
+    """Measure the covariance of an answer's pose: of the place of the object's origin, then of turns about the axes.
+
+    Axes are the frame's, lengths its unit, angles radians. What is far from Gaussian, such as another state that
+    explains the frame as well, counts by its second moments. None where the network answers, and where the registration
+    was read from a file.
+    """
+    registration = answer.registered
+    if registration is None:
+        return None
+    material, origin = registration.material, registration.pose()[:3, 3]
+    middle = material.mean(axis=0)
+    arms = _crosses(material - middle)
+    # motion of the best rigid body: of its middle the mean one, and the turn whose angular momentum is that of all
+    turn = np.moveaxis(np.linalg.solve(np.einsum("nij,nkj->ik", arms, arms), arms), 0, 1)
+    shift = np.repeat(np.eye(3)[:, None] / len(material), len(material), axis=1)
+    shift -= np.tensordot(_crosses(origin - middle), turn, axes=1)
+    spread = _spread(registration, np.concatenate([shift, turn]))
+    if spread is None or registration.uncertainty is None:
+        return None
+    factor = np.hstack(spread)
+    covariance: np.ndarray = factor @ factor.T
+    extra = registration.uncertainty.optimum.unit * registration.uncertainty.extra_radius
+    covariance[range(3), range(3)] += extra**2 / chdtri(3, 1 - LEVEL)  # as of every position
+    return covariance
+
+
+def _crosses(arms: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
+    """Matrices whose products with vectors are cross products."""
+    return np.cross(arms[..., None, :], np.eye(3), axis=-1).swapaxes(-1, -2)
+
+
+def _spread(
+    registration: Registration, gradient: Float[np.ndarray, "c m 3"]
+) -> tuple[Float[np.ndarray, "c q"], Float[np.ndarray, "c o"]] | None:
+    """Factor of the covariance of numbers with this gradient by the material points, and their ways to other states.
+
+    None where the uncertainty of the points is not known.
+    """
     sure = registration.uncertainty
     if sure is None:
         return None
     posterior, unit = sure.posterior, sure.optimum.unit
     T_registration_fit = fit_rigid(unit * posterior.material, registration.material)
-    follow = np.linalg.pinv(fit.jac).reshape(len(fit.x), len(rows), 3) @ T_registration_fit[:3, :3]
-    gradient = np.zeros((len(fit.x), len(posterior.material), 3))
-    gradient[:, rows] = follow * (unit / registration.scene_unit)
-    far = np.tensordot(gradient, posterior.open, axes=2)
-    spread = np.hypot(sure.factor * np.linalg.norm(posterior.motion_of(gradient), axis=1), np.linalg.norm(far, axis=1))
-    away: np.ndarray = np.abs(np.tensordot(gradient, posterior.ways, axes=2)).max(axis=1, initial=0.0)
-    return away + WITHIN * spread
+    gradient = unit * gradient @ T_registration_fit[:3, :3]
+    near, far = sure.factor * posterior.motion_of(gradient), np.tensordot(gradient, posterior.open, axes=2)
+    return np.hstack([near, far]), np.tensordot(gradient, posterior.ways, axes=2)
