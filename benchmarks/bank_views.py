@@ -55,8 +55,9 @@ SEED = 2000
 CHIRAL = ("bunny", "engine", "liver", "tumor", "robot", "bracket")
 """Objects that differ from their mirror images."""
 
-WIDE = 192
-"""Pixels along each side of a stereo camera's image, and of one of a desk."""
+WIDE, STEREO_WIDE = 192, 640
+"""Pixels along each side of a stereo camera's image, and of one of a desk; of a desk by a stereo camera, whose edges are
+off by pixels of its own, whatever the object's size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -335,7 +336,8 @@ def things_around(size: float, inner: float, rng: np.random.Generator) -> list[P
 def desk_view(scene: Scene, condition: str, number: int, rng: np.random.Generator) -> tuple[Observation, View | None]:
     """Cluttered desk before a wall, by one camera after the other; of the object at least 60 % are to be seen."""
     camera = ("paper", *CAMERAS)[number % 4]
-    image = Camera.from_fov(WIDE, WIDE, float(np.deg2rad(45)))
+    pixels = STEREO_WIDE if camera == "stereo" else WIDE
+    image = Camera.from_fov(pixels, pixels, float(np.deg2rad(45)))
     sensor = sensor_of(scene, camera)
     for _ in range(100):
         state = scene.sample_state(rng)

@@ -488,10 +488,6 @@ HEAVY, HEAVIER_STEPS, HELPS = 3000.0, (0.04, 12), 0.65
 """Weight of a cloud that an elastic solid explains only under it, the first sigma and the steps of the fit with it, and
 the share of the misfit that may be left: bends of a bunny's ears leave .45 to .54, states of livers .77 up."""
 
-NOISE_ALONE = (0.3, 0.6)
-"""Misfits of a camera's frame between which nothing but its noise is left over, .44 where that is normal: wrong states
-leave more, or less where their error is taken for noise (docs/experiments/077.md)."""
-
 WHOLE = 150.0
 """Misfit by which an object that is seen whole may be explained worse than one that something hides in part: it is on
 36 of 40 whole training views, and on none of 40 of which 30 % are hidden."""
@@ -527,12 +523,6 @@ class Trail:
         """Whether that explains the frame."""
         return self.best.explains(self.problem)
 
-    @property
-    def is_sure(self) -> bool:
-        """Whether other states need not be tried: a clean frame is explained, or a camera's but for its noise."""
-        is_noise = self.problem.is_camera and NOISE_ALONE[0] < self.best.misfit.cloud < NOISE_ALONE[1]
-        return is_noise if self.problem.noisy else self.is_explained
-
     def go_on(self, stage: SearchRound) -> None:
         """Fit the candidates of a round that may be the best, and explore from there."""
         ranked = bend_by_few(self.problem, screen_poses(self.problem, stage), stage.fitted)
@@ -565,28 +555,30 @@ class Trail:
         heavier = ScoredFit.of(problem, fit_cloud(problem, best.posed, Prior.whole(problem.model), *HEAVIER_STEPS, 0.0))
         return Trail(problem, 0.0, [heavier]) if heavier.misfit.cloud < HELPS * best.misfit.cloud else None
 
-    def with_noise(self, only_sure: bool) -> "Trail | None":
+    def with_noise(self, only_explained: bool) -> "Trail | None":
         """The same with the constants for what the best fit leaves over, where that is noise and not the fit's error.
 
-        None where that is not so, or the frame is explained, and with ``only_sure`` where it is not sure, as after the
-        first round: a wrong state may leave over what looks like noise, above all like noise that neighbours share.
+        None where that is not so, or the frame is explained, and with ``only_explained`` where noise does not explain
+        the rest, as after the first round: a wrong state may leave over what looks like noise that neighbours share.
         """
         if self.is_explained:
             return None
-        for is_shared in (False,) if only_sure else (False, True):
+        for is_shared in (False,) if only_explained else (False, True):
             noisy = self.problem.as_noisy_as(self.best.surface, is_shared)
             if noisy is None:
                 continue
             first = Trail(noisy, 0.0, [refined(noisy, fit_wide(noisy, self.best.posed))])
-            if first.leaves_noise(is_shared, only_sure):  # of most wrong states it does not, in a tenth of the time
+            if first.leaves_noise(
+                is_shared, only_explained
+            ):  # of most wrong states it does not, in a tenth of the time
                 trail = self.again(noisy, first.fitted)
-                if trail.leaves_noise(is_shared, only_sure):
+                if trail.leaves_noise(is_shared, only_explained):
                     return trail
         return None
 
-    def leaves_noise(self, is_shared: bool, only_sure: bool) -> bool:
-        """``Problem.leaves_noise`` of the best state, with ``only_sure`` only where that is sure."""
-        return self.problem.leaves_noise(self.best.surface, is_shared) and (self.is_sure or not only_sure)
+    def leaves_noise(self, is_shared: bool, only_explained: bool) -> bool:
+        """``Problem.leaves_noise`` of the best state, with ``only_explained`` only where it explains the frame."""
+        return self.problem.leaves_noise(self.best.surface, is_shared) and (self.is_explained or not only_explained)
 
     def again(self, noisy: Problem, begun: Sequence[ScoredFit] = ()) -> "Trail":
         """The same from its best states that differ, of which ``begun`` are fitted, in the problem of this noise."""
@@ -640,15 +632,15 @@ def search(
         better, is_last = chosen.with_heavier_cloud(), stage is rounds[-1]
         if better is None and chosen.best.misfit.cloud >= whole.config.unexplained:
             better = search_noisy(trails, chosen, not is_last)
-        if better is not None and (is_last or better.is_sure):
+        if better is not None and (is_last or better.is_explained):
             return better
     return chosen
 
 
-def search_noisy(trails: list[Trail], chosen: Trail, only_sure: bool) -> Trail | None:
+def search_noisy(trails: list[Trail], chosen: Trail, only_explained: bool) -> Trail | None:
     """``Trail.with_noise``; one other than the first, of a whole object, must win by the noise's constants too."""
     # to a clean frame's constants, noise at the rim looks like more than ``WHOLE``
-    noisy, whole = chosen.with_noise(only_sure), trails[0]
+    noisy, whole = chosen.with_noise(only_explained), trails[0]
     if noisy is None or chosen is whole:
         return noisy
     evidence = replace(noisy.problem.evidence, other_lines=whole.problem.evidence.other_lines)

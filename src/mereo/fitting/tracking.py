@@ -88,7 +88,7 @@ class Track:
             time_s=time_s,
             velocity=np.zeros(POSE + model.count),
             unsure=config.first_speed,
-            noise=base.residual_noise(fitted.surface),
+            noise=base.camera_noise(fitted.surface),
             clean=clean,
             other_lines=base.evidence.other_lines,
             area=base.evidence.area,
@@ -194,7 +194,7 @@ def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig)
     """Track with a further frame."""
     posed, scale = without_scale(fitted.posed)
     passed = max(time_s - track.time_s, 1e-3)
-    noise = track.noise + config.smoothing * (fitted.problem.residual_noise(fitted.surface) - track.noise)
+    noise = track.noise + config.smoothing * (fitted.problem.camera_noise(fitted.surface) - track.noise)
     return replace(
         track,
         problem=changed(

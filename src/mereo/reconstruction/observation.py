@@ -410,7 +410,7 @@ SILENT = 0.02
 well mean that the image was cut out or rendered."""
 
 FEWEST, ENOUGH = 4000, 20_000
-"""Pixels of a plane around the object that show a camera's noise, at least; and pixels by which the plane is found."""
+"""Pixels of a plane around the object that show a camera's noise; and pixels by which the plane is found."""
 
 ON_PLANE, FITS = 3.0, 8
 """Standard deviations from a plane up to which a pixel is on it, and fits to those that are."""
@@ -483,37 +483,47 @@ def lines_of_image(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SightLi
 def shared_noise(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> float:
     """Standard deviation of a camera's noise that neighbours share, at the distance of ``shown`` pixels.
 
-    What the largest plane around them leaves over beyond the noise of single pixels; infinite without such a plane. As
-    a share of the distance it is no less up close: there a camera's error stops to fall with its square.
+    What the largest plane around them leaves over beyond the noise of single pixels, where it is about as far away;
+    infinite without such a plane. Noise is taken to grow as the square of the distance, and to fall as the distance: up
+    close something else than disparity limits a camera.
     """
-    others = np.flatnonzero(np.where(shown, 0.0, whole.depth))
+    (height, width), depth = shown.shape, whole.depth
+    others = np.flatnonzero(np.where(shown, 0.0, depth))
     if len(others) < FEWEST or not (shown & whole.valid).any():
         return np.inf
-    v, u = np.indices(shown.shape)
-    terms = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) / shown.shape[1]
-    inverse = 1.0 / np.where(whole.valid, whole.depth, np.inf).ravel()
+    distance = float(np.median(depth[shown & whole.valid]))
+
+    def terms(pixels: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+        """What inverse depth is linear in along a plane."""
+        return np.stack([pixels % width, pixels // width, np.full(len(pixels), width)], axis=1) / width
+
     some = others[:: 1 + len(others) // ENOUGH]
-    points = whole.camera.directions().reshape(-1, 3)[some] / inverse[some, None]
+    places, inverse = terms(some), 1.0 / depth.ravel()[some]
+    points = whole.camera.unproject(width * places[:, :2] + 0.5, 1.0 / inverse)
     pixel = points[:, 2] / min(whole.camera.focal_x_px, whole.camera.focal_y_px)
     plane = largest_plane(points, pixel, np.random.default_rng(0))
     if plane is None:
         return np.inf
     is_on = plane.distance(points) <= pixel
-    for _ in range(FITS):  # along planes inverse depth is linear in the picture
-        linear = np.linalg.lstsq(terms[some[is_on]], inverse[some[is_on]])[0]
-        off = inverse[some] - terms[some] @ linear
+    for _ in range(FITS):
+        linear = np.linalg.lstsq(places[is_on], inverse[is_on])[0]
+        off = inverse - places @ linear
         noise = float(np.sqrt(np.mean(off[is_on] ** 2)))
         is_on = np.abs(off) <= ON_PLANE * noise
-    flat = np.zeros_like(whole.depth)
-    rows = others[np.abs(inverse[others] - terms[others] @ linear) <= ON_PLANE * noise]
+    expected = terms(others) @ linear
+    rows = np.flatnonzero(np.abs(1.0 / depth.ravel()[others] - expected) <= ON_PLANE * noise)
     if len(rows) < FEWEST:
         return np.inf
-    flat.ravel()[rows] = whole.depth.ravel()[rows]
-    alone = noise_of_differences(second_differences(flat, 1), second_differences(flat.T, 1))
-    distance = float(np.median(whole.depth[shown & whole.valid]))
-    return (
-        float(np.sqrt(max(noise**2 - alone**2, 0.0))) * distance * max(distance, float(np.median(flat.ravel()[rows])))
-    )
+    near = np.argpartition(np.abs(np.log(expected[rows] * distance)), FEWEST - 1)[:FEWEST]
+    rows = others[rows[near]]
+    flat = np.zeros(depth.size)
+    flat[rows] = depth.ravel()[rows]
+    left = flat.reshape(height, width)
+    alone = noise_of_differences(second_differences(left, 1), second_differences(left.T, 1))
+    places, inverse = terms(rows), 1.0 / flat[rows]
+    off = inverse - places @ np.linalg.lstsq(places, inverse)[0]
+    shared = float(np.sqrt(max(np.mean(off**2) - alone**2, 0.0)))
+    return shared * distance * max(distance, float(np.median(flat[rows])))
 
 
 def _evenly(

@@ -123,11 +123,6 @@ class Problem:
         return PairTerm.of(self.model)
 
     @property
-    def is_camera(self) -> bool:
-        """Whether the noise is a camera's."""
-        return self.noisy and self.config.cloud_sigma >= SIGMAS * CAMERA
-
-    @property
     def network_sigma(self) -> float:
         """Standard deviation of a correspondence, scene units."""
         return self.config.start_sigma * self.model.half
@@ -142,6 +137,11 @@ class Problem:
     def residual_noise(self, surface: Surface) -> float:
         """Noise of the frame, in scene units, as a fit with this surface leaves it over."""
         return noise_of(self.offsets(surface), self.evidence.around)
+
+    def camera_noise(self, surface: Surface) -> float:
+        """The same, with as much of what neighbours share of it as they do around the object."""
+        alone = self.residual_noise(surface)
+        return min(max(noise_of(self.offsets(surface)), alone), float(np.hypot(alone, self.evidence.expected_noise)))
 
     def as_noisy_as(self, surface: Surface, is_shared: bool = False) -> "Problem | None":
         """The problem of a frame as noisy as what a fit leaves over; None where the constants are for one like that.
@@ -246,9 +246,8 @@ class Problem:
     @cached_property
     def coarse(self) -> "Problem":
         """Problem with fewer points, for the choice among many states."""
-        exact_steps = 0 if self.noisy else self.config.exact_steps  # its sigma would use the faces in all steps
         few = self.config.silhouette_vertices // COARSE
-        config = replace(self.config, samples=1000, silhouette_vertices=few, exact_steps=exact_steps)
+        config = replace(self.config, samples=1000, silhouette_vertices=few, exact_steps=0)
         some = slice(None, None, COARSE)
         network = NetworkTerm(*(part[some] for part in vars(self.network).values()))
         evidence = self.evidence.few(OBSERVED_SAMPLES // COARSE)
