@@ -155,7 +155,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
         lambda: mereo.load_object("rope", units="mm"), "^the units are mm, but rope says its own: leave"
     ),
     "isolation": (
-        lambda: mereo.reconstruct(seen(), MODEL, isolation={}), "^isolation is {}; it must be an IsolationConfig"
+        lambda: mereo.reconstruct(seen(), MODEL, isolation=3), "^isolation is 3; it must be an IsolationConfig"
     ),
     "an extent": (
         lambda: mereo.reconstruct(seen(), MODEL, extent="half"),

@@ -1,25 +1,35 @@
-"""Frames that are already in memory: what other libraries call a point cloud, as mereo's own types.
+"""Frames and meshes that are already in memory: what other libraries call a point cloud, as mereo's own types.
 
     anything -points_of-> PointCloud (or the DepthImage that it was), number of points left out
+    meshes, by names or not -mesh_of-> SegmentedMesh
 
 Libraries are recognized by what their objects have, so that none of them is imported. What could be meant in two ways
 is refused: an image of depths has no positions without its camera, and the columns of a table name no axes.
 """
 
+import warnings
+from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Num
 from PIL import Image
 
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import DepthImage, PointCloud
 from mereo.geometry.conventions import LARGEST, check_real
+from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.io.errors import reason
-from mereo.io.readers import valid_points
-from mereo.io.ros_recordings import cloud_points
+from mereo.io.mesh_formats import read_segmented_mesh
+from mereo.io.readers import InputWarning, valid_points
+from mereo.io.ros_recordings import cloud_points, depth_pixels
+
+FACES = ("regular_faces", "faces", "triangles")
+"""Attributes with the triangles of a mesh: PyVista's, whose ``faces`` are of another form, trimesh's and Open3D's."""
 
 
 def points_of(source: object, drop_invalid: bool = False) -> tuple[PointCloud | DepthImage, int]:
@@ -29,7 +39,8 @@ def points_of(source: object, drop_invalid: bool = False) -> tuple[PointCloud | 
     64-bit floats in the source's order, axes and unit; grids are flattened row by row:
 
     - arrays n x 3 or h x w x 3 of integers or floats: numpy's, torch's of any device, and whatever else converts
-      itself into a numpy array; masked values are points without a measurement;
+      itself into a numpy array; masked values are points without a measurement. Of six columns the last three are unit
+      normals, which are used, or colours from 0 to 1 or 255, which are left out with an ``InputWarning``;
     - lists or tuples of rows of three numbers;
     - structured arrays with fields x, y and z in any order among others, in one or two dimensions;
     - objects with ``points`` or ``vertices`` (Open3D and its tensors, trimesh, PyVista), with their ``normals`` or
@@ -46,11 +57,12 @@ def points_of(source: object, drop_invalid: bool = False) -> tuple[PointCloud | 
     if isinstance(source, PointCloud | DepthImage):
         return source, 0
     with np.errstate(over="ignore", invalid="ignore"):  # infinite values are counted below, whoever made them
-        points, name, organized = _positions(source)
+        points, normals, name, organized = _positions(source)
         cure = "leave them out with drop_invalid=True"
         if organized:
             cure = "organized clouds mark pixels without a measurement so, and drop_invalid=True leaves them out"
-        kept = valid_points(_with_normals(points, source), name, drop_invalid, cure)
+        rows = _with_normals(points, source) if normals is None else np.hstack([points, normals])
+        kept = valid_points(rows, name, drop_invalid, cure)
     return PointCloud.of(kept), len(points) - len(kept)
 
 
@@ -74,7 +86,7 @@ def model_points(source: object) -> Float[np.ndarray, "n 3"]:
     if isinstance(source, PointCloud):
         return source.points
     with np.errstate(over="ignore", invalid="ignore"):
-        points, name, _ = _positions(source)
+        points, _, name, _ = _positions(source)
         if not len(points) or not (np.abs(points) <= LARGEST).all():
             raise ValueError(
                 f"{name} has no points, or some that are NaN, infinite or beyond {LARGEST:g}: correct them"
@@ -104,14 +116,14 @@ def _is_frame(item: object) -> bool:
     return _is_cloud_message(item) or _carried(item) is not None
 
 
-def _positions(source: Any) -> tuple[Float[np.ndarray, "n 3"], str, bool]:
-    """All points of a source, what to call it in sentences, and whether it is a grid of pixels."""
+def _positions(source: Any) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"] | None, str, bool]:
+    """All points of a source, normals in its rows, what to call it in sentences, and whether it is a grid of pixels."""
     kind = f"the {type(source).__name__}"
     if is_frame_list(source):
         raise ValueError(f"{kind} holds {counted(len(source), 'frame')}; one is needed: give its elements one by one")
     if _is_cloud_message(source):
         try:
-            return cloud_points(source), "the PointCloud2 message", source.height > 1
+            return cloud_points(source), None, "the PointCloud2 message", source.height > 1
         except Exception as error:  # whatever a broken message makes of the parser
             raise ValueError(
                 f"the PointCloud2 message cannot be read ({reason(error)}): take another message"
@@ -134,13 +146,30 @@ def _positions(source: Any) -> tuple[Float[np.ndarray, "n 3"], str, bool]:
     values = _array(source, kind)
     name = f"{kind} of shape {values.shape}"
     if values.dtype.names is not None:
-        return _structured_points(values, name), name, values.ndim > 1
+        return _structured_points(values, name), None, name, values.ndim > 1
     check_real(values, name)
     if values.size == 0:
-        return np.empty((0, 3)), name, False
+        return np.empty((0, 3)), None, name, False
+    normals = None
+    if values.ndim in (2, 3) and values.shape[-1] == 6:
+        normals, values = _normals(_floats(values[..., 3:]).reshape(-1, 3), name), values[..., :3]
     if wrong := _what_else(values):
         raise ValueError(f"{name} {wrong}")
-    return _floats(values).reshape(-1, 3), name, values.ndim == 3
+    return _floats(values).reshape(-1, 3), normals, name, values.ndim == 3
+
+
+def _normals(columns: Float[np.ndarray, "n 3"], name: str) -> Float[np.ndarray, "n 3"] | None:
+    """Normals that three more columns of points are; None of colours. Rows that are not finite or 0 say nothing."""
+    known = columns[np.isfinite(columns).all(axis=1) & columns.any(axis=1)]
+    if (np.abs(np.linalg.norm(known, axis=1) - 1) < 0.01).all() and (known < 0).any():
+        return columns
+    if (known < 0).any() or not ((known <= 1).all() or ((known <= 255).all() and (known == np.rint(known)).all())):
+        raise ValueError(
+            f"{name} has six columns, of which the last three are neither unit normals nor colours from 0 to 1 or 255: "
+            "give the positions alone, as points[:, :3]"
+        )
+    warnings.warn(f"the last three columns of {name} are colours, which are left out", InputWarning, stacklevel=6)
+    return None
 
 
 def _is_cloud_message(source: object) -> bool:
@@ -188,8 +217,7 @@ def mask_image(mask: Any) -> Image.Image:
     name = f"the mask of shape {values.shape}"
     if values.dtype != np.bool_:
         check_real(values, name)
-    while values.ndim > 2 and len(values) == 1:
-        values = values[0]
+    values = _one_image(values)
     if values.ndim != 2 or not values.size:
         raise ValueError(
             f"{name} is not one mask of h x w pixels; of several one is needed: choose it, as masks[scores.argmax()]"
@@ -203,6 +231,114 @@ def mask_image(mask: Any) -> Image.Image:
             "truth values, as mask > 127"
         )
     return Image.fromarray(values > 0 if low < 0 else values >= 0.5)
+
+
+def depth_values(source: Any) -> Num[np.ndarray, "h w"]:
+    """Stored values of a depth image in memory, as they are.
+
+    Args:
+        source: h x w numbers, 1 x h x w or h x w x 1, of whatever library; an image of Pillow or Open3D, or the
+            ``depth`` of an RGB-D image; a message of the type sensor_msgs/Image.
+
+    Raises ``ValueError`` for what is none of these, and for other shapes.
+    """
+    if isinstance(source, DepthImage):
+        raise ValueError("intrinsics are given for a DepthImage, which has its camera: leave them out")
+    if all(hasattr(source, name) for name in ("encoding", "step", "data", "height", "width")):
+        try:
+            return depth_pixels(source)
+        except Exception as error:  # whatever a broken message makes of the parser
+            raise ValueError(f"the Image message is no depth image ({reason(error)}): take the depth topic's") from None
+    source = getattr(source, "depth", source)
+    raw = _array(source, f"the depth image, a {type(source).__name__},", "pixels are needed: give h x w values")
+    check_real(raw, "the depth image")
+    values = _one_image(raw)
+    if values.ndim != 2:
+        raise ValueError(f"the depth image has the shape {raw.shape}; it must be rows of pixels: give h x w values")
+    return values
+
+
+def _one_image(values: np.ndarray) -> np.ndarray:
+    """Pixels without the axes of one that networks put before or behind them."""
+    while values.ndim > 2 and 1 in (values.shape[0], values.shape[-1]):
+        values = values[0] if len(values) == 1 else values[..., 0]
+    return values
+
+
+# --- meshes -----------------------------------------------------------------------------------------------------------
+
+
+def mesh_of(source: Any) -> SegmentedMesh | None:
+    """Mesh of whatever holds the parts of an object in memory; None of what holds none.
+
+    Args:
+        source: a ``SegmentedMesh``; a mapping of names to parts, or a scene of trimesh; a list of parts, or one alone. A
+            part is a ``Segment``, an object with vertices and faces (trimesh, Open3D, PyVista), a tuple (vertices,
+            faces), or in a mapping the path of a mesh file. Parts without a name are called part1, part2, ...
+
+    Raises ``ValueError`` for a mapping or list of which not all are parts, and for other faces than of three vertices.
+    """
+    if isinstance(source, SegmentedMesh):
+        return source
+    if hasattr(source, "geometry") and hasattr(source, "graph"):
+        placed = {name: source.graph[name] for name in source.graph.nodes_geometry}
+        source = {name: source.geometry[part].copy().apply_transform(T) for name, (T, part) in placed.items()}
+    if isinstance(source, Mapping):
+        named = {str(name): _part(part, str(name)) for name, part in source.items()}
+    elif (alone := _part(source, "")) is not None:
+        named = {"": alone}
+    elif isinstance(source, list | tuple) and any(_part(part, "") is not None for part in source):
+        named = {str(number): _part(part, "") for number, part in enumerate(source, start=1)}
+    else:
+        return None
+    if not named or (missing := [name for name, part in named.items() if part is None]):
+        what = f"its part {missing[0]!r} is none" if named else "it has none"
+        raise ValueError(f"the {type(source).__name__} must hold meshes, and {what}: give vertices and faces of each")
+    parts = (part for part in named.values() if part is not None)
+    return SegmentedMesh(
+        tuple(
+            part if part.name else replace(part, name=f"part{index + 1}", color=PALETTE[index % len(PALETTE)])
+            for index, part in enumerate(parts)
+        )
+    )
+
+
+def _part(source: Any, name: str) -> Segment | None:
+    """One mesh as a segment of this name, or of its own where that is empty; None of what is none."""
+    if isinstance(source, Segment):
+        return replace(source, name=name or source.name)
+    if isinstance(source, str | PathLike):
+        mesh = read_segmented_mesh(Path(source)) if name else None
+        return None if mesh is None or len(mesh.segments) > 1 else replace(mesh.segments[0], name=name)
+    faces: Any = None
+    if isinstance(source, tuple) and len(source) == 2 and all(map(_is_table, source)):
+        vertices, faces = source
+    elif (vertices := _carried(source)) is not None:
+        faces = next((each for key in FACES if (each := getattr(source, key, None)) is not None), None)
+        if faces is None and hasattr(source, "triangle"):  # Open3D's tensor meshes
+            faces = source.triangle["indices"]
+    if faces is None:
+        return None
+    points, corners = (
+        _array(each, f"the {key} of the mesh") for key, each in (("vertices", vertices), ("faces", faces))
+    )
+    if points.shape[1:] != (3,) or corners.shape[1:] != (3,) or corners.dtype.kind not in "iu":
+        raise ValueError(
+            f"the mesh has vertices of shape {points.shape} and faces of {corners.shape} ({corners.dtype}); they must "
+            "be v x 3 numbers and f x 3 whole ones: split its faces into triangles"
+        )
+    known = getattr(source, "metadata", None)
+    own = str(known.get("name") or Path(known.get("file_name") or "").stem) if isinstance(known, Mapping) else ""
+    return Segment(name or own, PALETTE[0], points.astype(np.float64), corners.astype(np.int64), solid=False)
+
+
+def _is_table(value: Any) -> bool:
+    with suppress(ValueError):  # of rows that differ in length
+        return bool(np.ndim(value if hasattr(value, "ndim") or isinstance(value, list | tuple) else None) == 2)
+    return False
+
+
+# --- arrays of other libraries ----------------------------------------------------------------------------------------
 
 
 def _array(
