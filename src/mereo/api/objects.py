@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, get_args
+from typing import Any
 
 from mereo.api.words import python_words
 from mereo.fitting.config import AnswerMethod
@@ -35,7 +35,7 @@ from mereo.scenes.scene import SCENES, AssetUnavailable, Scene
 from mereo.scenes.statistical_model import StatisticalModel
 
 Source = Any
-"""What an object is loaded from: a scene, weights, files, or meshes in memory."""
+"""An ``Object``, or what it is loaded from: a scene, weights, files, or meshes in memory."""
 
 OPTIONS = ("scene", "weights", "units", "deformations", "device", "precision")
 """Options of ``load_object``."""
@@ -92,9 +92,7 @@ class Object:
 
         Raises ``ValueError`` for a method that there is none of, and where it cannot be had of this object.
         """
-        if method not in get_args(AnswerMethod):
-            known = ", ".join(get_args(AnswerMethod))
-            raise ValueError(f"the method is {method!r}; it must be one of {known}: correct the spelling")
+        check_value("method", method, AnswerMethod, "auto")
         if method == "network" and self.network is None:
             raise ValueError(
                 "the method is network, but the object has no weights: name them with --weights, or leave it out"
@@ -136,7 +134,7 @@ class WithoutWeightsWarning(UserWarning):
 
 @python_words()
 def load_object(
-    source: Source | None = None,
+    source: Source = None,
     scene: Scene | str | Path | None = None,
     *,
     weights: Trained | str | Path | None = None,
@@ -149,7 +147,7 @@ def load_object(
 
     Args:
         source: its meshes, one file for each segment, one file of named parts, a robot's URDF or SDF file, a folder of
-            any of these, or label volumes, one or one for each segment; meshes in memory: of trimesh, Open3D or PyVista,
+            any of these, or label volumes, one or one for each segment; meshes in memory, of trimesh, Open3D, PyVista
             or (vertices, faces), as a dict by the segments' names or a list; a scene file, a built-in scene's name or a
             scene; the folder that ``mereo learn`` has written; or weights: a shipped name, a file, or some that are
             loaded already. A name that both weights and a scene have means the weights, which know that scene; without
@@ -211,10 +209,10 @@ def _built_in_by_model(name: str) -> Object:
     return Object(None, scene, model=statistical_model_in(name), known_as=name)
 
 
-def object_of(given: Object | Source, **options: Any) -> Object:
+def object_of(given: Source, **options: Any) -> Object:
     """Object of whatever a caller has of it; ``options`` are those of ``load_object``."""
     if options and isinstance(given, Object):
-        raise ValueError(f"{', '.join(options)} is given for an object that is loaded already: give it to load_object")
+        raise ValueError(f"{min(options)} is given for an object that is loaded already: give it to load_object")
     return given if isinstance(given, Object) else load_object(given, **options)
 
 

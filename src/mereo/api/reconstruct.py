@@ -13,14 +13,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, overload
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from mereo.api.objects import OPTIONS, Object, Source, object_of
 from mereo.api.result import Result
 from mereo.api.words import check_names, in_callers_words, names_of, python_words, with_changes
 from mereo.fitting.config import AnswerMethod
-from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.camera import DepthImage
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.transforms import checked_pose
 from mereo.io.bounds import Instances
@@ -43,30 +42,29 @@ from mereo.reconstruction.observation import (
 )
 from mereo.synthesis.sample_views import shipped_frame, shipped_frames
 
+Isolation = IsolationConfig | Mapping[str, Any] | None
+"""What of a frame is left out: settings, or a dict of some of their fields."""
+
 # --- frames -----------------------------------------------------------------------------------------------------------
 
-FRAME_OPTIONS = (*(name for name in names_of(InputConfig) if name != "frame"), "axes")
+FRAME_OPTIONS = {*names_of(InputConfig), "axes"} - {"frame"}
 """Options of ``load_frame``."""
 
-RECONSTRUCT_OPTIONS = (
+RECONSTRUCT_OPTIONS = {
     *("method", "resolution", "isolation", "label_points", "initial_pose", "instances"),
     *(*FRAME_OPTIONS, *names_of(IsolationConfig), *OPTIONS),
-)
+}
 """Options of ``reconstruct``."""
 
 PLACES = {
-    "frame": "axes are given as axes='camera' or axes='scanner'",
-    **dict.fromkeys(("output", "out"), "result.save(path) writes the folder, or one file"),
-    **dict.fromkeys(("formats", "millimetres"), "it is one of result.save(path, formats=..., millimetres=...)"),
-    **dict.fromkeys(("force", "overwrite"), "it is one of result.save(path, overwrite=True)"),
-    **dict.fromkeys(("carry", "carry_frame"), "result.carry(what, files=...) carries points, meshes, poses and files"),
-    "json": "result.to_dict() is the summary",
-    "uncertainty": "result.covariance, result['name'].error_radius and result.registered.uncertainty have it",
-    **dict.fromkeys(("ray", "task"), "a list of frames is answered one by one; mereo reconstruct --ray spreads them"),
-    "threads": "set OMP_NUM_THREADS before Python starts",
-    "options_from": "give the options by their names, as **json.load(file)",
+    "frame": "axes='scanner' states the axes",
+    **dict.fromkeys(
+        ("output", "formats", "millimetres", "force"), "result.save(path, formats=..., overwrite=True) has it"
+    ),
+    **dict.fromkeys(("carry", "carry_frame"), "result.carry(what, files=...) has it"),
+    **dict.fromkeys(("json", "threads", "ray", "task", "options_from"), "the command alone has it"),
 }
-"""Where what `mereo reconstruct` calls options is in Python, if not an option of ``reconstruct``."""
+"""Where options of `mereo reconstruct` are in Python that are none of ``reconstruct``."""
 
 
 @python_words()
@@ -126,8 +124,8 @@ def load_frame(
         return in_camera(frame, reading, pose)
     path = Path(source)
     if str(source) in shipped_frames() and not (path.is_file() or is_recording(path)):
-        stated = (axes, intrinsics, pose, *(() if mask is None else (mask,)))
-        if any(each is not None for each in stated) or replace(reading, drop_invalid=False) != InputConfig():
+        stated = axes is not None or intrinsics is not None or pose is not None
+        if stated or replace(reading, drop_invalid=False) != InputConfig():
             raise ValueError(f"the shipped frame {str(source)!r} is in metres and needs no options: leave them out")
         return shipped_frame(str(source))
     if not path.exists() and path.suffix == "":
@@ -190,21 +188,21 @@ def observation_of(frame: Any, isolation: IsolationConfig, reading: dict[str, An
 
 @overload
 def reconstruct(
-    frame: list[Any] | tuple[Any, ...], object: Object | Source, method: AnswerMethod = ..., **options: Any
+    frame: list[Any] | tuple[Any, ...], object: Source, method: AnswerMethod = ..., **options: Any
 ) -> list[Result]: ...
 
 
 @overload
-def reconstruct(frame: Any, object: Object | Source, method: AnswerMethod = ..., **options: Any) -> Result: ...
+def reconstruct(frame: Any, object: Source, method: AnswerMethod = ..., **options: Any) -> Result: ...
 
 
 def reconstruct(
     frame: Any,
-    object: Object | Source,
+    object: Source,
     method: AnswerMethod = "auto",
     *,
     resolution: int = 128,
-    isolation: IsolationConfig | Mapping[str, Any] | None = None,
+    isolation: Isolation = None,
     label_points: bool = False,
     initial_pose: ArrayLike | None = None,
     **options: Any,
@@ -219,8 +217,8 @@ def reconstruct(
             leaves the network alone; "search" leaves it out; "modes" and "full" take the registered model in any case,
             "full" by fitting the parameters of its scene as well. Without weights, "auto" is "search".
         resolution: cells along the longest side of the object's box.
-        isolation: what of the frame is left out, or a dict of its fields; lengths in metres, or in the frame's unit where
-            that is not known.
+        isolation: what of the frame is left out, or a dict of its fields; lengths in metres, or in the frame's unit
+            where that is not known.
         label_points: also say on which segment each observed point lies (``Result.reconstruction.observed``).
         initial_pose: rough pose of the object, as ``Result.pose``, from which the fit starts instead of a search or a
             network; what the scene holds (``held``) stays there. Both units must be known.
@@ -323,11 +321,11 @@ class Tracker:
 
     def __init__(
         self,
-        object: Object | Source,
+        object: Source,
         method: AnswerMethod = "auto",
         *,
         executor: Executor | None = None,
-        isolation: IsolationConfig | Mapping[str, Any] | None = None,
+        isolation: Isolation = None,
         initial_pose: ArrayLike | None = None,
     ) -> None:
         """Follow an object.
@@ -357,7 +355,7 @@ class Tracker:
         frame: Any,
         time_s: float,
         *,
-        isolation: IsolationConfig | Mapping[str, Any] | None = None,
+        isolation: Isolation = None,
         **options: Any,
     ) -> Result:
         """Find the object in the next frame.

@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from mereo.api.words import python_words, with_changes
 from mereo.fitting.config import AnswerMethod
@@ -183,9 +183,7 @@ def learn(
     """
     given = object if isinstance(object, Iterable) and not isinstance(object, str) else [object]
     files, folder = [checked_path(file, "object") for file in given], checked_path(output, "output")
-    if train not in get_args(TrainChoice):
-        known = ", ".join(get_args(TrainChoice))
-        raise ValueError(f"train is {train!r}; it must be one of {known}: correct the spelling")
+    check_value("train", train, TrainChoice, "auto")
     check_value("minutes", minutes, Positive, 10.0)
     if units is not None:
         check_value("units", units, LengthUnit, "mm")

@@ -80,9 +80,9 @@ def python_words() -> Iterator[None]:
 Settings = TypeVar("Settings")
 
 
-def names_of(settings: type, *more: str) -> tuple[str, ...]:
-    """Names of a dataclass's fields, and more."""
-    return (*(item.name for item in fields(settings)), *more)
+def names_of(settings: type) -> tuple[str, ...]:
+    """Names of a dataclass's fields."""
+    return tuple(item.name for item in fields(settings))
 
 
 def check_names(given: Iterable[str], known: Collection[str], places: Mapping[str, str] | None = None) -> None:

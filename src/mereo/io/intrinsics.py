@@ -87,7 +87,7 @@ def written_intrinsics(camera: Camera) -> dict[str, float]:
 
 
 def stated_fields(source: Any) -> Fields:
-    """Fields of intrinsics in memory, of plain values: of a mapping, a message or object of another library, or numbers.
+    """Fields of intrinsics in memory: of a mapping, of a message or object of another library, or of numbers.
 
     Understood: names as of ``read_intrinsics``, as keys or as attributes (ROS ``CameraInfo``, Open3D's and RealSense's
     intrinsics); 3 x 3, 3 x 4 or 4 x 4 numbers; fx, fy, cx, cy. Raises ``ValueError`` for what is none of these.
@@ -102,9 +102,10 @@ def stated_fields(source: Any) -> Fields:
         numbers = np.asarray(source, dtype=np.float64)
         return {"K": numbers.tolist()} if numbers.shape == (3, 3) else _fields_of_numbers(numbers.ravel().tolist())
     except (TypeError, ValueError):
+        text = " ".join(repr(source).split())
         raise ValueError(
-            f"intrinsics is {_brief(source)}; it must be a camera: give 3 x 3 numbers, (fx, fy, cx, cy), a dict of "
-            "these, a CameraInfo, a mereo.Camera, or the path of a file"
+            f"intrinsics is {text[:80]}; it must be a camera: give 3 x 3 numbers, (fx, fy, cx, cy), a dict of these, a "
+            "CameraInfo, a mereo.Camera, or the path of a file"
         ) from None
 
 
@@ -120,18 +121,13 @@ def intrinsics_of(source: Any, size: tuple[int, int] | None = None) -> Intrinsic
     try:
         intrinsics = Intrinsics(camera_from_fields(fields, size), _depth_scale(fields))
     except (TypeError, ValueError) as error:
-        raise ValueError(f"intrinsics is {_brief(source)} and cannot be used ({error}): give 3 x 3 numbers") from None
+        raise ValueError(f"intrinsics cannot be used: {error}; give 3 x 3 numbers, or these fields") from None
     if amount := _distortion(intrinsics.camera, fields):
         raise ValueError(
-            f"the intrinsics state lens distortion ({amount}), and a depth image must have none: rectify it and give the "
-            "camera of the rectified one (ROS: the matrix P), or set the coefficients to 0 where that is done already"
+            f"the intrinsics state lens distortion ({amount}), and a depth image must have none: rectify it and give "
+            "the camera of the rectified one (ROS: the matrix P), or set the coefficients to 0 where that is done"
         )
     return intrinsics
-
-
-def _brief(value: object) -> str:
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 80 else f"{text[:80]}..."
 
 
 def read_intrinsics(

@@ -8,15 +8,14 @@ is refused: an image of depths has no positions without its camera, and the colu
 """
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Num
+from jaxtyping import Float, Int, Num
 from PIL import Image
 
 from mereo.geometry.brief import counted, listed
@@ -24,7 +23,6 @@ from mereo.geometry.camera import DepthImage, PointCloud
 from mereo.geometry.conventions import LARGEST, check_real
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.io.errors import reason
-from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.readers import InputWarning, valid_points
 from mereo.io.ros_recordings import cloud_points, depth_pixels
 
@@ -122,12 +120,7 @@ def _positions(source: Any) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray,
     if is_frame_list(source):
         raise ValueError(f"{kind} holds {counted(len(source), 'frame')}; one is needed: give its elements one by one")
     if _is_cloud_message(source):
-        try:
-            return cloud_points(source), None, "the PointCloud2 message", source.height > 1
-        except Exception as error:  # whatever a broken message makes of the parser
-            raise ValueError(
-                f"the PointCloud2 message cannot be read ({reason(error)}): take another message"
-            ) from error
+        return _decoded(cloud_points, source, "PointCloud2"), None, "the PointCloud2 message", source.height > 1
     if not isinstance(source, np.ndarray | list | tuple):
         if hasattr(source, "columns"):
             raise ValueError(
@@ -161,15 +154,23 @@ def _positions(source: Any) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray,
 def _normals(columns: Float[np.ndarray, "n 3"], name: str) -> Float[np.ndarray, "n 3"] | None:
     """Normals that three more columns of points are; None of colours. Rows that are not finite or 0 say nothing."""
     known = columns[np.isfinite(columns).all(axis=1) & columns.any(axis=1)]
-    if (np.abs(np.linalg.norm(known, axis=1) - 1) < 0.01).all() and (known < 0).any():
-        return columns
-    if (known < 0).any() or not ((known <= 1).all() or ((known <= 255).all() and (known == np.rint(known)).all())):
-        raise ValueError(
-            f"{name} has six columns, of which the last three are neither unit normals nor colours from 0 to 1 or 255: "
-            "give the positions alone, as points[:, :3]"
-        )
-    warnings.warn(f"the last three columns of {name} are colours, which are left out", InputWarning, stacklevel=6)
-    return None
+    if (known < 0).any():
+        if (np.abs(np.linalg.norm(known, axis=1) - 1) < 0.01).all():
+            return columns
+    elif known.max(initial=0) <= 1 or (known.max() <= 255 and (known == np.rint(known)).all()):
+        warnings.warn(f"the last three columns of {name} are colours, which are left out", InputWarning, stacklevel=7)
+        return None
+    raise ValueError(
+        f"{name} has six columns, of which the last three are neither unit normals nor colours from 0 to 1 or 255: "
+        "give the positions alone, as points[:, :3]"
+    )
+
+
+def _decoded(decode: Callable[[Any], np.ndarray], message: Any, kind: str) -> np.ndarray:
+    try:
+        return decode(message)
+    except Exception as error:  # whatever a broken message makes of the parser
+        raise ValueError(f"the {kind} message cannot be read ({reason(error)}): take another message") from error
 
 
 def _is_cloud_message(source: object) -> bool:
@@ -217,7 +218,7 @@ def mask_image(mask: Any) -> Image.Image:
     name = f"the mask of shape {values.shape}"
     if values.dtype != np.bool_:
         check_real(values, name)
-    values = _one_image(values)
+    values = values.squeeze() if values.ndim > 2 else values  # of networks
     if values.ndim != 2 or not values.size:
         raise ValueError(
             f"{name} is not one mask of h x w pixels; of several one is needed: choose it, as masks[scores.argmax()]"
@@ -242,26 +243,14 @@ def depth_values(source: Any) -> Num[np.ndarray, "h w"]:
 
     Raises ``ValueError`` for what is none of these, and for other shapes.
     """
-    if isinstance(source, DepthImage):
-        raise ValueError("intrinsics are given for a DepthImage, which has its camera: leave them out")
     if all(hasattr(source, name) for name in ("encoding", "step", "data", "height", "width")):
-        try:
-            return depth_pixels(source)
-        except Exception as error:  # whatever a broken message makes of the parser
-            raise ValueError(f"the Image message is no depth image ({reason(error)}): take the depth topic's") from None
+        return _decoded(depth_pixels, source, "Image")
     source = getattr(source, "depth", source)
     raw = _array(source, f"the depth image, a {type(source).__name__},", "pixels are needed: give h x w values")
     check_real(raw, "the depth image")
-    values = _one_image(raw)
+    values = raw.squeeze() if raw.ndim > 2 else raw  # of networks
     if values.ndim != 2:
         raise ValueError(f"the depth image has the shape {raw.shape}; it must be rows of pixels: give h x w values")
-    return values
-
-
-def _one_image(values: np.ndarray) -> np.ndarray:
-    """Pixels without the axes of one that networks put before or behind them."""
-    while values.ndim > 2 and 1 in (values.shape[0], values.shape[-1]):
-        values = values[0] if len(values) == 1 else values[..., 0]
     return values
 
 
@@ -272,46 +261,43 @@ def mesh_of(source: Any) -> SegmentedMesh | None:
     """Mesh of whatever holds the parts of an object in memory; None of what holds none.
 
     Args:
-        source: a ``SegmentedMesh``; a mapping of names to parts, or a scene of trimesh; a list of parts, or one alone. A
-            part is a ``Segment``, an object with vertices and faces (trimesh, Open3D, PyVista), a tuple (vertices,
-            faces), or in a mapping the path of a mesh file. Parts without a name are called part1, part2, ...
+        source: a ``SegmentedMesh``; a mapping of names to parts, or a scene of trimesh; a list of parts, or one alone.
+            A part is a ``Segment``, an object with vertices and faces (trimesh, Open3D, PyVista), or a tuple (vertices,
+            faces). Parts without a name are called part1, part2, ...
 
-    Raises ``ValueError`` for a mapping or list of which not all are parts, and for other faces than of three vertices.
+    Raises ``ValueError`` for a mapping or list of which not all are parts, and for other faces than triangles.
     """
     if isinstance(source, SegmentedMesh):
         return source
-    if hasattr(source, "geometry") and hasattr(source, "graph"):
-        placed = {name: source.graph[name] for name in source.graph.nodes_geometry}
-        source = {name: source.geometry[part].copy().apply_transform(T) for name, (T, part) in placed.items()}
-    if isinstance(source, Mapping):
-        named = {str(name): _part(part, str(name)) for name, part in source.items()}
-    elif (alone := _part(source, "")) is not None:
-        named = {"": alone}
-    elif isinstance(source, list | tuple) and any(_part(part, "") is not None for part in source):
-        named = {str(number): _part(part, "") for number, part in enumerate(source, start=1)}
-    else:
-        return None
-    if not named or (missing := [name for name, part in named.items() if part is None]):
-        what = f"its part {missing[0]!r} is none" if named else "it has none"
-        raise ValueError(f"the {type(source).__name__} must hold meshes, and {what}: give vertices and faces of each")
-    parts = (part for part in named.values() if part is not None)
-    return SegmentedMesh(
-        tuple(
-            part if part.name else replace(part, name=f"part{index + 1}", color=PALETTE[index % len(PALETTE)])
-            for index, part in enumerate(parts)
-        )
-    )
+    named: Any = parts_of_scene(source)
+    if not isinstance(named, Mapping):
+        is_list = isinstance(source, list | tuple) and _triangles(source) is None
+        named = dict(enumerate(source if is_list else [source]))
+        if _triangles(named.get(0)) is None:
+            return None
+    segments = list[Segment]()
+    for index, (key, part) in enumerate(named.items()):
+        if (mesh := _triangles(part)) is None:
+            raise ValueError(f"the part {key!r} of the object is no mesh, as all must be: give its vertices and faces")
+        known = getattr(part, "metadata", None) or {}
+        own = getattr(part, "name", None) or known.get("name") or known.get("file_name") or f"part{index + 1}"
+        name = key if isinstance(key, str) else Path(own).stem
+        color = getattr(part, "color", PALETTE[index % len(PALETTE)])
+        segments.append(Segment(name, color, *mesh, solid=getattr(part, "solid", False)))
+    return SegmentedMesh(tuple(segments))
 
 
-def _part(source: Any, name: str) -> Segment | None:
-    """One mesh as a segment of this name, or of its own where that is empty; None of what is none."""
-    if isinstance(source, Segment):
-        return replace(source, name=name or source.name)
-    if isinstance(source, str | PathLike):
-        mesh = read_segmented_mesh(Path(source)) if name else None
-        return None if mesh is None or len(mesh.segments) > 1 else replace(mesh.segments[0], name=name)
+def parts_of_scene(source: Any) -> Any:
+    """Meshes of a scene of trimesh, where they are in it, by the names of its nodes; anything else as it is."""
+    if not (hasattr(source, "geometry") and hasattr(source, "dump")):
+        return source
+    return {mesh.metadata["node"]: mesh for mesh in source.dump()}
+
+
+def _triangles(source: Any) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]] | None:
+    """Vertices and faces of a mesh of whatever library, or of a tuple of both; None of what is none."""
     faces: Any = None
-    if isinstance(source, tuple) and len(source) == 2 and all(map(_is_table, source)):
+    if isinstance(source, tuple) and len(source) == 2 and np.ndim(source[0]) == 2:
         vertices, faces = source
     elif (vertices := _carried(source)) is not None:
         faces = next((each for key in FACES if (each := getattr(source, key, None)) is not None), None)
@@ -319,23 +305,13 @@ def _part(source: Any, name: str) -> Segment | None:
             faces = source.triangle["indices"]
     if faces is None:
         return None
-    points, corners = (
-        _array(each, f"the {key} of the mesh") for key, each in (("vertices", vertices), ("faces", faces))
-    )
+    points, corners = _array(vertices, "the vertices of the mesh"), _array(faces, "the faces of the mesh")
     if points.shape[1:] != (3,) or corners.shape[1:] != (3,) or corners.dtype.kind not in "iu":
         raise ValueError(
-            f"the mesh has vertices of shape {points.shape} and faces of {corners.shape} ({corners.dtype}); they must "
-            "be v x 3 numbers and f x 3 whole ones: split its faces into triangles"
+            f"the mesh has vertices of shape {points.shape} and faces of {corners.shape}; they must be "
+            "v x 3 numbers and f x 3 whole ones: split its faces into triangles"
         )
-    known = getattr(source, "metadata", None)
-    own = str(known.get("name") or Path(known.get("file_name") or "").stem) if isinstance(known, Mapping) else ""
-    return Segment(name or own, PALETTE[0], points.astype(np.float64), corners.astype(np.int64), solid=False)
-
-
-def _is_table(value: Any) -> bool:
-    with suppress(ValueError):  # of rows that differ in length
-        return bool(np.ndim(value if hasattr(value, "ndim") or isinstance(value, list | tuple) else None) == 2)
-    return False
+    return points.astype(np.float64), corners.astype(np.int64)
 
 
 # --- arrays of other libraries ----------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Num
 
 from mereo.geometry.brief import counted
-from mereo.geometry.camera import Camera, DepthImage, PointCloud
+from mereo.geometry.camera import Camera, DepthImage, PointCloud, camera_axes
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import FEW_VERTICES, oriented_points
 from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
@@ -62,6 +62,8 @@ class SensorFrame:
         whole: the whole depth image, without any mask; None for clouds.
         T_input_result: from the coordinates of ``cloud``, in which results come out, to the file's, in its unit: the
             camera's pose, or what was taken away of a map's coordinates; None where nothing was moved.
+        T_result_seen: from the coordinates in which the object was looked for, whose axes ``axes`` names, to those of
+            ``cloud``, where a result was brought into another frame; None else.
     """
 
     path: Path
@@ -73,6 +75,7 @@ class SensorFrame:
     invalid: int = 0
     whole: DepthImage | None = None
     T_input_result: Float[np.ndarray, "4 4"] | None = None
+    T_result_seen: Float[np.ndarray, "4 4"] | None = None
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -91,6 +94,26 @@ class SensorFrame:
             )
         cloud = self.cloud.transformed(np.linalg.inv(T_input_camera))  # its digits may be few
         return replace(self, cloud=cloud, T_input_result=T_input_camera)
+
+    def transformed(self, T_new_result: Float[np.ndarray, "4 4"]) -> "SensorFrame":
+        """Frame in other coordinates, in which it has no pixels."""
+        T_input_result, T_result_seen = (
+            np.eye(4) if T is None else T for T in (self.T_input_result, self.T_result_seen)
+        )
+        return replace(
+            self,
+            cloud=self.cloud.transformed(T_new_result),
+            depth=None,
+            whole=None,
+            T_input_result=T_input_result @ inverse_rigid(T_new_result),
+            T_result_seen=T_new_result @ T_result_seen,
+        )
+
+    @property
+    def T_camera_result(self) -> Float[np.ndarray, "4 4"]:
+        """From the coordinates of ``cloud`` into the axes of a camera that looks at it (``camera_axes``)."""
+        turn = camera_axes(self.axes)
+        return turn if self.T_result_seen is None else turn @ inverse_rigid(self.T_result_seen)
 
     @property
     def metres(self) -> float:
@@ -268,9 +291,13 @@ def depth_frame(path: Path, raw: Num[np.ndarray, "h w"], reading: InputConfig, c
         intrinsics = intrinsics_of(camera, size)
     stated = None if raw.dtype.kind == "f" else intrinsics.depth_scale
     scale = stated if reading.depth_scale is None else reading.depth_scale
-    whole = along_z(depth_of(path, raw, scale, intrinsics.camera), reading)
+    return _of_image(depth_of(path, raw, scale, intrinsics.camera), path, reading)
+
+
+def _of_image(depth: DepthImage, path: Path, reading: InputConfig, message: str = "") -> SensorFrame:
+    whole = along_z(depth, reading)
     image = usable_depth(whole, path, reading.mask, reading.mask_value)
-    return SensorFrame(path, image.to_points(), 1.0, "camera", image, whole=whole)
+    return SensorFrame(path, image.to_points(), 1.0, reading.frame, image, message, whole=whole)
 
 
 def along_z(image: DepthImage, reading: InputConfig) -> DepthImage:
@@ -288,9 +315,7 @@ def _recording_options(reading: InputConfig, camera: Any = None) -> tuple[str | 
 def _recorded(message: RecordedFrame, path: Path, reading: InputConfig) -> SensorFrame:
     content = message.read()
     if isinstance(content, DepthImage):
-        content = along_z(content, reading)
-        image = usable_depth(content, path, reading.mask, reading.mask_value)
-        return SensorFrame(path, image.to_points(), 1.0, reading.frame, image, message.name, whole=content)
+        return _of_image(content, path, reading, message.name)
     if reading.mask is not None or reading.depth_along == "ray":
         raise ValueError(
             f"{message.topic} in {path} has point clouds; leave out the mask and --depth-along, or name an image's "

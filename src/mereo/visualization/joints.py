@@ -1,7 +1,8 @@
-"""Values of a mechanism's joints in an answer, with their intervals.
+"""Pose and values of a mechanism's joints in an answer, with their covariance and intervals.
 
 The material points of a registration are those of the mechanism in some pose, so its joint values are a least squares
-problem of few unknowns. The Jacobian at its end says how the values follow the points, whose uncertainty is known.
+problem of few unknowns, as its pose is one. The derivative at its end says how the values follow the points, whose
+uncertainty is known.
 """
 
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ from scipy.optimize import OptimizeResult, least_squares
 from scipy.special import ndtr
 
 from mereo.deformation.samplers import RandomMotion
+from mereo.fitting.problem.gauss_newton import rigid_motion
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.uncertainty import WITHIN
@@ -110,15 +112,48 @@ def _reach(
 
     The parts are those of a radius (``RadiusParts``), without what each point has in addition: it averages out.
     """
+    gradient = np.zeros((len(fit.x), len(registration.material), 3))
+    gradient[:, rows] = np.linalg.pinv(fit.jac).reshape(len(fit.x), len(rows), 3) / registration.scene_unit
+    if (moves := _moves(registration, gradient)) is None:
+        return None
+    gaussian, ways = moves
+    away: np.ndarray = np.abs(ways).max(axis=1, initial=0.0)
+    return away + WITHIN * np.linalg.norm(gaussian, axis=1)
+
+
+def pose_covariance(registration: Registration) -> Float[np.ndarray, "6 6"] | None:
+    """Covariance of ``Registration.pose``; None where the uncertainty of the points is not known.
+
+    Of a rotation vector w in radians, then a translation t in the input's unit, both in the axes of the registration:
+    the true pose is ``[exp(w) R, p + t]`` where the registered one is ``[R, p]``, so that w turns about the origin of
+    the object's own files, which lies at p. By the posterior that radii come from, times the square of their factor
+    (``Uncertainty.factor``), with what a frame leaves open by its second moments; other states that explain the frame
+    alike, and the radius that each point has in addition, are left out.
+    """
+    target, placed = registration.material, registration.pose()
+    source = transform_points(placed, registration.model.source_points(registration.scene_unit))
+    arm, aim = source - source.mean(axis=0), target - target.mean(axis=0)
+    # The turn w of the best rotation solves sum arm x (aim + shift) = 0 to first order: M w = sum arm x shift
+    turning = np.linalg.inv((arm * aim).sum() * np.eye(3) - arm.T @ aim)
+    turn = np.moveaxis(rigid_motion(arm)[:, :, :3] @ turning, 2, 0)
+    lever = target.mean(axis=0) - placed[:3, 3]
+    shift = np.eye(3)[:, None] / len(arm) - np.cross(turn, lever, axisa=0, axisc=0)
+    moves = _moves(registration, np.concatenate([turn, shift]))
+    return None if moves is None else moves[0] @ moves[0].T
+
+
+def _moves(
+    registration: Registration, gradient: Float[np.ndarray, "c m 3"]
+) -> tuple[Float[np.ndarray, "c p"], Float[np.ndarray, "c o"]] | None:
+    """How c numbers, of which the gradient by the material points is given, are unsure; None where points are not.
+
+    Their changes with independent standard normal numbers, and in each other state that explains the frame alike.
+    """
     sure = registration.uncertainty
     if sure is None:
         return None
     posterior, unit = sure.posterior, sure.optimum.unit
     T_registration_fit = fit_rigid(unit * posterior.material, registration.material)
-    follow = np.linalg.pinv(fit.jac).reshape(len(fit.x), len(rows), 3) @ T_registration_fit[:3, :3]
-    gradient = np.zeros((len(fit.x), len(posterior.material), 3))
-    gradient[:, rows] = follow * (unit / registration.scene_unit)
-    far = np.tensordot(gradient, posterior.open, axes=2)
-    spread = np.hypot(sure.factor * np.linalg.norm(posterior.motion_of(gradient), axis=1), np.linalg.norm(far, axis=1))
-    away: np.ndarray = np.abs(np.tensordot(gradient, posterior.ways, axes=2)).max(axis=1, initial=0.0)
-    return away + WITHIN * spread
+    gradient = unit * (gradient @ T_registration_fit[:3, :3])
+    far, ways = (np.tensordot(gradient, part, axes=2) for part in (posterior.open, posterior.ways))
+    return np.hstack([sure.factor * posterior.motion_of(gradient), far]), ways
