@@ -165,8 +165,8 @@ def split_options(isolation: Any, options: dict[str, Any]) -> tuple[IsolationCon
         )
     check_names(options, RECONSTRUCT_OPTIONS, PLACES)
     stated = isolation if isinstance(isolation, IsolationConfig) else with_changes(IsolationConfig(), isolation or {})
-    own = {name: options.pop(name) for name in names_of(IsolationConfig) if name in options}
-    return replace(stated, **own), options
+    changes = {name: options.pop(name) for name in names_of(IsolationConfig) if name in options}
+    return replace(stated, **changes), options
 
 
 def observation_of(frame: Any, isolation: IsolationConfig, reading: dict[str, Any]) -> Observation:
