@@ -242,10 +242,9 @@ class Result(Answer, SegmentedResult):
         Raises ``ValueError`` for what is no rigid transform.
         """
         T = checked_pose(T_new_frame)
-        moved = replace(self.seen, frame=self.seen.frame.transformed(T), cloud=self.seen.cloud.transformed(T))
         return replace(
             self,
-            seen=moved,
+            seen=replace(self.seen, frame=self.seen.frame.transformed(T), cloud=self.seen.cloud.transformed(T)),
             T_camera_input=self.T_camera_input @ inverse_rigid(T),
             further=tuple(each.transformed(T) for each in self.instances[1:]),
             original=self,
@@ -542,8 +541,8 @@ def _shape(what: Any) -> tuple[int, ...]:
 
 
 def _as_kind_of(what: Any, mesh: SegmentedMesh) -> Any:
-    """Mesh as the kind of what it was made from."""
-    if isinstance(what, SegmentedMesh):
+    """Mesh as the kind of what it was made from; several are a ``SegmentedMesh``."""
+    if isinstance(what, SegmentedMesh | list) or len(mesh.segments) > 1:
         return mesh
     (segment,) = mesh.segments
     if isinstance(what, Segment):
@@ -674,7 +673,7 @@ def load_result(folder: str | Path) -> StoredResult:
     with readable(labels, "label grid"):
         values, origin, spacing, names = map(read_arrays(labels).__getitem__, ("labels", "origin", "spacing", "names"))
         grid = LabelGrid(values, origin, spacing, tuple(names.tolist()))
-        _ = grid.axes()  # raises where they are not those of a grid
+        grid.axes()  # raises where they are not those of a grid
     with readable(summary, "summary of a result"):
         facts = json.loads(summary.read_text("utf-8"))
         if grid.names != tuple(row["name"] for row in facts["segments"]) or not meshes.keys() <= set(grid.names):
@@ -685,6 +684,6 @@ def load_result(folder: str | Path) -> StoredResult:
         )
         mesh = SegmentedMesh(tuple(parts), tuple(map(tuple, facts["nested"])))
         result = StoredResult(facts, mesh, grid)
-        _ = result.pose, result.covariance, result.joints, result.explained, result.unit_m, repr(result)
+        _ = result.pose, result.covariance, result.joints, result.explained, repr(result)
     places = (folder / INSTANCE.format(number) for number, _ in enumerate(facts.get("further_instances", ()), start=2))
     return replace(result, further=tuple(map(load_result, places)))

@@ -280,11 +280,11 @@ def mesh_of(source: Any) -> SegmentedMesh | None:
         if (mesh := _triangles(part)) is None:
             raise ValueError(f"the part {key!r} of the object is no mesh, as all must be: give its vertices and faces")
         known = getattr(part, "metadata", None) or {}
-        stated = getattr(part, "name", None) or known.get("name") or known.get("file_name") or f"part{index + 1}"
-        name = key if isinstance(key, str) else Path(stated).stem
+        file = known.get("file_name") or f"part{index + 1}"
+        name = key if isinstance(key, str) else getattr(part, "name", None) or known.get("name") or Path(file).stem
         color = getattr(part, "color", PALETTE[index % len(PALETTE)])
         segments.append(Segment(name, color, *mesh, solid=getattr(part, "solid", False)))
-    return SegmentedMesh(tuple(segments))
+    return SegmentedMesh(tuple(segments)) if segments else None
 
 
 def parts_of_scene(source: Any) -> Any:

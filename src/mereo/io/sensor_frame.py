@@ -20,7 +20,7 @@ from mereo.geometry.mesh import FEW_VERTICES, oriented_points
 from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
 from mereo.io.bounds import PositiveOrUnknown, check_bounds
 from mereo.io.config import InputConfig
-from mereo.io.intrinsics import Intrinsics, intrinsics_of, read_intrinsics
+from mereo.io.intrinsics import intrinsics_of, read_intrinsics
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.readers import (
     MESHES,
@@ -306,7 +306,7 @@ def along_z(image: DepthImage, reading: InputConfig) -> DepthImage:
 
 
 def _recording_options(reading: InputConfig, camera: Any = None) -> tuple[str | None, Camera | None, float | None]:
-    known: Intrinsics | None = None if camera is None else intrinsics_of(camera)
+    known = None if camera is None else intrinsics_of(camera)
     known = known if reading.intrinsics is None else read_intrinsics(reading.intrinsics)
     scale = known.depth_scale if known and reading.depth_scale is None else reading.depth_scale
     return reading.topic, known.camera if known else None, scale
