@@ -1,6 +1,7 @@
 """Robots of URDF and SDF files: their joints are found in frames by name, and bad files are one sentence."""
 
 import json
+import pickle
 import re
 from pathlib import Path
 
@@ -184,7 +185,10 @@ def test_the_angle_of_a_hinge_is_found_with_its_interval(tmp_path: Path) -> None
     assert laptop.scene is not None
     true = write_frame(tmp_path / "frame.ply", laptop.scene, 0.6, 0)
     assert true == pytest.approx(0.3 + 0.6 * 1.9)  # the file's angle, although its rest pose is closed
-    joint = mereo.reconstruct(tmp_path / "frame.ply", laptop, unit_m=1.0).joints["hinge"]
+    result = mereo.reconstruct(tmp_path / "frame.ply", laptop, unit_m=1.0)
+    joint = result.joints["hinge"]
+    assert np.trace(result["lid"].pose_in("base")) == pytest.approx(2 + 2 * np.cos(joint.value), abs=1e-6)
+    assert pickle.loads(pickle.dumps(result)).joints == result.joints
     assert joint.interval is not None and joint.interval[0] < true < joint.interval[1]
     assert abs(np.rad2deg(joint.value - true)) < 1.0 and joint.unit == "rad"
     np.testing.assert_allclose(joint.limits, (0.3, 2.2))
