@@ -56,8 +56,8 @@ CHIRAL = ("bunny", "engine", "liver", "tumor", "robot", "bracket")
 """Objects that differ from their mirror images."""
 
 WIDE, STEREO_WIDE = 192, 640
-"""Pixels along each side of a stereo camera's image, and of one of a desk; of a desk by a stereo camera, whose edges are
-off by pixels of its own, whatever the object's size."""
+"""Pixels along each side of a stereo camera's image, and of one of a desk; of a desk by a stereo camera, whose edges
+are off by pixels of its own, whatever the object's size."""
 
 
 @dataclass(frozen=True, eq=False)

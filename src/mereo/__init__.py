@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from mereo.api.reconstruct import load_frame as load_frame
     from mereo.api.reconstruct import reconstruct as reconstruct
     from mereo.api.result import Result as Result
+    from mereo.api.result import load_result as load_result
     from mereo.api.steps import evaluate as evaluate
     from mereo.api.steps import export as export
     from mereo.api.steps import learn as learn
@@ -68,6 +69,7 @@ _HOME = {
     "load_frame": "mereo.api.reconstruct",
     "load_model": "mereo.models.weights",
     "load_object": "mereo.api.objects",
+    "load_result": "mereo.api.result",
     "load_scene": "mereo.scenes.registry",
     "read_camera": "mereo.io.intrinsics",
     "read_depth_image": "mereo.io.readers",

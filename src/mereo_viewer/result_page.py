@@ -27,7 +27,6 @@ from mereo.geometry.transforms import inverse_rigid, rigid, rotation_along, tran
 from mereo.io.errors import words_of
 from mereo.io.mesh_formats import GlbScene, is_glb, read_glb
 from mereo.io.writers.formats import WRITERS
-from mereo.io.writers.glb import viewer_rotation
 from mereo.models.trained import Answer as NetworkAnswer
 from mereo.results.state import STATE
 from mereo.visualization.color_scales import (
@@ -40,7 +39,7 @@ from mereo.visualization.color_scales import (
 )
 from mereo.visualization.contact_sheets import Picture, depth_ends, depth_picture
 from mereo.visualization.reconstruction_report import REPORT, read_report
-from mereo.visualization.result_files import radii_of
+from mereo.visualization.result_files import radii_of, to_viewer_of
 from mereo.visualization.units import UNKNOWN, Unit, rounded
 from mereo_viewer.display import (
     BOX,
@@ -293,7 +292,7 @@ def content_of_answer(answer: Answer) -> Content:
         verdict=source_of(answer),
         mesh=mesh,
         unit=unit,
-        rotation=viewer_rotation(frame.axes),
+        rotation=to_viewer_of(frame),
         cloud=cloud,
         depth=depth,
         colorings=colorings,

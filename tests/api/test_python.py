@@ -1,11 +1,9 @@
 """mereo in Python: frames, results that are saved, shown and told, and the commands as functions."""
 
 import base64
-import copy
 import inspect
 import io
 import json
-import pickle
 import re
 import sys
 from collections.abc import Callable
@@ -155,7 +153,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
         lambda: mereo.load_object("rope", units="mm"), "^the units are mm, but rope says its own: leave"
     ),
     "isolation": (
-        lambda: mereo.reconstruct(seen(), MODEL, isolation={}), "^isolation is {}; it must be an IsolationConfig"
+        lambda: mereo.reconstruct(seen(), MODEL, isolation=3), "^isolation is 3; it must be an IsolationConfig"
     ),
     "an extent": (
         lambda: mereo.reconstruct(seen(), MODEL, extent="half"),
@@ -173,7 +171,6 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "a ragged pose of a tracker": (
         lambda: mereo.Tracker(MODEL, initial_pose=[[1], [1, 2]]), "^the pose is of the shape .*must be 4 x"
     ),
-    "isolation of a tracker": (lambda: mereo.Tracker(MODEL, isolation=3), "^isolation is 3; it must be an Isolation"),
     "what to view": (lambda: mereo.view(3, block=False), "^input is 3; it must be a path"),
     "a port": (
         lambda: mereo.view("x.glb", port=-1), "^port is -1; it must be a whole number, from 0 to 65535: give for"
@@ -225,13 +222,6 @@ def test_masks_of_all_kinds_in_memory_agree() -> None:
         assert frame.whole is IMAGE and len(frame.cloud) == truth.sum()
     ids = masked(np.where(truth, 3, 5), mask_value=3)
     assert ids.depth is not None and np.array_equal(ids.depth.valid, truth)
-
-
-def test_a_result_says_that_it_cannot_be_sent(result: Result) -> None:
-    for send in (pickle.dumps, copy.copy, copy.deepcopy):
-        with pytest.raises(TypeError, match=r"a result cannot be pickled or copied.*write it with result.save\(\)"):
-            send(result)
-    assert pickle.loads(pickle.dumps(list(result)))[0].name == result.names[0]
 
 
 def contents(folder: Path) -> dict[str, Any]:
@@ -352,7 +342,7 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     frame = mereo.load_frame("rope")
     with pytest.raises(ValueError, match="axes is given for a frame that is read already: give it where"):
         mereo.reconstruct(frame, MODEL, axes="scanner")
-    with pytest.raises(ValueError, match="the method is 'fulll'; it must be one of .*: correct the spelling"):
+    with pytest.raises(ValueError, match="^method is 'fulll'; it must be one of auto, .*: give for example 'auto'"):
         inspect.unwrap(mereo.Object.registrar)(mereo.Object(MODEL), "fulll")
     with pytest.raises(ValueError, match="the unit is -1 m; it must be positive"):
         mereo.reconstruct(seen(), MODEL, unit_m=-1)
@@ -362,8 +352,6 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
         mereo.load_frame("rope", unit_m=0.001)
     with pytest.raises(ValueError, match="mask is given for a frame that is no file's: leave it out, or name the file"):
         mereo.load_frame(seen(), mask=tmp_path / "mask.png")
-    with pytest.raises(TypeError, match="unit"):
-        mereo.load_frame(tmp_path / "x.ply", unit=1.0)
 
 
 def test_fields_of_isolation_are_arguments_by_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -566,8 +554,6 @@ def test_generate_and_train_are_the_commands(tmp_path: Path, monkeypatch: pytest
     assert trained == [replace(PRESETS["tiny"], init="rope")]
     with pytest.raises(ValueError, match="the preset is 'tinny'; it must be one of paper, .*: correct the spelling"):
         inspect.unwrap(mereo.train)("data", tmp_path, "tinny")
-    with pytest.raises(TypeError, match="epoch"):
-        mereo.train("data", tmp_path, epoch=3)
 
 
 def test_evaluate_scores_with_and_without_a_folder(tmp_path: Path) -> None:
@@ -594,7 +580,7 @@ def test_learn_and_export_return_what_they_leave(tmp_path: Path, monkeypatch: py
     scores |= {"trained": False, "method": "search"}
     learned = mereo.learn("rope", tmp_path, train="never")
     assert learned.weights is learned.report is None and learned.method == "search" and learned.folder == tmp_path
-    with pytest.raises(ValueError, match="train is 'once'; it must be one of auto, always, never: correct"):
+    with pytest.raises(ValueError, match="train is 'once'; it must be one of auto, always, never: give"):
         inspect.unwrap(mereo.learn)("rope", tmp_path, train="once")
     monkeypatch.setattr(steps, "export_weights", lambda *given: calls.append(given))
     assert mereo.export("rope", tmp_path / "graphs", "torch") == tmp_path / "graphs"

@@ -44,15 +44,6 @@ def test_all_forms_of_intrinsics_mean_the_same_camera(tmp_path: Path, name: str)
     assert read_camera(tmp_path / name) == Camera(640, 480, 525.0, 520.0, 320.0, 240.0)
 
 
-def test_a_matrix_of_opencv_is_the_camera_of_its_file(tmp_path: Path) -> None:
-    """The constructor has pixel centres at 0.5, ``from_K`` and files of matrices at 0, flat (ROS) or not (OpenCV)."""
-    (tmp_path / "c.json").write_text(json.dumps({"K": K, **SIZE}))
-    for matrix in (K, FLAT, np.array(K)):
-        assert (
-            Camera.from_K(matrix, 640, 480) == read_camera(tmp_path / "c.json") == Camera(640, 480, 525, 520, 320, 240)
-        )
-
-
 @pytest.mark.parametrize(
     "content, expected",
     [

@@ -1,6 +1,7 @@
 """Robots of URDF and SDF files: their joints are found in frames by name, and bad files are one sentence."""
 
 import json
+import pickle
 import re
 from pathlib import Path
 
@@ -190,6 +191,8 @@ def test_the_angle_of_a_hinge_is_found_with_its_interval(tmp_path: Path) -> None
     facts = FrameAnswer.of(result).facts  # what a line of a stream has
     assert facts["joints"] == {"hinge": joint.facts()}
     np.testing.assert_allclose(facts["segments"]["lid"]["pose"], result["lid"].pose, atol=1e-6)
+    assert np.trace(result["lid"].pose_in("base")) == pytest.approx(2 + 2 * np.cos(joint.value), abs=1e-6)
+    assert pickle.loads(pickle.dumps(result)).joints == result.joints
     assert joint.interval is not None and joint.interval[0] < true < joint.interval[1]
     assert abs(np.rad2deg(joint.value - true)) < 1.0 and joint.unit == "rad"
     np.testing.assert_allclose(joint.limits, (0.3, 2.2))

@@ -23,7 +23,6 @@ from mereo.locating.regions import connected_pixels, off_planes, regions, thinne
 from mereo.locating.whole_frame import BY_MASK, Place, WholeFrame, at_point, doubted, is_whole
 from mereo.reconstruction.observation import find_object, shared_noise
 from mereo.synthesis.depth_sensor import add_depth_noise, render_depth
-from mereo.visualization.joints import measure_pose_covariance
 
 CAMERA = Camera(240, 180, 260.0, 260.0, 120.0, 90.0)
 NOISE = 2e-4
@@ -113,11 +112,11 @@ def test_an_object_among_others_is_known_at_its_place(
 
 
 def test_the_covariance_of_a_rigid_objects_pose_is_that_of_its_points(found: mereo.Result) -> None:
-    registered, covariance = found.registered, measure_pose_covariance(found)
+    registered, covariance = found.registered, found.covariance
     assert registered is not None and registered.uncertainty is not None and covariance is not None
     arms = registered.material - registered.pose()[:3, 3]
     turns = np.cross(np.eye(3), arms[:, None]).swapaxes(1, 2)  # by a turn about each axis
-    follow = np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns], axis=2)
+    follow = np.concatenate([turns, np.broadcast_to(np.eye(3), turns.shape)], axis=2)
     radii = radius95(follow @ covariance @ follow.swapaxes(1, 2))
     np.testing.assert_allclose(radii, registered.uncertainty.material, rtol=0.02)
 

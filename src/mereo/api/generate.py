@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from mereo.api.words import python_words
+from mereo.api.words import check_names, names_of, python_words
 from mereo.io.object_storage import ObjectPath, Place, place_of
 from mereo.scenes.scene import Scene
 from mereo.synthesis.config import GenerateConfig
@@ -44,6 +44,7 @@ def generate(
     Raises as ``mereo_learning.shards.generate`` does, and ``TypeError`` without ``examples``.
     """
     place, processes = place_of(output), workers or os.cpu_count() or 1
+    check_names(dataset, names_of(shards.DatasetConfig))
     with python_words():
         shards.generate(
             str(scene) if isinstance(scene, Path) else scene,

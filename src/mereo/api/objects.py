@@ -11,7 +11,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import get_args
+from tempfile import TemporaryDirectory
+from typing import Any
 
 from mereo.api.words import python_words
 from mereo.fitting.config import AnswerMethod
@@ -22,6 +23,8 @@ from mereo.io.bounds import check_value
 from mereo.io.errors import checked_path
 from mereo.io.extras import has_network
 from mereo.io.mesh_formats import MESH_SUFFIXES
+from mereo.io.point_arrays import mesh_of
+from mereo.io.writers.meshes import write_segments_obj
 from mereo.models.config import Device, InferenceConfig, Precision
 from mereo.models.trained import Trained
 from mereo.models.weights_place import is_weights, load_weights, shipped_names, statistical_model_in
@@ -31,8 +34,11 @@ from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES, AssetUnavailable, Scene
 from mereo.scenes.statistical_model import StatisticalModel
 
-Source = Scene | Trained | str | Path | Sequence[str | Path]
-"""What an object is loaded from."""
+Source = Any
+"""An ``Object``, or what it is loaded from: a scene, weights, files, or meshes in memory."""
+
+OPTIONS = ("scene", "weights", "units", "deformations", "device", "precision")
+"""Options of ``load_object``."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -86,9 +92,7 @@ class Object:
 
         Raises ``ValueError`` for a method that there is none of, and where it cannot be had of this object.
         """
-        if method not in get_args(AnswerMethod):
-            known = ", ".join(get_args(AnswerMethod))
-            raise ValueError(f"the method is {method!r}; it must be one of {known}: correct the spelling")
+        check_value("method", method, AnswerMethod, "auto")
         if method == "network" and self.network is None:
             raise ValueError(
                 "the method is network, but the object has no weights: name them with --weights, or leave it out"
@@ -130,7 +134,7 @@ class WithoutWeightsWarning(UserWarning):
 
 @python_words()
 def load_object(
-    source: Source | None = None,
+    source: Source = None,
     scene: Scene | str | Path | None = None,
     *,
     weights: Trained | str | Path | None = None,
@@ -143,7 +147,8 @@ def load_object(
 
     Args:
         source: its meshes, one file for each segment, one file of named parts, a robot's URDF or SDF file, a folder of
-            any of these, or label volumes, one or one for each segment; a scene file, a built-in scene's name or a
+            any of these, or label volumes, one or one for each segment; meshes in memory, of trimesh, Open3D, PyVista
+            or (vertices, faces), as a dict by the segments' names or a list; a scene file, a built-in scene's name or a
             scene; the folder that ``mereo learn`` has written; or weights: a shipped name, a file, or some that are
             loaded already. A name that both weights and a scene have means the weights, which know that scene; without
             PyTorch the object is searched by the model that they carry, with a ``WithoutWeightsWarning``.
@@ -204,9 +209,11 @@ def _built_in_by_model(name: str) -> Object:
     return Object(None, scene, model=statistical_model_in(name), known_as=name)
 
 
-def object_of(given: Object | Source) -> Object:
-    """Object of whatever a caller has of it."""
-    return given if isinstance(given, Object) else load_object(given)
+def object_of(given: Source, **options: Any) -> Object:
+    """Object of whatever a caller has of it; ``options`` are those of ``load_object``."""
+    if options and isinstance(given, Object):
+        raise ValueError(f"{min(options)} is given for an object that is loaded already: give it to load_object")
+    return given if isinstance(given, Object) else load_object(given, **options)
 
 
 def _learned_scene(weights: Trained | str | Path) -> str | None:
@@ -222,17 +229,35 @@ def _check_meshless(source: object, units: LengthUnit | None, deformations: Way)
             raise ValueError(f"the {what} are {value}, but {source or 'the object'} says its own: leave them out")
 
 
+def _scene_in_memory(mesh: SegmentedMesh, units: LengthUnit | None, deformations: Way) -> Scene:
+    """Scene of a mesh that no file has; sentences about it name one, object.obj, or that of its one segment."""
+    with TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        name = mesh.names[0].replace("/", "-") if len(mesh.names) == 1 else "object"
+        path = Path(folder) / f"{name}.obj"
+        write_segments_obj(path, mesh)
+        try:
+            scene = scene_of_meshes([path], units, deformations)
+        except ValueError as error:
+            raise ValueError(str(error).replace(str(path), path.name)) from None
+    for warning in caught:
+        warnings.warn(str(warning.message).replace(str(path), path.name), warning.category, stacklevel=5)
+    return scene
+
+
 def _scene(source: Source, units: LengthUnit | None, deformations: Way) -> Scene:
     """Scene of what has no weights."""
     if isinstance(source, Scene):
         _check_meshless(source.name, units, deformations)
         return source
     assert not isinstance(source, Trained)
+    if (mesh := mesh_of(source)) is not None:
+        return _scene_in_memory(mesh, units, deformations)
     given: Sequence[object] = [source] if isinstance(source, str | Path) else source
     if not isinstance(given, Sequence) or not all(isinstance(file, str | Path) and str(file) for file in given):
         raise ValueError(
             f"the object is {repr(source)[:80]}; it must be the path of a file or folder, a list of such paths, the "
-            "name of a scene, or a scene: name its meshes"
+            "name of a scene, a scene, or meshes with vertices and faces: name its meshes"
         )
     files = [Path(str(file)) for file in given]
     if len(files) == 1 and files[0].is_dir():

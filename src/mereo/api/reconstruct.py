@@ -7,29 +7,27 @@ A source is whatever holds a frame: a file, a shipped name, arrays, the clouds a
 """
 
 import warnings
+from collections.abc import Mapping
 from concurrent.futures import Executor
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, overload
 
-import numpy as np
-from jaxtyping import Num
 from numpy.typing import ArrayLike
 
-from mereo.api.objects import Object, Source, object_of
+from mereo.api.objects import OPTIONS, Object, Source, object_of
 from mereo.api.result import Result
-from mereo.api.words import in_callers_words, python_words
+from mereo.api.words import check_names, in_callers_words, names_of, python_words, with_changes
 from mereo.fitting.config import AnswerMethod
-from mereo.geometry.camera import Camera, DepthImage
-from mereo.geometry.conventions import CloudAxes, check_real
+from mereo.geometry.camera import DepthImage
+from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.transforms import checked_pose
 from mereo.io.bounds import Instances
 from mereo.io.config import InputConfig
-from mereo.io.intrinsics import read_intrinsics
-from mereo.io.point_arrays import is_frame_list, mask_image, points_of
-from mereo.io.readers import depth_of, mask_of_image, masked_depth, read_pose, usable_depth
+from mereo.io.point_arrays import depth_values, is_frame_list, mask_image, points_of
+from mereo.io.readers import mask_of_image, masked_depth, read_pose
 from mereo.io.ros_recordings import is_recording
-from mereo.io.sensor_frame import SensorFrame, along_z, in_camera, read_frame
+from mereo.io.sensor_frame import SensorFrame, along_z, depth_frame, in_camera, read_frame
 from mereo.locating import following
 from mereo.locating.whole_frame import answer_observation, at_point, is_whole
 from mereo.reconstruction.config import IsolationConfig
@@ -44,7 +42,29 @@ from mereo.reconstruction.observation import (
 )
 from mereo.synthesis.sample_views import shipped_frame, shipped_frames
 
+Isolation = IsolationConfig | Mapping[str, Any] | None
+"""What of a frame is left out: settings, or a dict of some of their fields."""
+
 # --- frames -----------------------------------------------------------------------------------------------------------
+
+FRAME_OPTIONS = {*names_of(InputConfig), "axes"} - {"frame"}
+"""Options of ``load_frame``."""
+
+RECONSTRUCT_OPTIONS = {
+    *("method", "resolution", "isolation", "label_points", "initial_pose", "instances"),
+    *(*FRAME_OPTIONS, *names_of(IsolationConfig), *OPTIONS),
+}
+"""Options of ``reconstruct``."""
+
+PLACES = {
+    "frame": "axes='scanner' states the axes",
+    **dict.fromkeys(
+        ("output", "formats", "millimetres", "force"), "result.save(path, formats=..., overwrite=True) has it"
+    ),
+    **dict.fromkeys(("carry", "carry_frame"), "result.carry(what, files=...) has it"),
+    **dict.fromkeys(("json", "threads", "ray", "task", "options_from"), "the command alone has it"),
+}
+"""Where options of `mereo reconstruct` are in Python that are none of ``reconstruct``."""
 
 
 @python_words()
@@ -52,7 +72,7 @@ def load_frame(
     source: object,
     *,
     axes: CloudAxes | None = None,
-    intrinsics: Camera | str | Path | None = None,
+    intrinsics: Any = None,
     mask: Any = None,
     mask_value: int | tuple[int, ...] = (),
     camera_pose: ArrayLike | str | Path | None = None,
@@ -63,9 +83,12 @@ def load_frame(
     Args:
         source: a file (depth image, cloud, mesh, ROS recording) or the name of a shipped frame (``shipped_frames``);
             or points as n x 3 numbers, as a cloud of Open3D or trimesh, as a structured array or a ROS ``PointCloud2``;
-            or a depth image, as ``DepthImage`` or as an array of h x w pixels with ``intrinsics``.
+            or a depth image, as ``DepthImage``, or as an array of h x w pixels, an image of Pillow or Open3D or a ROS
+            ``Image`` with ``intrinsics``. Of n x 6 numbers the last three are normals, or colours, which are left out.
         axes: of points: "camera" (default) is x right, y down, z forward; "scanner" is y up, z toward the scanner.
-        intrinsics: of a depth image: a camera, or a file of one.
+        intrinsics: of a depth image: a file; or 3 x 3 numbers, (fx, fy, cx, cy), a dict of these, a ROS ``CameraInfo``,
+            the intrinsics of Open3D or RealSense, all of which count pixels from 0 at the centre of the first; or a
+            ``Camera``. Lens distortion is refused, of a file it is warned of.
         mask: file of an image that is not 0 where the object is; or that image, of Pillow or an array of h x w (or
             1 x h x w) truth values, whole numbers, logits or probabilities, as segmentation networks return them.
         mask_value: of the object in a mask that holds ids of several things, or its values.
@@ -80,6 +103,7 @@ def load_frame(
     Raises ``FileNotFoundError`` where there is no such file or name; ``ValueError`` for what is damaged or no frame,
     and for options that do not belong to this kind of frame; ``TypeError`` for an option that there is none of.
     """
+    check_names(options, FRAME_OPTIONS, PLACES)
     values = (mask_value,) if isinstance(mask_value, int) else mask_value
     if mask is not None and not isinstance(mask, str | Path):
         image = mask_image(mask)
@@ -90,7 +114,9 @@ def load_frame(
         depth = masked_depth(frame.whole, frame.path, mask_of_image(image, size, values))
         return replace(frame, depth=depth, cloud=depth.to_points())
     mask, axes_or_camera = None if mask is None else Path(mask), "camera" if axes is None else axes
-    reading, pose = InputConfig(frame=axes_or_camera, mask=mask, mask_value=values, **options), None
+    is_file = isinstance(intrinsics, str | Path)
+    options |= {"frame": axes_or_camera, "mask": mask, "mask_value": values}
+    reading, pose = InputConfig(intrinsics=Path(intrinsics) if is_file else None, **options), None
     if camera_pose is not None:
         pose = read_pose(Path(camera_pose)) if isinstance(camera_pose, str | Path) else checked_pose(camera_pose)
     if not isinstance(source, str | Path):
@@ -98,20 +124,17 @@ def load_frame(
         return in_camera(frame, reading, pose)
     path = Path(source)
     if str(source) in shipped_frames() and not (path.is_file() or is_recording(path)):
-        if (axes, intrinsics, pose) != (None,) * 3 or replace(reading, drop_invalid=False) != InputConfig():
+        stated = axes is not None or intrinsics is not None or pose is not None
+        if stated or replace(reading, drop_invalid=False) != InputConfig():
             raise ValueError(f"the shipped frame {str(source)!r} is in metres and needs no options: leave them out")
         return shipped_frame(str(source))
     if not path.exists() and path.suffix == "":
         known = ", ".join(shipped_frames())
         raise FileNotFoundError(f"there is no frame {str(source)!r}; give a file or one of the shipped: {known}")
-    if isinstance(intrinsics, Camera):
-        raise ValueError(f"{source} is a file; its intrinsics are read from one as well: give the path of that")
-    return read_frame(source, replace(reading, intrinsics=None if intrinsics is None else Path(intrinsics)), pose)
+    return read_frame(source, reading, pose, None if is_file else intrinsics)
 
 
-def _frame_in_memory(
-    source: object, axes: CloudAxes | None, intrinsics: Camera | str | Path | None, reading: InputConfig
-) -> SensorFrame:
+def _frame_in_memory(source: object, axes: CloudAxes | None, intrinsics: Any, reading: InputConfig) -> SensorFrame:
     for name in ("mask", "mask_value", "topic", "frame_index"):
         if getattr(reading, name) not in (None, ()) and not (name.startswith("mask") and intrinsics is not None):
             raise ValueError(f"{name} is given for a frame that is no file's: leave it out, or name the file")
@@ -119,7 +142,7 @@ def _frame_in_memory(
     if intrinsics is not None:
         if axes == "scanner" or unit_m is not None:
             raise ValueError("a depth image is in metres and in the camera's axes: leave out axes and unit_m")
-        return _depth_frame(np.asarray(source), intrinsics, reading)
+        return depth_frame(Path("depth image"), depth_values(source), reading, intrinsics)
     if reading.depth_scale is not None:
         raise ValueError("depth_scale is given without intrinsics; a depth image needs both: give intrinsics=...")
     observed, invalid = points_of(source, reading.drop_invalid)
@@ -133,31 +156,17 @@ def _frame_in_memory(
     return SensorFrame(CLOUD, observed, unit_m, reading.frame, invalid=invalid)
 
 
-def _depth_frame(raw: Num[np.ndarray, "h w"], intrinsics: Camera | str | Path, reading: InputConfig) -> SensorFrame:
-    """Frame of a depth image that is an array of stored values."""
-    check_real(raw, "the depth image")
-    if raw.ndim != 2:
-        raise ValueError(f"the depth image has the shape {raw.shape}; it must be rows of pixels: give h x w values")
-    path, camera, scale = Path("depth image"), intrinsics, reading.depth_scale
-    if not isinstance(camera, Camera):
-        entry = read_intrinsics(camera, (raw.shape[1], raw.shape[0]))
-        camera = entry.camera
-        scale = entry.depth_scale if scale is None and raw.dtype.kind != "f" else scale
-    image = along_z(depth_of(path, raw, scale, camera), reading)
-    usable = usable_depth(image, path, reading.mask, reading.mask_value)
-    return SensorFrame(path, usable.to_points(), 1.0, "camera", usable, whole=image)
-
-
-def split_options(isolation: IsolationConfig | None, options: dict[str, Any]) -> tuple[IsolationConfig, dict[str, Any]]:
+def split_options(isolation: Any, options: dict[str, Any]) -> tuple[IsolationConfig, dict[str, Any]]:
     """Settings of isolation, with what of ``options`` is a field of them, and the other options."""
-    if not isinstance(isolation, IsolationConfig | None):
+    if not isinstance(isolation, IsolationConfig | Mapping | None):
         raise ValueError(
             f"isolation is {isolation!r}; it must be an IsolationConfig, or its fields are given by themselves: give "
             "for example largest_cluster=True"
         )
-    names = {item.name for item in fields(IsolationConfig)} & options.keys()
-    stated = replace(isolation or IsolationConfig(), **{name: options[name] for name in names})
-    return stated, {name: value for name, value in options.items() if name not in names}
+    check_names(options, RECONSTRUCT_OPTIONS, PLACES)
+    stated = isolation if isinstance(isolation, IsolationConfig) else with_changes(IsolationConfig(), isolation or {})
+    changes = {name: options.pop(name) for name in names_of(IsolationConfig) if name in options}
+    return replace(stated, **changes), options
 
 
 def observation_of(frame: Any, isolation: IsolationConfig, reading: dict[str, Any]) -> Observation:
@@ -179,21 +188,21 @@ def observation_of(frame: Any, isolation: IsolationConfig, reading: dict[str, An
 
 @overload
 def reconstruct(
-    frame: list[Any] | tuple[Any, ...], object: Object | Source, method: AnswerMethod = ..., **options: Any
+    frame: list[Any] | tuple[Any, ...], object: Source, method: AnswerMethod = ..., **options: Any
 ) -> list[Result]: ...
 
 
 @overload
-def reconstruct(frame: Any, object: Object | Source, method: AnswerMethod = ..., **options: Any) -> Result: ...
+def reconstruct(frame: Any, object: Source, method: AnswerMethod = ..., **options: Any) -> Result: ...
 
 
 def reconstruct(
     frame: Any,
-    object: Object | Source,
+    object: Source,
     method: AnswerMethod = "auto",
     *,
     resolution: int = 128,
-    isolation: IsolationConfig | None = None,
+    isolation: Isolation = None,
     label_points: bool = False,
     initial_pose: ArrayLike | None = None,
     **options: Any,
@@ -208,19 +217,22 @@ def reconstruct(
             leaves the network alone; "search" leaves it out; "modes" and "full" take the registered model in any case,
             "full" by fitting the parameters of its scene as well. Without weights, "auto" is "search".
         resolution: cells along the longest side of the object's box.
-        isolation: what of the frame is left out; lengths in metres, or in the frame's unit where that is not known.
+        isolation: what of the frame is left out, or a dict of its fields; lengths in metres, or in the frame's unit
+            where that is not known.
         label_points: also say on which segment each observed point lies (``Result.reconstruction.observed``).
         initial_pose: rough pose of the object, as ``Result.pose``, from which the fit starts instead of a search or a
             network; what the scene holds (``held``) stays there. Both units must be known.
         options: ``instances``, how many of the object are looked for in a whole depth image, or "all", of which the
             result is the most evident one's, and its ``instances`` are those of all that are known; fields of
             ``isolation`` by themselves, ``extent="partial"`` where a part of the object is hidden or cut
-            off, ``point=(u, v)``, the column and row of a pixel of the object, ``box`` and others; and
-            arguments of ``load_frame``, ``axes``, ``unit_m``, ``intrinsics``, ``mask`` and others.
+            off, ``point=(u, v)``, the column and row of a pixel of the object, ``box`` and others; arguments of
+            ``load_frame``, ``axes``, ``unit_m``, ``intrinsics``, ``mask`` and others; and those of ``load_object``,
+            ``units``, ``deformations`` and others, where ``object`` is not loaded yet.
 
     Warns with ``SizeWarning`` where the visible part cannot be the object of the weights, and without weights with
     ``ClustersWarning`` where the cloud may be two objects. Raises ``ValueError`` for unusable frames,
-    where nothing is found, and for methods other than "auto" where the model cannot be registered.
+    where nothing is found, and for methods other than "auto" where the model cannot be registered; ``TypeError`` for an
+    option that there is none of.
     """
     results = list[Result]()
     are_many = is_frame_list(frame) or (
@@ -229,7 +241,7 @@ def reconstruct(
     instances: Instances = options.pop("instances", 1)
     with python_words():
         isolation, reading = split_options(isolation, options)
-        known = object_of(object)
+        known = object_of(object, **{name: reading.pop(name) for name in OPTIONS if name in reading})
         for each in frame if are_many else [frame]:  # not a comprehension: a warning names the caller's line
             observation = observation_of(each, isolation, reading)
             if initial_pose is not None:
@@ -309,11 +321,11 @@ class Tracker:
 
     def __init__(
         self,
-        object: Object | Source,
+        object: Source,
         method: AnswerMethod = "auto",
         *,
         executor: Executor | None = None,
-        isolation: IsolationConfig | None = None,
+        isolation: Isolation = None,
         initial_pose: ArrayLike | None = None,
     ) -> None:
         """Follow an object.
@@ -338,7 +350,14 @@ class Tracker:
             )
         self._tracker = following.Tracker(registrar, executor=executor)
 
-    def follow(self, frame: Any, time_s: float, *, isolation: IsolationConfig | None = None, **options: Any) -> Result:
+    def follow(
+        self,
+        frame: Any,
+        time_s: float,
+        *,
+        isolation: Isolation = None,
+        **options: Any,
+    ) -> Result:
         """Find the object in the next frame.
 
         Args:

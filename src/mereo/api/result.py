@@ -6,39 +6,53 @@ Result[name] -> SegmentResult
 -carry-> what is defined in the object's own files, in the frame's axes and unit
 """
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields
-from functools import cached_property
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from copy import deepcopy
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property, reduce
 from html import escape
 from importlib import import_module
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from mereo.api.words import python_words
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.registration import Registration
-from mereo.geometry.camera import camera_axes
-from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
-from mereo.geometry.transforms import transform_points
-from mereo.io.atomic_files import atomic_file, new_directory
-from mereo.io.attachments import Attachment, Content, Positions, Surfaces, read_attachments, write_attachment
+from mereo.geometry.labels import LabelGrid
+from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.transforms import checked_pose, inverse_rigid, rigid, transform_points
+from mereo.io.atomic_files import atomic_file, new_directory, to_json
+from mereo.io.attachments import Attachment, Content, PoseTable, Positions, Surfaces, read_attachments, write_attachment
 from mereo.io.bounds import Port, check_value
 from mereo.io.config import DEFAULT_FILES, CarryFrame, FilesConfig, Format
-from mereo.io.errors import checked_path
-from mereo.io.point_arrays import model_points
+from mereo.io.errors import checked_path, readable
+from mereo.io.mesh_formats import read_glb
+from mereo.io.point_arrays import mesh_of, model_points, parts_of_scene
+from mereo.io.readers import read_arrays
 from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame
-from mereo.io.writers.formats import chosen_formats
-from mereo.io.writers.glb import viewer_rotation
+from mereo.io.writers.formats import WRITERS, chosen_formats
 from mereo.io.writers.volumes import MM_PER_M
+from mereo.reconstruction.pipeline import Reconstruction
 from mereo.results.carry import carry, place
-from mereo.visualization.joints import JointValue, measure_joints
+from mereo.visualization.joints import JointValue, measure_joints, pose_covariance
 from mereo.visualization.reconstruction_report import result_html
-from mereo.visualization.result_files import write_answer, write_answer_file
+from mereo.visualization.result_files import (
+    INSTANCE,
+    summary_of,
+    to_viewer_of,
+    write_answer,
+    write_answer_file,
+)
 from mereo.visualization.units import Unit
 
 if TYPE_CHECKING:
@@ -47,6 +61,15 @@ if TYPE_CHECKING:
     from mereo_viewer.server import OpenPage
 
 Pose = Float[np.ndarray, "4 4"]
+
+
+Entry = TypeVar("Entry")
+
+
+def _by_name(segments: Mapping[str, Entry], name: str) -> Entry:
+    if name not in segments:
+        raise KeyError(f"there is no segment {name!r}; the segments are {', '.join(segments)}")
+    return segments[name]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +87,7 @@ class SegmentResult:
         error_radius: radius around the centroid that holds the true one with probability 0.95; None where the answer
             is the network's.
         pose: best rigid motion from the object's own files to the frame, as ``Result.pose``; None likewise.
+        poses: of all segments, by their names; empty where the answer is the network's.
     """
 
     name: str
@@ -74,6 +98,18 @@ class SegmentResult:
     confidence: float
     error_radius: float | None
     pose: Pose | None
+    poses: Mapping[str, Pose] = field(default_factory=dict)
+
+    def pose_in(self, name: str) -> Pose:
+        """Pose of this segment in the frame of another one: its motion, seen by that one, from where it was at rest.
+
+        4 x 4, ``T_other_this``, in the frame's unit: both have the axes and the origin of the object's own files, so
+        that it is the unit matrix at rest. Raises ``KeyError`` for a name of no segment, and ``ValueError`` where the
+        answer is the network's, which has no poses.
+        """
+        if self.pose is None:
+            raise ValueError(NO_REGISTRATION)
+        return inverse_rigid(_by_name(self.poses, name)) @ self.pose
 
     @property
     def is_present(self) -> bool:
@@ -84,18 +120,12 @@ class SegmentResult:
         """Surface as a mesh of trimesh, in the segment's colour."""
         import trimesh
 
-        vertices, faces = self.mesh.vertices, self.mesh.faces
-        colors = np.tile(np.array([*self.mesh.color, 255], dtype=np.uint8), (len(faces), 1))
-        return trimesh.Trimesh(vertices, faces, face_colors=colors, process=False)
+        color = [*self.mesh.color, 255]
+        return trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, face_colors=color, process=False)
 
     def to_open3d(self) -> Any:
         """Surface as a ``TriangleMesh`` of Open3D, in the segment's colour; ``ImportError`` without Open3D."""
-        try:
-            open3d = import_module("open3d")
-        except ImportError:
-            raise ImportError("Open3D is not installed: pip install open3d, or take to_trimesh()") from None
-        vertices = open3d.utility.Vector3dVector(self.mesh.vertices)
-        mesh = open3d.geometry.TriangleMesh(vertices, open3d.utility.Vector3iVector(self.mesh.faces))
+        mesh = _open3d_mesh(self.mesh)
         mesh.paint_uniform_color([channel / 255 for channel in self.mesh.color])
         mesh.compute_vertex_normals()
         return mesh
@@ -106,104 +136,43 @@ class SegmentResult:
         return f"SegmentResult({self.name!r}, {figures})"
 
 
-SINGLE = (".glb", ".ply", ".npz", ".vti", ".nii.gz", ".seg.nrrd", ".json", ".html", ".png")
-"""Suffixes of the files that ``Result.save`` writes alone."""
+def _open3d_mesh(mesh: Segment) -> Any:
+    try:
+        open3d = import_module("open3d")
+    except ImportError:
+        raise ImportError("Open3D is not installed: pip install open3d, or take to_trimesh()") from None
+    vertices = open3d.utility.Vector3dVector(mesh.vertices)
+    return open3d.geometry.TriangleMesh(vertices, open3d.utility.Vector3iVector(mesh.faces))
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Result(Answer):
-    """Answer to one frame, its segments by their names; all lengths in the frame's axes and unit.
+class SegmentedResult(ABC):
+    """Object in a frame, its segments by their names; what a ``Result`` and a ``StoredResult`` have in common."""
 
-    What it was made from and who answers is as in ``Answer``.
-    """
-
-    @classmethod
-    def of(cls, answer: Answer) -> "Result":
-        """Result of an answer."""
-        return cls(**{item.name: getattr(answer, item.name) for item in fields(Answer)})
-
-    @cached_property
-    def instances(self) -> "tuple[Result, ...]":
-        """This result, and those of further instances of the object in the same frame, the most evident first."""
-        return self, *map(Result.of, self.further)
+    @property
+    @abstractmethod
+    def _segments(self) -> dict[str, SegmentResult]:
+        """All segments by their names."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the segments, in the order of their labels."""
-        return self.surfaces.names
-
-    @property
-    def unit_m(self) -> float | None:
-        """Metres per unit: as the frame states it, or by the true size of the registered object; None if unknown."""
-        return self.seen.frame.unit_m
-
-    @property
-    def known(self) -> bool | str:
-        """Whether the frame shows the object in a state that was learned: True, False or "unsure"."""
-        return self.recognition.known
+        """Names of the segments, in the order of their labels; none where the object is lost without an answer."""
+        return tuple(self._segments)
 
     def __getitem__(self, name: str) -> SegmentResult:
-        """Segment of a name; raises ``KeyError`` for a name of no segment."""
-        if name not in self._segments:
-            raise KeyError(f"there is no segment {name!r}; the segments are {', '.join(self.names)}")
-        return self._segments[name]
+        """Segment of a name; raises ``KeyError`` for a name of no segment, ``ValueError`` where the object is lost."""
+        return _by_name(self._segments, name)
+
+    def __contains__(self, name: object) -> bool:
+        """Whether there is a segment of this name."""
+        return name in self.names
 
     def __iter__(self) -> Iterator[SegmentResult]:
         """All segments, in the order of their labels."""
-        return iter(self._segments.values())
+        return iter(self._segments.values() if self.names else ())
 
     def __len__(self) -> int:
         """Number of segments."""
         return len(self.names)
-
-    @cached_property
-    def pose(self) -> Pose | None:
-        """``T_camera_model``: best rigid motion of the whole object from rest to the frame; None without a fit.
-
-        It moves points of the object's own files, once these are in the frame's unit (``model_scale`` times their
-        coordinates), to the frame's axes: those of the camera, but for frames in a scanner's. Points of the scene where
-        the weights do not know the files.
-        """
-        return None if self.registered is None else self.registered.pose()
-
-    @cached_property
-    def joints(self) -> dict[str, JointValue]:
-        """Value of each joint that the object's definition has by name, as a robot's file has; empty without a fit."""
-        return measure_joints(self)
-
-    @property
-    def model_scale(self) -> float | None:
-        """Length of a unit of the object's own files, or of its scene, in the frame's unit; None without a fit."""
-        return None if self.registered is None else self.registered.model_scale
-
-    @python_words()
-    def carry(self, what: Any, files: CarryFrame = "source") -> Any:
-        """Carry points, a mesh or a file of the object's own frame and unit to where it is now.
-
-        Args:
-            what: points (whatever ``load_frame`` takes of points), which come back as an array [n, 3]; a mesh of
-                trimesh, ``Segment`` or ``SegmentedMesh``, which comes back as its kind, with edges short enough to
-                bend; or the path of a file as of ``--carry``, a volume included, which comes back as a ``CarriedFile``.
-            files: frame and unit of it: "source" is that of the object's own files, "scene" that of its scene; "RAS"
-                and "LPS" state the space of the object's own files, where these do not name it.
-
-        Raises ``ValueError`` where the answer is the network's, where the frame of the object's files is not known, and
-        for what lies too far from the object to belong to it.
-        """
-        check_value("files", files, CarryFrame, "source")
-        attachment, registered = _attachment(what), registration_of(self)
-        assert self.registrar is not None
-        (placed,) = place([attachment], self.registrar, files)
-        carried = carry(placed, registered)
-        if isinstance(what, str | Path):
-            return CarriedFile(carried.name, carried.content, carried.inside, carried.farthest, self.seen.frame)
-        if isinstance(carried.content, Positions):
-            return carried.content.points
-        assert isinstance(carried.content, Surfaces)
-        if isinstance(what, SegmentedMesh):
-            return carried.content.mesh
-        (segment,) = carried.content.mesh.segments
-        return segment if isinstance(what, Segment) else type(what)(segment.vertices, segment.faces, process=False)
 
     def to_trimesh(self) -> "trimesh.Scene":
         """Scene of trimesh with a mesh for each segment that was found, by its name and in its colour."""
@@ -222,25 +191,186 @@ class Result(Answer):
         """
         return {segment.name: segment.to_open3d() for segment in self if segment.is_present}
 
+
+SINGLE = (".glb", ".ply", ".npz", ".vti", ".nii.gz", ".seg.nrrd", ".json", ".html", ".png")
+"""Suffixes of the files that ``Result.save`` writes alone."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Result(Answer, SegmentedResult):
+    """Answer to one frame, its segments by their names; all lengths in the frame's axes and unit.
+
+    What it was made from and who answers is as in ``Answer``. It never changes, so that its copies are itself; pickled
+    it is a ``StoredResult``, without the object's model.
+
+    Attributes:
+        original: the result in the frame's own axes, where this one was brought into others by ``transformed``.
+    """
+
+    original: "Result | None" = None
+
+    @classmethod
+    def of(cls, answer: Answer) -> "Result":
+        """Result of an answer."""
+        return (
+            answer
+            if isinstance(answer, cls)
+            else cls(**{item.name: getattr(answer, item.name) for item in fields(Answer)})
+        )
+
+    @cached_property
+    def instances(self) -> "tuple[Result, ...]":
+        """This result, and those of further instances of the object in the same frame, the most evident first."""
+        return self, *map(Result.of, self.further)
+
+    @cached_property
+    def reconstruction(self) -> Reconstruction:
+        """Surfaces, label grid and figures of all segments; raises as ``Answer.reconstruction``."""
+        if self.original is None:
+            return super().reconstruction
+        T_result_original = inverse_rigid(self.T_camera_input) @ self.original.T_camera_input
+        return self.original.reconstruction.transformed(T_result_original)
+
+    def transformed(self, T_new_frame: ArrayLike) -> "Result":
+        """Result in another frame, such as a robot's base: poses, surfaces, labels, covariance and what is carried.
+
+        Args:
+            T_new_frame: 4 x 4, the rigid transform from the result's axes to the new ones, in the frame's unit;
+                ``T_base_camera`` of a calibrated camera.
+
+        Voxels of labels lie along the new axes. Files are in the new frame, pictures are as the camera saw the object.
+        Raises ``ValueError`` for what is no rigid transform.
+        """
+        T = checked_pose(T_new_frame)
+        return replace(
+            self,
+            seen=replace(self.seen, frame=self.seen.frame.transformed(T), cloud=self.seen.cloud.transformed(T)),
+            T_camera_input=self.T_camera_input @ inverse_rigid(T),
+            further=tuple(each.transformed(T) for each in self.instances[1:]),
+            original=self,
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:  # noqa: D102 (SegmentedResult)
+        return () if self.is_missing else self.surfaces.names
+
+    @property
+    def labels(self) -> LabelGrid:
+        """Label grid along the frame's axes; raises as ``reconstruction`` does."""
+        return self.reconstruction.labels
+
+    @property
+    def unit_m(self) -> float | None:
+        """Metres per unit: as the frame states it, or by the true size of the registered object; None if unknown."""
+        return self.seen.frame.unit_m
+
+    @property
+    def known(self) -> bool | str:
+        """Whether the frame shows the object in a state that was learned: True, False or "unsure"."""
+        return self.recognition.known
+
+    @cached_property
+    def pose(self) -> Pose | None:
+        """``T_camera_model``: best rigid motion of the whole object from rest to the frame; None without a fit.
+
+        It moves points of the object's own files, once these are in the frame's unit (``model_scale`` times their
+        coordinates), to the frame's axes: those of the camera, but for frames in a scanner's. Points of the scene where
+        the weights do not know the files.
+        """
+        return None if self.registered is None else self.registered.pose()
+
+    @cached_property
+    def covariance(self) -> Float[np.ndarray, "6 6"] | None:
+        """Covariance of ``pose``: a turn in radians, then a shift in the frame's unit; None without a fit.
+
+        Both in the frame's axes: the true pose is ``[exp(turn) R, p + shift]`` where ``pose`` is ``[R, p]``; p is where
+        the origin of the object's own files lies, about which it turns. (ROS puts the shift first.) It holds what the
+        error radii hold and is calibrated as they are; how the object is bent is integrated out.
+        """
+        return None if self.registered is None else pose_covariance(self.registered)
+
+    @property
+    def explained(self) -> float | None:
+        """Share of the observed points that the registered model explains, from 0 to 1; None without a fit."""
+        return None if self.registered is None else self.registered.explained
+
+    @property
+    def residual(self) -> float | None:
+        """Root mean square distance of the observed points from it, in the frame's unit; None without a fit."""
+        return None if self.registered is None else self.registered.residual
+
+    @cached_property
+    def joints(self) -> dict[str, JointValue]:
+        """Value of each joint that the object's definition has by name, as a robot's file has; empty without a fit."""
+        return measure_joints(self)
+
+    @property
+    def model_scale(self) -> float | None:
+        """Length of a unit of the object's own files, or of its scene, in the frame's unit; None without a fit."""
+        return None if self.registered is None else self.registered.model_scale
+
     @cached_property
     def _segments(self) -> dict[str, SegmentResult]:
-        sure = None if self.registered is None else self.registered.uncertainty
+        fit, parts = self.registered, self.reconstruction.segments
+        sure = None if fit is None else fit.uncertainty
         radii = {} if sure is None else {segment.name: segment.centroid_radius95 for segment in sure.segments}
-        return {
-            figures.name: SegmentResult(
-                name=figures.name,
-                label=figures.label,
-                mesh=mesh,
-                centroid=figures.centroid,
-                volume=figures.volume,
-                confidence=figures.confidence,
-                error_radius=radii.get(figures.name),
-                pose=None
-                if self.registered is None
-                else self.registered.pose(self.registered.model.labels == figures.label),
-            )
-            for figures, mesh in zip(self.reconstruction.segments, self.surfaces.segments, strict=True)
-        }
+        poses = {} if fit is None else {part.name: fit.pose(fit.model.labels == part.label) for part in parts}
+        return _segment_results(parts, self.surfaces, radii, poses)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Figures as in ``summary.json``, in plain types: numbers, texts, lists, None for NaN.
+
+        Of a lost object without an answer they have no segments, and ``recognition`` says why.
+        """
+        figures: dict[str, Any] = to_json(summary_of(self))
+        return figures
+
+    def __reduce__(self) -> Any:
+        """Values of the result, without what computes further ones."""
+        parts = (None, None) if self.is_missing else (self.surfaces, self.labels)
+        return StoredResult, (self.to_dict(), *parts, self.instances[1:])
+
+    def __copy__(self) -> "Result":
+        return self
+
+    def __deepcopy__(self, memo: Any) -> "Result":
+        return self
+
+    @python_words()
+    def carry(self, what: Any, files: CarryFrame = "source") -> Any:
+        """Carry points, poses, a mesh or a file of the object's own frame and unit to where it is now.
+
+        Args:
+            what: points (whatever ``load_frame`` takes of points), which come back as an array [n, 3], of one point
+                [3]; rigid poses 4 x 4 or n x 4 x 4, which turn as their surroundings; a mesh of trimesh or Open3D,
+                ``Segment``, ``SegmentedMesh`` or (vertices, faces), which comes back as its kind, with edges short
+                enough to bend; a dict of these, or a scene of trimesh, as a dict; or the path of a file as of
+                ``--carry``, a volume included, which comes back as a ``CarriedFile``.
+            files: frame and unit of it: "source" is that of the object's own files, "scene" that of its scene; "RAS"
+                and "LPS" state the space of the object's own files, where these do not name it.
+
+        Raises ``ValueError`` where the answer is the network's, where the frame of the object's files is not known, and
+        for what lies too far from the object to belong to it.
+        """
+        check_value("files", files, CarryFrame, "source")
+        what = parts_of_scene(what)
+        if isinstance(what, Mapping):
+            return {name: self.carry(each, files) for name, each in what.items()}
+        attachment, registered = _attachment(what), registration_of(self)
+        assert self.registrar is not None
+        (placed,) = place([attachment], self.registrar, files)
+        carried = carry(placed, registered)
+        content = carried.content
+        if isinstance(what, str | Path):
+            return CarriedFile(carried.name, content, carried.inside, carried.farthest, self.seen.frame)
+        if isinstance(content, PoseTable):
+            assert content.rotations is not None
+            poses = np.stack([rigid(*each) for each in zip(content.rotations, content.points, strict=True)])
+            return poses.reshape(_shape(what))
+        if isinstance(content, Positions):
+            return content.points[0] if _shape(what) == (3,) else content.points
+        assert isinstance(content, Surfaces)
+        return _as_kind_of(what, content.mesh)
 
     @python_words()
     def save(
@@ -265,19 +395,18 @@ class Result(Answer):
         Raises ``FileExistsError`` for what exists, unless ``overwrite`` may replace it; ``ValueError`` for a suffix or
         a format that there is none of, and ``ImportError`` where a format's extra is missing.
         """
-        with python_words():
-            path = free_folder() if path is None else checked_path(path, "path")
-            suffix = file_suffix(path)
-            if suffix == "":
-                _check_list(formats)
-                wanted = chosen_formats(DEFAULT_FILES.formats if formats is None else formats)
-                with new_directory(path, overwrite, self._read()) as directory:
-                    write_answer(directory, self, FilesConfig(wanted, millimetres))
-            elif formats is not None:
-                raise ValueError(f"{path} is one file, whose suffix says its format: leave out formats")
-            else:
-                with atomic_file(path, force=overwrite, inputs=self._read()) as partial:
-                    write_answer_file(partial, suffix, self, FilesConfig((), millimetres))
+        path = free_folder() if path is None else checked_path(path, "path")
+        suffix = file_suffix(path)
+        if suffix == "":
+            _check_list(formats)
+            wanted = chosen_formats(DEFAULT_FILES.formats if formats is None else formats)
+            with new_directory(path, overwrite, self._read()) as directory:
+                write_answer(directory, self, FilesConfig(wanted, millimetres))
+        elif formats is not None:
+            raise ValueError(f"{path} is one file, whose suffix says its format: leave out formats")
+        else:
+            with atomic_file(path, force=overwrite, inputs=self._read()) as partial:
+                write_answer_file(partial, suffix, self, FilesConfig((), millimetres))
         return path
 
     @python_words()
@@ -313,7 +442,7 @@ class Result(Answer):
         """What a notebook shows: the points seen on what was found, from two sides, and the segments in figures."""
         if self.is_missing:
             return f"<p>{escape(repr(self))}</p>"
-        to_camera = camera_axes(self.seen.frame.axes)
+        to_camera = self.seen.frame.T_camera_result
         points = transform_points(to_camera, self.seen.cloud.points)
         surfaces = self.reconstruction.surfaces.transformed(to_camera)
         doubt = None if self.registrar is None else self.recognition.description
@@ -388,33 +517,172 @@ class CarriedFile:
             raise ValueError(f"{path} has another suffix than {self.name}, in whose format it is written: use that one")
         factor = MM_PER_M * self.frame.metres if millimetres else 1.0
         with atomic_file(path, force=overwrite) as partial:
-            write_attachment(partial, self.content, factor, viewer_rotation(self.frame.axes), self.frame.metres)
+            write_attachment(partial, self.content, factor, to_viewer_of(self.frame), self.frame.metres)
         return path
 
 
 def _attachment(what: Any) -> Attachment:
     if isinstance(what, str | Path):
         return read_attachments([what])[0]
-    if isinstance(what, SegmentedMesh | Segment) or (hasattr(what, "vertices") and hasattr(what, "faces")):
-        return Attachment("the mesh", Surfaces(_segmented(what)))
-    return Attachment("the points", Positions(model_points(what)))
+    if (mesh := mesh_of(what)) is not None:
+        return Attachment("the mesh", Surfaces(mesh))
+    if _shape(what)[-2:] == (4, 4):
+        poses = np.stack([checked_pose(pose) for pose in np.reshape(what, (-1, 4, 4))])
+        return Attachment("the poses", PoseTable((), (), "", poses[:, :3, 3], poses[:, :3, :3]))
+    return Attachment("the points", Positions(model_points([what] if _shape(what) == (3,) else what)))
 
 
-def _segmented(mesh: Any) -> SegmentedMesh:
-    """A mesh of any of these kinds as one of segments."""
-    if isinstance(mesh, SegmentedMesh):
+def _shape(what: Any) -> tuple[int, ...]:
+    """Shape of an array or list; empty of what is none."""
+    with suppress(ValueError):  # of rows that differ in length
+        return np.shape(what) if hasattr(what, "ndim") or isinstance(what, list | tuple) else ()
+    return ()
+
+
+def _as_kind_of(what: Any, mesh: SegmentedMesh) -> Any:
+    """Mesh as the kind of what it was made from; several are a ``SegmentedMesh``."""
+    if isinstance(what, SegmentedMesh | list) or len(mesh.segments) > 1:
         return mesh
-    if not isinstance(mesh, Segment):
-        vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
-        mesh = Segment("mesh", PALETTE[0], vertices, faces, solid=False)
-    return SegmentedMesh((mesh,))
+    (segment,) = mesh.segments
+    if isinstance(what, Segment):
+        return segment
+    if isinstance(what, tuple):
+        return segment.vertices, segment.faces
+    if not hasattr(what, "faces"):
+        return _open3d_mesh(segment)
+    return type(what)(segment.vertices, segment.faces, process=False)
+
+
+NO_REGISTRATION = (
+    "the network's answer is kept, but --carry needs a registration, along which things move: leave out of the "
+    "cloud what is not the object, or take the registered model in any case with --method modes"
+)
 
 
 def registration_of(answer: Answer) -> Registration:
     """Registration along which things are carried, in the frame's axes; ``ValueError`` where the network answers."""
     if answer.registered is None:
-        raise ValueError(
-            "the network's answer is kept, but --carry needs a registration, along which things move: leave out of the "
-            "cloud what is not the object, or take the registered model in any case with --method modes"
-        )
+        raise ValueError(NO_REGISTRATION)
     return answer.registered
+
+
+def _segment_results(
+    parts: Iterable[Any], surfaces: SegmentedMesh, radii: Mapping[str, Any], poses: Mapping[str, Pose]
+) -> dict[str, SegmentResult]:
+    """Segments by their names, of figures as ``SegmentFacts`` has them; radii and poses are those that are known."""
+    return {
+        part.name: SegmentResult(
+            part.name,
+            part.label,
+            mesh,
+            _numbers(part.centroid),
+            part.volume,
+            float(_numbers([part.confidence])[0]),
+            radii.get(part.name),
+            poses.get(part.name),
+            poses,
+        )
+        for part, mesh in zip(parts, surfaces.segments, strict=True)
+    }
+
+
+# --- results from files and pickles -----------------------------------------------------------------------------------
+
+
+def _numbers(values: Any) -> Any:
+    return None if values is None else np.array(values, dtype=np.float64)
+
+
+def _fact(*keys: str, read: Callable[[Any], Any] = lambda value: value) -> Any:
+    """Property with an entry of the facts; None where they have none, and of a registration that is not the answer."""
+    of_fit = "registration" in keys
+    return property(
+        lambda self: read(None if of_fit and self.facts["pose"] is None else reduce(dict.get, keys, self.facts))
+    )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class StoredResult(SegmentedResult):
+    """Result as a folder or a pickle has it: values in the axes and unit that it was in, and nothing that computes.
+
+    ``unit_m``, ``known``, ``explained``, ``residual``, ``model_scale``, ``pose``, ``covariance`` and ``joints`` are as
+    of ``Result``. It is not transformed, and what needs the object's model it does not have: ``carry``, distances and
+    rest positions of points, radii of single ones (``mereo.fitting.registration.state.load_state`` restores that).
+
+    Attributes:
+        facts: content of ``summary.json``.
+        surfaces: of all segments; None where the object was lost without an answer.
+        labels: label grid; None likewise.
+        further: results of further instances of the object in the same frame.
+    """
+
+    facts: dict[str, Any]
+    surfaces: SegmentedMesh | None
+    labels: LabelGrid | None
+    further: "tuple[StoredResult, ...]" = ()
+
+    unit_m, known, model_scale = _fact("unit_m"), _fact("recognition", "known"), _fact("model_scale")
+    explained, residual = _fact("registration", "explained"), _fact("registration", "residual")
+    pose, covariance = _fact("pose", read=_numbers), _fact("pose_covariance", read=_numbers)
+
+    @property
+    def instances(self) -> "tuple[StoredResult, ...]":
+        """This result, and those of further instances, the most evident first."""
+        return self, *self.further
+
+    @property
+    def joints(self) -> dict[str, JointValue]:
+        """As ``Result.joints``."""
+        return {
+            name: JointValue(
+                each["value"], each["interval"] and tuple(each["interval"]), each["unit"], tuple(each["limits"])
+            )
+            for name, each in self.facts.get("joints", {}).items()
+        }
+
+    @cached_property
+    def _segments(self) -> dict[str, SegmentResult]:
+        rows = self.facts["segments"]
+        radii = {row["name"]: row.get("centroid_radius95") for row in rows}
+        poses = {row["name"]: np.array(row["pose"]) for row in rows if "pose" in row}
+        if self.surfaces is None:
+            return {}
+        return _segment_results((SimpleNamespace(**row) for row in rows), self.surfaces, radii, poses)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As ``Result.to_dict``."""
+        return deepcopy(self.facts)
+
+    def __repr__(self) -> str:
+        present = sum(segment.is_present for segment in self)
+        return f"StoredResult({self.facts['title']!r}: {present} of {len(self)} segments; known: {self.known})"
+
+
+@python_words()
+def load_result(folder: str | Path) -> StoredResult:
+    """Load a result from the folder that ``Result.save`` or ``mereo reconstruct`` has written.
+
+    It needs summary.json, segments.glb and labels.npz, which are written by default; surfaces have the 7 digits of
+    their file. Nothing in the folder is run. Raises ``FileNotFoundError`` where a file is missing, and ``ValueError``
+    where one is damaged, or they do not belong together.
+    """
+    folder = checked_path(folder, "folder")
+    summary, surfaces, labels = (folder / WRITERS[name].file for name in ("json", "glb", "npz"))
+    meshes = {segment.name: segment for segment in read_glb(surfaces).mesh.segments}
+    with readable(labels, "label grid"):
+        values, origin, spacing, names = map(read_arrays(labels).__getitem__, ("labels", "origin", "spacing", "names"))
+        grid = LabelGrid(values, origin, spacing, tuple(names.tolist()))
+        grid.axes()  # raises where they are not those of a grid
+    with readable(summary, "summary of a result"):
+        facts = json.loads(summary.read_text("utf-8"))
+        if grid.names != tuple(row["name"] for row in facts["segments"]) or not meshes.keys() <= set(grid.names):
+            raise ValueError(f"its segments are not those of {surfaces.name} and {labels.name}")
+        empty = np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)
+        parts = (
+            meshes.get(row["name"], Segment(row["name"], tuple(row["color"]), *empty)) for row in facts["segments"]
+        )
+        mesh = SegmentedMesh(tuple(parts), tuple(map(tuple, facts["nested"])))
+        result = StoredResult(facts, mesh, grid)
+        _ = result.pose, result.covariance, result.joints, result.explained, repr(result)
+    places = (folder / INSTANCE.format(number) for number, _ in enumerate(facts.get("further_instances", ()), start=2))
+    return replace(result, further=tuple(map(load_result, places)))

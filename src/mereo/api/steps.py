@@ -9,11 +9,11 @@ They print their progress as the commands do, and raise the sentences that those
 
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
-from mereo.api.words import python_words
+from mereo.api.words import python_words, with_changes
 from mereo.fitting.config import AnswerMethod
 from mereo.geometry.conventions import LengthUnit
 from mereo.geometry.metrics import format_score
@@ -60,7 +60,7 @@ def train(
             raise ValueError(f"the preset is {config!r}; it must be one of {', '.join(PRESETS)}: correct the spelling")
         config = PRESETS[config]
     with python_words():
-        return trainer.train(place_of(dataset), Path(output), replace(config, **changes), device=device)
+        return trainer.train(place_of(dataset), Path(output), with_changes(config, changes), device=device)
 
 
 def evaluate(
@@ -91,7 +91,7 @@ def evaluate(
     """
     changes = {name: str(value) if isinstance(value, Path) else value for name, value in changes.items()}
     with python_words():
-        config, workers = replace(config, **changes), choose_cluster(ray) or 1
+        config, workers = with_changes(config, changes), choose_cluster(ray) or 1
         if output is not None:
             return evaluate_weights(model, output, config, inference=inference, workers=workers, force=overwrite)
         loaded = model if isinstance(model, Model) else load_for(model, settings_for(inference, workers))
@@ -183,9 +183,7 @@ def learn(
     """
     given = object if isinstance(object, Iterable) and not isinstance(object, str) else [object]
     files, folder = [checked_path(file, "object") for file in given], checked_path(output, "output")
-    if train not in get_args(TrainChoice):
-        known = ", ".join(get_args(TrainChoice))
-        raise ValueError(f"train is {train!r}; it must be one of {known}: correct the spelling")
+    check_value("train", train, TrainChoice, "auto")
     check_value("minutes", minutes, Positive, 10.0)
     if units is not None:
         check_value("units", units, LengthUnit, "mm")

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from mereo.api.objects import Object, Source, object_of
+from mereo.api.objects import Source, object_of
 from mereo.api.reconstruct import reconstruct_observation
 from mereo.api.words import python_words
 from mereo.fitting.registration.answer import Answer
@@ -27,7 +27,7 @@ from mereo_viewer.server import PORT, OpenPage, import_viser, is_interactive
 @python_words()
 def view(
     input: str | Path | Answer | None = None,
-    object: Object | Source | None = None,
+    object: Source = None,
     *,
     reading: InputConfig | None = None,
     isolation: IsolationConfig | None = None,

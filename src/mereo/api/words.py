@@ -1,10 +1,12 @@
 """Messages in the words of Python: sentences name options as the command line does, and a caller has arguments."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import get_args
+from dataclasses import fields, replace
+from difflib import get_close_matches
+from typing import Any, TypeVar, get_args
 
 from mereo.fitting.config import AnswerMethod
 from mereo.io.config import CarryFrame
@@ -71,3 +73,31 @@ def python_words() -> Iterator[None]:
         if error.args and isinstance(error.args[0], str):
             error.args = (in_callers_words(error.args[0]), *error.args[1:])
         raise
+
+
+# --- options by their names -------------------------------------------------------------------------------------------
+
+Settings = TypeVar("Settings")
+
+
+def names_of(settings: type) -> tuple[str, ...]:
+    """Names of a dataclass's fields."""
+    return tuple(item.name for item in fields(settings))
+
+
+def check_names(given: Iterable[str], known: Collection[str], places: Mapping[str, str] | None = None) -> None:
+    """Raise ``TypeError`` for the first name of no option, with the nearest, or where ``places`` has it."""
+    for name in given:
+        if name in known:
+            continue
+        cure = (places or {}).get(name)
+        if cure is None:
+            near = get_close_matches(name.lower(), known, 1)
+            cure = f"is {near[0]} meant?" if near else f"the options are {', '.join(sorted(known))}"
+        raise TypeError(f"there is no option {name!r} here: {cure}")
+
+
+def with_changes(settings: Settings, changes: Mapping[str, Any]) -> Settings:
+    """Settings with some fields changed; raises ``TypeError`` as ``check_names``, and as the settings' own checks."""
+    check_names(changes, names_of(type(settings)))
+    return replace(settings, **changes)  # type: ignore[type-var]

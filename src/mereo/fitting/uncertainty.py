@@ -220,7 +220,7 @@ def covariance_factor(precision: Float[np.ndarray, "p p"]) -> Float[np.ndarray, 
 # ModesOptimum, DrawsOptimum -> Terms of the normal equations -> Posterior
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ModesOptimum:
     """End of a fit of the modes, or, with a model that has none, of the pose alone.
 
@@ -276,7 +276,7 @@ class ModesOptimum:
             return Posterior.of(self.terms.total, self.posed, material, model.modes, model.residue, open, self.others)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class DrawsOptimum:
     """End of a fit of a scene's draws.
 

@@ -66,8 +66,8 @@ class Segment:
 
     @property
     def bounds(self) -> Float[np.ndarray, "2 3"]:
-        """Lower and upper corner of the axis-aligned box."""
-        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+        """Lower and upper corner of the axis-aligned box; infinite, upside down, without vertices."""
+        return np.stack([self.vertices.min(axis=0, initial=np.inf), self.vertices.max(axis=0, initial=-np.inf)])
 
     @property
     def volume(self) -> float:

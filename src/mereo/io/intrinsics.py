@@ -14,6 +14,7 @@ Three conventions differ between them and are settled here:
 import json
 import re
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,12 @@ OFF_MIDDLE = 0.15
 
 SIDES = (("width", "height"), ("image_width", "image_height"), ("w", "h"))
 """Names of the size in pixels."""
+
+DISTORTION = ("D", "d", "distortion_coefficients", "coeffs", "distortion")
+"""Names of distortion coefficients."""
+
+MODELS = ("distortion_model", "camera_model", "model")
+"""Names of the lens's model."""
 
 NESTED = ("intrinsic", "intrinsics", "depth_intrinsics")
 """Names of the blocks in which files that hold more keep intrinsics."""
@@ -79,6 +86,50 @@ def written_intrinsics(camera: Camera) -> dict[str, float]:
     }
 
 
+def stated_fields(source: Any) -> Fields:
+    """Fields of intrinsics in memory: of a mapping, of a message or object of another library, or of numbers.
+
+    Understood: names as of ``read_intrinsics``, as keys or as attributes (ROS ``CameraInfo``, Open3D's and RealSense's
+    intrinsics); 3 x 3, 3 x 4 or 4 x 4 numbers; fx, fy, cx, cy. Raises ``ValueError`` for what is none of these.
+    """
+    known = (*MATRICES, *DISTORTION, *MODELS, *(name for names in (*NAMED, *SIDES) for name in names))
+    if isinstance(source, Mapping):
+        return _flat(dict(source))
+    stated = {name: getattr(source, name) for name in known if getattr(source, name, None) is not None}
+    if _states_a_camera(stated):
+        return stated
+    try:
+        numbers = np.asarray(source, dtype=np.float64)
+        return {"K": numbers.tolist()} if numbers.shape == (3, 3) else _fields_of_numbers(numbers.ravel().tolist())
+    except (TypeError, ValueError):
+        text = " ".join(repr(source).split())
+        raise ValueError(
+            f"intrinsics is {text[:80]}; it must be a camera: give 3 x 3 numbers, (fx, fy, cx, cy), a dict of these, a "
+            "CameraInfo, a mereo.Camera, or the path of a file"
+        ) from None
+
+
+def intrinsics_of(source: Any, size: tuple[int, int] | None = None) -> Intrinsics:
+    """Intrinsics of a camera, or of what ``stated_fields`` makes of one in memory; ``size`` as of ``read_intrinsics``.
+
+    Raises ``ValueError`` for other fields, and for lens distortion: of a file it may be that of the colour image, of a
+    camera in memory it would be a wrong result.
+    """
+    if isinstance(source, Camera):
+        return Intrinsics(source)
+    fields = stated_fields(source)
+    try:
+        intrinsics = Intrinsics(camera_from_fields(fields, size), _depth_scale(fields))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"intrinsics cannot be used: {error}; give 3 x 3 numbers, or these fields") from None
+    if amount := _distortion(intrinsics.camera, fields):
+        raise ValueError(
+            f"the intrinsics state lens distortion ({amount}), and a depth image must have none: rectify it and give "
+            "the camera of the rectified one (ROS: the matrix P), or set the coefficients to 0 where that is done"
+        )
+    return intrinsics
+
+
 def read_intrinsics(
     path: str | Path, size: tuple[int, int] | None = None, image: str | Path | None = None, index: int | None = None
 ) -> Intrinsics:
@@ -108,9 +159,7 @@ def read_intrinsics(
             fields = next(iter(yaml.safe_load_all(plain.removeprefix("\n---"))), None)
         if not isinstance(fields, dict):
             raise ValueError("it is not an object with named fields")
-        fields = _frame(fields, Path(image or "").stem, index)
-        for key in NESTED:
-            fields = {**fields, **fields[key]} if isinstance(fields.get(key), dict) else fields
+        fields = _flat(_frame(fields, Path(image or "").stem, index))
         intrinsics = Intrinsics(camera_from_fields(fields, size), _depth_scale(fields))
         warn_of_distortion(intrinsics.camera, fields, str(path))
     camera = intrinsics.camera
@@ -122,6 +171,13 @@ def read_intrinsics(
             "JSON where it was cropped"
         )
     return intrinsics
+
+
+def _flat(fields: Fields) -> Fields:
+    """Fields with those of the blocks in ``NESTED`` among them."""
+    for key in NESTED:
+        fields = {**fields, **fields[key]} if isinstance(fields.get(key), dict) else fields
+    return fields
 
 
 def _names_of_sides(fields: Fields) -> tuple[str, str] | None:
@@ -238,11 +294,8 @@ def _depth_scale(fields: Fields) -> float | None:
 
 def warn_of_distortion(camera: Camera, fields: Fields, source: str) -> None:
     """Warn with one ``CameraWarning`` where coefficients are not zero: the image is taken as rectified."""
-    coefficients, model = _coefficients(fields)
-    if not coefficients.any():
+    if not (amount := _distortion(camera, fields)):
         return
-    fisheye = any(word in model.lower() for word in ("fisheye", "equidistant", "kannala"))
-    amount = "a fisheye lens" if fisheye else f"up to {_shift_px(camera, coefficients):.2g} pixels in the corners"
     warnings.warn(
         f"{source} states lens distortion ({amount}), which is ignored: rectify the depth image and give the "
         "intrinsics of the rectified one (ROS: the matrix P), or set the coefficients to 0 where that is done already",
@@ -251,13 +304,22 @@ def warn_of_distortion(camera: Camera, fields: Fields, source: str) -> None:
     )
 
 
+def _distortion(camera: Camera, fields: Fields) -> str:
+    """Phrase on how far a lens bends the image; empty where it does not."""
+    coefficients, model = _coefficients(fields)
+    if not coefficients.any():
+        return ""
+    fisheye = any(word in model.lower() for word in ("fisheye", "equidistant", "kannala"))
+    return "a fisheye lens" if fisheye else f"up to {_shift_px(camera, coefficients):.2g} pixels in the corners"
+
+
 def _coefficients(fields: Fields) -> tuple[Float[np.ndarray, " n"], str]:
     """Distortion coefficients k1, k2, p1, p2, k3 ... as OpenCV orders them, and the model's name."""
-    model = str(fields.get("distortion_model", fields.get("camera_model", fields.get("model", ""))))
-    for key in ("D", "d", "distortion_coefficients", "coeffs", "distortion"):
+    model = next((str(fields[name]) for name in MODELS if name in fields), "")
+    for key in DISTORTION:
         values = fields.get(key)
         values = values.get("data") if isinstance(values, dict) else values
-        if isinstance(values, list | tuple | np.ndarray) and len(values):
+        if values is not None and not isinstance(values, str) and np.size(values):
             return np.asarray(values, dtype=np.float64).reshape(-1), model
     names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
     return np.array([float(fields.get(name, 0.0)) for name in names]), model

@@ -1,25 +1,33 @@
-"""Frames that are already in memory: what other libraries call a point cloud, as mereo's own types.
+"""Frames and meshes that are already in memory: what other libraries call a point cloud, as mereo's own types.
 
     anything -points_of-> PointCloud (or the DepthImage that it was), number of points left out
+    meshes, by names or not -mesh_of-> SegmentedMesh
 
 Libraries are recognized by what their objects have, so that none of them is imported. What could be meant in two ways
 is refused: an image of depths has no positions without its camera, and the columns of a table name no axes.
 """
 
+import warnings
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int, Num
 from PIL import Image
 
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import DepthImage, PointCloud
 from mereo.geometry.conventions import LARGEST, check_real
+from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.io.errors import reason
-from mereo.io.readers import valid_points
-from mereo.io.ros_recordings import cloud_points
+from mereo.io.readers import InputWarning, valid_points
+from mereo.io.ros_recordings import cloud_points, depth_pixels
+
+FACES = ("regular_faces", "faces", "triangles")
+"""Attributes with the triangles of a mesh: PyVista's, whose ``faces`` are of another form, trimesh's and Open3D's."""
 
 
 def points_of(source: object, drop_invalid: bool = False) -> tuple[PointCloud | DepthImage, int]:
@@ -29,7 +37,8 @@ def points_of(source: object, drop_invalid: bool = False) -> tuple[PointCloud | 
     64-bit floats in the source's order, axes and unit; grids are flattened row by row:
 
     - arrays n x 3 or h x w x 3 of integers or floats: numpy's, torch's of any device, and whatever else converts
-      itself into a numpy array; masked values are points without a measurement;
+      itself into a numpy array; masked values are points without a measurement. Of six columns the last three are unit
+      normals, which are used, or colours from 0 to 1 or 255, which are left out with an ``InputWarning``;
     - lists or tuples of rows of three numbers;
     - structured arrays with fields x, y and z in any order among others, in one or two dimensions;
     - objects with ``points`` or ``vertices`` (Open3D and its tensors, trimesh, PyVista), with their ``normals`` or
@@ -46,11 +55,12 @@ def points_of(source: object, drop_invalid: bool = False) -> tuple[PointCloud | 
     if isinstance(source, PointCloud | DepthImage):
         return source, 0
     with np.errstate(over="ignore", invalid="ignore"):  # infinite values are counted below, whoever made them
-        points, name, organized = _positions(source)
+        points, normals, name, organized = _positions(source)
         cure = "leave them out with drop_invalid=True"
         if organized:
             cure = "organized clouds mark pixels without a measurement so, and drop_invalid=True leaves them out"
-        kept = valid_points(_with_normals(points, source), name, drop_invalid, cure)
+        rows = _with_normals(points, source) if normals is None else np.hstack([points, normals])
+        kept = valid_points(rows, name, drop_invalid, cure)
     return PointCloud.of(kept), len(points) - len(kept)
 
 
@@ -74,7 +84,7 @@ def model_points(source: object) -> Float[np.ndarray, "n 3"]:
     if isinstance(source, PointCloud):
         return source.points
     with np.errstate(over="ignore", invalid="ignore"):
-        points, name, _ = _positions(source)
+        points, _, name, _ = _positions(source)
         if not len(points) or not (np.abs(points) <= LARGEST).all():
             raise ValueError(
                 f"{name} has no points, or some that are NaN, infinite or beyond {LARGEST:g}: correct them"
@@ -104,18 +114,13 @@ def _is_frame(item: object) -> bool:
     return _is_cloud_message(item) or _carried(item) is not None
 
 
-def _positions(source: Any) -> tuple[Float[np.ndarray, "n 3"], str, bool]:
-    """All points of a source, what to call it in sentences, and whether it is a grid of pixels."""
+def _positions(source: Any) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"] | None, str, bool]:
+    """All points of a source, normals in its rows, what to call it in sentences, and whether it is a grid of pixels."""
     kind = f"the {type(source).__name__}"
     if is_frame_list(source):
         raise ValueError(f"{kind} holds {counted(len(source), 'frame')}; one is needed: give its elements one by one")
     if _is_cloud_message(source):
-        try:
-            return cloud_points(source), "the PointCloud2 message", source.height > 1
-        except Exception as error:  # whatever a broken message makes of the parser
-            raise ValueError(
-                f"the PointCloud2 message cannot be read ({reason(error)}): take another message"
-            ) from error
+        return _decoded(cloud_points, source, "PointCloud2"), None, "the PointCloud2 message", source.height > 1
     if not isinstance(source, np.ndarray | list | tuple):
         if hasattr(source, "columns"):
             raise ValueError(
@@ -134,13 +139,38 @@ def _positions(source: Any) -> tuple[Float[np.ndarray, "n 3"], str, bool]:
     values = _array(source, kind)
     name = f"{kind} of shape {values.shape}"
     if values.dtype.names is not None:
-        return _structured_points(values, name), name, values.ndim > 1
+        return _structured_points(values, name), None, name, values.ndim > 1
     check_real(values, name)
     if values.size == 0:
-        return np.empty((0, 3)), name, False
+        return np.empty((0, 3)), None, name, False
+    normals = None
+    if values.ndim in (2, 3) and values.shape[-1] == 6:
+        normals, values = _normals(_floats(values[..., 3:]).reshape(-1, 3), name), values[..., :3]
     if wrong := _what_else(values):
         raise ValueError(f"{name} {wrong}")
-    return _floats(values).reshape(-1, 3), name, values.ndim == 3
+    return _floats(values).reshape(-1, 3), normals, name, values.ndim == 3
+
+
+def _normals(columns: Float[np.ndarray, "n 3"], name: str) -> Float[np.ndarray, "n 3"] | None:
+    """Normals that three more columns of points are; None of colours. Rows that are not finite or 0 say nothing."""
+    known = columns[np.isfinite(columns).all(axis=1) & columns.any(axis=1)]
+    if (known < 0).any():
+        if (np.abs(np.linalg.norm(known, axis=1) - 1) < 0.01).all():
+            return columns
+    elif known.max(initial=0) <= 1 or (known.max() <= 255 and (known == np.rint(known)).all()):
+        warnings.warn(f"the last three columns of {name} are colours, which are left out", InputWarning, stacklevel=7)
+        return None
+    raise ValueError(
+        f"{name} has six columns, of which the last three are neither unit normals nor colours from 0 to 1 or 255: "
+        "give the positions alone, as points[:, :3]"
+    )
+
+
+def _decoded(decode: Callable[[Any], np.ndarray], message: Any, kind: str) -> np.ndarray:
+    try:
+        return decode(message)
+    except Exception as error:  # whatever a broken message makes of the parser
+        raise ValueError(f"the {kind} message cannot be read ({reason(error)}): take another message") from error
 
 
 def _is_cloud_message(source: object) -> bool:
@@ -188,8 +218,7 @@ def mask_image(mask: Any) -> Image.Image:
     name = f"the mask of shape {values.shape}"
     if values.dtype != np.bool_:
         check_real(values, name)
-    while values.ndim > 2 and len(values) == 1:
-        values = values[0]
+    values = values.squeeze() if values.ndim > 2 else values  # of networks
     if values.ndim != 2 or not values.size:
         raise ValueError(
             f"{name} is not one mask of h x w pixels; of several one is needed: choose it, as masks[scores.argmax()]"
@@ -203,6 +232,89 @@ def mask_image(mask: Any) -> Image.Image:
             "truth values, as mask > 127"
         )
     return Image.fromarray(values > 0 if low < 0 else values >= 0.5)
+
+
+def depth_values(source: Any) -> Num[np.ndarray, "h w"]:
+    """Stored values of a depth image in memory, as they are.
+
+    Args:
+        source: h x w numbers, 1 x h x w or h x w x 1, of whatever library; an image of Pillow or Open3D, or the
+            ``depth`` of an RGB-D image; a message of the type sensor_msgs/Image.
+
+    Raises ``ValueError`` for what is none of these, and for other shapes.
+    """
+    if all(hasattr(source, name) for name in ("encoding", "step", "data", "height", "width")):
+        return _decoded(depth_pixels, source, "Image")
+    source = getattr(source, "depth", source)
+    raw = _array(source, f"the depth image, a {type(source).__name__},", "pixels are needed: give h x w values")
+    check_real(raw, "the depth image")
+    values = raw.squeeze() if raw.ndim > 2 else raw  # of networks
+    if values.ndim != 2:
+        raise ValueError(f"the depth image has the shape {raw.shape}; it must be rows of pixels: give h x w values")
+    return values
+
+
+# --- meshes -----------------------------------------------------------------------------------------------------------
+
+
+def mesh_of(source: Any) -> SegmentedMesh | None:
+    """Mesh of whatever holds the parts of an object in memory; None of what holds none.
+
+    Args:
+        source: a ``SegmentedMesh``; a mapping of names to parts, or a scene of trimesh; a list of parts, or one alone.
+            A part is a ``Segment``, an object with vertices and faces (trimesh, Open3D, PyVista), or a tuple (vertices,
+            faces). Parts without a name are called part1, part2, ...
+
+    Raises ``ValueError`` for a mapping or list of which not all are parts, and for other faces than triangles.
+    """
+    if isinstance(source, SegmentedMesh):
+        return source
+    named: Any = parts_of_scene(source)
+    if not isinstance(named, Mapping):
+        is_list = isinstance(source, list | tuple) and _triangles(source) is None
+        named = dict(enumerate(source if is_list else [source]))
+        if _triangles(named.get(0)) is None:
+            return None
+    segments = list[Segment]()
+    for index, (key, part) in enumerate(named.items()):
+        if (mesh := _triangles(part)) is None:
+            raise ValueError(f"the part {key!r} of the object is no mesh, as all must be: give its vertices and faces")
+        known = getattr(part, "metadata", None) or {}
+        file = known.get("file_name") or f"part{index + 1}"
+        name = key if isinstance(key, str) else getattr(part, "name", None) or known.get("name") or Path(file).stem
+        color = getattr(part, "color", PALETTE[index % len(PALETTE)])
+        segments.append(Segment(name, color, *mesh, solid=getattr(part, "solid", False)))
+    return SegmentedMesh(tuple(segments)) if segments else None
+
+
+def parts_of_scene(source: Any) -> Any:
+    """Meshes of a scene of trimesh, where they are in it, by the names of its nodes; anything else as it is."""
+    if not (hasattr(source, "geometry") and hasattr(source, "dump")):
+        return source
+    return {mesh.metadata["node"]: mesh for mesh in source.dump()}
+
+
+def _triangles(source: Any) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]] | None:
+    """Vertices and faces of a mesh of whatever library, or of a tuple of both; None of what is none."""
+    faces: Any = None
+    if isinstance(source, tuple) and len(source) == 2 and np.ndim(source[0]) == 2:
+        vertices, faces = source
+    elif (vertices := _carried(source)) is not None:
+        faces = next((each for key in FACES if (each := getattr(source, key, None)) is not None), None)
+        if faces is None and hasattr(source, "triangle"):  # Open3D's tensor meshes
+            faces = source.triangle["indices"]
+    if faces is None:
+        return None
+    points, corners = _array(vertices, "the vertices of the mesh"), _array(faces, "the faces of the mesh")
+    if points.shape[1:] != (3,) or corners.shape[1:] != (3,) or corners.dtype.kind not in "iu":
+        raise ValueError(
+            f"the mesh has vertices of shape {points.shape} and faces of {corners.shape}; they must be "
+            "v x 3 numbers and f x 3 whole ones: split its faces into triangles"
+        )
+    return points.astype(np.float64), corners.astype(np.int64)
+
+
+# --- arrays of other libraries ----------------------------------------------------------------------------------------
 
 
 def _array(

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Num, UInt8
 
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.io.errors import check_count, is_foreseen, limited_memory, reason
@@ -233,13 +233,18 @@ def depth_image(message: Any, camera: Camera, depth_scale: float | None = None) 
 
     Raises ``ValueError``, whose text is a reason only, and for a broken message whatever it makes of the parser.
     """
+    raw = depth_pixels(message)
+    return DepthImage(metres(raw, depth_scale if raw.dtype.kind != "f" else None), camera)
+
+
+def depth_pixels(message: Any) -> Num[np.ndarray, "h w"]:
+    """Stored values of a message of the type sensor_msgs/Image; ``ValueError``, its reason only, for no depth image."""
     kind = DEPTH_ENCODINGS.get(message.encoding)
     if kind is None:
         raise ValueError(f"its encoding is {message.encoding!r}, not one of {', '.join(DEPTH_ENCODINGS)}")
     value = np.dtype(f"{'>' if message.is_bigendian else '<'}{kind}")
     rows = _rows(message, message.step, value.itemsize)
-    raw = np.ascontiguousarray(rows[:, : message.width * value.itemsize]).view(value).astype(kind)
-    return DepthImage(metres(raw, depth_scale if kind == "u2" else None), camera)
+    return np.ascontiguousarray(rows[:, : message.width * value.itemsize]).view(value).astype(kind)
 
 
 def _compressed_depth(message: Any, camera: Camera, depth_scale: float | None) -> DepthImage:

@@ -7,18 +7,19 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Num
 
 from mereo.geometry.brief import counted
-from mereo.geometry.camera import Camera, DepthImage, PointCloud
+from mereo.geometry.camera import Camera, DepthImage, PointCloud, camera_axes
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import FEW_VERTICES, oriented_points
 from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
 from mereo.io.bounds import PositiveOrUnknown, check_bounds
 from mereo.io.config import InputConfig
-from mereo.io.intrinsics import read_intrinsics
+from mereo.io.intrinsics import intrinsics_of, read_intrinsics
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.readers import (
     MESHES,
@@ -60,6 +61,8 @@ class SensorFrame:
         whole: the whole depth image, without any mask; None for clouds.
         T_input_result: from the coordinates of ``cloud``, in which results come out, to the file's, in its unit: the
             camera's pose, or what was taken away of a map's coordinates; None where nothing was moved.
+        T_result_seen: from the coordinates in which the object was looked for, whose axes ``axes`` names, to those of
+            ``cloud``, where a result was brought into another frame; None else.
     """
 
     path: Path
@@ -71,6 +74,7 @@ class SensorFrame:
     invalid: int = 0
     whole: DepthImage | None = None
     T_input_result: Float[np.ndarray, "4 4"] | None = None
+    T_result_seen: Float[np.ndarray, "4 4"] | None = None
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -89,6 +93,26 @@ class SensorFrame:
             )
         cloud = self.cloud.transformed(np.linalg.inv(T_input_camera))  # its digits may be few
         return replace(self, cloud=cloud, T_input_result=T_input_camera)
+
+    def transformed(self, T_new_result: Float[np.ndarray, "4 4"]) -> "SensorFrame":
+        """Frame in other coordinates, in which it has no pixels."""
+        T_input_result, T_result_seen = (
+            np.eye(4) if T is None else T for T in (self.T_input_result, self.T_result_seen)
+        )
+        return replace(
+            self,
+            cloud=self.cloud.transformed(T_new_result),
+            depth=None,
+            whole=None,
+            T_input_result=T_input_result @ inverse_rigid(T_new_result),
+            T_result_seen=T_new_result @ T_result_seen,
+        )
+
+    @property
+    def T_camera_result(self) -> Float[np.ndarray, "4 4"]:
+        """From the coordinates of ``cloud`` into the axes of a camera that looks at it (``camera_axes``)."""
+        turn = camera_axes(self.axes)
+        return turn if self.T_result_seen is None else turn @ inverse_rigid(self.T_result_seen)
 
     @property
     def metres(self) -> float:
@@ -110,27 +134,30 @@ def read_frame(
     path: str | Path,
     reading: InputConfig = InputConfig(),  # noqa: B008 (frozen)
     T_input_camera: Float[np.ndarray, "4 4"] | None = None,
+    camera: Any = None,
 ) -> SensorFrame:
     """Frame that a depth image, point cloud, mesh or ROS recording holds, or that ``reading`` picks from it.
 
     Depth images and recordings come in metres and camera axes; point clouds keep their file's unit and axes, unless the
     camera's pose is given, here or by the file's name, or stated in the file: then they are moved into the camera's.
+    ``camera`` are intrinsics in memory (``intrinsics_of``) instead of those of a file.
 
     Warns with ``InputWarning`` where a file states such a pose, and where a map's offset is taken away from a scan.
     Raises ``FileNotFoundError``, ``ImportError`` for a missing extra, and ``ValueError`` for a damaged file and for
     options that do not belong to this kind of file.
     """
     path = Path(path)
-    return in_camera(_as_stored(path, reading), reading, T_input_camera)
+    return in_camera(_as_stored(path, reading, camera), reading, T_input_camera)
 
 
-def _as_stored(path: Path, reading: InputConfig) -> SensorFrame:
+def _as_stored(path: Path, reading: InputConfig, camera: Any) -> SensorFrame:
     kind = "recording" if is_recording(path) else "depth image" if is_depth_image(path) else "point cloud"
-    _check_options(path, kind, reading)
+    _check_options(path, kind, reading, camera is not None)
     if kind == "recording":
-        return _recorded(recorded_frame(path, reading.frame_index or 0, *_recording_options(reading)), path, reading)
+        options = _recording_options(reading, camera)
+        return _recorded(recorded_frame(path, reading.frame_index or 0, *options), path, reading)
     if kind == "depth image":
-        return _depth_image(path, reading)
+        return _depth_image(path, reading, camera)
     unit_m = reading.unit_m
     if unit_m is None and path.suffix.lower() == ".zdf":  # in millimetres, by its definition
         unit_m = 0.001
@@ -225,14 +252,14 @@ def message_frame(message: RecordedFrame, path: Path, reading: InputConfig) -> S
     return in_camera(_recorded(message, path, reading), reading)
 
 
-def _check_options(path: Path, kind: str, reading: InputConfig) -> None:
+def _check_options(path: Path, kind: str, reading: InputConfig, has_camera: bool = False) -> None:
     if reading.topic is not None and kind != "recording":
         raise ValueError(f"{path} is no ROS recording and has no topics: leave out --topic")
     if reading.viewpoint != "auto" and path.suffix.lower() != ".pcd":
         raise ValueError(f"{path} is no PCD file, which alone states a viewpoint: leave out --viewpoint")
     if kind == "point cloud":
         image = reading.intrinsics, reading.mask, reading.mask_value, reading.depth_scale, reading.depth_along
-        if image != (None, None, (), None, "z"):
+        if has_camera or image != (None, None, (), None, "z"):
             raise ValueError(
                 f"{path} is read as a point cloud; leave out intrinsics, mask and depth scale or direction"
             )
@@ -245,16 +272,31 @@ def _check_options(path: Path, kind: str, reading: InputConfig) -> None:
         raise ValueError(f"{path} comes in metres: leave out --unit-m, and give --depth-scale if its scale is wrong")
 
 
-def _depth_image(path: Path, reading: InputConfig) -> SensorFrame:
-    if reading.intrinsics is None:
+def _depth_image(path: Path, reading: InputConfig, camera: Any) -> SensorFrame:
+    if reading.intrinsics is None and camera is None:
         raise ValueError(f"{path} is a depth image without intrinsics; they are needed: give --intrinsics FILE")
-    raw = read_raw_depth(path)
-    intrinsics = read_intrinsics(reading.intrinsics, (raw.shape[1], raw.shape[0]), path, reading.frame_index)
+    return depth_frame(path, read_raw_depth(path), reading, camera)
+
+
+def depth_frame(path: Path, raw: Num[np.ndarray, "h w"], reading: InputConfig, camera: Any = None) -> SensorFrame:
+    """Frame of a depth image's stored values, with the camera of ``reading``, or ``camera`` in memory.
+
+    Raises ``ValueError`` for values that are no depth, and for intrinsics of another image.
+    """
+    size = raw.shape[1], raw.shape[0]
+    if reading.intrinsics is not None:
+        intrinsics = read_intrinsics(reading.intrinsics, size, path, reading.frame_index)
+    else:
+        intrinsics = intrinsics_of(camera, size)
     stated = None if raw.dtype.kind == "f" else intrinsics.depth_scale
     scale = stated if reading.depth_scale is None else reading.depth_scale
-    whole = along_z(depth_of(path, raw, scale, intrinsics.camera), reading)
+    return _of_image(depth_of(path, raw, scale, intrinsics.camera), path, reading)
+
+
+def _of_image(depth: DepthImage, path: Path, reading: InputConfig, message: str = "") -> SensorFrame:
+    whole = along_z(depth, reading)
     image = usable_depth(whole, path, reading.mask, reading.mask_value)
-    return SensorFrame(path, image.to_points(), 1.0, "camera", image, whole=whole)
+    return SensorFrame(path, image.to_points(), 1.0, reading.frame, image, message, whole=whole)
 
 
 def along_z(image: DepthImage, reading: InputConfig) -> DepthImage:
@@ -262,8 +304,9 @@ def along_z(image: DepthImage, reading: InputConfig) -> DepthImage:
     return image.from_ray_lengths() if reading.depth_along == "ray" else image
 
 
-def _recording_options(reading: InputConfig) -> tuple[str | None, Camera | None, float | None]:
-    known = None if reading.intrinsics is None else read_intrinsics(reading.intrinsics)
+def _recording_options(reading: InputConfig, camera: Any = None) -> tuple[str | None, Camera | None, float | None]:
+    known = None if camera is None else intrinsics_of(camera)
+    known = known if reading.intrinsics is None else read_intrinsics(reading.intrinsics)
     scale = known.depth_scale if known and reading.depth_scale is None else reading.depth_scale
     return reading.topic, known.camera if known else None, scale
 
@@ -271,9 +314,7 @@ def _recording_options(reading: InputConfig) -> tuple[str | None, Camera | None,
 def _recorded(message: RecordedFrame, path: Path, reading: InputConfig) -> SensorFrame:
     content = message.read()
     if isinstance(content, DepthImage):
-        content = along_z(content, reading)
-        image = usable_depth(content, path, reading.mask, reading.mask_value)
-        return SensorFrame(path, image.to_points(), 1.0, reading.frame, image, message.name, whole=content)
+        return _of_image(content, path, reading, message.name)
     if reading.mask is not None or reading.depth_along == "ray":
         raise ValueError(
             f"{message.topic} in {path} has point clouds; leave out the mask and --depth-along, or name an image's "

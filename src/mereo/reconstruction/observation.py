@@ -183,11 +183,12 @@ class Observation:
 
         What is in metres is None where the unit is not known.
         """
-        known = self.frame.unit_m is not None
+        known, frame = self.frame.unit_m is not None, self.frame
+        along_z = known and frame.axes == "camera" and frame.T_result_seen is None
         return {
             "source": self.frame.source,
             "unit_m": self.frame.unit_m,
-            "depth_m": self.depth_m if known and self.frame.axes == "camera" else None,
+            "depth_m": self.depth_m if along_z else None,
             "visible_size_m": self.size_m if known else None,
             "invalid_points": self.frame.invalid,
             "T_input_result": None if self.frame.T_input_result is None else self.frame.T_input_result.tolist(),

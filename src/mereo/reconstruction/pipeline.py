@@ -24,6 +24,7 @@ from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import PALETTE, Color, SegmentedMesh
+from mereo.geometry.solids import label_grid
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.models.calibration import Calibration
 from mereo.models.trained import EncodedCloud, Trained, checked_points
@@ -98,6 +99,34 @@ class Reconstruction:
     reading: Reading
     observed: SegmentedCloud | None = None
     calibrated: bool = False
+
+    def transformed(self, T_new_input: Float[np.ndarray, "4 4"]) -> "Reconstruction":
+        """The same in another frame, by a rigid transform; its label grid lies along the new axes."""
+        surfaces, spacing = self.surfaces.transformed(T_new_input), self.labels.spacing
+        low, high = surfaces.bounds
+        counts = np.ceil((high - low) / spacing).astype(int) + 3  # with one empty voxel around
+        corner = (low + high - (counts - 1) * spacing) / 2
+        grid = replace(self.labels, labels=np.zeros(counts, dtype=np.uint8), origin=corner)
+        grid = replace(grid, labels=label_grid(surfaces, *grid.axes()))
+        segments = tuple(
+            replace(
+                segment,
+                centroid=transform_points(T_new_input, segment.centroid),
+                box=mesh.bounds if len(mesh.faces) else segment.box,
+                voxels=int((grid.labels == segment.label).sum()),
+            )
+            for segment, mesh in zip(self.segments, surfaces.segments, strict=True)
+        )
+        seen = self.observed
+        return replace(
+            self,
+            surfaces=surfaces,
+            labels=grid,
+            segments=segments,
+            T_camera_input=self.T_camera_input @ inverse_rigid(T_new_input),
+            reading=replace(self.reading, whole=self.reading.whole.transformed(T_new_input)),
+            observed=None if seen is None else replace(seen, points=transform_points(T_new_input, seen.points)),
+        )
 
     @property
     def seconds(self) -> float:

@@ -1,7 +1,8 @@
-"""Values of a mechanism's joints in an answer, with their intervals, and how sure its pose is.
+"""Pose and values of a mechanism's joints in an answer, with their covariance and intervals.
 
 The material points of a registration are those of the mechanism in some pose, so its joint values are a least squares
-problem of few unknowns. The Jacobian at its end says how the values follow the points, whose uncertainty is known.
+problem of few unknowns, as its pose is one. The derivative at its end says how the values follow the points, whose
+uncertainty is known.
 """
 
 from collections.abc import Sequence
@@ -10,11 +11,11 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.linalg import norm
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.special import chdtri, ndtr
 
 from mereo.deformation.samplers import RandomMotion
+from mereo.fitting.problem.gauss_newton import rigid_motion
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.uncertainty import LEVEL, WITHIN
@@ -111,59 +112,53 @@ def _reach(
 
     The parts are those of a radius (``RadiusParts``), without what each point has in addition: it averages out.
     """
-    follow = np.zeros((len(fit.x), len(registration.material), 3))
-    follow[:, rows] = np.linalg.pinv(fit.jac).reshape(len(fit.x), len(rows), 3) / registration.scene_unit
-    spread = _spread(registration, follow)
-    return None if spread is None else np.abs(spread[1]).max(axis=1, initial=0.0) + WITHIN * norm(spread[0], axis=1)
+    gradient = np.zeros((len(fit.x), len(registration.material), 3))
+    gradient[:, rows] = np.linalg.pinv(fit.jac).reshape(len(fit.x), len(rows), 3) / registration.scene_unit
+    if (moves := _moves(registration, gradient)) is None:
+        return None
+    gaussian, ways = moves
+    away: np.ndarray = np.abs(ways).max(axis=1, initial=0.0)
+    return away + WITHIN * np.linalg.norm(gaussian, axis=1)
 
 
-# --- pose -------------------------------------------------------------------------------------------------------------
+def pose_covariance(registration: Registration) -> Float[np.ndarray, "6 6"] | None:
+    """Covariance of ``Registration.pose``; None where the uncertainty of the points is not known.
 
-
-def measure_pose_covariance(answer: Answer) -> Float[np.ndarray, "6 6"] | None:
-    """Measure the covariance of an answer's pose: of the place of the object's origin, then of turns about the axes.
-
-    Axes are the frame's, lengths its unit, angles radians. What is far from Gaussian, such as another state that
-    explains the frame as well, counts by its second moments. None where the network answers, and where the registration
-    was read from a file.
+    Of a rotation vector w in radians, then a translation t in the input's unit, both in the axes of the registration:
+    the true pose is ``[exp(w) R, p + t]`` where the registered one is ``[R, p]``, so that w turns about the origin of
+    the object's own files, which lies at p. It holds what radii hold, times the square of their factor
+    (``Uncertainty.factor``): what the frame leaves open, and other states that explain it alike, by their second
+    moments, and for the translation the radius that each point has in addition.
     """
-    registration = answer.registered
-    if registration is None:
+    target, placed = registration.material, registration.pose()
+    source = transform_points(placed, registration.model.source_points(registration.scene_unit))
+    arm, aim = source - source.mean(axis=0), target - target.mean(axis=0)
+    # The turn w of the best rotation solves sum arm x (aim + shift) = 0 to first order: M w = sum arm x shift
+    turning = np.linalg.inv((arm * aim).sum() * np.eye(3) - arm.T @ aim)
+    turn = np.moveaxis(rigid_motion(arm)[:, :, :3] @ turning, 2, 0)
+    lever = target.mean(axis=0) - placed[:3, 3]
+    shift = np.eye(3)[:, None] / len(arm) - np.cross(turn, lever, axisa=0, axisc=0)
+    moves, sure = _moves(registration, np.concatenate([turn, shift])), registration.uncertainty
+    if moves is None or sure is None:
         return None
-    material, origin = registration.material, registration.pose()[:3, 3]
-    middle = material.mean(axis=0)
-    arms = _crosses(material - middle)
-    # motion of the best rigid body: of its middle the mean one, and the turn whose angular momentum is that of all
-    turn = np.moveaxis(np.linalg.solve(np.einsum("nij,nkj->ik", arms, arms), arms), 0, 1)
-    shift = np.repeat(np.eye(3)[:, None] / len(material), len(material), axis=1)
-    shift -= np.tensordot(_crosses(origin - middle), turn, axes=1)
-    spread = _spread(registration, np.concatenate([shift, turn]))
-    if spread is None or registration.uncertainty is None:
-        return None
-    factor = np.hstack(spread)
+    factor = np.hstack(moves)
     covariance: np.ndarray = factor @ factor.T
-    extra = registration.uncertainty.optimum.unit * registration.uncertainty.extra_radius
-    covariance[range(3), range(3)] += extra**2 / chdtri(3, 1 - LEVEL)  # as of every position
+    covariance[range(3, 6), range(3, 6)] += (sure.optimum.unit * sure.extra_radius) ** 2 / chdtri(3, 1 - LEVEL)
     return covariance
 
 
-def _crosses(arms: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
-    """Matrices whose products with vectors are cross products."""
-    return np.cross(arms[..., None, :], np.eye(3), axis=-1).swapaxes(-1, -2)
-
-
-def _spread(
+def _moves(
     registration: Registration, gradient: Float[np.ndarray, "c m 3"]
-) -> tuple[Float[np.ndarray, "c q"], Float[np.ndarray, "c o"]] | None:
-    """Factor of the covariance of numbers with this gradient by the material points, and their ways to other states.
+) -> tuple[Float[np.ndarray, "c p"], Float[np.ndarray, "c o"]] | None:
+    """How c numbers, of which the gradient by the material points is given, are unsure; None where points are not.
 
-    None where the uncertainty of the points is not known.
+    Their changes with independent standard normal numbers, and in each other state that explains the frame alike.
     """
     sure = registration.uncertainty
     if sure is None:
         return None
     posterior, unit = sure.posterior, sure.optimum.unit
     T_registration_fit = fit_rigid(unit * posterior.material, registration.material)
-    gradient = unit * gradient @ T_registration_fit[:3, :3]
-    near, far = sure.factor * posterior.motion_of(gradient), np.tensordot(gradient, posterior.open, axes=2)
-    return np.hstack([near, far]), np.tensordot(gradient, posterior.ways, axes=2)
+    gradient = unit * (gradient @ T_registration_fit[:3, :3])
+    far, ways = (np.tensordot(gradient, part, axes=2) for part in (posterior.open, posterior.ways))
+    return np.hstack([sure.factor * posterior.motion_of(gradient), far]), ways

@@ -8,22 +8,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import describe
 from mereo.fitting.registration.registration import Registration
-from mereo.geometry.camera import PointCloud, camera_axes
+from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.radii import Radii
 from mereo.geometry.transforms import transform_points
 from mereo.io.attachments import Surfaces, write_attachment
 from mereo.io.config import DEFAULT_FILES, FilesConfig
+from mereo.io.sensor_frame import SensorFrame
 from mereo.io.writers.formats import WRITERS, Results, chosen_formats, write_formats
-from mereo.io.writers.glb import viewer_rotation, write_segments_glb
+from mereo.io.writers.glb import GLTF_CAMERA_ROTATION, write_segments_glb
 from mereo.results.carry import Carried
 from mereo.results.state import write_state
 from mereo.scenes.rest_pose import rest_digest
-from mereo.visualization.joints import measure_joints
+from mereo.visualization.joints import measure_joints, pose_covariance
 from mereo.visualization.previews import render_cloud_and_segments
 from mereo.visualization.reconstruction_report import REPORT, Report, cluster, trust
 from mereo.visualization.units import Unit
@@ -35,8 +37,16 @@ INSTANCE = "instance{}"
 def summary_of(
     answer: Answer, carried: Sequence[Carried] = (), timings_s: Mapping[str, float] | None = None
 ) -> dict[str, Any]:
-    """Content of ``summary.json``: facts of the frame, how sure the answer is, each segment, the stages' seconds."""
-    result, frame = answer.reconstruction, answer.seen.frame
+    """Content of ``summary.json``: facts of the frame, how sure the answer is, each segment, the stages' seconds.
+
+    Of a lost object without an answer these are the facts of the frame, and no segments.
+    """
+    facts, frame = frame_facts(answer, carried), answer.seen.frame
+    axes = frame.axes if frame.T_result_seen is None else "other"
+    head = {"frame": axes, "unit_m": frame.unit_m, "verdict": trust(facts).level, **facts}
+    if answer.is_missing:
+        return {**head, "tracking": answer.tracking, "pose": None, "segments": []}
+    result, fit = answer.reconstruction, answer.registered
     segments: list[dict[str, Any]] = [
         {
             "name": segment.name,
@@ -48,24 +58,23 @@ def summary_of(
             "confidence": segment.confidence,
             "voxels": segment.voxels,
             "components": segment.components,
+            **({} if fit is None else {"pose": fit.pose(fit.model.labels == segment.label).tolist()}),
         }
         for segment, color in zip(result.segments, result.surfaces.colors, strict=True)
     ]
-    registered, radii = answer.registered, dict[str, Any]()
-    sure = None if registered is None else registered.uncertainty
-    if sure is not None:
+    radii, sure = dict[str, Any](), None if fit is None else fit.uncertainty
+    if fit is not None and sure is not None:
         radii["radius95"] = {**sure.summary(), "unit_m": frame.unit_m}
         for row, segment in zip(segments, sure.segments, strict=True):
             row |= {"centroid_radius95": segment.centroid_radius95, "volume95": list(segment.volume95)}
-    facts, joints = frame_facts(answer, carried), measure_joints(answer)
+        radii["pose_covariance"] = pose_covariance(fit)
+    joints = measure_joints(answer)
     return {
-        "frame": frame.axes,
-        "unit_m": frame.unit_m,
-        "verdict": trust(facts).level,
-        **facts,
+        **head,
         **radii,
         **({"joints": {name: joint.facts() for name, joint in joints.items()}} if joints else {}),
-        "pose": None if registered is None else registered.pose().tolist(),
+        "pose": None if fit is None else fit.pose().tolist(),
+        "model_scale": None if fit is None else fit.model_scale,
         "nested": [list(pair) for pair in result.surfaces.nested],
         "spacing": float(result.labels.spacing[0]),
         "evaluated_points": result.evaluated,
@@ -87,7 +96,8 @@ def frame_facts(answer: Answer, carried: Sequence[Carried] = ()) -> dict[str, ob
         "points": len(seen.cloud),
     }
     if registrar is not None:
-        source = {"answer": "registration" if answer.taken else "network", "located_by": answer.located_by}
+        kind = "registration" if answer.taken else None if answer.is_missing else "network"
+        source = {"answer": kind, "located_by": answer.located_by}
         fit = answer.registration
         facts["registration"] = source | ({"refusal": answer.refusal} if fit is None else describe(fit))
     facts["recognition"] = answer.recognition.facts()
@@ -123,7 +133,7 @@ def write_answer(
     reconstruction, frame = answer.reconstruction, answer.seen.frame
     started = time.perf_counter()
     formats = chosen_formats(files.formats)
-    results, to_viewer = _results(answer, files), viewer_rotation(frame.axes)
+    results, to_viewer = _results(answer, files), to_viewer_of(frame)
     write_formats(directory, [name for name in formats if name != "json"], results)  # which states the time of these
     for item in carried:
         write_attachment(directory / "carried" / item.name, item.content, results.factor, to_viewer, frame.metres)
@@ -166,15 +176,20 @@ def write_answer_file(path: Path, suffix: str, answer: Answer, files: FilesConfi
 def _results(answer: Answer, files: FilesConfig) -> Results:
     """What the writers of all formats are given."""
     result, frame = answer.reconstruction, answer.seen.frame
-    radii, to_viewer = radii_of(answer.registered), viewer_rotation(frame.axes)
+    radii, to_viewer = radii_of(answer.registered), to_viewer_of(frame)
     parts = result.surfaces, result.labels, result.observed
     return Results(*parts, to_viewer, frame.metres, files.millimetres, radii=radii)
+
+
+def to_viewer_of(frame: SensorFrame) -> Float[np.ndarray, "3 3"]:
+    """Rotation from a frame's axes to glTF's, in which it is seen as its camera saw it."""
+    return GLTF_CAMERA_ROTATION @ frame.T_camera_result[:3, :3]
 
 
 def report_of(answer: Answer, surfaces: SegmentedMesh, summary: dict[str, Any]) -> Report:
     """Page of an answer with these surfaces, which may be coarser and more than its own."""
     frame, cloud = answer.seen.frame, answer.seen.cloud
-    to_viewer, unit = viewer_rotation(frame.axes), Unit(frame.unit_m)
+    to_viewer, unit = to_viewer_of(frame), Unit(frame.unit_m)
     return Report(cloud, surfaces, summary, to_viewer, unit, answer.registered, frame.depth)
 
 
@@ -187,7 +202,7 @@ def radii_of(registered: Registration | None) -> Radii | None:
 
 def write_preview(path: Path, answer: Answer, surfaces: SegmentedMesh) -> None:
     """Write the picture of an answer's cloud and these surfaces, both turned as a camera sees them."""
-    frame, to_camera = answer.seen.frame, camera_axes(answer.seen.frame.axes)
+    frame, to_camera = answer.seen.frame, answer.seen.frame.T_camera_result
     cloud = PointCloud(transform_points(to_camera, answer.seen.cloud.points))
     render_cloud_and_segments(path, cloud, surfaces.transformed(to_camera), frame.source)
 

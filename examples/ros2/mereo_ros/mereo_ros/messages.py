@@ -29,7 +29,6 @@ from visualization_msgs.msg import Marker, MarkerArray
 import mereo
 from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.ros_recordings import camera_of_info, depth_image
-from mereo.visualization.joints import measure_pose_covariance
 
 # --- frames -----------------------------------------------------------------------------------------------------------
 
@@ -123,8 +122,8 @@ def joint_state(result: mereo.Result, header: Any) -> JointState:
 def pose(result: mereo.Result, header: Any) -> PoseWithCovarianceStamped:
     """Pose of the object with the covariance of its origin and of turns about the camera's axes."""
     assert result.pose is not None
-    covariance = measure_pose_covariance(result)
-    known = {} if covariance is None else {"covariance": covariance.ravel()}
+    covariance = result.covariance
+    known = {} if covariance is None else {"covariance": np.roll(covariance, 3, axis=(0, 1)).ravel()}  # shift first
     placed = Pose(position=_point(Point, result.pose[:3, 3]), orientation=_quaternion(result.pose))
     return PoseWithCovarianceStamped(
         header=Header(stamp=header.stamp, frame_id=header.frame_id), pose=PoseWithCovariance(pose=placed, **known)

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, SupportsIndex
 
 import numpy as np
 from jaxtyping import Float
@@ -38,7 +37,7 @@ PATCH = 0.02
 """Share of the points by which a smooth patch may explain fewer than the object, and still explains as many."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Candidate:
     """Modes fitted to the points that one hypothesis takes for the object's.
 
@@ -141,12 +140,6 @@ class Answer:
     located_by: LocatedBy = "network"
     tracking: Tracking = "found"
     further: "tuple[Answer, ...]" = ()
-
-    def __reduce_ex__(self, protocol: SupportsIndex) -> Any:
-        raise TypeError(
-            "a result cannot be pickled or copied, as it holds search structures of compiled libraries: write it with "
-            "result.save(), or send result.surfaces or its segments, list(result)"
-        )
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.seen.frame.source!r}: {self.source})"
