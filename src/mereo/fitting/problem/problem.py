@@ -247,7 +247,8 @@ class Problem:
     def coarse(self) -> "Problem":
         """Problem with fewer points, for the choice among many states."""
         few = self.config.silhouette_vertices // COARSE
-        config = replace(self.config, samples=1000, silhouette_vertices=few, exact_steps=0)
+        exact_steps = 0 if self.noisy else self.config.exact_steps  # its sigma would use the faces in all steps
+        config = replace(self.config, samples=1000, silhouette_vertices=few, exact_steps=exact_steps)
         some = slice(None, None, COARSE)
         network = NetworkTerm(*(part[some] for part in vars(self.network).values()))
         evidence = self.evidence.few(OBSERVED_SAMPLES // COARSE)
