@@ -15,7 +15,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from mereo.api.objects import load_object
-from mereo.api.reconstruct import load_frame, reconstruct
+from mereo.api.reconstruct import Tracker, load_frame, reconstruct
 from mereo.fitting.problem.correspondences import NoFit
 from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import Way
@@ -143,3 +143,16 @@ def test_a_bottle_before_a_stereo_camera_is_believed_without_a_dent(
     true = fit_rigid(rest, placed)[:3, :3]
     turns = (T[:3, :3] @ np.diag([x, x, 1.0]) @ true.T for x in (1.0, -1.0))  # its two sides look the same
     assert min(np.degrees(Rotation.from_matrix(turn).magnitude()) for turn in turns) < 3.0
+
+
+@pytest.mark.slow
+def test_a_bottle_before_a_stereo_camera_is_followed_on_its_desk(tmp_path: Path) -> None:
+    bottle = load_object(STEREO / "schauma.obj", units="m", deformations="rigid")
+    rest, _ = masked_bottle(tmp_path, "200")
+    with Tracker(bottle) as tracker:
+        for number, name in enumerate(("200", "201", "200", "201")):
+            depth = STEREO / f"depth_camera_image_{name}.png"
+            found = tracker.follow(depth, number / 30, intrinsics=tmp_path / "camera.json")
+            assert (found.tracking, found.known) == ("followed" if number else "found", True) and found.pose is not None
+            placed = masked_bottle(tmp_path, name)[1]
+            assert np.linalg.norm(transform_points(found.pose, rest).mean(axis=0) - placed.mean(axis=0)) < 0.004

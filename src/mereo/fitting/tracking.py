@@ -40,6 +40,7 @@ from mereo.io.cores import limit_blas_threads
 from mereo.models.calibration import Calibration
 from mereo.reconstruction.isolation import Reading
 from mereo.reconstruction.observation import Observation
+from mereo.reconstruction.pipeline import EncodedFrame
 
 # --- one frame's fit from the state of the frame before ---------------------------------------------------------------
 
@@ -455,13 +456,18 @@ class Tracker:
         self._T_camera_input, self._axes = before
         return None
 
+    def _found(self, frame: TrackedFrame) -> tuple[Observation, Candidate, EncodedFrame]:
+        """What of a frame is taken for the object, its best candidate, and what ``find`` returns besides."""
+        network = self.registrar.network
+        return frame.seen, *find(frame.seen, network, self.registrar, frame.keep_all, frame.scene_unit)
+
     def _by_itself(self, frame: TrackedFrame, tracked: "_Tracked | None", started: float) -> Answer:
         """Answer a frame by itself, which begins a track, or by the track that went on, where that is better.
 
         The object is lost where neither explains the frame, and then the track is kept.
         """
-        seen, registrar, config = frame.seen, self.registrar, self.config
-        candidate, likelier = find(seen, registrar.network, registrar, frame.keep_all, frame.scene_unit)
+        registrar, config = self.registrar, self.config
+        seen, candidate, likelier = self._found(frame)
         must_register = registrar.method != "auto" or registrar.network is None
         if candidate.error is not None and tracked is None and must_register:
             raise candidate.error

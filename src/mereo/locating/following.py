@@ -1,6 +1,6 @@
 """Follow an object through whole depth images, in which everything else is seen as well.
 
-frame, time -located, the first time and where it is lost-> part of the frame -Tracker.follow-> Answer
+frame, time -found_in, the first time and where it is lost-> part of the frame -Tracker.follow-> Answer
 """
 
 from concurrent.futures import Executor
@@ -13,8 +13,9 @@ from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.answer_frame import search_hypotheses
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.tracking import Track, TrackedFrame
-from mereo.locating.whole_frame import NEAR, WholeFrame, at_point, is_whole, located, part_of, pixels_near
+from mereo.locating.whole_frame import NEAR, WholeFrame, at_point, found_in, is_whole, part_of, pixels_near
 from mereo.reconstruction.observation import Observation
+from mereo.reconstruction.pipeline import EncodedFrame
 
 
 def search_frame(
@@ -22,7 +23,8 @@ def search_frame(
 ) -> tuple[Candidate, Any]:
     """Search the object, as ``search_hypotheses``, where a whole frame has it."""
     if is_whole(seen, registrar):
-        seen = located(WholeFrame.of(seen, registrar, scene_unit))
+        _, candidate = found_in(WholeFrame.of(seen, registrar, scene_unit), registrar.network, keep_all)
+        return candidate, candidate.encoded
     return search_hypotheses(seen, registrar, keep_all, scene_unit)
 
 
@@ -49,10 +51,13 @@ class Tracker(tracking.Tracker):
         # to look through a whole frame takes seconds, which frames of a lost object do not wait for
         return not self._has_begun if is_whole(seen, self.registrar) else super()._is_fitted_alone(seen)
 
-    def _by_itself(self, frame: TrackedFrame, tracked: Any, started: float) -> Answer:
-        if is_whole(frame.seen, self.registrar):
-            frame = replace(frame, seen=located(WholeFrame.of(frame.seen, self.registrar, frame.scene_unit)))
-        return super()._by_itself(frame, tracked, started)
+    def _found(self, frame: TrackedFrame) -> tuple[Observation, Candidate, EncodedFrame]:
+        seen, network = frame.seen, self.registrar.network
+        if not is_whole(seen, self.registrar):
+            return super()._found(frame)
+        whole = WholeFrame.of(seen, self._search.registrar, frame.scene_unit)
+        seen, candidate = found_in(whole, network, frame.keep_all)
+        return seen, candidate, candidate.encoded
 
     def _tracked(self, track: Track | None, frame: TrackedFrame, longest_s: float) -> Any:
         whole = frame.seen.frame.whole

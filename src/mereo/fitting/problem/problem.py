@@ -359,7 +359,7 @@ SIGMAS = 1.5
 """Standard deviation that the cloud gets, in noises: mixed pixels are far beyond ``residuals.ROBUST`` of these."""
 
 NOISES = 3.0
-"""Distance, in noises, that counts as a standard deviation of a clean frame does where a fit is to be believed."""
+"""Distance, in noises, up to which a point of a noisy frame lies on the surface where a fit is to be believed."""
 
 SHARED = 1.05
 """Misfit of a noisy cloud, in misfits of what neighbours do not share, up to which nothing more is to be explained."""
@@ -434,6 +434,6 @@ def constants_for(noise: float, config: FitConfig, largest: float) -> FitConfig:
     if noise <= CLEAN:
         return config
     sigma = max(SIGMAS * min(noise, largest), config.cloud_sigma)
-    tolerance = config.tolerance * max(min(NOISES * noise, SIGMAS * largest), config.cloud_sigma) / config.cloud_sigma
+    tolerance = max(NOISES * min(noise, largest), config.tolerance)
     accepted = config.accepted if noise < CAMERA else min(config.accepted, ACCEPTED)
     return replace(config, cloud_sigma=sigma, tolerance=tolerance, accepted=accepted)
