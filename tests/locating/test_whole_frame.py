@@ -402,3 +402,5 @@ def test_an_object_is_followed_through_whole_frames_lost_and_seen_again(
             assert np.linalg.norm(off, axis=1).max() < 0.006, "a pixel is 2.2 mm wide"
         assert tracker.follow(desk(), 5 / 15, unit_m=1.0, point=(0, 9999)).tracking == "lost"
         assert tracker.follow(image, 20 / 15, unit_m=1.0, point=CAN).tracking == "found"
+        tracker.forget()
+        assert tracker.follow(desk(), 0.0, unit_m=1.0).tracking == "lost", "the likeliest place has another outline"
