@@ -320,7 +320,7 @@ def test_constants_follow_the_noise_and_end() -> None:
     config = FitConfig()
     assert constants_for(CLEAN, config, 1.0) is config
     found = constants_for(0.2, config, 1.0)
-    assert (found.cloud_sigma, found.tolerance, found.accepted) == pytest.approx((0.3, 1.35, ACCEPTED))
+    assert (found.cloud_sigma, found.tolerance, found.accepted) == pytest.approx((0.3, 0.6, ACCEPTED))
     clean = replace(found, cloud_sigma=config.cloud_sigma, tolerance=config.tolerance, accepted=config.accepted)
     assert clean == config
     assert constants_for(0.2, replace(config, accepted=0.5), 1.0).accepted == 0.5

@@ -174,18 +174,22 @@ def test_under_noise_a_part_is_hidden_where_it_is_by_the_noises_constants_too(
     trails = [Trail(each, 0.0, [refined(each, fit_wide(each, posed))]) for each in (whole, partial)]
     for chosen in trails if not share else trails[1:]:
         noisy = search_noisy(trails, chosen, False)
-        assert noisy is not None and noisy.problem.is_camera
+        assert noisy is not None and noisy.problem.noisy
         assert noisy.problem.evidence.other_lines == ("unknown" if share else "past")
 
 
-def test_noise_alone_is_neither_more_nor_less_than_was_assumed(model: StatisticalModel) -> None:
+def test_a_noisy_frame_is_explained_where_neighbours_share_as_much_as_they_do_around_it(
+    model: StatisticalModel,
+) -> None:
     posed, rng = state(model, 3), np.random.default_rng(0)
     points = view(model, posed)
-    for noise, sure in ((0.1, False), (0.5, True), (0.8, False)):
-        seen = points * (1 + rng.normal(scale=noise / 150.0, size=(len(points), 1)))
-        config = replace(FitConfig(), cloud_sigma=0.75)  # of a noise of .5
-        problem = Problem(model, NetworkTerm.none(model), Evidence.of(seen), OPEN_SCALE_STD, config, noisy=True)
-        assert Trail(problem, 0.0, [refined(problem, posed)]).is_sure == sure
+    waves = 0.5 * np.sqrt(2) * np.sin(4 / model.half * points @ [0.6, 0.8, 0.0])
+    seen = points * (1 + (waves + rng.normal(scale=0.05, size=len(points)))[:, None] / 150.0)
+    config = replace(FitConfig(), cloud_sigma=0.75)  # of a noise of .5
+    for share, is_explained in ((np.inf, False), (0.1, False), (0.5, True)):
+        evidence = replace(Evidence.of(seen), shared_noise=share)
+        problem = Problem(model, NetworkTerm.none(model), evidence, OPEN_SCALE_STD, config, noisy=True)
+        assert ScoredFit.of(problem, posed).explains(problem) is is_explained
 
 
 def test_others_explain_a_frame_alike_where_their_misfit_is_hardly_greater(

@@ -456,7 +456,7 @@ class Tracker:
         self._T_camera_input, self._axes = before
         return None
 
-    def _found(self, frame: TrackedFrame) -> tuple[Observation, Candidate, EncodedFrame]:
+    def _locate(self, frame: TrackedFrame) -> tuple[Observation, Candidate, EncodedFrame]:
         """What of a frame is taken for the object, its best candidate, and what ``find`` returns besides."""
         network = self.registrar.network
         return frame.seen, *find(frame.seen, network, self.registrar, frame.keep_all, frame.scene_unit)
@@ -467,7 +467,7 @@ class Tracker:
         The object is lost where neither explains the frame, and then the track is kept.
         """
         registrar, config = self.registrar, self.config
-        seen, candidate, likelier = self._found(frame)
+        seen, candidate, likelier = self._locate(frame)
         must_register = registrar.method != "auto" or registrar.network is None
         if candidate.error is not None and tracked is None and must_register:
             raise candidate.error

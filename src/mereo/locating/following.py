@@ -1,6 +1,6 @@
 """Follow an object through whole depth images, in which everything else is seen as well.
 
-frame, time -found_in, the first time and where it is lost-> part of the frame -Tracker.follow-> Answer
+frame, time -locate_object, the first time and where it is lost-> part of the frame -Tracker.follow-> Answer
 """
 
 from concurrent.futures import Executor
@@ -13,7 +13,7 @@ from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.answer_frame import search_hypotheses
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.tracking import Track, TrackedFrame
-from mereo.locating.whole_frame import NEAR, WholeFrame, at_point, found_in, is_whole, part_of, pixels_near
+from mereo.locating.whole_frame import NEAR, WholeFrame, at_point, is_whole, locate_object, part_of, pixels_near
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.pipeline import EncodedFrame
 
@@ -23,7 +23,7 @@ def search_frame(
 ) -> tuple[Candidate, Any]:
     """Search the object, as ``search_hypotheses``, where a whole frame has it."""
     if is_whole(seen, registrar):
-        _, candidate = found_in(WholeFrame.of(seen, registrar, scene_unit), registrar.network, keep_all)
+        _, candidate = locate_object(WholeFrame.of(seen, registrar, scene_unit), registrar.network, keep_all)
         return candidate, candidate.encoded
     return search_hypotheses(seen, registrar, keep_all, scene_unit)
 
@@ -51,12 +51,12 @@ class Tracker(tracking.Tracker):
         # to look through a whole frame takes seconds, which frames of a lost object do not wait for
         return not self._has_begun if is_whole(seen, self.registrar) else super()._is_fitted_alone(seen)
 
-    def _found(self, frame: TrackedFrame) -> tuple[Observation, Candidate, EncodedFrame]:
+    def _locate(self, frame: TrackedFrame) -> tuple[Observation, Candidate, EncodedFrame]:
         seen, network = frame.seen, self.registrar.network
         if not is_whole(seen, self.registrar):
-            return super()._found(frame)
+            return super()._locate(frame)
         whole = WholeFrame.of(seen, self._search.registrar, frame.scene_unit)
-        seen, candidate = found_in(whole, network, frame.keep_all)
+        seen, candidate = locate_object(whole, network, frame.keep_all)
         return seen, candidate, candidate.encoded
 
     def _tracked(self, track: Track | None, frame: TrackedFrame, longest_s: float) -> Any:

@@ -264,15 +264,15 @@ class WholeFrame:
         return replace(best, answer=answer, outline=self.outline(answer.registration.mesh), is_finished=True)
 
 
-def found_in(frame: WholeFrame, model: Trained | None, keep_all: bool) -> tuple[Observation, Candidate]:
+def locate_object(frame: WholeFrame, model: Trained | None, keep_all: bool) -> tuple[Observation, Candidate]:
     """The object at the most evident place of a frame, by its modes; no fit where the outline is another thing's.
 
     Raises ``NoFit`` where nothing in the frame may be it.
     """
     frame = replace(frame, registrar=replace(frame.registrar, method="modes"))
     best, *_ = instances_in(frame, list(answers_in(frame, model, keep_all)), keep_all)
-    is_there = best.nats + best.lost > 0
-    return best.seen, best.candidate if is_there else replace(best.candidate, modes=None)
+    is_evident = best.nats + best.lost > 0
+    return best.seen, best.candidate if is_evident else replace(best.candidate, modes=None)
 
 
 def is_whole(seen: Observation, registrar: Registrar) -> bool:
