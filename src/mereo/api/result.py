@@ -212,11 +212,9 @@ class Result(Answer, SegmentedResult):
     @classmethod
     def of(cls, answer: Answer) -> "Result":
         """Result of an answer."""
-        return (
-            answer
-            if isinstance(answer, cls)
-            else cls(**{item.name: getattr(answer, item.name) for item in fields(Answer)})
-        )
+        if isinstance(answer, cls):
+            return answer
+        return cls(**{item.name: getattr(answer, item.name) for item in fields(Answer)})
 
     @cached_property
     def instances(self) -> "tuple[Result, ...]":
@@ -314,7 +312,7 @@ class Result(Answer, SegmentedResult):
         fit, parts = self.registered, self.reconstruction.segments
         sure = None if fit is None else fit.uncertainty
         radii = {} if sure is None else {segment.name: segment.centroid_radius95 for segment in sure.segments}
-        poses = {} if fit is None else {part.name: fit.pose(fit.model.labels == part.label) for part in parts}
+        poses = {} if fit is None else {part.name: fit.segment_pose(part.label) for part in parts}
         return _segment_results(parts, self.surfaces, radii, poses)
 
     def to_dict(self) -> dict[str, Any]:
@@ -607,7 +605,7 @@ class StoredResult(SegmentedResult):
 
     ``unit_m``, ``known``, ``explained``, ``residual``, ``model_scale``, ``pose``, ``covariance`` and ``joints`` are as
     of ``Result``. It is not transformed, and what needs the object's model it does not have: ``carry``, distances and
-    rest positions of points, radii of single ones (``mereo.fitting.registration.state.load_state`` restores that).
+    rest positions of points, radii of single ones (``mereo.results.state.load_state`` restores that).
 
     Attributes:
         facts: content of ``summary.json``.

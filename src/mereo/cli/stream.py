@@ -485,8 +485,7 @@ class FrameAnswer:
         facts |= {"pose": _rows(registered.pose()), "joints": joints}
         figures = zip(mesh.names, owned_centroids(mesh), mesh.owned_volumes, strict=True)
         for label, (name, centroid, volume) in enumerate(figures, start=1):
-            pose = registered.pose(registered.model.labels == label)
-            segments[name] = {**_facts(centroid, float(volume)), "pose": _rows(pose)}
+            segments[name] = {**_facts(centroid, float(volume)), "pose": _rows(registered.segment_pose(label))}
         if (radius or uncertainty) and (sure := registered.uncertainty) is not None:
             facts["radius95"] = sure.summary(sure.outline)
             for each in sure.segments if uncertainty else ():

@@ -568,9 +568,8 @@ class Trail:
             if noisy is None:
                 continue
             first = Trail(noisy, 0.0, [refined(noisy, fit_wide(noisy, self.best.posed))])
-            if first.leaves_noise(
-                is_shared, only_explained
-            ):  # of most wrong states it does not, in a tenth of the time
+            # of most wrong states it does not, in a tenth of the time
+            if first.leaves_noise(is_shared, only_explained):
                 trail = self.again(noisy, first.fitted)
                 if trail.leaves_noise(is_shared, only_explained):
                     return trail

@@ -177,7 +177,7 @@ def _first(reader: Any, topic: str) -> Any:
 
 
 def _realsense_scale(reader: Any, topic: str) -> float | None:
-    """Value of one metre by the option of the sensor, which the RealSense SDK records beside its images, if it has."""
+    """Value of one metre by the option of the sensor, which the RealSense SDK records with its images, if it has."""
     option = f"{topic.partition('/Depth_')[0]}/option/Depth_Units/value"
     is_stated = any(c.topic == option and c.msgcount for c in reader.connections)
     return 1.0 / float(_first(reader, option).data) if is_stated else None

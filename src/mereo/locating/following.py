@@ -13,7 +13,7 @@ from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.answer_frame import search_hypotheses
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.tracking import Track, TrackedFrame
-from mereo.locating.whole_frame import NEAR, WholeFrame, at_point, is_whole, locate_object, part_of, pixels_near
+from mereo.locating.whole_frame import NEAR, at_point, is_whole, locate_object, part_of, pixels_near
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.pipeline import EncodedFrame
 
@@ -23,7 +23,7 @@ def search_frame(
 ) -> tuple[Candidate, Any]:
     """Search the object, as ``search_hypotheses``, where a whole frame has it."""
     if is_whole(seen, registrar):
-        _, candidate = locate_object(WholeFrame.of(seen, registrar, scene_unit), registrar.network, keep_all)
+        _, candidate = locate_object(seen, registrar, keep_all, scene_unit)
         return candidate, candidate.encoded
     return search_hypotheses(seen, registrar, keep_all, scene_unit)
 
@@ -52,11 +52,9 @@ class Tracker(tracking.Tracker):
         return not self._has_begun if is_whole(seen, self.registrar) else super()._is_fitted_alone(seen)
 
     def _locate(self, frame: TrackedFrame) -> tuple[Observation, Candidate, EncodedFrame]:
-        seen, network = frame.seen, self.registrar.network
-        if not is_whole(seen, self.registrar):
+        if not is_whole(frame.seen, self.registrar):
             return super()._locate(frame)
-        whole = WholeFrame.of(seen, self._search.registrar, frame.scene_unit)
-        seen, candidate = locate_object(whole, network, frame.keep_all)
+        seen, candidate = locate_object(frame.seen, self._search.registrar, frame.keep_all, frame.scene_unit)
         return seen, candidate, candidate.encoded
 
     def _tracked(self, track: Track | None, frame: TrackedFrame, longest_s: float) -> Any:

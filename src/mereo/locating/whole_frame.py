@@ -264,15 +264,16 @@ class WholeFrame:
         return replace(best, answer=answer, outline=self.outline(answer.registration.mesh), is_finished=True)
 
 
-def locate_object(frame: WholeFrame, model: Trained | None, keep_all: bool) -> tuple[Observation, Candidate]:
+def locate_object(
+    seen: Observation, registrar: Registrar, keep_all: bool, scene_unit: float | None
+) -> tuple[Observation, Candidate]:
     """The object at the most evident place of a frame, by its modes; no fit where the outline is another thing's.
 
     Raises ``NoFit`` where nothing in the frame may be it.
     """
-    frame = replace(frame, registrar=replace(frame.registrar, method="modes"))
-    best, *_ = instances_in(frame, list(answers_in(frame, model, keep_all)), keep_all)
-    is_evident = best.nats + best.lost > 0
-    return best.seen, best.candidate if is_evident else replace(best.candidate, modes=None)
+    frame = WholeFrame.of(seen, replace(registrar, method="modes"), scene_unit)
+    best, *_ = instances_in(frame, list(answers_in(frame, registrar.network, keep_all)), keep_all)
+    return best.seen, best.candidate if best.is_outlined else replace(best.candidate, modes=None)
 
 
 def is_whole(seen: Observation, registrar: Registrar) -> bool:
@@ -345,9 +346,14 @@ class PlacedAnswer:
         return 0.5 * self.answer.recognition.strangeness**2
 
     @property
+    def is_outlined(self) -> bool:
+        """Whether the outline is none of another thing, as ``doubted`` has it."""
+        return self.nats + self.lost > 0
+
+    @property
     def is_believed(self) -> bool:
-        """Whether the object is known there, and the outline is none of another thing, as ``doubted`` has it."""
-        return self.nats + self.lost > 0 and self.answer.recognition.known is True
+        """Whether the object is known there, by its outline too."""
+        return self.is_outlined and self.answer.recognition.known is True
 
     @property
     def is_evident(self) -> bool:

@@ -58,7 +58,7 @@ def summary_of(
             "confidence": segment.confidence,
             "voxels": segment.voxels,
             "components": segment.components,
-            **({} if fit is None else {"pose": fit.pose(fit.model.labels == segment.label).tolist()}),
+            **({} if fit is None else {"pose": fit.segment_pose(segment.label).tolist()}),
         }
         for segment, color in zip(result.segments, result.surfaces.colors, strict=True)
     ]

@@ -140,8 +140,9 @@ class Problem:
 
     def camera_noise(self, surface: Surface) -> float:
         """The same, with as much of what neighbours share of it as they do around the object."""
-        alone = self.residual_noise(surface)
-        return min(max(noise_of(self.offsets(surface)), alone), float(np.hypot(alone, self.evidence.expected_noise)))
+        offset = self.offsets(surface)
+        alone = noise_of(offset, self.evidence.around)
+        return min(max(noise_of(offset), alone), float(np.hypot(alone, self.evidence.expected_noise)))
 
     def as_noisy_as(self, surface: Surface, is_shared: bool = False) -> "Problem | None":
         """The problem of a frame as noisy as what a fit leaves over; None where the constants are for one like that.
@@ -246,8 +247,8 @@ class Problem:
     @cached_property
     def coarse(self) -> "Problem":
         """Problem with fewer points, for the choice among many states."""
-        few = self.config.silhouette_vertices // COARSE
         exact_steps = 0 if self.noisy else self.config.exact_steps  # its sigma would use the faces in all steps
+        few = self.config.silhouette_vertices // COARSE
         config = replace(self.config, samples=1000, silhouette_vertices=few, exact_steps=exact_steps)
         some = slice(None, None, COARSE)
         network = NetworkTerm(*(part[some] for part in vars(self.network).values()))

@@ -133,6 +133,10 @@ class Registration:
         """Best rigid motion of some material points, of the object's own files in the input's unit, to the frame."""
         return fit_rigid(self.model.source_points(self.scene_unit)[rows], self.material[rows])
 
+    def segment_pose(self, label: int) -> Float[np.ndarray, "4 4"]:
+        """``pose`` of the segment of a label."""
+        return self.pose(self.model.labels == label)
+
     @cached_property
     def mesh(self) -> SegmentedMesh:
         """The segments, with the rest mesh's own faces, in the camera frame and input unit."""
