@@ -97,6 +97,9 @@ def test_one_word_says_the_deformations(tmp_path: Path) -> None:
         (ELASTIC_BAR + "    stiffness: {lefd: 2}\n", "no segment is called 'lefd'"),
         (ELASTIC_BAR + "    held: [{center: [0, 0, 0], radius: 5}]\n", r"holds 0 of \d+ nodes .* it gets 3 where"),
         (ELASTIC_BAR + "    held: [{center: [0, 0, 0]}]\n", "either a radius .* or a direction .*: give one"),
+        (ELASTIC_BAR + "    held: [{nodes: [0], radius: 5}]\n", "or else `points` or `nodes` alone: give one"),
+        (ELASTIC_BAR + "    held: [{nodes: [0, 1, 2]}]\n", "a lattice has no nodes with numbers: name the file"),
+        (ELASTIC_BAR + "    held: [{points: fixed.csv}]\n", "fixed.csv does not exist"),
         (ELASTIC_BAR.replace("0.1", "0.9"), "motion"),
         (ELASTIC_BAR + "    tetrahedra: bar.vtu\n", "both cells and tetrahedra; .*: drop one"),
         (ELASTIC_BAR.replace("cells: 10", "tetrahedra: bar.vtu"), "bar.vtu does not exist"),
@@ -148,6 +151,23 @@ def test_a_volume_mesh_takes_the_place_of_the_lattice(tmp_path: Path, volume: Te
 
     np.savez(tmp_path / "bar.npz", rest_nodes=volume.nodes * [1, 1, 1.01], tetrahedra=volume.elements)
     assert load_scene(str(path)).definition != scene.definition, "other tetrahedra are another object"
+
+
+def test_nodes_are_held_by_their_numbers_or_by_points_near_them(tmp_path: Path, volume: Tetrahedra) -> None:
+    block = write_volume(tmp_path, np.vstack([np.zeros(3), volume.nodes]), volume.elements + 1)  # node 0 is unused
+    at_end = volume.nodes[:, 0] > 139
+    np.savetxt(tmp_path / "fixed.csv", volume.nodes[at_end] + 0.01, delimiter=",")
+    numbers = (np.flatnonzero(at_end) + 1).tolist()
+    for held in (f"nodes: {numbers}", "points: fixed.csv", "center: [139, 0, 0], direction: [1, 0, 0]"):
+        path = write_bar(tmp_path, block + f"    held: [{{{held}}}]\n")
+        np.testing.assert_array_equal(load_scene(path).sample_deformations.steps[0][0].held, at_end)
+        assert (tmp_path / "fixed.csv" in files_of(path)) == (held == "points: fixed.csv")
+    for held, message in (
+        ("nodes: [0, 1, 2, 3]", "no tetrahedron has the node 0; they are 1 to"),
+        ("nodes: [1, 2]", r"the list of nodes holds 2 of \d+ nodes of the solid; it must hold 3 or more"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            load_scene(write_bar(tmp_path, block + f"    held: [{{{held}}}]\n"))
 
 
 @pytest.mark.parametrize(

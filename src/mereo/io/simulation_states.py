@@ -96,8 +96,8 @@ def read_states(path: Path, names: tuple[str, ...], mesh: Path | None = None) ->
     return _sequence(path, names, mesh)
 
 
-def read_tetrahedra(path: Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 4"]]:
-    """Nodes and tetrahedra, four node indices each, of a VTK, VTU, MSH or INP file, or of an NPZ.
+def read_tetrahedra(path: Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 4"], Int[np.ndarray, " n"]]:
+    """Nodes, tetrahedra, four node indices each, and the nodes' numbers in a VTK, VTU, MSH or INP file, or an NPZ.
 
     An NPZ has them as `rest_nodes` and `tetrahedra`.
 
@@ -125,9 +125,9 @@ def read_tetrahedra(path: Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarra
     if not len(elements):
         raise ValueError(f"{path} has no tetrahedra, nor other solid cells: export the volume mesh, not its surface")
     if elements.min() < 0 or elements.max() >= len(nodes):
-        return nodes, elements  # the mesh's own check names the index
+        return nodes, elements, np.arange(len(nodes))  # the mesh's own check names the index
     used, packed = np.unique(elements, return_inverse=True)
-    return nodes[used], packed.reshape(-1, 4)
+    return nodes[used], packed.reshape(-1, 4), used
 
 
 def frame_files(path: Path) -> list[Path]:

@@ -75,7 +75,7 @@ def files_of(path: Path) -> list[Path]:
     if file.states is not None:
         states, mesh = _paths_of_states(path, file)
         named += [states, *files_of_states(states, mesh)]
-    return [path, *named, *_volume_meshes(path, file)]
+    return [path, *named, *_files_of_solids(path, file)]
 
 
 def names_of_shapes(file: SceneFile) -> list[str]:
@@ -85,10 +85,11 @@ def names_of_shapes(file: SceneFile) -> list[str]:
     return [name for name in names if name is not None]
 
 
-def _volume_meshes(path: Path, file: SceneFile) -> list[Path]:
-    """Files of the tetrahedra that elastic solids are made of."""
-    names = [block.tetrahedra for block in file.deformations or () if isinstance(block, ElasticBlock)]
-    return [path.parent / name for name in names if name is not None]
+def _files_of_solids(path: Path, file: SceneFile) -> list[Path]:
+    """Files of the tetrahedra that elastic solids are made of, and of the points where they are held."""
+    solids = [block for block in file.deformations or () if isinstance(block, ElasticBlock)]
+    held = (place.points for block in solids for place in block.held or ())
+    return [path.parent / name for name in (*(block.tetrahedra for block in solids), *held) if name is not None]
 
 
 def _with_warnings(document: Document, mesh: SegmentedMesh) -> SegmentedMesh:
@@ -134,7 +135,7 @@ def build(document: Document, file: SceneFile, mesh: SegmentedMesh) -> Scene:
             blocks = list(_kept(default_deformations, _Keyed(_content(mesh), (mesh,))))
             definition += str([block.model_dump() for block in blocks])
         motions = _random_motion(document, placement, rest, blocks)
-        if volumes := _volume_meshes(document.path, file):
+        if volumes := _files_of_solids(document.path, file):
             definition += _digest(volumes)
         key = f"{_content(rest)} {placement.matrix.tolist()} {definition}"
         rest = _kept(refined, _Keyed(key, (rest, motions)))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -18,10 +18,12 @@ from pydantic import (
     ConfigDict,
     Field,
     FiniteFloat,
+    NonNegativeInt,
     field_validator,
     model_serializer,
     model_validator,
 )
+from scipy.spatial import cKDTree
 
 from mereo.deformation import samplers
 from mereo.deformation.elastic import ElasticSampler, ElasticSolid, Material, build_lattice
@@ -31,6 +33,8 @@ from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import Normalizer
+from mereo.io.point_arrays import model_points
+from mereo.io.readers import read_points
 from mereo.io.simulation_states import read_tetrahedra
 from mereo.io.yaml_document import similar
 from mereo.scenes.recorded_states import tetrahedra_around
@@ -335,30 +339,74 @@ class PushBlock(DeformationBlock):
 
 
 class HeldPlace(Block):
-    """Part of an elastic solid that does not move: a ball, or all on one side of a plane.
+    """Part of an elastic solid that does not move: a ball, all on one side of a plane, or some of its nodes.
 
     Attributes:
         center: of the ball, or a point of the plane.
         radius: of the ball.
         direction: to the side of the plane that is held.
+        points: file of points, in the unit and frame of the segments: the node nearest to each is held.
+        nodes: numbers of nodes in the file of ``tetrahedra``, counted from 0.
     """
 
-    center: Point
+    center: Point | None = None
     radius: Positive | None = None
     direction: Direction | None = None
+    points: FileName | None = None
+    nodes: Annotated[list[NonNegativeInt], Field(min_length=1)] | None = None
 
     @model_validator(mode="after")
-    def _is_ball_or_side(self) -> "HeldPlace":
-        if (self.radius is None) == (self.direction is None):
-            raise ValueError("a held place has either a radius (a ball) or a direction (a side of a plane): give one")
+    def _is_one_kind(self) -> "HeldPlace":
+        given = self.model_fields_set
+        if given not in ({"center", "radius"}, {"center", "direction"}, {"points"}, {"nodes"}):
+            raise ValueError(
+                "a held place has either a radius (a ball) or a direction (a side of a plane), and a center, or else "
+                "`points` or `nodes` alone: give one"
+            )
         return self
 
-    def depth(self, points: Float[np.ndarray, "n 3"], target: Target) -> Float[np.ndarray, " n"]:
-        """How far points of the scene's frame are inside, scene units; below 0 outside."""
-        offset = points - target.point(self.center)
+    @property
+    def name(self) -> str:
+        """Phrase for people."""
+        if self.center is None:
+            return "the list of nodes" if self.points is None else f"the file {self.points}"
+        return f"the place at {list(self.center)}"
+
+    def depth(
+        self, nodes: Float[np.ndarray, "n 3"], numbers: Int[np.ndarray, " n"] | None, target: Target
+    ) -> Float[np.ndarray, " n"]:
+        """How far nodes of a solid, in the scene's frame, are inside, scene units; below 0 outside.
+
+        ``numbers`` are those in their file. ``Misfit`` for points that cannot be read, and for numbers of no node.
+        """
+        if self.center is None:
+            held = nodes[self._rows(nodes, numbers, target)]
+            return -cKDTree(held).query(nodes)[0]
+        offset = nodes - target.point(self.center)
         if self.direction is not None:
             return np.asarray(offset @ unit(np.array(self.direction)))
         return np.asarray((self.radius or 0.0) * target.unit - np.linalg.norm(offset, axis=1))
+
+    def _rows(
+        self, nodes: Float[np.ndarray, "n 3"], numbers: Int[np.ndarray, " n"] | None, target: Target
+    ) -> Int[np.ndarray, " r"]:
+        """Rows of the nodes that are held one by one."""
+        if self.nodes is None:
+            try:
+                points = model_points(read_points(target.folder / (self.points or ""))[:, :3])
+            except (ValueError, OSError) as error:
+                raise Misfit("held", str(error)) from error
+            return np.asarray(cKDTree(nodes).query(target.placement.apply(points))[1])
+        if numbers is None:
+            raise Misfit("held", "a lattice has no nodes with numbers: name the file of `tetrahedra`, or give `points`")
+        unknown = np.setdiff1d(self.nodes, numbers)
+        if len(unknown):
+            raise Misfit(
+                "held",
+                f"no tetrahedron has the node {unknown[0]}; they are {numbers.min()} to {numbers.max()}, counted from "
+                "0 in the file's order: correct it",
+            )
+        return np.flatnonzero(np.isin(numbers, self.nodes))
 
 
 SOFT, STIFF = 0.1, 0.025
@@ -419,11 +467,11 @@ class ElasticBlock(DeformationBlock):
                 break
         return solid
 
-    def _volume(self, target: Target, stiffness: list[float] | None) -> ElasticSolid:
-        """Tetrahedra of the file, each as stiff as the segment around its middle."""
+    def _volume(self, target: Target, stiffness: list[float] | None) -> tuple[ElasticSolid, Int[np.ndarray, " n"]]:
+        """Tetrahedra of the file, each as stiff as the segment around its middle, and their nodes' numbers in it."""
         path = target.folder / (self.tetrahedra or "")
         try:
-            nodes, elements = read_tetrahedra(path)
+            nodes, elements, numbers = read_tetrahedra(path)
             if len(elements) > MOST_TETRAHEDRA:
                 raise ValueError(
                     f"{path} has {len(elements)} tetrahedra, and {MOST_TETRAHEDRA} is the most: mesh it coarser, or "
@@ -436,7 +484,7 @@ class ElasticBlock(DeformationBlock):
         if stiffness is not None:
             labels = Solids(target.moved).label(mesh.nodes[mesh.elements].mean(axis=1))
             factor = np.concatenate([[1.0], stiffness])[labels]
-        return ElasticSolid(mesh, np.ones(len(elements)), factor)
+        return ElasticSolid(mesh, np.ones(len(elements)), factor), numbers
 
     def sampler(self, target: Target) -> DeformationSampler:
         """Sampler of states of all segments as one solid, in scene units.
@@ -448,7 +496,10 @@ class ElasticBlock(DeformationBlock):
             if name not in names:
                 raise Misfit("stiffness", f"no segment is called {name!r}: {similar(name, names)}")
         stiffness = [self.stiffness.get(name, 1.0) for name in names] if self.stiffness else None
-        solid = self.lattice(target.moved, stiffness) if self.tetrahedra is None else self._volume(target, stiffness)
+        if self.tetrahedra is None:
+            solid, numbers = self.lattice(target.moved, stiffness), None
+        else:
+            solid, numbers = self._volume(target, stiffness)
         if (pieces := solid.pieces) > 1:
             if self.tetrahedra is not None:
                 raise Misfit(
@@ -463,13 +514,13 @@ class ElasticBlock(DeformationBlock):
             )
         held = None
         for place in self.held or ():
-            depth = place.depth(solid.mesh.nodes, target)
+            depth = place.depth(solid.mesh.nodes, numbers, target)
             inside = depth >= 0
             if not 3 <= inside.sum() < len(inside) - 3:
                 least = float(np.sort(-depth)[2]) / target.unit
                 raise Misfit(
                     "held",
-                    f"the place at {list(place.center)} holds {inside.sum()} of {len(inside)} nodes of the lattice; it "
+                    f"{place.name} holds {inside.sum()} of {len(inside)} nodes of the solid; it "
                     f"must hold 3 or more, and not all: it gets 3 where it reaches {least:.3g} farther",
                 )
             held = inside if held is None else held | inside
