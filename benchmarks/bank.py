@@ -70,7 +70,7 @@ with "from truth", the fit that starts there."""
 WITHIN: dict[str, str] = {
     "shaken": "shaken",
     "explored": "explored",
-    "with_noise": "noisy",
+    "in_problem": "noisy",
     "again": "noisy",
     "with_heavier_cloud": "heavier",
     "fit_rest": "rest",
@@ -236,8 +236,7 @@ def terms_of(candidate: Candidate) -> dict[str, Any]:
             candidate.misfit is not None
             and problem.explained(candidate.misfit.cloud, surface, problem.config.explained)
         ),
-        "leaves": [problem.leaves_noise(surface, shared) for shared in (False, True)],
-        "residual_noise": problem.residual_noise(surface),
+        "left_noise": problem.left_noise(surface),
         "material": surface.material,
     }
 
@@ -369,9 +368,9 @@ def packed(
             {
                 "other_lines": each.evidence.other_lines,
                 "is_open": each.evidence.is_open,
-                "cloud_sigma": each.config.cloud_sigma,
+                "cloud_sigma": each.cloud_sigma,
                 "cloud_weight": each.config.cloud_weight,
-                "noisy": each.noisy,
+                "noisy": each.is_noisy,
                 "scale_open": each.is_scale_open,
                 "samples": len(each.evidence.observed_samples),
                 "points": len(each.evidence.points),

@@ -21,7 +21,7 @@ from bank import FITTED
 from bank_views import CONDITIONS, OBJECTS
 from jaxtyping import Float
 
-from mereo.fitting.search import WHOLE
+from mereo.fitting.search import HELPS, WHOLE
 
 CLOSE = 0.01
 """Difference in mIoU up to which a choice is as good as the best."""
@@ -119,24 +119,19 @@ def today(frame: Frame) -> int | None:
     """The fit's own rules (``search.search``, ``modes.resting``, ``register.is_drawn``), from the terms alone."""
     rows, problems = frame.rows, frame.facts["problems"]
     fits = [n for n in frame.of_stages(FITTED) if frame.problem(rows[n])["modes"] == problems[0]["modes"]]
-    clean = [n for n in fits if not frame.problem(rows[n])["noisy"] and rows[n]["stage"] != "heavier"]
-    if not clean:
+    given = [n for n in fits if rows[n]["stage"] != "heavier"]
+    if not given:
         return None
-    trails = {frame.problem(rows[n])["other_lines"] for n in clean}
-    is_open = len(trails) > 1
+    if frame.problem(rows[given[-1]])["noisy"]:  # by every point, in a problem of its own
+        given = same(frame, given, given[-1])
+    is_open = len({frame.problem(rows[n])["other_lines"] for n in given}) > 1
 
     def handicap(row: dict[str, Any]) -> float:
         return WHOLE if is_open and frame.problem(row)["other_lines"] == "unknown" else 0.0
 
-    chosen = least(frame, clean, handicap)
-    if not rows[chosen]["explains"]:
-        heavier = [n for n in fits if rows[n]["stage"] == "heavier"]
-        noisy = [n for n in fits if frame.problem(rows[n])["noisy"]]
-        leaving = [n for n in noisy if any(rows[least(frame, same(frame, noisy, n))]["leaves"])]
-        if heavier:
-            chosen = least(frame, heavier)
-        elif leaving and rows[chosen]["cloud"] >= 0.3:
-            chosen = least(frame, leaving, handicap)
+    chosen, heavier = least(frame, given, handicap), frame.of_stages(["heavier"])
+    if not rows[chosen]["explains"] and heavier and rows[heavier[-1]]["cloud"] < HELPS * rows[chosen]["cloud"]:
+        chosen = heavier[-1]
     settled, rest = frame.of_stages(["settled"]), frame.of_stages(["rest"])
     chosen = settled[-1] if settled else chosen
     is_rigid = problems[0]["modes"] == 0

@@ -130,7 +130,7 @@ def test_a_bent_object_is_not(model: StatisticalModel, excess: float) -> None:
 def test_under_noise_draws_are_asked_too_and_an_object_at_rest_stays_at_rest(model: StatisticalModel) -> None:
     points, material = seen(model.rest.transformed(IN_FRONT)), transform_points(IN_FRONT, model.rest_points)
     clean = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
-    noisy = replace(clean, problem=replace(clean.problem, noisy=True))
+    noisy = replace(clean, problem=clean.problem.with_noise(0.2))
     assert noisy.may_take_draws and not clean.may_take_draws
     found = noisy.with_draws(DrawnStates.of(SCENE, model, 30))
     assert found.method == "rest" and found.seconds > clean.seconds

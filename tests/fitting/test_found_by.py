@@ -18,8 +18,7 @@ from mereo.fitting.problem.problem import (
     CLEAN,
     SHARED,
     SIGMAS,
-    constants_for,
-    is_noise,
+    is_normal,
     noise_of,
     shared,
     shared_variance,
@@ -228,46 +227,49 @@ def noisy(points: np.ndarray, std: float) -> np.ndarray:
 @pytest.mark.slow
 def test_a_noisy_frame_is_fitted_by_its_own_noise(registrar: Registrar, points: np.ndarray) -> None:
     clean, found = (fitted(registrar, cloud).modes for cloud in (points, noisy(points, 0.4)))
-    assert clean.problem.config == FitConfig()
-    config = found.problem.config
-    assert 0.3 < config.cloud_sigma <= SIGMAS * found.problem.evidence.largest_noise
-    assert config.tolerance == pytest.approx(4.5 * config.cloud_sigma, rel=0.5)
+    assert clean.problem.cloud_sigma == FitConfig.cloud_sigma and not clean.problem.is_noisy
+    assert found.problem.noise == pytest.approx(0.4, rel=0.15)
     assert len(found.problem.evidence.observed_samples) > len(clean.problem.evidence.observed_samples)
     assert found.registration.accepted
     metres = fitted(registrar, noisy(points, 0.4) * 0.005, unit=0.005).modes
-    assert metres is not None and metres.problem.config.cloud_sigma == pytest.approx(config.cloud_sigma, rel=0.02)
+    assert metres is not None and metres.problem.noise == pytest.approx(found.problem.noise, rel=0.02)
 
 
-def test_what_a_calm_frame_cannot_have_is_no_noise(
+def test_the_noise_left_is_what_points_have_alone_and_as_much_as_neighbours_share_around_the_object(
     registrar: Registrar, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    modes = fitted(registrar, points).modes
-    problem, surface = modes.problem, Surface.through(modes.problem.model, modes.registration.material)
-    offset = np.random.default_rng(1).normal(scale=0.4, size=len(points))
-    monkeypatch.setattr(Surface, "offsets", lambda _, given, *how: offset[: len(given)])
-    calm, rough = (replace(problem, evidence=Evidence.of(cloud)) for cloud in (points, noisy(points, 0.4)))
-    assert rough.leaves_noise(surface), "every neighbour differs, and so do the points"
-    assert not calm.leaves_noise(surface), "as a state that wriggles through a smooth surface does"
+    """What a wrong state leaves over beside that is none: its neighbours share it."""
+    modes, rng = fitted(registrar, points).modes, np.random.default_rng(1)
+    surface, own = modes.surface, rng.normal(scale=0.3, size=len(modes.problem.evidence.points))
+    for share, off_by, expected in ((np.inf, 0.0, 0.3), (np.inf, 2.0, 0.3), (0.4, 2.0, 0.5), (0.4, 0.0, 0.3)):
+        monkeypatch.setattr(Surface, "offsets", lambda *_, offset=own + off_by: offset)
+        problem = replace(modes.problem, evidence=replace(modes.problem.evidence, shared_noise=share))
+        assert problem.left_noise(surface) == pytest.approx(expected, rel=0.1)
 
 
-def test_what_neighbours_share_is_no_noise(points: np.ndarray) -> None:
+def test_the_first_noise_is_what_the_cloud_shows(points: np.ndarray) -> None:
+    calm, rough = (Evidence.of(cloud) for cloud in (points, noisy(points, 0.4)))
+    assert calm.noise < CLEAN and 0.2 < rough.noise < 0.4
+    assert replace(rough, shared_noise=0.3).noise == pytest.approx(np.hypot(rough.noise, 0.3))
+
+
+def test_what_neighbours_share_is_no_noise_of_points(points: np.ndarray) -> None:
     """An offset of all points, or of half of them, is the fit's; what each has for itself is the camera's."""
     around, rng = Evidence.of(points).around, np.random.default_rng(0)
     own = rng.normal(scale=0.3, size=len(points))
     half = np.where(points[:, 0] > np.median(points[:, 0]), 2.0, 0.0)
-    assert noise_of(own, around) == pytest.approx(0.3, rel=0.1) and is_noise(own, around)
+    assert noise_of(own, around) == pytest.approx(0.3, rel=0.1)
     assert noise_of(own + 1.0, around) == pytest.approx(0.3, rel=0.1)
-    assert not is_noise(own + 1.0, around)
     assert noise_of(half, around) == 0.0
     assert 0.97 < shared(own, around, 0.45) < SHARED
     assert shared(own + 0.5, around, 0.45) > 1.3 and shared(own + half, around, 0.45) > 1.3
 
 
 def test_noise_that_neighbours_share_is_spread_evenly_and_a_wrong_state_is_not() -> None:
-    rng, around = np.random.default_rng(0), np.zeros((2700, 8), dtype=int)
+    rng = np.random.default_rng(0)
     windows = 0.1 * np.repeat(rng.normal(size=300), 9)
-    assert is_noise(windows, around, is_shared=True)
-    assert not is_noise(np.where(rng.random(2700) < 0.1, 0.6, windows), around, is_shared=True)
+    assert is_normal(windows)
+    assert not is_normal(np.where(rng.random(2700) < 0.1, 0.6, windows))
 
 
 def plate(pixels: int = 64) -> np.ndarray:
@@ -294,7 +296,7 @@ def test_a_noisy_cloud_is_worth_no_more_than_its_points_and_less_where_they_shar
     registrar: Registrar, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     modes = fitted(registrar, points).modes
-    problem = replace(modes.problem, config=constants_for(0.4, FitConfig(), 1.0), noisy=True)
+    problem = modes.problem.with_noise(0.4)
     rng, count = np.random.default_rng(0), len(problem.evidence.points)
     own, common = rng.normal(scale=0.4, size=count), np.full(count, 0.4) * np.sign(problem.evidence.points[:, 0])
     weights = list[float]()
@@ -309,38 +311,36 @@ def test_a_noisy_cloud_is_worth_no_more_than_its_points_and_less_where_they_shar
 
 def test_a_noisy_cloud_is_explained_where_only_noise_is_left(registrar: Registrar, points: np.ndarray) -> None:
     found = fitted(registrar, noisy(points, 0.4)).modes
-    assert found is not None and found.problem.noisy
+    assert found is not None and found.problem.is_noisy
     problem, aside = found.problem, found.surface.material + np.array([0.0, 0.0, 1.0])
     assert problem.explained(9.0, found.surface, 0.1)
     assert not problem.explained(9.0, Surface.through(problem.model, aside), 0.1)
-    assert not replace(problem, noisy=False).explained(9.0, found.surface, 0.1)
+    assert not problem.with_noise(0.0).explained(9.0, found.surface, 0.1)
 
 
-def test_constants_follow_the_noise_and_end() -> None:
-    config = FitConfig()
-    assert constants_for(CLEAN, config, 1.0) is config
-    found = constants_for(0.2, config, 1.0)
-    assert (found.cloud_sigma, found.tolerance, found.accepted) == pytest.approx((0.3, 0.6, ACCEPTED))
-    clean = replace(found, cloud_sigma=config.cloud_sigma, tolerance=config.tolerance, accepted=config.accepted)
-    assert clean == config
-    assert constants_for(0.2, replace(config, accepted=0.5), 1.0).accepted == 0.5
-    assert constants_for(0.9 * CAMERA, config, 1.0).accepted == config.accepted, (
-        "a clean frame's fit that is not quite right"
-    )
-    assert constants_for(9.0, config, 1.0).cloud_sigma == SIGMAS
+def test_constants_follow_the_noise_and_end(registrar: Registrar, points: np.ndarray) -> None:
+    problem = fitted(registrar, points).modes.problem
+    config = problem.config
+
+    def constants(noise: float, **changes: float) -> tuple[float, float, float]:
+        of = replace(problem, config=replace(config, **changes)).with_noise(noise)
+        return of.cloud_sigma, of.tolerance, of.accepted
+
+    clean = (config.cloud_sigma, config.tolerance, config.accepted)
+    assert constants(0.0) == constants(CLEAN) == clean and not problem.with_noise(CLEAN).is_noisy
+    assert constants(0.2) == pytest.approx((0.3, 0.6, ACCEPTED)) and problem.with_noise(0.2).is_noisy
+    assert constants(0.2, accepted=0.5)[2] == 0.5
+    assert constants(0.9 * CAMERA)[2] == config.accepted, "a clean frame's fit that is not quite right"
+    assert constants(99.0)[0] == pytest.approx(SIGMAS * problem.evidence.largest_noise)
 
 
-def test_a_cameras_noise_is_at_most_a_hundredth_of_its_distance(
-    registrar: Registrar, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_cameras_noise_is_at_most_a_hundredth_of_its_distance(registrar: Registrar, points: np.ndarray) -> None:
     """Whatever the object's size is: a bottle is thinner than the noise that a stereo camera's pixels share."""
     modes = fitted(registrar, points).modes
     far = np.median(np.linalg.norm(points, axis=1))
     assert modes.problem.evidence.largest_noise == pytest.approx(0.01 * far, rel=0.02)
-    offset = np.random.default_rng(0).choice([-1.0, 1.0], len(points)) + 0.2 * np.sin(points[:, 0])
-    for share, is_plausible in ((0.005, True), (0.02, False)):
-        monkeypatch.setattr(Surface, "offsets", lambda *_, noise=share * far: noise * offset)
-        assert modes.problem.leaves_noise(modes.surface, is_shared=True) is is_plausible
+    assert modes.problem.with_noise(0.005 * far).noise == 0.005 * far
+    assert modes.problem.with_noise(0.02 * far).noise == modes.problem.evidence.largest_noise
 
 
 def test_doubtful_points_rule_nothing_out(points: np.ndarray) -> None:

@@ -26,7 +26,7 @@ from mereo.fitting.problem.problem import OPEN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import NetworkTerm, Surface
 from mereo.fitting.registration.answer_frame import check_size, search_modes
 from mereo.fitting.registration.register import CloudToFit
-from mereo.fitting.search import ALIKE, ROUNDS, SearchRound, SightTable, Trail, medoids, rotations, search_noisy
+from mereo.fitting.search import ALIKE, ROUNDS, WHOLE, SearchRound, SightTable, Trail, likelier, medoids, rotations
 from mereo.geometry.camera import PointCloud, SightLines
 from mereo.geometry.mesh import SegmentedMesh, area_vectors, surface_points
 from mereo.geometry.symmetry import Symmetry
@@ -155,10 +155,10 @@ def test_noise_is_told_from_a_wrong_state(
     off_by = np.random.default_rng(0).normal(scale=0.5, size=len(points))[rows]
     noisy = points * (1 + off_by / np.linalg.norm(points, axis=1))[:, None]
     fitted = search_modes(CloudToFit(noisy, 1.0, lines=SightLines.of_cloud("past")), model)
-    assert fitted.problem.noisy and fitted.registration.accepted
+    assert fitted.problem.is_noisy and fitted.registration.accepted
     assert off(model, fitted.registration.material, posed) < 0.1
     assert rounds == list(ROUNDS if patched else ROUNDS[:1])
-    assert patched or not search_modes(CloudToFit(points, 1.0), model).problem.noisy
+    assert patched or not search_modes(CloudToFit(points, 1.0), model).problem.is_noisy
 
 
 @pytest.mark.parametrize("share", [0.0, 0.4])
@@ -169,13 +169,13 @@ def test_under_noise_a_part_is_hidden_where_it_is_by_the_noises_constants_too(
     points = cut(view(model, posed), share)[0]
     points = points * (1 + np.random.default_rng(0).normal(scale=0.5 / 150.0, size=(len(points), 1)))
     evidence = Evidence.of(points)
-    whole = Problem(model, NetworkTerm.none(model), evidence, OPEN_SCALE_STD, FitConfig())
-    partial = replace(whole, evidence=replace(evidence, other_lines="unknown"))
-    trails = [Trail(each, 0.0, [refined(each, fit_wide(each, posed))]) for each in (whole, partial)]
-    for chosen in trails if not share else trails[1:]:
-        noisy = search_noisy(trails, chosen, False)
-        assert noisy is not None and noisy.problem.noisy
-        assert noisy.problem.evidence.other_lines == ("unknown" if share else "past")
+    whole = Problem(model, NetworkTerm.none(model), evidence, OPEN_SCALE_STD, FitConfig()).with_noise(evidence.noise)
+    partial = whole.changed(evidence=replace(evidence, other_lines="unknown"))
+    trails = [
+        Trail(each, handicap, [refined(each, fit_wide(each, posed))])
+        for each, handicap in ((whole, 0.0), (partial, WHOLE))
+    ]
+    assert whole.is_noisy and likelier(trails).problem is (partial if share else whole)
 
 
 def test_a_noisy_frame_is_explained_where_neighbours_share_as_much_as_they_do_around_it(
@@ -185,10 +185,9 @@ def test_a_noisy_frame_is_explained_where_neighbours_share_as_much_as_they_do_ar
     points = view(model, posed)
     waves = 0.5 * np.sqrt(2) * np.sin(4 / model.half * points @ [0.6, 0.8, 0.0])
     seen = points * (1 + (waves + rng.normal(scale=0.05, size=len(points)))[:, None] / 150.0)
-    config = replace(FitConfig(), cloud_sigma=0.75)  # of a noise of .5
     for share, is_explained in ((np.inf, False), (0.1, False), (0.5, True)):
         evidence = replace(Evidence.of(seen), shared_noise=share)
-        problem = Problem(model, NetworkTerm.none(model), evidence, OPEN_SCALE_STD, config, noisy=True)
+        problem = Problem(model, NetworkTerm.none(model), evidence, OPEN_SCALE_STD, FitConfig(), noise=0.5)
         assert ScoredFit.of(problem, posed).explains(problem) is is_explained
 
 

@@ -81,7 +81,7 @@ def shaken(problem: Problem, best: "ScoredFit") -> "ScoredFit":
     """
     rng, is_patient = np.random.default_rng(0), problem.config.retries and not problem.is_scale_open
     for _ in range(SHAKES if is_patient and has_many_optima(problem) else 0):
-        if best.explains(problem) or best.misfit.cloud > HOPELESS or problem.leaves_camera_noise(best.surface):
+        if best.explains(problem) or best.misfit.cloud > HOPELESS:
             break
         before, z = best, best.posed.z
         starts = [replace(best.posed, z=z + rng.standard_normal(len(z))) for _ in range(SHAKEN)]
@@ -192,10 +192,10 @@ def fit_cloud(problem: Problem, posed: Posed, prior: Prior, start: float, steps:
     config, half = problem.config, problem.model.half
     for step in range(steps):
         share = step / max(1, steps - 1)
-        sigma = max(start * half * 0.75**step, config.cloud_sigma)
+        sigma = max(start * half * 0.75**step, problem.cloud_sigma)
         weight = config.network_weight[0] * (1 - share) + config.network_weight[1] * share
         normal = problem.known(posed, prior, slack * half * 0.7**step)
-        exact = steps - step <= config.exact_steps and sigma <= 2 * config.cloud_sigma
+        exact = steps - step <= config.exact_steps and sigma <= 2 * problem.cloud_sigma
         posed = posed.moved(problem.seen(normal, posed, sigma, weight, exact).step(DAMPING))
     return posed
 
@@ -298,7 +298,7 @@ def resting(problem: Problem, correspondences: Correspondences, modes: ScoredFit
 def narrowing(problem: Problem, modes: Posed) -> float:
     """``NormalEquations.narrowing`` of the modes at a state."""
     known, config = problem.known(modes, Prior.whole(problem.model), 0.0), problem.config
-    return problem.seen(known, modes, config.cloud_sigma, config.network_weight[1], True).narrowing()
+    return problem.seen(known, modes, problem.cloud_sigma, config.network_weight[1], True).narrowing()
 
 
 # --- noisy frames -----------------------------------------------------------------------------------------------------
@@ -310,25 +310,27 @@ NetworkFit = tuple[Problem, Correspondences, ScoredFit]
 """A frame, the network's correspondences, and the fit to both."""
 
 
-def refit_noisy(
-    start: NetworkFit, points: Float[np.ndarray, "n 3"], predict: PredictCorrespondences | None
+def fit_seen(
+    problem: Problem,
+    correspondences: Correspondences,
+    points: Float[np.ndarray, "n 3"],
+    predict: PredictCorrespondences | None,
 ) -> NetworkFit:
-    """Fit a noisy frame once more where what the second fit leaves over is noise; else return the first fit.
+    """Fit a frame from the correspondences.
 
-    The second fit decides, since noise throws the first off by more than it is itself. The network also sees the
-    smoothed cloud. ``points`` are in scene units.
+    Of a noisy one the network also sees the smoothed cloud, and the better fit is taken, and fitted once more by every
+    point with the noise that it leaves over. ``points`` are in scene units.
     """
-    problem, correspondences, modes = start
-    noisy = problem.as_noisy_as(modes.surface)
-    if noisy is None:
-        return start
-    fits = [(noisy, correspondences, fit_modes(noisy))]
-    if predict is not None:
+    fits = [(problem, correspondences, fit_modes(problem))]
+    if problem.is_noisy and predict is not None:
         other = predict(smoothed(means_along_sight(points, MOST_POINTS)))
-        again = replace(noisy, network=NetworkTerm.of(noisy.model, other))
+        again = replace(problem, network=NetworkTerm.of(problem.model, other))
         fits.append((again, other, fit_modes(again)))
-    best = min(fits, key=lambda fit: fit[2].misfit.without_network)
-    return best if best[0].leaves_noise(best[2].surface) else start
+    problem, correspondences, best = min(fits, key=lambda fit: fit[2].misfit.without_network)
+    if problem.is_noisy:
+        problem = problem.with_noise(problem.left_noise(best.surface)).by_every_point
+        best = refined(problem, best.posed)
+    return problem, correspondences, best
 
 
 def settled(problem: Problem, posed: Posed) -> tuple[Problem, ScoredFit]:

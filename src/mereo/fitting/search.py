@@ -37,7 +37,7 @@ from mereo.fitting.modes import (
 )
 from mereo.fitting.problem.evidence import Evidence, Observed, SurfaceEvidence
 from mereo.fitting.problem.gauss_newton import DAMPING, Posed, cross
-from mereo.fitting.problem.problem import Problem
+from mereo.fitting.problem.problem import Problem, is_normal, noise_of
 from mereo.fitting.problem.residuals import ROBUST, Prior, SampledSurface
 from mereo.fitting.problem.segments import diverse_rows, rms_distance
 from mereo.geometry.transforms import rotation_along
@@ -481,6 +481,9 @@ ALIKE = 12.0
 """Misfit by which a state may be worse than the best and be the true one with 5 % of its probability, which a quarter
 of the misfit decides: points' errors are not independent (docs/experiments/078.md)."""
 
+KEPT = 4
+"""Fits that differ, which another problem of the frame begins with."""
+
 SHAKEN_FITS = 3
 """Fits that differ, around each of which states are tried in each round."""
 
@@ -555,38 +558,29 @@ class Trail:
         heavier = ScoredFit.of(problem, fit_cloud(problem, best.posed, Prior.whole(problem.model), *HEAVIER_STEPS, 0.0))
         return Trail(problem, 0.0, [heavier]) if heavier.misfit.cloud < HELPS * best.misfit.cloud else None
 
-    def with_noise(self, only_explained: bool) -> "Trail | None":
-        """The same with the constants for what the best fit leaves over, where that is noise and not the fit's error.
-
-        None where that is not so, or the frame is explained, and with ``only_explained`` where noise does not explain
-        the rest, as after the first round: a wrong state may leave over what looks like noise that neighbours share.
-        """
-        if self.is_explained:
-            return None
-        for is_shared in (False,) if only_explained else (False, True):
-            noisy = self.problem.as_noisy_as(self.best.surface, is_shared)
-            if noisy is None:
-                continue
-            first = Trail(noisy, 0.0, [refined(noisy, fit_wide(noisy, self.best.posed))])
-            # of most wrong states it does not, in a tenth of the time
-            if first.leaves_noise(is_shared, only_explained):
-                trail = self.again(noisy, first.fitted)
-                if trail.leaves_noise(is_shared, only_explained):
-                    return trail
-        return None
-
-    def leaves_noise(self, is_shared: bool, only_explained: bool) -> bool:
-        """``Problem.leaves_noise`` of the best state, with ``only_explained`` only where it explains the frame."""
-        return self.problem.leaves_noise(self.best.surface, is_shared) and (self.is_explained or not only_explained)
-
-    def again(self, noisy: Problem, begun: Sequence[ScoredFit] = ()) -> "Trail":
-        """The same from its best states that differ, of which ``begun`` are fitted, in the problem of this noise."""
+    def in_problem(self, problem: Problem) -> "Trail":
+        """The same from its best states that differ, in another problem of the frame."""
         states = [scored.posed for scored in sorted(self.fitted, key=_total)]
-        rows = differing(noisy, states, BENT_APART)[len(begun) : 4]
-        fits = (*begun, *(refined(noisy, fit_wide(noisy, states[row])) for row in rows))
-        trail = Trail(noisy, 0.0, [explored(noisy, fit) for fit in fits])
+        rows = differing(problem, states, BENT_APART)[:KEPT]
+        fits = [refined(problem, fit_wide(problem, states[row])) for row in rows]
+        return Trail(problem, self.handicap, fits)
+
+    def with_shared_noise(self) -> "Trail":
+        """The same with all noise that the best fit leaves over, where nothing else explains the frame."""
+        problem = self.problem.with_noise(noise_of(self.problem.offsets(self.best.surface))).by_every_point
+        is_close = self.is_explained or self.best.misfit.cloud < problem.config.unexplained
+        if is_close or problem.noise <= self.problem.noise:
+            return self
+        trail = self.in_problem(problem)
+        if not trail.leaves_noise:
+            return self
         trail.shake()
-        return trail
+        return trail if trail.leaves_noise else self
+
+    @property
+    def leaves_noise(self) -> bool:
+        """Whether what the best fit leaves over is spread as noise is."""
+        return is_normal(self.problem.offsets(self.best.surface))
 
     @property
     def others(self) -> tuple[Float[np.ndarray, "m 3"], ...]:
@@ -617,34 +611,36 @@ def search(
     if starts:
         for trail in trails:
             trail.fitted += [refined(trail.problem, fit_wide(trail.problem, start)) for start in starts]
-        chosen = min(trails, key=lambda trail: trail.best.misfit.total + trail.handicap)
-        return chosen.with_heavier_cloud() or search_noisy(trails, chosen, False) or chosen
+        chosen = likelier(with_left_noise(trails))
+        return chosen.with_heavier_cloud() or chosen.with_shared_noise()
     for stage in rounds:
         for trail in trails:
             trail.go_on(stage)
         for trail, other in permutations(trails, 2):  # either may have found what the other has missed
             trail.fitted.append(refined(trail.problem, other.best.posed))
-        chosen = min(trails, key=lambda trail: trail.best.misfit.total + trail.handicap)
+        trails = with_left_noise(trails)
+        chosen = likelier(trails)
         chosen.shake()
         if chosen.is_explained:
-            break
-        better, is_last = chosen.with_heavier_cloud(), stage is rounds[-1]
-        if better is None and chosen.best.misfit.cloud >= whole.config.unexplained:
-            better = search_noisy(trails, chosen, not is_last)
-        if better is not None and (is_last or better.is_explained):
-            return better
-    return chosen
+            return chosen
+        heavier = chosen.with_heavier_cloud()
+        if heavier is not None and (stage is rounds[-1] or heavier.is_explained):
+            return heavier
+    return chosen.with_shared_noise()
 
 
-def search_noisy(trails: list[Trail], chosen: Trail, only_explained: bool) -> Trail | None:
-    """``Trail.with_noise``; one other than the first, of a whole object, must win by the noise's constants too."""
-    # to a clean frame's constants, noise at the rim looks like more than ``WHOLE``
-    noisy, whole = chosen.with_noise(only_explained), trails[0]
-    if noisy is None or chosen is whole:
-        return noisy
-    evidence = replace(noisy.problem.evidence, other_lines=whole.problem.evidence.other_lines)
-    again = whole.again(replace(noisy.problem, evidence=evidence))
-    return again if again.best.misfit.total < noisy.best.misfit.total + WHOLE else noisy
+def likelier(trails: list[Trail]) -> Trail:
+    """The trail under the likelier hypothesis."""
+    return min(trails, key=lambda trail: trail.best.misfit.total + trail.handicap)
+
+
+def with_left_noise(trails: list[Trail]) -> list[Trail]:
+    """Trails by every point of a noisy frame, with no more noise than the likelier one leaves over."""
+    chosen = likelier(trails)
+    if not chosen.problem.is_noisy:
+        return trails
+    noise = min(chosen.problem.noise, chosen.problem.left_noise(chosen.best.surface))
+    return [trail.in_problem(trail.problem.with_noise(noise).by_every_point) for trail in trails]
 
 
 def screen_poses(problem: Problem, stage: SearchRound) -> list[Posed]:

@@ -25,7 +25,7 @@ from mereo.fitting.config import FitConfig, LocatedBy, TrackConfig, Tracking
 from mereo.fitting.modes import ScoredFit, explored, has_many_optima, refine
 from mereo.fitting.problem.correspondences import nothing
 from mereo.fitting.problem.gauss_newton import DAMPING, POSE, NormalEquations, Posed, in_space
-from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem, constants_for
+from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import NetworkTerm, Prior, are_near
 from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.answer_frame import answer_of, find, in_registered_unit, search_hypotheses
@@ -50,13 +50,11 @@ class Track:
     """State of an object at a time, from which the next frame is fitted.
 
     Attributes:
-        problem: of that frame, without correspondences: the model, and constants by the frame's noise.
+        problem: of that frame, without correspondences: the model, and the frames' noise, smoothed.
         unit: length of a scene unit in the clouds' unit.
         posed: the state, scene units, without a scale.
         velocity: of the parameters, in the order of ``gauss_newton``, a second.
         unsure: how far the velocity may be off because little is known yet, scene units per second.
-        noise: of the frames, smoothed, scene units.
-        clean: constants of frames without noise; ``problem`` has those for ``noise``.
         other_lines: kind of the lines of sight of which a frame says nothing, as it was when the track began.
         area: greatest area of the object that was seen (``area`` of the evidence).
         left, explored_s: misfit of the cloud that the last exploration left over (``explore``), and when.
@@ -68,8 +66,6 @@ class Track:
     time_s: float
     velocity: Float[np.ndarray, " p"]
     unsure: float
-    noise: float
-    clean: FitConfig
     other_lines: SightKind
     area: float
     calibration: Calibration | None = None
@@ -77,20 +73,20 @@ class Track:
     explored_s: float = -np.inf
 
     @classmethod
-    def of(cls, fitted: ModesFit, time_s: float, config: TrackConfig, clean: FitConfig) -> "Track":
-        """Track that begins with a frame's own fit."""
+    def of(cls, fitted: ModesFit, time_s: float, config: TrackConfig, constants: FitConfig) -> "Track":
+        """Track that begins with a frame's own fit, with these ``constants``."""
         posed, scale = without_scale(fitted.posed)
         base, model = fitted.problem, fitted.problem.model
         scale_std = config.scale_std if base.is_scale_open else KNOWN_SCALE_STD
         return cls(
-            problem=changed(base, network=NetworkTerm.none(model), scale_std=scale_std),
+            problem=base.changed(network=NetworkTerm.none(model), scale_std=scale_std, config=constants).with_noise(
+                base.left_noise(fitted.surface)
+            ),
             unit=fitted.unit * scale,
             posed=posed,
             time_s=time_s,
             velocity=np.zeros(POSE + model.count),
             unsure=config.first_speed,
-            noise=base.camera_noise(fitted.surface),
-            clean=clean,
             other_lines=base.evidence.other_lines,
             area=base.evidence.area,
             calibration=fitted.calibration,
@@ -124,13 +120,6 @@ def without_scale(posed: Posed) -> tuple[Posed, float]:
     return replace(posed, translation=posed.translation / scale, log_scale=0.0), scale
 
 
-def changed(problem: Problem, **changes: Any) -> Problem:
-    """A problem of the same model, with what this one has prepared of the model's surface."""
-    other = replace(problem, **changes)
-    vars(other).update({"pairs": problem.pairs, "samples": problem.samples})
-    return other
-
-
 def gated(track: Track, points: Float[np.ndarray, "n 3"], time_s: float, config: TrackConfig) -> Bool[np.ndarray, " n"]:
     """Mark the points, in the cloud's unit, near the expected surface; others are outliers, or the object is lost."""
     samples = track.problem.samples.every(2)
@@ -159,7 +148,7 @@ def next_fit(
         def fit(other_lines: SightKind) -> ModesFit:
             like = replace(cloud, lines=replace(lines, other_lines=other_lines))
             evidence = like.evidence(track.unit, config.observed_samples, config.points)
-            problem = changed(track.problem, evidence=evidence)
+            problem = track.problem.changed(evidence=evidence)
             posed = descend(problem, start, precision, config)
             return ModesFit(problem, nothing(), track.unit, posed, 0.0, calibration=track.calibration)
 
@@ -195,18 +184,15 @@ def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig)
     """Track with a further frame."""
     posed, scale = without_scale(fitted.posed)
     passed = max(time_s - track.time_s, 1e-3)
-    noise = track.noise + config.smoothing * (fitted.problem.camera_noise(fitted.surface) - track.noise)
+    before, left = track.problem.noise, fitted.problem.left_noise(fitted.surface)
     return replace(
         track,
-        problem=changed(
-            fitted.problem, config=constants_for(noise, track.clean, fitted.problem.evidence.largest_noise)
-        ),
+        problem=fitted.problem.with_noise(before + config.smoothing * (left - before)),
         unit=track.unit * scale,
         posed=posed,
         time_s=time_s,
         velocity=track.velocity + config.smoothing * (between(track.posed, posed) / passed - track.velocity),
         unsure=track.unsure * (1 - config.smoothing),
-        noise=noise,
         area=max(track.area, fitted.problem.evidence.area),
     )
 
@@ -222,7 +208,7 @@ def motion_precision(track: Track, passed_s: float, config: TrackConfig) -> Floa
     """Precision of the parameters' step from the expected state: a point is there up to its speeds times the time."""
     speed = config.speed + max(config.gain * max(track.speed - config.dead, 0.0), track.unsure)
     # noisy frames weigh less, and a moving object must not lag behind for that
-    coarser = track.problem.config.cloud_sigma / track.clean.cloud_sigma
+    coarser = track.problem.cloud_sigma / track.problem.config.cloud_sigma
     sigma = coarser * (speed * passed_s + config.least)
     precision: Float[np.ndarray, "p p"] = track.squared * (config.motion_weight / sigma**2)
     return precision
@@ -230,11 +216,11 @@ def motion_precision(track: Track, passed_s: float, config: TrackConfig) -> Floa
 
 def descend(problem: Problem, start: Posed, precision: Float[np.ndarray, "p p"], config: TrackConfig) -> Posed:
     """State that explains cloud, silhouette and prior from nearby, and lies near ``start``, which is expected."""
-    constants, half = problem.config, problem.model.half
+    half = problem.model.half
     prior = Prior.near(problem.model, start.z) if are_near(problem.model) else Prior.whole(problem.model)
     posed, steps = start, config.steps + config.exact_steps
     for step in range(steps):
-        sigma = max(config.first_sigma * half * config.cooling**step, constants.cloud_sigma)
+        sigma = max(config.first_sigma * half * config.cooling**step, problem.cloud_sigma)
         expected = NormalEquations(precision, precision @ between(start, posed))
         normal = problem.known(posed, prior, 0.0).plus(expected)
         normal = problem.seen(normal, posed, sigma, 0.0, exact=step >= config.steps)
@@ -561,11 +547,11 @@ class _Tracked:
     hypothesis: Reading
 
     @classmethod
-    def of_frame(cls, candidate: Candidate, time_s: float, config: TrackConfig, clean: FitConfig) -> "_Tracked":
+    def of_frame(cls, candidate: Candidate, time_s: float, config: TrackConfig, constants: FitConfig) -> "_Tracked":
         """Candidate of a frame that was fitted by itself."""
         assert candidate.modes is not None
         fitted = replace(candidate.modes, rest=None)
-        return cls(fitted, Track.of(fitted, time_s, config, clean), candidate.hypothesis)
+        return cls(fitted, Track.of(fitted, time_s, config, constants), candidate.hypothesis)
 
     @property
     def score(self) -> float:

@@ -44,11 +44,12 @@ WITHIN = float(norm.ppf(0.5 + LEVEL / 2))
 """Standard deviations of one Gaussian number on either side that hold it with this probability: 1.96."""
 
 UNCALIBRATED = 1.25
-"""Factor of the posterior's radii of an object that was not calibrated, by training views of ten shipped objects
-without their calibrations and of soft ones (docs/experiments/071.md and 077.md)."""
+"""Factor of the posterior's radii of noisy frames of an object that was not calibrated, by training views of 17 objects
+without calibrations (docs/experiments/085.md); those of clean frames are right as they are."""
 
 LEAST_RADIUS = 0.1
-"""Radius in scene units that every position has in addition: the paper camera's noise, for facets and a fit's end."""
+"""Radius in scene units that every position has in addition under a calibration, which whole views have made: the paper
+camera's noise."""
 
 _FREEDOM = np.linspace(1.0, 3.0, 201)
 _QUANTILE = chdtri(_FREEDOM, 1.0 - LEVEL)
@@ -257,7 +258,7 @@ class ModesOptimum:
                 ),
                 cloud=problem.cloud_rows(posed),
                 observed_samples=problem.evidence.observed_samples,
-                ruled_out=problem.add_silhouette(nothing, posed, problem.samples.posed(posed), config.cloud_sigma),
+                ruled_out=problem.add_silhouette(nothing, posed, problem.samples.posed(posed), problem.cloud_sigma),
             )
 
     @cached_property
@@ -301,7 +302,7 @@ class DrawsOptimum:
         """Terms of the neighbourhood in which the scene is linear in its draws."""
         assert self.fit.motion is not None
         with limit_blas_threads():
-            return terms_of_draws(self.problem, self.fit, self.fit.motion, self.problem.base.config.cloud_sigma)
+            return terms_of_draws(self.problem, self.fit, self.fit.motion, self.problem.base.cloud_sigma)
 
     @property
     def surface(self) -> Surface:
@@ -325,7 +326,7 @@ class DrawsOptimum:
 def turns_left_open(problem: Problem, material: Float[np.ndarray, "m 3"]) -> Float32[np.ndarray, "m 3 e"]:
     """How far turns of single segments that the frame does not tell apart may have moved the material points."""
     samples, config = problem.evidence.observed_samples, problem.config
-    return left_open(problem.model, material, samples, config.cloud_sigma, config.cloud_weight)
+    return left_open(problem.model, material, samples, problem.cloud_sigma, config.cloud_weight)
 
 
 Optimum = ModesOptimum | DrawsOptimum
@@ -411,7 +412,7 @@ class Uncertainty:
         model: statistical model of the object.
         scale: factor by which views of training seeds showed the posterior's radii to be too small, in frames like
             this; None where that was not measured.
-        extra_radius: radius added in quadrature at every position, ``LEAST_RADIUS`` of a fit; scene units.
+        extra_radius: radius added in quadrature at every position: ``LEAST_RADIUS`` where they are calibrated; scene units.
     """
 
     optimum: Optimum
@@ -432,7 +433,7 @@ class Uncertainty:
     @property
     def factor(self) -> float:
         """Factor of the posterior's radii."""
-        return self.scale or UNCALIBRATED
+        return self.scale or (UNCALIBRATED if self.optimum.frame.is_noisy else 1.0)
 
     def _of(self, parts: RadiusParts) -> Float[np.ndarray, " n"]:
         return self.optimum.unit * parts.radii(self.factor, self.extra_radius)
@@ -541,7 +542,7 @@ class Uncertainty:
     def unexplained(self) -> Float[np.ndarray, "k 3"]:
         """Observed points farther from the surface than the tolerance; the fit's camera frame, scene units."""
         frame = self.optimum.frame
-        return frame.evidence.points[np.abs(frame.offsets(self.optimum.surface)) > frame.config.tolerance]
+        return frame.evidence.points[np.abs(frame.offsets(self.optimum.surface)) > frame.tolerance]
 
     def centroid_motion(self, index: int) -> Float[np.ndarray, "3 p"]:
         """Motion of the centroid of a segment, as ``Posterior.motion_at``."""

@@ -136,7 +136,7 @@ def score_material(
         return None
     met = problem.base.met(surface) if problem.by_sight else problem.base.nearest(surface)
     fit = DrawsFit(drawn, z, rigid, material, surface, *met, np.inf)
-    return replace(fit, misfit=misfit(problem, fit, problem.base.config.cloud_sigma))
+    return replace(fit, misfit=misfit(problem, fit, problem.base.cloud_sigma))
 
 
 def misfit(problem: DrawsProblem, fit: DrawsFit, sigma: float) -> float:
@@ -156,7 +156,7 @@ def by_misfit(state: "DrawsFit | StateOnShape") -> float:
 def narrowing(problem: DrawsProblem, fit: DrawsFit) -> float:
     """``NormalEquations.narrowing`` of the draws that move something."""
     assert fit.motion is not None
-    equations = terms(problem, fit, fit.motion, problem.base.config.cloud_sigma).total
+    equations = terms(problem, fit, fit.motion, problem.base.cloud_sigma).total
     return equations.narrowing() - int(unmoving(fit.motion).sum()) * float(np.log(HELD))
 
 
@@ -446,7 +446,7 @@ def fit_like_network(problem: DrawsProblem, modes: Posed, fits: list[DrawsFit]) 
 
 def explains_cloud(problem: DrawsProblem, fits: list[DrawsFit], most: float) -> bool:
     """Whether one of the states explains the cloud: ``Problem.explained``."""
-    sigma = problem.base.config.cloud_sigma
+    sigma = problem.base.cloud_sigma
     misfits = [float(robust_square(fit.distance, sigma).mean()) for fit in fits]
     return bool(fits) and problem.base.explained(min(misfits), fits[int(np.argmin(misfits))].surface, most)
 
@@ -568,14 +568,14 @@ def draws_that_may_jump(problem: DrawsProblem, fit: DrawsFit) -> Int[np.ndarray,
 
 def first_sigma(problem: DrawsProblem) -> float:
     """The cloud's first standard deviation, scene units."""
-    return max(0.03 * problem.model.half, problem.base.config.cloud_sigma)
+    return max(0.03 * problem.model.half, problem.base.cloud_sigma)
 
 
 def descend(
     problem: DrawsProblem, fit: DrawsFit, fresh: int, motion: Float32[np.ndarray, "a 3 d"] | None = None
 ) -> DrawsFit:
     """Descend by Levenberg and Marquardt's method, with ``fresh`` sets of differences after the given one."""
-    config, least = problem.config, problem.base.config.cloud_sigma
+    config, least = problem.config, problem.base.cloud_sigma
     index, sigma, damping = problem.states.played.index, first_sigma(problem), 0.03
     for number in range(fresh + (motion is not None)):
         if number or motion is None:

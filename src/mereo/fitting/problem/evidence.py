@@ -8,6 +8,7 @@ lines of sight on which nothing is known. Lines of sight are compared by their a
 the same.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -138,7 +139,7 @@ def without_sign(normals: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class ObservedPoints:
+class ObservedPoints(ABC):
     """Observed points, prepared for comparison with surfaces; lengths in scene units.
 
     Attributes:
@@ -180,6 +181,17 @@ class ObservedPoints:
     def expected_noise(self) -> float:
         """Standard deviation of the noise that neighbours are known to share; 0 where none is known."""
         return 0.0
+
+    @property
+    @abstractmethod
+    def roughness(self) -> float:
+        """Noise that points alone have at most (``surface_patches.roughness``)."""
+
+    @property
+    def noise(self) -> float:
+        """Noise of the frame as it shows before any fit."""
+        roughness = self.roughness if np.isfinite(self.roughness) else 0.0  # of a few points
+        return float(np.hypot(roughness, self.expected_noise))
 
     @cached_property
     def nested(self) -> Int[np.ndarray, " m"]:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -12,7 +13,6 @@ from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.evidence import (
     MORE_SAMPLES,
     OBSERVED_SAMPLES,
-    ROUGHER,
     Directions,
     Observed,
     ObservedPoints,
@@ -87,8 +87,8 @@ class Problem:
 
     Attributes:
         scale_std: standard deviation of the scale's logarithm.
-        config: constants.
-        noisy: whether they are those of a noisy frame.
+        config: constants, as a clean frame has them.
+        noise: standard deviation of the observed points from the surface (``with_noise``).
         given: pose that is known; None where the frame alone says it.
     """
 
@@ -97,7 +97,7 @@ class Problem:
     evidence: Observed
     scale_std: float
     config: FitConfig
-    noisy: bool = False
+    noise: float = 0.0
     given: GivenPose | None = None
 
     @classmethod
@@ -134,43 +134,56 @@ class Problem:
             normal = self.given.add_to(normal, self.model, posed)
         return self.pairs.add_to(normal, posed.z, PAIR_WEIGHT, slack)
 
-    def residual_noise(self, surface: Surface) -> float:
-        """Noise of the frame, in scene units, as a fit with this surface leaves it over."""
-        return noise_of(self.offsets(surface), self.evidence.around)
+    def changed(self, **changes: Any) -> "Problem":
+        """A problem of the same model, with what this one has prepared of the model's surface."""
+        other = replace(self, **changes)
+        vars(other).update({name: vars(self)[name] for name in ("pairs", "samples", "joints") if name in vars(self)})
+        return other
 
-    def camera_noise(self, surface: Surface) -> float:
-        """The same, with as much of what neighbours share of it as they do around the object."""
+    # what depends on the noise
+
+    def with_noise(self, noise: float) -> "Problem":
+        """The problem of a frame of this noise, in scene units, or of the largest that its camera may have."""
+        return self.changed(noise=min(noise, self.evidence.largest_noise))
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether a fit would bend to the noise under a clean frame's constants."""
+        return self.noise > CLEAN
+
+    @property
+    def cloud_sigma(self) -> float:
+        """Last standard deviation of the cloud, scene units."""
+        return max(SIGMAS * self.noise * self.is_noisy, self.config.cloud_sigma)
+
+    @property
+    def tolerance(self) -> float:
+        """Distance, in scene units, up to which an observed point lies on a surface."""
+        return max(NOISES * self.noise * self.is_noisy, self.config.tolerance)
+
+    @property
+    def accepted(self) -> float:
+        """Share of the observed points that must lie there for a fit to be believed."""
+        return self.config.accepted if self.noise < CAMERA else min(self.config.accepted, ACCEPTED)
+
+    def left_noise(self, surface: Surface) -> float:
+        """Noise of the frame as a fit leaves it over: of that neighbours may share as much as around the object."""
         offset = self.offsets(surface)
         alone = noise_of(offset, self.evidence.around)
         return min(max(noise_of(offset), alone), float(np.hypot(alone, self.evidence.expected_noise)))
 
-    def as_noisy_as(self, surface: Surface, is_shared: bool = False) -> "Problem | None":
-        """The problem of a frame as noisy as what a fit leaves over; None where the constants are for one like that.
-
-        What neighbours share is taken for noise too where ``is_shared``.
-        """
-        noise = noise_of(self.offsets(surface)) if is_shared else self.residual_noise(surface)
-        config = constants_for(noise, self.config, self.evidence.largest_noise)
-        if config is self.config:
-            return None
-        return replace(self, config=config, evidence=self.evidence.with_more_samples, noisy=True)
-
     def explains_noise(self, surface: Surface) -> bool:
         """Whether the frame is noisy, and enough of its points lie on a surface for a fit to be believed."""
         off = self.nearest(surface)[0]
-        return self.noisy and float((off <= self.config.tolerance).mean()) >= self.config.accepted
+        return self.is_noisy and float((off <= self.tolerance).mean()) >= self.accepted
 
     def worth(self, surface: Surface) -> "Problem":
         """The problem with as many independent points as what a fit leaves over shows that the cloud is worth."""
         config, offset = self.config, self.offsets(surface)
-        alone = (config.cloud_sigma / SIGMAS) ** 2  # variance of a point of which neighbours share nothing
+        alone = (self.cloud_sigma / SIGMAS) ** 2  # variance of a point of which neighbours share nothing
         share = min(alone / shared_variance(offset, self.evidence, POSE + self.model.count), 1.0)
         weight, outside = SIGMAS**2 * share * len(offset), FitConfig.silhouette_weight * share
         return replace(self, config=replace(config, cloud_weight=weight, silhouette_weight=outside))
-
-    def leaves_camera_noise(self, surface: Surface) -> bool:
-        """Whether a fit with a clean frame's constants leaves a camera's noise over, to which it would bend."""
-        return not self.noisy and self.residual_noise(surface) >= CAMERA
 
     @property
     def by_every_point(self) -> "Problem":
@@ -178,29 +191,23 @@ class Problem:
         evidence = self.evidence
         if len(evidence.observed_samples) >= min(len(evidence.points), MORE_SAMPLES):
             return self
-        return replace(self, evidence=evidence.with_more_samples)
-
-    def leaves_noise(self, surface: Surface, is_shared: bool = False) -> bool:
-        """Whether what a fit leaves over is noise, and not its own error; ``is_shared`` as in ``as_noisy_as``."""
-        seen, offset = self.evidence, self.offsets(surface)
-        limit = max(ROUGHER * seen.roughness, is_shared * seen.largest_noise)
-        return noise_of(offset) <= limit and is_noise(offset, seen.around, is_shared)
+        return self.changed(evidence=evidence.with_more_samples)
 
     def explained(self, cloud: float, surface: Surface, most: float) -> bool:
         """Whether a surface explains the cloud: by a misfit below ``most``, or of a noisy one all but the noise.
 
-        Of that neighbours may share as much as they do around the object.
+        Of that neighbours may share as much as they do around the object. A fit that is not believed explains nothing.
         """
-        if cloud < most or not self.noisy:
+        if cloud < most or not self.explains_noise(surface):
             return cloud < most
         offset = self.offsets(surface, self.far)
         evidence = self.evidence
-        return shared(offset, evidence.around, self.config.cloud_sigma, evidence.expected_noise) < SHARED
+        return shared(offset, evidence.around, self.cloud_sigma, evidence.expected_noise) < SHARED
 
     @property
     def far(self) -> float:
         """Distance, in scene units, beyond which a point along a line of sight is of another surface than was seen."""
-        return ROBUST * self.config.cloud_sigma
+        return ROBUST * self.cloud_sigma
 
     def met(self, surface: Surface) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
         """What of a surface each observed sample is compared with: ``Surface.compared``."""
@@ -232,7 +239,7 @@ class Problem:
 
     def cloud_misfit(self, surface: Surface) -> float:
         """Misfit of the cloud, in squared standard deviations of an observed sample."""
-        return float(robust_square(self.met(surface)[0], self.config.cloud_sigma).mean())
+        return float(robust_square(self.met(surface)[0], self.cloud_sigma).mean())
 
     @cached_property
     def samples(self) -> SampledSurface:
@@ -247,9 +254,8 @@ class Problem:
     @cached_property
     def coarse(self) -> "Problem":
         """Problem with fewer points, for the choice among many states."""
-        exact_steps = 0 if self.noisy else self.config.exact_steps  # its sigma would use the faces in all steps
         few = self.config.silhouette_vertices // COARSE
-        config = replace(self.config, samples=1000, silhouette_vertices=few, exact_steps=exact_steps)
+        config = replace(self.config, samples=1000, silhouette_vertices=few)
         some = slice(None, None, COARSE)
         network = NetworkTerm(*(part[some] for part in vars(self.network).values()))
         evidence = self.evidence.few(OBSERVED_SAMPLES // COARSE)
@@ -302,7 +308,7 @@ class Problem:
         """Residuals of the observed samples from the faces, as the last steps of a fit have them."""
         observed, config = self.evidence.observed_samples, self.config
         planes = self.surface(posed).planes(observed, self.far, self.alike)
-        return cloud_rows(posed, observed, planes, config.cloud_sigma, config.cloud_weight, self.directions)
+        return cloud_rows(posed, observed, planes, self.cloud_sigma, config.cloud_weight, self.directions)
 
     @property
     def directions(self) -> Directions | None:
@@ -322,11 +328,11 @@ class Problem:
     def _silhouette_square(self, surface: Surface) -> float:
         """Mean square of how far a vertex is ruled out, in standard deviations."""
         vertices = surface.material[self.model.silhouette_vertices]
-        return float(silhouette_losses(vertices, self.evidence, self.config.cloud_sigma).mean())
+        return float(silhouette_losses(vertices, self.evidence, self.cloud_sigma).mean())
 
     def ruled_out(self, surface: Surface) -> float:
         """Share of a surface's vertices that the frame rules out by more than a scene unit beyond the tolerance."""
-        amount = self.evidence.violations(surface.material[self.model.silhouette_vertices], self.config.tolerance)[1]
+        amount = self.evidence.violations(surface.material[self.model.silhouette_vertices], self.tolerance)[1]
         return float((amount > 1.0).mean())
 
     def total(self, cloud: float, network: float, silhouette: float, z: Float[np.ndarray, " k"]) -> Misfit:
@@ -349,9 +355,6 @@ TO_STD = 1.4826
 
 CLEAN = 0.1
 """Noise, in scene units, up to which the constants are as they are; clean frames have 0.05 to 0.07."""
-
-COHERENT = 1.3
-"""What a fit leaves over, in noises, from which on it is wrong; right ones have 0.8 to 1.1."""
 
 NORMAL = 4.3
 """The 95 % quantile of what a fit leaves over, in its median, up to which it looks like normal numbers, with 2.9."""
@@ -410,16 +413,9 @@ def noise_of(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"] | N
     return TO_STD * float(np.median(np.abs(offset if around is None else unshared(offset, around))))
 
 
-def is_noise(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"], is_shared: bool = False) -> bool:
-    """Whether what a fit leaves over is noise, and not its own error.
-
-    Where ``is_shared``, noise that neighbours may share, as stereo cameras match windows of pixels: constants reach to
-    it, and it is spread as normal numbers are, while a wrong fit is right in most of the frame and far off in the rest.
-    """
-    if not is_shared:
-        return noise_of(offset) <= COHERENT * noise_of(offset, around)
-    far, middle = float(np.quantile(np.abs(offset), 0.95)), float(np.median(np.abs(offset)))
-    return far <= NORMAL * middle
+def is_normal(offset: Float[np.ndarray, " n"]) -> bool:
+    """Whether offsets are spread as normal numbers are; those of a wrong fit are small in most places, or large."""
+    return float(np.quantile(np.abs(offset), 0.95)) <= NORMAL * float(np.median(np.abs(offset)))
 
 
 def shared(
@@ -428,13 +424,3 @@ def shared(
     """Misfit of a cloud, in misfits of noise: what points do not share with those around them, and what is expected."""
     noise = robust_square(np.hypot(unshared(offset, around), expected), sigma).mean()
     return float(robust_square(offset, sigma).mean() / max(noise, 1e-12))
-
-
-def constants_for(noise: float, config: FitConfig, largest: float) -> FitConfig:
-    """Constants for a frame of this noise, ``largest`` at most, in scene units; the same where it is clean."""
-    if noise <= CLEAN:
-        return config
-    sigma = max(SIGMAS * min(noise, largest), config.cloud_sigma)
-    tolerance = max(NOISES * min(noise, largest), config.tolerance)
-    accepted = config.accepted if noise < CAMERA else min(config.accepted, ACCEPTED)
-    return replace(config, cloud_sigma=sigma, tolerance=tolerance, accepted=accepted)

@@ -441,6 +441,7 @@ def search_modes(
         evidence = cloud.evidence(unit)
         given = GivenPose(starts[0], HELD_STD * model.half) if starts and model.is_held else None
         whole = Problem(model, NetworkTerm.none(model), evidence, cloud.scale_std, config, given=given)
+        whole = whole.with_noise(evidence.noise)
         partial = replace(whole, evidence=replace(evidence, other_lines="unknown")) if is_open else None
         trail = search(whole, partial, starts, rounds)
         problem, modes = trail.problem, trail.best

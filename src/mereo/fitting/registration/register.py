@@ -20,9 +20,8 @@ from mereo.fitting.draws.playback import MOST_DRAWS, STATES_SEED, Drawn, DrawnSt
 from mereo.fitting.modes import (
     PredictCorrespondences,
     ScoredFit,
-    fit_modes,
+    fit_seen,
     of_rest,
-    refit_noisy,
     resting,
     settled,
 )
@@ -128,8 +127,6 @@ class ModesFit:
     ) -> "ModesFit":
         """Fit the modes to a cloud, with correspondences in its unit.
 
-        Where what is left is noise, the frame is fitted once more as a noisy one.
-
         Args:
             cloud: its lines of sight went past the object where it leaves that open.
             correspondences: of the network, or others.
@@ -142,22 +139,22 @@ class ModesFit:
         correspondences = correspondences.scaled(1 / unit)
 
         with limit_blas_threads():
-            problem = Problem.of(model, correspondences, cloud.evidence(unit), cloud.scale_std, config)
-            fit = problem, correspondences, fit_modes(problem)
+            evidence = cloud.evidence(unit)
+            problem = Problem.of(model, correspondences, evidence, cloud.scale_std, config).with_noise(evidence.noise)
             scaled = None if predict is None else lambda seen: predict(seen * unit).scaled(1 / unit)
-            problem, correspondences, modes = refit_noisy(fit, cloud.points / unit, scaled)
+            problem, correspondences, modes = fit_seen(problem, correspondences, cloud.points / unit, scaled)
             rest = resting(problem, correspondences, modes)
         return cls(problem, correspondences, unit, modes.posed, time.perf_counter() - started, rest)
 
     @property
     def may_take_draws(self) -> bool:
         """Whether draws may be the answer: besides the rest model only under noise, where modes may miss what moved."""
-        return self.rest is None or self.problem.noisy
+        return self.rest is None or self.problem.is_noisy
 
     @property
     def tolerance(self) -> float:
         """Distance in scene units up to which an observed point lies on the surface, by the frame's noise."""
-        return self.problem.config.tolerance
+        return self.problem.tolerance
 
     @cached_property
     def surface(self) -> Surface:
@@ -216,7 +213,7 @@ class ModesFit:
         explained = float((distance <= self.tolerance).mean())
         factors = RadiusFactors()
         if self.calibration is not None:
-            factors = self.calibration.radii(draws=method == "draws", noisy=self.problem.noisy)
+            factors = self.calibration.radii(draws=method == "draws", noisy=self.problem.is_noisy)
         misfit = 0.0 if factors.misfit is None else self.problem.cloud_misfit(surface)
         return Registration(
             model=self.problem.model,
@@ -230,10 +227,10 @@ class ModesFit:
             seconds=self.seconds,
             residual=float(np.sqrt((distance**2).mean())) * self.unit,
             ruled_out=self.problem.ruled_out(surface),
-            needed=self.problem.config.accepted,
+            needed=self.problem.accepted,
             optimum=optimum,
             radius_scale=factors.scale_at(misfit),
-            extra_radius=LEAST_RADIUS,
+            extra_radius=0.0 if factors.scale is None else LEAST_RADIUS,
             alike=1 + len(self.others),
         )
 
@@ -242,9 +239,8 @@ class ModesFit:
 
         On clean training views the fit was better than the network in each that the second rule adds.
         """
-        config = self.problem.config
-        least = min(config.accepted, 0.85)
-        return explained >= config.accepted or (explained >= least and self._agreement(surface) >= 0.8)
+        least = min(self.problem.accepted, 0.85)
+        return explained >= self.problem.accepted or (explained >= least and self._agreement(surface) >= 0.8)
 
     def _agreement(self, surface: Surface) -> float:
         """Share of the correspondences on the object whose segment is that of the nearest position of the surface."""
