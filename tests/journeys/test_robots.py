@@ -4,9 +4,11 @@ import json
 import pickle
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 from page_blocks import blocks
 from robot_files import LAPTOP, LAPTOP_SDF, write_gripper
 
@@ -222,3 +224,152 @@ def test_the_commands_of_the_page_give_the_joints_of_a_gripper(
     result = variables["result"]
     assert isinstance(result, mereo.Result)
     assert result.joints["finger"].value == pytest.approx(facts["finger"]["value"], abs=1e-6)
+    assert isinstance(held := variables["held"], mereo.Result) and held.known is True
+    assert held.joints["finger"].interval == pytest.approx((true, true), abs=1e-12)
+
+
+# --- joints whose values are known ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def known(gripper: Path) -> mereo.Object:
+    return mereo.load_object(gripper)
+
+
+def given_shares(known: mereo.Object, given: object) -> tuple[float, float]:
+    """Shares of the range of the gripper's finger that are left, of which both fingers' random states are."""
+    narrowed = known.with_joints(given)
+    assert narrowed.scene is not None and known.scene is not None
+    motion = narrowed.scene.sample_deformations
+    assert isinstance(motion, RandomMotion)
+    shares = motion.joints["finger"][0].shares
+    places = np.array([[each(np.zeros((1, 3)))[0, 0] for each in motion(example_rng(0, i))] for i in range(50)])
+    ends = np.array([[each(np.zeros((1, 3)))[0, 0] for each in motion.at({"finger": share})] for share in shares])
+    assert (places >= ends.min(axis=0) - 1e-9).all() and (places <= ends.max(axis=0) + 1e-9).all()
+    assert (np.ptp(places, axis=0) >= 0.8 * np.ptp(ends, axis=0)).all()
+    return shares
+
+
+def test_known_values_narrow_the_random_states_whoever_states_them(known: mereo.Object, tmp_path: Path) -> None:
+    share = pytest.approx((0.017 / 0.032, 0.017 / 0.032))
+    state = {"name": ["wheel", "finger", "other finger"], "position": np.array([3.0, 0.02, 0.012])}
+    for given in (
+        {"finger": 0.02},
+        {"other finger": 0.012},
+        state,
+        SimpleNamespace(**state),
+        {"finger": np.float64(0.02)},
+    ):
+        assert given_shares(known, given) == share
+    (tmp_path / "joints.json").write_text('{"finger": {"value": 0.02, "within": 0.0}}')
+    (tmp_path / "state.yaml").write_text(  # what `ros2 topic echo --once /joint_states` prints
+        "header:\n  stamp:\n    sec: 5\n  frame_id: ''\nname:\n- finger\n- wheel\nposition:\n- 0.02\n- 1.0e-05\n"
+        "velocity: []\neffort: []\n---\n"
+    )
+    for file in ("joints.json", "state.yaml"):
+        assert given_shares(known, tmp_path / file) == share == given_shares(known, str(tmp_path / file))
+    within = {"value": 0.005, "within": 0.008}  # as far as the limits go
+    assert given_shares(known, {"finger": within}) == pytest.approx((0.0, 0.01 / 0.032))
+    both = {"finger": within, "other finger": {"value": 0.006, "within": 0.001}}
+    assert given_shares(known, both) == pytest.approx((0.003 / 0.032, 0.007 / 0.032))
+    assert known.with_joints({"finger": 0.02}) is known.with_joints(state)  # made once
+
+
+def test_a_joint_of_a_whole_turn_goes_on_beyond_its_limits(tmp_path: Path) -> None:
+    (tmp_path / "laptop.urdf").write_text(LAPTOP.replace("revolute", "continuous"))
+    laptop = mereo.load_object(tmp_path / "laptop.urdf")
+    for value in (3.1 - 2 * np.pi, 3.1 + 4 * np.pi):
+        scene = laptop.with_joints({"hinge": {"value": value, "within": 0.1}}).scene
+        assert scene is not None and isinstance(scene.sample_deformations, RandomMotion)
+        shares = np.array(scene.sample_deformations.joints["hinge"][0].shares)
+        np.testing.assert_allclose((2 * np.pi * shares - np.pi) % (2 * np.pi), [3.0, 3.2], atol=1e-9)
+
+
+NO_JOINTS: dict[str, object] = {
+    "no joint is called 'fingr'; it must be one of other finger, finger: correct it": {"fingr": 0.02},
+    "joint 'finger' is 0.05; its limits are 0.003 to 0.035 m: correct it, or add `within`": {"finger": 0.05},
+    "joint 'finger' is 'open'; it must be a finite number: give for example 0.1": {"finger": "open"},
+    "joint 'finger' is nan; it must be a finite number": {"finger": float("nan")},
+    "joint 'finger' is True; it must be a finite number": {"finger": True},
+    "`within` of joint 'finger' is -0.1; it must be at least 0: give": {"finger": {"value": 0.02, "within": -0.1}},
+    "joint 'finger' is {'value': 0.02, 'std': 0.1}; it must be a number, or `value` and `within`, its": {
+        "finger": {"value": 0.02, "std": 0.1}
+    },
+    "joint 'other finger' is 0.01, which contradicts others that move with it: give 'finger' alone": {
+        "finger": 0.02,
+        "other finger": 0.01,
+    },
+    "`name` has 1 joints and `position` 2 values; they must be as many": {"name": ["finger"], "position": [0.0, 0.1]},
+    "the joints are {}; they must be values by name, of other finger, finger: give": {"name": ["a"], "position": [0.0]},
+    "the joints are 0.02; they must be values by name": 0.02,
+}
+
+
+@pytest.mark.parametrize("message", NO_JOINTS)
+def test_values_that_cannot_be_are_one_sentence(message: str, known: mereo.Object, tmp_path: Path) -> None:
+    given = NO_JOINTS[message]
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}"):
+        mereo.reconstruct(np.ones((500, 3)), known, joints=given)
+    if isinstance(given, dict):
+        (tmp_path / "joints.yaml").write_text(yaml.safe_dump(given, sort_keys=False))
+        with pytest.raises(ValueError, match=re.escape(f"joints.yaml: {message}")):
+            known.with_joints(tmp_path / "joints.yaml")
+
+
+def test_objects_without_named_joints_and_files_of_other_things_are_refused(
+    gripper: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    palm = mereo.load_object(gripper.parents[1] / "meshes/palm.stl", units="mm", deformations="rigid")
+    with pytest.raises(ValueError, match="joints are given, but the object has none with a name: leave them out, or"):
+        mereo.Tracker(palm, joints={"finger": 0.02})
+    (tmp_path / "list.yaml").write_text("- 0.02")
+    (tmp_path / "bad.yaml").write_text("finger: [0.02")
+    (tmp_path / "bad joint.yaml").write_text("finger: 1")
+    (tmp_path / "frames").mkdir()
+    write_positions_ply(tmp_path / "frames/frame.ply", np.random.default_rng(0).normal(size=(500, 3)))
+    monkeypatch.chdir(tmp_path)
+    for name, sentence in (
+        ("list.yaml", "list.yaml holds no `key: value` lines; a file of joints starts with `JOINT:`"),
+        ("bad.yaml", "bad.yaml:1: this is not YAML"),
+        ("no.yaml", "no.yaml does not exist; a file of joints is needed"),
+        ("bad joint.yaml", "bad joint.yaml: joint 'finger' is 1; its limits are 0.003 to 0.035 m"),
+    ):
+        for command in (["reconstruct", "frames/frame.ply", "--output", "result"], ["stream", "frames"]):
+            assert command_line.main([*command, "--object", str(gripper), "--joints", name]) == 2
+            assert sentence in capsys.readouterr().err
+    assert not Path("result").exists()
+
+
+def test_only_the_rest_of_a_gripper_with_known_joints_is_looked_for(
+    known: mereo.Object,
+    gripper: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert known.scene is not None
+    true = write_frame(Path("frame.ply"), known.scene, 0.4, 5)
+    free, fixed = (mereo.reconstruct("frame.ply", known, unit_m=1.0, joints=j) for j in (None, {"finger": true}))
+    joints = fixed.joints
+    assert joints["finger"].value == pytest.approx(true, abs=1e-12) and fixed.known is True
+    assert joints["finger"].interval == pytest.approx((true, true), abs=1e-12)
+    assert joints["other finger"].value == pytest.approx(0.5 * true + 0.002, abs=1e-12)
+    np.testing.assert_allclose(joints["finger"].limits, [0.003, 0.035])
+    np.testing.assert_allclose(fixed["left"].mesh.vertices, free["left"].mesh.vertices, atol=3e-4)
+    Path("joints.yaml").write_text(f"finger: {{value: {true + 0.002}, within: 0.003}}\n")
+    options = ["--object", str(gripper), "--unit-m", "1", "--joints", "joints.yaml"]
+    command_line.main(["reconstruct", "frame.ply", *options, "--output", "result"])
+    assert "joint finger: " in capsys.readouterr().out
+    facts = json.loads(Path("result/summary.json").read_text())["joints"]["finger"]
+    assert true - 0.001 <= facts["interval"][0] <= true <= facts["interval"][1] <= true + 0.005
+    assert facts["value"] == pytest.approx(true, abs=3e-4)
+    assert json.loads(Path("result/config.json").read_text())["joints"] == str(tmp_path / "joints.yaml")
+
+
+@pytest.mark.slow  # as nothing explains the frame, the search tries all it has
+def test_a_frame_that_contradicts_a_known_value_is_not_believed(known: mereo.Object, tmp_path: Path) -> None:
+    assert known.scene is not None
+    true = write_frame(tmp_path / "frame.ply", known.scene, 0.4, 5)
+    result = mereo.reconstruct(tmp_path / "frame.ply", known, unit_m=1.0, joints={"finger": true + 0.01})
+    assert result.known is False and result.joints["finger"].value == pytest.approx(true + 0.01, abs=1e-12)

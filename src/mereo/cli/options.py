@@ -107,6 +107,7 @@ def loaded_object(
     units: MeshUnits = None,
     inference: InferenceConfig = InferenceConfig(),  # noqa: B008 (frozen)
     deformations: Way = "auto",
+    joints: Path | None = None,
 ) -> "Object":
     """Object that options name: ``--object``, ``--weights`` and ``--scene``; raises as ``load_object`` does.
 
@@ -121,7 +122,7 @@ def loaded_object(
     source: Any = (object[0] if len(object) == 1 else list(object)) or None
     if source in SCENES:
         source = load_scene(source)
-    return load_object(
+    known = load_object(
         source,
         scene,
         weights=weights,
@@ -130,6 +131,7 @@ def loaded_object(
         device=inference.device,
         precision=inference.precision,
     )
+    return known if joints is None else known.with_joints(joints)
 
 
 def files_read(object: Sequence[str], weights: str | Path | None) -> list[str | Path]:

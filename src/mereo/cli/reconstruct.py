@@ -92,7 +92,8 @@ class FrameJob:
         scene = () if command.scene is None else files_of(command.scene)
         reading = command.reading
         given = (reading.intrinsics, reading.mask, reading.camera_pose, command.initial_pose, *command.carry)
-        return (*files_read(command.object, command.weights), *scene, *(path for path in given if path is not None))
+        named = (*given, command.joints)
+        return (*files_read(command.object, command.weights), *scene, *(path for path in named if path is not None))
 
     @cached_property
     def attachments(self) -> tuple[Attachment, ...]:
@@ -110,7 +111,13 @@ class FrameJob:
         command = self.command
         inference = self.inference or command.inference
         loaded = loaded_object(
-            command.object, command.weights, command.scene, command.units, inference, command.deformations
+            command.object,
+            command.weights,
+            command.scene,
+            command.units,
+            inference,
+            command.deformations,
+            command.joints,
         )
         return loaded.with_deformation_model() if self.attachments else loaded
 

@@ -382,7 +382,8 @@ def stream_reconstructions(command: StreamCommand) -> Summary:
         if command.watch
         else frames_of(source, reading, command.isolation, command.rate, command.align_color)
     )
-    known = loaded_object(command.object, command.weights, None, command.units, command.inference, command.deformations)
+    object_options = command.object, command.weights, None, command.units, command.inference, command.deformations
+    known = loaded_object(*object_options, command.joints)
     answer = Answering(
         known.network,
         known.registrar(command.method),
