@@ -94,6 +94,37 @@ def test_shapes_of_collisions_stand_in_where_none_are_visual(tmp_path: Path) -> 
         assert high[2] == pytest.approx(0.041, abs=1e-4)  # a round part that is joined to the lid
 
 
+WEDGE = """<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit meter="0.001" name="millimeter"/><up_axis>Y_UP</up_axis></asset>
+<library_geometries><geometry id="wedge"><mesh>
+<source id="at"><float_array id="at-array" count="12">0 0 0 100 0 0 0 200 0 0 0 300</float_array>
+<technique_common><accessor source="#at-array" count="4" stride="3">
+<param name="X" type="float"/><param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common>
+</source><vertices id="of"><input semantic="POSITION" source="#at"/></vertices>
+<triangles count="2"><input semantic="VERTEX" source="#of" offset="0"/><p>0 2 1 0 1 3</p></triangles>
+<triangles count="2"><input semantic="VERTEX" source="#of" offset="0"/><p>0 3 2 1 2 3</p></triangles>
+</mesh></geometry></library_geometries>
+<library_visual_scenes><visual_scene id="scene"><node id="n"><translate>0 0 50</translate>
+<node id="m"><instance_geometry url="#wedge"/></node></node></visual_scene></library_visual_scenes>
+<scene><instance_visual_scene url="#scene"/></scene></COLLADA>"""
+"""A tetrahedron in millimetres, in two materials, with y up and a node that is shifted."""
+
+
+def test_meshes_of_collada_are_as_rviz_shows_them(tmp_path: Path) -> None:
+    """In metres by their unit, whichever axis they say is up, and scaled as the robot's file says."""
+    (tmp_path / "wedge.dae").write_text(WEDGE)
+    path, mesh = tmp_path / "laptop.urdf", '<mesh filename="wedge.dae" scale="1 1 2"/>'
+    path.write_text(LAPTOP.replace('<box size="0.3 0.2 0.02"/>', mesh))
+    base = read_robot(path).mesh.segments[0]
+    np.testing.assert_allclose(base.bounds, [[0, 0, 0.1], [0.1, 0.2, 0.7]], atol=1e-9)
+    assert len(base.vertices) == 4 and base.volume == pytest.approx(0.002)  # the materials together are closed
+    (tmp_path / "wedge.dae").write_text(WEDGE.replace('<unit meter="0.001" name="millimeter"/>', ""))
+    np.testing.assert_allclose(read_robot(path).mesh.segments[0].bounds, [[0, 0, 100], [100, 200, 700]], atol=1e-9)
+    (tmp_path / "wedge.dae").write_text(WEDGE.replace("#wedge", "#edge"))
+    with pytest.raises(ValueError, match=r"wedge.dae cannot be read as a mesh \(.*edge.*\): export or download"):
+        read_robot(path)
+
+
 def test_a_scene_file_has_the_joints_and_one_number_moves_both_fingers(
     gripper: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
