@@ -20,6 +20,7 @@ from mereo.geometry.camera import Camera
 from mereo.geometry.transforms import inverse_rigid
 from mereo.io.robots import read_robot
 from mereo.io.writers.meshes import write_positions_ply
+from mereo.results.joints import JointValue
 from mereo.scenes.files.object_files import scene_of_meshes
 from mereo.scenes.parameters import parameters, random_state
 from mereo.scenes.random_states import CACHE_VARIABLE
@@ -27,7 +28,6 @@ from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.depth_sensor import add_depth_noise, render_depth
-from mereo.visualization.joints import JointValue
 
 pytest.importorskip("yourdfpy", reason="yourdfpy is not installed: pip install 'mereo[robot]'")
 
@@ -92,6 +92,18 @@ def test_shapes_of_collisions_stand_in_where_none_are_visual(tmp_path: Path) -> 
         low, high = robot.mesh.bounds
         np.testing.assert_allclose([*low, *high[:2]], [-0.15, -0.1, -0.01, 0.15, 0.1], atol=1e-9)
         assert high[2] == pytest.approx(0.041, abs=1e-4)  # a round part that is joined to the lid
+
+
+def test_a_link_without_visual_shapes_has_those_for_collisions(tmp_path: Path) -> None:
+    base, lid = LAPTOP.split('<link name="lid">')
+    ball = "<collision><geometry><sphere radius='0.4'/></geometry></collision></link>"
+    note = "link 'base' has no visual shape, so those for collisions are taken"
+    for first, notes in ((base.replace("visual", "collision"), (note,)), (base.replace("</link>", ball), ())):
+        path = tmp_path / "laptop.urdf"
+        path.write_text(f'{first}<link name="lid">{lid}')
+        robot = read_robot(path)
+        np.testing.assert_allclose(np.ptp(robot.mesh.segments[0].bounds, axis=0), [0.3, 0.2, 0.02], atol=1e-9)
+        assert robot.mesh.names == ("base", "lid") and robot.notes == notes
 
 
 WEDGE = """<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
@@ -213,7 +225,7 @@ def test_a_robot_is_named_alone_and_an_sdf_file_has_one_model(gripper: Path, tmp
 # --- frames -----------------------------------------------------------------------------------------------------------
 
 
-def test_the_angle_of_a_hinge_is_found_with_its_interval(tmp_path: Path) -> None:
+def test_the_angle_of_a_hinge_is_found_with_its_interval(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "laptop.urdf").write_text(LAPTOP)
     laptop = mereo.load_object(tmp_path)  # the folder of a robot's file
     assert laptop.scene is not None
@@ -221,6 +233,7 @@ def test_the_angle_of_a_hinge_is_found_with_its_interval(tmp_path: Path) -> None
     assert true == pytest.approx(0.3 + 0.6 * 1.9)  # the file's angle, although its rest pose is closed
     result = mereo.reconstruct(tmp_path / "frame.ply", laptop, unit_m=1.0)
     joint = result.joints["hinge"]
+    monkeypatch.delattr("mereo.results.joints.least_squares")  # they are measured once
     facts = FrameAnswer.of(result).facts  # what a line of a stream has
     assert facts["joints"] == {"hinge": joint.facts()}
     np.testing.assert_allclose(facts["segments"]["lid"]["pose"], result["lid"].pose, atol=1e-6)
@@ -330,7 +343,11 @@ NO_JOINTS: dict[str, object] = {
         "finger": 0.02,
         "other finger": 0.01,
     },
-    "`name` has 1 joints and `position` 2 values; they must be as many": {"name": ["finger"], "position": [0.0, 0.1]},
+    "`name` is ['finger'] and `position` [0.0, 0.1]; they must be lists of one length: correct them": {
+        "name": ["finger"],
+        "position": [0.0, 0.1],
+    },
+    "`name` is 'finger' and `position` 0.02; they must be lists": {"name": "finger", "position": 0.02},
     "the joints are {}; they must be values by name, of other finger, finger: give": {"name": ["a"], "position": [0.0]},
     "the joints are 0.02; they must be values by name": 0.02,
 }
