@@ -131,6 +131,7 @@ class ViewCommand:
         weights: a shipped name or a file; by default those of the shipped frame, or none.
         units: of the object's meshes; guessed where not given.
         deformations: how an object of meshes moves, as for `mereo scene new`: rigid, soft, stiff or articulated.
+        joints: file of joints whose values are known, as for `mereo reconstruct`.
         port: where the page is; 0 takes any that is free.
         resolution: grid cells along the longest side.
         reading: how the frame is read.
@@ -143,6 +144,7 @@ class ViewCommand:
     weights: str | None = None
     units: MeshUnits = None
     deformations: Way = "auto"
+    joints: Path | None = None
     port: Port = 8080
     resolution: Cells = 128
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
@@ -167,7 +169,7 @@ class ViewCommand:
             input = Path(self.weights)
         if self.object or self.weights is not None:
             with shown_stages():
-                known = loaded_object(self.object, self.weights, None, self.units, self.inference, self.deformations)
+                known = loaded_object(self)
         view(
             input,
             known,

@@ -8,7 +8,7 @@ See ``mereo.scenes.draw_recorder`` for how draws are recorded, and docs/design/0
 import linecache
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Sized
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -333,9 +333,6 @@ def draw_names(played: Played) -> tuple[str, ...]:
 ROUNDING = 1e-3
 """Share of a joint's range by which a value may lie beyond its limits, or off the joint that it follows."""
 
-STATE = "name", "position"
-"""Lists of a ``JointState`` of ROS."""
-
 
 def with_joints(scene: Scene | None, given: Any) -> Scene:
     """Scene whose joints lie where an encoder or a person knows them; those of which nothing is given, as they did.
@@ -356,10 +353,11 @@ def with_joints(scene: Scene | None, given: Any) -> Scene:
             "joints have names"
         )
     if isinstance(given, str | Path):
+        content = Document(Path(given), "file of joints", "JOINT:").data
         try:
-            return with_joints(scene, Document(Path(given), "file of joints", "JOINT:").data)
+            return with_joints(scene, content)
         except ValueError as error:
-            raise error if str(given) in str(error) else ValueError(f"{given}: {error}") from None
+            raise ValueError(f"{given}: {error}") from None
     shares = dict[str, Range]()
     for name, (value, within) in _values(given, list(motion.joints)).items():
         joint, _ = motion.joints[name]
@@ -376,14 +374,17 @@ def with_joints(scene: Scene | None, given: Any) -> Scene:
 
 def _values(given: Any, names: list[str]) -> dict[str, tuple[float, float]]:
     """Value of each joint that is given, and its largest error."""
-    state = [given.get(key) if isinstance(given, Mapping) else getattr(given, key, None) for key in STATE]
-    if isinstance(state[0], list | tuple) and state[1] is not None:
-        if len(state[0]) != len(state[1]):
+    if hasattr(given, "position"):  # a message
+        given = {"name": given.name, "position": given.position}
+    if isinstance(given, Mapping) and given.keys() >= {"name", "position"}:
+        listed, positions = given["name"], given["position"]
+        are_lists = isinstance(listed, list | tuple) and isinstance(positions, Sized)
+        if not are_lists or len(listed) != len(positions):
             raise ValueError(
-                f"`name` has {len(state[0])} joints and `position` {len(state[1])} values; they must be as many: "
-                "correct them"
+                f"`name` is {repr(listed)[:80]} and `position` {repr(positions)[:80]}; they must be lists of one "
+                "length: correct them"
             )
-        given = {name: value for name, value in zip(*state, strict=True) if name in names}
+        given = {name: value for name, value in zip(listed, positions, strict=True) if name in names}
     if not isinstance(given, Mapping) or not given:
         raise ValueError(
             f"the joints are {repr(given)[:80]}; they must be values by name, of {', '.join(names)}: give for example "
@@ -415,6 +416,8 @@ def _shares(joint: JointSampler, value: float, within: float, unit_m: float) -> 
     if abs(second - first) > turn - ROUNDING:  # beyond the limits of a whole turn it goes on
         return low, high
     if low > 1 + ROUNDING or high < -ROUNDING:
-        limits = f"{min(first, second):.6g} to {max(first, second):.6g} {name}"
+        least, most = sorted((first, second))
+        limits = f"{least:.6g} to {most:.6g} {name}"
         raise ValueError(f"joint {joint.name!r} is {value:.6g}; its limits are {limits}: correct it, or add `within`")
-    return min(max(low, 0.0), 1.0), max(min(high, 1.0), 0.0)
+    least, most = np.clip([low, high], 0.0, 1.0).tolist()
+    return least, most

@@ -8,6 +8,7 @@ uncertainty is known.
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -19,8 +20,9 @@ from mereo.fitting.problem.gauss_newton import rigid_motion
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.uncertainty import LEVEL, WITHIN
+from mereo.geometry.brief import as_exact_as
 from mereo.geometry.transforms import fit_rigid, transform_points
-from mereo.visualization.units import as_exact_as
+from mereo.scenes.scene import Scene
 
 SHOWN = {"rad": (180 / np.pi, "°"), "m": (1000.0, " mm"), "": (1.0, " units")}
 """Factor and name of the units in which people read values."""
@@ -65,11 +67,22 @@ class JointValue:
 def measure_joints(answer: Answer) -> dict[str, JointValue]:
     """Measure the joints that have names in the object's definition, by which they are counted, in an answer's state.
 
-    Empty where there are none, and where the network answers.
+    Empty where there are none, and where the network answers. Those of a registration are measured once.
     """
-    registration, scene = answer.registered, None if answer.registrar is None else answer.registrar.scene
+    registration, fitted = answer.registered, answer.registration
+    if registration is None or fitted is None or answer.registrar is None:
+        return {}
+    if fitted not in _MEASURED:
+        _MEASURED[fitted] = _measured(registration, answer.registrar.scene)
+    return _MEASURED[fitted]
+
+
+_MEASURED = WeakKeyDictionary[Registration, dict[str, JointValue]]()
+
+
+def _measured(registration: Registration, scene: Scene | None) -> dict[str, JointValue]:
     motion = None if scene is None else scene.sample_deformations
-    if registration is None or scene is None or not isinstance(motion, RandomMotion) or not motion.joints:
+    if scene is None or not isinstance(motion, RandomMotion) or not motion.joints:
         return {}
     leaders = list(dict.fromkeys(joint.follows or joint.name for joint, _ in motion.joints.values()))  # as drawn
     rows = np.unique(np.concatenate([anchors[:: 1 + len(anchors) // 64] for anchors in registration.model.anchors]))
