@@ -18,7 +18,7 @@ from jaxtyping import Float, UInt8
 
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.registration import nearest_labels
-from mereo.geometry.brief import counted
+from mereo.geometry.brief import counted, rounded
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color, SegmentedMesh
 from mereo.geometry.radii import Radii
@@ -40,7 +40,7 @@ from mereo.visualization.color_scales import (
 from mereo.visualization.contact_sheets import Picture, depth_ends, depth_picture
 from mereo.visualization.reconstruction_report import REPORT, read_report
 from mereo.visualization.result_files import radii_of, to_viewer_of
-from mereo.visualization.units import UNKNOWN, Unit, rounded
+from mereo.visualization.units import UNKNOWN, Unit
 from mereo_viewer.display import (
     BOX,
     SOFT,

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 import mereo
 from mereo import __main__ as command_line
+from mereo.cli.answers import ReconstructCommand, StreamCommand
 from mereo.cli.options import loaded_object
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.register import Registrar
@@ -353,10 +354,10 @@ def test_a_network_cannot_answer_for_an_object_without(angle: mereo.Object, poin
 
 
 def test_a_built_in_scene_is_named_like_a_file() -> None:
-    rope = loaded_object(("rope",), None)
+    rope = loaded_object(StreamCommand("-", ("rope",)))
     assert rope.network is None and rope.scene is not None and rope.name == "rope"
     with pytest.raises(ValueError, match="--scene is rope, but --object says what the object is"):
-        loaded_object(("rope",), None, "rope")
+        loaded_object(ReconstructCommand((), ("rope",), scene="rope"))
 
 
 def test_folders_of_meshes_and_scene_files_are_objects(folder: Path, tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 import mereo
 from mereo import __main__ as command_line
+from mereo.cli.answers import StreamCommand
 from mereo.cli.options import loaded_object
 from mereo.fitting.draws.playback import DrawnStates
 from mereo.geometry.transforms import rigid, transform_points
@@ -416,7 +417,7 @@ def test_a_folder_is_an_object(small: None, tmp_path: Path, capsys: pytest.Captu
     assert command_line.main(command) == 0
     assert (out / "search.json").read_bytes() == scores
     assert 0.5 < json.loads((out / "metrics.json").read_text())["iou"] <= 1
-    angle = loaded_object([str(out)], None)  # as every command with --object has it
+    angle = loaded_object(StreamCommand("-", (str(out),)))  # as every command with --object has it
     assert angle.network is None and angle.names == ("long", "short")
 
 

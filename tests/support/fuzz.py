@@ -487,6 +487,7 @@ ALL: dict[str, Target] = {
     "scene_camera.json": Target(text(json.dumps(BOP)), lambda p: read_intrinsics(p, (16, 12), index=1)),
     **{f"mesh.{kind}": Target(exported(kind), read_segmented_mesh) for kind in ("stl", "glb", "off")},
     "mesh.3mf": Target(exported("3mf"), read_segmented_mesh, "lxml"),
+    "mesh.dae": Target(exported("dae"), read_segmented_mesh, "collada"),
     "laptop.urdf": Target(text(LAPTOP), lambda p: scene_of_meshes([p]), "yourdfpy"),
     "laptop.sdf": Target(text(LAPTOP_SDF), lambda p: scene_of_meshes([p]), "yourdfpy"),
     "text.stl": Target(exported("stl_ascii"), lambda p: read_attachments([p])),

@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from mereo.api.words import python_words
+from mereo.deformation.samplers import RandomMotion, Range
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.register import Registrar, other_mesh, registrar_for, statistical_model_of
 from mereo.geometry.conventions import LengthUnit, Way
@@ -24,12 +25,14 @@ from mereo.io.errors import checked_path
 from mereo.io.extras import has_network
 from mereo.io.mesh_formats import MESH_SUFFIXES
 from mereo.io.point_arrays import mesh_of
+from mereo.io.progress import stage
 from mereo.io.writers.meshes import write_segments_obj
 from mereo.models.config import Device, InferenceConfig, Precision
 from mereo.models.trained import Trained
 from mereo.models.weights_place import is_weights, load_weights, shipped_names, statistical_model_in
 from mereo.scenes.files.object_files import SCENE, names_scene, scene_of_folder, scene_of_meshes, shapes_in
-from mereo.scenes.random_states import kept_model
+from mereo.scenes.parameters import parameters, random_state, with_joints
+from mereo.scenes.random_states import OBJECT_STATES, STATES_SEED, kept_model, scene_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES, AssetUnavailable, Scene
 from mereo.scenes.statistical_model import StatisticalModel
@@ -57,6 +60,7 @@ class Object:
     _registrars: dict[str, Registrar | None] = field(default_factory=dict)
     model: StatisticalModel | None = None
     known_as: str = ""
+    _narrowed: "dict[tuple[Range, ...], Object]" = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.network is None and self.model is None:
@@ -112,12 +116,38 @@ class Object:
 
         Raises ``ValueError`` where it cannot be had.
         """
+        return self if self.network is None else self._moved_by(statistical_model_of(self.network), self.scene)
+
+    def _moved_by(self, model: StatisticalModel, scene: Scene | None) -> "Object":
+        """The same with another statistical model and scene."""
         if self.network is None:
-            return self
+            return Object(None, scene, model=model, known_as=self.known_as)
         from mereo.models.model import Model  # torch is there, as the network is
 
         assert isinstance(self.network, Model)
-        return Object(replace(self.network, statistical_model=statistical_model_of(self.network)), self.scene)
+        return Object(replace(self.network, statistical_model=model), scene)
+
+    @python_words()
+    def with_joints(self, joints: object) -> "Object":
+        """The same with joints whose values are known: only the others are looked for.
+
+        ``joints`` are those of ``reconstruct``, which makes the same of them. The statistical model of the states that
+        are left is made in seconds, at once where all values are known; that of the last values is kept. Raises
+        ``FileNotFoundError`` and ``ValueError`` for what gives no values of its joints.
+        """
+        scene = with_joints(self.scene, joints)
+        motion = scene.sample_deformations
+        assert isinstance(motion, RandomMotion)
+        moved = [joint for joint, _ in motion.joints.values()]
+        key = tuple(joint.shares for joint in moved)
+        if key not in self._narrowed:
+            self._narrowed.clear()
+            rests = all(joint.shares[0] <= joint.share(0.0) <= joint.shares[1] for joint in moved)
+            states = OBJECT_STATES if parameters(random_state(scene, STATES_SEED)) else 2
+            with stage("make the statistical model of the states that the given joints leave"):
+                model = replace(scene_model(scene, states), rests=rests)
+            self._narrowed[key] = self._moved_by(model, scene)
+        return self._narrowed[key]
 
     def asking(self, network: Trained | None) -> "Object":
         """The same with the same weights on another device; registrars that are set up stay so."""
@@ -209,11 +239,12 @@ def _built_in_by_model(name: str) -> Object:
     return Object(None, scene, model=statistical_model_in(name), known_as=name)
 
 
-def object_of(given: Source, **options: Any) -> Object:
-    """Object of whatever a caller has of it; ``options`` are those of ``load_object``."""
+def object_of(given: Source, joints: object = None, **options: Any) -> Object:
+    """Object of whatever a caller has of it, with known ``joints``; ``options`` are those of ``load_object``."""
     if options and isinstance(given, Object):
         raise ValueError(f"{min(options)} is given for an object that is loaded already: give it to load_object")
-    return given if isinstance(given, Object) else load_object(given, **options)
+    known = given if isinstance(given, Object) else load_object(given, **options)
+    return known if joints is None else known.with_joints(joints)
 
 
 def _learned_scene(weights: Trained | str | Path) -> str | None:

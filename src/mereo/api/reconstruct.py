@@ -51,7 +51,7 @@ FRAME_OPTIONS = {*names_of(InputConfig), "axes"} - {"frame"}
 """Options of ``load_frame``."""
 
 RECONSTRUCT_OPTIONS = {
-    *("method", "resolution", "isolation", "label_points", "initial_pose", "instances"),
+    *("method", "resolution", "isolation", "label_points", "initial_pose", "instances", "joints"),
     *(*FRAME_OPTIONS, *names_of(IsolationConfig), *OPTIONS),
 }
 """Options of ``reconstruct``."""
@@ -222,12 +222,15 @@ def reconstruct(
         label_points: also say on which segment each observed point lies (``Result.reconstruction.observed``).
         initial_pose: rough pose of the object, as ``Result.pose``, from which the fit starts instead of a search or a
             network; what the scene holds (``held``) stays there. Both units must be known.
-        options: ``instances``, how many of the object are looked for in a whole depth image, or "all", of which the
-            result is the most evident one's, and its ``instances`` are those of all that are known; fields of
-            ``isolation`` by themselves, ``extent="partial"`` where a part of the object is hidden or cut
-            off, ``point=(u, v)``, the column and row of a pixel of the object, ``box`` and others; arguments of
-            ``load_frame``, ``axes``, ``unit_m``, ``intrinsics``, ``mask`` and others; and those of ``load_object``,
-            ``units``, ``deformations`` and others, where ``object`` is not loaded yet.
+        options: ``joints``, values of joints that are known, as by encoders: by name a number, or a dict of ``value``
+            and ``within``, the largest error (radians, or metres of joints that slide), or a ``JointState`` of ROS, or
+            a YAML or JSON file of either; only the others are looked for. ``instances``, how many of the object are
+            looked for in a whole depth image, or "all", of which the result is the most evident one's, and its
+            ``instances`` are those of all that are known; fields of ``isolation`` by themselves, ``extent="partial"``
+            where a part of the object is hidden or cut off, ``point=(u, v)``, the column and row of a pixel of the
+            object, ``box`` and others; arguments of ``load_frame``, ``axes``, ``unit_m``, ``intrinsics``, ``mask`` and
+            others; and those of ``load_object``, ``units``, ``deformations`` and others, where ``object`` is not
+            loaded yet.
 
     Warns with ``SizeWarning`` where the visible part cannot be the object of the weights, and without weights with
     ``ClustersWarning`` where the cloud may be two objects. Raises ``ValueError`` for unusable frames,
@@ -241,7 +244,7 @@ def reconstruct(
     instances: Instances = options.pop("instances", 1)
     with python_words():
         isolation, reading = split_options(isolation, options)
-        known = object_of(object, **{name: reading.pop(name) for name in OPTIONS if name in reading})
+        known = object_of(object, **{name: reading.pop(name) for name in ("joints", *OPTIONS) if name in reading})
         for each in frame if are_many else [frame]:  # not a comprehension: a warning names the caller's line
             observation = observation_of(each, isolation, reading)
             if initial_pose is not None:
@@ -327,6 +330,7 @@ class Tracker:
         executor: Executor | None = None,
         isolation: Isolation = None,
         initial_pose: ArrayLike | None = None,
+        joints: object = None,
     ) -> None:
         """Follow an object.
 
@@ -336,13 +340,14 @@ class Tracker:
             executor: what searches for a lost object; by default a thread of the tracker's own.
             isolation: what of each frame is left out, as in ``reconstruct``.
             initial_pose: rough pose of the object in the first frame, as in ``reconstruct``.
+            joints: values that are known and stay as they are, as in ``reconstruct``.
 
         Raises ``ValueError`` for other methods and poses, and for weights without a deformation model.
         """
         with python_words():
             self._isolation, _ = split_options(isolation, {})
             self._initial_pose = None if initial_pose is None else checked_pose(initial_pose)
-            registrar = None if method == "network" else object_of(object).registrar(method)
+            registrar = None if method == "network" else object_of(object, joints).registrar(method)
         if registrar is None or method == "full":
             raise ValueError(
                 f'the method is {method!r}, and only the modes of a deformation model can be followed: take "auto" '

@@ -44,7 +44,7 @@ from mereo.io.writers.formats import WRITERS, chosen_formats
 from mereo.io.writers.volumes import MM_PER_M
 from mereo.reconstruction.pipeline import Reconstruction
 from mereo.results.carry import carry, place
-from mereo.visualization.joints import JointValue, measure_joints, pose_covariance
+from mereo.results.joints import JointValue, measure_joints, pose_covariance
 from mereo.visualization.reconstruction_report import result_html
 from mereo.visualization.result_files import (
     INSTANCE,
@@ -297,7 +297,7 @@ class Result(Answer, SegmentedResult):
         """Root mean square distance of the observed points from it, in the frame's unit; None without a fit."""
         return None if self.registered is None else self.registered.residual
 
-    @cached_property
+    @property
     def joints(self) -> dict[str, JointValue]:
         """Value of each joint that the object's definition has by name, as a robot's file has; empty without a fit."""
         return measure_joints(self)

@@ -56,6 +56,9 @@ class ReconstructCommand:
         initial_pose: file of the object's rough pose, from which the fit starts instead of a search or a network: 4 x 4
             numbers (text, NPY, or the summary.json of a result) that take the object's own files, in the frame's unit,
             to the frame. Parts that the scene holds stay there.
+        joints: file (YAML, JSON) of joints whose values are known, as by encoders, in all frames: NAME: VALUE, or NAME:
+            {value: VALUE, within: ERROR}, in radians, or metres of joints that slide; or what `ros2 topic echo --once
+            /joint_states` prints. Only the others are looked for.
         instances: how many of the object are looked for in a whole depth image, or all; further ones that are known get
             folders of their own in the output.
         carry: file to bring to where the object is, its inside included; once for each: mesh (STL, PLY, OBJ, GLB),
@@ -87,6 +90,7 @@ class ReconstructCommand:
     method: AnswerMethod = "auto"
     scene: str | None = None
     initial_pose: Path | None = None
+    joints: Path | None = None
     instances: Instances = 1
     carry: UseAppendAction[tuple[Path, ...]] = ()
     carry_frame: CarryFrame = "source"
@@ -127,6 +131,7 @@ class ViewCommand:
         weights: a shipped name or a file; by default those of the shipped frame, or none.
         units: of the object's meshes; guessed where not given.
         deformations: how an object of meshes moves, as for `mereo scene new`: rigid, soft, stiff or articulated.
+        joints: file of joints whose values are known, as for `mereo reconstruct`.
         port: where the page is; 0 takes any that is free.
         resolution: grid cells along the longest side.
         reading: how the frame is read.
@@ -139,6 +144,7 @@ class ViewCommand:
     weights: str | None = None
     units: MeshUnits = None
     deformations: Way = "auto"
+    joints: Path | None = None
     port: Port = 8080
     resolution: Cells = 128
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
@@ -163,7 +169,7 @@ class ViewCommand:
             input = Path(self.weights)
         if self.object or self.weights is not None:
             with shown_stages():
-                known = loaded_object(self.object, self.weights, None, self.units, self.inference, self.deformations)
+                known = loaded_object(self)
         view(
             input,
             known,
@@ -192,6 +198,7 @@ class StreamCommand:
         weights: a shipped name or a file; with --object they start the fit, without they say what is looked for.
         units: of the object's meshes; guessed where not given.
         deformations: how an object of meshes moves, as for `mereo scene new`: rigid, soft, stiff or articulated.
+        joints: file of joints whose values are known and stay as they are, as for `mereo reconstruct`.
         resolution: grid cells along the longest side of the network's surfaces: fewer are faster.
         method: auto follows the registered model where it explains the frame, if the weights carry one, and else asks
             the network; network uses it alone, frame by frame; search leaves it out; modes takes the model in any case.
@@ -215,6 +222,7 @@ class StreamCommand:
     weights: str | None = None
     units: MeshUnits = None
     deformations: Way = "auto"
+    joints: Path | None = None
     resolution: Cells = 48
     method: StreamMethod = "auto"
     radius: bool = True

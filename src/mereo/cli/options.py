@@ -21,13 +21,14 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 from tyro.conf import Positional, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
-from mereo.geometry.conventions import LengthUnit, Way
+from mereo.geometry.conventions import LengthUnit
 from mereo.io.bounds import check_values
 from mereo.io.object_storage import Place, place_of
 from mereo.models.config import InferenceConfig
 
 if TYPE_CHECKING:
     from mereo.api.objects import Object
+    from mereo.cli.answers import ReconstructCommand, StreamCommand, ViewCommand
 
 
 @dataclass(frozen=True)
@@ -101,32 +102,28 @@ def check_named(command: str, object: Sequence[str], weights: str | Path | None)
 
 
 def loaded_object(
-    object: Sequence[str],
-    weights: str | Path | None,
-    scene: str | None = None,
-    units: MeshUnits = None,
-    inference: InferenceConfig = InferenceConfig(),  # noqa: B008 (frozen)
-    deformations: Way = "auto",
+    command: "ReconstructCommand | ViewCommand | StreamCommand", inference: InferenceConfig | None = None
 ) -> "Object":
-    """Object that options name: ``--object``, ``--weights`` and ``--scene``; raises as ``load_object`` does.
+    """Object that a command's options name, with the joints that are known; raises as ``load_object`` does.
 
     One word of ``--object`` that is a built-in scene's name is that scene; its weights are named by ``--weights``.
+    ``inference`` is where the network computes, where that is not as the options say.
     """
-    from mereo.api.objects import load_object
+    from mereo.api.objects import object_of
     from mereo.scenes.registry import load_scene
     from mereo.scenes.scene import SCENES
 
+    object, scene, inference = command.object, getattr(command, "scene", None), inference or command.inference
     if object and scene is not None:
         raise ValueError(f"--scene is {scene}, but --object says what the object is: leave one of them out")
     source: Any = (object[0] if len(object) == 1 else list(object)) or None
-    if source in SCENES:
-        source = load_scene(source)
-    return load_object(
-        source,
-        scene,
-        weights=weights,
-        units=units,
-        deformations=deformations,
+    return object_of(
+        load_scene(source) if source in SCENES else source,
+        command.joints,
+        scene=scene,
+        weights=command.weights,
+        units=command.units,
+        deformations=command.deformations,
         device=inference.device,
         precision=inference.precision,
     )

@@ -32,6 +32,7 @@ from mereo.cli.stream import frame_error, frames_in
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
+from mereo.geometry.brief import rounded
 from mereo.geometry.radii import describe_level
 from mereo.geometry.symmetry import describe_symmetries
 from mereo.io.atomic_files import MARKER, check_new_directory, check_place, new_directory, write_json
@@ -50,7 +51,7 @@ from mereo.results.carry import Placed, carry, place
 from mereo.scenes.registry import files_of
 from mereo.visualization.reconstruction_report import confidence_title, trust
 from mereo.visualization.result_files import INSTANCE, summary_of, write_answer
-from mereo.visualization.units import Unit, rounded
+from mereo.visualization.units import Unit
 from mereo.workers.spread import Cluster, spread
 
 Summary = Mapping[str, Any]
@@ -92,7 +93,8 @@ class FrameJob:
         scene = () if command.scene is None else files_of(command.scene)
         reading = command.reading
         given = (reading.intrinsics, reading.mask, reading.camera_pose, command.initial_pose, *command.carry)
-        return (*files_read(command.object, command.weights), *scene, *(path for path in given if path is not None))
+        named = (*given, command.joints)
+        return (*files_read(command.object, command.weights), *scene, *(path for path in named if path is not None))
 
     @cached_property
     def attachments(self) -> tuple[Attachment, ...]:
@@ -107,11 +109,7 @@ class FrameJob:
     @cached_property
     def object(self) -> Object:
         """What is looked for, its weights on their device; what is carried needs a deformation model."""
-        command = self.command
-        inference = self.inference or command.inference
-        loaded = loaded_object(
-            command.object, command.weights, command.scene, command.units, inference, command.deformations
-        )
+        loaded = loaded_object(self.command, self.inference)
         return loaded.with_deformation_model() if self.attachments else loaded
 
     @cached_property

@@ -48,8 +48,8 @@ from mereo.locating.whole_frame import at_point
 from mereo.models.trained import Trained
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import Observation, find_object
+from mereo.results.joints import measure_joints
 from mereo.synthesis.recording import CAMERA, FRAMES, is_recording_folder
-from mereo.visualization.joints import measure_joints
 
 STANDARD_INPUT = "-"
 """Source that means names of files on standard input."""
@@ -382,7 +382,7 @@ def stream_reconstructions(command: StreamCommand) -> Summary:
         if command.watch
         else frames_of(source, reading, command.isolation, command.rate, command.align_color)
     )
-    known = loaded_object(command.object, command.weights, None, command.units, command.inference, command.deformations)
+    known = loaded_object(command)
     answer = Answering(
         known.network,
         known.registrar(command.method),

@@ -133,7 +133,7 @@ class JointSampler:
     """Rigid motions: a turn about an axis, a slide along it, and a shift of at most ``shift`` along x, y, z.
 
     A joint with a ``name`` either turns or slides, by one number, and those that follow it move by the same share of
-    their ranges, which may go either way.
+    their ranges, which may go either way. It has only some ``shares`` of its range where more of it is known.
     """
 
     pivot: Vector
@@ -143,6 +143,7 @@ class JointSampler:
     shift: Vector
     name: str = ""
     follows: str = ""
+    shares: Range = (0.0, 1.0)
 
     def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
         """A random rigid motion."""
@@ -161,11 +162,15 @@ class JointSampler:
         """Values of a joint with a name at the shares 0 and 1: radians, or scene units."""
         return self.angle_rad if self.turns else self.slide
 
+    def share(self, value: float) -> float:
+        """Share of the range of a joint with a name at a value: 0 at its least, 1 at its greatest."""
+        return float((value - self.limits[0]) / (self.limits[1] - self.limits[0]))
+
     def sample_share(self, rng: np.random.Generator) -> float:
-        """Random share of the range of a joint with a name: 0 at its least value, 1 at its greatest."""
-        least, most = self.limits
-        value = (named(rng, "angle", "rad") if self.turns else named(rng, "slide")).uniform(least, most)
-        return float((value - least) / (most - least))
+        """Random share that a joint with a name may have."""
+        drawn = named(rng, "angle", "rad") if self.turns else named(rng, "slide")
+        least, most = ((1 - share) * self.limits[0] + share * self.limits[1] for share in self.shares)
+        return self.share(drawn.uniform(least, most))
 
     def at(self, share: float) -> Rigid:
         """Motion of a joint with a name at a share of its range."""
@@ -230,6 +235,11 @@ class RandomMotion:
         """Joints with a name, by it, and indices of the segments that each moves; in the order of the steps."""
         joints = ((sampler, members) for sampler, members in self.steps if isinstance(sampler, JointSampler))
         return {sampler.name: (sampler, members) for sampler, members in joints if sampler.name}
+
+    def narrowed(self, shares: Mapping[str, Range]) -> "RandomMotion":
+        """The same where joints that follow no other one have but these shares of their ranges, by their names."""
+        joints = {name: replace(self.joints[name][0], shares=each) for name, each in shares.items()}
+        return replace(self, steps=tuple((joints.get(getattr(s, "name", ""), s), members) for s, members in self.steps))
 
     def at(self, shares: Mapping[str, float]) -> tuple[Deformation, ...]:
         """One deformation for each segment by the joints with a name alone, at these shares of their ranges.

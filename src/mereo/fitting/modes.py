@@ -289,10 +289,14 @@ def of_rest(problem: Problem, correspondences: Correspondences) -> Problem:
 
 
 def resting(problem: Problem, correspondences: Correspondences, modes: ScoredFit) -> ScoredFit | None:
-    """Fit of the rest model where its evidence is greater than that of the modes; a rigid object is always at rest."""
-    rest = fit_rest(problem, correspondences, modes.posed)
-    is_rigid = problem.model.count == 0
-    return rest if is_rigid or rest.misfit.total - modes.misfit.total < narrowing(problem, modes.posed) else None
+    """Fit of the rest model where its evidence is greater than that of the modes; a rigid object is always at rest.
+
+    None where the rest pose is none of the object's states.
+    """
+    rest, model = fit_rest(problem, correspondences, modes.posed), problem.model
+    is_rigid = model.count == 0
+    is_better = is_rigid or rest.misfit.total - modes.misfit.total < narrowing(problem, modes.posed)
+    return rest if model.rests and is_better else None
 
 
 def narrowing(problem: Problem, modes: Posed) -> float:

@@ -37,8 +37,11 @@ VIEWER_ROOT = "camera_frame"
 STL_NAME = b"written by mereo: "
 """What the header of our own STL files says before the name of the segment."""
 
-MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", ".3mf")
+MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", ".3mf", ".dae")
 """Suffixes of mesh files that are read."""
+
+EXTRAS = {".3mf": ("lxml", "cad"), ".dae": ("collada", "robot")}
+"""Libraries that some need, and the extras that have them."""
 
 ROBOT_SUFFIXES = (".urdf", ".sdf")
 """Suffixes of files of robots, whose links are meshes."""
@@ -49,19 +52,20 @@ class MeshWarning(UserWarning):
 
 
 def read_segmented_mesh(*paths: str | Path) -> SegmentedMesh:
-    """Segments of one or more GLB, OBJ, 3MF, PLY, STL or OFF files, in label order; they are not checked.
+    """Segments of one or more GLB, OBJ, 3MF, DAE, PLY, STL or OFF files, in label order; they are not checked.
 
     A file with several named parts (GLB nodes and their instances, OBJ objects or groups, 3MF objects) gives one
     segment each; a file with one part gives one segment called after its GLB node, or as our own STL files say, or else
     after the file. Materials are parts where each of them is closed by itself: those of one GLB node, and of an OBJ
     file without objects and groups; of such a file whose materials are not, a ``MeshWarning`` says so. A directory
     stands for the mesh files in it, by name. Node transforms are applied, except the root of GLB files written by
-    mereo: those come back in the camera frame. Vertices at the same position are merged, because exporters split them
+    mereo: those come back in the camera frame. DAE files come in metres, by the unit that they state, and in their own
+    axes whichever is up, as RViz has them. Vertices at the same position are merged, because exporters split them
     at normals and texture seams, which would open a closed mesh. Other files are opened only where a glTF file names
     them as buffers, and an OBJ file for its materials' colours, and only in the same folder or below.
 
     Raises ``FileNotFoundError``, ``ValueError`` where a file is of another format, damaged or without faces, or two
-    segments have the same name, and ``ImportError`` for a 3MF file without the extra `cad`.
+    segments have the same name, and ``ImportError`` for a 3MF or DAE file without the extra `cad` or `robot`.
     """
     parts = list[Part]()
     for path in map(Path, paths):
@@ -124,8 +128,8 @@ Part = tuple[str, Color | None, Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]
 def _parts(path: Path) -> list[Part]:
     suffix = path.suffix.lower()
     check_suffix(path, MESH_SUFFIXES, "mesh")
-    if suffix == ".3mf":
-        library("lxml", "cad", path)
+    if suffix in EXTRAS:
+        library(*EXTRAS[suffix], path)
     with readable(path, "mesh"):
         if suffix == ".ply":
             check_ply(path)
@@ -272,13 +276,16 @@ def _neighbour(path: Path, name: str) -> Path:
 def _scene_parts(path: Path) -> list[Part]:
     scene = _load_scene(path)
     base = VIEWER_ROOT if VIEWER_ROOT in scene.graph.nodes else scene.graph.base_frame
-    nodes, parts = _nodes_with_faces(scene), list[Part]()
+    nodes, parts, is_dae = _nodes_with_faces(scene), list[Part](), path.suffix.lower() == ".dae"
+    unit_m = trimesh.units.unit_conversion(scene.units, "meters") if is_dae and nodes else 1.0
     for node in nodes:
         vertices, faces, geometry = _in_frame(scene, node, base)
+        vertices *= unit_m
         # a file without names gets its own name as the node's
         is_unnamed = len(nodes) == 1 and (node.startswith("geometry_") or Path(node).stem == path.stem)
         parts.append((path.stem if is_unnamed else node, _color(geometry), *merge_positions(vertices, faces)))
-    parts = [part for _, group in groupby(parts, _node_of) for part in _whole_parts(list(group))]
+    nodes_parts = [list(group) for _, group in groupby(parts, (lambda _: "") if is_dae else _node_of)]
+    parts = [part for group in nodes_parts for part in _whole_parts(group)]  # trimesh does not name the nodes of DAE
     names = _numbered([name for name, *_ in parts])
     parts = [(name, *rest) for name, (_, *rest) in zip(names, parts, strict=True)]  # type: ignore[misc]
     if path.suffix.lower() == ".stl":
@@ -293,7 +300,8 @@ def _scene_parts(path: Path) -> list[Part]:
 def _load_scene(path: Path) -> Any:
     """trimesh's scene of a file; no other file is opened but the buffers of glTF."""
     if path.suffix.lower() not in (".glb", ".gltf"):
-        return trimesh.load_scene(path, resolver={}, process=False)
+        strict: dict[str, Any] = {"ignore_broken": False} if path.suffix.lower() == ".dae" else {}
+        return trimesh.load_scene(path, resolver={}, process=False, **strict)
     tree, buffers = _plain_gltf(path)
     return trimesh.load_scene(BytesIO(json.dumps(tree).encode()), "gltf", buffers, process=False)
 

@@ -63,7 +63,7 @@ class Robot:
         mesh: a segment for each link that moves, with all links fixed to it, called after the first of them that has a
             shape; where all joints are zero.
         joints: those that move some of the segments against others, the tip of each chain first.
-        notes: sentences about joints that are left out.
+        notes: sentences about joints that are left out, and about links with shapes for collisions alone.
     """
 
     mesh: SegmentedMesh
@@ -79,7 +79,7 @@ def is_robot(path: Path) -> bool:
 def read_robot(path: str | Path) -> Robot:
     """Read a robot from a URDF or SDF file, with the meshes that it names.
 
-    Shapes are those of the visual elements, where the file has any, else of the collision elements.
+    Shapes are those of the visual elements, and of links that have none, of the collision elements.
     ``package://NAME/...`` and ``model://NAME/...`` are looked for in the folders above the file.
 
     Raises ``FileNotFoundError`` for a missing file or mesh; ``ValueError`` for a damaged file, a joint that is neither
@@ -100,8 +100,7 @@ def read_robot(path: str | Path) -> Robot:
             described = _read_sdf(yourdfpy, root)
         for joint in described.joints:
             joint.axis = np.reshape(joint.axis, 3)
-        drawn = any(link.visuals for link in described.links)
-        every = [(link.name, each) for link in described.links for each in (link.visuals if drawn else link.collisions)]
+        every = [(link.name, each) for link in described.links for each in (link.visuals or link.collisions)]
         solids = [_solid(each.geometry) for _, each in every]
     shapes, states = list[_Shape](), [(str(path), path.stat())]
     for (link, each), solid in zip(every, solids, strict=True):
@@ -314,7 +313,9 @@ def _assembled(content: _Described) -> Robot:
     segments = (Segment(name, color, *united(each)) for (name, each), color in zip(parts.items(), colors, strict=True))
     moved = {joint: tuple(name for chain, name in names.items() if joint in chain) for joint in limits}
     kept = {joint: each for joint, each in moved.items() if 0 < len(each) < len(names)}
-    notes = (f"joint {name!r} is left out, for it moves no segment against others" for name in limits.keys() - kept)
+    notes = [f"joint {name!r} is left out, for it moves no segment against others" for name in limits.keys() - kept]
+    stood_in = (link.name for link in content.robot.links if link.collisions and not link.visuals)
+    notes += [f"link {name!r} has no visual shape, so those for collisions are taken" for name in stood_in]
     joined = []
     for joint in reversed(joints):
         if joint.name in kept:

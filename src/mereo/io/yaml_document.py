@@ -29,23 +29,24 @@ MOST_VALUES = 100_000
 class Document:
     """YAML mapping with the lines of its values: the file's ``path`` and ``text``, and ``data``, Python's values."""
 
-    def __init__(self, path: Path) -> None:
-        """Read a file. Raises ``FileNotFoundError``, or ``ValueError`` where it is no YAML mapping."""
+    def __init__(self, path: Path, kind: str = "scene file", start: str = "name:") -> None:
+        """Read a file of a kind, which starts with a key; a line of dashes at its end, as ROS prints, is left out.
+
+        Raises ``FileNotFoundError``, or ``ValueError`` where it is no YAML mapping.
+        """
         self.path = path
         if not path.is_file():
-            raise FileNotFoundError(f"{path} does not exist; a scene file is needed: check the path")
+            raise FileNotFoundError(f"{path} does not exist; a {kind} is needed: check the path")
         if (size := path.stat().st_size) > MOST_BYTES:
-            raise ValueError(
-                f"{path} has {size:,} bytes; a scene file has at most {MOST_BYTES:,}: is it the right one?"
-            )
+            raise ValueError(f"{path} has {size:,} bytes; a {kind} has at most {MOST_BYTES:,}: is it the right one?")
         try:
-            self.text = path.read_text(encoding="utf-8")
+            self.text = path.read_text(encoding="utf-8").rstrip().removesuffix("\n---")
             # two passes, because only nodes know their lines and only values their types
             root = yaml.compose(self.text, Loader=yaml.SafeLoader)
             count = _count(root, {})
             self.data: Any = yaml.safe_load(self.text) if count <= MOST_VALUES else None
         except RecursionError:  # also of what contains itself by an alias
-            raise ValueError(f"{path} is nested too deeply; a scene file has lists in blocks: write it again") from None
+            raise ValueError(f"{path} is nested too deeply; a {kind} has lists in blocks: write it again") from None
         except (yaml.YAMLError, ValueError, KeyError) as error:  # the last two of dates, numbers and truth values
             mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
             place, why = f"{path}:{mark.line + 1}" if mark else path, getattr(error, "problem", None) or reason(error)
@@ -53,7 +54,7 @@ class Document:
         if count > MOST_VALUES:
             raise ValueError(f"{path} holds {count} values; at most {MOST_VALUES} can be read: use fewer aliases")
         if not isinstance(root, yaml.MappingNode):
-            raise ValueError(f"{path} holds no `key: value` lines; a scene file starts with `name:`: write one")
+            raise ValueError(f"{path} holds no `key: value` lines; a {kind} starts with `{start}`: write one")
         self._root: yaml.Node = root
         self._refuse_repeated(root)
 

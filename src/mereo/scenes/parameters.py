@@ -8,9 +8,11 @@ See ``mereo.scenes.draw_recorder`` for how draws are recorded, and docs/design/0
 import linecache
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Sized
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 from zlib import crc32
 
 import numpy as np
@@ -18,6 +20,9 @@ from jaxtyping import Float
 from scipy.special import ndtr, ndtri
 
 from mereo.deformation.maps import Deformation
+from mereo.deformation.samplers import JointSampler, RandomMotion, Range
+from mereo.io.bounds import NotNegative, Number, check_value
+from mereo.io.yaml_document import Document
 from mereo.scenes.draw_recorder import Call, Key, OutOfDraws, Place, Recorder, Shares, Trail
 from mereo.scenes.scene import Scene
 
@@ -321,3 +326,98 @@ def draw_names(played: Played) -> tuple[str, ...]:
         f"{sliders[key, None]} {index + 1}" if (key, None) in sliders else sliders.get((key, index), "")
         for key, index in numbers
     )
+
+
+# --- joints whose values are given ------------------------------------------------------------------------------------
+
+ROUNDING = 1e-3
+"""Share of a joint's range by which a value may lie beyond its limits, or off the joint that it follows."""
+
+
+def with_joints(scene: Scene | None, given: Any) -> Scene:
+    """Scene whose joints lie where an encoder or a person knows them; those of which nothing is given, as they did.
+
+    Args:
+        scene: with joints that have names.
+        given: values by these names, each a number, or a dict of ``value`` and ``within``, the largest error; radians,
+            or metres of joints that slide. Or lists ``name`` and ``position``, as a dict or a ``JointState`` of ROS,
+            of which joints that the scene lacks are passed over. Or a YAML or JSON file of either.
+
+    A joint that follows another one gives that one's value. Raises ``FileNotFoundError``, and ``ValueError`` where the
+    scene has no joints with names, for names that none has, values beyond limits, and two that contradict.
+    """
+    motion = None if scene is None else scene.sample_deformations
+    if scene is None or not isinstance(motion, RandomMotion) or not motion.joints:
+        raise ValueError(
+            "joints are given, but the object has none with a name: leave them out, or write a scene file in which its "
+            "joints have names"
+        )
+    if isinstance(given, str | Path):
+        content = Document(Path(given), "file of joints", "JOINT:").data
+        try:
+            return with_joints(scene, content)
+        except ValueError as error:
+            raise ValueError(f"{given}: {error}") from None
+    shares = dict[str, Range]()
+    for name, (value, within) in _values(given, list(motion.joints)).items():
+        joint, _ = motion.joints[name]
+        leader = joint.follows or name
+        least, most = _shares(joint, value, within, scene.unit_m or 1.0)
+        before = shares.get(leader, (least, most))
+        least, most = shares[leader] = max(least, before[0]), min(most, before[1])
+        if least > most + ROUNDING:
+            raise ValueError(
+                f"joint {name!r} is {value:.6g}, which contradicts others that move with it: give {leader!r} alone"
+            )
+    return replace(scene, sample_deformations=motion.narrowed(shares))
+
+
+def _values(given: Any, names: list[str]) -> dict[str, tuple[float, float]]:
+    """Value of each joint that is given, and its largest error."""
+    if hasattr(given, "position"):  # a message
+        given = {"name": given.name, "position": given.position}
+    if isinstance(given, Mapping) and given.keys() >= {"name", "position"}:
+        listed, positions = given["name"], given["position"]
+        are_lists = isinstance(listed, list | tuple) and isinstance(positions, Sized)
+        if not are_lists or len(listed) != len(positions):
+            raise ValueError(
+                f"`name` is {repr(listed)[:80]} and `position` {repr(positions)[:80]}; they must be lists of one "
+                "length: correct them"
+            )
+        given = {name: value for name, value in zip(listed, positions, strict=True) if name in names}
+    if not isinstance(given, Mapping) or not given:
+        raise ValueError(
+            f"the joints are {repr(given)[:80]}; they must be values by name, of {', '.join(names)}: give for example "
+            f"{{{names[0]!r}: 0.1}}"
+        )
+    values = dict[str, tuple[float, float]]()
+    for name, value in given.items():
+        if name not in names:
+            raise ValueError(f"no joint is called {name!r}; it must be one of {', '.join(names)}: correct it")
+        parts = {"within": 0.0, **(value if isinstance(value, Mapping) else {"value": value})}
+        if parts.keys() != {"value", "within"}:
+            raise ValueError(
+                f"joint {name!r} is {value!r}; it must be a number, or `value` and `within`, its largest error: "
+                "correct it"
+            )
+        check_value(f"joint {name!r}", parts["value"], Number, 0.1)
+        check_value(f"`within` of joint {name!r}", parts["within"], NotNegative, 0.01)
+        values[name] = float(parts["value"]), float(parts["within"])
+    return values
+
+
+def _shares(joint: JointSampler, value: float, within: float, unit_m: float) -> Range:
+    """Least and greatest share of a joint's range by its value in radians or metres."""
+    unit, turn, name = (1.0, 2 * np.pi, "rad") if joint.turns else (unit_m, np.inf, "m")
+    first, second = (unit * limit for limit in joint.limits)
+    if joint.turns:  # a whole turn more is the same state
+        value -= turn * round((value - (first + second) / 2) / turn)
+    low, high = sorted((value + side - first) / (second - first) for side in (-within, within))
+    if abs(second - first) > turn - ROUNDING:  # beyond the limits of a whole turn it goes on
+        return low, high
+    if low > 1 + ROUNDING or high < -ROUNDING:
+        least, most = sorted((first, second))
+        limits = f"{least:.6g} to {most:.6g} {name}"
+        raise ValueError(f"joint {joint.name!r} is {value:.6g}; its limits are {limits}: correct it, or add `within`")
+    least, most = np.clip([low, high], 0.0, 1.0).tolist()
+    return least, most

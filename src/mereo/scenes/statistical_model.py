@@ -132,6 +132,7 @@ class StatisticalModel:
         is_normal: whether the states are the normal distribution of the modes itself, as those of an elastic solid, so
             that a fit's surroundings in the library say nothing more.
         is_held: whether parts of the object at rest do not move in its states, so that a pose of it is that of theirs.
+        rests: whether the rest pose is one of its states; not where joints are known to be elsewhere. No file has it.
     """
 
     rest: SegmentedMesh
@@ -145,6 +146,7 @@ class StatisticalModel:
     source_frame: SourceFrame | None = None
     is_normal: bool = False
     is_held: bool = False
+    rests: bool = True
 
     def __repr__(self) -> str:
         states = f"{counted(self.count, 'mode')} of {counted(len(self.library), 'state')}"
@@ -152,8 +154,8 @@ class StatisticalModel:
 
     @cached_property
     def rest_z(self) -> Float[np.ndarray, " k"]:
-        """Coefficients nearest to the rest pose."""
-        return self.project(self.rest_points)[1]
+        """Coefficients nearest to the rest pose; those of the mean where that is none of the states."""
+        return self.project(self.rest_points)[1] if self.rests else np.zeros(self.count)
 
     @cached_property
     def symmetries(self) -> tuple[Symmetry, ...]:

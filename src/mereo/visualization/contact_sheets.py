@@ -11,12 +11,13 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
+from mereo.geometry.brief import rounded
 from mereo.geometry.camera import DepthImage
 from mereo.geometry.mesh import Color
 from mereo.io.atomic_files import atomic_file
 from mereo.visualization.color_scales import viridis
 from mereo.visualization.renderer import Canvas, Viewpoint
-from mereo.visualization.units import Unit, rounded
+from mereo.visualization.units import Unit
 
 Picture = UInt8[np.ndarray, "_ _ 3"]
 Font = ImageFont.FreeTypeFont | ImageFont.ImageFont

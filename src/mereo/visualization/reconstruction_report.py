@@ -27,6 +27,7 @@ from scipy.spatial import cKDTree
 
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.uncertainty import Explanation
+from mereo.geometry.brief import rounded
 from mereo.geometry.camera import DepthImage, PointCloud
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.mesh import Color, Segment, SegmentedMesh
@@ -38,7 +39,7 @@ from mereo.io.writers.meshes import OUTER_OPACITY
 from mereo.reconstruction.pipeline import SegmentFacts
 from mereo.visualization.contact_sheets import MOST_DEPTH_PX, PNG_URL, Picture, data_url, depth_data
 from mereo.visualization.previews import CAMERA_VIEWS, points_on_segments
-from mereo.visualization.units import UNKNOWN, Unit, rounded
+from mereo.visualization.units import UNKNOWN, Unit
 
 REPORT = "report.html"
 """Name of the page in a folder of results."""

@@ -23,9 +23,9 @@ from mereo.io.sensor_frame import SensorFrame
 from mereo.io.writers.formats import WRITERS, Results, chosen_formats, write_formats
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION, write_segments_glb
 from mereo.results.carry import Carried
+from mereo.results.joints import measure_joints, pose_covariance
 from mereo.results.state import write_state
 from mereo.scenes.rest_pose import rest_digest
-from mereo.visualization.joints import measure_joints, pose_covariance
 from mereo.visualization.previews import render_cloud_and_segments
 from mereo.visualization.reconstruction_report import REPORT, Report, cluster, trust
 from mereo.visualization.units import Unit

@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import floor, isfinite, log10
 
 import numpy as np
 from jaxtyping import Float
+
+from mereo.geometry.brief import as_exact_as, rounded
 
 
 @dataclass(frozen=True)
@@ -58,17 +59,3 @@ class Unit:
 
 UNKNOWN = Unit(None)
 """Unit of a cloud that does not say which it is."""
-
-
-def rounded(value: float) -> str:
-    """Number with three digits, or all before the point: 0.0123, 4.56, 78.9, 12,345."""
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
-
-
-def as_exact_as(error: float, *values: float) -> list[str]:
-    """Numbers with as many decimals as show two digits of an error: 0.187 makes 24.7 into 24.70, and 3.75 into 24.7."""
-    if not (isfinite(error) and error > 0):
-        return [rounded(value) for value in values]
-    decimals = max(0, 1 - floor(log10(error)))
-    # adding 0.0 makes a zero of a negative zero
-    return [f"{round(value, decimals) + 0.0:,.{decimals}f}" for value in values]

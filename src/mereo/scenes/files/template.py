@@ -494,6 +494,7 @@ def _likely_frame(file: Path, bounds: Float[np.ndarray, "2 3"]) -> tuple[str, st
         "glb": ("m", "the rule of glTF"),
         "gltf": ("m", "the rule of glTF"),
         "3mf": ("mm", "the default of 3MF"),
+        "dae": ("m", "as it is read by the unit that it states"),
     }
     unit, reason = known.get(kind, (guess, f"guessed: the object would be {longest_m:.3g} m long"))
     up = 1 if kind in ("glb", "gltf", "obj") else 2

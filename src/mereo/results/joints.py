@@ -8,6 +8,7 @@ uncertainty is known.
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -19,11 +20,16 @@ from mereo.fitting.problem.gauss_newton import rigid_motion
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.uncertainty import LEVEL, WITHIN
+from mereo.geometry.brief import as_exact_as
 from mereo.geometry.transforms import fit_rigid, transform_points
-from mereo.visualization.units import as_exact_as
+from mereo.scenes.scene import Scene
 
 SHOWN = {"rad": (180 / np.pi, "°"), "m": (1000.0, " mm"), "": (1.0, " units")}
 """Factor and name of the units in which people read values."""
+
+
+WHOLE = 0.0, 1.0
+"""Shares of a joint of which nothing is given; beyond them its value may lie, as far as the frame says so."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +38,9 @@ class JointValue:
 
     Attributes:
         value: radians of one that turns, metres of one that slides; scene units where the object's size is not known.
-        interval: values between which the true one is with probability 0.95; None where the registration was read from
-            a file. Like a radius, it does not cover a fit that ended in a wrong state.
+        interval: values between which the true one is with probability 0.95, none beyond those that are given; None
+            where the registration was read from a file. Like a radius, it does not cover a fit that ended in a wrong
+            state.
         unit: of the value: "rad", "m", or "" of scene units.
         limits: least and greatest value that the object's definition allows.
     """
@@ -60,11 +67,22 @@ class JointValue:
 def measure_joints(answer: Answer) -> dict[str, JointValue]:
     """Measure the joints that have names in the object's definition, by which they are counted, in an answer's state.
 
-    Empty where there are none, and where the network answers.
+    Empty where there are none, and where the network answers. Those of a registration are measured once.
     """
-    registration, scene = answer.registered, None if answer.registrar is None else answer.registrar.scene
+    registration, fitted = answer.registered, answer.registration
+    if registration is None or fitted is None or answer.registrar is None:
+        return {}
+    if fitted not in _MEASURED:
+        _MEASURED[fitted] = _measured(registration, answer.registrar.scene)
+    return _MEASURED[fitted]
+
+
+_MEASURED = WeakKeyDictionary[Registration, dict[str, JointValue]]()
+
+
+def _measured(registration: Registration, scene: Scene | None) -> dict[str, JointValue]:
     motion = None if scene is None else scene.sample_deformations
-    if registration is None or scene is None or not isinstance(motion, RandomMotion) or not motion.joints:
+    if scene is None or not isinstance(motion, RandomMotion) or not motion.joints:
         return {}
     leaders = list(dict.fromkeys(joint.follows or joint.name for joint, _ in motion.joints.values()))  # as drawn
     rows = np.unique(np.concatenate([anchors[:: 1 + len(anchors) // 64] for anchors in registration.model.anchors]))
@@ -73,13 +91,17 @@ def measure_joints(answer: Answer) -> dict[str, JointValue]:
     values = dict[str, JointValue]()
     for name, (joint, _) in motion.joints.items():
         index = leaders.index(joint.follows or name)
+        leader = motion.joints[leaders[index]][0]
         unit, factor = ("rad", 1.0) if joint.turns else ("m", scene.unit_m) if scene.unit_m else ("", 1.0)
         first, second = (factor * limit for limit in joint.limits)
-        value = first + float(fit.x[index]) * (second - first)
+        ends = [first + share * (second - first) for share in leader.shares]
+        value = ends[0] + float(fit.x[index]) * (ends[1] - ends[0])
+        off = None if reach is None else abs(ends[1] - ends[0]) * float(reach[index])
         if joint.turns:  # a whole turn more is the same state
-            value -= 2 * np.pi * float(np.round((value - (first + second) / 2) / (2 * np.pi)))
-        off = None if reach is None else abs(second - first) * float(reach[index])
-        interval = None if off is None else (value - off, value + off)
+            turn = 2 * np.pi * float(np.round((value - (first + second) / 2) / (2 * np.pi)))
+            value, ends = value - turn, [end - turn for end in ends]
+        low, high = (-np.inf, np.inf) if leader.shares == WHOLE else sorted(ends)
+        interval = None if off is None else (max(value - off, low), min(value + off, high))
         values[name] = JointValue(value, interval, unit, (min(first, second), max(first, second)))  # type: ignore[arg-type]
     return values
 
@@ -87,22 +109,29 @@ def measure_joints(answer: Answer) -> dict[str, JointValue]:
 def _fit_shares(
     registration: Registration, motion: RandomMotion, leaders: Sequence[str], rows: Int[np.ndarray, " n"]
 ) -> OptimizeResult:
-    """Shares of the joints' ranges that bring the object's points at rest nearest to the registered ones."""
+    """Numbers of the joints that bring the object's points at rest nearest to the registered ones.
+
+    0 is the least and 1 the greatest share that a joint may have, between which one stays whose value is given.
+    """
     model, drawn = registration.model, registration.drawn
     rest, labels = model.rest_points[rows], model.labels[rows]
     goal = registration.material[rows] / registration.scene_unit
+    joints = [motion.joints[name][0] for name in leaders]
+    least, most = np.transpose([joint.shares for joint in joints])
 
-    def misfit(shares: Float[np.ndarray, " j"]) -> Float[np.ndarray, " r"]:
-        moved = np.empty_like(rest)
+    def misfit(numbers: Float[np.ndarray, " j"]) -> Float[np.ndarray, " r"]:
+        moved, shares = np.empty_like(rest), least + numbers * (most - least)
         for label, deform in enumerate(motion.at(dict(zip(leaders, shares.tolist(), strict=True))), start=1):
             moved[labels == label] = deform(rest[labels == label])
         return np.ravel(transform_points(fit_rigid(moved, goal), moved) - goal)
 
-    limits = np.array([motion.joints[name][0].limits for name in leaders])
-    starts = [np.full(len(leaders), 0.5), limits[:, 0] / (limits[:, 0] - limits[:, 1])]  # the middle, and rest
+    at_rest = np.array([joint.share(0.0) for joint in joints])
+    starts = [np.full(len(leaders), 0.5), (at_rest - least) / np.maximum(most - least, 1e-9)]  # the middle, and rest
     if drawn is not None and len(drawn.z) == len(leaders):
         starts = [ndtr(drawn.z)]
-    return min((least_squares(misfit, start, method="lm") for start in starts), key=lambda fit: float(fit.cost))
+    free = np.where([joint.shares == WHOLE for joint in joints], np.inf, 0.0)
+    fits = (least_squares(misfit, np.clip(start, -free, 1 + free), bounds=(-free, 1 + free)) for start in starts)
+    return min(fits, key=lambda fit: float(fit.cost))
 
 
 def _reach(
