@@ -24,7 +24,6 @@ from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.tracking import Tracker
 from mereo.fitting.uncertainty import (
-    LEAST_RADIUS,
     UNCALIBRATED,
     ModesOptimum,
     Posterior,
@@ -125,10 +124,13 @@ def test_radii_are_in_the_unit_of_the_input(model: StatisticalModel, material: n
 
 
 def test_a_calibration_scales_radii_and_intervals(found: Registration, sure: Uncertainty) -> None:
-    """The least radius, which every position has in addition, is no part of what is scaled."""
-    assert sure.extra_radius == LEAST_RADIUS and (sure.material > LEAST_RADIUS).all()
-    sure, found = replace(sure, extra_radius=0.0), replace(found, extra_radius=0.0)
-    wide = replace(found, radius_scale=3.0 * UNCALIBRATED).uncertainty
+    """Without one, radii of clean frames are as they are, and those of noisy ones wider."""
+    assert sure.extra_radius == 0.0 and sure.factor == 1.0
+    optimum = sure.optimum
+    assert isinstance(optimum, ModesOptimum)
+    noisy = replace(optimum, problem=optimum.problem.with_noise(0.3))
+    assert replace(sure, optimum=noisy).factor == UNCALIBRATED
+    wide = replace(found, radius_scale=3.0).uncertainty
     assert wide is not None and wide.calibrated and not sure.calibrated
     np.testing.assert_allclose(wide.material, 3.0 * sure.material)
     for one, other in zip(wide.segments, sure.segments, strict=True):

@@ -412,7 +412,7 @@ class Uncertainty:
         model: statistical model of the object.
         scale: factor by which views of training seeds showed the posterior's radii to be too small, in frames like
             this; None where that was not measured.
-        extra_radius: radius added in quadrature at every position: ``LEAST_RADIUS`` where they are calibrated; scene units.
+        extra_radius: radius added in quadrature at every position, ``LEAST_RADIUS`` under a calibration; scene units.
     """
 
     optimum: Optimum
