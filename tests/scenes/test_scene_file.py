@@ -10,6 +10,7 @@ import pytest
 import trimesh
 from label_cases import halves, write_nifti
 from overlapping import check_overlap
+from pydantic.fields import FieldInfo
 from scene_code import CODE, EVERYTHING
 from scene_files import HEAD, write_bar, write_mesh
 from shapes import ball, box
@@ -19,7 +20,14 @@ from mereo.deformation.maps import jacobian_determinant
 from mereo.deformation.samplers import RandomMotion
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.scenes.files import build, check
-from mereo.scenes.files.deformation_blocks import AnyDeformation, SceneFile
+from mereo.scenes.files.deformation_blocks import (
+    AnyDeformation,
+    Block,
+    CameraBlock,
+    FilePart,
+    ModelPart,
+    SceneFile,
+)
 from mereo.scenes.files.template import (
     UNPLACED,
     default_deformations,
@@ -238,13 +246,34 @@ def test_a_scene_from_a_python_file(tmp_path: Path) -> None:
             load_scene(tmp_path / missing)
 
 
-def test_every_key_and_every_deformation_is_documented() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "own-object.md").read_text("utf-8")
-    assert [key for key in SceneFile.model_fields if f"| `{key}` |" not in text] == []
-    for block in get_args(AnyDeformation):
-        (kind,) = get_args(block.model_fields["type"].annotation)
-        row = next(line for line in text.splitlines() if line.startswith(f"| `{kind}` |"))
-        assert [key for key in block.model_fields if key not in ("type", "segments") and f"`{key}`" not in row] == []
+def test_every_key_is_documented_with_its_default() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "scene-file.md").read_text("utf-8").replace("`", "")
+    rows = [re.split(r"\s*\|\s*", line)[1:-1] for line in text.splitlines() if line.startswith("| ")]
+    defaults = {(kind, key): row[1] for kinds, key, *row in rows if len(row) == 3 for kind in kinds.split(", ")}
+    defaults |= {("", key): row[1] for key, *row in rows if len(row) == 3}
+    blocks: list[tuple[str, type[Block]]] = [
+        ("", SceneFile),
+        ("", CameraBlock),
+        ("segments", FilePart),
+        ("parts", ModelPart),
+    ]
+    blocks += [(get_args(block.model_fields["type"].annotation)[0], block) for block in get_args(AnyDeformation)]
+    for kind, block in blocks:
+        for key, field in block.model_fields.items():
+            if kind in ("", "segments", "parts") or key not in ("type", "segments"):
+                assert_default(defaults[kind, key], field)
+
+
+def assert_default(stated: str, field: FieldInfo) -> None:
+    """Numbers are as the schema has them, and what it requires is required."""
+    if isinstance(field.default, bool):
+        assert stated == str(field.default).lower()
+    elif isinstance(field.default, float | int):
+        assert float(stated) == field.default
+    elif isinstance(field.default, tuple):
+        assert stated == str([float(value) for value in field.default]).replace(".0", "")
+    elif field.is_required():
+        assert stated.startswith("required")
 
 
 # --- new files --------------------------------------------------------------------------------------------------------
