@@ -129,8 +129,8 @@ Hidden.asked.clear()
 # --- the pages, as printed, after a clone and its ./demo --------------------------------------------------------------
 
 PAGES = {page: ROOT / page for page in ("README.md", "docs/quickstart.md")}
-ANSWERS = ROOT / "docs/faq.md"
-"""Its commands go on with what those of the quickstart have left."""
+ANSWERS, PYTHON = ROOT / "docs/faq.md", ROOT / "docs/python.md"
+"""What goes on with what the quickstart has left: commands, and blocks that are one program."""
 
 
 def test_five_lines_find_a_built_in_object(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -204,7 +204,8 @@ def test_every_block_of_a_page_runs_as_printed(page: str, clone: Path, monkeypat
         pytest.importorskip(library)
     text, done = PAGES[page].read_text("utf-8"), 0
     if page == "docs/quickstart.md":
-        text += ANSWERS.read_text("utf-8")
+        program = "".join(blocks(PYTHON, "python"))
+        text += f"{ANSWERS.read_text('utf-8')}\n\npip install '[network]'\n\n```python\n{program}```"
     for block in FENCE.finditer(text):
         before = text[: block.start()].rstrip().rsplit("\n\n", 1)[-1]
         monkeypatch.delenv("MEREO_TEST_TORCH", raising=False)
