@@ -151,4 +151,5 @@ def _public_names() -> str:
         if alias.asname
     ]
     table = "\n".join(["| name | defined as |", "|---|---|", *rows])
-    return f"# mereo\n\n{ast.get_docstring(tree)}\n\n{table}\n"
+    examples = "[Python by example](../python.md) shows how they are used."
+    return f"# mereo\n\n{examples}\n\n{ast.get_docstring(tree)}\n\n{table}\n"

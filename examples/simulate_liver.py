@@ -8,7 +8,7 @@ lattice of tetrahedra around the scene `liver`'s two organs, which carries their
 
 Each state is the equilibrium under one to three instruments, which grasp tissue around random surface nodes and move it
 by 10 to 35 mm in random directions, and a random share of gravity (the patient's position). The tissue hangs at its
-back, where ligaments hold it. The file holds tetrahedral states (docs/own-object.md), millimetres.
+back, where ligaments hold it. The file holds tetrahedral states (docs/scene-file.md), millimetres.
 
 Material: Saint Venant-Kirchhoff, Young's modulus 5 kPa (a healthy liver's; Yeh et al., Ultrasound in Medicine & Biology
 2002, measure 0.6 to 12 kPa in vitro), Poisson's ratio 0.4 (linear tetrahedra lock closer to 0.5), 1060 kg per cubic

@@ -267,7 +267,7 @@ def read_start(path: str | Path, rest: SegmentedMesh, scale: float | None = None
         raise ValueError(f'{path} has the key {odd[0]!r}; it may have "object" and "segments": correct it')
     segments = stated.get("segments", {})
     if not isinstance(segments, dict):
-        raise ValueError(f'"segments" of {path} is not an object; it maps names to poses: see docs/own-object.md')
+        raise ValueError(f'"segments" of {path} is not an object; it maps names to poses: see docs/training.md')
     if unknown := sorted(set(segments) - set(rest.names)):
         raise ValueError(
             f"{path} gives a start of the segment {unknown[0]!r}; the segments are {', '.join(rest.names)}: correct "

@@ -587,22 +587,6 @@ def test_learn_and_export_return_what_they_leave(tmp_path: Path, monkeypatch: py
     assert calls[-1] == ("rope", tmp_path / "graphs", "torch", False)
 
 
-@pytest.mark.slow
-def test_the_lines_of_the_readme_run_as_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = (Path(__file__).parents[2] / "README.md").read_text("utf-8")
-    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    monkeypatch.chdir(tmp_path)
-    names: dict[str, Any] = {}
-    exec(compile(code, "README.md", "exec"), names)
-    result = names["result"]
-    assert result.taken and result.known is True and result["head"].error_radius > 0
-    here = result.registered.to_camera([[0.0, 1.0, 2.0]])
-    np.testing.assert_allclose(result.registered.to_rest(here), [[0, 1, 2]], atol=0.01)
-    assert sorted(path.name for path in (tmp_path / "result").glob("[!.]*")) == [
-        *("labels.npz", "preview.png", "radius95.glb", "report.html", "segments.glb", "state.json", "summary.json")
-    ]
-
-
 # --- sentences name options on the command line and arguments in Python -----------------------------------------------
 
 

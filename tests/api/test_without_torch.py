@@ -129,6 +129,8 @@ Hidden.asked.clear()
 # --- the pages, as printed, after a clone and its ./demo --------------------------------------------------------------
 
 PAGES = {page: ROOT / page for page in ("README.md", "docs/quickstart.md")}
+ANSWERS, PYTHON = ROOT / "docs/faq.md", ROOT / "docs/python.md"
+"""What goes on with what the quickstart has left: commands, and blocks that are one program."""
 
 
 def test_five_lines_find_a_built_in_object(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -153,6 +155,9 @@ np.testing.assert_allclose(result.carry([[0.0, 0.1, 0.0]]), [[0.0, 0.1, 0.0]], a
 PROGRAMS = ("mereo view", "mereo serve")
 """Commands that go on until Ctrl-C."""
 
+CAMERA = "mereo stream realsense "
+"""A command that needs a camera; tests/io/test_realsense.py runs it with a stand-in."""
+
 
 @pytest.fixture
 def clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -161,6 +166,7 @@ def clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "bin/mereo").write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m mereo "$@"\n')
     (tmp_path / "bin/mereo").chmod(0o755)
     torch = 'import os\nif "MEREO_TEST_TORCH" not in os.environ:\n'
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
     (tmp_path / "site").mkdir()
     (tmp_path / "site/sitecustomize.py").write_text(torch + textwrap.indent(HIDDEN, "    "))
     for name, first, divider in (("PATH", "bin", ":"), ("PYTHONPATH", "site", os.pathsep)):
@@ -172,7 +178,7 @@ def clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def run_line(line: str, clone: Path) -> None:
     """Run a line of a shell block; one that installs is done already, one that waits is interrupted when it does."""
-    if line.startswith(("git clone ", "pip install ")):
+    if line.startswith(("git clone ", "pip install ", CAMERA)):
         return
     line = re.sub(r"^\./demo\b", "mereo demo", line).replace("source .venv/bin/activate", "true")
     if not line.startswith(PROGRAMS):
@@ -194,9 +200,12 @@ def run_line(line: str, clone: Path) -> None:
 @pytest.mark.parametrize("page", PAGES)
 def test_every_block_of_a_page_runs_as_printed(page: str, clone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In the order of the page; those after a paragraph that installs PyTorch with it, all others without."""
-    for library in ("viser", "fastapi", "onnxscript"):
+    for library in ("viser", "fastapi", "onnxscript", "yourdfpy"):
         pytest.importorskip(library)
     text, done = PAGES[page].read_text("utf-8"), 0
+    if page == "docs/quickstart.md":
+        program = "".join(blocks(PYTHON, "python"))
+        text += f"{ANSWERS.read_text('utf-8')}\n\npip install '[network]'\n\n```python\n{program}```"
     for block in FENCE.finditer(text):
         before = text[: block.start()].rstrip().rsplit("\n\n", 1)[-1]
         monkeypatch.delenv("MEREO_TEST_TORCH", raising=False)

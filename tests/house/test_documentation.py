@@ -156,8 +156,11 @@ def test_the_glossary_names_what_exists_and_each_term_once() -> None:
     assert {name for name in named if name.removeprefix("--").replace("-", "_") not in known} == set()
 
 
-def test_readme_is_one_screen_and_decisions_are_short() -> None:
+def test_readme_is_one_screen_and_pages_of_use_and_decisions_are_short() -> None:
     assert len((ROOT / "README.md").read_text().splitlines()) <= 80
+    use = (ROOT / "mkdocs.yml").read_text().partition("- Use:")[2].partition("- Reference:")[0]
+    pages = [ROOT / "README.md", *(DOCS / name for name in re.findall(r": ((?!tour)\S+)", use))]
+    assert sum(len(page.read_text().split()) for page in pages) <= 9000
     for page in ROOT.glob("docs/design/*.md"):
         assert len(page.read_text().splitlines()) <= 40, page
 

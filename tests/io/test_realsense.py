@@ -1,6 +1,8 @@
 """RealSense: what a camera does by a stand-in of its library, and a recording by the library where it is installed."""
 
 import json
+import re
+import shlex
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,6 +11,8 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+import trimesh
+from page_blocks import ROOT
 
 from mereo import __main__ as command_line
 from mereo.geometry.camera import Camera
@@ -72,6 +76,20 @@ def test_depth_as_the_colour_camera_sees_it(connect: Any) -> None:
     sdk.align().process().get_depth_frame.return_value = image(5000, 0.0)
     assert next(camera_frames("realsense:12", align_color=True)).read().depth.max() == pytest.approx(0.5)
     sdk.config().enable_stream.assert_called_with(sdk.stream.color)
+
+
+def test_the_line_of_the_quickstart_finds_a_rigid_object(
+    connect: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    trimesh.creation.box((0.16, 0.24, 0.1)).export("bottle.obj")
+    front = image(0, 0.0)
+    front.get_data()[10:39, 22:41] = 5000
+    connect(front)
+    (line,) = re.findall("^mereo (stream realsense .*)", (ROOT / "docs/quickstart.md").read_text("utf-8"), re.M)
+    assert command_line.main(shlex.split(line, comments=True)) == 2, "the camera falls silent"
+    first = json.loads(capsys.readouterr().out.splitlines()[0])
+    assert first["tracking"] == "found" and first["pose"][2][3] == pytest.approx(0.55, abs=0.005)
 
 
 BROKEN = {

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from camera_files import write_camera
 from page_blocks import ROOT, blocks
-from PIL import Image
 from toy_frames import MODEL, NAMES, seen
 from two_balls import scene
 
@@ -22,7 +21,6 @@ from mereo.fitting.registration.answer import Answer
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import CloudAxes
 from mereo.io.atomic_files import to_json
-from mereo.io.readers import read_mask
 from mereo.io.writers.meshes import write_positions_ply
 from mereo.synthesis.config import SensorModel
 from mereo.synthesis.depth_sensor import KINECT_DISPARITY_M, axial_std_m, quantize
@@ -113,7 +111,7 @@ def test_a_depth_image_has_one_answer(tmp_path: Path) -> None:
     assert wanted.unit_m == 1.0 and asked(image).unit_m is None, "an image of any unit, unless it is said"
 
 
-FRAMES, TOOLS = ROOT / "docs" / "frames.md", ROOT / "docs" / "from-other-tools.md"
+CAMERAS, TOOLS = ROOT / "docs" / "cameras.md", ROOT / "docs" / "from-other-tools.md"
 MODELS: tuple[SensorModel, ...] = ("structured-light", "time-of-flight")
 
 
@@ -126,7 +124,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[s
             monkeypatch.setitem(sys.modules, name, module)
         monkeypatch.chdir(tmp_path)
         monkeypatch.setattr(mereo, "load_object", lambda _: MODEL, raising=False)
-        (code,) = (code for page in (FRAMES, TOOLS) for code in blocks(page, "python") if word in code)
+        (code,) = (code for code in blocks(TOOLS, "python") if word in code)
         names: dict[str, Any] = {}
         exec(compile(code, word, "exec"), names)
         return names
@@ -159,7 +157,7 @@ def test_slicer(run: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
 
 def test_the_table_of_distances_follows_the_formulas() -> None:
     row = r"^\| ([\d.]+) \| ([\d.]+), ([\d.]+) \| ([\d.]+) \| ([\d.]+), ([\d.]+) \| (\d+) \| (\d+) \|$"
-    rows = re.findall(row, FRAMES.read_text(), re.M)
+    rows = re.findall(row, CAMERAS.read_text(), re.M)
     assert len(rows) == 6
     for z, *stated in np.array(rows, dtype=float).tolist():
         at, angles = np.full(2, z), np.deg2rad([0.0, 60.0])
@@ -168,14 +166,3 @@ def test_the_table_of_distances_follows_the_formulas() -> None:
         assert stated[5:] == [round(0.1 * focal / z) for focal in (420, 525)]
     depths = np.unique(quantize(np.linspace(0.99, 1.01, 10_000), 1.0))
     assert 1e3 * np.median(np.diff(depths)) == pytest.approx(2.85, abs=0.02), "the step as it is simulated"
-
-
-def test_the_colour_threshold_finds_the_orange_ball(run: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
-    row, column = np.mgrid[:120, :160]
-    ball = (row - 60) ** 2 + (column - 70) ** 2 < 30**2
-    picture = np.full((120, 160, 3), (60, 90, 200), np.uint8)
-    picture[ball] = picture[10:30, 130:150] = picture[100, 5] = (250, 110, 20)
-    Image.fromarray(picture).save(tmp_path / "color.png")
-    run("ndimage", {})
-    mask = read_mask(tmp_path / "mask.png")
-    assert not (mask & ~ball).any() and mask.sum() > 0.9 * ball.sum()

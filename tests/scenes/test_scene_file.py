@@ -19,7 +19,7 @@ from mereo.deformation.maps import jacobian_determinant
 from mereo.deformation.samplers import RandomMotion
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.scenes.files import build, check
-from mereo.scenes.files.deformation_blocks import AnyDeformation, SceneFile
+from mereo.scenes.files.deformation_blocks import AnyDeformation, CameraBlock, SceneFile
 from mereo.scenes.files.template import (
     UNPLACED,
     default_deformations,
@@ -238,13 +238,14 @@ def test_a_scene_from_a_python_file(tmp_path: Path) -> None:
             load_scene(tmp_path / missing)
 
 
-def test_every_key_and_every_deformation_is_documented() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "own-object.md").read_text("utf-8")
-    assert [key for key in SceneFile.model_fields if f"| `{key}` |" not in text] == []
-    for block in get_args(AnyDeformation):
-        (kind,) = get_args(block.model_fields["type"].annotation)
-        row = next(line for line in text.splitlines() if line.startswith(f"| `{kind}` |"))
-        assert [key for key in block.model_fields if key not in ("type", "segments") and f"`{key}`" not in row] == []
+def test_every_key_is_documented_with_its_default() -> None:
+    rows = (Path(__file__).parents[2] / "docs" / "scene-file.md").read_text("utf-8").splitlines()
+    kinds = {f"`{get_args(block.model_fields['type'].annotation)[0]}`": block for block in get_args(AnyDeformation)}
+    for kind, block in [("", SceneFile), ("", CameraBlock), *kinds.items()]:
+        for key in block.model_fields.keys() - ({"type", "segments"} if kind else ()):
+            start = rf"\| .*{kind}.* \| `{key}` \|" if kind else rf"\| `{key}` \|"
+            row, default = next(row for row in rows if re.match(start, row)), block.model_fields[key].default
+            assert type(default) not in (int, float) or f"| {default:g} |" in row
 
 
 # --- new files --------------------------------------------------------------------------------------------------------

@@ -60,7 +60,7 @@ class Align:
         if (self.start is None) == (self.weights is None):
             raise ValueError(
                 f"{'no start is' if self.start is None else 'two starts are'} given; one is needed: --start FILE or "
-                "--weights NAME (docs/own-object.md says how to make a start file)"
+                "--weights NAME (docs/training.md says how to make a start file)"
             )
         from mereo.geometry.conventions import UNITS_M
         from mereo.io.atomic_files import new_directory

@@ -1,6 +1,6 @@
 """Recorded states from files: vertex or node positions per frame, as simulators export them.
 
-The formats are in docs/own-object.md. This module reads and checks what files say by themselves;
+The formats are in docs/scene-file.md. This module reads and checks what files say by themselves;
 ``mereo.scenes.recorded_states`` fits them to an object.
 """
 

@@ -6,6 +6,7 @@ uncertainty is known.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 from weakref import WeakKeyDictionary
@@ -22,7 +23,7 @@ from mereo.fitting.registration.registration import Registration
 from mereo.fitting.uncertainty import LEVEL, WITHIN
 from mereo.geometry.brief import as_exact_as
 from mereo.geometry.transforms import fit_rigid, transform_points
-from mereo.scenes.scene import Scene
+from mereo.scenes.scene import AssetUnavailable, Scene
 
 SHOWN = {"rad": (180 / np.pi, "°"), "m": (1000.0, " mm"), "": (1.0, " units")}
 """Factor and name of the units in which people read values."""
@@ -73,8 +74,9 @@ def measure_joints(answer: Answer) -> dict[str, JointValue]:
     if registration is None or fitted is None or answer.registrar is None:
         return {}
     if fitted not in _MEASURED:
-        _MEASURED[fitted] = _measured(registration, answer.registrar.scene)
-    return _MEASURED[fitted]
+        with suppress(AssetUnavailable):  # the meshes of a scene's weights, which need none
+            _MEASURED[fitted] = _measured(registration, answer.registrar.scene)
+    return _MEASURED.get(fitted, {})
 
 
 _MEASURED = WeakKeyDictionary[Registration, dict[str, JointValue]]()

@@ -75,7 +75,7 @@ class StateDraws(Block):
 
 
 class RegistrationState(Block):
-    """State of a registration: content of ``state.json``, whose keys docs/registration.md explains."""
+    """State of a registration: content of ``state.json``, whose keys docs/conventions.md explains."""
 
     format: int
     mereo: Text

@@ -1,7 +1,7 @@
 """Simulated states: an object's deformations taken from a simulator's recorded frames instead of drawn by formula.
 
 A random state is one recorded frame, drawn at random. Frames are finitely many, so some are kept for testing: training
-and test seeds never share one. See docs/own-object.md for formats.
+and test seeds never share one. See docs/scene-file.md for formats.
 """
 
 from dataclasses import dataclass, replace
@@ -60,7 +60,7 @@ def load_states(
     """Recorded states of an object; ``scene = file * scale + shift`` takes the file's coordinates to those of ``rest``.
 
     Args:
-        path: a file, a directory or a pattern of files, see docs/own-object.md.
+        path: a file, a directory or a pattern of files, see docs/scene-file.md.
         rest: the object at rest, in scene units.
         mesh: file of the states' own nodes at rest, and of their tetrahedra, where the frames do not have them.
         scale: above 0.

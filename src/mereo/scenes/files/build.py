@@ -1,4 +1,4 @@
-"""Scenes of your own, as YAML files: from the text to a ``Scene`` (docs/own-object.md explains every key).
+"""Scenes of your own, as YAML files: from the text to a ``Scene`` (docs/scene-file.md explains every key).
 
 Document -validated-> SceneFile -read_segments-> SegmentedMesh in the file's unit -scaled-> Scene
 """

@@ -574,7 +574,7 @@ def _radians(degrees: tuple[float, float]) -> tuple[float, float]:
 # What a scene file may say: one class per block, its fields the keys, their types the rules.
 #
 # Lengths and places are in the file's own unit and frame, those of its meshes; the camera's distances and ``size`` are
-# in scene units, the unit of datasets and weights. Angles are in degrees. ``docs/own-object.md`` explains every key.
+# in scene units, the unit of datasets and weights. Angles are in degrees. ``docs/scene-file.md`` explains every key.
 
 # --- schema -----------------------------------------------------------------------------------------------------------
 

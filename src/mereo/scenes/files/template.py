@@ -765,7 +765,7 @@ FURTHER = """\
 TEMPLATE = """\
 # A scene for mereo: what the object is, how it may deform, and from where it is seen.
 # Lengths and places are those of the files, angles are degrees, a range is [least, most].
-# Every key is explained in docs/own-object.md.
+# Every key is explained in docs/scene-file.md.
 
 name: {name}
 units: {unit}  # {reason}. mm, cm, m, in, or metres per unit
