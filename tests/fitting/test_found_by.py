@@ -14,7 +14,6 @@ from mereo.fitting.problem import correspondences
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.problem import (
     ACCEPTED,
-    CAMERA,
     CLEAN,
     SHARED,
     SIGMAS,
@@ -249,7 +248,7 @@ def test_the_noise_left_is_what_points_have_alone_and_as_much_as_neighbours_shar
 
 def test_the_first_noise_is_what_the_cloud_shows(points: np.ndarray) -> None:
     calm, rough = (Evidence.of(cloud) for cloud in (points, noisy(points, 0.4)))
-    assert calm.noise < CLEAN and 0.2 < rough.noise < 0.4
+    assert calm.noise < CLEAN and 0.3 < rough.noise < 0.5
     assert replace(rough, shared_noise=0.3).noise == pytest.approx(np.hypot(rough.noise, 0.3))
 
 
@@ -330,7 +329,6 @@ def test_constants_follow_the_noise_and_end(registrar: Registrar, points: np.nda
     assert constants(0.0) == constants(CLEAN) == clean and not problem.with_noise(CLEAN).is_noisy
     assert constants(0.2) == pytest.approx((0.3, 0.6, ACCEPTED)) and problem.with_noise(0.2).is_noisy
     assert constants(0.2, accepted=0.5)[2] == 0.5
-    assert constants(0.9 * CAMERA)[2] == config.accepted, "a clean frame's fit that is not quite right"
     assert constants(99.0)[0] == pytest.approx(SIGMAS * problem.evidence.largest_noise)
 
 

@@ -81,7 +81,8 @@ def shaken(problem: Problem, best: "ScoredFit") -> "ScoredFit":
     """
     rng, is_patient = np.random.default_rng(0), problem.config.retries and not problem.is_scale_open
     for _ in range(SHAKES if is_patient and has_many_optima(problem) else 0):
-        if best.explains(problem) or best.misfit.cloud > HOPELESS:
+        is_hopeless = best.misfit.cloud > HOPELESS or (problem.is_noisy and not problem.explains_noise(best.surface))
+        if is_hopeless or best.explains(problem):
             break
         before, z = best, best.posed.z
         starts = [replace(best.posed, z=z + rng.standard_normal(len(z))) for _ in range(SHAKEN)]
@@ -332,7 +333,7 @@ def fit_seen(
         fits.append((again, other, fit_modes(again)))
     problem, correspondences, best = min(fits, key=lambda fit: fit[2].misfit.without_network)
     if problem.is_noisy:
-        problem = problem.with_noise(problem.left_noise(best.surface)).by_every_point
+        problem = problem.with_noise(min(problem.noise, problem.left_noise(best.surface))).by_its_points
         best = refined(problem, best.posed)
     return problem, correspondences, best
 

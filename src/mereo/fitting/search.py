@@ -640,7 +640,7 @@ def with_left_noise(trails: list[Trail]) -> list[Trail]:
     if not chosen.problem.is_noisy:
         return trails
     noise = min(chosen.problem.noise, chosen.problem.left_noise(chosen.best.surface))
-    return [trail.in_problem(trail.problem.with_noise(noise).by_every_point) for trail in trails]
+    return [trail.in_problem(trail.problem.with_noise(noise).by_its_points) for trail in trails]
 
 
 def screen_poses(problem: Problem, stage: SearchRound) -> list[Posed]:

@@ -52,9 +52,9 @@ NORMAL_POINTS = 12
 NOISE_SHARE = 0.01
 """Largest noise of a depth camera, as a share of its distance: two to five times that of the usual ones."""
 
-ROUGHER = 1.8
-"""Largest noise of points alone, in the roughness of the cloud's calmest part; right fits of noisy frames have 0.6 to
-1.4, and a fit to another object up to 4.6 (docs/experiments/072.md)."""
+ROUGHER = 1.4
+"""Largest noise of points alone, in the roughness of the cloud's calmest part: right fits leave 0.3 to 1.4
+(docs/experiments/085.md), fits to another object up to 4.6 (docs/experiments/072.md)."""
 
 NOISIER = 2.0
 """Largest noise that neighbours share on the object, in that around it: dark and slanted surfaces have more."""
@@ -189,9 +189,9 @@ class ObservedPoints(ABC):
 
     @property
     def noise(self) -> float:
-        """Noise of the frame as it shows before any fit."""
+        """Noise of the frame at most, as it shows before any fit."""
         roughness = self.roughness if np.isfinite(self.roughness) else 0.0  # of a few points
-        return float(np.hypot(roughness, self.expected_noise))
+        return float(np.hypot(ROUGHER * roughness, self.expected_noise))
 
     @cached_property
     def nested(self) -> Int[np.ndarray, " m"]:

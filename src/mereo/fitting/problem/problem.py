@@ -164,7 +164,7 @@ class Problem:
     @property
     def accepted(self) -> float:
         """Share of the observed points that must lie there for a fit to be believed."""
-        return self.config.accepted if self.noise < CAMERA else min(self.config.accepted, ACCEPTED)
+        return min(self.config.accepted, ACCEPTED) if self.is_noisy else self.config.accepted
 
     def left_noise(self, surface: Surface) -> float:
         """Noise of the frame as a fit leaves it over: of that neighbours may share as much as around the object."""
@@ -172,10 +172,13 @@ class Problem:
         alone = noise_of(offset, self.evidence.around)
         return min(max(noise_of(offset), alone), float(np.hypot(alone, self.evidence.expected_noise)))
 
+    def share_on(self, surface: Surface) -> float:
+        """Share of the observed samples that lie on a surface, up to the tolerance."""
+        return float((self.nearest(surface)[0] <= self.tolerance).mean())
+
     def explains_noise(self, surface: Surface) -> bool:
         """Whether the frame is noisy, and enough of its points lie on a surface for a fit to be believed."""
-        off = self.nearest(surface)[0]
-        return self.is_noisy and float((off <= self.tolerance).mean()) >= self.accepted
+        return self.is_noisy and self.share_on(surface) >= self.accepted
 
     def worth(self, surface: Surface) -> "Problem":
         """The problem with as many independent points as what a fit leaves over shows that the cloud is worth."""
@@ -184,6 +187,11 @@ class Problem:
         share = min(alone / shared_variance(offset, self.evidence, POSE + self.model.count), 1.0)
         weight, outside = SIGMAS**2 * share * len(offset), FitConfig.silhouette_weight * share
         return replace(self, config=replace(config, cloud_weight=weight, silhouette_weight=outside))
+
+    @property
+    def by_its_points(self) -> "Problem":
+        """The problem with as many observed samples as its noise asks for."""
+        return self.by_every_point if self.is_noisy else self
 
     @property
     def by_every_point(self) -> "Problem":
@@ -196,9 +204,10 @@ class Problem:
     def explained(self, cloud: float, surface: Surface, most: float) -> bool:
         """Whether a surface explains the cloud: by a misfit below ``most``, or of a noisy one all but the noise.
 
-        Of that neighbours may share as much as they do around the object. A fit that is not believed explains nothing.
+        Of that neighbours may share as much as they do around the object, and as many points as of a clean frame must
+        lie on the surface.
         """
-        if cloud < most or not self.explains_noise(surface):
+        if cloud < most or not self.is_noisy or self.share_on(surface) < self.config.accepted:
             return cloud < most
         offset = self.offsets(surface, self.far)
         evidence = self.evidence
@@ -353,8 +362,9 @@ class Problem:
 TO_STD = 1.4826
 """Standard deviation of normal numbers over the median of their absolute values."""
 
-CLEAN = 0.1
-"""Noise, in scene units, up to which the constants are as they are; clean frames have 0.05 to 0.07."""
+CLEAN = 0.15
+"""Noise, in scene units, up to which the constants are as they are; more is a camera's. Clean frames have 0.05 to 0.1,
+and a clean frame's fit that is not quite right leaves less over, too."""
 
 NORMAL = 4.3
 """The 95 % quantile of what a fit leaves over, in its median, up to which it looks like normal numbers, with 2.9."""
@@ -367,10 +377,6 @@ NOISES = 3.0
 
 SHARED = 1.05
 """Misfit of a noisy cloud, in misfits of what neighbours do not share, up to which nothing more is to be explained."""
-
-CAMERA = 0.15
-"""Noise, in scene units, from which on it is a camera's. Less is left over by a clean frame's fit that is not quite
-right, from which as much is asked as from any clean frame's."""
 
 ACCEPTED = 0.75
 """Share of a camera's points that a fit must explain to be believed: nothing reveals the outliers among them."""
