@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from mereo.geometry.downsampling import first_in_cell
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
+from mereo.geometry.transforms import Points, Transform, Vector, inverse_rigid, rigid, transform_points
 
 # --- the visible surface ----------------------------------------------------------------------------------------------
 
@@ -68,7 +68,7 @@ def moved(mesh: SegmentedMesh, poses: Poses) -> SegmentedMesh:
     return mesh.with_vertices([transform_points(pose, segment.vertices) for pose, segment in pairs])
 
 
-def facing(placed: SegmentedMesh, viewpoint: Float[np.ndarray, "3"]) -> SegmentedMesh:
+def facing(placed: SegmentedMesh, viewpoint: Vector) -> SegmentedMesh:
     """Faces that are turned towards ``viewpoint``, or nearly."""
     segments = []
     for segment in placed.segments:
@@ -158,12 +158,12 @@ class Scan:
     """
 
     points: Float[np.ndarray, "p 3"]
-    viewpoint: Float[np.ndarray, "3"]
+    viewpoint: Vector
     size: float
     area: float
 
     @classmethod
-    def of(cls, points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray, "3"], size: float) -> "Scan":
+    def of(cls, points: Points, viewpoint: Vector, size: float) -> "Scan":
         """Scan of an object of diagonal ``size``, thinned.
 
         Raises ``ValueError`` where fewer than ``LEAST_POINTS`` points are left.
@@ -265,7 +265,7 @@ def register(
 
 def icp(
     points: Float[np.ndarray, "p 3"], surface: SegmentedMesh, limit: float, area: float, hold: bool
-) -> tuple[Float[np.ndarray, "4 4"], int]:
+) -> tuple[Transform, int]:
     """Rigid motion of ``surface`` onto ``points``, in their frame, and the number of directions in which it is held.
 
     Args:
@@ -302,9 +302,7 @@ def icp(
     return rigid(rotation, center - rotation @ center + radius * motion[:3, 3]), held
 
 
-def constrained(
-    motion: Float[np.ndarray, "4 4"], curvature: Float[np.ndarray, "6 6"]
-) -> tuple[Float[np.ndarray, "4 4"], int]:
+def constrained(motion: Transform, curvature: Float[np.ndarray, "6 6"]) -> tuple[Transform, int]:
     """Motion without its part along directions (turns, then shifts) curved less than ``LOOSE``, and their number."""
     values, directions = np.linalg.eigh(curvature)
     firm = directions[:, values >= LOOSE]

@@ -20,9 +20,9 @@ from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, Localized, Rigid, unit
 from mereo.deformation.warps import Bend, FreeFormLattice, SmoothField, Squash, Taper, Twist
 from mereo.geometry.mesh import SegmentedMesh, vertex_normals
+from mereo.geometry.transforms import Points, Vector
 
 Range = tuple[float, float]
-Vector = Float[np.ndarray, "3"]
 
 Surface = Callable[[], tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 3"]]]
 """Vertices of what is to be moved, as the maps before have left them, and outward unit normals."""
@@ -282,7 +282,7 @@ def _surface(
     return np.concatenate([s.vertices for s in moved]), np.concatenate([vertex_normals(s) for s in moved])
 
 
-def distance_from_line(points: Float[np.ndarray, "n 3"], origin: Vector, axis: Vector) -> float:
+def distance_from_line(points: Points, origin: Vector, axis: Vector) -> float:
     """Largest distance of the points; that of all of a mesh is at a vertex, because the distance is convex."""
     local = points - origin
     across = local - np.outer(local @ unit(axis), unit(axis))

@@ -22,6 +22,7 @@ from mereo.deformation.maps import newton, smooth_step
 from mereo.geometry.downsampling import farthest_point_order
 from mereo.geometry.mesh import barycentric
 from mereo.geometry.read_only import read_only, read_only_view
+from mereo.geometry.transforms import Points
 
 
 class Tetrahedra:
@@ -30,7 +31,7 @@ class Tetrahedra:
     Raises ``ValueError`` for NaN, indices that do not exist, and tetrahedra without volume.
     """
 
-    def __init__(self, nodes: Float[np.ndarray, "n 3"], elements: Int[np.ndarray, "m 4"]) -> None:
+    def __init__(self, nodes: Points, elements: Int[np.ndarray, "m 4"]) -> None:
         if len(elements) == 0:
             raise ValueError("there are no tetrahedra; at least one is needed: export the volume mesh")
         if not np.isfinite(nodes).all():
@@ -83,11 +84,11 @@ class Tetrahedra:
         """Gradients of the linear functions that are 1 at a tetrahedron's corner and 0 at its others."""
         return np.concatenate([-self._rest_inverse.sum(axis=1, keepdims=True), self._rest_inverse], axis=1)
 
-    def volume_ratios(self, nodes: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " m"]:
+    def volume_ratios(self, nodes: Points) -> Float[np.ndarray, " m"]:
         """Volume of each tetrahedron at other node positions, of that at rest; 0 or less where it is inverted."""
         return np.linalg.det(_edges(nodes, self.elements)) / (6 * self.volumes)
 
-    def gradients(self, nodes: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3 3"]:
+    def gradients(self, nodes: Points) -> Float[np.ndarray, "m 3 3"]:
         """Deformation gradients A of all tetrahedra at other node positions."""
         return _edges(nodes, self.elements) @ self._rest_inverse
 
@@ -132,7 +133,7 @@ class TetrahedralMap:
     """
 
     rest: Tetrahedra
-    nodes: Float[np.ndarray, "n 3"]
+    nodes: Points
 
     @cached_property
     def _gradients(self) -> Float[np.ndarray, "m 3 3"]:
@@ -179,13 +180,13 @@ class TetrahedralMap:
         return rest, converged
 
 
-def _edges(nodes: Float[np.ndarray, "n 3"], elements: Int[np.ndarray, "m 4"]) -> Float[np.ndarray, "m 3 3"]:
+def _edges(nodes: Points, elements: Int[np.ndarray, "m 4"]) -> Float[np.ndarray, "m 3 3"]:
     """Edges from the first node as columns."""
     corners = nodes[elements]
     return np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
 
 
-def _tree(vertices: Float[np.ndarray, "n 3"], elements: Int[np.ndarray, "m k"]) -> igl.AABB:
+def _tree(vertices: Points, elements: Int[np.ndarray, "m k"]) -> igl.AABB:
     tree = igl.AABB()
     tree.init(vertices, elements)
     return tree
@@ -193,7 +194,7 @@ def _tree(vertices: Float[np.ndarray, "n 3"], elements: Int[np.ndarray, "m k"]) 
 
 def _locate(
     tree: igl.AABB,
-    nodes: Float[np.ndarray, "n 3"],
+    nodes: Points,
     elements: Int[np.ndarray, "m 4"],
     points: Float[np.ndarray, "p 3"],
 ) -> Int[np.ndarray, " p"]:

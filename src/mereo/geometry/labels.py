@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.mesh import Color
+from mereo.geometry.transforms import Points, Vector
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,8 +22,8 @@ class LabelGrid:
     """
 
     labels: UInt8[np.ndarray, "x y z"]
-    origin: Float[np.ndarray, "3"]
-    spacing: Float[np.ndarray, "3"]
+    origin: Vector
+    spacing: Vector
     names: tuple[str, ...]
 
     def __repr__(self) -> str:
@@ -59,7 +60,7 @@ class SegmentedCloud:
         names, colors: of the segments; ``names[k]`` has label k + 1.
     """
 
-    points: Float[np.ndarray, "n 3"]
+    points: Points
     labels: UInt8[np.ndarray, " n"]
     confidence: Float[np.ndarray, " n"]
     occupancy: Float[np.ndarray, " n"]

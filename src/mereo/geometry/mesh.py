@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from mereo.geometry.brief import counted, listed, sides
 from mereo.geometry.read_only import read_only_view
-from mereo.geometry.transforms import transform_points
+from mereo.geometry.transforms import Points, Transform, transform_points
 
 Color = tuple[int, int, int]
 """Red, green, blue in 0..255."""
@@ -165,7 +165,7 @@ class SegmentedMesh:
         moved = tuple(replace(s, vertices=v) for s, v in zip(self.segments, vertices, strict=True))
         return replace(self, segments=moved)
 
-    def transformed(self, transform: Float[np.ndarray, "4 4"]) -> "SegmentedMesh":
+    def transformed(self, transform: Transform) -> "SegmentedMesh":
         """Mesh with all vertices mapped by a homogeneous transform."""
         return self.with_vertices([transform_points(transform, segment.vertices) for segment in self.segments])
 
@@ -236,7 +236,7 @@ def connected(pairs: Int[np.ndarray, "p 2"], count: int) -> Int[np.ndarray, " n"
 
 def surface_points(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], count: int
-) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
+) -> tuple[Points, Int[np.ndarray, " n"]]:
     """Points evenly spread over a surface, the same in every call, and the face of each.
 
     Vertices are not: a CAD program's are where a surface is round, none where it is flat.
@@ -266,7 +266,7 @@ def oriented_points(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "
     return np.hstack([points, area_vectors(vertices, faces)[face]])
 
 
-def barycentric(triangles: Float[np.ndarray, "n 3 3"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def barycentric(triangles: Float[np.ndarray, "n 3 3"], points: Points) -> Points:
     """Barycentric coordinates of points in the planes of their triangles."""
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
     normal = np.cross(b - a, c - a)

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from mereo.geometry.brief import counted
 from mereo.geometry.mesh import Segment, SegmentedMesh, area_vectors, connected, edge_uses
 from mereo.geometry.solids import label_grid
+from mereo.geometry.transforms import Vector
 
 Vertices = Float[np.ndarray, "_ 3"]
 Faces = Int[np.ndarray, "_ 3"]
@@ -162,7 +163,7 @@ def _notes(vertices: Vertices, faces: Faces, surface: "_FrontWinding", unit: str
     return tuple(notes)
 
 
-def near(point: Float[np.ndarray, "3"], unit: str) -> str:
+def near(point: Vector, unit: str) -> str:
     """Phrase for a place, such as "near [1.5, 0, -2] mm"."""
     digits = 4 - int(np.floor(np.log10(max(float(np.abs(point).max()), 1e-300))))  # of the largest coordinate, for all
     return f"near [{', '.join(f'{round(float(value), digits) + 0.0:.4g}' for value in point)}]{unit and f' {unit}'}"

@@ -29,6 +29,7 @@ from mereo.geometry.mesh_check import (
     pieces,
     solid_of,
 )
+from mereo.geometry.transforms import Vector
 
 MERGED_WITHIN = (1e-6, 1e-4)
 """Vertices of open edges this near to each other, in diagonals of the box, count as one; the less, where it helps."""
@@ -305,7 +306,7 @@ def _even_surface(body: _Body) -> manifold3d.Manifold:
 
 def _with_thin_parts(
     body: _Body, solid: manifold3d.Manifold
-) -> tuple[manifold3d.Manifold, float, tuple[float, Float[np.ndarray, "3"]] | None]:
+) -> tuple[manifold3d.Manifold, float, tuple[float, Vector] | None]:
     """Solid with finer cells where the old surface is far from it; the least cell; the most still lost, and where.
 
     What is thin breaks into dashes before it vanishes. They are near it, so shells of few cells do not count.
@@ -423,7 +424,7 @@ def simplified(segment: Segment) -> tuple[Segment, float]:
 
 # --- what a repair moved ----------------------------------------------------------------------------------------------
 
-Reach = tuple[float, Float[np.ndarray, "3"]]
+Reach = tuple[float, Vector]
 """A distance, and the place where it is."""
 
 

@@ -26,6 +26,7 @@ from mereo.geometry.conventions import LARGEST
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh, edge_uses
 from mereo.geometry.mesh_repair import simplified
 from mereo.geometry.radii import Radii
+from mereo.geometry.transforms import Points
 from mereo.io.errors import check_count, check_size, check_suffix, readable
 from mereo.io.extras import library
 from mereo.io.progress import stage
@@ -459,7 +460,7 @@ def _values(tree: dict[str, Any], buffers: Buffers, accessor: dict[str, Any]) ->
     return np.maximum(values / np.iinfo(kind).max, -1.0) if accessor.get("normalized") else values
 
 
-def _stored(tree: dict[str, Any], buffers: Buffers, values: Float[np.ndarray, "n 3"]) -> dict[str, Any]:
+def _stored(tree: dict[str, Any], buffers: Buffers, values: Points) -> dict[str, Any]:
     """Accessor of values in a new buffer."""
     content = values.astype("<f4").tobytes()
     tree["bufferViews"].append({"buffer": len(buffers), "byteLength": len(content)})

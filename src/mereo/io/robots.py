@@ -14,22 +14,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from mereo.geometry.conventions import LARGEST
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.mesh_check import united
-from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
+from mereo.geometry.transforms import Transform, Vector, inverse_rigid, rigid, transform_points
 from mereo.io.errors import readable
 from mereo.io.extras import library
 from mereo.io.mesh_formats import ROBOT_SUFFIXES, read_object_mesh
 
 KINDS = ("revolute", "continuous", "prismatic", "fixed")
 """Kinds of joints that are known."""
-
-Matrix = Float[np.ndarray, "4 4"]
-Vector = Float[np.ndarray, "3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +143,7 @@ def _read_sdf(yourdfpy: Any, root: Any) -> Any:
     names = {"link": "", "joint": "child", "frame": "attached_to"}
     poses, pending = {"": np.eye(4), "__model__": np.eye(4)}, set[str]()
 
-    def pose_of(name: str) -> Matrix:
+    def pose_of(name: str) -> Transform:
         """Pose of a link, joint or frame in the model."""
         if name not in poses:
             if name in pending or name not in elements:
@@ -158,7 +154,7 @@ def _read_sdf(yourdfpy: Any, root: Any) -> Any:
             poses[name] = pose(element, (element.findtext(base) or element.get(base, "")) if base else "")
         return poses[name]
 
-    def pose(element: Any, base: str) -> Matrix:
+    def pose(element: Any, base: str) -> Transform:
         place = element.find("pose")
         if place is None:
             return pose_of(base.strip())
@@ -210,7 +206,7 @@ LIMITS = {"lower": "-inf", "upper": "inf"}
 """Limits of a joint of an SDF file that states none."""
 
 
-def _geometries(yourdfpy: Any, element: Any) -> Iterator[tuple[Matrix, Any]]:
+def _geometries(yourdfpy: Any, element: Any) -> Iterator[tuple[Transform, Any]]:
     """Shapes of a visual or collision element of an SDF file, and where they are in it."""
     shape = element.find("geometry/*")
     if shape is None:
@@ -265,7 +261,7 @@ class _Shape(NamedTuple):
     """Shape of a link: a solid, or a mesh's file with its scale."""
 
     link: str
-    T_link_shape: Matrix
+    T_link_shape: Transform
     content: trimesh.Trimesh | Path
     scale: Vector | None = None
 
@@ -335,7 +331,7 @@ def _check_numbers(path: Path, name: str, values: np.ndarray) -> None:
         )
 
 
-def _origin(element: Any) -> Matrix:
+def _origin(element: Any) -> Transform:
     return np.eye(4) if element.origin is None else np.asarray(element.origin)
 
 

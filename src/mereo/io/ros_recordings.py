@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Num, UInt8
+from jaxtyping import Num, UInt8
 
 from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.transforms import Points
 from mereo.io.errors import check_count, is_foreseen, limited_memory, reason
 from mereo.io.extras import library
 from mereo.io.intrinsics import camera_from_fields, warn_of_distortion
@@ -37,7 +38,7 @@ DEPTH_ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Numpy type of each datatype of sensor_msgs/PointField."""
 
-Content = DepthImage | Float[np.ndarray, "n 3"]
+Content = DepthImage | Points
 """Content of a message: depth in metres, or points in metres with NaN where nothing was measured."""
 
 
@@ -275,7 +276,7 @@ def _rows(message: Any, step: int, item: int) -> UInt8[np.ndarray, "h s"]:
     return data[: message.height * step].reshape(message.height, step)
 
 
-def cloud_points(message: Any) -> Float[np.ndarray, "n 3"]:
+def cloud_points(message: Any) -> Points:
     """Points of a PointCloud2 message of ROS 1 or 2, row by row, NaN where nothing was measured.
 
     Args:

@@ -13,6 +13,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
+from mereo.geometry.transforms import Points
 from mereo.io.errors import readable
 from mereo.io.readers import read_arrays
 from mereo.io.vtk_frames import (
@@ -51,7 +52,7 @@ class TetrahedralRecord:
         frames: their names, for messages.
     """
 
-    rest_nodes: Float[np.ndarray, "n 3"]
+    rest_nodes: Points
     tetrahedra: Int[np.ndarray, "m 4"]
     displacements: Float[np.ndarray, "f n 3"]
     frames: tuple[str, ...]
@@ -96,7 +97,7 @@ def read_states(path: Path, names: tuple[str, ...], mesh: Path | None = None) ->
     return _sequence(path, names, mesh)
 
 
-def read_tetrahedra(path: Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 4"], Int[np.ndarray, " n"]]:
+def read_tetrahedra(path: Path) -> tuple[Points, Int[np.ndarray, "m 4"], Int[np.ndarray, " n"]]:
     """Nodes, tetrahedra, four node indices each, and the nodes' numbers in a VTK, VTU, MSH or INP file, or an NPZ.
 
     An NPZ has them as `rest_nodes` and `tetrahedra`.
@@ -189,9 +190,7 @@ def _sequence(path: Path, names: tuple[str, ...], mesh: Path | None) -> Tetrahed
     )
 
 
-def _positions(
-    path: Path, frames: MeshFrames, rest: Float[np.ndarray, "n 3"] | None
-) -> tuple[Float[np.ndarray, "f n 3"], Float[np.ndarray, "n 3"] | None]:
+def _positions(path: Path, frames: MeshFrames, rest: Points | None) -> tuple[Float[np.ndarray, "f n 3"], Points | None]:
     """Positions in all frames, and those at rest where displacements say them.
 
     Points that stay are moved by their displacements. Of points that move, displacements tell the rest, if they agree.
@@ -290,7 +289,7 @@ def _tetrahedral(path: Path, arrays: dict[str, np.ndarray]) -> TetrahedralRecord
     return TetrahedralRecord(rest, elements, moved - rest if key == "nodes" else moved, frames)
 
 
-def _volume(path: Path, arrays: dict[str, np.ndarray]) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 4"]]:
+def _volume(path: Path, arrays: dict[str, np.ndarray]) -> tuple[Points, Int[np.ndarray, "m 4"]]:
     """Nodes and tetrahedra of an archive."""
     rest = _floats(path, "rest_nodes", arrays["rest_nodes"], 2).astype(np.float64)
     elements = arrays["tetrahedra"]

@@ -21,7 +21,7 @@ from skimage.measure import marching_cubes
 
 from mereo.geometry.brief import listed
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
-from mereo.geometry.transforms import transform_points
+from mereo.geometry.transforms import Points, Transform, Vector, transform_points
 from mereo.io.config import Space
 from mereo.io.errors import check_size, limited_memory, quiet, readable
 from mereo.io.extras import library
@@ -48,13 +48,13 @@ class Volume:
     """
 
     values: Shaped[np.ndarray, "..."]
-    T_world_index: Float[np.ndarray, "4 4"]
+    T_world_index: Transform
     slope: float = 1.0
     intercept: float = 0.0
     header: Any = field(default=None, repr=False)
 
     @property
-    def spacing(self) -> Float[np.ndarray, "3"]:
+    def spacing(self) -> Vector:
         """Distance between voxel centres along each axis."""
         return np.linalg.norm(self.T_world_index[:3, :3], axis=0)
 
@@ -65,15 +65,15 @@ class Volume:
         corners = transform_points(self.T_world_index, ends.reshape(-1, 3))
         return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
-    def index_of(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def index_of(self, points: Points) -> Points:
         """Voxel indices, with fractions, of positions."""
         return transform_points(np.linalg.inv(self.T_world_index), points)
 
-    def holds(self, index: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    def holds(self, index: Points) -> Bool[np.ndarray, " n"]:
         """Whether indices with fractions lie in a voxel."""
         return np.all((index >= -0.5) & (index <= np.array(self.values.shape) - 0.5), axis=1)
 
-    def tissue_share(self, points: Float[np.ndarray, "n 3"]) -> float:
+    def tissue_share(self, points: Points) -> float:
         """Share of points that lie in voxels above the mean: in tissue, and not in air or empty space."""
         index = np.rint(self.index_of(points)).astype(np.int64)
         held = np.all((index >= 0) & (index < self.values.shape), axis=1)
@@ -167,7 +167,7 @@ def file_space(path: Path) -> Space | None:
     return None if space is None else "LPS" if space[1] == "LPS" else "RAS"
 
 
-def _to_ras(space: str) -> Float[np.ndarray, "4 4"]:
+def _to_ras(space: str) -> Transform:
     """Transform to RAS from an anatomical frame, such as left-posterior-superior or LPS; others stay as they are."""
     axes = ANATOMICAL.fullmatch(space.lower())
     return np.diag([*(-1.0 if axis in "lpi" else 1.0 for axis in ("ras" if axes is None else axes.groups())), 1.0])
@@ -224,7 +224,7 @@ class LabelVolume:
     """
 
     labels: Integer[np.ndarray, "l x y z"]
-    T_world_index: Float[np.ndarray, "4 4"]
+    T_world_index: Transform
     names: Mapping[int, str]
     colors: Mapping[int, Color] = field(default_factory=dict)
 
@@ -502,13 +502,13 @@ class _Grid:
     first: Int[np.ndarray, "3"]
     counts: Int[np.ndarray, "3"]
     block: Int[np.ndarray, "3"]
-    T_world_index: Float[np.ndarray, "4 4"]
+    T_world_index: Transform
 
     @classmethod
     def around(
         cls,
         mask: Mask,
-        transform: Float[np.ndarray, "4 4"],
+        transform: Transform,
         cells: int,
     ) -> "_Grid":
         """Grid over all that is set, with about ``cells`` along the longest side; cells are whole numbers of voxels."""

@@ -16,6 +16,7 @@ from skimage.measure import marching_cubes
 
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import Color, Segment, SegmentedMesh
+from mereo.geometry.transforms import Points, Vector
 
 # --- coarse to fine ---------------------------------------------------------------------------------------------------
 
@@ -33,7 +34,7 @@ from mereo.geometry.mesh import Color, Segment, SegmentedMesh
 #
 # Notation: nodes are points of the grid, cells are the boxes between eight nodes; c classes; class 0 is empty space.
 
-Field = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n c"]]
+Field = Callable[[Points], Float[np.ndarray, "n c"]]
 """Function from points to their class logits."""
 
 COARSE = 4
@@ -61,7 +62,7 @@ class Sampled:
 class _Evaluator:
     """Field at nodes of the finest grid; keeps every answer."""
 
-    def __init__(self, field: Field, origin: Float[np.ndarray, "3"], spacing: Float[np.ndarray, "3"]) -> None:
+    def __init__(self, field: Field, origin: Vector, spacing: Vector) -> None:
         self.field, self.origin, self.spacing = field, origin, spacing
         self.chunks: list[Float[np.ndarray, "m c"]] = []
         self.count = 0
@@ -79,18 +80,14 @@ class _Evaluator:
         return np.concatenate(self.chunks)
 
 
-def sample_dense(
-    field: Field, origin: Float[np.ndarray, "3"], spacing: Float[np.ndarray, "3"], shape: tuple[int, int, int]
-) -> Sampled:
+def sample_dense(field: Field, origin: Vector, spacing: Vector, shape: tuple[int, int, int]) -> Sampled:
     """Field evaluated at every node ``origin + [i, j, k] * spacing``."""
     evaluate = _Evaluator(field, origin, spacing)
     labels, rows = evaluate(_all_nodes(shape))
     return Sampled(labels.reshape(shape), rows.reshape(shape), evaluate.logits())
 
 
-def sample_coarse_to_fine(
-    field: Field, origin: Float[np.ndarray, "3"], spacing: Float[np.ndarray, "3"], shape: tuple[int, int, int]
-) -> Sampled:
+def sample_coarse_to_fine(field: Field, origin: Vector, spacing: Vector, shape: tuple[int, int, int]) -> Sampled:
     """Labels of ``sample_dense`` from few evaluations; every cell with a change of label is known exactly."""
     evaluate = _Evaluator(field, origin, spacing)
     # whole coarse cells: up to three nodes beyond the grid are evaluated too and cut off at the end
@@ -280,9 +277,7 @@ def extract(
     return Extraction(replace(empty, segments=tuple(segments)), grid, len(sampled.logits))
 
 
-def _grid(
-    box: Float[np.ndarray, "2 3"], resolution: int
-) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], tuple[int, int, int]]:
+def _grid(box: Float[np.ndarray, "2 3"], resolution: int) -> tuple[Vector, Vector, tuple[int, int, int]]:
     """Origin, spacing and number of nodes of a grid, which may end up to one cell behind the box."""
     size = box[1] - box[0]
     if resolution < 4:

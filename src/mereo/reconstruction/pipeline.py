@@ -25,7 +25,7 @@ from mereo.geometry.downsampling import random_subset
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import PALETTE, Color, SegmentedMesh
 from mereo.geometry.solids import label_grid
-from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.geometry.transforms import Points, Transform, Vector, inverse_rigid, transform_points
 from mereo.models.calibration import Calibration
 from mereo.models.trained import EncodedCloud, Trained, checked_points
 from mereo.reconstruction.isolation import Reading
@@ -56,7 +56,7 @@ class SegmentFacts:
     name: str
     label: int
     volume: float
-    centroid: Float[np.ndarray, "3"]
+    centroid: Vector
     box: Float[np.ndarray, "2 3"]
     confidence: float
     voxels: int
@@ -95,12 +95,12 @@ class Reconstruction:
     evaluated: int
     clipped: bool
     code: EncodedCloud | None
-    T_camera_input: Float[np.ndarray, "4 4"]
+    T_camera_input: Transform
     reading: Reading
     observed: SegmentedCloud | None = None
     calibrated: bool = False
 
-    def transformed(self, T_new_input: Float[np.ndarray, "4 4"]) -> "Reconstruction":
+    def transformed(self, T_new_input: Transform) -> "Reconstruction":
         """The same in another frame, by a rigid transform; its label grid lies along the new axes."""
         surfaces, spacing = self.surfaces.transformed(T_new_input), self.labels.spacing
         low, high = surfaces.bounds
@@ -154,12 +154,12 @@ class EncodedFrame:
 
     reading: Reading
     axes: CloudAxes
-    T_camera_input: Float[np.ndarray, "4 4"]
+    T_camera_input: Transform
     code: EncodedCloud | None
     timings_s: dict[str, float]
 
     @property
-    def points(self) -> Float[np.ndarray, "n 3"]:
+    def points(self) -> Points:
         """The object's points, in the input's frame and unit."""
         return self.reading.cloud.points
 
@@ -267,7 +267,7 @@ def turned_back(result: Reconstruction) -> Reconstruction:
 
 def segment_points(
     logits: Float[np.ndarray, "n c"],
-    points: Float[np.ndarray, "n 3"],
+    points: Points,
     names: tuple[str, ...],
     colors: tuple[Color, ...],
     calibration: Calibration | None = None,

@@ -15,6 +15,7 @@ from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Deformation
 from mereo.deformation.tetrahedral import Surface, SurfaceMap, Tetrahedra, TetrahedralMap
 from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.transforms import Points, Vector
 from mereo.io.simulation_states import SurfaceRecord, TetrahedralRecord, read_states
 from mereo.scenes.scene import Scene, Workspace
 
@@ -122,7 +123,7 @@ class TetrahedralFrames:
         """Number of frames."""
         return len(self.displacements)
 
-    def nodes(self, frame: int) -> Float[np.ndarray, "n 3"]:
+    def nodes(self, frame: int) -> Points:
         """Node positions in scene units."""
         return self.mesh.nodes + self.scale * self.displacements[frame].astype(np.float64)
 
@@ -135,9 +136,7 @@ FAR = 0.1
 """A surface that lies mostly farther from the tetrahedra than this, of their longest side, is not theirs."""
 
 
-def tetrahedra_around(
-    path: Path, nodes: Float[np.ndarray, "n 3"], elements: Int[np.ndarray, "m 4"], rest: SegmentedMesh
-) -> Tetrahedra:
+def tetrahedra_around(path: Path, nodes: Points, elements: Int[np.ndarray, "m 4"], rest: SegmentedMesh) -> Tetrahedra:
     """Tetrahedra of a file around an object, both in scene units.
 
     Raises ``ValueError`` naming the file for tetrahedra that are none, and for a mesh far from ``rest``.
@@ -159,7 +158,7 @@ def tetrahedra_around(
 
 
 def _tetrahedral_frames(
-    path: Path, record: TetrahedralRecord, rest: SegmentedMesh, scale: float, shift: Float[np.ndarray, "3"]
+    path: Path, record: TetrahedralRecord, rest: SegmentedMesh, scale: float, shift: Vector
 ) -> TetrahedralFrames:
     """Frames; ``ValueError`` for a mesh far from ``rest`` and for the first frame that inverts a tetrahedron."""
     mesh = tetrahedra_around(path, record.rest_nodes * scale + shift, record.tetrahedra, rest)
@@ -185,7 +184,7 @@ class SurfaceFrames:
     surfaces: tuple[Surface, ...]
     vertices: tuple[Float[np.ndarray, "f _ 3"], ...]
     scale: float
-    shift: Float[np.ndarray, "3"]
+    shift: Vector
 
     @property
     def count(self) -> int:
@@ -202,7 +201,7 @@ class SurfaceFrames:
 
 
 def _surface_frames(
-    path: Path, record: SurfaceRecord, rest: SegmentedMesh, scale: float, shift: Float[np.ndarray, "3"]
+    path: Path, record: SurfaceRecord, rest: SegmentedMesh, scale: float, shift: Vector
 ) -> SurfaceFrames:
     """Frames; ``ValueError`` for vertices that do not match ``rest`` and for the first frame that is inside out."""
     ordered = []

@@ -13,13 +13,14 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Int, UInt8
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from mereo.geometry.labels import SegmentedCloud
 from mereo.geometry.mesh import Color, Segment, SegmentedMesh
 from mereo.geometry.radii import Radii
+from mereo.geometry.transforms import Points
 from mereo.io.atomic_files import atomic_file, new_directory
 from mereo.io.mesh_formats import STL_NAME
 
@@ -116,7 +117,7 @@ def write_points_ply(path: str | Path, cloud: SegmentedCloud) -> None:
     _write(path, _comments(cloud.names, cloud.colors), {"vertex": vertices})
 
 
-def write_positions_ply(path: str | Path, points: Float[np.ndarray, "n 3"], comment: str = "") -> None:
+def write_positions_ply(path: str | Path, points: Points, comment: str = "") -> None:
     """Write a cloud's positions alone, as float32; ``comment`` is for people who open the file."""
     _write(path, [comment] if comment else [], {"vertex": _records(_positions(points))})
 
@@ -125,7 +126,7 @@ Columns = dict[str, tuple[str, np.ndarray]]
 """Type and values of each property, in the order of the file."""
 
 
-def _positions(points: Float[np.ndarray, "n 3"]) -> Columns:
+def _positions(points: Points) -> Columns:
     return {axis: ("f4", points[:, k]) for k, axis in enumerate("xyz")}
 
 

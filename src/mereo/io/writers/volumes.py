@@ -19,10 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float32
 
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import Color
+from mereo.geometry.transforms import Transform, Vector
 from mereo.io.atomic_files import atomic_file
 from mereo.io.extras import library
 from mereo.io.volume_files import Volume, segment_fields
@@ -175,7 +176,7 @@ def nibabel() -> Any:
     return library("nibabel", "medical", "NIfTI")
 
 
-def _T_lps_index(grid: LabelGrid, unit_m: float) -> Float[np.ndarray, "4 4"]:
+def _T_lps_index(grid: LabelGrid, unit_m: float) -> Transform:
     """Transform from voxel indices to LPS coordinates in millimetres; ``unit_m`` is metres per unit of the grid."""
     transform = np.eye(4)
     transform[:3, :3] = np.diag(grid.spacing)
@@ -203,9 +204,7 @@ def write_labels_seg_nrrd(path: str | Path, grid: LabelGrid, colors: Sequence[Co
         partial.write_bytes(content)
 
 
-def _nrrd(
-    magic: str, values: np.ndarray, T_lps_index: Float[np.ndarray, "4 4"], fields: dict[str, str], level: int
-) -> bytes:
+def _nrrd(magic: str, values: np.ndarray, T_lps_index: Transform, fields: dict[str, str], level: int) -> bytes:
     header = NRRD_HEADER.format(
         magic=magic,
         type={"float32": "float", "float64": "double"}.get(values.dtype.name, values.dtype.name),
@@ -234,7 +233,7 @@ def _segment_fields(grid: LabelGrid, index: int, color: Color) -> dict[str, str]
     return {f"Segment{index}_{key}": value for key, value in values.items()}
 
 
-def _vector(values: Float[np.ndarray, "3"]) -> str:
+def _vector(values: Vector) -> str:
     return f"({','.join(map(repr, values.tolist()))})"
 
 
@@ -264,7 +263,7 @@ def write_volume(path: Path, volume: Volume, unit_m: float = 1.0) -> None:
         partial.write_bytes(_nrrd("NRRD0005", volume.values, T_lps_index, fields, LEVEL))
 
 
-def _write_volume_nifti(path: Path, volume: Volume, T_ras_index: Float[np.ndarray, "4 4"]) -> None:
+def _write_volume_nifti(path: Path, volume: Volume, T_ras_index: Transform) -> None:
     nifti: Any = nibabel()
     header = volume.header if isinstance(volume.header, nifti.Nifti1Header) else None
     image = nifti.Nifti1Image(volume.values, T_ras_index, header, dtype=volume.values.dtype)

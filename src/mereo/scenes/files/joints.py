@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from mereo.deformation.maps import Compose, Rigid
 from mereo.geometry.mesh import Segment, SegmentedMesh, area_vectors, connected, surface_points
 from mereo.geometry.mesh_check import overlaps
+from mereo.geometry.transforms import Points, Vector
 
 # --- contacts ---------------------------------------------------------------------------------------------------------
 
@@ -36,9 +37,6 @@ SAME_NORMAL = float(np.cos(np.deg2rad(3.0)))
 FLATTEST, LEAST_ARC, MISFIT = 0.02, 0.1, 0.05
 """Mean square cosine of a cylinder's normals with its axis at most, and of them across their main direction at least
 (an arc of 80 degrees or so); root mean square distance of the points from the cylinder at most, in radii."""
-
-Points = Float[np.ndarray, "n 3"]
-Vector = Float[np.ndarray, "3"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,7 @@ from mereo.geometry.brief import counted, listed
 from mereo.geometry.conventions import UNITS_M, Way
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, surface_points
 from mereo.geometry.mesh_check import examine, likely_unit, overlaps
-from mereo.geometry.transforms import Normalizer, fit_rigid, inverse_rigid, transform_points
+from mereo.geometry.transforms import Normalizer, Points, Vector, fit_rigid, inverse_rigid, transform_points
 from mereo.io.atomic_files import atomic_file, check_file_place
 from mereo.io.mesh_formats import ROBOT_SUFFIXES, read_object_mesh
 from mereo.io.robots import RobotJoint, is_robot, read_robot
@@ -77,9 +77,7 @@ def measure_motion(rest: SegmentedMesh, draw: Draw) -> Motion:
     return Motion(float(np.median(np.sqrt(np.mean(shares**2, axis=1)))), float(np.median(shares.max(axis=1))))
 
 
-def _moved(
-    points: Float[np.ndarray, "n 3"], owner: Int[np.ndarray, " n"], deformations: tuple[Deformation, ...]
-) -> Float[np.ndarray, "n 3"]:
+def _moved(points: Points, owner: Int[np.ndarray, " n"], deformations: tuple[Deformation, ...]) -> Points:
     result = np.empty_like(points)
     for index in np.unique(owner):
         rows = owner == index
@@ -87,7 +85,7 @@ def _moved(
     return result
 
 
-def material_points(mesh: SegmentedMesh, count: int) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
+def material_points(mesh: SegmentedMesh, count: int) -> tuple[Points, Int[np.ndarray, " n"]]:
     """Points evenly spread over the surface of all segments, and the index of the segment of each."""
     vertices, faces, owner = mesh.merged()
     points, face = surface_points(vertices, faces, count)
@@ -187,7 +185,7 @@ class FlatBase:
         share: of the area of the object's convex hull that lies within the outline of the face, from 0 to 1.
     """
 
-    normal: Float[np.ndarray, "3"]
+    normal: Vector
     share: float
 
     def describe(self, workspace: Workspace) -> str:
@@ -225,7 +223,7 @@ def flat_base(mesh: SegmentedMesh, up: Sequence[float]) -> FlatBase | None:
     return max(lowest or bases, key=lambda base: base.share, default=None)
 
 
-def _base(solid: trimesh.Trimesh, hull: trimesh.Trimesh, normal: Float[np.ndarray, "3"]) -> FlatBase | None:
+def _base(solid: trimesh.Trimesh, hull: trimesh.Trimesh, normal: Vector) -> FlatBase | None:
     heights = solid.vertices @ normal
     top = heights.max() - THICKNESS_SHARE * hull.volume / hull.area
     crossed = solid.triangles_cross * np.sign(solid.triangles_cross @ normal)[:, None]
@@ -695,7 +693,7 @@ def quoted(text: str) -> str:
     return listed.strip()[1:-1]
 
 
-def _numbers(values: Float[np.ndarray, "3"]) -> str:
+def _numbers(values: Vector) -> str:
     largest = max(float(np.abs(values).max()), 1e-12)  # what is nothing compared with it is rounding
     return "[" + ", ".join(f"{value if abs(value) > 1e-4 * largest else 0.0:.4g}" for value in values) + "]"
 
