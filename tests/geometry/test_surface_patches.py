@@ -8,7 +8,8 @@ from two_balls import front
 
 from mereo.geometry.camera import Camera
 from mereo.geometry.downsampling import MAX_POINTS, farthest_point_order, means_along_sight, random_subset
-from mereo.geometry.surface_patches import longest_side, roughness, smoothed, surface_points
+from mereo.geometry.surface_patches import roughness, smoothed, surface_points
+from mereo.geometry.transforms import longest_side
 
 
 def rays(size: int = 96) -> np.ndarray:

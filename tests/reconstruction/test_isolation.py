@@ -10,7 +10,7 @@ from two_balls import front
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.downsampling import random_subset, thin_to_grid
 from mereo.geometry.solids import Solids
-from mereo.geometry.surface_patches import longest_side
+from mereo.geometry.transforms import longest_side
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.isolation import IsolationStep, Reading, clusters, largest_plane, readings
 from mereo.reconstruction.observation import find_object, observe

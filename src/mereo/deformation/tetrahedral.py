@@ -22,7 +22,8 @@ from mereo.deformation.maps import newton, smooth_step
 from mereo.geometry.downsampling import farthest_point_order
 from mereo.geometry.mesh import barycentric
 from mereo.geometry.read_only import read_only, read_only_view
-from mereo.geometry.transforms import Points
+from mereo.geometry.solids import search_tree
+from mereo.geometry.transforms import Points, longest_side
 
 
 class Tetrahedra:
@@ -46,7 +47,7 @@ class Tetrahedra:
         self.elements = read_only_view(np.ascontiguousarray(elements, dtype=np.int64))
         edges = _edges(self.nodes, self.elements)
         self.volumes = np.linalg.det(edges) / 6
-        size = float(np.ptp(self.nodes, axis=0).max())
+        size = longest_side(self.nodes)
         if (flat := np.abs(self.volumes) <= 1e-12 * size**3).any():
             raise ValueError(
                 f"tetrahedron {np.argmax(flat)} has no volume at rest; it must have some: remove it from the mesh"
@@ -59,7 +60,7 @@ class Tetrahedra:
 
     @cached_property
     def _tree(self) -> igl.AABB:
-        return _tree(self.nodes, self.elements)
+        return search_tree(self.nodes, self.elements)
 
     @cached_property
     def surface(self) -> Int[np.ndarray, "f 3"]:
@@ -69,7 +70,7 @@ class Tetrahedra:
 
     @cached_property
     def _surface_tree(self) -> igl.AABB:
-        return _tree(self.nodes, self.surface)
+        return search_tree(self.nodes, self.surface)
 
     @cached_property
     def _node_mean(self) -> csr_array:
@@ -169,7 +170,7 @@ class TetrahedralMap:
         Where the deformed mesh overlaps itself one of the answers is given.
         """
         elements = self.rest.elements
-        element = _locate(_tree(self.nodes, elements), self.nodes, elements, points)
+        element = _locate(search_tree(self.nodes, elements), self.nodes, elements, points)
         inside = element >= 0
         rest, converged = np.empty_like(points, dtype=np.float64), inside.copy()
         first = elements[element[inside], 0]
@@ -184,12 +185,6 @@ def _edges(nodes: Points, elements: Int[np.ndarray, "m 4"]) -> Float[np.ndarray,
     """Edges from the first node as columns."""
     corners = nodes[elements]
     return np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
-
-
-def _tree(vertices: Points, elements: Int[np.ndarray, "m k"]) -> igl.AABB:
-    tree = igl.AABB()
-    tree.init(vertices, elements)
-    return tree
 
 
 def _locate(
@@ -242,7 +237,7 @@ class Surface:
 
     @cached_property
     def _tree(self) -> igl.AABB:
-        return _tree(self.vertices, self.faces)
+        return search_tree(self.vertices, self.faces)
 
     @cached_property
     def solver(self) -> Float[np.ndarray, "k c"]:

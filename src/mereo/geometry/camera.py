@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from mereo.geometry.brief import counted, sides
 from mereo.geometry.conventions import CloudAxes, check_real
 from mereo.geometry.read_only import read_only
-from mereo.geometry.transforms import Normalizer, Points, Transform, rigid, transform_points
+from mereo.geometry.transforms import Normalizer, Points, Transform, rigid, transform_points, unit_rows
 
 
 @dataclass(frozen=True)
@@ -112,8 +112,7 @@ class PointCloud:
         """Cloud of rows with three numbers, or with six where a normal of any length follows each position."""
         if rows.shape[1] == 3:
             return cls(rows)
-        normals = rows[:, 3:]
-        return cls(rows[:, :3].copy(), normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30))
+        return cls(rows[:, :3].copy(), unit_rows(rows[:, 3:]))
 
     def __post_init__(self) -> None:
         if self.normals is not None and np.shape(self.normals) != np.shape(self.points):

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float, Int, Real, Shaped
 from scipy.spatial import cKDTree
 
-from mereo.geometry.transforms import Points
+from mereo.geometry.transforms import Points, longest_side
 
 MAX_POINTS = 50_000
 """Many times what any network is trained on; comparing neighbours takes a fraction of a second."""
@@ -29,7 +29,7 @@ def thin_to_grid(points: Points, limit: int) -> Int[np.ndarray, " m"]:
     """
     if len(points) <= limit:
         return np.arange(len(points))
-    low, side = points.min(axis=0), float(np.ptp(points, axis=0).max())
+    low, side = points.min(axis=0), longest_side(points)
     if side == 0:
         return np.arange(limit)
     # a surface through a cube of c^3 cells occupies about c^2 of them

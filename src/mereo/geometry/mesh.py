@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from mereo.geometry.brief import counted, listed, sides
 from mereo.geometry.read_only import read_only_view
-from mereo.geometry.transforms import Points, Transform, transform_points
+from mereo.geometry.transforms import Points, Transform, transform_points, unit_rows
 
 Color = tuple[int, int, int]
 """Red, green, blue in 0..255."""
@@ -77,8 +77,7 @@ class Segment:
 
     def edge_imbalance(self) -> tuple[int, int]:
         """Numbers of open and of misoriented edges: both zero exactly when the mesh is closed and oriented alike."""
-        _, uses, unbalanced = edge_uses(self.faces)
-        return int((uses % 2 == 1).sum()), int((unbalanced & (uses % 2 == 0)).sum())
+        return edge_imbalance(self.faces)
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,6 +221,30 @@ def edge_uses(
     return np.stack(np.divmod(keys, size), axis=1), uses, unbalanced
 
 
+def edge_imbalance(faces: Int[np.ndarray, "f 3"]) -> tuple[int, int]:
+    """Numbers of open and of misoriented edges: both zero exactly when a mesh is closed and oriented alike."""
+    _, uses, unbalanced = edge_uses(faces)
+    return int((uses % 2 == 1).sum()), int((unbalanced & (uses % 2 == 0)).sum())
+
+
+def three_cornered(faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
+    """Which faces have three different vertices."""
+    return np.asarray((faces != np.roll(faces, 1, axis=1)).all(axis=1))
+
+
+def with_used_vertices(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f k"]
+) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "f k"]]:
+    """Mesh without the vertices that no face has; the others stay in their order."""
+    used, kept = np.unique(faces, return_inverse=True)  # flat before numpy 2
+    return vertices[used], kept.reshape(faces.shape)
+
+
+def palette_color(index: int) -> Color:
+    """Colour of the palette, which starts again after its last."""
+    return PALETTE[index % len(PALETTE)]
+
+
 def area_vectors(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
     """Normals of faces, each as long as twice the face's area."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
@@ -281,4 +304,4 @@ def vertex_normals(segment: Segment) -> Float[np.ndarray, "v 3"]:
     normals = np.zeros_like(segment.vertices)
     for k in range(3):
         np.add.at(normals, segment.faces[:, k], area_vectors(segment.vertices, segment.faces))
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    return unit_rows(normals)

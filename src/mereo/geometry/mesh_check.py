@@ -11,9 +11,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mereo.geometry.brief import counted
-from mereo.geometry.mesh import Segment, SegmentedMesh, area_vectors, connected, edge_uses
+from mereo.geometry.mesh import (
+    Segment,
+    SegmentedMesh,
+    area_vectors,
+    connected,
+    edge_imbalance,
+    edge_uses,
+    three_cornered,
+)
 from mereo.geometry.solids import label_grid
-from mereo.geometry.transforms import Vector
+from mereo.geometry.transforms import Vector, longest_side
 
 Vertices = Float[np.ndarray, "_ 3"]
 Faces = Int[np.ndarray, "_ 3"]
@@ -74,7 +82,7 @@ def examine(segment: Segment, unit: str = "") -> Health:
     extent = np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)
     if len(corners) < 4 or not extent[2] > FLAT * extent[0]:  # in any direction: of float32, a plane is this rough
         return Health(hopeless=(*hopeless, "is flat, without any volume"), mendable=False)
-    collapsed = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    collapsed = ~three_cornered(faces)
     dirty = []
     if collapsed.any():
         where = near(vertices[faces[collapsed][0]].mean(axis=0), unit)
@@ -172,7 +180,7 @@ def near(point: Vector, unit: str) -> str:
 def faces_astray(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> bool:
     """Whether neighbouring faces disagree in orientation, or some face inwards."""
     surface = _front_winding(vertices, faces)
-    disagree = Segment("", (0, 0, 0), vertices, faces).edge_imbalance()[1] > 0
+    disagree = edge_imbalance(faces)[1] > 0
     return disagree or surface.share_where(surface.winding < -0.5) > 1e-3
 
 
@@ -244,7 +252,7 @@ def fragments(vertices: Vertices, faces: Faces, unit: str = "") -> tuple[Bool[np
 
 def likely_unit(bounds: Float[np.ndarray, "2 3"]) -> str:
     """Guess of a mesh's unit from its longest side: CAD and scanners write millimetres, robots and glTF metres."""
-    longest = float((bounds[1] - bounds[0]).max())
+    longest = longest_side(bounds)
     return "m" if longest < 3 else "mm"
 
 

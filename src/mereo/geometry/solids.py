@@ -22,7 +22,7 @@ from scipy.sparse import csr_array
 
 from mereo.geometry.mesh import Segment, SegmentedMesh, area_vectors
 from mereo.geometry.read_only import read_only
-from mereo.geometry.transforms import Points, Vector
+from mereo.geometry.transforms import Points, Vector, unit_rows
 
 _DIRECTIONS = read_only(np.array([[0.4637, 0.5718, 0.6767], [-0.7301, 0.3469, -0.5887]], dtype=np.float32))
 """Two generic directions: not along any axis, face diagonal or each other."""
@@ -89,6 +89,13 @@ def toward(directions: Points, low: Vector, high: Vector) -> Int[np.ndarray, " m
     return np.flatnonzero((x >= x0) & (x <= x1) & (y >= y0) & (y <= y1))
 
 
+def search_tree(vertices: Float[np.ndarray, "v 3"], elements: Int[np.ndarray, "m k"]) -> igl.AABB:
+    """Tree in which libigl finds the nearest of triangles, or the tetrahedron around a point."""
+    tree = igl.AABB()
+    tree.init(vertices, elements)
+    return tree
+
+
 # --- segments and objects ---------------------------------------------------------------------------------------------
 
 
@@ -109,9 +116,7 @@ class _Solid:
 
     @cached_property
     def tree(self) -> igl.AABB:
-        tree = igl.AABB()
-        tree.init(self.vertices, self.faces)
-        return tree
+        return search_tree(self.vertices, self.faces)
 
     def in_box(self, points: Points) -> Bool[np.ndarray, " n"]:
         """Whether points lie strictly in the segment's box, outside of which nothing is inside."""
@@ -249,8 +254,7 @@ class Solids:
     def face_normals(self, face: Int[np.ndarray, " n"]) -> Points:
         """Unit normals of faces of ``mesh.merged()``."""
         vertices, faces, _ = self._merged
-        normal = area_vectors(vertices, faces[face])
-        return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+        return unit_rows(area_vectors(vertices, faces[face]))
 
 
 def signed_distance_and_direction(

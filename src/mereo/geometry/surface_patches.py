@@ -14,7 +14,7 @@ from scipy.stats import median_abs_deviation
 
 from mereo.geometry.downsampling import MAX_POINTS, thin_to_grid
 from mereo.geometry.mesh import connected
-from mereo.geometry.transforms import Points
+from mereo.geometry.transforms import Points, longest_side
 
 NEIGHBORS = 24
 """Neighbours that are looked at: in an image, the 5 x 5 pixels around one."""
@@ -84,11 +84,6 @@ def _patches(
     patch = connected(np.stack([row, neighbor[row, column]], axis=1), len(points))
     same = (angle <= AROUND * around[:, None]) & (patch[neighbor] == patch[:, None])
     return patch, same.sum(axis=1) >= INNER, tall
-
-
-def longest_side(points: Points) -> float:
-    """Longest side of the points' box, parallel to the axes."""
-    return float(np.ptp(points, axis=0).max())
 
 
 def stretch(points: Points, keep: Bool[np.ndarray, " n"]) -> float:

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import Points, Transform, Vector, transform_points
+from mereo.geometry.mesh import SegmentedMesh, area_vectors
+from mereo.geometry.solids import Solids, search_tree
+from mereo.geometry.transforms import Points, Transform, Vector, longest_side, transform_points
 
 TOLERANCE = 0.45
 """Scene units up to which a turned surface looks the same: a fit explains a point by a surface up to there."""
@@ -146,25 +146,22 @@ class _Surface:
     @classmethod
     def of(cls, mesh: SegmentedMesh, tolerance: float) -> "_Surface":
         vertices, faces, _ = mesh.merged()
-        corners = vertices[faces]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals = area_vectors(vertices, faces)
         area = np.linalg.norm(normals, axis=1)
         rng, total = np.random.default_rng(0), np.cumsum(area)
         face = np.searchsorted(total, (np.arange(SAMPLES) + rng.random(SAMPLES)) * total[-1] / SAMPLES)
         face = np.minimum(face, len(faces) - 1)
         share = rng.dirichlet((1.0, 1.0, 1.0), SAMPLES)
-        points = np.einsum("nk,nki->ni", share, corners[face])
+        points = np.einsum("nk,nki->ni", share, vertices[faces[face]])
         normals = normals[face] / area[face, None]
-        size = float(np.ptp(vertices, axis=0).max())
+        size = longest_side(vertices)
         outside = Solids(mesh).label(points + 1e-3 * size * normals) == 0
         return cls(mesh, tolerance, points, normals, np.flatnonzero(outside))
 
     @cached_property
     def _tree(self) -> tuple[igl.AABB, np.ndarray, np.ndarray]:
         vertices, faces, _ = self.mesh.merged()
-        tree = igl.AABB()
-        tree.init(vertices, faces)
-        return tree, vertices, faces
+        return search_tree(vertices, faces), vertices, faces
 
     def nearest(self, points: Float[np.ndarray, "p 3"]) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
         """Distance and place of the nearest point of all surfaces."""

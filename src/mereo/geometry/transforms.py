@@ -84,6 +84,16 @@ def look_at(eye: Vector, target: Vector, up: Vector, roll_rad: float = 0.0) -> T
     return rigid(np.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=1), eye)
 
 
+def longest_side(points: Float[np.ndarray, "_ 3"]) -> float:
+    """Longest side of the points' box, parallel to the axes."""
+    return float(np.ptp(points, axis=0).max())
+
+
+def unit_rows(vectors: Points) -> Points:
+    """Vectors of length 1 along each row; rows of zeros stay so."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)
+
+
 def finite_svd(
     matrix: Float[np.ndarray, "*b m n"],
 ) -> tuple[Float[np.ndarray, "*b m m"], Float[np.ndarray, "*b k"], Float[np.ndarray, "*b n n"]]:

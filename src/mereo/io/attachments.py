@@ -17,8 +17,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.transforms import Points
-from mereo.io.atomic_files import atomic_file
+from mereo.geometry.transforms import Points, longest_side
+from mereo.io.atomic_files import atomic_file, write_file
 from mereo.io.config import CarryFrame, Space
 from mereo.io.errors import check_suffix, readable
 from mereo.io.mesh_formats import read_segmented_mesh
@@ -184,7 +184,7 @@ def _fits_better(turned: Content, content: Content, inside: Points) -> bool:
         share = content.tissue_share(inside)
         return share < SHARE and turned.tissue_share(inside) > share + MORE
     assert not isinstance(turned, Volume) and not isinstance(content, Volume)
-    tree, size = cKDTree(inside), float(np.ptp(inside, axis=0).max())
+    tree, size = cKDTree(inside), longest_side(inside)
     away, other = (float(np.median(tree.query(each.points)[0])) for each in (content, turned))
     return away > NEAR * size and away > FARTHER * other
 
@@ -233,8 +233,7 @@ def write_attachment(
     if isinstance(content, Volume):
         write_volume(path, content, unit_m)
     elif isinstance(content, PoseTable):
-        with atomic_file(path) as partial:
-            partial.write_text(content.text(factor), encoding="utf-8")
+        write_file(path, content.text(factor))
     elif isinstance(content, Positions) and suffix == ".ply":
         write_positions_ply(path, factor * content.points)
     elif isinstance(content, Positions):

@@ -21,7 +21,7 @@ from PIL import Image
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import DepthImage, PointCloud
 from mereo.geometry.conventions import LARGEST, check_real
-from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.mesh import Segment, SegmentedMesh, palette_color
 from mereo.geometry.transforms import Points
 from mereo.io.errors import reason
 from mereo.io.readers import InputWarning, valid_points
@@ -283,7 +283,7 @@ def mesh_of(source: Any) -> SegmentedMesh | None:
         known = getattr(part, "metadata", None) or {}
         file = known.get("file_name") or f"part{index + 1}"
         name = key if isinstance(key, str) else getattr(part, "name", None) or known.get("name") or Path(file).stem
-        color = getattr(part, "color", PALETTE[index % len(PALETTE)])
+        color = getattr(part, "color", palette_color(index))
         segments.append(Segment(name, color, *mesh, solid=getattr(part, "solid", False)))
     return SegmentedMesh(tuple(segments)) if segments else None
 

@@ -17,7 +17,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from mereo.geometry.conventions import LARGEST
-from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, palette_color
 from mereo.geometry.mesh_check import united
 from mereo.geometry.transforms import Transform, Vector, inverse_rigid, rigid, transform_points
 from mereo.io.errors import readable
@@ -305,7 +305,7 @@ def _assembled(content: _Described) -> Robot:
             pieces.append(Segment(str(len(pieces)), PALETTE[0], vertices, faces))
     if not parts:
         raise ValueError(f"{path} has no link with a shape, of which a camera could see something: add meshes")
-    colors = (PALETTE[index % len(PALETTE)] for index in range(len(parts)))
+    colors = (palette_color(index) for index in range(len(parts)))
     segments = (Segment(name, color, *united(each)) for (name, each), color in zip(parts.items(), colors, strict=True))
     moved = {joint: tuple(name for chain, name in names.items() if joint in chain) for joint in limits}
     kept = {joint: each for joint, each in moved.items() if 0 < len(each) < len(names)}

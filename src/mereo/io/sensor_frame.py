@@ -16,7 +16,7 @@ from mereo.geometry.brief import counted
 from mereo.geometry.camera import Camera, DepthImage, PointCloud, camera_axes
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import FEW_VERTICES, oriented_points
-from mereo.geometry.transforms import Points, Transform, inverse_rigid, rigid, transform_points
+from mereo.geometry.transforms import Points, Transform, inverse_rigid, longest_side, rigid, transform_points
 from mereo.io.bounds import PositiveOrUnknown, check_bounds
 from mereo.io.config import InputConfig
 from mereo.io.intrinsics import intrinsics_of, read_intrinsics
@@ -189,7 +189,7 @@ def _near_origin(frame: SensorFrame) -> SensorFrame:
 
     A scan is moved by whole units, where the origin means nothing. Raises ``ValueError`` where it is to be the camera.
     """
-    points, size = frame.cloud.points, float(np.ptp(frame.cloud.points, axis=0).max())
+    points, size = frame.cloud.points, longest_side(frame.cloud.points)
     middle = np.median(points, axis=0)
     times = float(np.linalg.norm(middle)) / size if size > 0 else 0.0
     if frame.depth is not None or times <= FAR:

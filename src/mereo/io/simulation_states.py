@@ -13,7 +13,8 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
-from mereo.geometry.transforms import Points
+from mereo.geometry.mesh import with_used_vertices
+from mereo.geometry.transforms import Points, longest_side
 from mereo.io.errors import readable
 from mereo.io.readers import read_arrays
 from mereo.io.vtk_frames import (
@@ -127,8 +128,7 @@ def read_tetrahedra(path: Path) -> tuple[Points, Int[np.ndarray, "m 4"], Int[np.
         raise ValueError(f"{path} has no tetrahedra, nor other solid cells: export the volume mesh, not its surface")
     if elements.min() < 0 or elements.max() >= len(nodes):
         return nodes, elements, np.arange(len(nodes))  # the mesh's own check names the index
-    used, packed = np.unique(elements, return_inverse=True)
-    return nodes[used], packed.reshape(-1, 4), used
+    return *with_used_vertices(nodes, elements), np.unique(elements)
 
 
 def frame_files(path: Path) -> list[Path]:
@@ -197,7 +197,7 @@ def _positions(path: Path, frames: MeshFrames, rest: Points | None) -> tuple[Flo
     """
     points, moved = frames.points, frames.displacements
     start = points[0] if rest is None else rest
-    size = float(np.ptp(start, axis=0).max())
+    size = longest_side(start)
     if np.abs(points - start).max() <= STILL * size:
         if moved is not None:
             return points + moved, points[0]

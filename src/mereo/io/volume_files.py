@@ -20,7 +20,7 @@ from scipy.ndimage import gaussian_filter
 from skimage.measure import marching_cubes
 
 from mereo.geometry.brief import listed
-from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
+from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh, palette_color
 from mereo.geometry.transforms import Points, Transform, Vector, transform_points
 from mereo.io.config import Space
 from mereo.io.errors import check_size, limited_memory, quiet, readable
@@ -425,7 +425,7 @@ def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) 
     margins = _margins(_in_partition([grid.share(mask) for mask in masks], parents), parents)
     thin, parts, cell = dict[str, str](), list[Segment](), abs(float(np.linalg.det(volume.T_world_index[:3, :3])))
     for index, (name, margin) in enumerate(zip(segments, margins, strict=True)):
-        part = grid.surface(margin, name, volume.colors.get(labels[index][0], PALETTE[index % len(PALETTE)]))
+        part = grid.surface(margin, name, volume.colors.get(labels[index][0], palette_color(index)))
         kept = 0.0 if part is None else part.volume / (float(masks[index].sum()) * cell)
         if part is None or kept < LEAST_VOLUME:
             thin[name] = (

@@ -19,7 +19,7 @@ from mereo.geometry.camera import DepthImage, PointCloud, SightKind, SightLines,
 from mereo.geometry.conventions import MIN_POINTS, CloudAxes
 from mereo.geometry.downsampling import MAX_POINTS, STEEPEST, random_subset
 from mereo.geometry.surface_patches import noise_of_differences, second_differences
-from mereo.geometry.transforms import Points, Transform, transform_points
+from mereo.geometry.transforms import Points, Transform, longest_side, transform_points
 from mereo.io.sensor_frame import SensorFrame
 from mereo.reconstruction.config import Extent, IsolationConfig
 from mereo.reconstruction.isolation import (
@@ -218,7 +218,7 @@ class Observation:
 
 def main_length(points: Points) -> float:
     """Length of the box of some points, without the outermost hundredths."""
-    return float(np.ptp(np.quantile(points, (0.01, 0.99), axis=0), axis=0).max())
+    return longest_side(np.quantile(points, (0.01, 0.99), axis=0))
 
 
 def depths(cloud: PointCloud, factor: float) -> tuple[float, float, float]:
@@ -576,7 +576,7 @@ def lines_of_points(points: Points, is_object: Bool[np.ndarray, " n"]) -> SightL
     tree = cKDTree(sight[is_object])
     # the fourth neighbour of a pixel is one pitch away, as the first is
     pitch = float(np.median(tree.query(tree.data, k=[min(len(tree.data), 5)])[0]))
-    size = float(np.ptp(tree.data, axis=0).max())
+    size = longest_side(tree.data)
     angle = tree.query(sight[others], distance_upper_bound=max(size, pitch))[0]
     # along a line that met the object, nothing else is said
     is_free = (angle > 0.5 * pitch) & np.isfinite(angle)

@@ -14,7 +14,7 @@ from mereo.deformation.elastic import ElasticSampler, elastic_motion
 from mereo.deformation.moving_least_squares import spread
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import align_all, fit_rigid
+from mereo.geometry.transforms import align_all, fit_rigid, longest_side
 from mereo.io.cores import limit_blas_threads
 from mereo.io.errors import limited_memory, words_of
 from mereo.io.progress import stage, tracked
@@ -206,7 +206,7 @@ def _aligned(
 ) -> tuple[Float[np.ndarray, "m 3"], Float32[np.ndarray, "n c"]]:
     """The mean, turned as the rest pose, and the aligned states' differences from it."""
     few = spread(rest, PROCRUSTES_POINTS)
-    rotation, center, mean = align_all(states[:, few], PROCRUSTES_ROUNDS, 1e-5 * float(np.ptp(rest, axis=0).max()))
+    rotation, center, mean = align_all(states[:, few], PROCRUSTES_ROUNDS, 1e-5 * longest_side(rest))
     T = fit_rigid(mean.astype(np.float64), rest[few])
     rotation = (T[:3, :3] @ rotation).astype(np.float32)
     aligned = np.matmul(states - center[:, None], rotation.transpose(0, 2, 1)) + T[:3, 3].astype(np.float32)

@@ -15,7 +15,7 @@ from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Deformation
 from mereo.deformation.tetrahedral import Surface, SurfaceMap, Tetrahedra, TetrahedralMap
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.transforms import Points, Vector
+from mereo.geometry.transforms import Points, Vector, longest_side
 from mereo.io.simulation_states import SurfaceRecord, TetrahedralRecord, read_states
 from mereo.scenes.scene import Scene, Workspace
 
@@ -145,7 +145,7 @@ def tetrahedra_around(path: Path, nodes: Points, elements: Int[np.ndarray, "m 4"
         mesh = Tetrahedra(nodes, elements)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    size = float(np.ptp(mesh.nodes, axis=0).max())
+    size = longest_side(mesh.nodes)
     for segment in rest.segments:
         away = segment.vertices[mesh.locate(segment.vertices) < 0]
         distance = np.linalg.norm(away - mesh.closest(away)[2], axis=1) if len(away) else np.zeros(0)
@@ -242,7 +242,7 @@ def _order(
             "be the same vertices: export both from the same mesh"
         )
     distance, nearest = cKDTree(known).query(segment.vertices)
-    size = float(np.ptp(segment.vertices, axis=0).max())
+    size = longest_side(segment.vertices)
     if distance.max() > MATCHED * size:
         raise ValueError(
             f"{path}: the rest positions of {segment.name!r} miss a vertex of its mesh by {distance.max():.3g}, of "

@@ -20,7 +20,7 @@ from mereo.geometry.downsampling import farthest_point_order
 from mereo.geometry.mesh import SegmentedMesh, barycentric
 from mereo.geometry.solids import Nearest, Solids, signed_distance_and_direction
 from mereo.geometry.surface_patches import without_strays
-from mereo.geometry.transforms import Normalizer, Points, Transform, inverse_rigid, transform_points
+from mereo.geometry.transforms import Normalizer, Points, Transform, inverse_rigid, transform_points, unit_rows
 from mereo.scenes.rest_pose import rest_frame
 from mereo.scenes.scene import Scene
 from mereo.synthesis.clutter import OBJECT
@@ -186,7 +186,7 @@ def _triangle_frames(triangles: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray,
     """Rotations whose columns are each triangle's first edge, its normal, and the direction across."""
     along = triangles[:, 1] - triangles[:, 0]
     normal = np.cross(along, triangles[:, 2] - triangles[:, 0])
-    along, normal = (v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-30) for v in (along, normal))
+    along, normal = (unit_rows(vectors) for vectors in (along, normal))
     return np.stack([along, normal, np.cross(along, normal)], axis=2)
 
 

@@ -24,7 +24,7 @@ from jaxtyping import Float32
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import Color
 from mereo.geometry.transforms import Transform, Vector
-from mereo.io.atomic_files import atomic_file
+from mereo.io.atomic_files import atomic_file, write_file
 from mereo.io.extras import library
 from mereo.io.volume_files import Volume, segment_fields
 from mereo.io.writers.meshes import segment_table
@@ -109,8 +109,7 @@ def write_labels_vti(
         labels=_compressed(grid.labels),
         radii="" if radii is None else array.format(_compressed(radii.astype("<f4"))),
     )
-    with atomic_file(path) as partial:
-        partial.write_text(text, "utf-8")
+    write_file(path, text)
 
 
 def _compressed(values: np.ndarray) -> str:
@@ -165,10 +164,9 @@ def _write_nifti(path: Path, image: Any, level: int) -> None:
     image.set_qform(image.affine, code="scanner")
     image.set_sform(image.affine, code="scanner")
     content = image.to_bytes()
-    with atomic_file(path) as partial:
-        # mtime: the same result gives the same bytes
-        is_packed = path.suffix.lower() == ".gz"
-        partial.write_bytes(gzip.compress(content, level, mtime=0) if is_packed else content)
+    # mtime: the same result gives the same bytes
+    is_packed = path.suffix.lower() == ".gz"
+    write_file(path, gzip.compress(content, level, mtime=0) if is_packed else content)
 
 
 def nibabel() -> Any:
@@ -199,9 +197,7 @@ def write_labels_seg_nrrd(path: str | Path, grid: LabelGrid, colors: Sequence[Co
         "Segmentation_MasterRepresentation": "Binary labelmap",
         "Segmentation_ReferenceImageExtentOffset": "0 0 0",
     }
-    content = _nrrd("NRRD0004", grid.labels, _T_lps_index(grid, unit_m), fields, 9)
-    with atomic_file(path) as partial:
-        partial.write_bytes(content)
+    write_file(path, _nrrd("NRRD0004", grid.labels, _T_lps_index(grid, unit_m), fields, 9))
 
 
 def _nrrd(magic: str, values: np.ndarray, T_lps_index: Transform, fields: dict[str, str], level: int) -> bytes:
@@ -259,8 +255,7 @@ def write_volume(path: Path, volume: Volume, unit_m: float = 1.0) -> None:
     whole = " ".join(f"0 {n - 1}" for n in volume.values.shape)  # of 3D Slicer's segments
     fields |= {key: whole for key in fields if key.endswith("_Extent")}
     fields |= {key: "0 0 0" for key in fields if key.endswith("Segmentation_ReferenceImageExtentOffset")}
-    with atomic_file(path) as partial:
-        partial.write_bytes(_nrrd("NRRD0005", volume.values, T_lps_index, fields, LEVEL))
+    write_file(path, _nrrd("NRRD0005", volume.values, T_lps_index, fields, LEVEL))
 
 
 def _write_volume_nifti(path: Path, volume: Volume, T_ras_index: Transform) -> None:

@@ -32,7 +32,7 @@ from mereo.deformation.samplers import DeformationSampler
 from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import Normalizer, Points, Vector
+from mereo.geometry.transforms import Normalizer, Points, Vector, longest_side
 from mereo.io.point_arrays import model_points
 from mereo.io.readers import read_points
 from mereo.io.simulation_states import read_tetrahedra
@@ -163,7 +163,7 @@ class LatticeBlock(DeformationBlock):
         bounds = target.moved.bounds
         if self.spacing is None:
             return samplers.LatticeSampler(bounds, self.cells or samplers.default_cells(bounds), self.strength)
-        longest = float((bounds[1] - bounds[0]).max()) / target.unit
+        longest = longest_side(bounds) / target.unit
         if longest > MOST_CELLS * self.spacing:
             raise Misfit(
                 "spacing",
@@ -521,7 +521,7 @@ class ElasticBlock(DeformationBlock):
                 )
             held = inside if held is None else held | inside
         count = min(self.modes, solid.most_modes(held))
-        motion = self.motion * float((bounds[1] - bounds[0]).max()) / 2
+        motion = self.motion * longest_side(bounds) / 2
         return ElasticSampler(solid, Material(self.poisson), count, motion, held)
 
 

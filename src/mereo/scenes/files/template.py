@@ -25,10 +25,18 @@ from mereo.deformation.maps import Deformation, unit
 from mereo.deformation.samplers import RandomMotion, distance_from_line
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.conventions import UNITS_M, Way
-from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, surface_points
+from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, palette_color, surface_points
 from mereo.geometry.mesh_check import examine, likely_unit, overlaps
-from mereo.geometry.transforms import Normalizer, Points, Vector, fit_rigid, inverse_rigid, transform_points
-from mereo.io.atomic_files import atomic_file, check_file_place
+from mereo.geometry.transforms import (
+    Normalizer,
+    Points,
+    Vector,
+    fit_rigid,
+    inverse_rigid,
+    longest_side,
+    transform_points,
+)
+from mereo.io.atomic_files import check_file_place, write_file
 from mereo.io.mesh_formats import ROBOT_SUFFIXES, read_object_mesh
 from mereo.io.robots import RobotJoint, is_robot, read_robot
 from mereo.io.volume_files import (
@@ -73,7 +81,7 @@ def measure_motion(rest: SegmentedMesh, draw: Draw) -> Motion:
     points, owner = material_points(rest, POINTS)
     states = [_moved(points, owner, draw(example_rng(0, index))) for index in range(STATES)]
     ways = [moved - transform_points(fit_rigid(points, moved), points) for moved in states]
-    shares = np.linalg.norm(ways, axis=2) / float((rest.bounds[1] - rest.bounds[0]).max())
+    shares = np.linalg.norm(ways, axis=2) / longest_side(rest.bounds)
     return Motion(float(np.median(np.sqrt(np.mean(shares**2, axis=1)))), float(np.median(shares.max(axis=1))))
 
 
@@ -356,8 +364,7 @@ def write_scene_file(
             "scene file without it, and name that"
         )
     text, notes = _draft(name, source, units, aperture, deformations)
-    with atomic_file(path, force=False) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_file(path, text, force=False)
     if report is not None:
         for note in (*(f"left out: {text}" for text in source.lost), *source.notes, *notes):
             report(note)
@@ -399,7 +406,7 @@ def _source(files: Sequence[Path], folder: Path) -> _Source:
     mesh = SegmentedMesh(tuple(parts))
     lines = ["segments:  # one closed mesh for each; their order is that of the labels"]
     for number, (name, text) in enumerate(zip(names, relative, strict=True)):
-        color = list(PALETTE[number % len(PALETTE)])
+        color = list(palette_color(number))
         lines += [f"  - name: {quoted(name)}", f"    file: {quoted(text)}", f"    color: {color}"]
     lines.append("    # nested_in: NAME  # for a segment that lies inside another one, which has to come after it")
     return _Source("\n".join(lines), mesh, *_likely_frame(files[0], mesh.bounds))
@@ -433,7 +440,7 @@ def _from_model(file: Path, relative: str, mesh: SegmentedMesh, what: str = "") 
     for number, (part, name) in enumerate(zip(mesh.names, names, strict=True)):
         lines.append(f"  - name: {quoted(name)}")
         lines += [f"    parts: [{quoted(part)}]"] if part != name else []
-        lines.append(f"    color: {list(PALETTE[number % len(PALETTE)])}")
+        lines.append(f"    color: {list(palette_color(number))}")
     mesh = SegmentedMesh(tuple(replace(part, name=name) for part, name in zip(mesh.segments, names, strict=True)))
     lines.append("    # parts: [A, B]  # parts of the model to join into this segment, instead of the one of its name")
     return _Source("\n".join(lines), mesh, *_likely_frame(file, mesh.bounds))
@@ -486,7 +493,7 @@ def _surfaces(
 def _likely_frame(file: Path, bounds: Float[np.ndarray, "2 3"]) -> tuple[str, str, int, str]:
     """Unit of a mesh file, and why; the axis that points upwards in it, and why."""
     kind, guess = file.suffix.lower().lstrip("."), likely_unit(bounds)
-    longest_m = float((bounds[1] - bounds[0]).max()) * UNITS_M[guess]
+    longest_m = longest_side(bounds) * UNITS_M[guess]
     robots = dict.fromkeys((suffix[1:] for suffix in ROBOT_SUFFIXES), ("m", "the rule of URDF and SDF"))
     known = robots | {
         "glb": ("m", "the rule of glTF"),
@@ -648,7 +655,7 @@ def _soft(mesh: SegmentedMesh, blocks: Blocks) -> str:
             stiff=STIFF,
             part=quoted(mesh.names[-1]),
             end=_numbers(vertices[vertices[:, longest].argmin()]),
-            held=0.15 * np.ptp(mesh.bounds, axis=0).max(),
+            held=0.15 * longest_side(mesh.bounds),
         )
     bend, lattice = blocks[0], blocks[-1]
     assert isinstance(bend, BendBlock) and isinstance(lattice, LatticeBlock)
