@@ -26,9 +26,9 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from mereo.geometry.downsampling import first_in_cell
-from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.mesh import SegmentedMesh, area_vectors
 from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import Points, Transform, Vector, inverse_rigid, rigid, transform_points
+from mereo.geometry.transforms import Points, Transform, Vector, inverse_rigid, rigid, transform_points, unit_rows
 
 # --- the visible surface ----------------------------------------------------------------------------------------------
 
@@ -72,9 +72,8 @@ def facing(placed: SegmentedMesh, viewpoint: Vector) -> SegmentedMesh:
     """Faces that are turned towards ``viewpoint``, or nearly."""
     segments = []
     for segment in placed.segments:
-        corners = segment.vertices[segment.faces]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        way = viewpoint - corners.mean(axis=1)
+        normal = area_vectors(segment.vertices, segment.faces)
+        way = viewpoint - segment.vertices[segment.faces].mean(axis=1)
         size = np.linalg.norm(normal, axis=1) * np.linalg.norm(way, axis=1)
         is_facing = np.einsum("ij,ij->i", normal, way) > -0.1 * size  # below 0, as the pose is not right yet
         segments.append(replace(segment, faces=segment.faces[is_facing]))
@@ -84,8 +83,7 @@ def facing(placed: SegmentedMesh, viewpoint: Vector) -> SegmentedMesh:
 def face_areas(mesh: SegmentedMesh) -> Float[np.ndarray, " f"]:
     """Areas of all faces, segment by segment."""
     vertices, faces, _ = mesh.merged()
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    return np.linalg.norm(area_vectors(vertices, faces), axis=1) / 2
 
 
 def sample_surface(
@@ -104,9 +102,9 @@ def sample_surface(
     along, across = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     places = a * (1 - along) + b * along * (1 - across) + c * along * across
-    first = (b - a) / np.linalg.norm(b - a, axis=1, keepdims=True)
+    first = unit_rows(b - a)
     normal = np.cross(first, c - a)
-    second = np.cross(normal / np.linalg.norm(normal, axis=1, keepdims=True), first)
+    second = np.cross(unit_rows(normal), first)
     angle = np.linspace(0, 2 * np.pi, CLUSTER, endpoint=False)[:, None]
     ring = np.cos(angle) * first[:, None] + np.sin(angle) * second[:, None]
     return places[:, None] + 1e-3 * np.sqrt(areas.sum() / count) * ring

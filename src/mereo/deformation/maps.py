@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Integer
 from scipy.spatial.transform import Rotation
 
 from mereo.geometry.transforms import Points, Vector
@@ -126,6 +126,15 @@ def smooth_step(t: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     """Quintic step from 0 (t <= 0) to 1 (t >= 1) with two continuous derivatives; its slope is at most 15/8."""
     t = np.clip(t, 0.0, 1.0)
     return t * t * t * (t * (6.0 * t - 15.0) + 10.0)
+
+
+def moved_by(points: Points, owner: Integer[np.ndarray, " n"], deformations: tuple[Deformation, ...]) -> Points:
+    """Images of points, each by the deformation of its ``owner``'s number."""
+    result = np.empty_like(points)
+    for index in np.unique(owner):
+        rows = owner == index
+        result[rows] = deformations[index](points[rows])
+    return result
 
 
 def unit(vector: Vector) -> Vector:

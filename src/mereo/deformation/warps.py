@@ -14,7 +14,7 @@ from scipy.ndimage import map_coordinates
 
 from mereo.deformation.draw_names import named
 from mereo.deformation.maps import crossing, smooth_step, turn, unit
-from mereo.geometry.transforms import Points, Vector
+from mereo.geometry.transforms import Corners, Points, Vector
 
 LATTICE_LIMIT = 1 / 2.48
 """Choi & Lee, "Injectivity conditions of 2D and 3D uniform cubic B-spline functions", Graphical Models 62, 2000."""
@@ -189,7 +189,7 @@ class FreeFormLattice:
 
     @classmethod
     def sample(
-        cls, rng: np.random.Generator, bounds: Float[np.ndarray, "2 3"], cells: tuple[int, int, int], strength: float
+        cls, rng: np.random.Generator, bounds: Corners, cells: tuple[int, int, int], strength: float
     ) -> "FreeFormLattice":
         """Random control points over a box of ``cells`` and one spacing around; ``strength`` in [0, 1) of the limit."""
         spacing = (bounds[1] - bounds[0]) / np.array(cells)

@@ -10,6 +10,11 @@ from mereo.geometry.mesh import Color
 from mereo.geometry.transforms import Points, Vector
 
 
+def part_of_grid(low: Int[np.ndarray, "3"], end: Int[np.ndarray, "3"]) -> tuple[slice, ...]:
+    """Index of the voxels from ``low`` to before ``end``."""
+    return tuple(slice(first, after) for first, after in zip(low, end, strict=True))
+
+
 @dataclass(frozen=True, eq=False)
 class LabelGrid:
     """Labels on a regular grid.

@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from mereo.geometry.brief import counted, listed, sides
 from mereo.geometry.read_only import read_only_view
-from mereo.geometry.transforms import Points, Transform, transform_points, unit_rows
+from mereo.geometry.transforms import Corners, Points, Transform, transform_points, unit_rows
 
 Color = tuple[int, int, int]
 """Red, green, blue in 0..255."""
@@ -65,7 +65,7 @@ class Segment:
         return f"Segment({self.name!r}, {size}, {sides(self.vertices)})"
 
     @property
-    def bounds(self) -> Float[np.ndarray, "2 3"]:
+    def bounds(self) -> Corners:
         """Lower and upper corner of the axis-aligned box; infinite, upside down, without vertices."""
         return np.stack([self.vertices.min(axis=0, initial=np.inf), self.vertices.max(axis=0, initial=-np.inf)])
 
@@ -131,7 +131,7 @@ class SegmentedMesh:
         return tuple(segment.color for segment in self.segments)
 
     @property
-    def bounds(self) -> Float[np.ndarray, "2 3"]:
+    def bounds(self) -> Corners:
         """Joint axis-aligned box of all segments."""
         boxes = np.stack([segment.bounds for segment in self.segments])
         return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])

@@ -21,7 +21,7 @@ from mereo.geometry.mesh import (
     three_cornered,
 )
 from mereo.geometry.solids import label_grid
-from mereo.geometry.transforms import Vector, longest_side
+from mereo.geometry.transforms import Corners, Vector, longest_side
 
 Vertices = Float[np.ndarray, "_ 3"]
 Faces = Int[np.ndarray, "_ 3"]
@@ -250,7 +250,7 @@ def fragments(vertices: Vertices, faces: Faces, unit: str = "") -> tuple[Bool[np
     return stray, f"{count}, {which}, {where}"
 
 
-def likely_unit(bounds: Float[np.ndarray, "2 3"]) -> str:
+def likely_unit(bounds: Corners) -> str:
     """Guess of a mesh's unit from its longest side: CAD and scanners write millimetres, robots and glTF metres."""
     longest = longest_side(bounds)
     return "m" if longest < 3 else "mm"

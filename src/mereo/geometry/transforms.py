@@ -17,6 +17,9 @@ Vector = Float[np.ndarray, "3"]
 Transform = Float[np.ndarray, "4 4"]
 """Homogeneous matrix of a map between two frames."""
 
+Corners = Float[np.ndarray, "2 3"]
+"""Lower and upper corner of a box along the axes."""
+
 
 def rigid(rotation: Float[np.ndarray, "3 3"], translation: Vector) -> Transform:
     """Homogeneous transform from a rotation and a translation."""
@@ -89,7 +92,7 @@ def longest_side(points: Float[np.ndarray, "_ 3"]) -> float:
     return float(np.ptp(points, axis=0).max())
 
 
-def unit_rows(vectors: Points) -> Points:
+def unit_rows(vectors: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
     """Vectors of length 1 along each row; rows of zeros stay so."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)
 

@@ -35,7 +35,7 @@ from mereo.geometry.mesh import (
 )
 from mereo.geometry.mesh_repair import simplified
 from mereo.geometry.radii import Radii
-from mereo.geometry.transforms import Points
+from mereo.geometry.transforms import Points, transform_points
 from mereo.io.errors import check_count, check_size, check_suffix, readable
 from mereo.io.extras import library
 from mereo.io.progress import stage
@@ -348,7 +348,7 @@ def _in_frame(scene: Any, node: str, base: str) -> tuple[Float[np.ndarray, "v 3"
     """Vertices of a node in the frame of another one, its faces, and trimesh's geometry."""
     transform, key = scene.graph.get(node, frame_from=base)
     geometry = scene.geometry[key]
-    vertices = np.asarray(geometry.vertices, dtype=np.float64) @ transform[:3, :3].T + transform[:3, 3]
+    vertices = transform_points(transform, np.asarray(geometry.vertices, dtype=np.float64))
     faces = np.asarray(geometry.faces, dtype=np.int64)
     if np.linalg.det(transform[:3, :3]) < 0:
         faces = faces[:, ::-1]

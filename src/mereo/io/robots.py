@@ -191,19 +191,18 @@ def _with_axis(yourdfpy: Any, joint: Any, axis: Any, pose_of: Any) -> Any:
         base = "__model__"
     turn = pose_of(joint.name)[:3, :3].T @ pose_of(base)[:3, :3]
     joint.axis = turn @ _numbers(axis.findtext("xyz"), 3)
-    lower, upper = (_numbers(axis.findtext(f"limit/{key}") or value, 1)[0] for key, value in LIMITS.items())
+    lower, upper = _number(axis, "limit/lower", "-inf"), _number(axis, "limit/upper", "inf")
     joint.limit = yourdfpy.Limit(lower=lower, upper=upper)
     if (leader := axis.find("mimic")) is not None:
-        factor, offset, start = (
-            _numbers(leader.findtext(key) or value, 1)[0]
-            for key, value in (("multiplier", "1"), ("offset", "0"), ("reference", "0"))
-        )
-        joint.mimic = yourdfpy.Mimic(leader.get("joint"), factor, offset - factor * start)
+        factor, start = _number(leader, "multiplier", "1"), _number(leader, "reference", "0")
+        offset = _number(leader, "offset", "0") - factor * start
+        joint.mimic = yourdfpy.Mimic(leader.get("joint"), factor, offset)
     return joint
 
 
-LIMITS = {"lower": "-inf", "upper": "inf"}
-"""Limits of a joint of an SDF file that states none."""
+def _number(element: Any, key: str, default: str) -> float:
+    """Number of an element within another one, ``default`` where there is none."""
+    return _numbers(element.findtext(key) or default, 1)[0]
 
 
 def _geometries(yourdfpy: Any, element: Any) -> Iterator[tuple[Transform, Any]]:

@@ -157,9 +157,7 @@ def _messages(reader: Any, connections: list[Any], source: str | Path) -> Iterat
 
 def _depth_topic(reader: Any, path: Path) -> str:
     """Topic of depth: the first of images whose first message is one, else of compressed ones, else of clouds."""
-    images, compressed, clouds = (
-        sorted({c.topic for c in reader.connections if c.msgtype == kind and c.msgcount}) for kind in FRAMES
-    )
+    images, compressed, clouds = (_topics(reader, kind) for kind in FRAMES)
     depths = [topic for topic in images if _first(reader, topic).encoding in DEPTH_ENCODINGS]
     depths = depths or [topic for topic in compressed if COMPRESSED_DEPTH in _first(reader, topic).format] or clouds
     if not depths:
@@ -169,6 +167,11 @@ def _depth_topic(reader: Any, path: Path) -> str:
             "depth topic and its camera_info"
         )
     return depths[0]
+
+
+def _topics(reader: Any, kind: str) -> list[str]:
+    """Topics on which there are messages of a type, by name."""
+    return sorted({c.topic for c in reader.connections if c.msgtype == kind and c.msgcount})
 
 
 def _first(reader: Any, topic: str) -> Any:
@@ -186,7 +189,7 @@ def _realsense_scale(reader: Any, topic: str) -> float | None:
 
 def _camera(reader: Any, topic: str, path: Path) -> Camera:
     """Camera from the CameraInfo topic that shares the most leading names with ``topic``."""
-    infos = sorted({c.topic for c in reader.connections if c.msgtype == INFO and c.msgcount})
+    infos = _topics(reader, INFO)
     if not infos:
         raise ValueError(f"{path} has no CameraInfo; the intrinsics of {topic} are needed: give --intrinsics FILE")
     nearest = max(infos, key=lambda info: len(commonpath([f"/{info}", f"/{topic}"])))

@@ -15,13 +15,14 @@ from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, Integer, Shaped
+from jaxtyping import Bool, Float32, Int, Integer, Shaped
 from scipy.ndimage import gaussian_filter
 from skimage.measure import marching_cubes
 
 from mereo.geometry.brief import listed
+from mereo.geometry.labels import part_of_grid
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh, palette_color
-from mereo.geometry.transforms import Points, Transform, Vector, transform_points
+from mereo.geometry.transforms import Corners, Points, Transform, Vector, transform_points
 from mereo.io.config import Space
 from mereo.io.errors import check_size, limited_memory, quiet, readable
 from mereo.io.extras import library
@@ -59,7 +60,7 @@ class Volume:
         return np.linalg.norm(self.T_world_index[:3, :3], axis=0)
 
     @property
-    def bounds(self) -> Float[np.ndarray, "2 3"]:
+    def bounds(self) -> Corners:
         """Axis-aligned box of the voxels, their own extent included."""
         ends = np.stack(np.meshgrid(*([-0.5, n - 0.5] for n in self.values.shape), indexing="ij"), axis=-1)
         corners = transform_points(self.T_world_index, ends.reshape(-1, 3))
@@ -522,7 +523,7 @@ class _Grid:
     def share(self, mask: Mask) -> tuple[Share, float]:
         """Share of each cell that is set, smoothed, with ``MARGIN`` empty cells around; and the one at the surface."""
         end = np.minimum(self.first + self.counts * self.block, mask.shape)
-        part = mask[tuple(slice(a, b) for a, b in zip(self.first, end, strict=True))]
+        part = mask[part_of_grid(self.first, end)]
         part = np.pad(part, [(0, int(n)) for n in self.counts * self.block - part.shape])
         (a, b, c), (i, j, k) = self.counts, self.block
         means = np.pad(part.reshape(a, i, b, j, c, k).mean(axis=(1, 3, 5), dtype=np.float32), MARGIN)
@@ -543,8 +544,8 @@ class _Grid:
         inside = np.argwhere(share > 0.5)
         if len(inside) == 0:
             return 0.0
-        box = tuple(slice(a - 1, b + 2) for a, b in zip(inside.min(axis=0), inside.max(axis=0), strict=True))
-        part = self.surface(share[box] - np.float32(0.5), "", PALETTE[0])
+        near = part_of_grid(inside.min(axis=0) - 1, inside.max(axis=0) + 2)
+        part = self.surface(share[near] - np.float32(0.5), "", PALETTE[0])
         return 0.0 if part is None else part.volume
 
     def surface(self, margin: Share, name: str, color: Color) -> Segment | None:
@@ -553,7 +554,7 @@ class _Grid:
             return None
         vertices, faces, _, _ = marching_cubes(margin, 0.0, gradient_direction="ascent")
         index = (vertices - MARGIN + 0.5) * self.block - 0.5 + self.first
-        world = index @ self.T_world_index[:3, :3].T + self.T_world_index[:3, 3]
+        world = transform_points(self.T_world_index, index)
         # voxel axes may be left-handed
         turned = -1 if np.linalg.det(self.T_world_index[:3, :3]) < 0 else 1
         return Segment(name, color, world, faces[:, ::turned].astype(np.int64))

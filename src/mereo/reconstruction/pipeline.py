@@ -22,10 +22,10 @@ from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud, into_camera
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.downsampling import random_subset
-from mereo.geometry.labels import LabelGrid, SegmentedCloud
+from mereo.geometry.labels import LabelGrid, SegmentedCloud, part_of_grid
 from mereo.geometry.mesh import PALETTE, Color, SegmentedMesh
 from mereo.geometry.solids import label_grid
-from mereo.geometry.transforms import Points, Transform, Vector, inverse_rigid, transform_points
+from mereo.geometry.transforms import Corners, Points, Transform, Vector, inverse_rigid, transform_points
 from mereo.models.calibration import Calibration
 from mereo.models.trained import EncodedCloud, Trained, checked_points
 from mereo.reconstruction.isolation import Reading
@@ -57,7 +57,7 @@ class SegmentFacts:
     label: int
     volume: float
     centroid: Vector
-    box: Float[np.ndarray, "2 3"]
+    box: Corners
     confidence: float
     voxels: int
     components: int
@@ -314,8 +314,7 @@ def measure(extraction: Extraction, model: Trained | None, code: EncodedCloud | 
         if model is not None and code is not None:
             chosen = random_subset(voxels, CONFIDENCE_VOXELS)
             confidence = float(model.query(code, grid.positions(chosen)).probability[:, label].mean())
-        low, high = voxels.min(axis=0), voxels.max(axis=0) + 1
-        part = grid.labels[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+        part = grid.labels[part_of_grid(voxels.min(axis=0), voxels.max(axis=0) + 1)]
         measured.append(
             SegmentFacts(
                 name=segment.name,

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
 from mereo.deformation.elastic import ElasticSampler, elastic_motion
+from mereo.deformation.maps import moved_by
 from mereo.deformation.moving_least_squares import spread
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
@@ -64,11 +65,7 @@ def state_points(
     state: State, nodes: Float[np.ndarray, "j 3"], labels: UInt8[np.ndarray, " j"]
 ) -> Float[np.ndarray, "m 3"]:
     """Positions to which a state has moved all material points, in the scene's frame."""
-    moved = np.empty_like(nodes)
-    for label in np.unique(labels):
-        rows = labels == label
-        moved[rows] = state.deformations[label - 1](nodes[rows])
-    return material_points(state.mesh, moved)
+    return material_points(state.mesh, moved_by(nodes, labels - 1, state.deformations))
 
 
 def sample_states(

@@ -132,10 +132,6 @@ class TetrahedralFrames:
         return (TetrahedralMap(self.mesh, self.nodes(frame)),) * self.segments
 
 
-FAR = 0.1
-"""A surface that lies mostly farther from the tetrahedra than this, of their longest side, is not theirs."""
-
-
 def tetrahedra_around(path: Path, nodes: Points, elements: Int[np.ndarray, "m 4"], rest: SegmentedMesh) -> Tetrahedra:
     """Tetrahedra of a file around an object, both in scene units.
 

@@ -30,7 +30,7 @@ from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import Transform, Vector, inverse_rigid
+from mereo.geometry.transforms import Transform, Vector, inverse_rigid, unit_rows
 from mereo.io.atomic_files import write_json
 from mereo.io.intrinsics import written_intrinsics
 from mereo.scenes.draw_recorder import SMOOTH, Key, OutOfDraws, Recorder
@@ -100,7 +100,7 @@ def process_weights(times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:
     away = np.abs(times[:, None] - nodes)
     near, far = 2 / 3 - away**2 + away**3 / 2, np.maximum(2 - away, 0.0) ** 3 / 6
     weights = np.where(away < 1, near, far)
-    return np.asarray(weights / np.linalg.norm(weights, axis=1, keepdims=True))
+    return unit_rows(weights)
 
 
 def switches(scene: Scene, start: Played) -> set[Key]:

@@ -32,7 +32,7 @@ from mereo.deformation.samplers import DeformationSampler
 from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import Normalizer, Points, Vector, longest_side
+from mereo.geometry.transforms import Corners, Normalizer, Points, Vector, longest_side
 from mereo.io.point_arrays import model_points
 from mereo.io.readers import read_points
 from mereo.io.simulation_states import read_tetrahedra
@@ -106,7 +106,7 @@ class Target:
     """
 
     moved: SegmentedMesh
-    whole: Float[np.ndarray, "2 3"]
+    whole: Corners
     placement: Normalizer
     folder: Path = Path()
 

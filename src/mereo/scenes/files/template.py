@@ -18,16 +18,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 import yaml
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from scipy.spatial import ConvexHull, QhullError
 
-from mereo.deformation.maps import Deformation, unit
+from mereo.deformation.maps import Deformation, moved_by, unit
 from mereo.deformation.samplers import RandomMotion, distance_from_line
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.conventions import UNITS_M, Way
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, palette_color, surface_points
 from mereo.geometry.mesh_check import examine, likely_unit, overlaps
 from mereo.geometry.transforms import (
+    Corners,
     Normalizer,
     Points,
     Vector,
@@ -79,18 +80,10 @@ class Motion(NamedTuple):
 def measure_motion(rest: SegmentedMesh, draw: Draw) -> Motion:
     """Motion of an object in random states, which are the same in every call, beyond turns and shifts of the whole."""
     points, owner = material_points(rest, POINTS)
-    states = [_moved(points, owner, draw(example_rng(0, index))) for index in range(STATES)]
+    states = [moved_by(points, owner, draw(example_rng(0, index))) for index in range(STATES)]
     ways = [moved - transform_points(fit_rigid(points, moved), points) for moved in states]
     shares = np.linalg.norm(ways, axis=2) / longest_side(rest.bounds)
     return Motion(float(np.median(np.sqrt(np.mean(shares**2, axis=1)))), float(np.median(shares.max(axis=1))))
-
-
-def _moved(points: Points, owner: Int[np.ndarray, " n"], deformations: tuple[Deformation, ...]) -> Points:
-    result = np.empty_like(points)
-    for index in np.unique(owner):
-        rows = owner == index
-        result[rows] = deformations[index](points[rows])
-    return result
 
 
 def material_points(mesh: SegmentedMesh, count: int) -> tuple[Points, Int[np.ndarray, " n"]]:
@@ -271,7 +264,7 @@ def _default_view(rest: SegmentedMesh, draw: Draw, workspace: Workspace) -> tupl
     corners = [segment.vertices[:: 1 + len(segment.vertices) // FRAMED] for segment in rest.segments]
     owner = np.concatenate([owner, np.repeat(np.arange(len(corners)), [len(part) for part in corners])])
     points = np.concatenate([points, *corners])
-    moved = [_moved(points, owner, draw(example_rng(0, index))) for index in range(STATES_SEEN)]
+    moved = [moved_by(points, owner, draw(example_rng(0, index))) for index in range(STATES_SEEN)]
     # the camera aims at the middle of their box
     states = [(places, (places.min(axis=0) + places.max(axis=0)) / 2) for places in moved]
     reach = max(float(np.linalg.norm(points - center, axis=1).max()) for points, center in states)
@@ -490,7 +483,7 @@ def _surfaces(
     raise ThinSegmentError(thin)
 
 
-def _likely_frame(file: Path, bounds: Float[np.ndarray, "2 3"]) -> tuple[str, str, int, str]:
+def _likely_frame(file: Path, bounds: Corners) -> tuple[str, str, int, str]:
     """Unit of a mesh file, and why; the axis that points upwards in it, and why."""
     kind, guess = file.suffix.lower().lstrip("."), likely_unit(bounds)
     longest_m = longest_side(bounds) * UNITS_M[guess]
