@@ -14,7 +14,7 @@ from scipy.ndimage import map_coordinates
 
 from mereo.deformation.draw_names import named
 from mereo.deformation.maps import crossing, smooth_step, turn, unit
-from mereo.geometry.transforms import Corners, Points, Vector
+from mereo.geometry.transforms import Corners, Points, Vector, unit_rows
 
 LATTICE_LIMIT = 1 / 2.48
 """Choi & Lee, "Injectivity conditions of 2D and 3D uniform cubic B-spline functions", Graphical Models 62, 2000."""
@@ -154,8 +154,7 @@ class SmoothField:
     ) -> "SmoothField":
         """Field of ``modes`` random waves, wavelengths uniform in a range, with gradient bound ``strength``."""
         directions, amplitudes = named(rng, "pattern").normal(size=(2, modes, 3))
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        frequencies = directions * 2 * np.pi / named(rng, "wavelength").uniform(*wavelength, size=(modes, 1))
+        frequencies = unit_rows(directions) * 2 * np.pi / named(rng, "wavelength").uniform(*wavelength, size=(modes, 1))
         shares = np.linalg.norm(amplitudes, axis=1) @ np.linalg.norm(frequencies, axis=1)
         phases = named(rng, "phase", "rad").uniform(0, 2 * np.pi, size=modes)
         return cls(amplitudes * (strength / shares), frequencies, phases)
