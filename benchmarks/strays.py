@@ -16,7 +16,8 @@ import numpy as np
 
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.solids import Solids
-from mereo.geometry.surface_patches import longest_side, surface_points
+from mereo.geometry.surface_patches import surface_points
+from mereo.geometry.transforms import longest_side
 from mereo.models.weights_place import shipped_names
 from mereo.reconstruction.isolation import readings
 from mereo.scenes.registry import load_scene

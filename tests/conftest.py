@@ -49,6 +49,13 @@ def pytest_runtest_call() -> Iterator[None]:
 pytest_runtest_setup = pytest_runtest_call
 
 
+@pytest.fixture
+def working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder in which the test runs."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
 @pytest.fixture(scope="session")
 def require_asset() -> Callable[[str], Path]:
     """``require_asset("bunny/bunny.off")`` is the file's path, or the test is skipped."""

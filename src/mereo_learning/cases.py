@@ -36,7 +36,7 @@ from mereo.geometry.metrics import (
 )
 from mereo.geometry.solids import label_grid
 from mereo.geometry.symmetry import STEP, Symmetry
-from mereo.geometry.transforms import transform_points
+from mereo.geometry.transforms import Points, Transform, Vector, transform_points
 from mereo.models.trained import EncodedCloud, Trained
 from mereo.reconstruction.isosurfaces import sample_coarse_to_fine
 from mereo.reconstruction.observation import observe
@@ -46,9 +46,7 @@ from mereo.scenes.statistical_model import StatisticalModel
 # --- errors of a registration, and their radii ------------------------------------------------------------------------
 
 
-def nearest_truth(
-    model: StatisticalModel, answer: Float[np.ndarray, "m 3"], truth: Float[np.ndarray, "n 3"]
-) -> Float[np.ndarray, "n 3"]:
+def nearest_truth(model: StatisticalModel, answer: Float[np.ndarray, "m 3"], truth: Points) -> Points:
     """Choose the true positions of material points that an answer is nearest to, of those that no frame tells apart.
 
     Of an object that looks the same turned, a place of the answer is as right where the true object has its turned
@@ -68,10 +66,10 @@ def nearest_truth(
 def _turned(
     model: StatisticalModel,
     symmetry: Symmetry,
-    turn: Float[np.ndarray, "4 4"],
+    turn: Transform,
     truth: Float[np.ndarray, "m 3"],
     rows: slice | Int[np.ndarray, " n"] = slice(None),
-) -> Float[np.ndarray, "n 3"]:
+) -> Points:
     """Places in the true object to which a turn at rest brings material points."""
     landing = np.array([index for index in symmetry.lands_on if index is not None])
     labels = (landing[model.labels[rows] - 1] + 1).astype(np.uint8)
@@ -80,13 +78,13 @@ def _turned(
 
 def _nearest_turn(
     model: StatisticalModel, symmetry: Symmetry, answer: Float[np.ndarray, "m 3"], truth: Float[np.ndarray, "m 3"]
-) -> Float[np.ndarray, "4 4"]:
+) -> Transform:
     """The turn about the axis of a symmetry by any angle that brings the true places nearest to an answer."""
     axis = symmetry.axis
     assert axis is not None
     middle = np.linalg.lstsq(np.eye(3) - symmetry.turn[:3, :3], symmetry.turn[:3, 3], rcond=1e-6)[0]
 
-    def turn(angle: float) -> Float[np.ndarray, "4 4"]:
+    def turn(angle: float) -> Transform:
         T = np.eye(4)
         T[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix()
         T[:3, 3] = middle - T[:3, :3] @ middle
@@ -231,9 +229,7 @@ SAMPLED_CELLS = 20_000
 """Cells of a view at which the network is evaluated, evenly drawn: all would take longer than the evaluation."""
 
 
-def sample_cells(
-    truth: TruthGrid, count: int = SAMPLED_CELLS
-) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, " n"]]:
+def sample_cells(truth: TruthGrid, count: int = SAMPLED_CELLS) -> tuple[Points, UInt8[np.ndarray, " n"]]:
     """Centres and true labels of at most ``count`` of the cells that count, the same ones every time."""
     kept = np.argwhere(truth.kept)
     if len(kept) > count:
@@ -337,7 +333,7 @@ def network_labels(model: Trained, code: EncodedCloud, grid: LabelGrid) -> UInt8
     """Labels by the network at the voxels of a grid, evaluated coarse to fine."""
     x, y, z = grid.labels.shape
 
-    def logits(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n c"]:
+    def logits(points: Points) -> Float[np.ndarray, "n c"]:
         return model.logits(code, points)
 
     return sample_coarse_to_fine(logits, grid.origin, grid.spacing, (x, y, z)).labels
@@ -396,8 +392,8 @@ class EvaluatedView:
     cloud: PointCloud
     reference: UInt8[np.ndarray, "x y z"]
     predicted: UInt8[np.ndarray, "x y z"]
-    origin: Float[np.ndarray, "3"]
-    spacing: Float[np.ndarray, "3"]
+    origin: Vector
+    spacing: Vector
     colors: Sequence[Color]
 
 

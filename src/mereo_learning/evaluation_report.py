@@ -18,7 +18,7 @@ from PIL import Image
 
 from mereo.geometry.mesh import Color
 from mereo.geometry.metrics import format_score
-from mereo.io.atomic_files import atomic_file, new_directory, write_json
+from mereo.io.atomic_files import new_directory, write_file, write_json
 from mereo.io.config import CONFIG
 from mereo.models.config import EXACT, InferenceConfig
 from mereo.models.model import Model
@@ -166,8 +166,7 @@ def write_evaluation_report(
         f'src="data:image/jpeg;base64,{data}"></section><footer>Made by mereo: {words}.</footer></main></body>'
         "</html>\n"
     ).encode("utf-8", errors="replace")
-    with atomic_file(path) as partial:
-        partial.write_bytes(page)
+    write_file(path, page)
 
 
 def _segments(per_segment: Mapping[str, float], colors: Sequence[Color]) -> str:

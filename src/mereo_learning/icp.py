@@ -26,9 +26,9 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from mereo.geometry.downsampling import first_in_cell
-from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.mesh import SegmentedMesh, area_vectors
 from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
+from mereo.geometry.transforms import Points, Transform, Vector, inverse_rigid, rigid, transform_points, unit_rows
 
 # --- the visible surface ----------------------------------------------------------------------------------------------
 
@@ -68,13 +68,12 @@ def moved(mesh: SegmentedMesh, poses: Poses) -> SegmentedMesh:
     return mesh.with_vertices([transform_points(pose, segment.vertices) for pose, segment in pairs])
 
 
-def facing(placed: SegmentedMesh, viewpoint: Float[np.ndarray, "3"]) -> SegmentedMesh:
+def facing(placed: SegmentedMesh, viewpoint: Vector) -> SegmentedMesh:
     """Faces that are turned towards ``viewpoint``, or nearly."""
     segments = []
     for segment in placed.segments:
-        corners = segment.vertices[segment.faces]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        way = viewpoint - corners.mean(axis=1)
+        normal = area_vectors(segment.vertices, segment.faces)
+        way = viewpoint - segment.vertices[segment.faces].mean(axis=1)
         size = np.linalg.norm(normal, axis=1) * np.linalg.norm(way, axis=1)
         is_facing = np.einsum("ij,ij->i", normal, way) > -0.1 * size  # below 0, as the pose is not right yet
         segments.append(replace(segment, faces=segment.faces[is_facing]))
@@ -84,8 +83,7 @@ def facing(placed: SegmentedMesh, viewpoint: Float[np.ndarray, "3"]) -> Segmente
 def face_areas(mesh: SegmentedMesh) -> Float[np.ndarray, " f"]:
     """Areas of all faces, segment by segment."""
     vertices, faces, _ = mesh.merged()
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    return np.linalg.norm(area_vectors(vertices, faces), axis=1) / 2
 
 
 def sample_surface(
@@ -104,9 +102,9 @@ def sample_surface(
     along, across = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     places = a * (1 - along) + b * along * (1 - across) + c * along * across
-    first = (b - a) / np.linalg.norm(b - a, axis=1, keepdims=True)
+    first = unit_rows(b - a)
     normal = np.cross(first, c - a)
-    second = np.cross(normal / np.linalg.norm(normal, axis=1, keepdims=True), first)
+    second = np.cross(unit_rows(normal), first)
     angle = np.linspace(0, 2 * np.pi, CLUSTER, endpoint=False)[:, None]
     ring = np.cos(angle) * first[:, None] + np.sin(angle) * second[:, None]
     return places[:, None] + 1e-3 * np.sqrt(areas.sum() / count) * ring
@@ -158,12 +156,12 @@ class Scan:
     """
 
     points: Float[np.ndarray, "p 3"]
-    viewpoint: Float[np.ndarray, "3"]
+    viewpoint: Vector
     size: float
     area: float
 
     @classmethod
-    def of(cls, points: Float[np.ndarray, "n 3"], viewpoint: Float[np.ndarray, "3"], size: float) -> "Scan":
+    def of(cls, points: Points, viewpoint: Vector, size: float) -> "Scan":
         """Scan of an object of diagonal ``size``, thinned.
 
         Raises ``ValueError`` where fewer than ``LEAST_POINTS`` points are left.
@@ -265,7 +263,7 @@ def register(
 
 def icp(
     points: Float[np.ndarray, "p 3"], surface: SegmentedMesh, limit: float, area: float, hold: bool
-) -> tuple[Float[np.ndarray, "4 4"], int]:
+) -> tuple[Transform, int]:
     """Rigid motion of ``surface`` onto ``points``, in their frame, and the number of directions in which it is held.
 
     Args:
@@ -302,9 +300,7 @@ def icp(
     return rigid(rotation, center - rotation @ center + radius * motion[:3, 3]), held
 
 
-def constrained(
-    motion: Float[np.ndarray, "4 4"], curvature: Float[np.ndarray, "6 6"]
-) -> tuple[Float[np.ndarray, "4 4"], int]:
+def constrained(motion: Transform, curvature: Float[np.ndarray, "6 6"]) -> tuple[Transform, int]:
     """Motion without its part along directions (turns, then shifts) curved less than ``LOOSE``, and their number."""
     values, directions = np.linalg.eigh(curvature)
     firm = directions[:, values >= LOOSE]

@@ -26,7 +26,8 @@ import numpy as np
 import torch
 
 from mereo.geometry.metrics import format_score
-from mereo.io.atomic_files import MARKER, atomic_file, check_place, scratch_folder, write_json
+from mereo.geometry.transforms import longest_side
+from mereo.io.atomic_files import MARKER, check_place, scratch_folder, write_file, write_json
 from mereo.io.config import CONFIG
 from mereo.io.errors import words_of
 from mereo.io.object_storage import claim
@@ -368,8 +369,7 @@ def _calibrated(weights: Path, output: Path, scene: str, left_s: float) -> float
     views = min(max(views_for(CALIBRATION_SHARE * left_s, each_s), LEAST_VIEWS), VIEWS)
     # other things than the object would take as long again, and only place the second limit of recognition
     calibration = calibrate(load_model(weights), scene, views=views, quiet=False)
-    with atomic_file(output / WEIGHTS) as scratch:
-        scratch.write_bytes(with_calibration(weights, calibration))
+    write_file(output / WEIGHTS, with_calibration(weights, calibration))
     return each_s
 
 
@@ -752,5 +752,5 @@ def write_example_frame(scene: Scene, path: Path) -> str:
     points = view.depth.to_points().points * (scene.unit_m or 1.0)
     unit = "scene units" if scene.unit_m is None else "metres"
     write_positions_ply(path, points, comment=f"unit: {unit}")
-    longest = float(np.ptp(points, axis=0).max())
+    longest = longest_side(points)
     return f"a test view of {len(points)} points in {unit}; what is seen is {longest:.3g} {unit} long"

@@ -20,7 +20,7 @@ from mereo.geometry.conventions import LARGEST, CloudAxes
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import fit_rigid, inverse_rigid, rigid, transform_points
+from mereo.geometry.transforms import Points, Transform, Vector, fit_rigid, inverse_rigid, rigid, transform_points
 from mereo.io.errors import readable
 from mereo.models.trained import Trained
 from mereo.scenes.rest_pose import rest_frame
@@ -74,7 +74,7 @@ class PlacedSegment:
     """
 
     name: str
-    T_scan_segment: Float[np.ndarray, "4 4"]
+    T_scan_segment: Transform
     placed_by: str
     points: int
     median: float
@@ -107,14 +107,14 @@ class Placement:
     explained: float
 
 
-def scale_of(pose: Float[np.ndarray, "4 4"]) -> float:
+def scale_of(pose: Transform) -> float:
     """Scale of a similarity: scan units per scene unit; negative for a reflection."""
     return float(np.cbrt(np.linalg.det(pose[:3, :3])))
 
 
 def place(
     rest: SegmentedMesh,
-    points: Float[np.ndarray, "n 3"],
+    points: Points,
     start: Start,
     frame: CloudAxes = "camera",
     *,
@@ -187,7 +187,7 @@ def _check(rest: SegmentedMesh, before: Poses, result: Registration, scan: Scan,
             )
 
 
-def _shift(before: Float[np.ndarray, "4 4"], after: Float[np.ndarray, "4 4"], point: Float[np.ndarray, "3"]) -> float:
+def _shift(before: Transform, after: Transform, point: Vector) -> float:
     return float(np.linalg.norm(transform_points(after, point) - transform_points(before, point)))
 
 
@@ -202,7 +202,7 @@ def neighbour(rest: SegmentedMesh, index: int, seen: Bool[np.ndarray, " s"], cou
 def _measured(
     rest: SegmentedMesh,
     shown: SegmentedMesh,
-    points: Float[np.ndarray, "n 3"],
+    points: Points,
     scan: Scan,
     start: Start,
     result: Registration,
@@ -293,7 +293,7 @@ def read_start(path: str | Path, rest: SegmentedMesh, scale: float | None = None
     )
 
 
-def _pose(entry: Any, of: str, rest: SegmentedMesh, scale: float | None) -> Float[np.ndarray, "4 4"]:
+def _pose(entry: Any, of: str, rest: SegmentedMesh, scale: float | None) -> Transform:
     """Pose by an entry: of pairs, or a matrix, which must be a similarity without reflection, of the known scale."""
     if isinstance(entry, dict):
         if set(entry) != {"model", "scan"}:
@@ -339,12 +339,12 @@ def _numbers(value: Any, shape: tuple[int, int], what: str) -> np.ndarray:
 
 
 def pose_of_pairs(
-    model: Float[np.ndarray, "n 3"],
+    model: Points,
     scan: Float[np.ndarray, "m 3"],
     of: str,
     scale: float | None,
     tolerance: float,
-) -> Float[np.ndarray, "4 4"]:
+) -> Transform:
     """Similarity of known scale that takes points of the model to those of the scan best (Kabsch, 1976).
 
     Args:
@@ -389,14 +389,14 @@ def pose_of_pairs(
     return rigid(scale * rotation, scan.mean(axis=0) - scale * rotation @ model.mean(axis=0))
 
 
-def misfit(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> float:
+def misfit(source: Points, target: Points) -> float:
     """RMS distance of pairs of points after the best rigid motion."""
     moved = transform_points(fit_rigid(source, target), source)
     return float(np.sqrt(np.mean(np.sum((target - moved) ** 2, axis=1))))
 
 
 def start_from_model(
-    model: Trained, points: Float[np.ndarray, "n 3"], frame: CloudAxes, rest: SegmentedMesh, scale: float | None
+    model: Trained, points: Points, frame: CloudAxes, rest: SegmentedMesh, scale: float | None
 ) -> Start:
     """Rough poses from a trained network: where it believes the seen points were at rest, fitted segment by segment.
 

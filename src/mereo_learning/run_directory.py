@@ -13,7 +13,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
-from mereo.io.atomic_files import atomic_file
+from mereo.io.atomic_files import write_file
 from mereo.io.errors import reason
 from mereo.io.object_storage import claim
 from mereo.models.config import NetworkConfig
@@ -266,8 +266,7 @@ def save_checkpoint(run_dir: Path, checkpoint: Checkpoint) -> None:
         tensors |= {f"{prefix}/{name}": value.contiguous() for name, value in module.state_dict().items()}
     for index, state in checkpoint.optimizer.state_dict()["state"].items():
         tensors |= {f"optimizer/{index}/{name}": value.contiguous() for name, value in state.items()}
-    with atomic_file(run_dir / CHECKPOINT) as partial:
-        partial.write_bytes(save(tensors, metadata={"step": str(checkpoint.step)}))
+    write_file(run_dir / CHECKPOINT, save(tensors, metadata={"step": str(checkpoint.step)}))
 
 
 def load_checkpoint(run_dir: Path, checkpoint: Checkpoint, process: Process | None = None) -> int | None:

@@ -14,12 +14,11 @@ from types import MappingProxyType
 from typing import Any, get_args
 
 import numpy as np
-from jaxtyping import Float
 
 from mereo.geometry.camera import PointCloud, into_camera
 from mereo.geometry.conventions import LARGEST, UNITS_M, CloudAxes
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.transforms import transform_points
+from mereo.geometry.transforms import Transform, transform_points
 from mereo.io.atomic_files import write_json
 from mereo.io.errors import readable
 from mereo.io.readers import read_point_cloud
@@ -30,13 +29,13 @@ from mereo_learning.placement import Placement
 from mereo_objects import assets
 
 
-def _pose(*rows: tuple[float, ...]) -> Float[np.ndarray, "4 4"]:
+def _pose(*rows: tuple[float, ...]) -> Transform:
     pose = np.array([*rows, (0.0, 0.0, 0.0, 1.0)])
     pose.setflags(write=False)
     return pose
 
 
-BUNNY_SCAN_POSES: Mapping[str, Float[np.ndarray, "4 4"]] = MappingProxyType(
+BUNNY_SCAN_POSES: Mapping[str, Transform] = MappingProxyType(
     {
         "bun000": _pose((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)),
         "bun090": _pose(
@@ -67,7 +66,7 @@ SCANS = tuple(BUNNY_SCAN_POSES)
 """Names of the bunny's scans."""
 
 
-def bunny_scan(name: str) -> tuple[PointCloud, Float[np.ndarray, "4 4"]]:
+def bunny_scan(name: str) -> tuple[PointCloud, Transform]:
     """Real scan of the bunny in its scanner frame, metres, and ``T_model_scan`` into the frame of bunny.off.
 
     Raises ``ValueError`` for an unknown name and ``AssetUnavailable`` where the scan cannot be had.
@@ -110,7 +109,7 @@ class PosedScan:
     frame: CloudAxes
     scene_unit: float | None = None
 
-    def in_camera(self) -> tuple[PointCloud, SegmentedMesh, Float[np.ndarray, "4 4"]]:
+    def in_camera(self) -> tuple[PointCloud, SegmentedMesh, Transform]:
         """Scan and truth in a camera frame, in the scan's unit, and ``T_camera_scan``."""
         T_camera_scan = into_camera(self.cloud.points, self.frame)
         cloud = PointCloud(transform_points(T_camera_scan, self.cloud.points))
@@ -124,7 +123,7 @@ def bunny_posed(name: str) -> PosedScan:
     return PosedScan(name, bunny_scan(name)[0], bunny_truth(name), "scanner", 1 / model_to_scene()[1])
 
 
-def scan_in_camera(name: str) -> tuple[PointCloud, SegmentedMesh, Float[np.ndarray, "4 4"]]:
+def scan_in_camera(name: str) -> tuple[PointCloud, SegmentedMesh, Transform]:
     """Real scan of the bunny and its truth in a camera frame, metres, and ``T_camera_scan``."""
     return bunny_posed(name).in_camera()
 

@@ -38,6 +38,7 @@ import numpy as np
 from jaxtyping import Float, Float16
 from pydantic import BaseModel, Field, ValidationError
 
+from mereo.geometry.transforms import Points
 from mereo.io.atomic_files import check_place
 from mereo.io.checked_tensors import check_tensors, pack_tensors, read_content, unpack_tensors
 from mereo.io.errors import first_problem, reason
@@ -448,5 +449,5 @@ def pack(example: Example, points: int) -> dict[str, np.ndarray]:
     }
 
 
-def _filled(cloud: Float[np.ndarray, "n 3"], points: int) -> Float[np.ndarray, "p 3"]:
+def _filled(cloud: Points, points: int) -> Float[np.ndarray, "p 3"]:
     return cloud[np.arange(points) % len(cloud)]

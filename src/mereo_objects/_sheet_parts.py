@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import Delaunay, cKDTree
 
 from mereo.deformation.maps import smooth_step
-from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, with_used_vertices
 from mereo.geometry.read_only import read_only
 
 LENGTH, WIDTH = 52.0, 38.0
@@ -198,5 +198,4 @@ def _thickened(
         upwards, np.stack([start, end + points, end], 1), np.stack([start + points, end + points, end], 1)
     )
     faces = np.concatenate([triangles, triangles[:, ::-1] + points, first, second])
-    used, renumbered = np.unique(faces, return_inverse=True)
-    return Segment(name, color, vertices[used], renumbered.reshape(faces.shape))
+    return Segment(name, color, *with_used_vertices(vertices, faces))

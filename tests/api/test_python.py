@@ -3,7 +3,6 @@
 import base64
 import inspect
 import io
-import json
 import re
 import sys
 from collections.abc import Callable
@@ -19,6 +18,8 @@ import torch
 from analytic import untrained
 from angle import write_angle
 from answers import answer_to
+from folder_contents import read_json
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from toy_frames import CENTERS, MODEL, NAMES, RADII, seen
 from toy_scene import toy_scene
@@ -229,7 +230,7 @@ def contents(folder: Path) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for path in sorted(folder.rglob("*")):
         if path.name == "summary.json":
-            facts = json.loads(path.read_text())
+            facts = read_json(path)
             found[path.name] = {name: value for name, value in facts.items() if name not in ("timings_s", "weights")}
         elif path.name == "report.html":
             found[path.name] = re.sub(r'"timings_s": \{.*?\}|"weights": ".*?"', "", path.read_text())
@@ -324,7 +325,7 @@ def test_a_notebook_shows_pictures_and_figures(result: Result) -> None:
     assert "not found" in rows[2] and "volume, cm³" in page and "centre, mm" in page
     volume, _, place = re.findall(r"<td>(.*?)</td>", rows[0])
     assert float(volume) == pytest.approx(4 / 3 * np.pi * 6**3, rel=0.02)
-    np.testing.assert_allclose([float(value) for value in place.split()], [20, -30, 600], atol=2)
+    assert_allclose([float(value) for value in place.split()], [20, -30, 600], atol=2)
 
 
 def test_a_size_of_none_is_warned_of_at_the_call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -398,13 +399,13 @@ def test_meshes_deform_as_their_user_says(way: Way, tmp_path: Path, monkeypatch:
     known = mereo.load_object(files, units="mm", deformations=way)
     assert known.scene is not None
     ours, theirs = (each.sample_state(example_rng(0, 7)).mesh.merged()[0] for each in (known.scene, scene))
-    np.testing.assert_array_equal(ours, theirs)
+    assert_array_equal(ours, theirs)
     moved = np.abs(ours - known.scene.rest.merged()[0]).max()
     assert moved == 0 if way == "rigid" else moved > 0
     command = ReconstructCommand((), object=tuple(map(str, files)), units="mm", deformations=way)
     loaded = FrameJob(command).object.scene
     assert loaded is not None
-    np.testing.assert_array_equal(loaded.sample_state(example_rng(0, 7)).mesh.merged()[0], theirs)
+    assert_array_equal(loaded.sample_state(example_rng(0, 7)).mesh.merged()[0], theirs)
 
 
 def test_a_part_alone_has_no_joints(tmp_path: Path) -> None:
@@ -413,7 +414,7 @@ def test_a_part_alone_has_no_joints(tmp_path: Path) -> None:
 
 
 def test_a_page_stays_open_where_somebody_goes_on(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     page = OpenPage(server := MagicMock(**{"get_port.return_value": 1234}))
     monkeypatch.setattr("mereo_viewer.server.threading", MagicMock())
@@ -454,7 +455,7 @@ def test_segments_are_had_by_their_names(result: Result) -> None:
     assert result.names == NAMES and len(result) == 3
     for name, center, radius in zip(NAMES, CENTERS, RADII, strict=False):
         found = result[name]
-        np.testing.assert_allclose(found.centroid, center, atol=0.003)
+        assert_allclose(found.centroid, center, atol=0.003)
         assert found.volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.05)
         assert found.name == name and found.label == NAMES.index(name) + 1 and found.is_present
         assert 0.5 < found.confidence <= 1 and found.error_radius is None and found.pose is None
@@ -490,7 +491,7 @@ def test_the_pose_brings_the_objects_files_to_the_frame(
     registered = result.registered
     assert registered is not None and result.pose is not None and result.unit_m == unit
     assert result.model_scale == pytest.approx(SCALE * UNIT_M / unit, rel=0.1)
-    np.testing.assert_allclose(result.pose[:3, :3] @ result.pose[:3, :3].T, np.eye(3), atol=1e-9)
+    assert_allclose(result.pose[:3, :3] @ result.pose[:3, :3].T, np.eye(3), atol=1e-9)
     assert np.linalg.det(result.pose[:3, :3]) == pytest.approx(1.0)
     source = registered.model.source_frame
     assert source is not None
@@ -499,7 +500,7 @@ def test_the_pose_brings_the_objects_files_to_the_frame(
     away = np.linalg.norm(placed - registered.material, axis=1)
     length = float(np.ptp(registered.material, axis=0).max())
     assert np.median(away) < 0.5 * length, "rigidly placed, a bent rope lies about where it is"
-    np.testing.assert_allclose(placed.mean(axis=0), registered.material.mean(axis=0), atol=1e-6 * length)
+    assert_allclose(placed.mean(axis=0), registered.material.mean(axis=0), atol=1e-6 * length)
 
 
 def test_each_segment_has_its_own_pose_and_radius(rope: Model, registrar: Registrar) -> None:
@@ -529,14 +530,11 @@ def test_a_unit_that_nobody_states_is_found_by_the_true_size(rope: Model, regist
     assert free.registered is not None and free.model_scale == free.registered.scene_unit
 
 
-def test_without_a_name_it_is_saved_beside_the_last(
-    result: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_without_a_name_it_is_saved_beside_the_last(result: Result, working_folder: Path) -> None:
     assert [result.save(formats=("json",)) for _ in range(3)] == [Path("result"), Path("result2"), Path("result3")]
-    assert {path.name for path in tmp_path.iterdir()} == {"result", "result2", "result3"}
-    (tmp_path / "result2").rename(tmp_path / "other")
-    (tmp_path / "result2").symlink_to(tmp_path / "nowhere")
+    assert {path.name for path in working_folder.iterdir()} == {"result", "result2", "result3"}
+    (working_folder / "result2").rename(working_folder / "other")
+    (working_folder / "result2").symlink_to(working_folder / "nowhere")
     assert result.save(formats=("json",)) == Path("result4"), "a link that leads nowhere is somebody's"
 
 
@@ -562,9 +560,9 @@ def test_evaluate_scores_with_and_without_a_folder(tmp_path: Path) -> None:
     written = mereo.evaluate(
         model, scene=load_scene("rope"), output=tmp_path / "out", examples=1, cells=8, method="network"
     )
-    np.testing.assert_array_equal(alone.confusion, written.confusion)
+    assert_array_equal(alone.confusion, written.confusion)
     assert len(alone.seconds) == 1
-    assert json.loads((tmp_path / "out/metrics.json").read_text())["scene"] == "rope"
+    assert read_json(tmp_path / "out/metrics.json")["scene"] == "rope"
     with pytest.raises(ValueError, match="scans are real and take no simulated camera"):
         mereo.evaluate(model, scans=(), settings=GenerateConfig(image_size=48))
 
@@ -631,7 +629,7 @@ def test_an_error_is_told_in_the_words_of_who_asks() -> None:
     assert system.value.errno == 2 and system.value.strerror == "--force"
 
 
-def test_one_frame_is_refused_in_two_languages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_frame_is_refused_in_two_languages(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """The command's words are options, also after somebody has asked in Python."""
     cloud = seen()
     cloud[3] = np.nan

@@ -23,6 +23,7 @@ import torch
 import trimesh
 from answers import answer_to
 from memory_frames import Tensor, TensorMap, Vectors
+from numpy.testing import assert_allclose, assert_equal
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -102,7 +103,7 @@ def test_every_depth_image_with_every_camera_is_one_frame(line: str, tmp_path: P
     for source in (depth, file):
         frame = mereo.load_frame(source, intrinsics=intrinsics)
         assert frame.whole is not None and frame.whole.camera == IMAGE.camera
-        np.testing.assert_allclose(frame.cloud.points, IMAGE.to_points().points, rtol=1e-6)
+        assert_allclose(frame.cloud.points, IMAGE.to_points().points, rtol=1e-6)
 
 
 # --- what goes in: clouds with more columns ---------------------------------------------------------------------------
@@ -114,7 +115,7 @@ def test_columns_behind_positions_are_normals_or_colours() -> None:
     points = seen()
     oriented = np.hstack([points, NORMALS])
     cloud = mereo.load_frame(oriented.reshape(30, 40, 6)).cloud
-    np.testing.assert_allclose(np.hstack([cloud.points, cloud.normals]), oriented)
+    assert_allclose(np.hstack([cloud.points, cloud.normals]), oriented)
     for colors in (np.abs(NORMALS), 255 * (NORMALS > 0)):
         with pytest.warns(InputWarning, match="^the last three columns of the ndarray .* are colours, which are lef"):
             cloud = mereo.load_frame(np.hstack([points, colors])).cloud
@@ -186,7 +187,7 @@ def test_every_kind_of_meshes_is_one_object(line: str, boxes: mereo.Object) -> N
     known = mereo.load_object(MESHES[line], units="mm", deformations="rigid")
     assert known.names == ("left", "right") and known.scene is not None and known.scene.file is None
     assert known.model is not None and boxes.model is not None
-    np.testing.assert_allclose(known.model.rest_points, boxes.model.rest_points, rtol=1e-6)
+    assert_allclose(known.model.rest_points, boxes.model.rest_points, rtol=1e-6)
 
 
 def test_one_mesh_is_an_object_too(boxes: mereo.Object) -> None:
@@ -272,7 +273,7 @@ def test_the_covariance_is_that_of_the_pose_under_the_posterior(kind: str, resul
         expected += np.outer(change, change)
     expected[range(3, 6), range(3, 6)] += (unit * sure.extra_radius) ** 2 / chi2.ppf(0.95, 3)  # as of every position
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-    np.testing.assert_allclose(results[kind].covariance / scale, expected / scale, atol=1e-4)
+    assert_allclose(results[kind].covariance / scale, expected / scale, atol=1e-4)
 
 
 FACTS = ("unit_m", "known", "explained", "residual", "model_scale", "pose", "covariance", "joints", "names")
@@ -285,9 +286,9 @@ def same(stored: Any, result: Any) -> None:
     assert {**stored.to_dict(), "timings_s": 0} == {**result.to_dict(), "timings_s": 0}
     for names, pairs in ((FACTS, [(stored, result)]), (SEGMENT, zip(stored, result, strict=True))):
         for one, other in pairs:
-            np.testing.assert_equal(*({name: getattr(each, name) for name in names} for each in (one, other)))
+            assert_equal(*({name: getattr(each, name) for name in names} for each in (one, other)))
     for one, other in zip(stored, result, strict=True):
-        np.testing.assert_allclose(one.mesh.bounds, other.mesh.bounds, rtol=1e-5)
+        assert_allclose(one.mesh.bounds, other.mesh.bounds, rtol=1e-5)
     assert not result or np.array_equal(stored.labels.labels, result.labels.labels)
 
 
@@ -336,7 +337,7 @@ def test_a_lost_object_says_so_in_every_form(results: dict[str, Any]) -> None:
 @pytest.mark.parametrize("kind", ANSWERED)
 def test_a_result_in_a_robots_frame_is_the_same_there(kind: str, results: dict[str, Any]) -> None:
     result, moved = results[kind], results[kind].transformed(T_BASE)
-    near = partial(np.testing.assert_allclose, atol=1e-9 * np.ptp(result.surfaces.merged()[0]), rtol=1e-9)
+    near = partial(assert_allclose, atol=1e-9 * np.ptp(result.surfaces.merged()[0]), rtol=1e-9)
     place, facts, labels = partial(transform_points, T_BASE), moved.to_dict(), moved.labels
     near(moved.surfaces.merged()[0], place(result.surfaces.merged()[0]))
     near(moved.transformed(facts["T_input_result"]).surfaces.bounds, result.surfaces.bounds)

@@ -1,6 +1,5 @@
 """An object without weights needs no torch, and what does need it says how to get it: the pages run as printed."""
 
-import json
 import os
 import re
 import shlex
@@ -13,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from angle import write_angle
+from folder_contents import read_json
 from page_blocks import FENCE, ROOT, blocks
 
 from mereo.scenes.files.object_files import scene_of_meshes
@@ -228,7 +228,7 @@ def test_every_block_of_a_page_runs_as_printed(page: str, clone: Path, monkeypat
 
 @pytest.mark.slow
 def test_the_tour_needs_torch_only_where_it_says_so(tmp_path: Path) -> None:
-    cells = json.loads((ROOT / "docs/tour.ipynb").read_text("utf-8"))["cells"]
+    cells = read_json(ROOT / "docs/tour.ipynb")["cells"]
     sources = ["".join(cell["source"]) for cell in cells]
     (first,) = [n for n, source in enumerate(sources) if "pip install 'mereo[network]'" in source]
     code = [source for cell, source in zip(cells[:first], sources, strict=False) if cell["cell_type"] == "code"]

@@ -52,7 +52,7 @@ def test_help_loads_no_heavy_library_and_few_modules(command: str) -> None:
 
 
 @pytest.mark.parametrize("option", ["-V", "--version"])
-def test_version(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_version(option: str, capsys: pytest.CaptureFixture) -> None:
     assert command_line.main([option]) == 0
     assert capsys.readouterr().out == f"mereo {version('mereo')}\n"
 
@@ -105,7 +105,7 @@ def test_without_standard_streams_a_command_does_its_work(streams: str, line: st
     ],
 )
 def test_arguments_that_mean_no_command_are_explained_in_a_box(
-    arguments: str, parts: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+    arguments: str, parts: tuple[str, ...], capsys: pytest.CaptureFixture
 ) -> None:
     with pytest.raises(SystemExit, match="^2$"):
         command_line.main(arguments.split())
@@ -134,8 +134,9 @@ CALLS = {
 
 
 @pytest.mark.parametrize("line", CALLS)
-def test_command_calls_the_library_with_its_options(line: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_command_calls_the_library_with_its_options(
+    line: str, monkeypatch: pytest.MonkeyPatch, working_folder: Path
+) -> None:
     place, expected = CALLS[line]
     module, _, function = place.rpartition(".")
     library, calls = import_module(module), list[dict[str, object]]()
@@ -151,7 +152,7 @@ def test_command_calls_the_library_with_its_options(line: str, monkeypatch: pyte
 
 
 def test_report_names_versions_device_threads_and_what_is_missing(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     version = doctor._version
     monkeypatch.setattr(doctor, "_version", lambda name: None if name == "tensorboard" else version(name))
@@ -242,7 +243,7 @@ def test_every_option_is_explained(command: str) -> None:
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh"])
-def test_completion_prints_as_documented(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_completion_prints_as_documented(shell: str, capsys: pytest.CaptureFixture) -> None:
     assert f"mereo --tyro-print-completion {shell}" in QUICKSTART.read_text("utf-8")
     with pytest.raises(SystemExit) as end:
         command_line.main(["--tyro-print-completion", shell])

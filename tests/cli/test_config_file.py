@@ -102,7 +102,7 @@ def test_a_runs_own_settings_are_such_a_file(tmp_path: Path) -> None:
     ],
 )
 def test_what_is_wrong_with_a_file_is_one_sentence(
-    content: Any, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    content: Any, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     path, out = str(written(tmp_path, content)), tmp_path / "out"
     assert command_line.main(["reconstruct", "a", "--weights", "w", "--output", str(out), "--config", path]) == 2
@@ -110,13 +110,13 @@ def test_what_is_wrong_with_a_file_is_one_sentence(
     assert sentence in said and said.count("\n") == 1 and not out.exists(), said
 
 
-def test_a_file_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert command_line.main(["learn", "a.stl", "--output", "out", "--config", str(tmp_path / "no.json")]) == 2
     assert "no.json does not exist; --config takes a file of options" in capsys.readouterr().err
 
 
 def test_a_result_is_made_again_from_its_own_options(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     monkeypatch.setattr("mereo.models.weights.load_for", lambda *_: scene("camera")[1])
     monkeypatch.chdir(tmp_path)
@@ -150,7 +150,7 @@ def mereo(*arguments: str) -> int:
     return command_line.main([*arguments, "--resolution", "12", "--formats", "glb"])
 
 
-def test_one_frame_is_one_object_and_the_rest_goes_elsewhere(here: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_one_frame_is_one_object_and_the_rest_goes_elsewhere(here: Path, capfd: pytest.CaptureFixture) -> None:
     assert mereo("reconstruct", "rope.npy", "--weights", "rope", "--method", "network", "--json") == 4
     out, err = capfd.readouterr()
     found = json.loads(out)
@@ -161,7 +161,7 @@ def test_one_frame_is_one_object_and_the_rest_goes_elsewhere(here: Path, capfd: 
 
 
 def test_what_is_not_the_object_has_a_status_of_its_own_and_a_failure_outweighs_it(
-    here: Path, capfd: pytest.CaptureFixture[str]
+    here: Path, capfd: pytest.CaptureFixture
 ) -> None:
     asked = ("--weights", PLIERS, "--method", "modes", "--json", "--output")
     assert mereo("reconstruct", "plane.npy", *asked, "one") == 3
@@ -179,9 +179,7 @@ def test_what_is_not_the_object_has_a_status_of_its_own_and_a_failure_outweighs_
     assert out == "" and "text.npy" in err
 
 
-def test_a_stage_is_shown_once_it_takes_long(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_stage_is_shown_once_it_takes_long(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture) -> None:
     monkeypatch.setattr(progress, "STAGE_S", 0.05)
     with progress.stage("nobody asks"):
         time.sleep(0.2)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.random import Generator, default_rng
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
@@ -38,22 +39,22 @@ REACH = HALF * 3**0.5
 BOX = np.array([[-HALF] * 3, [HALF] * 3])
 
 
-def direction(rng: np.random.Generator) -> np.ndarray:
+def direction(rng: Generator) -> np.ndarray:
     vector = rng.normal(size=3)
     return vector / np.linalg.norm(vector)
 
 
-def make_bend(rng: np.random.Generator) -> Deformation:
+def make_bend(rng: Generator) -> Deformation:
     length = rng.uniform(5.0, 25.0)
     return Bend(np.zeros(3), direction(rng), direction(rng), length, rng.uniform(-0.9, 0.9) * length / REACH, REACH)
 
 
-def make_window(rng: np.random.Generator) -> Deformation:
+def make_window(rng: Generator) -> Deformation:
     inner = Rigid(rng.uniform(-0.4, 0.4, 3), rng.uniform(-0.8, 0.8, 3), np.zeros(3))
     return Localized(inner, np.zeros(3), 2.0, 9.0)
 
 
-def make_sweep(rng: np.random.Generator) -> Deformation:
+def make_sweep(rng: Generator) -> Deformation:
     """A slice of a helix of curvature 0.9 / REACH at most, so that the whole cube stays within its reach."""
     nodes = np.linspace(-HALF, HALF, 81)
     radius, rise = REACH / 0.9, rng.uniform(0.0, 20.0)
@@ -63,7 +64,7 @@ def make_sweep(rng: np.random.Generator) -> Deformation:
     )
 
 
-MAKERS: dict[str, Callable[[np.random.Generator], Deformation]] = {
+MAKERS: dict[str, Callable[[Generator], Deformation]] = {
     "identity": lambda rng: Identity(),
     "rigid": lambda rng: Rigid(rng.uniform(-2, 2, 3), rng.uniform(-5, 5, 3), rng.uniform(-5, 5, 3)),
     "bend": make_bend,
@@ -78,7 +79,7 @@ MAKERS: dict[str, Callable[[np.random.Generator], Deformation]] = {
 }
 
 
-def cube(rng: np.random.Generator, count: int = 300) -> np.ndarray:
+def cube(rng: Generator, count: int = 300) -> np.ndarray:
     return rng.uniform(*BOX, size=(count, 3))
 
 
@@ -86,7 +87,7 @@ def cube(rng: np.random.Generator, count: int = 300) -> np.ndarray:
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_jacobian_is_positive(name: str, seed: int) -> None:
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     deformation = MAKERS[name](rng)
     assert isinstance(deformation, Deformation)
     assert jacobian_determinant(deformation, cube(rng)).min() > 0
@@ -94,7 +95,7 @@ def test_jacobian_is_positive(name: str, seed: int) -> None:
 
 @pytest.mark.parametrize("name", MAKERS)
 def test_points_move_independently_of_each_other(name: str) -> None:
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     deformation, points = MAKERS[name](rng), cube(rng)
     before = points.copy()
     together = deformation(points)
@@ -105,7 +106,7 @@ def test_points_move_independently_of_each_other(name: str) -> None:
 
 @pytest.mark.parametrize("name", MAKERS)
 def test_inverse_of_the_image_is_the_point(name: str) -> None:
-    rng = np.random.default_rng(2)
+    rng = default_rng(2)
     for _ in range(5):
         deformation, points = MAKERS[name](rng), cube(rng)
         guess = points + rng.normal(scale=0.3, size=points.shape)
@@ -133,13 +134,13 @@ def test_what_cannot_be_reached_is_reported() -> None:
 def test_jacobian_of_a_linear_map_is_its_matrix_at_any_scale() -> None:
     matrix = np.array([[1.0, 0.2, 0.0], [-0.3, 2.0, 0.1], [0.0, 0.5, 0.7]])
     for scale in (1e-3, 1.0, 1e4):
-        points = np.random.default_rng(0).normal(scale=scale, size=(50, 3))
+        points = default_rng(0).normal(scale=scale, size=(50, 3))
         value, found = jacobian(lambda p: p @ matrix.T, points)
         assert np.allclose(value, points @ matrix.T, rtol=1e-12, atol=0) and np.allclose(found, matrix, atol=1e-7)
 
 
 def test_composition_applies_the_first_part_first() -> None:
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     turn, twist, points = MAKERS["rigid"](rng), MAKERS["twist"](rng), cube(rng)
     assert np.array_equal(Compose((turn, twist))(points), twist(turn(points)))
     assert np.abs(Compose((turn, twist))(points) - Compose((twist, turn))(points)).max() > 0.1
@@ -154,7 +155,7 @@ def test_bend_preserves_arc_length_and_has_the_closed_form_jacobian() -> None:
     axis = np.linspace(-5, 20, 4001)[:, None] * np.array([0, 0, 1.0])
     steps = np.linalg.norm(np.diff(bend(axis), axis=0), axis=1)
     assert np.isclose(steps.sum(), 25.0, rtol=1e-6)
-    points = np.random.default_rng(5).uniform([-7, -7, 0.1], [7, 7, 11.9], size=(500, 3))
+    points = default_rng(5).uniform([-7, -7, 0.1], [7, 7, 11.9], size=(500, 3))
     assert np.allclose(jacobian_determinant(bend, points), 1 - 1.5 / 12 * points[:, 0], atol=1e-4)
 
 
@@ -172,7 +173,7 @@ def test_bend_is_a_circle_between_rigid_ends() -> None:
 
 
 def test_twist_and_squash_preserve_volume_and_taper_scales_by_the_square() -> None:
-    rng = np.random.default_rng(6)
+    rng = default_rng(6)
     points = cube(rng)
     for make in (MAKERS["twist"], MAKERS["squash"]):
         assert np.allclose(jacobian_determinant(make(rng), points), 1.0, atol=1e-4)
@@ -185,7 +186,7 @@ def test_twist_and_squash_preserve_volume_and_taper_scales_by_the_square() -> No
 @given(seed=st.integers(0, 2**32 - 1), strength=st.floats(0.05, 0.95))
 def test_smooth_field_changes_distances_within_its_bound(seed: int, strength: float) -> None:
     """The theorem behind the diffeomorphism: (1 - g) |x - y| <= |f(x) - f(y)| <= (1 + g) |x - y|."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     field = SmoothField.sample(rng, strength, (5.0, 30.0))
     assert np.isclose(field.gradient_bound, strength)
     x, y = cube(rng), cube(rng) * rng.choice([1e-2, 1.0])
@@ -194,7 +195,7 @@ def test_smooth_field_changes_distances_within_its_bound(seed: int, strength: fl
 
 
 def test_lattice_equals_the_sum_of_b_splines() -> None:
-    rng = np.random.default_rng(7)
+    rng = default_rng(7)
     lattice, points = MAKERS["lattice"](rng), cube(rng, 40) * 1.6
     at = (points - lattice.origin) / lattice.spacing
     basis = BSpline.basis_element(np.arange(-2.0, 3.0), extrapolate=False)
@@ -213,7 +214,7 @@ def test_lattice_at_its_limit_stays_positive_even_when_neighbours_oppose() -> No
     spacing, limit = np.full(3, 5.0), 5.0 / 2.4801
     grid = np.stack(np.meshgrid(-signs, -signs, -signs, indexing="ij"), axis=-1)
     lattice = FreeFormLattice(np.zeros(3), spacing, limit * grid)
-    points = np.random.default_rng(8).uniform(12.0, 23.0, size=(4000, 3))
+    points = default_rng(8).uniform(12.0, 23.0, size=(4000, 3))
     determinant = jacobian_determinant(lattice, points)
     assert 0 < determinant.min() < 0.1
     with pytest.raises(ValueError, match="must stay below 0.403"):
@@ -221,7 +222,7 @@ def test_lattice_at_its_limit_stays_positive_even_when_neighbours_oppose() -> No
 
 
 def test_window_is_its_inner_map_inside_and_nothing_outside() -> None:
-    rng = np.random.default_rng(9)
+    rng = default_rng(9)
     inner = Rigid(np.array([0.0, 0, 0.3]), np.array([0.5, 0, 0]), np.zeros(3))
     window, points = Localized(inner, np.ones(3), 3.0, 9.0), cube(rng, 4000)
     distance = np.linalg.norm(points - 1.0, axis=1)
@@ -233,7 +234,7 @@ def test_sweep_onto_a_circle_is_a_torus() -> None:
     angle = np.linspace(0, 1.5 * np.pi, 400)
     centers = 10.0 * np.stack([np.sin(angle), 1 - np.cos(angle), np.zeros_like(angle)], axis=1)
     sweep = CurveSweep.through(10.0 * angle, centers, np.array([0.0, 1, 0]), radius=4.0)
-    rng = np.random.default_rng(10)
+    rng = default_rng(10)
     x, y, z = rng.uniform([0, -4, -4], [15 * np.pi, 4, 4], size=(500, 3)).T
     t, ring = x / 10.0, 10.0 - y
     expected = np.stack([ring * np.sin(t), 10 - ring * np.cos(t), z], axis=1)

@@ -7,6 +7,8 @@ from functools import cache
 import numpy as np
 import pytest
 from lattice import fine, lattice
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
 from shapes import box
 
 from mereo.deformation.elastic import (
@@ -42,7 +44,7 @@ def solid(scale: float = 1.0) -> ElasticSolid:
 def partly_filled() -> ElasticSolid:
     """Tetrahedra of both orientations, each filled by another share."""
     mesh = lattice()
-    return ElasticSolid(mesh, np.random.default_rng(1).uniform(0.1, 1.0, size=len(mesh.elements)))
+    return ElasticSolid(mesh, default_rng(1).uniform(0.1, 1.0, size=len(mesh.elements)))
 
 
 @cache
@@ -59,17 +61,17 @@ def covariance(scale: float = 1.0, young: float = 1.0, power: float = 2.0) -> np
 def test_the_lattice_holds_the_mesh_and_its_volume() -> None:
     mesh, made = block(), solid()
     assert (made.mesh.locate(mesh.segments[0].vertices) >= 0).all()
-    np.testing.assert_allclose(made.volumes.sum(), mesh.segments[0].volume, rtol=0.05)
-    np.testing.assert_allclose(made.mass.sum(), made.volumes.sum(), rtol=1e-12)
-    np.testing.assert_allclose(np.abs(made.mesh.volumes), (5.0 / 8) ** 3 / 6, rtol=1e-9)
+    assert_allclose(made.volumes.sum(), mesh.segments[0].volume, rtol=0.05)
+    assert_allclose(made.mass.sum(), made.volumes.sum(), rtol=1e-12)
+    assert_allclose(np.abs(made.mesh.volumes), (5.0 / 8) ** 3 / 6, rtol=1e-9)
 
 
 def test_points_of_the_mesh_follow_affine_motions_of_the_nodes() -> None:
     points = np.concatenate([block().segments[0].vertices, solid().mesh.nodes])
-    np.testing.assert_allclose(solid().mesh.embed(points) @ solid().mesh.nodes, points, atol=1e-12)
+    assert_allclose(solid().mesh.embed(points) @ solid().mesh.nodes, points, atol=1e-12)
     outside = np.array([[-2.0, 0.4, 0.3], [9.0, 3.0, 1.0]])
     _, _, closest = solid().mesh.closest(outside)
-    np.testing.assert_allclose(solid().mesh.embed(outside) @ solid().mesh.nodes, closest, atol=1e-12)
+    assert_allclose(solid().mesh.embed(outside) @ solid().mesh.nodes, closest, atol=1e-12)
 
 
 @pytest.mark.parametrize("poisson", [-0.3, 0.0, 0.4])
@@ -101,12 +103,12 @@ def test_modes_are_sorted_orthonormal_in_the_mass_and_without_rigid_motion() -> 
     assert (np.diff(values) >= 0).all() and values[0] > 0
     mass = np.repeat(solid().mass, 3) / solid().mass.sum()
     flat = vectors.reshape(-1, COUNT)
-    np.testing.assert_allclose(flat.T @ (mass[:, None] * flat), np.eye(COUNT), atol=1e-6)
+    assert_allclose(flat.T @ (mass[:, None] * flat), np.eye(COUNT), atol=1e-6)
     turns = np.cross(np.eye(3)[:, None], solid().mesh.nodes - solid().mesh.nodes.mean(axis=0)).reshape(3, -1)
     rigid = np.concatenate([np.tile(np.eye(3), len(solid().mesh.nodes)), turns])
     assert np.abs(rigid @ (mass[:, None] * flat)).max() < 1e-6
     energy = np.einsum("ik,ik->k", flat, assemble_stiffness(solid(), Material()) @ flat) / solid().mass.sum()
-    np.testing.assert_allclose(energy, values, rtol=1e-6)
+    assert_allclose(energy, values, rtol=1e-6)
 
 
 @pytest.mark.parametrize("power", [1.0, 2.0])
@@ -116,23 +118,23 @@ def test_scaled_modes_move_the_solid_by_the_motion(power: float) -> None:
     share = solid().mass / solid().mass.sum()
     assert np.einsum("n,nik,nik->", share, scaled, scaled) == pytest.approx(0.09, rel=1e-6)
     size = np.sqrt(np.einsum("n,nik,nik->k", share, scaled, scaled))
-    np.testing.assert_allclose(size / size[0], (values / values[0]) ** (-power / 2), rtol=1e-6)
+    assert_allclose(size / size[0], (values / values[0]) ** (-power / 2), rtol=1e-6)
 
 
 def test_units_and_youngs_modulus_change_nothing() -> None:
     reference = covariance()
     size = np.abs(reference).max()
-    np.testing.assert_allclose(covariance(scale=1000.0) / 1e6, reference, atol=1e-6 * size)
-    np.testing.assert_allclose(covariance(young=3500.0), reference, atol=1e-6 * size)
-    np.testing.assert_allclose(modes(young=3500.0)[0], 3500 * modes()[0], rtol=1e-8)
+    assert_allclose(covariance(scale=1000.0) / 1e6, reference, atol=1e-6 * size)
+    assert_allclose(covariance(young=3500.0), reference, atol=1e-6 * size)
+    assert_allclose(modes(young=3500.0)[0], 3500 * modes()[0], rtol=1e-8)
 
 
 def test_no_coefficients_are_the_rest_and_small_ones_are_linear() -> None:
     scaled = scale_modes(*modes(), motion=1e-4)
     state = StateMap(solid(), scaled)
-    np.testing.assert_allclose(state(np.zeros(COUNT)).nodes, solid().mesh.nodes, atol=1e-7)
-    coefficients = np.random.default_rng(0).normal(size=COUNT)
-    np.testing.assert_allclose(state(coefficients).nodes, solid().mesh.nodes + scaled @ coefficients, atol=1e-6)
+    assert_allclose(state(np.zeros(COUNT)).nodes, solid().mesh.nodes, atol=1e-7)
+    coefficients = default_rng(0).normal(size=COUNT)
+    assert_allclose(state(coefficients).nodes, solid().mesh.nodes + scaled @ coefficients, atol=1e-6)
 
 
 def test_drawn_states_keep_their_volume_and_centre() -> None:
@@ -140,12 +142,12 @@ def test_drawn_states_keep_their_volume_and_centre() -> None:
     state, share = StateMap(body, scaled), body.volumes / body.volumes.sum()
     changes = []
     for seed in range(40):
-        coefficients = np.random.default_rng(seed).normal(size=COUNT)
+        coefficients = default_rng(seed).normal(size=COUNT)
         drawn, linear = state(coefficients).nodes, body.mesh.nodes + scaled @ coefficients
         ratios = body.mesh.volume_ratios(drawn)
         assert ratios.min() > 0.3
         changes.append([share @ ratios - 1, share @ body.mesh.volume_ratios(linear) - 1])
-        np.testing.assert_allclose(body.mass @ (drawn - body.mesh.nodes), 0, atol=1e-9)
+        assert_allclose(body.mass @ (drawn - body.mesh.nodes), 0, atol=1e-9)
     kept, grown = np.abs(changes).T
     assert kept.max() < 0.03 and np.median(kept) < 0.01
     assert np.median(grown) > 3 * np.median(kept) and grown.max() > 0.1
@@ -156,12 +158,12 @@ def test_no_drawn_state_folds_or_swells_however_large_the_motion() -> None:
     sampler = ElasticSampler(solid(), Material(), COUNT, 0.5 * 2.5)
     state, share, calmed = StateMap(solid(), sampler.modes), solid().volumes / solid().volumes.sum(), 0
     for seed in range(12):
-        drawn = sampler(np.random.default_rng(seed), no_surface)
+        drawn = sampler(default_rng(seed), no_surface)
         ratios = solid().mesh.volume_ratios(drawn.nodes)
         assert ratios.min() >= LEAST_RATIO and abs(share @ ratios - 1) <= MOST_SWELLING
-        again = pickle.loads(pickle.dumps(sampler))(np.random.default_rng(seed), no_surface)  # as another process draws
+        again = pickle.loads(pickle.dumps(sampler))(default_rng(seed), no_surface)  # as another process draws
         assert np.array_equal(drawn.nodes, again.nodes)
-        wild = state(np.random.default_rng(seed).normal(size=COUNT)).nodes
+        wild = state(default_rng(seed).normal(size=COUNT)).nodes
         calmed += not np.allclose(wild, drawn.nodes)
     assert calmed > 6
 
@@ -197,7 +199,7 @@ def test_what_is_held_does_not_move_and_nothing_is_rigid() -> None:
     assert (vectors[held] == 0).all() and (np.abs(vectors[~held]).max(axis=(1, 2)) > 0).all()
     assert (np.diff(values) >= 0).all() and values[0] > 0
     flat, mass = vectors.reshape(-1, COUNT), np.repeat(solid().mass, 3) / solid().mass.sum()
-    np.testing.assert_allclose(flat.T @ (mass[:, None] * flat), np.eye(COUNT), atol=1e-6)
+    assert_allclose(flat.T @ (mass[:, None] * flat), np.eye(COUNT), atol=1e-6)
     free = find_modes(solid(), COUNT, Material())[0]
     assert values[0] < free[0], "a cantilever is softer than a free bar"
     hinge = np.isclose(solid().mesh.nodes[:, [0, 2]], solid().mesh.nodes[0, [0, 2]]).all(axis=1)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from lattice import boxes, lattice, pvd_text, states, xdmf_text
+from numpy.testing import assert_allclose
 
 from mereo.deformation.tetrahedral import Tetrahedra, TetrahedralMap
 from mereo.io.simulation_states import TetrahedralRecord, read_states
@@ -195,7 +196,7 @@ def test_a_sequence_of_positions_starts_at_rest_and_hexahedra_are_divided(tmp_pa
         pyvista.StructuredGrid(x, y, z).cast_to_unstructured_grid().save(tmp_path / f"{frame}.vtu")
     frames = load_states(tmp_path, boxes()).training.frames
     for part, deformation in zip(boxes().segments, frames.deformations(2), strict=True):
-        np.testing.assert_allclose(deformation(part.vertices), part.vertices @ (matrix @ matrix).T, atol=1e-12)
+        assert_allclose(deformation(part.vertices), part.vertices @ (matrix @ matrix).T, atol=1e-12)
     record = read_states(tmp_path, ("left", "right"))
     assert isinstance(record, TetrahedralRecord) and np.abs(record.displacements[0]).max() == 0
     assert np.abs(Tetrahedra(record.rest_nodes, record.tetrahedra).volumes).sum() == pytest.approx(6 * 3 * 3)

@@ -1,6 +1,5 @@
 """Experiments: what is shared, what is written, and that a claim can fail; what an answer costs."""
 
-import json
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -8,6 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from folder_contents import read_json
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from mereo import __main__ as command_line
@@ -65,7 +67,7 @@ def test_results_are_three_files(tmp_path: Path) -> None:
     write_result(result, tmp_path / "noise")
     write_result(result, tmp_path / "noise")  # again, over the old ones
     assert {path.name for path in (tmp_path / "noise").glob("[!.]*")} == {"table.md", "results.json", "figure.png"}
-    found = json.loads((tmp_path / "noise" / "results.json").read_text())
+    found = read_json(tmp_path / "noise" / "results.json")
     assert found["rows"][0]["score"]["miou"] is None
     assert found["claims"][0]["verdict"] == "We agree (rope)."
 
@@ -110,7 +112,7 @@ def test_costs_are_those_of_what_experiments_do() -> None:
     assert cost("encoders", "paper").trainings == 6 and cost("encoders-losses", "paper").trainings == 5 * 11
 
 
-def test_the_list_says_which_results_are_here(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_list_says_which_results_are_here(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     result = Result("noise", "Noise", "cpu", (Row("rope", "x", score(0.5, NAN)),), ())
     for folder in ("noise-cpu", "noise-smoke-rope"):
         write_result(result, tmp_path / "results" / folder)
@@ -155,7 +157,7 @@ def test_answers_side_by_side_are_drawn_from_results(name: str, picture: str, co
 
 
 @pytest.mark.slow
-def test_a_store_makes_each_thing_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_store_makes_each_thing_once(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     store, recipe = Store(tmp_path), replace(SCALES["smoke"].recipe, epochs=0.1)
     settings = replace(GenerateConfig(), noise_std=0.5)
     for _ in range(2):
@@ -186,21 +188,21 @@ MACHINE = Machine(1e11, 1e10)
 def test_the_rival_answers_as_the_model() -> None:
     view, model = load_view("rope"), load_model("rope")
     cloud = view.depth.to_points()
-    points = view.truth.grid.positions(np.random.default_rng(0).integers(0, 100, (500, 3)))
+    points = view.truth.grid.positions(default_rng(0).integers(0, 100, (500, 3)))
     ours = model.logits(model.encode(cloud), points)
     theirs = Rival(model, *model.normalized_cloud(cloud)).logits(points)
-    np.testing.assert_allclose(theirs, ours, atol=1e-3 * np.abs(ours).max())
+    assert_allclose(theirs, ours, atol=1e-3 * np.abs(ours).max())
     assert len(np.unique(ours.argmax(axis=1))) > 3
 
 
 def test_needed_nodes_are_the_corners_of_cells_with_a_change() -> None:
-    labels = (np.random.default_rng(1).random((6, 5, 4)) < 0.1).astype(np.uint8)
+    labels = (default_rng(1).random((6, 5, 4)) < 0.1).astype(np.uint8)
     needed = np.zeros(labels.shape, dtype=bool)
     for cell in np.ndindex(5, 4, 3):
         corners = tuple(np.array([np.add(cell, step) for step in product((0, 1), repeat=3)]).T)
         if len(np.unique(labels[corners])) > 1:
             needed[corners] = True
-    np.testing.assert_array_equal(needed_nodes(labels), needed)
+    assert_array_equal(needed_nodes(labels), needed)
     assert 0 < needed.sum() < needed.size
 
 

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from answers import fit_correspondences
 from fit_cases import IN_FRONT, SCENE, said, seen, shown
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from mereo.fitting.config import FitConfig, TrackConfig
@@ -76,24 +78,24 @@ def test_what_the_frame_rules_out_is_told(model: StatisticalModel, view: View, r
 
 
 def test_to_rest_undoes_to_camera(registration: Registration) -> None:
-    points = np.random.default_rng(0).uniform([-17, -5, -4], [17, 5, 4], size=(200, 3))
+    points = default_rng(0).uniform([-17, -5, -4], [17, 5, 4], size=(200, 3))
     labels = registration.rest_solids.label(points)
     points, labels = points[labels > 0], labels[labels > 0]
     moved = registration.to_camera(points)
-    np.testing.assert_allclose(registration.to_rest(moved, labels), points, atol=1e-3)
+    assert_allclose(registration.to_rest(moved, labels), points, atol=1e-3)
 
 
 def test_queries_agree_with_the_mesh(registration: Registration) -> None:
     low, high = registration.mesh.bounds
-    points = np.random.default_rng(0).uniform(low, high, size=(500, 3))
+    points = default_rng(0).uniform(low, high, size=(500, 3))
     found = registration.query(points)
-    np.testing.assert_array_equal(found.label, registration.solids.label(points))
-    np.testing.assert_array_equal(found.distance < 0, found.label > 0)
+    assert_array_equal(found.label, registration.solids.label(points))
+    assert_array_equal(found.distance < 0, found.label > 0)
     registration.mesh.check()
 
 
 def test_derivatives_are_those_of_differences(model: StatisticalModel) -> None:
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     posed = Posed(Rotation.random(rng=rng).as_matrix(), rng.normal(size=3) * 10, rng.normal(size=model.count), 0.1)
     chosen = rng.choice(len(model.labels), 10)
     direction = rng.normal(size=(10, 3))
@@ -104,21 +106,21 @@ def test_derivatives_are_those_of_differences(model: StatisticalModel) -> None:
         step[number] = 1e-2
         there, back = posed.moved(step), posed.moved(-step)
         moved = there.place(model.material(there.z))[chosen] - back.place(model.material(back.z))[chosen]
-        np.testing.assert_allclose(found[:, number], (moved * direction).sum(axis=1) / 2e-2, rtol=2e-3, atol=2e-2)
+        assert_allclose(found[:, number], (moved * direction).sum(axis=1) / 2e-2, rtol=2e-3, atol=2e-2)
 
 
 @pytest.mark.parametrize(("noise", "unit"), [(0.0, 1.0), (0.1, 1.0), (0.1, 0.004)])
 def test_an_object_at_rest_is_found_to_be_at_rest(model: StatisticalModel, noise: float, unit: float) -> None:
     material = transform_points(IN_FRONT, model.rest_points)
     points = seen(model.rest.transformed(IN_FRONT))
-    points = points + np.random.default_rng(0).normal(scale=noise, size=points.shape)
+    points = points + default_rng(0).normal(scale=noise, size=points.shape)
     found = fit_correspondences(unit * points, said(model, material).scaled(unit), model, unit)
     assert found.method == "rest" and found.accepted
     # a rigid motion of the rest model, and the right one
     apart = [np.linalg.norm(np.diff(places[::50], axis=0), axis=1) for places in (found.material / unit, material)]
-    np.testing.assert_allclose(*apart, atol=1e-6)
+    assert_allclose(*apart, atol=1e-6)
     assert np.linalg.norm(found.material / unit - material, axis=1).max() < 0.05 + noise / 2
-    np.testing.assert_allclose(found.z, model.rest_z)
+    assert_allclose(found.z, model.rest_z)
 
 
 @pytest.mark.parametrize("excess", [0.1, 0.3, 1.0])
@@ -158,12 +160,12 @@ def drawn(problem: DrawsProblem, fitted: ModesFit) -> DrawsFit:
 
 
 def test_a_secant_agrees_with_the_step_and_only_there() -> None:
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     motion, step = rng.normal(size=(5, 3, 4)).astype(np.float32), rng.normal(size=4)
     moved, across = rng.normal(size=(5, 3)), np.array([step[1], -step[0], 0.0, 0.0])
     found = secant(motion, step, moved)
-    np.testing.assert_allclose(found @ step, moved, atol=1e-5)
-    np.testing.assert_allclose(found @ across, motion @ across, atol=1e-5)
+    assert_allclose(found @ step, moved, atol=1e-5)
+    assert_allclose(found @ across, motion @ across, atol=1e-5)
 
 
 def test_the_approach_reaches_a_state_of_the_scene(model: StatisticalModel, states: DrawnStates) -> None:
@@ -212,15 +214,15 @@ def test_modes_reproduce_states_they_were_not_built_from(model: StatisticalModel
 
 
 def test_a_model_needs_two_states_whose_poses_do_not_matter() -> None:
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     nodes, labels = interior_nodes(SCENE.rest)
     states = sample_states(SCENE, nodes, labels, 60, 3)
     turned = np.stack([s @ Rotation.random(rng=rng).as_matrix().T + rng.normal(size=3) * 50 for s in states])
     plain = build_model(SCENE.rest, nodes, labels, states)
     posed = build_model(SCENE.rest, nodes, labels, turned.astype(np.float32))
     assert plain.count == posed.count
-    np.testing.assert_allclose(plain.mean, posed.mean, atol=0.02)
-    np.testing.assert_allclose(plain.motion, posed.motion, rtol=0.02)
+    assert_allclose(plain.mean, posed.mean, atol=0.02)
+    assert_allclose(plain.motion, posed.motion, rtol=0.02)
     with pytest.raises(ValueError, match="cannot be made of 1 states; it needs 2 or more: record more states"):
         build_model(SCENE.rest, nodes, labels, states[:1])
 
@@ -249,7 +251,7 @@ def stuck(model: StatisticalModel, index: int, other: int, noise: float = 0.0) -
         turn, np.array([12.0, -7.0, 150.0]) - turn @ model.mean.mean(axis=0), model.library[index].astype(float)
     )
     points = seen(model.mesh(posed.place(model.material(posed.z))))
-    points = points * (1 + np.random.default_rng(0).normal(scale=noise / 150.0, size=(len(points), 1)))
+    points = points * (1 + default_rng(0).normal(scale=noise / 150.0, size=(len(points), 1)))
     problem = Problem(model, NetworkTerm.none(model), Evidence.of(points), KNOWN_SCALE_STD, FitConfig())
     return problem, refined(problem, fit_wide(problem, replace(posed, z=model.library[other].astype(float))))
 
@@ -279,7 +281,7 @@ def test_states_near_one_tell_of_it_where_they_lie_on_a_curved_set_and_not_where
 ) -> None:
     """By states that are left out: a track follows under the prior that tells more of them."""
     assert are_near(robot)
-    scattered = np.random.default_rng(0).standard_normal(robot.library.shape).astype(np.float32)
+    scattered = default_rng(0).standard_normal(robot.library.shape).astype(np.float32)
     assert not are_near(replace(robot, library=scattered))
     nearest = Prior.near(robot, robot.library[7].astype(np.float64), 0).center
     assert np.abs(Prior.near(robot, robot.library[7].astype(np.float64), 1).center - nearest).max() > 0

@@ -7,6 +7,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from answers import answer_to
+from numpy.random import default_rng
 from scipy.spatial import cKDTree
 
 from mereo.fitting.config import FitConfig
@@ -61,7 +62,7 @@ def confused(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def lying(*given: Any) -> Any:
         found = honest(*given)
-        return replace(found, rest=np.random.default_rng(0).permutation(found.rest))
+        return replace(found, rest=default_rng(0).permutation(found.rest))
 
     monkeypatch.setattr("mereo.fitting.registration.register.find_correspondences", lying)
 
@@ -108,7 +109,7 @@ def test_the_parameters_of_a_scene_are_fitted_to_what_may_be_a_view_of_the_objec
     monkeypatch.setattr(Registrar, "finish", lambda registrar, modes: finish(modes))
     registrar = Registrar.of(liver).without_retries
     assert answer_to(cloud, liver, registrar, 24).recognition.known is True and finish.call_count == 1
-    noise = PointCloud(cloud.points.mean(axis=0) + np.random.default_rng(0).uniform(-40, 40, cloud.points.shape))
+    noise = PointCloud(cloud.points.mean(axis=0) + default_rng(0).uniform(-40, 40, cloud.points.shape))
     assert answer_to(noise, liver, registrar, 24).recognition.known is False and finish.call_count == 1
     asked = replace(registrar, method="full")
     assert answer_to(noise, liver, asked, 24).recognition.known is False and finish.call_count == 2
@@ -137,7 +138,7 @@ def test_a_network_far_from_what_it_starts_is_no_start(by_network: Candidate) ->
     """Weights after a minute of training explain a frame by chance, with the object turned end for end."""
     assert by_network.modes is not None and not is_astray(by_network)
     found = by_network.modes.correspondences
-    guessed = replace(found, rest=np.random.default_rng(0).permutation(found.rest))
+    guessed = replace(found, rest=default_rng(0).permutation(found.rest))
     lucky = replace(by_network, modes=replace(by_network.modes, correspondences=guessed))
     assert lucky.is_accepted and is_astray(lucky)
     displaced = lucky.displaced(by_network.modes.registration)
@@ -199,7 +200,7 @@ def test_points_that_a_fit_explains_are_given_back_beside_strays(
     registrar: Registrar, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     contaminated = with_rim(points)
-    lost = np.random.default_rng(0).choice(len(points), 10, replace=False)
+    lost = default_rng(0).choice(len(points), 10, replace=False)
 
     def hasty(cloud: PointCloud, axes: str, keep_all: bool) -> tuple[Reading, Reading]:
         keep = np.arange(len(cloud)) < len(points)
@@ -219,7 +220,7 @@ def test_an_answer_says_which_points_it_is_of(registrar: Registrar, points: np.n
 
 
 def noisy(points: np.ndarray, std: float) -> np.ndarray:
-    noise = np.random.default_rng(0).normal(scale=std, size=(len(points), 1))
+    noise = default_rng(0).normal(scale=std, size=(len(points), 1))
     return points + noise * points / np.linalg.norm(points, axis=1)[:, None]
 
 
@@ -238,7 +239,7 @@ def test_the_noise_left_is_what_points_have_alone_and_as_much_as_neighbours_shar
     registrar: Registrar, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What a wrong state leaves over beside that is none: its neighbours share it."""
-    modes, rng = fitted(registrar, points).modes, np.random.default_rng(1)
+    modes, rng = fitted(registrar, points).modes, default_rng(1)
     surface, own = modes.surface, rng.normal(scale=0.3, size=len(modes.problem.evidence.points))
     for share, off_by, expected in ((np.inf, 0.0, 0.3), (np.inf, 2.0, 0.3), (0.4, 2.0, 0.5), (0.4, 0.0, 0.3)):
         monkeypatch.setattr(Surface, "offsets", lambda *_, offset=own + off_by: offset)
@@ -254,7 +255,7 @@ def test_the_first_noise_is_what_the_cloud_shows(points: np.ndarray) -> None:
 
 def test_what_neighbours_share_is_no_noise_of_points(points: np.ndarray) -> None:
     """An offset of all points, or of half of them, is the fit's; what each has for itself is the camera's."""
-    around, rng = Evidence.of(points).around, np.random.default_rng(0)
+    around, rng = Evidence.of(points).around, default_rng(0)
     own = rng.normal(scale=0.3, size=len(points))
     half = np.where(points[:, 0] > np.median(points[:, 0]), 2.0, 0.0)
     assert noise_of(own, around) == pytest.approx(0.3, rel=0.1)
@@ -265,7 +266,7 @@ def test_what_neighbours_share_is_no_noise_of_points(points: np.ndarray) -> None
 
 
 def test_noise_that_neighbours_share_is_spread_evenly_and_a_wrong_state_is_not() -> None:
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     windows = 0.1 * np.repeat(rng.normal(size=300), 9)
     assert is_normal(windows)
     assert not is_normal(np.where(rng.random(2700) < 0.1, 0.6, windows))
@@ -280,7 +281,7 @@ def plate(pixels: int = 64) -> np.ndarray:
 
 def test_what_neighbours_share_leaves_a_fit_as_unsure_as_fewer_points() -> None:
     """Of windows of 4 x 4 pixels, off by as much as each pixel is besides, and twice that for what a fit has bent."""
-    rng, evidence = np.random.default_rng(0), Evidence.of(plate())
+    rng, evidence = default_rng(0), Evidence.of(plate())
     pixel = cKDTree(plate()).query(evidence.points)[1]
     for window, expected in ((1, 2.0), (4, 2 * (16.0 + 1.0))):
         off = [np.kron(rng.normal(size=(64 // window,) * 2), np.ones((window, window))) for _ in range(8)]
@@ -296,7 +297,7 @@ def test_a_noisy_cloud_is_worth_no_more_than_its_points_and_less_where_they_shar
 ) -> None:
     modes = fitted(registrar, points).modes
     problem = modes.problem.with_noise(0.4)
-    rng, count = np.random.default_rng(0), len(problem.evidence.points)
+    rng, count = default_rng(0), len(problem.evidence.points)
     own, common = rng.normal(scale=0.4, size=count), np.full(count, 0.4) * np.sign(problem.evidence.points[:, 0])
     weights = list[float]()
     for offset in (own, own + common):

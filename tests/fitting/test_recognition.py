@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.random import Generator, default_rng
 
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.problem import ACCEPTED
@@ -136,13 +137,13 @@ def test_noise_excuses_points_that_are_not_explained(registration: Registration)
     assert recognize(noisy).strangeness < recognize(clean).strangeness and recognize(noisy).known is True
 
 
-def signs(rng: np.random.Generator, factor: float = 1.0) -> Signs:
+def signs(rng: Generator, factor: float = 1.0) -> Signs:
     own = factor * np.exp(rng.normal(scale=0.3, size=4))
     return Signs(None, 0.2 * own[0], 0.01 * own[1], 0.05 * own[2], None, 0.05 * own[3])
 
 
 def test_views_of_the_object_say_what_is_usual() -> None:
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     found = RecognitionSigns([signs(rng) for _ in range(24)], [signs(rng, 2.0) for _ in range(12)]).usual()
     own = [strangeness(signs(rng).strange(found.clean)) for _ in range(200)]
     noisy = [strangeness(signs(rng, 2.0).strange(found.noisy)) for _ in range(200)]
@@ -151,7 +152,7 @@ def test_views_of_the_object_say_what_is_usual() -> None:
 
 
 def test_a_view_that_was_not_understood_moves_no_limit() -> None:
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     views = [signs(rng) for _ in range(24)]
     usual, spoiled = usual_of(views), usual_of([*views, signs(rng, 1e4)])
     assert all(abs(usual[name].mean - spoiled[name].mean) < 0.15 for name in usual)
@@ -205,7 +206,7 @@ def test_only_a_patch_is_explained_by_a_patch() -> None:
 
 def test_few_views_tell_nothing() -> None:
     assert RecognitionSigns().usual() is None
-    few = RecognitionSigns([signs(np.random.default_rng(2)) for _ in range(8)]).usual()
+    few = RecognitionSigns([signs(default_rng(2)) for _ in range(8)]).usual()
     assert few is not None and few.noisy == dict(CONSERVATIVE.noisy)
 
 

@@ -1,6 +1,5 @@
 """The registered model as a reconstruction: the rest mesh's own segments, in the input's frame."""
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,8 @@ import numpy as np
 import pytest
 from analytic import untrained
 from answers import answer_to, reconstruct
+from folder_contents import read_json
+from numpy.testing import assert_allclose, assert_array_equal
 from trimesh.remesh import subdivide
 
 import mereo
@@ -83,7 +84,7 @@ def test_the_answer_is_the_model_itself(network: Reconstruction, found: Answer, 
     rest = statistical_model_of(model).rest
     assert found.taken and result.surfaces.names == rest.names
     for segment, at_rest in zip(result.surfaces.segments, rest.segments, strict=True):
-        np.testing.assert_array_equal(segment.faces, at_rest.faces)
+        assert_array_equal(segment.faces, at_rest.faces)
     assert iou(view, result) > iou(view, network) + 0.05
 
 
@@ -102,7 +103,7 @@ def test_a_scanners_frame_gets_its_answer_in_that_frame(model: Model, view: Samp
     assert np.median(Solids(result.surfaces).nearest(points).distance) < 0.02 * np.ptp(points, axis=0).max()
     for one in result.segments:
         inside = result.labels.positions(np.argwhere(result.labels.labels == one.label)).mean(axis=0)
-        np.testing.assert_allclose(one.centroid, inside, atol=1e-9)
+        assert_allclose(one.centroid, inside, atol=1e-9)
 
 
 def test_full_needs_a_scene(model: Model) -> None:
@@ -255,7 +256,7 @@ def test_a_registration_is_as_far_off_as_its_points_are(engine: Model, engine_vi
     large_shown = seen_points(5 * truth, PointCloud(5 * cloud.points), 5.0)
     moved = replace(found, material=5 * truth + np.array([0.0, 15.0, 0.0]))
     large = RegistrationErrors.of(moved, 5 * truth, large_shown, 5.0)
-    np.testing.assert_allclose(large.distances, shifted.distances)
+    assert_allclose(large.distances, shifted.distances)
 
 
 @pytest.mark.slow
@@ -272,7 +273,7 @@ def test_an_evaluation_compares_all_who_could_answer(engine: Model, tmp_path: Pa
     seen = values["registration_error"]["seen"]
     assert seen["median_mm"] == pytest.approx(10.0 * seen["median"])  # a unit of the engine is a centimetre
     write_json(tmp_path / "metrics.json", values)
-    assert json.loads((tmp_path / "metrics.json").read_text())["chosen"] == values["chosen"]
+    assert read_json(tmp_path / "metrics.json")["chosen"] == values["chosen"]
     assert "modes alone" in markdown_table(found)
     off = evaluate(engine, EvaluationConfig("engine", 2, SEED, cells=24, method="network"))
     assert (off.scores.iou, off.scores.miou) == (values["network"]["iou"], values["network"]["miou"])

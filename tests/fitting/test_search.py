@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fit_cases import seen
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from mereo.fitting.config import FitConfig
@@ -82,7 +84,7 @@ def test_points_far_off_are_named_before_the_unit(model: StatisticalModel) -> No
 
 def test_rotations_are_even() -> None:
     turns = rotations(600)
-    np.testing.assert_allclose(turns @ turns.transpose(0, 2, 1), np.broadcast_to(np.eye(3), turns.shape), atol=1e-12)
+    assert_allclose(turns @ turns.transpose(0, 2, 1), np.broadcast_to(np.eye(3), turns.shape), atol=1e-12)
     trace = np.einsum("nij,mij->nm", turns, turns)
     np.fill_diagonal(trace, -1.0)
     nearest = np.degrees(np.arccos(np.clip((trace.max(axis=1) - 1) / 2, -1, 1)))
@@ -94,7 +96,7 @@ def test_medoids_are_states_that_stand_for_all(model: StatisticalModel) -> None:
     assert len(set(rows)) == len(rows) <= 8
     shape = model.library * model.motion
     spread = np.sqrt(((shape[:, None] - shape[rows]) ** 2).sum(axis=2)).min(axis=1).mean()
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     others = [rng.choice(len(shape), 8, replace=False) for _ in range(20)]
     random = [np.sqrt(((shape[:, None] - shape[other]) ** 2).sum(axis=2)).min(axis=1).mean() for other in others]
     assert spread < np.min(random)
@@ -104,12 +106,12 @@ def test_a_table_of_sight_rules_out_what_the_evidence_does(model: StatisticalMod
     posed = state(model, 3)
     points, unknown = cut(view(model, posed), 0.3)
     evidence = Evidence.of(points, lines=SightLines(np.empty((0, 3)), unknown, "past"))
-    places = posed.place(model.material(posed.z)) + np.random.default_rng(0).normal(scale=4.0, size=model.mean.shape)
+    places = posed.place(model.material(posed.z)) + default_rng(0).normal(scale=4.0, size=model.mean.shape)
     _, exact = evidence.violations(places, 0.5)
     _, looked_up = SightTable.of(evidence).violations(places[None].astype(np.float32), 0.5)
     # up to a cell's width, which is a few pixels here
     assert np.mean((exact > 0) == (looked_up[0] > 0)) > 0.85
-    np.testing.assert_allclose(np.median(np.abs(exact - looked_up[0])), 0.0, atol=0.1)
+    assert_allclose(np.median(np.abs(exact - looked_up[0])), 0.0, atol=0.1)
 
 
 @pytest.mark.parametrize("index", [0, 5])
@@ -152,7 +154,7 @@ def test_noise_is_told_from_a_wrong_state(
     if patched:
         cells = (points[:, :2] / points[:, 2:] // 0.012).astype(int)
         rows = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
-    off_by = np.random.default_rng(0).normal(scale=0.5, size=len(points))[rows]
+    off_by = default_rng(0).normal(scale=0.5, size=len(points))[rows]
     noisy = points * (1 + off_by / np.linalg.norm(points, axis=1))[:, None]
     fitted = search_modes(CloudToFit(noisy, 1.0, lines=SightLines.of_cloud("past")), model)
     assert fitted.problem.is_noisy and fitted.registration.accepted
@@ -167,7 +169,7 @@ def test_under_noise_a_part_is_hidden_where_it_is_by_the_noises_constants_too(
 ) -> None:
     posed = state(model, 3)
     points = cut(view(model, posed), share)[0]
-    points = points * (1 + np.random.default_rng(0).normal(scale=0.5 / 150.0, size=(len(points), 1)))
+    points = points * (1 + default_rng(0).normal(scale=0.5 / 150.0, size=(len(points), 1)))
     evidence = Evidence.of(points)
     whole = Problem(model, NetworkTerm.none(model), evidence, OPEN_SCALE_STD, FitConfig()).with_noise(evidence.noise)
     partial = whole.changed(evidence=replace(evidence, other_lines="unknown"))
@@ -181,7 +183,7 @@ def test_under_noise_a_part_is_hidden_where_it_is_by_the_noises_constants_too(
 def test_a_noisy_frame_is_explained_where_neighbours_share_as_much_as_they_do_around_it(
     model: StatisticalModel,
 ) -> None:
-    posed, rng = state(model, 3), np.random.default_rng(0)
+    posed, rng = state(model, 3), default_rng(0)
     points = view(model, posed)
     waves = 0.5 * np.sqrt(2) * np.sin(4 / model.half * points @ [0.6, 0.8, 0.0])
     seen = points * (1 + (waves + rng.normal(scale=0.05, size=len(points)))[:, None] / 150.0)
@@ -221,7 +223,7 @@ def all_around(model: StatisticalModel, posed: Posed, std: float = 0.05) -> tupl
     points, face = surface_points(vertices, faces, 1500)
     normals = area_vectors(vertices, faces)[face]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return points + np.random.default_rng(0).normal(scale=std, size=points.shape), normals
+    return points + default_rng(0).normal(scale=std, size=points.shape), normals
 
 
 @pytest.mark.parametrize("kind", ["whole", "half", "unknown unit", "without normals"])
@@ -282,7 +284,7 @@ def test_points_of_a_sheet_are_compared_with_the_side_whose_normals_are_theirs(m
     for normal, lift, distance, face in ((up, signed, 0.9, 1), (-up, signed, 0.1, 0), (up, without_sign, 0.1, 0)):
         found = surface.alike(point, Directions(lift, lift(normal), 2.0))
         assert (found[0][0], found[1][0]) == (pytest.approx(distance), face)
-        np.testing.assert_allclose(found[2], [[2.0, 2.0, float(face)]])
+        assert_allclose(found[2], [[2.0, 2.0, float(face)]])
     across = np.array([[1.0, 0.0, 0.0]])  # a normal that no place has: the distance counts it
     assert surface.alike(point, Directions(signed, across, 2.0))[0][0] > 2.0
 

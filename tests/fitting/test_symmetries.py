@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 from fit_cases import IN_FRONT, said, seen
+from numpy.random import Generator, default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, ndtri
 from shapes import box
@@ -45,19 +47,19 @@ def moves(way: float, spin: float, lean: float) -> tuple[Deformation, ...]:
     return Rigid(np.zeros(3), way * X, np.zeros(3)), Rigid(turn, np.zeros(3), np.array([0.0, 0.0, 8.0]))
 
 
-def free(rng: np.random.Generator) -> tuple[Deformation, ...]:
+def free(rng: Generator) -> tuple[Deformation, ...]:
     """The wheel spins, whatever else."""
     spin, lean, way = (named(rng, name).uniform(-1, 1) for name in ("spin", "lean", "way"))
     return moves(0.5 * way, np.pi * spin, 0.05 * lean)
 
 
-def coupled(rng: np.random.Generator) -> tuple[Deformation, ...]:
+def coupled(rng: Generator) -> tuple[Deformation, ...]:
     """The wheel spins only as it leans."""
     spin = named(rng, "spin").uniform(-1, 1)
     return moves(0.0, np.pi * spin, 2.5 * spin)
 
 
-def held(rng: np.random.Generator) -> tuple[Deformation, ...]:
+def held(rng: Generator) -> tuple[Deformation, ...]:
     return moves(0.0, 0.0, 0.1 * named(rng, "lean").uniform(-1, 1))
 
 
@@ -113,7 +115,7 @@ def test_what_is_left_open_has_the_second_moments_of_the_turns() -> None:
     for angle, share in zip(turn.angles, weight / weight.sum(), strict=False):
         moved = Rotation.from_rotvec(angle * turn.axis).apply(model.rest_points[wheel] - turn.center) + turn.center
         squared[wheel] += share * ((moved - model.rest_points[wheel]) ** 2).sum(axis=1)
-    np.testing.assert_allclose((motion**2).sum(axis=(1, 2)), squared, rtol=1e-4, atol=1e-8)
+    assert_allclose((motion**2).sum(axis=(1, 2)), squared, rtol=1e-4, atol=1e-8)
 
 
 def test_a_peg_that_is_seen_leaves_no_turn_open() -> None:
@@ -139,21 +141,21 @@ def test_radii_hold_what_is_left_open() -> None:
     without = Posterior(posed, material, model.modes, factor, 0.0, nothing, nothing)
     alone, parts = without.radii(), replace(without, open=turns).radii()
     radii = parts.radii()
-    np.testing.assert_allclose(parts.gaussian, alone.gaussian)
+    assert_allclose(parts.gaussian, alone.gaussian)
     assert not alone.open.any()
     wheel = model.labels == 2
-    np.testing.assert_allclose(radii[~wheel], alone.radii()[~wheel])
+    assert_allclose(radii[~wheel], alone.radii()[~wheel])
     rim = wheel & (np.linalg.norm(model.rest_points[:, :2], axis=1) > 5.5)
     assert radii[rim].min() > 8.0 and radii[rim].max() < 20.0
     follow = model.weights(model.rest_points[:5], model.labels[:5])
-    np.testing.assert_allclose(replace(without, open=turns).radii(follow).radii(), radii[:5], rtol=0.2)
-    np.testing.assert_allclose(parts.radii(1e-9)[rim], parts.open[rim])  # how far a turn goes no calibration scales
-    np.testing.assert_allclose(parts.radii(2.0, 3.0) ** 2, 4 * parts.gaussian**2 + parts.open**2 + 9)
+    assert_allclose(replace(without, open=turns).radii(follow).radii(), radii[:5], rtol=0.2)
+    assert_allclose(parts.radii(1e-9)[rim], parts.open[rim])  # how far a turn goes no calibration scales
+    assert_allclose(parts.radii(2.0, 3.0) ** 2, 4 * parts.gaussian**2 + parts.open**2 + 9)
 
 
 def test_a_covariance_that_rounding_has_spoilt_is_as_unsure_as_rounding_tells() -> None:
     """Single precision may leave a sum of squares a little below zero, as of a unit that nobody knows."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     axes = np.linalg.qr(rng.normal(size=(6, 6)))[0]
     precision = axes @ np.diag([10.0, 5.0, 3.0, 2.0, 1.0, -1e-7]) @ axes.T
     covariance = covariance_factor(precision) @ covariance_factor(precision).T
@@ -173,7 +175,7 @@ def test_of_many_draws_those_jump_that_slide_along_the_surface() -> None:
     wrong = truth.copy()
     wrong[0] = ndtri((ndtr(truth[0]) + 1 / 6) % 1.0)
     start = descend(problem, simulate(problem, drawn, wrong, POSE), 1)
-    np.testing.assert_array_equal(draws_that_may_jump(problem, start), [0])
+    assert_array_equal(draws_that_may_jump(problem, start), [0])
     found = try_jumps(problem, start)
     assert abs(ndtr(start.z[0]) - ndtr(truth[0])) > 0.1 and abs(ndtr(found.z[0]) - ndtr(truth[0])) < 0.01
     assert found.misfit < start.misfit
@@ -184,7 +186,7 @@ X, Y, WRIST = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), np.array([6.
 POSE = Posed(IN_FRONT[:3, :3], IN_FRONT[:3, 3], np.empty(0))
 
 
-def arm(rng: np.random.Generator) -> tuple[Deformation, ...]:
+def arm(rng: Generator) -> tuple[Deformation, ...]:
     """A forearm that rolls, a wrist that bends, a hand that spins: half a roll, bent back, half a spin is the same."""
     roll, pitch, spin = (named(rng, name).uniform(-1, 1) for name in ("roll", "pitch", "spin"))
     rolled = Rigid(np.pi * roll * X, np.zeros(3), WRIST)
@@ -244,8 +246,8 @@ def test_forearm_and_wrist_are_turned_together_to_the_shape_of_other_draws() -> 
     assert all(angle == pytest.approx(np.pi) and abs(turn.axis[0]) > 0.999 for turn, angle in together)
     there = turn_segments(model(), moved(TRUTH), together)
     assert np.abs(there - moved(TRUTH)).max() > 4.0
-    np.testing.assert_allclose(there, moved(flipped(TRUTH)), atol=0.02)
-    np.testing.assert_allclose(turn_segments(model(), there, together), moved(TRUTH), atol=1e-6)
+    assert_allclose(there, moved(flipped(TRUTH)), atol=0.02)
+    assert_allclose(turn_segments(model(), there, together), moved(TRUTH), atol=1e-6)
 
 
 def test_a_state_that_is_turned_so_is_found() -> None:

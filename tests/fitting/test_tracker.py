@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mereo.api.result import Result
 from mereo.cli.stream import Answering, Outcome, StreamFrame, SurfaceFolder, line
@@ -61,7 +63,7 @@ def mesh_of(model: StatisticalModel, turn: int, share: float = 0.0) -> Segmented
 
 
 def view(mesh: SegmentedMesh, seed: int = 0, occluders: tuple[Capsule, ...] = ()) -> SimulatedView:
-    solids, rng, away = Solids(mesh), np.random.default_rng(seed), np.array([0.0, 0.0, 1.0])
+    solids, rng, away = Solids(mesh), default_rng(seed), np.array([0.0, 0.0, 1.0])
     wall = Backdrop(away, farthest(solids, away) + 60.0)
     return depth_sensor.observe(solids, CAMERA, 0.02, SENSORS["paper"], rng, around=Surroundings(occluders, wall))
 
@@ -350,7 +352,7 @@ def scene() -> Scene:
 
 def seen(scene: Scene, mesh: SegmentedMesh, noise: float = 0.0, seed: int = 0) -> PointCloud:
     camera = Camera.from_fov(96, 96, scene.workspace.fov_rad)
-    return add_depth_noise(render_depth(Solids(mesh), camera), noise, np.random.default_rng(seed)).to_points()
+    return add_depth_noise(render_depth(Solids(mesh), camera), noise, default_rng(seed)).to_points()
 
 
 def states(scene: Scene, seed: int, count: int, change_s: float) -> list[SegmentedMesh]:
@@ -410,7 +412,7 @@ def test_an_object_that_jumps_or_goes_and_comes_again_is_found_in_its_own_frame(
         )
         assert not jumped.tracked and tracked.tracked and apart(tracked, mesh) < apart(jumped, mesh) + 0.05 < 1.0
         if mesh is second:
-            np.testing.assert_allclose(jumped.registration.material, own.material, atol=1e-9)
+            assert_allclose(jumped.registration.material, own.material, atol=1e-9)
     tracker.forget()
     assert not tracker.follow(observe(seen(scene, second)), 5.2, scene_unit=1.0).tracked
 
@@ -423,7 +425,7 @@ def test_points_away_from_the_expected_surface_are_strays(
     beside = observe(PointCloud(np.concatenate([cloud.points, 1.5 * cloud.points[:12]])))
     found = tracker.follow(beside, 0.03, scene_unit=1.0)
     assert found.tracked and found.hypothesis.dropped == 12 and not found.hypothesis.keep[-12:].any()
-    np.testing.assert_array_equal(found.seen.cloud.points, cloud.points)
+    assert_array_equal(found.seen.cloud.points, cloud.points)
     assert apart(found, first) < 0.2
     assert tracker.follow(beside, 0.06, keep_all=True).hypothesis.dropped == 0
 
@@ -454,21 +456,19 @@ def test_without_evidence_the_expected_state_is_the_answer(
     config = TrackConfig()
     track = Track.of(engine.fit_modes(CloudToFit(seen(scene, first).points, scene_unit=1.0)), 0.0, config, FitConfig())
     count = POSE + track.problem.model.count
-    velocity = 0.1 * np.random.default_rng(0).normal(size=count)
+    velocity = 0.1 * default_rng(0).normal(size=count)
     moving = replace(track, velocity=velocity)
     state = moving.expected(0.5, config)
     # what noise alone may be does not count as motion
-    np.testing.assert_allclose(
-        between(track.posed, state), 0.5 * velocity * (1 - (config.dead / moving.speed) ** 2), atol=1e-9
-    )
+    assert_allclose(between(track.posed, state), 0.5 * velocity * (1 - (config.dead / moving.speed) ** 2), atol=1e-9)
     shift = np.concatenate([np.zeros(3), [1.0, -2.0, 2.0], np.zeros(count - 6)])
     assert replace(track, velocity=shift).speed == pytest.approx(3.0, rel=1e-6) and track.speed == 0.0
     slow = replace(track, velocity=velocity * config.dead / moving.speed)
-    np.testing.assert_allclose(between(track.posed, slow.expected(0.5, config)), 0.0, atol=1e-9)
+    assert_allclose(between(track.posed, slow.expected(0.5, config)), 0.0, atol=1e-9)
     precision = motion_precision(moving, 0.5, config)
-    off = state.moved(0.01 * np.random.default_rng(1).normal(size=count))
+    off = state.moved(0.01 * default_rng(1).normal(size=count))
     back = off.moved(NormalEquations(precision, precision @ between(state, off)).step(0.0))
-    np.testing.assert_allclose(back.place(np.eye(3)), state.place(np.eye(3)), atol=1e-2)
+    assert_allclose(back.place(np.eye(3)), state.place(np.eye(3)), atol=1e-2)
     # what moves is less certain than what is still
     still = replace(moving, velocity=np.zeros(count), unsure=0.0)
     assert np.trace(motion_precision(still, 0.5, config)) > 10 * np.trace(precision)

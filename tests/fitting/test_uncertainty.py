@@ -2,7 +2,6 @@
 
 import base64
 import copy
-import json
 import re
 import zlib
 from dataclasses import replace
@@ -13,6 +12,9 @@ import pytest
 import trimesh
 from answers import answer_to, fit_correspondences
 from fit_cases import SCENE, said, seen, shown
+from folder_contents import read_json
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -64,8 +66,8 @@ def sure(found: Registration) -> Uncertainty:
 
 def test_the_radius_holds_95_percent_of_a_gaussian() -> None:
     one, three = np.diag([4.0, 0.0, 0.0]), 4.0 * np.eye(3)
-    np.testing.assert_allclose(radius95(np.stack([one, three])), 2.0 * np.sqrt(chi2.ppf(0.95, [1, 3])), rtol=1e-9)
-    rng = np.random.default_rng(0)
+    assert_allclose(radius95(np.stack([one, three])), 2.0 * np.sqrt(chi2.ppf(0.95, [1, 3])), rtol=1e-9)
+    rng = default_rng(0)
     for spread in ([1.0, 0.5, 0.1], [1.0, 1.0, 0.0], [1.0, 0.2, 0.2]):
         turn = Rotation.random(random_state=1).as_matrix()
         points = rng.normal(size=(200_000, 3)) * spread @ turn.T
@@ -75,7 +77,7 @@ def test_the_radius_holds_95_percent_of_a_gaussian() -> None:
 
 def test_the_posterior_of_a_linear_problem_is_its_closed_form() -> None:
     """The pose is held; the prior is N(0, 1), measured is ``m_i z + noise``."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     modes, sigma = rng.normal(size=(7, 3, 1)).astype(np.float32), 0.3
     held = NormalEquations.prior(np.zeros(1), np.zeros(1), np.eye(1), 0.0, 1e-6)
     matrix = held.matrix + np.diag([1e12] * 6 + [0.0, 0.0])
@@ -87,13 +89,13 @@ def test_the_posterior_of_a_linear_problem_is_its_closed_form() -> None:
     posterior = Posterior.of(normal, posed, rng.normal(size=(7, 3)), modes)
     variance = 1.0 / (1.0 + float((modes.astype(float) ** 2).sum()) / sigma**2)
     lengths = np.linalg.norm(modes[..., 0], axis=1)
-    np.testing.assert_allclose(posterior.radii().radii(), lengths * np.sqrt(variance * chi2.ppf(0.95, 1)), rtol=1e-3)
+    assert_allclose(posterior.radii().radii(), lengths * np.sqrt(variance * chi2.ppf(0.95, 1)), rtol=1e-3)
 
 
 def test_the_gradients_of_volumes_and_centroids_are_their_differences() -> None:
     mesh = SCENE.rest
     nested = SegmentedMesh((mesh.segments[3], replace(mesh.segments[0], name="around")), (("ball", "around"),))
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     gradients = owned_gradients(nested)
     for _ in range(3):
         change = rng.normal(size=gradients.shape[2:])
@@ -107,8 +109,8 @@ def test_the_gradients_of_volumes_and_centroids_are_their_differences() -> None:
 
         (more, center), (less, other) = at(1e-5), at(-1e-5)
         said = np.einsum("sqvi,vi->sq", gradients, change)
-        np.testing.assert_allclose(said[:, 0], (more - less) / 2e-5, rtol=1e-5)
-        np.testing.assert_allclose(said[:, 1:], (center - other) / 2e-5, rtol=1e-3, atol=1e-5)
+        assert_allclose(said[:, 0], (more - less) / 2e-5, rtol=1e-5)
+        assert_allclose(said[:, 1:], (center - other) / 2e-5, rtol=1e-3, atol=1e-5)
 
 
 def test_radii_are_in_the_unit_of_the_input(model: StatisticalModel, material: np.ndarray, sure: Uncertainty) -> None:
@@ -117,7 +119,7 @@ def test_radii_are_in_the_unit_of_the_input(model: StatisticalModel, material: n
     for unit in (0.001, 25.0):
         other = replace(network, points=unit * network.points @ turn.T)
         again = fit_correspondences(unit * points @ turn.T, other, model, unit)
-        np.testing.assert_allclose(again.uncertainty.material, unit * sure.material, rtol=0.02)
+        assert_allclose(again.uncertainty.material, unit * sure.material, rtol=0.02)
         for one, first in zip(again.uncertainty.segments, sure.segments, strict=True):
             assert one.centroid_radius95 == pytest.approx(unit * first.centroid_radius95, rel=0.02)
             assert one.volume95 == pytest.approx([unit**3 * value for value in first.volume95], rel=0.02)
@@ -132,7 +134,7 @@ def test_a_calibration_scales_radii_and_intervals(found: Registration, sure: Unc
     assert replace(sure, optimum=noisy).factor == UNCALIBRATED
     wide = replace(found, radius_scale=3.0).uncertainty
     assert wide is not None and wide.calibrated and not sure.calibrated
-    np.testing.assert_allclose(wide.material, 3.0 * sure.material)
+    assert_allclose(wide.material, 3.0 * sure.material)
     for one, other in zip(wide.segments, sure.segments, strict=True):
         assert one.centroid_radius95 == pytest.approx(3.0 * other.centroid_radius95)
         assert np.ptp(one.volume95) == pytest.approx(3.0 * np.ptp(other.volume95), rel=1e-6)
@@ -144,7 +146,7 @@ def test_radii_reach_other_states_that_explain_the_frame_alike_and_no_farther(su
     optimum, way = sure.optimum, np.array([3.0, -4.0, 12.0])
     assert isinstance(optimum, ModesOptimum)
     moved = replace(sure, optimum=replace(optimum, others=(sure.posterior.material + way,)))
-    np.testing.assert_allclose(moved.material, sure.material + 13.0 * optimum.unit, rtol=1e-5)
+    assert_allclose(moved.material, sure.material + 13.0 * optimum.unit, rtol=1e-5)
     for one, other in zip(moved.segments, sure.segments, strict=True):
         assert one.centroid_radius95 == pytest.approx(other.centroid_radius95 + 13.0 * optimum.unit, rel=1e-3)
 
@@ -164,12 +166,12 @@ def test_the_scale_is_that_which_holds_95_percent(found: Registration, sure: Unc
     shown = seen_points(material, PointCloud(seen(found.model.mesh(material))), 1.0)
     sure, found = replace(sure, scale=1.0, extra_radius=0.0), replace(found, radius_scale=1.0, extra_radius=0.0)
     one = RegistrationErrors.of(found, material, shown, 1.0)
-    np.testing.assert_array_equal(one.seen, shown)
+    assert_array_equal(one.seen, shown)
     calibrated = RegistrationErrors.of(replace(found, radius_scale=7.0, extra_radius=0.05), material, shown, 1.0)
-    np.testing.assert_allclose(calibrated.radii, np.hypot(7.0 * one.radii, 0.05))
+    assert_allclose(calibrated.radii, np.hypot(7.0 * one.radii, 0.05))
     off = np.linalg.norm(found.material - material, axis=1)
-    np.testing.assert_array_equal(calibrated.ratios <= 1.0, off <= calibrated.radii)
-    np.testing.assert_array_equal(one.ratios <= 1.0, off <= sure.material)
+    assert_array_equal(calibrated.ratios <= 1.0, off <= calibrated.radii)
+    assert_array_equal(one.ratios <= 1.0, off <= sure.material)
     both = RegistrationErrors.together([one, one])
     scale = both.scale()
     said = both.scaled(scale).coverage(unit_mm=2.0)
@@ -211,13 +213,13 @@ def test_an_influence_is_how_far_a_moved_point_moves_the_place(found: Registrati
     step = np.linalg.solve(total.matrix, -(jacobian * weight[:, None]).T.astype(float) @ change)
     moved = optimum.posed.moved(step)
     before, after = optimum.posterior.material[row], moved.place(found.model.material(moved.z))[row]
-    np.testing.assert_allclose((after - before) / 1e-3, one.influence[best], rtol=0.05, atol=1e-3)
+    assert_allclose((after - before) / 1e-3, one.influence[best], rtol=0.05, atol=1e-3)
 
 
 def test_segments_are_explained_by_name(found: Registration) -> None:
     name = found.model.rest.names[0]
     one = found.explain(name)
-    np.testing.assert_allclose(one.place, owned_centroids(found.mesh)[0])
+    assert_allclose(one.place, owned_centroids(found.mesh)[0])
     with pytest.raises(ValueError, match=r"there is no segment 'nose'; the segments are box_0, .*: name one of them"):
         found.explain("nose")
     with pytest.raises(ValueError, match="x, y, z"):
@@ -272,8 +274,8 @@ def test_a_ply_has_the_radius_of_each_vertex_in_its_unit(answer: Answer, radii: 
     assert b"comment radius95 is in the unit of x, y, z; it is not calibrated\n" in head
     kinds = [*((axis, "<f4") for axis in "xyz"), ("color", "u1", 3), ("label", "u1"), ("radius95", "<f4")]
     vertices = np.frombuffer(body, np.dtype(kinds), count=len(radii))
-    np.testing.assert_allclose(vertices["radius95"], 500.0 * radii, rtol=1e-5)
-    np.testing.assert_allclose(vertices["x"], 500.0 * answer.registered.material[: len(vertices), 0], rtol=1e-4)
+    assert_allclose(vertices["radius95"], 500.0 * radii, rtol=1e-5)
+    assert_allclose(vertices["x"], 500.0 * answer.registered.material[: len(vertices), 0], rtol=1e-4)
 
 
 def test_a_glb_has_the_radius_of_each_vertex_and_says_its_unit(answer: Answer, radii: np.ndarray, folder: Path) -> None:
@@ -284,25 +286,25 @@ def test_a_glb_has_the_radius_of_each_vertex_and_says_its_unit(answer: Answer, r
         # vertices that are one place are written once
         away, same = cKDTree(answer.registered.material[part]).query(mesh.vertices)
         assert away.max() < 1e-4 and len(mesh.vertices) > 0.99 * len(part)
-        np.testing.assert_allclose(mesh.vertex_attributes["_RADIUS95"][:, 0], radii[part][same], rtol=1e-3)
+        assert_allclose(mesh.vertex_attributes["_RADIUS95"][:, 0], radii[part][same], rtol=1e-3)
 
 
 def test_label_volumes_have_the_radius_of_each_voxel(radii: np.ndarray, folder: Path) -> None:
     with np.load(folder / "labels.npz") as values:
         labels, found = values["labels"], values["radius95"]
     assert found.shape == labels.shape and found.dtype == np.float32
-    np.testing.assert_array_equal(np.isfinite(found), labels > 0)
+    assert_array_equal(np.isfinite(found), labels > 0)
     assert radii.min() * 0.9 < np.nanmedian(found) < radii.max()
     text = (folder / "labels.vti").read_text()
     array = re.search(r'Name="radius95" format="binary">([^<]+)<', text)
     assert array is not None and 'type="Float32"' in text
     packed = base64.b64decode(array[1][44:])  # after the head of 32 bytes
     told = np.frombuffer(zlib.decompress(packed), "<f4").reshape(labels.shape, order="F")
-    np.testing.assert_allclose(told, 500.0 * found, rtol=1e-5)
+    assert_allclose(told, 500.0 * found, rtol=1e-5)
 
 
 def test_the_summary_tells_centroids_volumes_and_the_whole(told: Uncertainty, radii: np.ndarray, folder: Path) -> None:
-    summary = json.loads((folder / "summary.json").read_text())
+    summary = read_json(folder / "summary.json")
     lengths = {"median": pytest.approx(np.median(radii)), "max": pytest.approx(radii.max())}
     assert summary["radius95"] == {**lengths, "calibrated": False, "unit_m": 0.5}
     for row, one in zip(summary["segments"], told.segments, strict=True):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from label_cases import CENTER, ORIGIN, RADIUS, SPACING, halves, nibabel, write_nifti
+from numpy.testing import assert_allclose, assert_array_equal
 from overlapping import check_overlap
 from shapes import ball, box
 from shapes import segment as segment_of
@@ -37,8 +38,8 @@ def test_a_nifti_volume_is_in_millimetres_of_ras(cells: int, tmp_path: Path) -> 
     for label, segment in enumerate(mesh.segments, start=1):
         assert segment.volume == pytest.approx((halves() == label).sum() * SPACING.prod(), rel=0.02)
     low, high = mesh.bounds
-    np.testing.assert_allclose((low + high) / 2, ORIGIN + CENTER, atol=1.0)
-    np.testing.assert_allclose(high - low, 2 * RADIUS, atol=2.5)
+    assert_allclose((low + high) / 2, ORIGIN + CENTER, atol=1.0)
+    assert_allclose(high - low, 2 * RADIUS, atol=2.5)
     assert mesh.segments[0].bounds[1, 0] == pytest.approx(ORIGIN[0] + CENTER[0], abs=2.0)
 
 
@@ -53,8 +54,8 @@ def test_nrrd_in_lps_is_the_same_place_as_nifti_in_ras(tmp_path: Path) -> None:
     nrrd.write(str(tmp_path / "a.seg.nrrd"), halves().astype(np.uint8), header)
     volume = read_label_volume(tmp_path / "a.seg.nrrd")
     expected = read_label_volume(write_nifti(tmp_path / "a.nii", halves()))
-    np.testing.assert_allclose(volume.T_world_index, expected.T_world_index)
-    np.testing.assert_array_equal(volume.labels, expected.labels)
+    assert_allclose(volume.T_world_index, expected.T_world_index)
+    assert_array_equal(volume.labels, expected.labels)
     assert volume.names == {2: "spleen"}
 
 
@@ -74,7 +75,7 @@ def test_a_segment_at_the_border_is_closed(tmp_path: Path) -> None:
     labels = np.ones((20, 30, 10), dtype=np.int64)
     mesh = segment_surfaces(read_label_volume(write_nifti(tmp_path / "a.nii", labels)), {1: "block"}, 96)
     mesh.check()
-    np.testing.assert_allclose(mesh.bounds[0], ORIGIN - SPACING / 2, atol=0.6)
+    assert_allclose(mesh.bounds[0], ORIGIN - SPACING / 2, atol=0.6)
     assert mesh.segments[0].volume == pytest.approx(labels.size * SPACING.prod(), rel=0.06)  # its edges are rounded
 
 
@@ -196,7 +197,7 @@ def test_a_segment_in_a_nested_one_comes_before_it_whatever_the_order_of_their_l
     mesh = segment_surfaces(volume, {1: "b", 2: "c", 3: "a"}, 48)
     assert mesh.names == ("a", "b", "c") and set(mesh.nested) == {("a", "b"), ("b", "c")} and overlaps(mesh) == ()
     owned = np.diff([mask.sum() for mask in sorted(balls, key=np.sum)], prepend=0) * GRID.prod()
-    np.testing.assert_allclose(mesh.owned_volumes, owned, rtol=0.06)
+    assert_allclose(mesh.owned_volumes, owned, rtol=0.06)
 
 
 def test_what_mereo_writes_for_slicer_comes_back_with_all_letters_of_its_names_and_its_colours(tmp_path: Path) -> None:
@@ -206,7 +207,7 @@ def test_what_mereo_writes_for_slicer_comes_back_with_all_letters_of_its_names_a
     write_labels_seg_nrrd(tmp_path / "a.seg.nrrd", grid, colors, 0.001)
     volume = read_label_volume(tmp_path / "a.seg.nrrd")
     assert volume.names == {1: "Größe", 2: "肝臓"} and volume.colors == {1: colors[0], 2: colors[1]}
-    np.testing.assert_array_equal(volume.labels[0], labels)
+    assert_array_equal(volume.labels[0], labels)
 
 
 def write_parts(folder: Path, **changes: np.ndarray) -> list[Path]:
@@ -251,7 +252,7 @@ def test_thin_segments_keep_their_volume_in_thick_slices(cells: int, tmp_path: P
     for label, segment in enumerate(mesh.segments, start=1):
         assert segment.volume == pytest.approx(5 * (labels == label).sum(), rel=0.05)
     low, high = mesh.segments[1].bounds
-    np.testing.assert_allclose([low[0], high[0]], [15, 105], atol=2.5)
+    assert_allclose([low[0], high[0]], [15, 105], atol=2.5)
 
 
 def test_what_is_lost_is_reported_and_what_is_too_thin_can_be_left_out(tmp_path: Path) -> None:
@@ -278,9 +279,9 @@ BOX, BALL = box((-0.5, -1.0, -1.5), (0.5, 1.0, 1.5)), ball((4.0, 0.0, 0.0), 1.0,
 def check(segment: Segment) -> Segment:
     """Split segment, after a check that it is the same surface, with old vertices first."""
     split, source = split_at_creases(segment)
-    np.testing.assert_array_equal(split.vertices, segment.vertices[source])
-    np.testing.assert_array_equal(source[split.faces], segment.faces)
-    np.testing.assert_array_equal(source[: len(segment.vertices)], np.arange(len(segment.vertices)))
+    assert_array_equal(split.vertices, segment.vertices[source])
+    assert_array_equal(source[split.faces], segment.faces)
+    assert_array_equal(source[: len(segment.vertices)], np.arange(len(segment.vertices)))
     return split
 
 
@@ -288,11 +289,11 @@ def test_a_box_has_three_normals_at_each_corner() -> None:
     split = check(BOX)
     assert len(split.vertices) == 24
     normals = vertex_normals(split)
-    np.testing.assert_allclose(np.abs(normals).max(axis=1), 1.0)
+    assert_allclose(np.abs(normals).max(axis=1), 1.0)
     faces = split.vertices[split.faces]
     own = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
     own /= np.linalg.norm(own, axis=1, keepdims=True)
-    np.testing.assert_allclose(normals[split.faces], np.repeat(own[:, None], 3, axis=1), atol=1e-12)
+    assert_allclose(normals[split.faces], np.repeat(own[:, None], 3, axis=1), atol=1e-12)
 
 
 @pytest.mark.parametrize("sides, times", [(12, 2), (24, 2), (8, 3)])
@@ -302,7 +303,7 @@ def test_a_cylinder_is_smooth_around_and_has_rims(sides: int, times: int) -> Non
     assert len(split.vertices) == times * 2 * sides + 2
     round_it = np.abs(vertex_normals(split)[:, 2]) < 0.5
     assert round_it.sum() == (times - 1) * 2 * sides
-    np.testing.assert_allclose(vertex_normals(split)[~round_it, 2], np.sign(split.vertices[~round_it, 2]), atol=1e-9)
+    assert_allclose(vertex_normals(split)[~round_it, 2], np.sign(split.vertices[~round_it, 2]), atol=1e-9)
 
 
 def test_faces_without_area_and_edges_of_many_faces_are_no_trouble() -> None:

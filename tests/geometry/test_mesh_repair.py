@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 import yaml
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from overlapping import check_overlap
 from scene_files import write_bar, write_mesh
 from shapes import ball, box, knobbly_torus, one, segment
@@ -38,7 +40,7 @@ def turned(part: Segment) -> Segment:
 
 def soup(part: Segment, noise: float) -> Segment:
     vertices = part.vertices[part.faces].reshape(-1, 3)
-    vertices += noise * np.random.default_rng(0).normal(size=vertices.shape)
+    vertices += noise * default_rng(0).normal(size=vertices.shape)
     return replace(part, vertices=vertices, faces=np.arange(len(vertices)).reshape(-1, 3))
 
 
@@ -115,7 +117,7 @@ def test_thin_horns_stay_where_a_new_surface_is_made() -> None:
     assert "new surface" in made and "in thin places those below" in made and "also lost" not in made
     assert examine(fixed.segment).sound
     assert len(solid_of(fixed.segment.vertices, fixed.segment.faces).decompose()) == 1
-    np.testing.assert_allclose(fixed.segment.bounds, part.bounds, atol=cell)
+    assert_allclose(fixed.segment.bounds, part.bounds, atol=cell)
     assert farthest(fixed.kept, fixed.segment)[0][0] < 1.1 * cell
     label = Solids(one(fixed.segment)).label
     for angle in np.radians([180, 220]):  # each is there along all of its length, and no thicker than it was
@@ -131,7 +133,7 @@ def test_what_is_too_thin_for_the_finest_cells_is_said() -> None:
     assert (share := re.search(lost, fixed.changes[-1])) and float(share[1]) < 1e-3, fixed.changes[-1]
     (distance, place), _ = farthest(fixed.kept, fixed.segment)
     assert distance == pytest.approx(0.6, abs=0.02)
-    np.testing.assert_allclose(place, [-1.6, 0, 0], atol=1e-4)
+    assert_allclose(place, [-1.6, 0, 0], atol=1e-4)
     assert max(way for way, _ in farthest(fixed.segment, fixed.kept)) < 0.1
 
 
@@ -178,14 +180,14 @@ def test_what_a_cut_drops_is_said_with_its_share() -> None:
 
 @pytest.mark.parametrize("axes", [np.array([[1, 2, 3]]), np.array([[1, 2, 3], [3, -1, 2]])])
 def test_a_line_or_plane_in_any_direction_is_no_solid(axes: np.ndarray) -> None:
-    places = np.random.default_rng(0).random((12, len(axes))) @ axes
+    places = default_rng(0).random((12, len(axes))) @ axes
     for vertices in (places, places.astype(np.float32).astype(float)):
         health = examine(Segment("part", (1, 2, 3), vertices, np.arange(12).reshape(4, 3)))
         assert health.hopeless == ("is flat, without any volume",) and not health.mendable
 
 
 def test_holes_are_closed_as_one_by_one() -> None:
-    part = replace(TORUS, faces=np.delete(TORUS.faces, np.random.default_rng(0).integers(0, 1920, 60), axis=0))
+    part = replace(TORUS, faces=np.delete(TORUS.faces, default_rng(0).integers(0, 1920, 60), axis=0))
     vertices, faces = part.vertices, part.faces
     rim = open_edges(vertices, faces)
     group = connected(rim, len(vertices))
@@ -195,12 +197,12 @@ def test_holes_are_closed_as_one_by_one() -> None:
         vertices = np.concatenate([vertices, vertices[loop[:, :1]].mean(axis=0)])
     assert len(vertices) > len(part.vertices) + 20
     closed = close_holes(part.vertices, part.faces)
-    np.testing.assert_array_equal(closed[0], vertices)
-    np.testing.assert_array_equal(closed[1], faces)
+    assert_array_equal(closed[0], vertices)
+    assert_array_equal(closed[1], faces)
 
 
 def test_closed_triangles_enclose_nothing_and_no_repair_makes_a_solid_of_loose_ones() -> None:
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     places = (rng.random((40, 1, 3)) + 0.05 * rng.random((40, 3, 3))).reshape(-1, 3)
     loose = Segment("loose", (1, 2, 3), places, np.arange(120).reshape(-1, 3))
     assert examine(loose).hopeless == ("is an open surface (120 open edges) that encloses no volume",)
@@ -267,7 +269,7 @@ def test_overlaps_are_cut_from_the_larger_segment() -> None:
 
 @pytest.mark.slow
 def test_check_counts_faults_and_repair_leaves_the_users_files(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(check, "STATES", 3)
     path = write_bar(tmp_path, "# kept here\nsize: 15\n")
@@ -298,7 +300,7 @@ def test_check_counts_faults_and_repair_leaves_the_users_files(
         check_scene(str(path), repair=True)
 
 
-def test_parts_of_a_model_get_files_of_their_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_parts_of_a_model_get_files_of_their_own(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     scene = trimesh.Scene()
     parts = {
         "a": box((0, 0, 0), (2, 2, 2)),
@@ -348,11 +350,11 @@ def truth(points: np.ndarray, part: Segment) -> np.ndarray:
 
 @pytest.mark.parametrize("part", [holed(), crossing()], ids=["hole", "self-intersection"])
 def test_points_and_grids_are_labelled_as_of_the_solid(part: Segment) -> None:
-    axis, points = np.linspace(-2.7, 3.7, 33), np.random.default_rng(0).uniform(-3, 4, size=(4000, 3))
+    axis, points = np.linspace(-2.7, 3.7, 33), default_rng(0).uniform(-3, 4, size=(4000, 3))
     found = Solids(one(part)).label(points), label_grid(one(part), axis, axis, axis)
     for labels, places in zip(found, (points, nodes(axis, axis, axis)), strict=True):
         clear = (np.abs(truth(places, part)) > 0.06) & (np.linalg.norm(places - [2, 0, 0], axis=-1) > 0.6)
-        np.testing.assert_array_equal(labels[clear] == 1, truth(places, part)[clear] < 0)
+        assert_array_equal(labels[clear] == 1, truth(places, part)[clear] < 0)
 
 
 def test_the_mark_travels_and_relaxes_the_check_only_for_marked_segments() -> None:
@@ -382,7 +384,7 @@ def test_a_scene_with_a_hole_warns_and_makes_examples(tmp_path: Path) -> None:
 
 def convex_polyhedron(seed: int) -> tuple[Segment, np.ndarray, np.ndarray]:
     """A random convex hull with the outward unit normals and offsets of its faces' planes."""
-    mesh = trimesh.convex.convex_hull(np.random.default_rng(seed).normal(size=(60, 3)))
+    mesh = trimesh.convex.convex_hull(default_rng(seed).normal(size=(60, 3)))
     normal = np.array(mesh.face_normals)
     return segment(mesh), normal, np.einsum("ij,ij->i", normal, mesh.triangles[:, 0])
 
@@ -391,7 +393,7 @@ def convex_polyhedron(seed: int) -> tuple[Segment, np.ndarray, np.ndarray]:
 def test_depth_in_a_convex_solid_is_the_distance_to_the_nearest_face_plane(seed: int) -> None:
     part, normal, offset = convex_polyhedron(seed)
     solids = Solids(one(part))
-    points = np.random.default_rng(seed).uniform(-1, 1, size=(4000, 3))
+    points = default_rng(seed).uniform(-1, 1, size=(4000, 3))
     height = points @ normal.T - offset
     points, height = points[height.max(axis=1) < 0], height[height.max(axis=1) < 0]
     distance, direction = signed_distance_and_direction(solids, points, solids.label(points))
@@ -401,7 +403,7 @@ def test_depth_in_a_convex_solid_is_the_distance_to_the_nearest_face_plane(seed:
 
 def test_outside_a_box_distance_and_direction_have_closed_forms() -> None:
     solids = Solids(one(box((-1, -2, -3), (1, 2, 3))))
-    points = np.random.default_rng(0).uniform(-6, 6, size=(5000, 3))
+    points = default_rng(0).uniform(-6, 6, size=(5000, 3))
     outside = np.maximum(np.abs(points) - [1, 2, 3], 0.0)
     points = points[(outside > 0).any(axis=1)]
     foot = np.clip(points, [-1, -2, -3], [1, 2, 3])
@@ -420,7 +422,7 @@ def test_a_point_on_the_surface_takes_the_outward_normal() -> None:
 
 def test_nearest_over_all_segments_is_the_least_of_each_segments_distance() -> None:
     solids = Solids(SegmentedMesh((knobbly_torus(1), ball((0, 0, 6), 1.5, color=1), box((4, 4, 4), (5, 6, 7)))))
-    points = np.random.default_rng(3).uniform(-8, 8, size=(2000, 3))
+    points = default_rng(3).uniform(-8, 8, size=(2000, 3))
     each = np.stack([solids.segment_distance(index, points) for index in range(3)])
     found = solids.nearest(points)
     assert np.allclose(found.distance, each.min(axis=0))
@@ -433,7 +435,7 @@ def test_nearest_over_all_segments_is_the_least_of_each_segments_distance() -> N
 def test_labels_are_right_beyond_two_millionths_of_the_longest_side(seed: int, shift: float) -> None:
     """As ``Solids.label`` states it, for points this close to faces, edges and corners; nearly all within 1e-7."""
     part, normal, offset = convex_polyhedron(seed)
-    side, rng = float(np.ptp(part.vertices, axis=0).max()), np.random.default_rng(seed)
+    side, rng = float(np.ptp(part.vertices, axis=0).max()), default_rng(seed)
     face = rng.integers(len(part.faces), size=40_000)
     corners = part.vertices[part.faces[face]]
     points = np.einsum("ni,nij->nj", rng.dirichlet((0.3, 0.3, 0.3), len(face)), corners)
@@ -456,7 +458,7 @@ def test_the_first_segment_owns_an_overlap() -> None:
 def test_a_label_grid_is_the_labels_of_its_nodes(seed: int) -> None:
     mesh = SegmentedMesh((knobbly_torus(seed), knobbly_torus(seed + 9, "other", 1), ball((0, 0, 0), 1.0, color=2)))
     low, high = mesh.bounds
-    around = np.random.default_rng(seed).uniform(1.1 * low - 0.1 * high, 1.1 * high - 0.1 * low, (40, 3))
+    around = default_rng(seed).uniform(1.1 * low - 0.1 * high, 1.1 * high - 0.1 * low, (40, 3))
     axes = np.sort(around, axis=0).T
     labels = Solids(mesh).label(nodes(*axes).reshape(-1, 3)).reshape(40, 40, 40)
     assert np.array_equal(label_grid(mesh, *axes), labels)
@@ -466,7 +468,7 @@ def test_a_label_grid_is_the_labels_of_its_nodes(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(12))
 def test_columns_through_vertices_and_edges_leave_no_crack(seed: int) -> None:
     """Integer vertices on integer columns: every tie there is, in any numbering, is decided as beside it."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     mesh = trimesh.convex.convex_hull(rng.integers(0, 7, size=(14, 3)))
     number = rng.permutation(len(mesh.vertices))
     vertices = np.empty((len(number), 3))

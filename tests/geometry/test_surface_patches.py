@@ -3,12 +3,15 @@
 import numpy as np
 import pytest
 from jaxtyping import Float
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 from two_balls import front
 
 from mereo.geometry.camera import Camera
 from mereo.geometry.downsampling import MAX_POINTS, farthest_point_order, means_along_sight, random_subset
-from mereo.geometry.surface_patches import longest_side, roughness, smoothed, surface_points
+from mereo.geometry.surface_patches import roughness, smoothed, surface_points
+from mereo.geometry.transforms import longest_side
 
 
 def rays(size: int = 96) -> np.ndarray:
@@ -21,7 +24,7 @@ def plate(size: int = 96, half: float = 0.5, rim: int = 2) -> tuple[np.ndarray, 
     radius = np.hypot(*np.meshgrid(line, line))
     inside, wide = radius < half, radius < half + 2 * rim / size
     depth = np.where(inside, 5 + rays(size)[..., 0], 8.0)
-    noise = np.random.default_rng(0).normal(0, 0.002, depth.shape)
+    noise = default_rng(0).normal(0, 0.002, depth.shape)
     return (rays(size) * (depth + noise)[..., None])[wide], inside[wide]
 
 
@@ -31,21 +34,21 @@ POINTS, PLATE = plate()
 @pytest.mark.parametrize("rim", [1, 2, 3])
 def test_a_rim_of_background_is_no_surface(rim: int) -> None:
     points, genuine = plate(rim=rim)
-    np.testing.assert_array_equal(surface_points(points), genuine)
+    assert_array_equal(surface_points(points), genuine)
     assert longest_side(points) > 1.5 * longest_side(points[genuine])
 
 
 def test_parts_of_different_density_lose_nothing() -> None:
     """A ball of 1,800 random points beside a plate of 600, which are farther apart."""
-    plate = np.random.default_rng(4).uniform((2, -1, 6), (4, 1, 6), (600, 3))
+    plate = default_rng(4).uniform((2, -1, 6), (4, 1, 6), (600, 3))
     assert surface_points(np.concatenate([front((0.0, 0.0, 6.0), 1.0, -1.0, 1800), plate])).mean() > 0.99
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1.0, 1e4])
 def test_neither_unit_nor_turn_nor_order_matters(factor: float) -> None:
-    order = np.random.default_rng(1).permutation(len(POINTS))
+    order = default_rng(1).permutation(len(POINTS))
     turned = factor * POINTS[order] @ Rotation.from_rotvec([1.0, 0.5, -0.3]).as_matrix().T
-    np.testing.assert_array_equal(surface_points(turned), PLATE[order])
+    assert_array_equal(surface_points(turned), PLATE[order])
 
 
 def test_many_points_are_decided_by_some_of_them() -> None:
@@ -55,7 +58,7 @@ def test_many_points_are_decided_by_some_of_them() -> None:
 
 
 def test_too_few_points_to_tell_are_all_kept() -> None:
-    rng = np.random.default_rng(2)
+    rng = default_rng(2)
     for count in (0, 1, 2, 25):
         assert surface_points(rng.normal((0, 0, 9), 1, (count, 3))).all()
     for place in ([0.0, 0, 0], [0, 0, 3.0]):
@@ -64,7 +67,7 @@ def test_too_few_points_to_tell_are_all_kept() -> None:
 
 def test_points_closer_than_their_noise_are_a_surface() -> None:
     """A hundred frames of one plate fused: neighbours' ranges differ by many times their distance."""
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     points = rng.uniform(-1, 1, (20_000, 3)) * [1, 1, 0] + [0, 0, 5]
     assert surface_points(points * (1 + rng.normal(0, 0.05, (len(points), 1)))).mean() > 0.99
 
@@ -78,13 +81,13 @@ def plane(tilt: float) -> Float[np.ndarray, "n 3"]:
 
 
 def noisy(points: Float[np.ndarray, "n 3"], std: float) -> Float[np.ndarray, "n 3"]:
-    return points * (1.0 + np.random.default_rng(2).normal(scale=std / 50.0, size=(len(points), 1)))
+    return points * (1.0 + default_rng(2).normal(scale=std / 50.0, size=(len(points), 1)))
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.6, 1.1])
 def test_planes_stay_and_their_noise_falls(tilt: float) -> None:
     flat = plane(tilt)
-    np.testing.assert_allclose(smoothed(flat), flat, rtol=2e-3)
+    assert_allclose(smoothed(flat), flat, rtol=2e-3)
     before, after = noisy(flat, 0.3) - flat, smoothed(noisy(flat, 0.3)) - flat
     assert np.linalg.norm(after, axis=1).std() < 0.5 * np.linalg.norm(before, axis=1).std()
 
@@ -93,8 +96,8 @@ def test_points_stay_on_their_lines_of_sight_in_any_frame_and_unit() -> None:
     points = noisy(plane(0.4), 0.3)
     moved = smoothed(points)
     along = np.einsum("ij,ij->i", moved, points) / (np.linalg.norm(moved, axis=1) * np.linalg.norm(points, axis=1))
-    np.testing.assert_allclose(along, 1.0)
-    np.testing.assert_allclose(smoothed(points * 1024.0), moved * 1024.0)
+    assert_allclose(along, 1.0)
+    assert_allclose(smoothed(points * 1024.0), moved * 1024.0)
     turn = Rotation.from_rotvec([0.2, -0.4, 1.0]).as_matrix()
     turned = smoothed(points @ turn.T) @ turn
     assert np.median(np.linalg.norm(turned - moved, axis=1)) < 0.02
@@ -111,7 +114,7 @@ def test_an_edge_stays_sharp() -> None:
 def test_the_calmest_part_of_a_cloud_bounds_its_noise(std: float) -> None:
     points = noisy(plane(0.6), std)
     assert 0.5 * std < roughness(points) < 0.8 * std, "a tenth of all patches is that calm by chance"
-    crumpled = np.where(SIGHT[:, :1] > 0, 1.0, 1.0 + np.random.default_rng(3).uniform(-0.1, 0.1, (len(SIGHT), 1)))
+    crumpled = np.where(SIGHT[:, :1] > 0, 1.0, 1.0 + default_rng(3).uniform(-0.1, 0.1, (len(SIGHT), 1)))
     assert 0.5 * std < roughness(points * crumpled) < std, "however rough the rest is"
     assert roughness(1024.0 * points) == pytest.approx(1024.0 * roughness(points), rel=1e-6)
     assert roughness(points[:6]) == np.inf
@@ -120,14 +123,14 @@ def test_the_calmest_part_of_a_cloud_bounds_its_noise(std: float) -> None:
 @pytest.mark.parametrize("count", [1, 3, 5])
 def test_a_handful_of_points_is_as_good_as_it_is(count: int) -> None:
     points = SIGHT[:count] * 50.0
-    np.testing.assert_allclose(smoothed(points), points, rtol=2e-2)
+    assert_allclose(smoothed(points), points, rtol=2e-2)
     same = np.repeat(points[:1], 8, axis=0)
-    np.testing.assert_allclose(smoothed(same), same)
+    assert_allclose(smoothed(same), same)
 
 
 @pytest.mark.parametrize("limit", [1, 7, 49, 50, 51])
 def test_a_random_subset_is_the_same_every_time(limit: int) -> None:
-    points = np.random.default_rng(3).normal(size=(50, 3))
+    points = default_rng(3).normal(size=(50, 3))
     chosen = random_subset(points, limit)
     assert len(chosen) == min(limit, 50) == len(np.unique(chosen, axis=0))
     assert set(map(tuple, chosen)) <= set(map(tuple, points))
@@ -138,7 +141,7 @@ def test_a_random_subset_is_the_same_every_time(limit: int) -> None:
 
 def wall(noise: float) -> Float[np.ndarray, "n 3"]:
     directions = Camera.from_fov(200, 200, 0.6).directions().reshape(-1, 3)
-    return directions * (50.0 + noise * np.random.default_rng(5).normal(size=(len(directions), 1)))
+    return directions * (50.0 + noise * default_rng(5).normal(size=(len(directions), 1)))
 
 
 def test_means_of_neighbours_average_the_noise() -> None:
@@ -179,11 +182,11 @@ def test_on_a_lattice_the_choice_is_exact_and_ties_go_to_smaller_coordinates() -
     assert np.array_equal(order[1:], gaps.argmax(axis=0))
 
 
-@pytest.mark.parametrize("points", [lattice(4), np.random.default_rng(2).normal(size=(200, 3))], ids=["ties", "random"])
+@pytest.mark.parametrize("points", [lattice(4), default_rng(2).normal(size=(200, 3))], ids=["ties", "random"])
 def test_the_points_chosen_do_not_depend_on_their_order(points: np.ndarray) -> None:
     expected = points[farthest_point_order(points, 50)]
     for seed in range(4):
-        shuffled = np.random.default_rng(seed).permutation(points)
+        shuffled = default_rng(seed).permutation(points)
         assert np.array_equal(shuffled[farthest_point_order(shuffled, 50)], expected)
 
 
@@ -194,14 +197,14 @@ def test_it_starts_at_the_point_farthest_from_the_middle_of_the_box_or_where_it_
 
 
 def test_coinciding_points_come_last_and_no_row_twice() -> None:
-    distinct = np.random.default_rng(4).normal(size=(30, 3))
-    points = np.random.default_rng(5).permutation(np.concatenate([distinct, distinct[:12], distinct[:5]]))
+    distinct = default_rng(4).normal(size=(30, 3))
+    points = default_rng(5).permutation(np.concatenate([distinct, distinct[:12], distinct[:5]]))
     order = farthest_point_order(points, 100)
     assert sorted(order) == list(range(47))
     assert len(np.unique(points[order[:30]], axis=0)) == 30
 
 
 def test_where_a_small_cloud_lies_does_not_matter() -> None:
-    points = np.round(np.random.default_rng(6).normal(size=(300, 3)), 3)
+    points = np.round(default_rng(6).normal(size=(300, 3)), 3)
     far = points + 4096.0
     assert np.array_equal(farthest_point_order(points, 300)[:100], farthest_point_order(far, 300)[:100])

@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 from shapes import segment
 
@@ -82,26 +84,26 @@ def test_scores_up_to_symmetry_take_the_exchange_that_fits_best() -> None:
     right = np.array([[90, 1, 0, 0], [2, 30, 0, 0], [0, 0, 40, 1], [0, 0, 0, 9]])
     exchanged = right[[0, 2, 1, 3]]  # the answer has taken one part for the other
     for confusion in (right, exchanged):
-        np.testing.assert_array_equal(with_segments_exchanged(confusion, [(1, 0, 2)]), right)
-    np.testing.assert_array_equal(with_segments_exchanged(exchanged, []), exchanged)
+        assert_array_equal(with_segments_exchanged(confusion, [(1, 0, 2)]), right)
+    assert_array_equal(with_segments_exchanged(exchanged, []), exchanged)
 
 
 def test_a_fit_of_moved_points_is_the_motion() -> None:
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     for count in (3, 4, 50):
         motion = rigid(Rotation.from_rotvec(rng.normal(size=3)).as_matrix(), rng.normal(size=3) * 100)
         source = rng.normal(size=(count, 3)) * [1, 5, 0.0 if count == 4 else 0.1]  # four of them in a plane
         found = fit_rigid(source, transform_points(motion, source))
-        np.testing.assert_allclose(found, motion, atol=1e-9)
+        assert_allclose(found, motion, atol=1e-9)
 
 
 def test_a_fit_of_noisy_pairs_is_the_one_of_scipy_and_nothing_near_it_is_better() -> None:
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     source, target, weights = rng.normal(size=(20, 3)), rng.normal(size=(20, 3)), rng.random(20)
     found = fit_rigid(source, target, weights)
     middle, aim = (np.average(points, axis=0, weights=weights) for points in (source, target))
     expected = Rotation.align_vectors(target - aim, source - middle, weights=weights)[0].as_matrix()
-    np.testing.assert_allclose(found, rigid(expected, aim - expected @ middle), atol=1e-9)
+    assert_allclose(found, rigid(expected, aim - expected @ middle), atol=1e-9)
 
     def error(motion: np.ndarray) -> float:
         return float(weights @ np.sum((transform_points(motion, source) - target) ** 2, axis=1))
@@ -118,7 +120,7 @@ def test_a_fit_of_points_whose_products_are_infinite_ends() -> None:
 
 
 def test_mirrored_points_are_turned_not_mirrored() -> None:
-    source = np.random.default_rng(3).normal(size=(30, 3))
+    source = default_rng(3).normal(size=(30, 3))
     rotation = fit_rigid(source, source * [-1, 1, 1])[:3, :3]
-    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(rotation) == pytest.approx(1.0)

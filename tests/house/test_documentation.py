@@ -92,11 +92,10 @@ def test_every_entry_that_is_mentioned_exists() -> None:
 
 
 @pytest.mark.parametrize("page", [p for p in RELEASED if any(commands(p))], ids=lambda page: page.name)
-def test_commands_parse(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_commands_parse(page: Path, working_folder: Path) -> None:
     for folder in ("result", "out/bunny"):  # which an earlier line of a page has made
-        (tmp_path / folder).mkdir(parents=True)
-        (tmp_path / folder / "config.json").write_text('{"inputs": ["frame.ply"], "weights": "bunny"}')
+        (working_folder / folder).mkdir(parents=True)
+        (working_folder / folder / "config.json").write_text('{"inputs": ["frame.ply"], "weights": "bunny"}')
     for line in commands(page):
         try:
             parse(shlex.split(line, comments=True)[1:])

@@ -147,7 +147,7 @@ def test_a_shipped_name_is_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert find_weights("runs") == Path("runs/weights.safetensors")
 
 
-def test_what_cannot_be_released_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_released_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     other = evaluation(tmp_path / "other", per_segment={"base": 1.0})
     for arguments, said in (
         (["--name", "My Bunny"], "the name is 'My Bunny'; weights are named by"),

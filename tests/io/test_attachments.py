@@ -5,6 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 from shapes import ball, box
 
@@ -16,7 +18,7 @@ from mereo.scenes.files.template import write_scene_file
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SourceFrame
 
-POINTS = np.random.default_rng(0).normal(size=(20, 3))
+POINTS = default_rng(0).normal(size=(20, 3))
 
 
 def written(path: Path, text: str) -> Path:
@@ -35,7 +37,7 @@ def test_a_mesh_keeps_its_format_and_its_surface(tmp_path: Path, suffix: str) ->
     path = tmp_path / "out" / found.name
     write_attachment(path, moved, 1.0, viewer_rotation("camera"), 0.001)
     (again,) = read_attachments([path])
-    np.testing.assert_allclose(np.sort(again.content.points, axis=0), np.sort(part.vertices + 1.0, axis=0), atol=1e-5)
+    assert_allclose(np.sort(again.content.points, axis=0), np.sort(part.vertices + 1.0, axis=0), atol=1e-5)
     assert isinstance(again.content, Surfaces)
     again.content.mesh.check()
 
@@ -46,7 +48,7 @@ def test_a_cloud_keeps_its_format_and_its_points(tmp_path: Path, suffix: str) ->
     write_attachment(path, Positions(POINTS), 1000.0, np.eye(3), 1.0)
     (found,) = read_attachments([path])
     assert isinstance(found.content, Positions)
-    np.testing.assert_allclose(found.content.points, 1000.0 * POINTS, rtol=1e-6)
+    assert_allclose(found.content.points, 1000.0 * POINTS, rtol=1e-6)
 
 
 @pytest.mark.parametrize("mark", [",", ";", "\t"])
@@ -55,26 +57,26 @@ def test_a_table_keeps_its_other_columns(tmp_path: Path, mark: str) -> None:
     text = "\n".join(rows) if mark == "," else "\n".join(rows).replace("a, b", "a b").replace(",", mark)
     table = read_pose_table(written(tmp_path / "t.csv", text))
     assert table.rotations is None
-    np.testing.assert_array_equal(table.points, [[1, 2, 3], [4, 5, 6], [7, 8, 9]])
+    assert_array_equal(table.points, [[1, 2, 3], [4, 5, 6], [7, 8, 9]])
     again = read_pose_table(written(tmp_path / "u.csv", table.at(table.points + 0.5, None).text(10.0)))
-    np.testing.assert_allclose(again.points, 10 * (table.points + 0.5))
+    assert_allclose(again.points, 10 * (table.points + 0.5))
     assert again.header == ("Z", "note", "X", "y")
     assert [row[1] for row in again.rows] == [row[1] for row in table.rows]
 
 
 def test_poses_come_back_turned(tmp_path: Path) -> None:
-    turns = Rotation.random(4, rng=np.random.default_rng(1))
+    turns = Rotation.random(4, rng=default_rng(1))
     rows = ["grasp,x,y,z,qx,qy,qz,qw"]
     for index, (turn, point) in enumerate(zip(turns, POINTS, strict=False)):
         rows.append(",".join(map(str, [f"g{index}", *point, *turn.as_quat()])))
     about = Rotation.from_rotvec([0.2, 0.5, -1.0]).as_matrix()
     table = read_pose_table(written(tmp_path / "p.csv", "\n".join(rows)))
     assert table.rotations is not None
-    np.testing.assert_allclose(table.rotations, turns.as_matrix(), atol=1e-12)
+    assert_allclose(table.rotations, turns.as_matrix(), atol=1e-12)
     again = read_pose_table(written(tmp_path / "q.csv", table.at(table.points, about @ table.rotations).text()))
     assert again.rotations is not None
-    np.testing.assert_allclose(again.rotations, about @ turns.as_matrix(), atol=1e-9)
-    np.testing.assert_allclose(again.points, POINTS[:4], rtol=1e-9)
+    assert_allclose(again.rotations, about @ turns.as_matrix(), atol=1e-9)
+    assert_allclose(again.points, POINTS[:4], rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -151,6 +153,6 @@ def test_splitting_long_edges_keeps_the_surface() -> None:
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     assert mesh.edges_unique_length.max() <= 0.7 and mesh.is_watertight
     assert mesh.volume == pytest.approx(24.0) and mesh.area == pytest.approx(70.0)
-    np.testing.assert_array_equal(vertices[: len(part.vertices)], part.vertices)
+    assert_array_equal(vertices[: len(part.vertices)], part.vertices)
     with pytest.raises(ValueError, match="would take 1,000 triangles or more to have no edge over 0.05; it"):
         split_long_edges(part.vertices, part.faces, 0.05, 1000)

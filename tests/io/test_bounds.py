@@ -83,16 +83,15 @@ def test_every_number_has_bounds_that_it_cannot_leave(settings: type, name: str,
     ],
 )
 def test_an_option_out_of_its_bounds_is_refused_before_anything_is_read_or_written(
-    text: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    text: str, message: str, working_folder: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     assert command_line.main(text.split()) == 2
     printed = capsys.readouterr().err
     assert printed.startswith(f"mereo: error: {message}") and printed.count("\n") == 1
-    assert not list(tmp_path.iterdir())
+    assert not list(working_folder.iterdir())
 
 
-def test_the_help_shows_bounds(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_help_shows_bounds(capsys: pytest.CaptureFixture) -> None:
     with pytest.raises(SystemExit):
         command_line.main(["bench", "--help"])
     assert "(default: 7; at least 1)" in " ".join(capsys.readouterr().out.replace("│", "").split())

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from point_files import save_pcd, save_ply
 
@@ -19,7 +21,7 @@ from mereo.geometry.camera import Camera, PointCloud
 from mereo.io.mesh_formats import MeshWarning, read_glb, read_segmented_mesh
 from mereo.io.readers import InputWarning, is_depth_image, read_depth_image, read_mask, read_point_cloud
 
-POINTS = np.random.default_rng(0).normal(size=(57, 3)).astype(np.float32) + np.float32(3)
+POINTS = default_rng(0).normal(size=(57, 3)).astype(np.float32) + np.float32(3)
 
 
 def text(points: np.ndarray, separator: str, *, extra: str = "") -> str:
@@ -49,13 +51,13 @@ CLOUDS: dict[str, bytes] = {
 @pytest.mark.parametrize("name", CLOUDS)
 def test_every_format_gives_back_the_points(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(CLOUDS[name])
-    np.testing.assert_array_equal(read_point_cloud(tmp_path / name).points, POINTS.astype(np.float64))
+    assert_array_equal(read_point_cloud(tmp_path / name).points, POINTS.astype(np.float64))
 
 
 def test_whole_numbers_between_commas_are_numbers(tmp_path: Path) -> None:
     """Millimetres with colours, and zeros among them, are no halves of numbers."""
     (tmp_path / "a.csv").write_text("x,y,z,r,g,b\n10,0,300,0,255,0\n-12,20,301,7,0,0\n")
-    np.testing.assert_array_equal(read_point_cloud(tmp_path / "a.csv").points, [[10, 0, 300], [-12, 20, 301]])
+    assert_array_equal(read_point_cloud(tmp_path / "a.csv").points, [[10, 0, 300], [-12, 20, 301]])
 
 
 def test_arrays_in_numpy_files(tmp_path: Path) -> None:
@@ -64,7 +66,7 @@ def test_arrays_in_numpy_files(tmp_path: Path) -> None:
     np.savez(tmp_path / "named.npz", points=POINTS, other=POINTS[:2])
     np.savez(tmp_path / "only.npz", cloud=POINTS, matrix=np.eye(4))
     for name, count in (("flat.npy", 57), ("organized.npy", 56), ("named.npz", 57), ("only.npz", 57)):
-        np.testing.assert_array_equal(read_point_cloud(tmp_path / name).points, POINTS[:count])
+        assert_array_equal(read_point_cloud(tmp_path / name).points, POINTS[:count])
 
 
 def test_missing_points_are_refused_with_the_cure_or_dropped(tmp_path: Path) -> None:
@@ -75,7 +77,7 @@ def test_missing_points_are_refused_with_the_cure_or_dropped(tmp_path: Path) -> 
         with pytest.raises(ValueError, match=r"3 of 57 points without a measurement.*--drop-invalid"):
             read_point_cloud(tmp_path / name)
         kept = np.delete(POINTS, [3, 5, 9], axis=0)
-        np.testing.assert_array_equal(read_point_cloud(tmp_path / name, drop_invalid=True).points, kept)
+        assert_array_equal(read_point_cloud(tmp_path / name, drop_invalid=True).points, kept)
 
 
 def npy(array: np.ndarray) -> bytes:
@@ -152,7 +154,7 @@ def test_parts_of_an_obj_keep_their_order_names_and_closedness(tmp_path: Path) -
     mesh = read_segmented_mesh(tmp_path / "parts.obj")
     mesh.check()
     assert mesh.names == ("zebra", "ant", "middle part")
-    np.testing.assert_allclose([s.volume for s in mesh.segments], 1.0)
+    assert_allclose([s.volume for s in mesh.segments], 1.0)
 
 
 def test_one_file_for_each_segment(tmp_path: Path) -> None:
@@ -232,7 +234,7 @@ def test_each_instance_and_node_of_a_glb_file_is_a_segment_in_its_place(tmp_path
     middles = {part.name: part.bounds.mean(axis=0).tolist() for part in mesh.segments}
     fingers = {f"finger_{number}": [x, y, 10] for number, (x, y, _) in enumerate(shifts.tolist(), 1)}
     assert middles == fingers | {"thumb": [9, 0, 0], "thumb_1": [-9, 0, 0]}
-    np.testing.assert_allclose([part.volume for part in mesh.segments], [1, 2, 3, 1, 1], rtol=1e-6)
+    assert_allclose([part.volume for part in mesh.segments], [1, 2, 3, 1, 1], rtol=1e-6)
     assert read_glb(tmp_path / "hand.glb").mesh.names == mesh.names
 
 
@@ -353,15 +355,15 @@ def save_depth(path: Path, values: np.ndarray) -> Path:
 
 
 def test_depth_is_value_over_scale_and_masked(tmp_path: Path) -> None:
-    values = np.random.default_rng(1).integers(400, 60000, (6, 8)).astype(np.uint16)
+    values = default_rng(1).integers(400, 60000, (6, 8)).astype(np.uint16)
     values[2, 3] = 0
     path = save_depth(tmp_path / "d.png", values)
-    np.testing.assert_array_equal(read_depth_image(path, CAMERA, 5000.0).depth, values / 5000.0)
+    assert_array_equal(read_depth_image(path, CAMERA, 5000.0).depth, values / 5000.0)
     mask = np.zeros((6, 8), np.uint8)
     mask[1:4, 2:5] = 255
     masked = read_depth_image(path, CAMERA, 5000.0, save_depth(tmp_path / "m.png", mask))
     assert int(masked.valid.sum()) == 8
-    np.testing.assert_array_equal(masked.depth, np.where(mask > 0, values / 5000.0, 0))
+    assert_array_equal(masked.depth, np.where(mask > 0, values / 5000.0, 0))
 
 
 def test_a_bad_depth_image_gets_one_sentence(tmp_path: Path) -> None:
@@ -378,7 +380,7 @@ def test_a_bad_depth_image_gets_one_sentence(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=expected) as caught:
             read_depth_image(path, CAMERA, scale)
         assert "\n" not in str(caught.value)
-    noise = np.random.default_rng(0).integers(500, 1500, (60, 80)).astype(np.uint16)
+    noise = default_rng(0).integers(500, 1500, (60, 80)).astype(np.uint16)
     path.write_bytes(save_depth(path, noise).read_bytes()[:3000])
     with pytest.raises(ValueError, match="cannot be read as a depth image") as caught:
         read_depth_image(path, CAMERA)
@@ -391,7 +393,7 @@ def test_a_bad_depth_image_gets_one_sentence(tmp_path: Path) -> None:
 
 
 def test_masks_of_all_kinds_agree(tmp_path: Path) -> None:
-    truth = np.random.default_rng(2).random((5, 7)) > 0.5
+    truth = default_rng(2).random((5, 7)) > 0.5
     grey = Image.fromarray(truth.astype(np.uint8) * 9)
     for name, image in (
         ("grey", grey),
@@ -401,7 +403,7 @@ def test_masks_of_all_kinds_agree(tmp_path: Path) -> None:
         ("opaque", Image.merge("RGBA", (grey, grey, grey, Image.new("L", grey.size, 255)))),
     ):
         image.save(tmp_path / f"{name}.png")
-        np.testing.assert_array_equal(read_mask(tmp_path / f"{name}.png"), truth, err_msg=name)
+        assert_array_equal(read_mask(tmp_path / f"{name}.png"), truth, err_msg=name)
 
 
 def disk(*values: int) -> np.ndarray:
@@ -420,7 +422,7 @@ def test_soft_edges_are_taken_from_half_of_white_and_a_word_is_said(tmp_path: Pa
     for name, why, factor in (("mask.jpg", r" \(a lossy format makes them\)", 1), ("resized.png", "", 2)):
         with pytest.warns(InputWarning, match=f"{name} has grey edges{why}; its pixels from half of white"):
             mask = read_mask(tmp_path / name)
-        np.testing.assert_array_equal(mask, np.kron(truth, np.ones((factor, factor))) > 0, err_msg=name)
+        assert_array_equal(mask, np.kron(truth, np.ones((factor, factor))) > 0, err_msg=name)
 
 
 def test_a_mask_of_ids_needs_the_objects(tmp_path: Path) -> None:
@@ -435,8 +437,8 @@ def test_a_mask_of_ids_needs_the_objects(tmp_path: Path) -> None:
             ValueError, match=r"has the values 0, 1, 3, 4, which may be ids .* --mask-value 4 or others"
         ):
             read_mask(tmp_path / name)
-        np.testing.assert_array_equal(read_mask(tmp_path / name, values=(3,)), ids == 3)
-        np.testing.assert_array_equal(read_mask(tmp_path / name, values=(3, 4)), ids >= 3)
+        assert_array_equal(read_mask(tmp_path / name, values=(3,)), ids == 3)
+        assert_array_equal(read_mask(tmp_path / name, values=(3, 4)), ids >= 3)
     with pytest.raises(
         ValueError, match=r"has the values 0, 1, 3, 4, and the object's are to be \[7\]; .*--mask-value"
     ):
@@ -447,21 +449,21 @@ def test_a_mask_of_ids_needs_the_objects(tmp_path: Path) -> None:
 
 
 def test_what_is_opaque_is_the_object(tmp_path: Path) -> None:
-    truth, noise = disk(255) > 0, np.random.default_rng(3).integers(0, 256, (40, 60, 3)).astype(np.uint8)
+    truth, noise = disk(255) > 0, default_rng(3).integers(0, 256, (40, 60, 3)).astype(np.uint8)
     alpha = Image.fromarray(truth.astype(np.uint8) * 250)
     for name, image in (
         ("colors", Image.merge("RGBA", (*Image.fromarray(noise).split(), alpha))),
         ("grey", Image.merge("LA", (Image.fromarray(noise[..., 0]), alpha))),
     ):
         image.save(tmp_path / f"{name}.png")
-        np.testing.assert_array_equal(read_mask(tmp_path / f"{name}.png"), truth, err_msg=name)
+        assert_array_equal(read_mask(tmp_path / f"{name}.png"), truth, err_msg=name)
     cut_out = Image.fromarray(np.where(truth, 7, 2).astype(np.uint8))
     cut_out.putpalette([9] * 30)
     cut_out.save(tmp_path / "palette.png", transparency=2)
-    np.testing.assert_array_equal(read_mask(tmp_path / "palette.png"), truth)
+    assert_array_equal(read_mask(tmp_path / "palette.png"), truth)
 
 
-MILLIMETRES = np.random.default_rng(5).integers(400, 9000, (6, 8)).astype(np.uint16)
+MILLIMETRES = default_rng(5).integers(400, 9000, (6, 8)).astype(np.uint16)
 MILLIMETRES[2, 3] = 0
 METRES = np.where(MILLIMETRES > 0, MILLIMETRES / np.float32(1000), np.nan).astype(np.float32)
 
@@ -473,7 +475,7 @@ def test_every_format_gives_the_same_metres(tmp_path: Path, name: str) -> None:
     stored = values.get(path.stem, METRES)
     np.save(path, stored) if path.suffix == ".npy" else save_depth(path, stored)
     depth = read_depth_image(path, CAMERA).depth
-    np.testing.assert_allclose(depth, MILLIMETRES / 1000, rtol=1e-6)
+    assert_allclose(depth, MILLIMETRES / 1000, rtol=1e-6)
     assert depth[2, 3] == 0, "NaN and 0 both say that nothing was measured"
 
 
@@ -486,7 +488,7 @@ def test_exr(tmp_path: Path, channels: dict[str, float], monkeypatch: pytest.Mon
     pixels = {name: np.ascontiguousarray(stored * np.float32(factor)) for name, factor in channels.items()}
     header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
     openexr.File(header, pixels).write(str(tmp_path / "d.exr"))
-    np.testing.assert_allclose(read_depth_image(tmp_path / "d.exr", CAMERA).depth, MILLIMETRES / 1000, rtol=1e-6)
+    assert_allclose(read_depth_image(tmp_path / "d.exr", CAMERA).depth, MILLIMETRES / 1000, rtol=1e-6)
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     with pytest.raises(ImportError, match=r"d.exr needs OpenEXR, .*: pip install 'mereo\[sensors\]'"):
         read_depth_image(tmp_path / "d.exr", CAMERA)
@@ -517,7 +519,7 @@ def test_arrays_are_told_apart_by_their_shape(tmp_path: Path) -> None:
 
 
 def test_normals_of_a_ply_file_are_read_with_its_points(tmp_path: Path) -> None:
-    normals = np.random.default_rng(1).normal(size=POINTS.shape)
+    normals = default_rng(1).normal(size=POINTS.shape)
     names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
     head = f"ply\nformat {{}} 1.0\nelement vertex {len(POINTS)}\n{names}end_header\n"
     rows = np.hstack([POINTS, normals]).astype("<f4")
@@ -525,9 +527,9 @@ def test_normals_of_a_ply_file_are_read_with_its_points(tmp_path: Path) -> None:
     (tmp_path / "b.ply").write_bytes(head.format("binary_little_endian").encode() + rows.tobytes())
     for name in ("a.ply", "b.ply"):
         cloud = read_point_cloud(tmp_path / name)
-        np.testing.assert_array_equal(cloud.points, POINTS.astype(np.float64))
+        assert_array_equal(cloud.points, POINTS.astype(np.float64))
         length = np.linalg.norm(normals, axis=1, keepdims=True)
-        np.testing.assert_allclose(cloud.normals, normals / length, atol=1e-6)
+        assert_allclose(cloud.normals, normals / length, atol=1e-6)
     rows[3], rows[5, 3] = 0.0, np.nan
     (tmp_path / "b.ply").write_bytes(head.format("binary_little_endian").encode() + rows.tobytes())
     cloud = read_point_cloud(tmp_path / "b.ply", drop_invalid=True)

@@ -59,11 +59,10 @@ def test_credentials_in_a_url_are_refused_and_not_repeated() -> None:
     assert "geheim" not in str(refused.value) and "AKIA" not in str(refused.value)
 
 
-def test_outputs_that_cannot_be_objects_refuse_a_url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_outputs_that_cannot_be_objects_refuse_a_url(working_folder: Path) -> None:
     with pytest.raises(ValueError, match="the output s3://bucket/run is a URL, and a local path is needed here; only"):
         check_place(Path("s3://bucket/run"))
-    (tmp_path / "s3:").mkdir()
+    (working_folder / "s3:").mkdir()
     check_place(Path("s3:/bucket/run"))
 
 
@@ -161,7 +160,7 @@ def contents(folder: Path | ObjectPath) -> dict[str, bytes]:
     return {name: (folder / name).read_bytes() for name in names_in(folder)}
 
 
-def test_a_dataset_is_shared_and_made_again(s3: ObjectPath, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_dataset_is_shared_and_made_again(s3: ObjectPath, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     make = partial(generate, toy_scene(), settings=SMALL, examples=4, seed=3)
     make(tmp_path / "data")
     whole = contents(tmp_path / "data")
@@ -191,11 +190,10 @@ def test_what_goes_wrong_is_one_sentence_without_credentials(
     change: dict[str, str | None],
     text: str,
     sentence: str,
-    tmp_path: Path,
+    working_folder: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    capsys: pytest.CaptureFixture,
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     for name, value in change.items():
         monkeypatch.delenv(name) if value is None else monkeypatch.setenv(name, value)
     pytest.importorskip("s3fs").S3FileSystem.clear_instance_cache()
@@ -203,4 +201,4 @@ def test_what_goes_wrong_is_one_sentence_without_credentials(
     said = capsys.readouterr()
     assert said.err.startswith("mereo: error: s3://") and sentence in said.err and said.err.count("\n") == 1
     assert "testing-" not in said.err + said.out
-    assert not any(tmp_path.iterdir())
+    assert not any(working_folder.iterdir())

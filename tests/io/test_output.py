@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from folder_contents import contents
+from folder_contents import contents, read_json
 
 from mereo.io.atomic_files import MARKER, OLD, atomic_file, new_directory, write_json
 from mereo.io.errors import words_of
@@ -99,7 +99,7 @@ def test_json_knows_arrays_and_has_no_nan(tmp_path: Path) -> None:
     write_json(
         tmp_path / "a.json", {"a": np.arange(3), "b": (np.float32(0.5), float("nan")), "c": Path("x"), "é": True}
     )
-    loaded = json.loads((tmp_path / "a.json").read_text(encoding="utf-8"))
+    loaded = read_json(tmp_path / "a.json")
     assert loaded == {"a": [0, 1, 2], "b": [0.5, None], "c": "x", "é": True}
 
 

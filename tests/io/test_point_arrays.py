@@ -10,6 +10,7 @@ import pytest
 import torch
 import trimesh
 from memory_frames import FORMS, GRID, POINTS, Tensor, TensorMap, message, records, with_data
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.io.point_arrays import is_frame_list, model_points, points_of
@@ -23,7 +24,7 @@ def test_every_form_gives_the_same_points(form: str) -> None:
     cloud, lost = points_of(FORMS[form])
     assert isinstance(cloud, PointCloud) and lost == 0
     assert cloud.points.dtype == np.float64 and type(cloud.points) is np.ndarray
-    np.testing.assert_array_equal(cloud.points, POINTS)
+    assert_array_equal(cloud.points, POINTS)
     assert not is_frame_list(FORMS[form])
 
 
@@ -32,7 +33,7 @@ def test_own_types_are_returned_and_others_are_copied_in_all_their_digits() -> N
     fine = np.random.default_rng(1).normal(size=(9, 3))
     cloud, _ = points_of(fine)
     assert isinstance(cloud, PointCloud)
-    np.testing.assert_array_equal(cloud.points, fine)
+    assert_array_equal(cloud.points, fine)
     assert not np.shares_memory(cloud.points, fine)
 
 
@@ -63,7 +64,7 @@ def test_missing_points_are_refused_or_dropped_and_counted(kind: str, points: np
         points_of(KINDS[kind](broken(points)))
     cloud, lost = points_of(KINDS[kind](broken(points)), drop_invalid=True)
     assert isinstance(cloud, PointCloud) and lost == 3
-    np.testing.assert_array_equal(cloud.points, MEASURED)
+    assert_array_equal(cloud.points, MEASURED)
 
 
 @pytest.mark.parametrize("made", [POINTS, records(POINTS)], ids=["array", "structured"])
@@ -74,7 +75,7 @@ def test_masked_values_are_missing(made: np.ndarray) -> None:
         points_of(masked)
     cloud, lost = points_of(masked, drop_invalid=True)
     assert isinstance(cloud, PointCloud) and lost == 1
-    np.testing.assert_array_equal(cloud.points, np.delete(POINTS, 4, axis=0))
+    assert_array_equal(cloud.points, np.delete(POINTS, 4, axis=0))
 
 
 def test_other_marks_of_missing_points() -> None:
@@ -173,7 +174,7 @@ def test_points_of_a_model_may_be_its_origin_and_must_be_finite() -> None:
         np.array([[0.0, 0, 0], [1, 2, 3]]),
         PointCloud(np.array([[0.0, 0, 0], [1, 2, 3]])),
     ):
-        np.testing.assert_array_equal(model_points(form), [[0, 0, 0], [1, 2, 3]])
+        assert_array_equal(model_points(form), [[0, 0, 0], [1, 2, 3]])
     for wrong in ([[0, 0, np.nan]], np.empty((0, 3)), [[1e13, 0, 0]]):
         with pytest.raises(
             ValueError, match=r"of shape .* has no points, or some that are NaN, infinite or beyond 1e.12"
@@ -193,9 +194,9 @@ def test_normals_of_other_libraries_come_with_the_points() -> None:
     ball = trimesh.creation.icosphere()
     cloud, _ = points_of(ball)
     assert isinstance(cloud, PointCloud) and cloud.normals is not None
-    np.testing.assert_allclose(cloud.normals, ball.vertices, atol=0.05)
+    assert_allclose(cloud.normals, ball.vertices, atol=0.05)
     longer, lost = points_of(SimpleNamespace(points=broken(POINTS), normals=3.0 * POINTS), drop_invalid=True)
     assert isinstance(longer, PointCloud) and lost == 3
-    np.testing.assert_allclose(longer.normals, MEASURED / np.linalg.norm(MEASURED, axis=1, keepdims=True))
+    assert_allclose(longer.normals, MEASURED / np.linalg.norm(MEASURED, axis=1, keepdims=True))
     for normals in ([], POINTS[:3], np.full(POINTS.shape, np.nan), "none"):
         assert points_of(SimpleNamespace(points=POINTS, normals=normals))[0].normals is None  # type: ignore[union-attr]

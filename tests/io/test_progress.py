@@ -25,7 +25,7 @@ def wait(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     return pass_by
 
 
-def test_lines_say_stage_rate_and_time_left(wait: Callable[[float], None], capsys: pytest.CaptureFixture[str]) -> None:
+def test_lines_say_stage_rate_and_time_left(wait: Callable[[float], None], capsys: pytest.CaptureFixture) -> None:
     with progress("generate", 30) as shown:
         wait(2.0)
         shown.advance(10)
@@ -40,9 +40,7 @@ def test_lines_say_stage_rate_and_time_left(wait: Callable[[float], None], capsy
     ]
 
 
-def test_pauses_count_for_the_end_not_the_rate(
-    wait: Callable[[float], None], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_pauses_count_for_the_end_not_the_rate(wait: Callable[[float], None], capsys: pytest.CaptureFixture) -> None:
     with progress("train", 4, "steps", each=2) as shown:
         wait(1.0)
         shown.advance()
@@ -54,7 +52,7 @@ def test_pauses_count_for_the_end_not_the_rate(
     assert last == "train: 2 of 4 steps, 2.0 examples/s, 2 s left" and end == "train: 2 steps in 52 s"
 
 
-def test_a_failure_is_not_called_done_and_nothing_to_do_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_failure_is_not_called_done_and_nothing_to_do_says_nothing(capsys: pytest.CaptureFixture) -> None:
     with pytest.raises(ValueError, match="broken"), progress("generate", 3) as shown:
         shown.advance()
         raise ValueError("broken")
@@ -66,7 +64,7 @@ def test_a_failure_is_not_called_done_and_nothing_to_do_says_nothing(capsys: pyt
 
 
 def test_a_terminal_gets_a_bar_below_what_is_printed(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     drawn = io.StringIO()
     monkeypatch.setattr(

@@ -12,6 +12,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_allclose
 from page_blocks import ROOT
 
 from mereo import __main__ as command_line
@@ -66,7 +67,7 @@ def test_a_camera_gives_metres_its_intrinsics_and_times_of_one_clock(connect: An
     source = camera_frames("realsense")
     first, second, third = frames = [next(source) for _ in range(3)]
     shared.get_data()[:] = 0  # the library uses the memory of an image again
-    np.testing.assert_allclose([each.read().depth[0, 0] for each in frames], [0.5, 0, 0.5001])
+    assert_allclose([each.read().depth[0, 0] for each in frames], [0.5, 0, 0.5001])
     assert first.read().camera == CAMERA and first.name == f"realsense {SERIAL} at 0.000 s"
     assert third.time_s - second.time_s == pytest.approx(0.033) and second.time_s < 60  # between clocks
 
@@ -79,9 +80,8 @@ def test_depth_as_the_colour_camera_sees_it(connect: Any) -> None:
 
 
 def test_the_line_of_the_quickstart_finds_a_rigid_object(
-    connect: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    connect: Any, working_folder: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     trimesh.creation.box((0.16, 0.24, 0.1)).export("bottle.obj")
     front = image(0, 0.0)
     front.get_data()[10:39, 22:41] = 5000
@@ -102,7 +102,7 @@ BROKEN = {
 
 @pytest.mark.parametrize("sentence", BROKEN)
 def test_a_camera_that_breaks_off_ends_the_stream_with_one_sentence(
-    sentence: str, connect: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    sentence: str, connect: Any, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     sdk = connect(image(0, 0.0), BROKEN[sentence])
     arguments = ["--weights", "rope", "--method", "network", "--surfaces", str(tmp_path / "out")]
@@ -126,7 +126,7 @@ REFUSED = {
 
 @pytest.mark.parametrize("sentence", REFUSED)
 def test_what_cannot_be_is_said_before_anything_is_loaded(
-    sentence: str, connect: Any, capsys: pytest.CaptureFixture[str]
+    sentence: str, connect: Any, capsys: pytest.CaptureFixture
 ) -> None:
     connect(serials=("12",) if "12" in sentence else ())
     assert command_line.main(["stream", *REFUSED[sentence], "--weights", "none.safetensors"]) == 2
@@ -150,7 +150,7 @@ def test_a_recording_has_the_images_that_were_recorded_or_is_one_sentence(tmp_pa
     assert [frame.time_s for frame in frames] == pytest.approx([0, 1 / 30, 2 / 30], abs=1e-6)
     for number, frame in enumerate(frames, start=1):
         read = frame.read()
-        np.testing.assert_allclose(read.depth.ravel(), UNIT_M * (1000 * number + np.arange(48 * 64)), rtol=1e-6)
+        assert_allclose(read.depth.ravel(), UNIT_M * (1000 * number + np.arange(48 * 64)), rtol=1e-6)
         assert read.camera == CAMERA
     with pytest.raises(ValueError, match="gives no stream of depth and colour .*: record it again"):
         camera_frames(f"realsense:{RECORDED}", align_color=True)

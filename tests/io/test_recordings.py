@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.io.config import InputConfig
@@ -27,12 +28,12 @@ def test_the_depth_topic_is_found_and_read(tmp_path: Path, name: str, ros: int) 
     for frame, depth in zip(frames, DEPTH_MM, strict=True):
         content = frame.read()
         assert isinstance(content, DepthImage) and content.camera == CAMERA
-        np.testing.assert_array_equal(content.depth, depth / 1000)
+        assert_array_equal(content.depth, depth / 1000)
     seen = read_frame(path, InputConfig(frame_index=2))
     assert len(seen.cloud) == 47 and seen.unit_m == 1.0
     assert seen.source == f"{path.name}, /camera/depth/image_raw at 3.000 s"
     assert seen.depth is not None
-    np.testing.assert_array_equal(seen.depth.depth, DEPTH_MM[2] / 1000)
+    assert_array_equal(seen.depth.depth, DEPTH_MM[2] / 1000)
 
 
 def test_a_recording_that_is_damaged_anywhere_is_a_sentence_after_its_whole_frames(tmp_path: Path) -> None:
@@ -55,7 +56,7 @@ def test_the_unit_is_that_which_the_sdk_of_a_realsense_records(tmp_path: Path) -
         return {"/a/Depth_0": [depth], "/b": [make.info()], "/a/option/Depth_Units/value": [unit]}
 
     read: Any = recorded_frame(write_bag(tmp_path / "a.mcap", 2, topics)).read()
-    np.testing.assert_allclose(read.depth, DEPTH_MM[0] / 10_000)
+    assert_allclose(read.depth, DEPTH_MM[0] / 10_000)
 
 
 def test_floats_are_metres_in_either_byte_order(tmp_path: Path) -> None:
@@ -66,7 +67,7 @@ def test_floats_are_metres_in_either_byte_order(tmp_path: Path) -> None:
     )
     content = recorded_frame(path).read()
     assert isinstance(content, DepthImage)
-    np.testing.assert_allclose(content.depth, DEPTH_MM[0] / 1000, rtol=1e-6)
+    assert_allclose(content.depth, DEPTH_MM[0] / 1000, rtol=1e-6)
 
 
 def test_compressed_depth_is_found_beside_compressed_colour(tmp_path: Path) -> None:
@@ -83,7 +84,7 @@ def test_compressed_depth_is_found_beside_compressed_colour(tmp_path: Path) -> N
     for frame, depth in zip(frames, DEPTH_MM, strict=True):
         content = frame.read()
         assert isinstance(content, DepthImage) and content.camera == CAMERA
-        np.testing.assert_array_equal(content.depth, depth / 1000)
+        assert_array_equal(content.depth, depth / 1000)
 
 
 def test_compressed_floats_are_inverse_depth(tmp_path: Path) -> None:
@@ -97,7 +98,7 @@ def test_compressed_floats_are_inverse_depth(tmp_path: Path) -> None:
     )
     content = recorded_frame(path).read()
     assert isinstance(content, DepthImage)
-    np.testing.assert_allclose(content.depth, DEPTH_MM[0] / 1000, rtol=2e-4)
+    assert_allclose(content.depth, DEPTH_MM[0] / 1000, rtol=2e-4)
 
 
 @pytest.mark.parametrize(
@@ -115,7 +116,7 @@ def test_point_clouds_keep_their_missing_points_until_asked(tmp_path: Path) -> N
     points = np.random.default_rng(1).normal((0, 0, 2), 0.1, (80, 3)).astype(np.float32)
     points[5] = np.nan
     path = write_bag(tmp_path / "a.mcap", 2, lambda m: {"/points": [m.cloud(points)]})
-    np.testing.assert_array_equal(recorded_frame(path).read(), points.astype(np.float64))
+    assert_array_equal(recorded_frame(path).read(), points.astype(np.float64))
     with pytest.raises(ValueError, match="1 of 80 points without a measurement.*--drop-invalid"):
         read_frame(path)
     assert len(read_frame(path, InputConfig(drop_invalid=True)).cloud) == 79

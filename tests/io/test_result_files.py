@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_allclose, assert_array_equal
 from written_results import CENTER, COLORS, NAMES, SIDES, centroid, cloud, grid, segments
 
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
@@ -29,8 +30,8 @@ def test_a_file_keeps_names_colours_and_vertices(write: Callable[[Path, Segmente
     assert back.names == ("zebra head", "Öhrchen")
     assert back.colors == (COLORS[0], COLORS[2])
     for found, written in zip(back.segments, (mesh.segments[0], mesh.segments[2]), strict=True):
-        np.testing.assert_allclose(found.vertices, written.vertices, atol=1e-7)
-        np.testing.assert_array_equal(found.faces, written.faces)
+        assert_allclose(found.vertices, written.vertices, atol=1e-7)
+        assert_array_equal(found.faces, written.faces)
 
 
 def test_other_programs_see_the_glb_y_up_in_metres(tmp_path: Path) -> None:
@@ -38,14 +39,14 @@ def test_other_programs_see_the_glb_y_up_in_metres(tmp_path: Path) -> None:
     write_segments_glb(tmp_path / "s.glb", mesh, unit_m=0.001)
     scene = trimesh.load_scene(tmp_path / "s.glb", process=False)
     node, key = scene.graph["zebra head"]
-    np.testing.assert_allclose(node, np.diag([0.001, -0.001, -0.001, 1.0]))
+    assert_allclose(node, np.diag([0.001, -0.001, -0.001, 1.0]))
     # camera (0.1, 0.2, 0.5): y down and z forward become y up and z toward the viewer
     place = trimesh.transform_points(scene.geometry["Öhrchen"].vertices, scene.graph["Öhrchen"][0])
-    np.testing.assert_allclose(place.mean(axis=0), 0.001 * CENTER * [1, -1, -1], atol=1e-9)
+    assert_allclose(place.mean(axis=0), 0.001 * CENTER * [1, -1, -1], atol=1e-9)
     # glTF factors are linear light: viewers turn them back into the segment's sRGB colour
     linear = np.asarray(scene.geometry[key].visual.material.baseColorFactor[:3]) / 255.0
     srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    np.testing.assert_allclose(255 * srgb, (86, 180, 233), atol=1.5)
+    assert_allclose(255 * srgb, (86, 180, 233), atol=1.5)
     assert scene.geometry[key].visual.material.doubleSided
 
 
@@ -56,7 +57,7 @@ def test_a_glb_has_normals_that_point_outward(tmp_path: Path) -> None:
     for name in ("zebra head", "Öhrchen"):
         part = scene.geometry[name]
         outward = part.vertices - part.vertices.mean(axis=0)
-        np.testing.assert_allclose(np.linalg.norm(part.vertex_normals, axis=1), 1.0, atol=1e-6)
+        assert_allclose(np.linalg.norm(part.vertex_normals, axis=1), 1.0, atol=1e-6)
         # at the corners of a long box, whose faces have normals of their own, they are nearly across
         assert (np.einsum("ij,ij->i", part.vertex_normals, outward) > 0.2 * np.linalg.norm(outward, axis=1)).all()
 
@@ -80,13 +81,13 @@ def test_a_ply_has_positions_labels_and_colours_of_vertices_and_faces(tmp_path: 
         assert data.dtype["label"] == np.uint8 and len(data) == count
         assert set(np.unique(data["label"])) == {1, 3}
         colors = np.stack([data[channel] for channel in ("red", "green", "blue")], axis=1)
-        np.testing.assert_array_equal(colors, np.array(COLORS)[data["label"] - 1])
+        assert_array_equal(colors, np.array(COLORS)[data["label"] - 1])
     label = raw["vertex"]["data"]["label"]
-    np.testing.assert_allclose(found.vertices[label == 1], mesh.segments[0].vertices, atol=1e-7)
+    assert_allclose(found.vertices[label == 1], mesh.segments[0].vertices, atol=1e-7)
     box = found.vertices[label == 3]
-    np.testing.assert_allclose([box.min(axis=0), box.max(axis=0)], BOX, atol=1e-7)
+    assert_allclose([box.min(axis=0), box.max(axis=0)], BOX, atol=1e-7)
     of_faces = raw["face"]["data"]["label"]
-    np.testing.assert_array_equal(label[found.faces], np.repeat(of_faces[:, None], 3, axis=1))
+    assert_array_equal(label[found.faces], np.repeat(of_faces[:, None], 3, axis=1))
     assert found.submesh([np.flatnonzero(of_faces == 3)], append=True).volume == pytest.approx(SIDES.prod(), rel=1e-5)
 
 
@@ -115,8 +116,8 @@ def test_other_programs_see_the_obj_in_its_colours(tmp_path: Path) -> None:
     parts = {part.visual.material.name: part for part in scene.geometry.values()}
     assert set(parts) == {"zebra_head", "Öhrchen"}
     for name, color in (("zebra_head", COLORS[0]), ("Öhrchen", COLORS[2])):
-        np.testing.assert_allclose(parts[name].visual.material.diffuse[:3], color, atol=1)
-    np.testing.assert_allclose(parts["Öhrchen"].bounds, BOX, atol=1e-7)
+        assert_allclose(parts[name].visual.material.diffuse[:3], color, atol=1)
+    assert_allclose(parts["Öhrchen"].bounds, BOX, atol=1e-7)
     assert parts["Öhrchen"].volume == pytest.approx(SIDES.prod())
 
 
@@ -160,9 +161,9 @@ def test_stl_files_are_closed_solids_at_their_place(tmp_path: Path) -> None:
     assert sorted(path.name for path in (tmp_path / "stl").glob("[!.]*")) == ["1-zebra-head.stl", "3-Öhrchen.stl"]
     box = trimesh.load_mesh(tmp_path / "stl/3-Öhrchen.stl")
     assert box.is_watertight and box.volume == pytest.approx(SIDES.prod(), rel=1e-5)
-    np.testing.assert_allclose(box.bounds, BOX, atol=1e-7)
+    assert_allclose(box.bounds, BOX, atol=1e-7)
     raw = trimesh.load_mesh(tmp_path / "stl/3-Öhrchen.stl", process=False)
-    np.testing.assert_allclose(np.abs(raw.face_normals).max(axis=1), 1.0, atol=1e-5)
+    assert_allclose(np.abs(raw.face_normals).max(axis=1), 1.0, atol=1e-5)
     outward = raw.triangles_center - CENTER
     assert (np.einsum("ij,ij->i", raw.face_normals, outward) > 0).all()
 
@@ -194,9 +195,9 @@ def test_vtk_sees_the_labels(tmp_path: Path) -> None:
     pyvista = pytest.importorskip("pyvista", reason="pyvista is not installed: pip install 'mereo[dev]'")
     volumes.write_labels_vti(tmp_path / "l.vti", grid(), COLORS)
     image = pyvista.read(tmp_path / "l.vti")
-    np.testing.assert_array_equal(image["label"], np.ravel(grid().labels, order="F"))
+    assert_array_equal(image["label"], np.ravel(grid().labels, order="F"))
     assert (image.dimensions, image.origin) == (grid().labels.shape, tuple(grid().origin))
-    np.testing.assert_allclose(image.spacing, grid().spacing)
+    assert_allclose(image.spacing, grid().spacing)
 
 
 def test_nibabel_sees_the_labels_in_ras_millimetres(tmp_path: Path) -> None:
@@ -204,18 +205,18 @@ def test_nibabel_sees_the_labels_in_ras_millimetres(tmp_path: Path) -> None:
     volumes.write_labels_nifti(tmp_path / "l.nii.gz", grid(), COLORS)
     image = nibabel.load(tmp_path / "l.nii.gz")
     values = np.asarray(image.dataobj)
-    np.testing.assert_array_equal(values, grid().labels)
+    assert_array_equal(values, grid().labels)
     assert values.dtype == np.uint8
     for label in (1, 3):
         index = np.argwhere(values == label).mean(axis=0)
         place = nibabel.affines.apply_affine(image.affine, index)
-        np.testing.assert_allclose(place, 1000.0 * centroid(label) * RAS_OF_INPUT, atol=1e-3)
+        assert_allclose(place, 1000.0 * centroid(label) * RAS_OF_INPUT, atol=1e-3)
     assert image.header.get_xyzt_units()[0] == "mm"
     assert nibabel.aff2axcodes(image.affine) == ("L", "P", "S")
     for form in (image.get_sform, image.get_qform):
         found, code = form(coded=True)
         assert code == 1
-        np.testing.assert_allclose(found, image.affine, atol=1e-4)
+        assert_allclose(found, image.affine, atol=1e-4)
     table = json.loads(image.header.extensions[0].text)["segments"]
     assert [(row["label"], row["name"], tuple(row["color"])) for row in table] == [
         (index + 1, name, color) for index, (name, color) in enumerate(zip(NAMES, COLORS, strict=True))
@@ -231,7 +232,7 @@ def test_slicer_finds_what_it_looks_for(tmp_path: Path) -> None:
     for index, (name, color) in enumerate(zip(NAMES, COLORS, strict=True)):
         own = {key.partition("_")[2]: value for key, value in fields.items() if key.startswith(f"Segment{index}_")}
         assert (own["Name"], own["LabelValue"], own["Layer"]) == (name, str(index + 1), "0")
-        np.testing.assert_allclose([255 * float(value) for value in own["Color"].split()], color, atol=1e-3)
+        assert_allclose([255 * float(value) for value in own["Color"].split()], color, atol=1e-3)
         # Slicer cuts the shared layer to the extent of its first segment: a tight one would cut off the others
         assert own["Extent"] == "0 6 0 10 0 19"
     assert len({fields[f"Segment{index}_ID"] for index in range(3)}) == 3 and "Segment3_ID" not in fields
@@ -248,10 +249,10 @@ def test_both_volumes_coincide(tmp_path: Path, unit_m: float) -> None:
     volumes.write_labels_nifti(tmp_path / "l.nii", grid(), COLORS, unit_m)
     volumes.write_labels_seg_nrrd(tmp_path / "l.seg.nrrd", grid(), COLORS, unit_m)
     nifti, nrrd = read_label_volume(tmp_path / "l.nii"), read_label_volume(tmp_path / "l.seg.nrrd")
-    np.testing.assert_array_equal(nifti.labels, nrrd.labels)
-    np.testing.assert_allclose(nifti.T_world_index, nrrd.T_world_index, atol=1e-3 * unit_m)
+    assert_array_equal(nifti.labels, nrrd.labels)
+    assert_allclose(nifti.T_world_index, nrrd.T_world_index, atol=1e-3 * unit_m)
     place = nrrd.T_world_index @ [*np.argwhere(nrrd.labels[0] == 3).mean(axis=0), 1.0]
-    np.testing.assert_allclose(place[:3], 1000 * unit_m * CENTER * RAS_OF_INPUT, atol=0.5 * unit_m)
+    assert_allclose(place[:3], 1000 * unit_m * CENTER * RAS_OF_INPUT, atol=0.5 * unit_m)
 
 
 def test_the_same_result_gives_the_same_bytes(tmp_path: Path) -> None:
@@ -276,14 +277,14 @@ def test_labelled_points_come_back(tmp_path: Path) -> None:
     volumes.write_points_npz(tmp_path / "p.npz", written)
     found = trimesh.load(tmp_path / "p.ply", process=False)
     data = found.metadata["_ply_raw"]["vertex"]["data"]
-    np.testing.assert_allclose(found.vertices, written.points, atol=1e-7)
-    np.testing.assert_array_equal(data["label"], written.labels)
-    np.testing.assert_allclose(data["confidence"], written.confidence, atol=1e-7)
-    np.testing.assert_allclose(data["occupancy"], written.occupancy, atol=1e-7)
-    np.testing.assert_array_equal(np.asarray(found.colors)[:, :3], np.array(COLORS)[written.labels - 1])
+    assert_allclose(found.vertices, written.points, atol=1e-7)
+    assert_array_equal(data["label"], written.labels)
+    assert_allclose(data["confidence"], written.confidence, atol=1e-7)
+    assert_allclose(data["occupancy"], written.occupancy, atol=1e-7)
+    assert_array_equal(np.asarray(found.colors)[:, :3], np.array(COLORS)[written.labels - 1])
     head = (tmp_path / "p.ply").read_bytes().partition(b"end_header")[0].decode("ascii")
     assert tuple(json.loads(row)["name"] for row in re.findall(r"comment segment (.*)", head)) == NAMES
     with np.load(tmp_path / "p.npz") as stored:
         for key in ("points", "labels", "confidence", "occupancy", "names", "colors"):
-            np.testing.assert_array_equal(stored[key], np.asarray(getattr(written, key)))
-    np.testing.assert_allclose(read_point_cloud(tmp_path / "p.ply").points, written.points, atol=1e-7)
+            assert_array_equal(stored[key], np.asarray(getattr(written, key)))
+    assert_allclose(read_point_cloud(tmp_path / "p.ply").points, written.points, atol=1e-7)

@@ -12,6 +12,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 from camera_files import write_camera
+from numpy.testing import assert_allclose, assert_array_equal
 from page_blocks import ROOT, blocks
 from toy_frames import MODEL, NAMES, seen
 from two_balls import scene
@@ -42,9 +43,9 @@ def asked(frame: Any, **reading: Any) -> mereo.Result:
 
 
 def same(found: Answer, wanted: Answer) -> None:
-    np.testing.assert_array_equal(found.seen.cloud.points, wanted.seen.cloud.points)
-    np.testing.assert_array_equal(found.reconstruction.labels.labels, wanted.reconstruction.labels.labels)
-    np.testing.assert_array_equal(found.surfaces.merged()[0], wanted.surfaces.merged()[0])
+    assert_array_equal(found.seen.cloud.points, wanted.seen.cloud.points)
+    assert_array_equal(found.reconstruction.labels.labels, wanted.reconstruction.labels.labels)
+    assert_array_equal(found.surfaces.merged()[0], wanted.surfaces.merged()[0])
     assert figures(found) == figures(wanted)
 
 
@@ -150,8 +151,8 @@ def test_slicer(run: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
     made = slicer.mrmlScene.AddNewNodeByClass
     node, points = slicer.util.updateMarkupsControlPointsFromArray.call_args[0]
     assert made.call_args[0][1] == "centroids" and node is made.return_value
-    np.testing.assert_allclose(points[0], [-20, 30, 600], atol=8)
-    np.testing.assert_allclose(names["from_ras_mm"](names["to_ras_mm"](seen(), 0.5), 0.5), seen())
+    assert_allclose(points[0], [-20, 30, 600], atol=8)
+    assert_allclose(names["from_ras_mm"](names["to_ras_mm"](seen(), 0.5), 0.5), seen())
     assert names["to_ras_mm"]([[1, 2, 3]], 0.001).tolist() == [[-1, -2, 3]]
 
 

@@ -14,6 +14,8 @@ import pytest
 import trimesh
 from angle import write_angle
 from fit_cases import seen
+from folder_contents import read_json
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 import mereo
@@ -106,7 +108,7 @@ def test_it_has_names_and_colours_of_the_meshes_and_no_confidence(found: mereo.R
 
 def test_what_is_written_leaves_out_what_nobody_knows(found: mereo.Result, tmp_path: Path) -> None:
     found.save(tmp_path / "out", formats=["json", "points"])
-    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    summary = read_json(tmp_path / "out/summary.json")
     assert summary["weights"] is None and summary["registration"]["located_by"] == "search"
     assert [one["confidence"] for one in summary["segments"]] == [None, None] and "device" not in summary
     assert summary["recognition"]["signs"]["displaced"] is None
@@ -119,10 +121,10 @@ def test_the_model_is_made_once_and_read_again(folder: Path, scene: Scene, monke
     first = kept_model(scene)
     monkeypatch.setattr("mereo.scenes.random_states.scene_model", None)
     again = kept_model(scene)
-    np.testing.assert_array_equal(first.modes, again.modes)
+    assert_array_equal(first.modes, again.modes)
     monkeypatch.undo()
     path.write_bytes(path.read_bytes()[:100])  # damaged: made anew, with the same bits
-    np.testing.assert_array_equal(kept_model(scene).modes, first.modes)
+    assert_array_equal(kept_model(scene).modes, first.modes)
 
 
 def test_a_cache_that_cannot_be_used_is_named_and_what_it_holds_is_never_waited_for(
@@ -144,7 +146,7 @@ def test_a_cache_that_cannot_be_used_is_named_and_what_it_holds_is_never_waited_
     for place, expected in (places | {"/dev/zero": "cannot be kept .*/dev/zero"}).items():
         monkeypatch.setenv(CACHE_VARIABLE, place)
         with pytest.warns(CacheWarning, match=expected) as caught:
-            np.testing.assert_array_equal(kept_model(scene).modes, model.modes)
+            assert_array_equal(kept_model(scene).modes, model.modes)
         text = str(caught[0].message)
         assert "--output" not in text and text.endswith("with MEREO_CACHE") and len(caught) == 1
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "new"))  # made
@@ -207,9 +209,9 @@ def test_an_initial_pose_takes_the_place_of_a_search(
     given = ["--unit-m", "1", "--initial-pose", str(tmp_path / "first/summary.json"), "--output", str(tmp_path / "out")]
     objects = ["--object", *meshes, "--units", "mm", "--resolution", "24"]
     assert command_line.main(["reconstruct", str(tmp_path / "frame.npy"), *objects, *given]) in (0, 3, 4)
-    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    summary = read_json(tmp_path / "out/summary.json")
     assert summary["registration"]["located_by"] == "pose"
-    np.testing.assert_allclose(summary["pose"], again.pose, atol=1e-4)
+    assert_allclose(summary["pose"], again.pose, atol=1e-4)
     with pytest.raises(ValueError, match="the length of the frame's or of the object's unit is not known"):
         mereo.reconstruct(points, angle, initial_pose=found.pose)
     for wrong in (np.eye(3), 2 * np.eye(4), np.diag([1.0, 1.0, -1.0, 1.0]), np.full((4, 4), np.nan)):
@@ -218,7 +220,7 @@ def test_an_initial_pose_takes_the_place_of_a_search(
 
 
 def test_a_mesh_file_is_a_frame_that_no_camera_saw(
-    scene: Scene, meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    scene: Scene, meshes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     """In millimetres around the origin, as CT has it: extent, pose and surfaces come out in the file's frame."""
     vertices, faces, _ = scene.rest.merged()
@@ -238,7 +240,7 @@ def test_a_mesh_file_is_a_frame_that_no_camera_saw(
     ]
     assert command_line.main(command) == 0
     assert "it is a surface that no single camera saw" in capsys.readouterr().out
-    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    summary = read_json(tmp_path / "out/summary.json")
     assert summary["extent"] == "surface" and summary["recognition"]["known"] is True
     assert summary["recognition"]["signs"]["ruled_out"] == 0.0 and summary["recognition"]["signs"]["unseen"] is None
     answer = trimesh.load(tmp_path / "out/segments.ply", process=False)
@@ -251,7 +253,7 @@ def test_what_is_defined_in_the_meshes_is_carried(found: mereo.Result, scene: Sc
     mesh = found.carry(scene.rest, files="scene")
     assert mesh.names == found.names and np.abs(mesh.bounds - found.surfaces.bounds).max() < 0.02 * np.ptp(mesh.bounds)
     origin, near = found.carry([[0, 0, 0]]), found.carry(np.array([[1e-9, 0.0, 0.0], [0.0, 0.0, 0.0]]))
-    np.testing.assert_allclose(near, np.repeat(origin, 2, axis=0), atol=1e-9)  # of the files: a point like any other
+    assert_allclose(near, np.repeat(origin, 2, axis=0), atol=1e-9)  # of the files: a point like any other
 
 
 def test_it_is_served_without_weights(folder: Path, meshes: list[str], points: np.ndarray) -> None:
@@ -320,11 +322,9 @@ def test_a_wrong_unit_ends_a_command_with_a_sentence_and_nothing_written(
     words: str,
     meshes: list[str],
     points: np.ndarray,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    working_folder: Path,
+    capsys: pytest.CaptureFixture,
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     np.save("frame.npy", points), np.save("mm.npy", 1000 * points)
     before = set(Path().iterdir())
     given = ["reconstruct", frame, "--object", *meshes, "--units", "mm", "--unit-m", unit_m, "--output", "out"]
@@ -342,8 +342,7 @@ def test_a_wrong_unit_ends_a_command_with_a_sentence_and_nothing_written(
         (".", "holds no meshes .*: name the folder of an object, or its files"),
     ],
 )
-def test_no_object_is_a_sentence(source: object, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_no_object_is_a_sentence(source: object, words: str, working_folder: Path) -> None:
     with pytest.raises((ValueError, FileNotFoundError), match=words):
         mereo.load_object(source)  # type: ignore[arg-type]
 

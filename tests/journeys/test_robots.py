@@ -1,6 +1,5 @@
 """Robots of URDF and SDF files: their joints are found in frames by name, and bad files are one sentence."""
 
-import json
 import pickle
 import re
 from pathlib import Path
@@ -9,6 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
+from folder_contents import read_json
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
 from page_blocks import blocks
 from robot_files import LAPTOP, LAPTOP_SDF, write_gripper
 
@@ -52,7 +54,7 @@ def write_frame(path: Path, scene: Scene, share: float, seed: int) -> float:
     assert isinstance(motion, RandomMotion) and scene.unit_m is not None
     (leader,) = (joint for joint, _ in motion.joints.values() if not joint.follows)
     mesh = scene.deform(motion.at({leader.name: share})).mesh
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     seen = mesh.transformed(inverse_rigid(scene.workspace.sample(rng, mesh.bounds.mean(axis=0))))
     image = add_depth_noise(render_depth(seen, Camera.from_fov(128, 128, scene.workspace.fov_rad)), 0.1, rng)
     write_positions_ply(path, image.to_points().points * scene.unit_m)
@@ -68,15 +70,15 @@ def test_both_formats_give_links_in_metres_and_joints_by_name(gripper: Path, suf
     assert robot.mesh.names == ("palm", "left", "right")  # what is fixed is one segment
     bounds = [[[-0.05, -0.025, -0.055], [0.05, 0.025, 0.015]], [[-0.016, -0.015, 0.017], [0.017, 0.015, 0.077]]]
     for segment, expected in zip(robot.mesh.segments, bounds, strict=False):
-        np.testing.assert_allclose(segment.bounds, expected, atol=1e-9)
+        assert_allclose(segment.bounds, expected, atol=1e-9)
     assert min(segment.volume for segment in robot.mesh.segments) > 0  # the mirrored mesh faces outwards, too
     assert robot.mesh.segments[1].volume == pytest.approx(robot.mesh.segments[2].volume)
     follower, finger = robot.joints  # the last link first
     assert (finger.name, finger.turns, finger.moved, finger.follows) == ("finger", False, ("left",), "")
     assert (follower.name, follower.moved, follower.follows) == ("other finger", ("right",), "finger")
-    np.testing.assert_allclose([finger.pivot, finger.axis], [[-0.01, 0, 0.047], [-1, 0, 0]], atol=1e-12)
-    np.testing.assert_allclose([follower.pivot, follower.axis], [[0.01, 0, 0.047], [1, 0, 0]], atol=1e-12)
-    np.testing.assert_allclose([finger.limits, follower.limits], [[0.003, 0.035], [0.0035, 0.0195]], atol=1e-12)
+    assert_allclose([finger.pivot, finger.axis], [[-0.01, 0, 0.047], [-1, 0, 0]], atol=1e-12)
+    assert_allclose([follower.pivot, follower.axis], [[0.01, 0, 0.047], [1, 0, 0]], atol=1e-12)
+    assert_allclose([finger.limits, follower.limits], [[0.003, 0.035], [0.0035, 0.0195]], atol=1e-12)
     left_out = ("joint 'spin' is left out, for it moves no segment against others",)
     assert robot.notes == (left_out if suffix == ".urdf" else ())
 
@@ -87,10 +89,10 @@ def test_shapes_of_collisions_stand_in_where_none_are_visual(tmp_path: Path) -> 
         path.write_text(text)
         robot, (joint,) = read_robot(path), read_robot(path).joints
         assert robot.mesh.names == ("base", "lid") and joint.turns and joint.moved == ("lid",)
-        np.testing.assert_allclose([joint.pivot, joint.axis], [[0, -0.1, 0.016], [1, 0, 0]], atol=1e-9)
-        np.testing.assert_allclose(joint.limits, (0.3, 2.2))
+        assert_allclose([joint.pivot, joint.axis], [[0, -0.1, 0.016], [1, 0, 0]], atol=1e-9)
+        assert_allclose(joint.limits, (0.3, 2.2))
         low, high = robot.mesh.bounds
-        np.testing.assert_allclose([*low, *high[:2]], [-0.15, -0.1, -0.01, 0.15, 0.1], atol=1e-9)
+        assert_allclose([*low, *high[:2]], [-0.15, -0.1, -0.01, 0.15, 0.1], atol=1e-9)
         assert high[2] == pytest.approx(0.041, abs=1e-4)  # a round part that is joined to the lid
 
 
@@ -102,7 +104,7 @@ def test_a_link_without_visual_shapes_has_those_for_collisions(tmp_path: Path) -
         path = tmp_path / "laptop.urdf"
         path.write_text(f'{first}<link name="lid">{lid}')
         robot = read_robot(path)
-        np.testing.assert_allclose(np.ptp(robot.mesh.segments[0].bounds, axis=0), [0.3, 0.2, 0.02], atol=1e-9)
+        assert_allclose(np.ptp(robot.mesh.segments[0].bounds, axis=0), [0.3, 0.2, 0.02], atol=1e-9)
         assert robot.mesh.names == ("base", "lid") and robot.notes == notes
 
 
@@ -128,17 +130,17 @@ def test_meshes_of_collada_are_as_rviz_shows_them(tmp_path: Path) -> None:
     path, mesh = tmp_path / "laptop.urdf", '<mesh filename="wedge.dae" scale="1 1 2"/>'
     path.write_text(LAPTOP.replace('<box size="0.3 0.2 0.02"/>', mesh))
     base = read_robot(path).mesh.segments[0]
-    np.testing.assert_allclose(base.bounds, [[0, 0, 0.1], [0.1, 0.2, 0.7]], atol=1e-9)
+    assert_allclose(base.bounds, [[0, 0, 0.1], [0.1, 0.2, 0.7]], atol=1e-9)
     assert len(base.vertices) == 4 and base.volume == pytest.approx(0.002)  # the materials together are closed
     (tmp_path / "wedge.dae").write_text(WEDGE.replace('<unit meter="0.001" name="millimeter"/>', ""))
-    np.testing.assert_allclose(read_robot(path).mesh.segments[0].bounds, [[0, 0, 100], [100, 200, 700]], atol=1e-9)
+    assert_allclose(read_robot(path).mesh.segments[0].bounds, [[0, 0, 100], [100, 200, 700]], atol=1e-9)
     (tmp_path / "wedge.dae").write_text(WEDGE.replace("#wedge", "#edge"))
     with pytest.raises(ValueError, match=r"wedge.dae cannot be read as a mesh \(.*edge.*\): export or download"):
         read_robot(path)
 
 
 def test_a_scene_file_has_the_joints_and_one_number_moves_both_fingers(
-    gripper: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    gripper: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     path = tmp_path / "gripper.yaml"
     assert command_line.main(["scene", "new", str(gripper), "--output", str(path)]) in (0, None)
@@ -152,7 +154,7 @@ def test_a_scene_file_has_the_joints_and_one_number_moves_both_fingers(
     assert isinstance(motion, RandomMotion)
     palm, left, right = (deform(np.zeros((1, 3)))[0] * scene.unit_m for deform in motion(rng))
     assert 0.003 < -left[0] < 0.035 and right[0] == pytest.approx(-0.5 * left[0] + 0.002)
-    np.testing.assert_allclose([*palm, *left[1:], *right[1:]], 0.0, atol=1e-12)
+    assert_allclose([*palm, *left[1:], *right[1:]], 0.0, atol=1e-12)
     assert command_line.main(["scene", "check", str(path)]) in (0, None)  # links that overlap are no fault
     assert "note: left and right overlap" in capsys.readouterr().out
 
@@ -236,17 +238,17 @@ def test_the_angle_of_a_hinge_is_found_with_its_interval(tmp_path: Path, monkeyp
     monkeypatch.delattr("mereo.results.joints.least_squares")  # they are measured once
     facts = FrameAnswer.of(result).facts  # what a line of a stream has
     assert facts["joints"] == {"hinge": joint.facts()}
-    np.testing.assert_allclose(facts["segments"]["lid"]["pose"], result["lid"].pose, atol=1e-6)
+    assert_allclose(facts["segments"]["lid"]["pose"], result["lid"].pose, atol=1e-6)
     assert np.trace(result["lid"].pose_in("base")) == pytest.approx(2 + 2 * np.cos(joint.value), abs=1e-6)
     assert pickle.loads(pickle.dumps(result)).joints == result.joints
     assert joint.interval is not None and joint.interval[0] < true < joint.interval[1]
     assert abs(np.rad2deg(joint.value - true)) < 1.0 and joint.unit == "rad"
-    np.testing.assert_allclose(joint.limits, (0.3, 2.2))
+    assert_allclose(joint.limits, (0.3, 2.2))
     assert re.fullmatch(r"82\.\d+° \(82\.\d+ to 82\.\d+\)", str(joint))
 
 
 def test_the_commands_of_the_page_give_the_joints_of_a_gripper(
-    gripper: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    gripper: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     monkeypatch.chdir(gripper.parent)
     true = write_frame(Path("frame.ply"), scene_of_meshes([Path("gripper.urdf")]), 0.5, 2)
@@ -256,7 +258,7 @@ def test_the_commands_of_the_page_give_the_joints_of_a_gripper(
     for line in commands.splitlines():
         command_line.main(line.partition("#")[0].split()[1:])
     printed = capsys.readouterr().out
-    facts = json.loads(Path("result/summary.json").read_text())["joints"]
+    facts = read_json(Path("result/summary.json"))["joints"]
     assert set(facts) == {"finger", "other finger"} and facts["finger"]["unit"] == "m"
     for name, expected in (("finger", true), ("other finger", 0.5 * true + 0.002)):
         assert facts[name]["value"] == pytest.approx(expected, abs=0.001)
@@ -326,7 +328,7 @@ def test_a_joint_of_a_whole_turn_goes_on_beyond_its_limits(tmp_path: Path) -> No
         scene = laptop.with_joints({"hinge": {"value": value, "within": 0.1}}).scene
         assert scene is not None and isinstance(scene.sample_deformations, RandomMotion)
         shares = np.array(scene.sample_deformations.joints["hinge"][0].shares)
-        np.testing.assert_allclose((2 * np.pi * shares - np.pi) % (2 * np.pi), [3.0, 3.2], atol=1e-9)
+        assert_allclose((2 * np.pi * shares - np.pi) % (2 * np.pi), [3.0, 3.2], atol=1e-9)
 
 
 NO_JOINTS: dict[str, object] = {
@@ -365,7 +367,7 @@ def test_values_that_cannot_be_are_one_sentence(message: str, known: mereo.Objec
 
 
 def test_objects_without_named_joints_and_files_of_other_things_are_refused(
-    gripper: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    gripper: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     palm = mereo.load_object(gripper.parents[1] / "meshes/palm.stl", units="mm", deformations="rigid")
     with pytest.raises(ValueError, match="joints are given, but the object has none with a name: leave them out, or"):
@@ -374,7 +376,7 @@ def test_objects_without_named_joints_and_files_of_other_things_are_refused(
     (tmp_path / "bad.yaml").write_text("finger: [0.02")
     (tmp_path / "bad joint.yaml").write_text("finger: 1")
     (tmp_path / "frames").mkdir()
-    write_positions_ply(tmp_path / "frames/frame.ply", np.random.default_rng(0).normal(size=(500, 3)))
+    write_positions_ply(tmp_path / "frames/frame.ply", default_rng(0).normal(size=(500, 3)))
     monkeypatch.chdir(tmp_path)
     for name, sentence in (
         ("list.yaml", "list.yaml holds no `key: value` lines; a file of joints starts with `JOINT:`"),
@@ -391,11 +393,9 @@ def test_objects_without_named_joints_and_files_of_other_things_are_refused(
 def test_only_the_rest_of_a_gripper_with_known_joints_is_looked_for(
     known: mereo.Object,
     gripper: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    working_folder: Path,
+    capsys: pytest.CaptureFixture,
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     assert known.scene is not None
     true = write_frame(Path("frame.ply"), known.scene, 0.4, 5)
     free, fixed = (mereo.reconstruct("frame.ply", known, unit_m=1.0, joints=j) for j in (None, {"finger": true}))
@@ -403,16 +403,16 @@ def test_only_the_rest_of_a_gripper_with_known_joints_is_looked_for(
     assert joints["finger"].value == pytest.approx(true, abs=1e-12) and fixed.known is True
     assert joints["finger"].interval == pytest.approx((true, true), abs=1e-12)
     assert joints["other finger"].value == pytest.approx(0.5 * true + 0.002, abs=1e-12)
-    np.testing.assert_allclose(joints["finger"].limits, [0.003, 0.035])
-    np.testing.assert_allclose(fixed["left"].mesh.vertices, free["left"].mesh.vertices, atol=3e-4)
+    assert_allclose(joints["finger"].limits, [0.003, 0.035])
+    assert_allclose(fixed["left"].mesh.vertices, free["left"].mesh.vertices, atol=3e-4)
     Path("joints.yaml").write_text(f"finger: {{value: {true + 0.002}, within: 0.003}}\n")
     options = ["--object", str(gripper), "--unit-m", "1", "--joints", "joints.yaml"]
     command_line.main(["reconstruct", "frame.ply", *options, "--output", "result"])
     assert "joint finger: " in capsys.readouterr().out
-    facts = json.loads(Path("result/summary.json").read_text())["joints"]["finger"]
+    facts = read_json(Path("result/summary.json"))["joints"]["finger"]
     assert true - 0.001 <= facts["interval"][0] <= true <= facts["interval"][1] <= true + 0.005
     assert facts["value"] == pytest.approx(true, abs=3e-4)
-    assert json.loads(Path("result/config.json").read_text())["joints"] == str(tmp_path / "joints.yaml")
+    assert read_json(Path("result/config.json"))["joints"] == str(working_folder / "joints.yaml")
 
 
 @pytest.mark.slow  # as nothing explains the frame, the search tries all it has

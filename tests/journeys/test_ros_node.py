@@ -12,6 +12,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 import yaml
+from numpy.testing import assert_allclose
 from robot_files import write_gripper
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
@@ -150,13 +151,13 @@ def test_a_gripper_is_published_with_its_joints_until_it_is_lost(
     node.answer(frame)
     assert all(each.header.stamp is frame.header.stamp for each in node.sent if "header" in vars(each))
     sent = taken(node)
-    np.testing.assert_allclose(sent["object/palm"], T, atol=0.01)
+    assert_allclose(sent["object/palm"], T, atol=0.01)
     joints = dict(zip(sent["JointState"].name, sent["JointState"].position, strict=True))
     assert joints == pytest.approx({"finger": 0.02, "other finger": 0.012}, abs=0.001)
     for marker, part in zip(sent["MarkerArray"].markers, mesh.segments, strict=True):
         corners = np.array([list(vars(each).values()) for each in marker.points])
         corners = transform_points(sent[marker.header.frame_id], corners)
-        np.testing.assert_allclose(corners, part.vertices[part.faces].reshape(-1, 3), atol=0.002)
+        assert_allclose(corners, part.vertices[part.faces].reshape(-1, 3), atol=0.002)
         assert (marker.type, marker.scale.x) == (11, 1)
     (status,) = sent["DiagnosticArray"].status
     assert status.level == b"\0" and [each.value for each in status.values][:2] == ["True", "found"]

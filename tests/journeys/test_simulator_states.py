@@ -1,6 +1,5 @@
 """The page's way from a simulation to a reconstruction, with a solid of tetrahedra that a closed form bends."""
 
-import json
 import shlex
 import subprocess
 import sys
@@ -10,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from folder_contents import read_json
+from numpy.random import Generator, default_rng
 from page_blocks import ROOT, blocks
 
 import mereo
@@ -31,7 +32,7 @@ class Simulator:
     """An angle 120 mm long whose arm bends and whose end twists, by other amounts at each step."""
 
     rest: np.ndarray
-    rng: np.random.Generator
+    rng: Generator
     amounts: tuple[float, float] = (0.0, 0.0)
 
     def step(self) -> None:
@@ -56,7 +57,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     x, y, _ = solid.cell_centers().points.T
     solid = solid.extract_cells((x < 40) | (y < 36))
     solid.save(found / "volume.vtk")
-    simulator = Simulator(np.array(solid.points, dtype=float), np.random.default_rng(0))
+    simulator = Simulator(np.array(solid.points, dtype=float), default_rng(0))
     (code,) = (code for code in blocks(ROOT / "docs/own-object.md", "python") if "simulator.step()" in code)
     (text,) = (text for text in blocks(ROOT / "docs/own-object.md", "yaml") if text.startswith("name: organ"))
     (found / "organ.yaml").write_text(text, encoding="utf-8")
@@ -83,7 +84,7 @@ def run_command(folder: Path, word: str, *more: str) -> int:
         return command_line.main([*shlex.split(line)[1:], *more])
 
 
-def test_the_scene_is_checked(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_scene_is_checked(folder: Path, capsys: pytest.CaptureFixture) -> None:
     assert run_command(folder, "scene check") == 0
     assert "organ: 1 segments, closed, outward oriented, without overlap" in capsys.readouterr().out
 
@@ -91,7 +92,7 @@ def test_the_scene_is_checked(folder: Path, capsys: pytest.CaptureFixture[str]) 
 @pytest.mark.slow
 def test_a_state_that_was_held_out_is_found(folder: Path) -> None:
     assert run_command(folder, "reconstruct", "--unit-m", "1") == 0
-    assert json.loads((folder / "result/summary.json").read_text())["registration"]["located_by"] == "search"
+    assert read_json(folder / "result/summary.json")["registration"]["located_by"] == "search"
     scene, view = mereo.load_scene(str(folder / "organ.yaml")), held_out_view(folder)
     assert scene.unit_m is not None
     truth = truth_grid(view.mesh.with_vertices([scene.unit_m * part.vertices for part in view.mesh.segments]), 40)
@@ -100,9 +101,9 @@ def test_a_state_that_was_held_out_is_found(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_it_is_learnt(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_it_is_learnt(folder: Path, capsys: pytest.CaptureFixture) -> None:
     assert run_command(folder, "learn", "--train", "never") == 0
-    assert json.loads((folder / "learned/metrics.json").read_text())
+    assert read_json(folder / "learned/metrics.json")
 
 
 def run_mereo(*arguments: object) -> str:
@@ -121,7 +122,7 @@ def test_a_tiny_network_finds_the_rope(tmp_path: Path) -> None:
     run_mereo("train", data, "--output", run, "--preset", "tiny", "--epochs", 12)
     weights = run / "weights.safetensors"
     run_mereo("evaluate", weights, "--examples", 6, "--seed", TEST_SEED_START, "--output", test)
-    scores = json.loads((test / "metrics.json").read_text())
+    scores = read_json(test / "metrics.json")
     assert scores["iou"] > 0.45 and scores["miou"] > 0.15
     view = sample_view(load_scene("rope"), GenerateConfig(), example_rng(TEST_SEED_START, 0))
     np.save(tmp_path / "cloud.npy", view.depth.to_points().points)
@@ -133,5 +134,5 @@ def test_a_tiny_network_finds_the_rope(tmp_path: Path) -> None:
     nodes = trimesh.load(result / "segments.glb").graph.nodes_geometry
     assert "base" in nodes
     base = next(s for s in view.mesh.segments if s.name == "base")
-    found = next(s for s in json.loads((result / "summary.json").read_text())["segments"] if s["name"] == "base")
+    found = next(s for s in read_json(result / "summary.json")["segments"] if s["name"] == "base")
     assert np.linalg.norm(np.array(found["centroid"]) - base.vertices.mean(axis=0)) < 4.0

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import torch
 from analytic import untrained
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from safetensors.torch import load_file
 
 from mereo import __main__ as command_line
@@ -41,7 +43,7 @@ def test_the_error_is_the_distance_of_confidence_from_right_answers() -> None:
 
 def test_scaling_finds_what_made_the_probabilities_wrong() -> None:
     """Labels are drawn as likely as the logits say."""
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     logits = rng.normal(scale=3.0, size=(40_000, 3))
     truth = (logits + rng.gumbel(size=logits.shape)).argmax(axis=1).astype(np.uint8)
     assert calibration.ece_of(logits, truth) < 0.01
@@ -49,7 +51,7 @@ def test_scaling_finds_what_made_the_probabilities_wrong() -> None:
     assert sharper.biases is None and sharper.temperature == pytest.approx(2.5, rel=0.03)
     favoured = calibration.fit_scaling(2.5 * (logits + FAVOUR), truth)
     assert favoured.biases is not None and favoured.temperature == pytest.approx(2.5, rel=0.03)
-    np.testing.assert_allclose(favoured.biases, [0.0, -2.0, 1.0], atol=0.08)
+    assert_allclose(favoured.biases, [0.0, -2.0, 1.0], atol=0.08)
     before = calibration.ece_of(2.5 * (logits + FAVOUR), truth)
     assert calibration.ece_of(2.5 * (logits + FAVOUR), truth, favoured) < calibration.GOOD_ENOUGH / 2 < before / 5
 
@@ -57,12 +59,12 @@ def test_scaling_finds_what_made_the_probabilities_wrong() -> None:
 def test_labels_stay_and_probabilities_are_scaled() -> None:
     plain = untrained(NAMES)
     scaled = replace(plain, calibration=SCALED)
-    points = np.random.default_rng(2).normal(size=(300, 3)) + np.array([0.0, 0.0, 5.0])
+    points = default_rng(2).normal(size=(300, 3)) + np.array([0.0, 0.0, 5.0])
     before, after = (model.query(model.encode(points), points) for model in (plain, scaled))
-    np.testing.assert_array_equal(before.label, after.label)
+    assert_array_equal(before.label, after.label)
     logits = plain.logits(plain.encode(points), points).astype(np.float64)
     expected = np.exp(logits / 2.0 + [0.0, -1.0, 0.5])
-    np.testing.assert_allclose(after.probability, expected / expected.sum(axis=1, keepdims=True), atol=1e-5)
+    assert_allclose(after.probability, expected / expected.sum(axis=1, keepdims=True), atol=1e-5)
     assert scaled.calibrates and not plain.calibrates
     own = torch.tensor([[1.0, 2.0, 3.0]])
     assert scaled_logits(Calibration(seed=0, views=8).scaling, own) is own
@@ -72,10 +74,10 @@ def test_observed_points_have_the_calibrated_probability_of_their_own_segment() 
     logits = np.log(np.array([[0.5, 0.4, 0.1], [0.2, 0.3, 0.5]], dtype=np.float32))
     of_segments = partial(segment_points, logits, np.zeros((2, 3)), NAMES, ((0, 0, 0), (9, 9, 9)))
     halved = of_segments(Calibration(seed=0, views=8, temperature=0.5))
-    np.testing.assert_array_equal(of_segments().labels, halved.labels)
-    np.testing.assert_allclose(halved.confidence, [16 / 17, 25 / 34], rtol=1e-5)
+    assert_array_equal(of_segments().labels, halved.labels)
+    assert_allclose(halved.confidence, [16 / 17, 25 / 34], rtol=1e-5)
     given = of_segments(labels=np.array([2, 2], dtype=np.uint8))
-    np.testing.assert_allclose(given.confidence, [0.2, 5 / 8], rtol=1e-5)
+    assert_allclose(given.confidence, [0.2, 5 / 8], rtol=1e-5)
 
 
 def test_all_else_of_a_file_stays_and_biases_of_other_classes_are_refused(tmp_path: Path) -> None:
@@ -90,9 +92,7 @@ def test_all_else_of_a_file_stays_and_biases_of_other_classes_are_refused(tmp_pa
         load_model(calibrated)
 
 
-def test_the_command_writes_what_was_measured_beside_the_weights(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_what_was_measured_beside_the_weights(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """A network that knows nothing: its probabilities become those of the classes' shares."""
     path, output = tmp_path / "plain.safetensors", tmp_path / "calibrated.safetensors"
     save_model(untrained(load_scene("rope").rest.names), path)
@@ -119,8 +119,8 @@ def test_test_seeds_and_too_few_views_are_refused() -> None:
 
 def test_radii_between_points_are_between_theirs_and_their_scale_ends_at_all_but_a_twentieth() -> None:
     labels = np.repeat(np.array([1, 2, 1], dtype=np.uint8), 10)
-    radii = Radii(np.random.default_rng(0).random((30, 3)), labels, np.linspace(1, 2, 30), (10, 10), False)
-    np.testing.assert_allclose(radii.at(radii.points[:10], 1), radii.values[:10])
+    radii = Radii(default_rng(0).random((30, 3)), labels, np.linspace(1, 2, 30), (10, 10), False)
+    assert_allclose(radii.at(radii.points[:10], 1), radii.values[:10])
     between = radii.at(np.full((1, 3), 0.5), 2)
     assert radii.values[10:20].min() <= between[0] <= radii.values[10:20].max()
     assert [len(part) for part in radii.vertices] == [10, 10]
@@ -128,12 +128,12 @@ def test_radii_between_points_are_between_theirs_and_their_scale_ends_at_all_but
     on_grid = radii.on_grid(grid)[0, 0]
     assert np.isnan(on_grid[0]) and 1 <= on_grid[1] <= 2 and 1.3 < on_grid[2] < 1.7
     scaled = radii.scaled(1000.0)
-    np.testing.assert_allclose(scaled.at(1000.0 * radii.points[:3], 1), 1000.0 * radii.values[:3])
+    assert_allclose(scaled.at(1000.0 * radii.points[:3], 1), 1000.0 * radii.values[:3])
     scale = radius_scale(radii, " mm")
     assert scale.high == pytest.approx(np.quantile(radii.values[:20], 0.95)) and "not calibrated" in scale.title
-    np.testing.assert_array_equal(scale.colors(radii.values), radii.colors(radii.values))
+    assert_array_equal(scale.colors(radii.values), radii.colors(radii.values))
     assert scale.words[1].endswith(" mm")
-    np.testing.assert_allclose(rounded_to(np.array([0.0123456, 98765.0, 1.0]), 3), [0.0123, 98800.0, 1.0], rtol=1e-9)
+    assert_allclose(rounded_to(np.array([0.0123456, 98765.0, 1.0]), 3), [0.0123, 98800.0, 1.0], rtol=1e-9)
 
 
 def measured(off: np.ndarray, misfit: float = 0.1) -> calibration.MeasuredRadii:
@@ -144,7 +144,7 @@ def measured(off: np.ndarray, misfit: float = 0.1) -> calibration.MeasuredRadii:
 
 
 def test_a_scale_is_measured_on_all_clean_views() -> None:
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     right = [measured(rng.normal(size=200)) for _ in range(20)]
     elsewhere = measured(30.0 + rng.random(200))
     views = calibration.ViewRadii()
@@ -159,7 +159,7 @@ def test_a_scale_is_measured_on_all_clean_views() -> None:
 
 def test_a_frame_that_is_misfitted_has_wider_radii() -> None:
     """By how much more than usual; so the lost frame of many does not widen the others' radii."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     right = [measured(rng.normal(size=400)) for _ in range(18)]
     lost = [measured(4.0 * rng.normal(size=400), misfit=0.2) for _ in range(2)]
     factors = calibration.factors_of([*right, *lost])
@@ -168,5 +168,5 @@ def test_a_frame_that_is_misfitted_has_wider_radii() -> None:
     assert plain > 2.2
     one = replace(factors, scale=1.0)
     assert one.scale_at(0.2) == pytest.approx(4.0) and one.scale_at(0.05) == 1.0
-    np.testing.assert_allclose(lost[1].widened(factors).radii, 4.0)
+    assert_allclose(lost[1].widened(factors).radii, 4.0)
     assert RadiusFactors(2.0).scale_at(9.9) == 2.0 and RadiusFactors().scale_at(1.0) is None

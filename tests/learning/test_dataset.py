@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from folder_contents import read_json
 from safetensors.torch import load_file
 from small_training import SMALL
 from toy_data import half_balls, read_all, write_toy_dataset
@@ -43,7 +44,7 @@ def test_the_size_of_what_is_seen_is_known_where_the_unit_is(tmp_path: Path) -> 
     """Half balls of radius 5 to 10 are 10 to 20 wide, seen by points that nearly reach the rim."""
     directory = write_toy_dataset(tmp_path / "data")
     assert Dataset.load(directory).visible_m is None
-    manifest = json.loads((directory / "manifest.json").read_text())
+    manifest = read_json(directory / "manifest.json")
     (directory / "manifest.json").write_text(json.dumps({**manifest, "unit_m": 0.01}))
     visible_m = Dataset.load(directory).visible_m
     assert visible_m is not None
@@ -220,7 +221,7 @@ def test_a_run_scores_sensors_apart_and_says_what_it_saw(folders: tuple[Path, Pa
             reader = csv.DictReader(file)
             rows = list(reader)
         headers.append(tuple(reader.fieldnames or ()))
-        recipe = json.loads((run / "config.json").read_text())["train"]
+        recipe = read_json(run / "config.json")["train"]
         assert recipe["augment"].get("observations") == (0.5 if folder.name == "seen" else None)
     assert headers == [FIELDS, FIELDS + SENSOR_FIELDS]
     assert 0 <= float(rows[-1]["sensor_iou"]) <= 1 and 0 <= float(rows[-1]["sensor_miou"]) <= 1

@@ -1,12 +1,14 @@
 """The paper's scores: against closed forms, slow references and an oracle."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from analytic import AnalyticModel, untrained
+from folder_contents import read_json
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from shapes import box, one
 
 from mereo.api.objects import Object
@@ -41,7 +43,7 @@ def two_cuboids() -> SegmentedMesh:
 
 
 def cloud() -> PointCloud:
-    return PointCloud(np.random.default_rng(0).uniform([0, 0, 5], [2, 1, 5.001], size=(200, 3)))
+    return PointCloud(default_rng(0).uniform([0, 0, 5], [2, 1, 5.001], size=(200, 3)))
 
 
 def oracle(mesh: SegmentedMesh, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> AnalyticModel:
@@ -54,7 +56,7 @@ def test_the_truth_scores_one_and_a_shifted_answer_its_closed_form() -> None:
     """A shift by 0.25 along x, on the joint box [0, 2]: what is predicted outside the true box is not counted."""
     for shift, per_segment, iou in ((0.0, [1.0, 1.0], 1.0), (0.25, [0.6, 0.75], 1.75 / 2)):
         scores = grid_scores(oracle(two_cuboids(), (shift, 0.0, 0.0)), cloud(), two_cuboids(), cells=40)
-        np.testing.assert_allclose(scores.per_segment, per_segment)
+        assert_allclose(scores.per_segment, per_segment)
         assert (scores.iou, scores.miou) == (pytest.approx(iou), pytest.approx(np.mean(per_segment)))
 
 
@@ -74,12 +76,12 @@ def test_truth_grid_against_point_by_point() -> None:
     low, high = mesh.bounds
     index = np.indices((16, 16, 16)).reshape(3, -1).T
     points = low + (index + 0.5) / 16 * (high - low)
-    np.testing.assert_allclose(truth.grid.positions(index), points)
+    assert_allclose(truth.grid.positions(index), points)
     kept = np.zeros(len(points), dtype=bool)
     for segment in mesh.segments:
         center, size = segment.bounds.mean(axis=0), np.ptp(segment.bounds, axis=0)
         kept |= (np.abs(points - center) <= 0.75 * size).all(axis=1)
-    np.testing.assert_array_equal(truth.kept.ravel(), kept)
+    assert_array_equal(truth.kept.ravel(), kept)
     assert (truth.grid.labels.ravel() == Solids(mesh).label(points)).mean() > 0.999
     assert 0.02 < kept.mean() < 1.0 and not truth.grid.labels[~truth.kept].any()
 
@@ -110,9 +112,9 @@ def test_pictures_show_what_lies_beside_the_box_of_the_truth() -> None:
     shift = 2.0 * truth.grid.spacing[0]
     result = score_cases(oracle(mesh, (shift, 0.0, 0.0)), lambda _: TestCase("0", cloud(), truth), 1, progress=False)
     shown, inner = result.views[0], (slice(PICTURE_MARGIN, -PICTURE_MARGIN),) * 3
-    np.testing.assert_array_equal(shown.reference[inner], truth.grid.labels)
+    assert_array_equal(shown.reference[inner], truth.grid.labels)
     assert (shown.reference > 0).sum() == (truth.grid.labels > 0).sum()
-    np.testing.assert_allclose(shown.origin + PICTURE_MARGIN * shown.spacing, truth.grid.origin)
+    assert_allclose(shown.origin + PICTURE_MARGIN * shown.spacing, truth.grid.origin)
     assert (shown.predicted > 0).sum() == (shown.reference > 0).sum()  # all of it, though two cells are outside
     assert (shown.predicted[inner] > 0).sum() < (shown.reference > 0).sum()
 
@@ -133,7 +135,7 @@ def test_a_model_of_distances_is_scored_on_the_whole() -> None:
 def rope() -> AnalyticModel:
     """An answer of planes: quick to evaluate, right nowhere in particular."""
     names = load_scene("rope").rest.names
-    planes = np.random.default_rng(1).normal(size=(3, len(names) + 1))
+    planes = default_rng(1).normal(size=(3, len(names) + 1))
     return replace(AnalyticModel.of(lambda points: points @ planes, names), provenance={"scene": "rope"})
 
 
@@ -141,7 +143,7 @@ def test_example_i_is_made_from_seed_and_i_alone_and_of_the_weights_own_object(r
     three, two = (evaluate(rope, EvaluationConfig(None, n, 1_000_005, cells=16)) for n in (3, 2))
     assert list(three.examples) == ["rope 0", "rope 1", "rope 2"]
     for name, scores in two.examples.items():
-        np.testing.assert_array_equal(scores.per_segment, three.examples[name].per_segment)
+        assert_array_equal(scores.per_segment, three.examples[name].per_segment)
     other = evaluate(rope, EvaluationConfig(load_scene("rope"), 2, 1_000_006, cells=16))
     assert (other.confusion != two.confusion).any()
     with pytest.raises(ValueError, match="the weights know the segments left, right but the truth has"):
@@ -163,12 +165,12 @@ def test_impossible_evaluations(rope: AnalyticModel, options: dict[str, object],
         evaluate(rope, EvaluationConfig(**options))  # type: ignore[arg-type]
 
 
-def test_written_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_written_results(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     save_model(untrained(load_scene("rope").rest.names), tmp_path / "w.safetensors")
     result = evaluate_weights(tmp_path / "w.safetensors", tmp_path / "out", EvaluationConfig(examples=2, cells=12))
     names = {place.name for place in (tmp_path / "out").glob("[!.]*")}
     assert names == {"errors.png", "metrics.json", "report.html", "table.md"}
-    stored = json.loads((tmp_path / "out/metrics.json").read_text())
+    stored = read_json(tmp_path / "out/metrics.json")
     assert stored["iou"] == pytest.approx(result.scores.iou) and stored["seed"] == 1_000_000
     assert stored["confusion"] == result.confusion.tolist()
     assert stored["scene"] == "rope" and stored["examples"] == 2 and len(stored["per_example"]) == 2
@@ -184,7 +186,7 @@ def test_written_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
 
 def test_a_shipped_view_shows_its_truth(tmp_path: Path) -> None:
     view, stored = load_view("rope"), np.load(SHIPPED / "rope.npz")
-    np.testing.assert_allclose(view.depth.depth, stored["depth"] * 0.005)
+    assert_allclose(view.depth.depth, stored["depth"] * 0.005)
     assert (view.scene, view.seed, view.unit_m) == ("rope", 1_000_000, None)
     grid, points = view.truth.grid, view.depth.to_points().points
     cells = np.rint((points - grid.origin) / grid.spacing).astype(int)
@@ -199,9 +201,7 @@ def test_a_shipped_view_shows_its_truth(tmp_path: Path) -> None:
         load_view("teapot")
 
 
-def test_the_demo_scores_itself(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_demo_scores_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     mesh = two_cuboids()
     case = "cuboids", "two cuboids", Object(oracle(mesh)), load_frame(cloud()), truth_grid(mesh, 20)
     monkeypatch.setattr(demo, "_inputs", lambda _: iter([case]))
@@ -219,7 +219,7 @@ def test_the_demo_scores_itself(
 
 @pytest.mark.slow
 def test_the_demo_needs_no_assets(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     def missing(name: str) -> Path:
         raise AssetUnavailable(f"{name} is not here")

@@ -13,6 +13,7 @@ import pytest
 import torch
 import trimesh
 from angle import write_angle
+from folder_contents import read_json
 from safetensors.torch import load_file
 from scene_files import HEAD, write_bar
 from scipy.spatial.transform import Rotation
@@ -79,7 +80,7 @@ def test_no_time_gives_the_least_and_late_examples_leave_less_training() -> None
 # --- the object -------------------------------------------------------------------------------------------------------
 
 
-def test_meshes_get_a_scene_file_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_meshes_get_a_scene_file_once(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     write_bar(tmp_path)
     meshes = [tmp_path / "left.stl", tmp_path / "right.stl"]
     (tmp_path / "out").mkdir()
@@ -99,7 +100,7 @@ def test_meshes_get_a_scene_file_once(tmp_path: Path, capsys: pytest.CaptureFixt
             learning.scene_for(files, tmp_path, units)
 
 
-def test_what_hardly_deforms_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_hardly_deforms_is_said(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     for text, hardly in (("deformations:\n  - {type: squash, factor: [0.999, 1.001]}\n", True), ("", False)):
         scene = write_bar(tmp_path, text)
         learning.check_object([scene], None)
@@ -194,7 +195,7 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFact
 
 
 def test_one_command_and_the_same_again(
-    small: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    small: None, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene, out = write_bar(tmp_path), tmp_path / "out"
     config = LearnConfig(minutes=0.05, init="rope", train="always")
@@ -207,7 +208,7 @@ def test_one_command_and_the_same_again(
     assert f"mereo reconstruct {out}/frame.ply --weights {out}/weights.safetensors --scene {scene}" in said
     files = "config.json data frame.ply metrics.json plan.json run search.json test weights.safetensors"
     assert sorted(place.name for place in out.iterdir()) == files.split()
-    plan = Plan(**json.loads((out / "plan.json").read_text())["plan"])
+    plan = Plan(**read_json(out / "plan.json")["plan"])
     assert plan.examples == 30 and plan.init == "rope"
     kept = [*(out / "data").glob("shard-*"), out / "weights.safetensors"]
     before = [path.stat().st_mtime_ns for path in kept]
@@ -226,7 +227,7 @@ def test_one_command_and_the_same_again(
 
 @pytest.mark.slow
 def test_the_nearest_weights_are_those_that_adapt_fastest(
-    small: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    small: None, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(learning, "shipped_names", lambda: ("rope", "skull"))
     _, name = learning.measure(str(write_bar(tmp_path)), tmp_path, LIGHT, init="", workers=1)
@@ -325,7 +326,7 @@ def test_segments_that_no_frame_tells_apart_are_right_either_way() -> None:
 
 
 def test_time_ends_the_views_but_not_before_the_least_and_begun_ones_are_kept(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     made: list[int] = []
 
@@ -354,14 +355,14 @@ def scored(monkeypatch: pytest.MonkeyPatch) -> list[SearchScores]:
 
 
 def test_the_scores_decide_whether_anything_is_trained(
-    scored: list[SearchScores], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    scored: list[SearchScores], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     monkeypatch.setattr(learning, "_train", Mock(side_effect=InterruptedError))
     scene, out = write_bar(tmp_path), tmp_path / "out"
     metrics = learn([scene], out)
     said = capsys.readouterr().out
     assert metrics["method"] == "search" and not metrics["trained"] and metrics["miou"] == 0.95
-    assert json.loads((out / "metrics.json").read_text()) == metrics
+    assert read_json(out / "metrics.json") == metrics
     assert "nothing is trained: the search alone is good enough (every view is explained, mIoU is 0.85 or more" in said
     assert f"A network may still be faster: mereo learn {scene} --output {out} --train always" in said
     assert f"mereo reconstruct {out}/frame.ply --object {out} --output {out}/result" in said
@@ -400,13 +401,13 @@ def test_a_folder_knows_its_scene(scored: list[SearchScores], tmp_path: Path) ->
     scene, out = write_bar(tmp_path), tmp_path / "out"
     learn([scene], out)
     assert scene_of_folder(out) == str(scene) and scene_of_folder(tmp_path) is None
-    content = json.loads((out / "search.json").read_text())
+    content = read_json(out / "search.json")
     (out / "search.json").write_text(json.dumps({**content, "scene": "mine.py"}))  # never run by a folder's word
     assert scene_of_folder(out) is None
     assert "--object mine.py" in learning.command(out, "mine.py", is_trained=False)
 
 
-def test_a_folder_is_an_object(small: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_is_an_object(small: None, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     out, meshes = tmp_path / "out", [str(path) for path in write_angle(tmp_path)]
     command = ["learn", *meshes, "--units", "mm", "--train", "never", "--output", str(out)]
     assert command_line.main(command) == 0
@@ -416,7 +417,7 @@ def test_a_folder_is_an_object(small: None, tmp_path: Path, capsys: pytest.Captu
     assert f"--object {out} --output" in said
     assert command_line.main(command) == 0
     assert (out / "search.json").read_bytes() == scores
-    assert 0.5 < json.loads((out / "metrics.json").read_text())["iou"] <= 1
+    assert 0.5 < read_json(out / "metrics.json")["iou"] <= 1
     angle = loaded_object(StreamCommand("-", (str(out),)))  # as every command with --object has it
     assert angle.network is None and angle.names == ("long", "short")
 

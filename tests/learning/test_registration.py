@@ -9,6 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from analytic import AnalyticModel
+from folder_contents import read_json
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from scene_files import write_bar
 from scipy.spatial.transform import Rotation
 from shapes import ball, box
@@ -59,12 +62,12 @@ def true_poses() -> np.ndarray:
 def scan_of(mesh: SegmentedMesh, noise: float, seed: int = 0) -> np.ndarray:
     """What ``CAMERA`` sees of a mesh in its frame, noise in the mesh's unit."""
     points = render_depth(mesh, CAMERA).to_points().points
-    return points + np.random.default_rng(seed).normal(scale=noise, size=points.shape)
+    return points + default_rng(seed).normal(scale=noise, size=points.shape)
 
 
 def perturbed(pose: np.ndarray, middle: np.ndarray, degrees: float, shift: float, seed: int) -> np.ndarray:
     """``pose``, then a turn about ``middle`` (model coordinates) and a shift, both in a random direction."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     axis, way = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))
     turn, place = Rotation.from_rotvec(np.deg2rad(degrees) * axis).as_matrix(), transform_points(pose, middle)
     return rigid(turn, place - turn @ place + shift * way) @ pose
@@ -117,7 +120,7 @@ def test_each_segment_comes_to_its_own_true_pose_and_a_hidden_one_goes_with_its_
     assert placement.explained > 0.98
     assert arm.shift == pytest.approx(2, abs=0.05) and arm.turn_deg == pytest.approx(10, abs=0.2)
     assert peg.points == 0 and not peg.seen and peg.placed_by == "with base"
-    np.testing.assert_array_equal(peg.T_scan_segment, base.T_scan_segment)
+    assert_array_equal(peg.T_scan_segment, base.T_scan_segment)
     assert np.isnan(peg.median)
 
 
@@ -126,7 +129,7 @@ def test_a_held_segment_is_left_to_its_neighbour_or_start(points: np.ndarray) ->
     rest, rough = object_at_rest(), start()
     own = place(rest, points, rough, hold=["arm"]).segments[1]
     assert own.placed_by == "start"
-    np.testing.assert_array_equal(own.T_scan_segment, rough.poses[1])
+    assert_array_equal(own.T_scan_segment, rough.poses[1])
     with pytest.raises(ValueError, match="no segment 'leg' to hold; the segments are base, arm, peg"):
         place(rest, points, rough, hold=["leg"])
 
@@ -139,14 +142,14 @@ def test_as_one_moves_all_by_one_motion(points: np.ndarray) -> None:
     rough = Start(start().poses[[0, 2]], np.zeros(2, bool), "")
     base, peg = place(rest, mine, rough, is_rigid=True).segments
     assert base.placed_by == peg.placed_by == "object"
-    np.testing.assert_array_equal(base.T_scan_segment, peg.T_scan_segment)
+    assert_array_equal(base.T_scan_segment, peg.T_scan_segment)
     assert pose_error(base.T_scan_segment, true_poses()[0], middles()[0])[0] < 0.05
 
 
 def test_a_scan_of_something_else_or_far_from_the_start_is_refused(points: np.ndarray) -> None:
     """Three points in five belong to a wall behind the object."""
     few = points[::4]
-    wall = np.random.default_rng(0).uniform([-60, -60, 170], [60, 60, 171], size=(len(few) * 3 // 2, 3))
+    wall = default_rng(0).uniform([-60, -60, 170], [60, 60, 171], size=(len(few) * 3 // 2, 3))
     with pytest.raises(ValueError, match="4.% of the scan's points|[0-3].% of the scan's points lie within"):
         place(object_at_rest(), np.concatenate([few, wall]), start())
     with pytest.raises(ValueError, match="the scan has 1 points that are .* apart; at least 40 are needed"):
@@ -171,13 +174,13 @@ def test_a_ball_is_shifted_but_not_turned() -> None:
     """Its three turns are free: half of a ball, moved by a known shift, gives the shift and no turn."""
     sphere = ball((0, 0, 50), 6.0, "ball", level=4)
     shift = np.array([0.4, -0.3, 0.2])
-    way = np.random.default_rng(0).normal(size=(3000, 3))
+    way = default_rng(0).normal(size=(3000, 3))
     way /= np.linalg.norm(way, axis=1, keepdims=True)
     half = np.array([0.0, 0.0, 50.0]) + 6.0 * way * [1, 1, -1] + shift
     motion, held = icp(half[half[:, 2] < 50.2], SegmentedMesh((sphere,)), 1.0, 0.05, hold=True)
     assert held == 3
-    np.testing.assert_allclose(motion[:3, 3] + motion[:3, :3] @ [0, 0, 50] - [0, 0, 50], shift, atol=0.02)
-    np.testing.assert_allclose(motion[:3, :3], np.eye(3), atol=2e-3)
+    assert_allclose(motion[:3, 3] + motion[:3, :3] @ [0, 0, 50] - [0, 0, 50], shift, atol=0.02)
+    assert_allclose(motion[:3, :3], np.eye(3), atol=2e-3)
 
 
 def test_faces_in_contact_cannot_be_seen() -> None:
@@ -213,14 +216,14 @@ def write(folder: Path, value: object) -> Path:
 def test_exact_pairs_and_matrices_give_the_pose_and_a_segment_may_have_its_own(tmp_path: Path) -> None:
     rest = object_at_rest()
     by_pairs = read_start(write(tmp_path, {"object": pairs()}), rest, SCALE)
-    np.testing.assert_allclose(by_pairs.poses, np.stack([POSE] * 3), atol=1e-9)
+    assert_allclose(by_pairs.poses, np.stack([POSE] * 3), atol=1e-9)
     assert not by_pairs.separate.any()
     by_matrix = read_start(write(tmp_path, {"object": POSE.tolist()}), rest)
-    np.testing.assert_allclose(by_matrix.poses[0], POSE, atol=1e-9)
+    assert_allclose(by_matrix.poses[0], POSE, atol=1e-9)
     other = rigid(SCALE * np.eye(3), np.array([5.0, 6.0, 7.0]))
     start = read_start(write(tmp_path, {"object": pairs(), "segments": {"arm": pairs(pose=other)}}), rest, SCALE)
     assert start.separate.tolist() == [False, True, False]
-    np.testing.assert_allclose(start.poses, [POSE, other, POSE], atol=1e-9)
+    assert_allclose(start.poses, [POSE, other, POSE], atol=1e-9)
     assert start.how == "object; arm from start.json"
 
 
@@ -228,9 +231,9 @@ def test_the_known_scale_is_kept_and_the_middle_stays_and_a_missing_file_is_name
     """A matrix of a scale that is 5 % off: size from the units, place and turn from the matrix."""
     rest, rough = object_at_rest(), rigid(1.05 * SCALE * TURN, np.array([1.0, 2.0, 3.0]))
     pose = read_start(write(tmp_path, {"object": rough.tolist()}), rest, SCALE).poses[0]
-    np.testing.assert_allclose(pose[:3, :3], SCALE * TURN, atol=1e-9)
+    assert_allclose(pose[:3, :3], SCALE * TURN, atol=1e-9)
     middle = rest.bounds.mean(axis=0)
-    np.testing.assert_allclose(transform_points(pose, middle), transform_points(rough, middle))
+    assert_allclose(transform_points(pose, middle), transform_points(rough, middle))
     with pytest.raises(FileNotFoundError, match="gone.json does not exist; a start file is needed"):
         read_start(tmp_path / "gone.json", object_at_rest())
 
@@ -281,7 +284,7 @@ def bar(tmp_path_factory: pytest.TempPathFactory) -> Bar:
     pose = rigid(turn, np.array([2.0, 1.0, 90.0]) - turn @ (low + high) / 2)
     np.save(folder / "scan.npy", scan_of(moved(scene.rest, np.stack([pose, pose])), NOISE))
     model = low + np.array([[0, 0, 0], [0, 1, 1], [1, 0, 1], [1, 1, 0]]) * (high - low)
-    picked = transform_points(pose, model) + np.random.default_rng(1).normal(scale=1.5, size=(4, 3))  # to 1.5 mm
+    picked = transform_points(pose, model) + default_rng(1).normal(scale=1.5, size=(4, 3))  # to 1.5 mm
     start = write(folder, {"object": {"model": model.tolist(), "scan": picked.tolist()}})
     arguments = ["--scene", str(path), "--start", str(start), "--unit", "mm", "--output", str(folder / "truth")]
     assert main(["align", str(folder / "scan.npy"), *arguments]) == 0
@@ -291,7 +294,7 @@ def bar(tmp_path_factory: pytest.TempPathFactory) -> Bar:
 def test_the_command_places_the_segments_and_the_truth_is_in_one_frame(bar: Bar) -> None:
     """Points are 0.02 mm off and 0.2 mm apart; the bar is 40 mm long."""
     folder, scene, pose = bar
-    facts = json.loads((folder / "truth/truth.json").read_text())
+    facts = read_json(folder / "truth/truth.json")
     assert facts["unit"] == "mm" and facts["start"] == "object from start.json"
     assert facts["scan"] == "../scan.npy" and facts["scene"] == "../bar.yaml"
     for segment in scene.rest.segments:
@@ -306,7 +309,7 @@ def test_the_command_places_the_segments_and_the_truth_is_in_one_frame(bar: Bar)
     for found, true in zip(posed.truth.segments, expected.segments, strict=True):
         assert np.abs(found.vertices - true.vertices).max() < 0.1
     assert (posed.name, posed.frame) == ("truth", "camera")
-    np.testing.assert_array_equal(posed.cloud.points, np.load(folder / "scan.npy"))
+    assert_array_equal(posed.cloud.points, np.load(folder / "scan.npy"))
 
 
 @pytest.mark.slow
@@ -318,7 +321,7 @@ def test_evaluate_takes_the_truth(bar: Bar, tmp_path: Path, shift_mm: float, low
     model = AnalyticModel.of(lambda points: 5.0 * np.eye(3)[solids.label(points - shift)], truth.names)
     evaluation = evaluate_weights(model, tmp_path / "test", EvaluationConfig(scans=[bar[0] / "truth"], cells=20))
     assert list(evaluation.examples) == ["truth"] and low <= evaluation.scores.iou <= high
-    written = json.loads((tmp_path / "test/metrics.json").read_text())
+    written = read_json(tmp_path / "test/metrics.json")
     assert written["iou"] == evaluation.scores.iou and written["scans"] == ["truth"]
 
 
@@ -353,7 +356,7 @@ def test_a_truth_file_runs_no_python_that_nobody_has_named(bar: Bar, tmp_path: P
     )
     truth = folder / "truth/truth.json"
     for name in ("../evil.py", "../evil.PY"):
-        truth.write_text(json.dumps(json.loads(truth.read_text()) | {"scene": name}))
+        truth.write_text(json.dumps(read_json(truth) | {"scene": name}))
         with pytest.raises(ValueError, match=f"names the scene '{name}', which is neither built in nor a YAML file"):
             read_truth(truth)
         assert not (folder / "was-run").exists()
@@ -378,7 +381,7 @@ def test_a_scene_without_truths_and_two_truths_of_one_name_are_refused(bar: Bar)
     ],
 )
 def test_the_command_refuses(
-    bar: Bar, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], options: list[str], sentence: str
+    bar: Bar, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, options: list[str], sentence: str
 ) -> None:
     monkeypatch.chdir(bar[0])
     assert main(["align", "scan.npy", "--scene", "bar.yaml", "--output", "out", *options]) == 2
@@ -386,11 +389,11 @@ def test_the_command_refuses(
     assert not (bar[0] / "out").exists()
 
 
-def test_the_rest_pose_is_exported(bar: Bar, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_rest_pose_is_exported(bar: Bar, capsys: pytest.CaptureFixture) -> None:
     folder, scene, _ = bar
     for name in ("rest.ply", "rest.glb"):
         assert main(["scene", "export", str(folder / "bar.yaml"), "--output", str(folder / name)]) == 0
-        np.testing.assert_allclose(read_segmented_mesh(folder / name).bounds, scene.rest.bounds, atol=1e-5)
+        assert_allclose(read_segmented_mesh(folder / name).bounds, scene.rest.bounds, atol=1e-5)
     assert main(["scene", "export", str(folder / "bar.yaml"), "--output", str(folder / "rest.xyz")]) == 2
     assert "has the suffix '.xyz'; it must be .ply or .glb" in capsys.readouterr().err
 
@@ -450,15 +453,15 @@ def test_the_bunnys_scans_remain_what_scans_alone_means(require_asset: Require) 
 
 def test_a_scan_is_put_before_the_camera() -> None:
     """Nearer to the scanner (larger z) becomes nearer to the camera (smaller z); up becomes minus y."""
-    scan = np.random.default_rng(0).uniform(-1, 1, size=(200, 3)) * [0.3, 0.5, 0.1] + [4.0, 5.0, 6.0]
+    scan = default_rng(0).uniform(-1, 1, size=(200, 3)) * [0.3, 0.5, 0.1] + [4.0, 5.0, 6.0]
     T_camera_scanner = into_camera(scan, "scanner")
     seen = transform_points(T_camera_scanner, scan)
-    np.testing.assert_allclose(T_camera_scanner[:3, :3] @ T_camera_scanner[:3, :3].T, np.eye(3))
+    assert_allclose(T_camera_scanner[:3, :3] @ T_camera_scanner[:3, :3].T, np.eye(3))
     assert np.linalg.det(T_camera_scanner[:3, :3]) == pytest.approx(1.0)
     for axis, sign in ((0, 1), (1, -1), (2, -1)):
-        np.testing.assert_array_equal(np.argsort(seen[:, axis]), np.argsort(sign * scan[:, axis]))
-    np.testing.assert_allclose(Normalizer.fit(seen).viewpoint, [0.0, 0.0, -VIEW_DISTANCE], atol=1e-12)
-    np.testing.assert_allclose(transform_points(inverse_rigid(T_camera_scanner), seen), scan)
+        assert_array_equal(np.argsort(seen[:, axis]), np.argsort(sign * scan[:, axis]))
+    assert_allclose(Normalizer.fit(seen).viewpoint, [0.0, 0.0, -VIEW_DISTANCE], atol=1e-12)
+    assert_allclose(transform_points(inverse_rigid(T_camera_scanner), seen), scan)
     with pytest.raises(ValueError, match="there is no scan 'bun045'; it must be one of bun000, bun090, bun270, chin"):
         bunny_scan("bun045")
 
@@ -474,7 +477,7 @@ def test_the_truth_lies_where_the_scan_is(name: str, require_asset: Require) -> 
     distance = np.abs(solids.nearest(points).distance)
     assert np.median(distance) < 1.5e-4 and np.quantile(distance, 0.95) < 6e-4
     assert 0.2 < (solids.label(points) > 0).mean() < 0.8
-    np.testing.assert_allclose(
+    assert_allclose(
         truth.bounds, bunny_truth(name).transformed(T_camera_scan).bounds, err_msg="scan frame and camera frame agree"
     )
     # the side that the camera sees: scanned points lie nearer than the middle of the object

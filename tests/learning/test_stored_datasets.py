@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from folder_contents import read_json
 from toy_data import SMALL, make_small_datasets, read_all, small_shards
 from toy_scene import toy_scene
 
@@ -125,7 +126,7 @@ DAMAGE: dict[str, Callable[[bytes, bytes], bytes]] = {
 @pytest.mark.parametrize("name", ["shard-00001.safetensors", "template.safetensors", "statistical_model.safetensors"])
 @pytest.mark.parametrize("reason", DAMAGE)
 def test_a_damaged_file_is_named_and_made_again(
-    stored: Place, originals: tuple[Path, Path], name: str, reason: str, capsys: pytest.CaptureFixture[str]
+    stored: Place, originals: tuple[Path, Path], name: str, reason: str, capsys: pytest.CaptureFixture
 ) -> None:
     write_whole(stored / name, DAMAGE[reason](*((folder / name).read_bytes() for folder in originals)))
     with pytest.raises(ValueError, match=rf"{name} .*\({reason}.*\); delete it and run .?mereo generate"):
@@ -139,7 +140,7 @@ def test_a_damaged_file_is_named_and_made_again(
 
 def test_a_manifest_that_was_changed_does_not_fit_its_files(data: Path) -> None:
     place = data / "manifest.json"
-    manifest = json.loads(place.read_text())
+    manifest = read_json(place)
     for change in ({"seed": 4}, {"any_roll": True}, {"segments": manifest["segments"][::-1]}):
         place.write_text(json.dumps(manifest | change))
         with pytest.raises(ValueError, match="it is of another dataset"):
@@ -155,7 +156,7 @@ def test_a_manifest_that_was_changed_does_not_fit_its_files(data: Path) -> None:
 # --- `mereo dataset check` and `show` ---------------------------------------------------------------------------------
 
 
-def test_a_whole_dataset_passes(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_whole_dataset_passes(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     before = contents(whole)
     assert main(["dataset", "check", str(whole)]) == 0
     assert "all 4 files are whole, 4 examples" in capsys.readouterr().out
@@ -165,7 +166,7 @@ def test_a_whole_dataset_passes(whole: Path, tmp_path: Path, capsys: pytest.Capt
     assert main(["dataset", "check", str(tmp_path / "test")]) == 0
 
 
-def test_every_bad_file_is_named_with_its_reason(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_bad_file_is_named_with_its_reason(data: Path, capsys: pytest.CaptureFixture) -> None:
     (data / "template.safetensors").unlink()
     (data / "statistical_model.safetensors").write_bytes((data / "statistical_model.safetensors").read_bytes()[:-1])
     for number in (0, 2):
@@ -182,7 +183,7 @@ def test_every_bad_file_is_named_with_its_reason(data: Path, capsys: pytest.Capt
     assert said.err.count("\n") == 2
 
 
-def test_show_says_what_a_dataset_is(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_show_says_what_a_dataset_is(data: Path, capsys: pytest.CaptureFixture) -> None:
     (data / "shard-00001.safetensors").unlink()
     assert main(["dataset", "show", str(data)]) == 0
     rows = dict(re.split(r"\s+", line, maxsplit=1) for line in capsys.readouterr().out.splitlines())
@@ -204,7 +205,7 @@ def test_show_says_what_a_dataset_is(data: Path, capsys: pytest.CaptureFixture[s
         ("train memory://nowhere/x --output s3://b/run", "the output s3://b/run is a URL, and a local path is"),
     ],
 )
-def test_what_is_no_place_is_one_sentence(text: str, sentence: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_no_place_is_one_sentence(text: str, sentence: str, capsys: pytest.CaptureFixture) -> None:
     assert main(text.split()) == 2
     said = capsys.readouterr().err
     assert said.startswith("mereo: error: ") and sentence in said and said.count("\n") == 1

@@ -2,7 +2,6 @@
 
 import csv
 import errno
-import json
 import math
 import os
 import shutil
@@ -13,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from folder_contents import read_json
+from numpy.random import default_rng
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from small_training import SMALL, TRANSFORMER
@@ -75,7 +76,7 @@ def test_run_directory_tells_the_story(finished: Path) -> None:
     rows = [row.split(",")[0] for row in (finished / "metrics.csv").read_text().splitlines()]
     assert rows == ["step", *map(str, range(1, 16))]  # 58 examples, batches of 8, two passes
     assert 0 <= float(last_row(finished)["val_iou"]) <= 1
-    assert json.loads((finished / "config.json").read_text())["train"]["batch"] == 8
+    assert read_json(finished / "config.json")["train"]["batch"] == 8
     assert (finished / "curves.png").read_bytes().startswith(b"\x89PNG")
     model = load_model(finished / "weights.safetensors")
     assert model.names == NAMES
@@ -118,7 +119,7 @@ def test_every_loss_variant_trains_and_answers(dataset: Path, tmp_path: Path, lo
     model = load_model(trainer.train(dataset, tmp_path / "run", config))
     last = last_row(tmp_path / "run")
     assert (last["ce"] == "", last["val_miou"] == "") == (loss == "l1", loss == "l1") and last["val_iou"]
-    cloud = np.random.default_rng(0).normal(loc=(0.0, 0.0, 50.0), size=(80, 3))
+    cloud = default_rng(0).normal(loc=(0.0, 0.0, 50.0), size=(80, 3))
     answer = model.query(model.encode(cloud), cloud[:7])
     assert answer.label.shape == (7,) and answer.probability.shape[1] == (2 if loss == "l1" else 3)
     # what was not trained is not answered
@@ -198,7 +199,7 @@ def test_a_chain_of_trainings_adds_up_and_only_a_learned_box_limits_it(dataset: 
 
 def noisy_world(count: int, share: tuple[float, ...], seed: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Labels drawn with ``share``, a noisy observation of each, and the log likelihood of every class given it."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     labels = rng.choice(len(share), size=count, p=share)
     seen = labels + rng.normal(scale=0.6, size=count)
     logits = -0.5 * ((seen[:, None] - np.arange(len(share))) / 0.6) ** 2
@@ -313,7 +314,7 @@ def test_a_diverged_training_stops_and_keeps_what_was_good(
 
 
 def test_a_divergence_before_anything_is_saved_is_an_error_of_the_command(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     diverge_at(monkeypatch, 1, math.nan, math.nan)
     command = f"train {dataset} --output {tmp_path / 'run'} --preset tiny --batch 8 --precision float32"

@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 from angle import write_angle
+from folder_contents import read_json
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
@@ -82,7 +85,7 @@ def things() -> list[Segment]:
 
 def desk(*parts: Segment) -> DepthImage:
     """Depth image of the desk, and of what else is there."""
-    return add_depth_noise(render_depth(SegmentedMesh((*things(), *parts)), CAMERA), NOISE, np.random.default_rng(0))
+    return add_depth_noise(render_depth(SegmentedMesh((*things(), *parts)), CAMERA), NOISE, default_rng(0))
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +110,7 @@ def test_an_object_among_others_is_known_at_its_place(
     assert found.seen.steps[-1].name == "whole frame" and found.seen.steps[-1].before == image.valid.sum()
     long = np.asarray(trimesh.load(folder / "long.stl").vertices) / 1000
     true = transform_points(PLACED, rest.segments[0].vertices)
-    np.testing.assert_allclose(transform_points(found.pose, long), true, atol=2e-3)
+    assert_allclose(transform_points(found.pose, long), true, atol=2e-3)
     assert found.seen.cloud.points[:, 2].max() < 0.65, "neither the desk behind it nor the wall is taken for it"
 
 
@@ -118,7 +121,7 @@ def test_the_covariance_of_a_rigid_objects_pose_is_that_of_its_points(found: mer
     turns = np.cross(np.eye(3), arms[:, None]).swapaxes(1, 2)  # by a turn about each axis
     follow = np.concatenate([turns, np.broadcast_to(np.eye(3), turns.shape)], axis=2)
     radii = radius95(follow @ covariance @ follow.swapaxes(1, 2))
-    np.testing.assert_allclose(radii, registered.uncertainty.material, rtol=0.02)
+    assert_allclose(radii, registered.uncertainty.material, rtol=0.02)
 
 
 def test_what_is_not_in_the_frame_is_not_known_and_the_likeliest_place_is_stated(angle: mereo.Object) -> None:
@@ -144,9 +147,9 @@ def test_each_instance_is_at_its_place_and_has_a_folder(
         true = transform_points(T, rest.segments[0].vertices)
         assert min(np.abs(place - true).max() for place in places) < 3e-3
     found.save(tmp_path / "result")
-    summary = json.loads((tmp_path / "result" / "summary.json").read_text(encoding="utf-8"))
+    summary = read_json(tmp_path / "result" / "summary.json")
     (further,) = summary["further_instances"]
-    alone = json.loads((tmp_path / "result" / "instance2" / "summary.json").read_text(encoding="utf-8"))
+    alone = read_json(tmp_path / "result" / "instance2" / "summary.json")
     assert further["pose"] == alone["pose"] != summary["pose"]
     every = trimesh.load_scene(tmp_path / "result" / "instances.glb")
     assert set(every.geometry) == {"1 long", "1 short", "2 long", "2 short"}
@@ -161,7 +164,7 @@ def test_several_instances_are_of_a_whole_frame(placed: SegmentedMesh, angle: me
 
 
 def test_the_command_looks_through_the_frame_and_says_so(
-    image: DepthImage, on_angle: tuple[int, int], folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    image: DepthImage, on_angle: tuple[int, int], folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     np.save(tmp_path / "depth.npy", image.depth)
     intrinsics = {"width": 240, "height": 180, "fx": 260.0, "fy": 260.0, "cx": 119.5, "cy": 89.5}
@@ -174,7 +177,7 @@ def test_the_command_looks_through_the_frame_and_says_so(
     where = "at the point {} {}".format(*on_angle)
     assert f"the object is looked for in all {image.valid.sum()} points of the frame, {where}" in printed
     assert "whole frame: " in printed and "where the object is likeliest" in printed
-    summary = json.loads((tmp_path / "result" / "summary.json").read_text(encoding="utf-8"))
+    summary = read_json(tmp_path / "result" / "summary.json")
     assert summary["isolation"][-1]["name"] == "whole frame" and summary["recognition"]["known"] is True
 
 
@@ -278,7 +281,7 @@ def test_a_point_or_a_box_has_the_answer_of_the_whole_frame_and_another_point_no
     frame = mereo.load_frame(image, unit_m=1.0)
     narrowed = mereo.reconstruct(frame, angle, point=on_angle, box=BOX)
     assert narrowed.known is True and [step.name for step in narrowed.seen.steps] == ["box", "whole frame"]
-    np.testing.assert_allclose(narrowed.pose, found.pose, atol=2e-3)
+    assert_allclose(narrowed.pose, found.pose, atol=2e-3)
     wrong = mereo.reconstruct(frame, angle, point=CAN).recognition
     assert wrong.known is False and f"the object is not at the point {CAN[0]} {CAN[1]}; " in str(wrong.reason)
 
@@ -331,11 +334,11 @@ def test_surfaces_end_at_gaps_in_depth() -> None:
 
 def test_a_large_image_is_thinned_to_pixels_that_are_its_own() -> None:
     camera = Camera(900, 700, 1000.0, 1100.0, 440.0, 360.0)
-    depth = np.random.default_rng(0).uniform(0.9, 1.1, (700, 900))
+    depth = default_rng(0).uniform(0.9, 1.1, (700, 900))
     thin, every = thinned(DepthImage(depth, camera), 0.3)
     assert every == 5 and thin.depth.shape == (140, 180)
     points, places = depth[2::5, 2::5, None] * camera.directions()[2::5, 2::5], thin.camera.directions()
-    np.testing.assert_allclose(thin.depth[..., None] * places, points, atol=1e-12)
+    assert_allclose(thin.depth[..., None] * places, points, atol=1e-12)
     assert thinned(DepthImage(depth, camera), 0.05)[1] == 1
 
 
@@ -373,7 +376,7 @@ def test_what_an_occluder_hides_of_the_outline_does_not_count(image: DepthImage,
 def test_noise_that_neighbours_share_is_measured_on_the_plane_around_the_object(
     placed: SegmentedMesh, std: float, level: float
 ) -> None:
-    clean, depth, rng = desk(*placed.segments), render_depth(placed, CAMERA).depth, np.random.default_rng(1)
+    clean, depth, rng = desk(*placed.segments), render_depth(placed, CAMERA).depth, default_rng(1)
     field = gaussian_filter(rng.normal(size=depth.shape), 8)
     shared = np.where(clean.valid, clean.depth + level * clean.depth * field / field.std(), 0.0)
     noisy = add_depth_noise(DepthImage(shared, clean.camera), std, rng)

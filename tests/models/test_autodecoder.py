@@ -9,7 +9,7 @@ import torch
 from answers import reconstruct
 from safetensors.torch import load_file
 from shapes import ball
-from toy_data import read_all, write_toy_dataset
+from toy_data import example_of, read_all, write_toy_dataset
 from training_runs import assert_resumes_exactly
 
 from mereo.geometry.camera import PointCloud
@@ -53,25 +53,15 @@ def ball_pair(rng: np.random.Generator, points: int, queries: int) -> dict[str, 
     front[:, 2] = -np.abs(front[:, 2])
     which = rng.integers(0, 2, size=points)
     cloud = centers[which] + radii[which, None] * front
-    low, high = cloud.min(axis=0), cloud.max(axis=0)
-    middle, scale = (low + high) / 2, 2 / (high - low).max()
     places = rng.uniform([-1.4, -1.4, 18.6], [1.4 + 2 * radii[1], 1.4, 21.4], size=(queries, 3))
     to_center = centers - places[:, None]
     reach, rows = np.linalg.norm(to_center, axis=2), np.arange(queries)
     nearest = (reach - radii).argmin(axis=1)
     distance = (reach - radii)[rows, nearest]
     outward = np.where(distance < 0, -1, 1)[:, None]
-    return {
-        "cloud": ((cloud - middle) * scale).astype(np.float32),
-        "cloud_count": np.array(points, dtype=np.int32),
-        "center": middle,
-        "scale": np.array(scale),
-        "positions": ((places - middle) * scale).astype(np.float32),
-        "labels": np.where(distance < 0, nearest + 1, 0).astype(np.uint8),
-        "distances": (distance * scale).astype(np.float32),
-        "directions": (outward * (to_center / reach[..., None])[rows, nearest]).astype(np.float16),
-        "rest": np.full((queries, 3), np.nan, dtype=np.float16),
-    }
+    directions = outward * (to_center / reach[..., None])[rows, nearest]
+    labels, rest = np.where(distance < 0, nearest + 1, 0), np.full((queries, 3), np.nan)
+    return example_of(cloud, places, labels=labels, distances=distance, directions=directions, rest=rest)
 
 
 @pytest.fixture(scope="module")

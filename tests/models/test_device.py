@@ -11,6 +11,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
+from numpy.random import default_rng
 from torch.nn import functional as F
 
 from mereo import __main__ as command_line
@@ -55,14 +56,14 @@ def test_auto_takes_bfloat16_where_the_processor_gains_by_it(
 
 
 def cloud_file(folder: Path) -> Path:
-    np.save(folder / "cloud.npy", np.random.default_rng(0).normal((0, 0, 0.6), 0.04, (600, 3)))
+    np.save(folder / "cloud.npy", default_rng(0).normal((0, 0, 0.6), 0.04, (600, 3)))
     return folder / "cloud.npy"
 
 
 def test_bfloat16_changes_few_labels_and_little_distance(tmp_path: Path) -> None:
     """The stated cost: about one label in a thousand; a rounding of coordinates instead would change every tenth."""
     points = np.load(cloud_file(tmp_path))
-    queries = np.random.default_rng(1).uniform(points.min(axis=0), points.max(axis=0), (4000, 3))
+    queries = default_rng(1).uniform(points.min(axis=0), points.max(axis=0), (4000, 3))
     on_cpu = replace(EXACT, device="cpu")
     models = [load_for("bunny", config) for config in (CPU, on_cpu, InferenceConfig(device="cpu"))]
     assert {model.device.type for model in models} == {"cpu"}
@@ -75,7 +76,7 @@ def test_bfloat16_changes_few_labels_and_little_distance(tmp_path: Path) -> None
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device here")
-def test_cuda_where_there_is_none_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_cuda_where_there_is_none_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert find_device("auto") == find_device("cpu") == torch.device("cpu")
     arguments = ["reconstruct", str(cloud_file(tmp_path)), "--weights", "bunny", "--output", str(tmp_path / "out")]
     assert command_line.main([*arguments, "--device", "cuda"]) != 0
@@ -151,7 +152,7 @@ def threads() -> Iterator[None]:
 def test_answers_are_the_same_bits_in_any_number_of_threads(precision: Precision) -> None:
     model, view = replace(load_model("bunny"), precision=precision), load_view("bunny")
     code = model.encode(view.depth.to_points())
-    points = np.random.default_rng(0).normal(size=(3 * CPU_QUERY_CHUNK + 7, 3)) * 8 + view.depth.to_points().points[0]
+    points = default_rng(0).normal(size=(3 * CPU_QUERY_CHUNK + 7, 3)) * 8 + view.depth.to_points().points[0]
     torch.set_num_threads(1)
     alone = model.query(code, points)
     for count in (2, 3):

@@ -1,7 +1,6 @@
 """Exported networks answer as the network does: ONNX Runtime, torch.export, and the runner without torch."""
 
 import ast
-import json
 import re
 import subprocess
 import sys
@@ -12,6 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from folder_contents import read_json
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mereo.geometry.downsampling import farthest_point_order
 from mereo.geometry.mesh import PALETTE
@@ -70,7 +72,7 @@ def model_of(config: NetworkConfig, loss: str) -> Model:
 
 def seen(count: int, seed: int) -> np.ndarray:
     """Normalized points on a bent surface, in random order, float32."""
-    u, v = np.random.default_rng(seed).uniform(-1, 1, (2, count))
+    u, v = default_rng(seed).uniform(-1, 1, (2, count))
     return np.stack([u, 0.7 * v, 0.4 * np.sin(2 * u) + 0.3 * v * v], axis=1).astype(np.float32)
 
 
@@ -95,7 +97,7 @@ def agree(found: dict[str, Any], expected: tuple[np.ndarray, ...]) -> None:
     for name, wanted in zip(ANSWERS, expected, strict=True):
         got = np.asarray(found[name])
         assert got.shape == wanted.shape
-        np.testing.assert_allclose(got, wanted, atol=TOLERANCE, rtol=TOLERANCE, err_msg=name)
+        assert_allclose(got, wanted, atol=TOLERANCE, rtol=TOLERANCE, err_msg=name)
     assert np.asarray(found["logits"]).std() > 100 * TOLERANCE, "the comparison would be empty"
 
 
@@ -118,7 +120,7 @@ def test_a_reloaded_torch_program_answers_as_the_network(tmp_path: Path, case: s
     model, folder = export(case, tmp_path, "torch")
     assert sorted(path.name for path in folder.glob("[!.]*")) == ["encoder.pt2", "model.json", "query.pt2"]
     encoder, query = (torch.export.load(folder / f"{name}.pt2").module() for name in ("encoder", "query"))
-    wanted = json.loads((folder / "model.json").read_text())["query_inputs"]
+    wanted = read_json(folder / "model.json")["query_inputs"]
     for cloud, places in inputs_of(model):
         given = {**encoder(cloud), "cloud": cloud, "viewpoint": torch.tensor([[0.1, -0.2, -8.0]])}
         found = query(places, {name: given[name] for name in wanted})
@@ -142,7 +144,7 @@ def test_missing_packages_are_named_with_their_extra(tmp_path: Path, monkeypatch
 
 def raw_cloud(count: int, seed: int = 0) -> np.ndarray:
     points = np.concatenate([seen(count - 5, seed), seen(count - 5, seed)[:5]])
-    return np.random.default_rng(seed).permutation(0.05 * points.astype(np.float64) + [0.1, -0.2, 0.7])
+    return default_rng(seed).permutation(0.05 * points.astype(np.float64) + [0.1, -0.2, 0.7])
 
 
 @pytest.mark.parametrize("count", [40, 256, 1500, 5000])
@@ -152,8 +154,8 @@ def test_the_runner_prepares_clouds_as_the_model_does(count: int) -> None:
     settings = {"points": 256, "dense_factor": 8, "fewest_points_of_a_cloud": 32}
     found, center, scale = prepare(raw_cloud(count), settings)
     code = model.encode(raw_cloud(count))
-    np.testing.assert_array_equal(found, code.code.cloud[0].numpy())
-    np.testing.assert_array_equal(center, code.normalizer.center)
+    assert_array_equal(found, code.code.cloud[0].numpy())
+    assert_array_equal(center, code.normalizer.center)
     assert scale == code.normalizer.scale
 
 
@@ -172,7 +174,7 @@ def test_the_runner_refuses_unusable_clouds(cloud: np.ndarray, text: str) -> Non
 
 
 def test_the_runner_says_in_one_line_what_is_wrong_and_replaces_nothing_unasked(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     output = tmp_path / "out.npz"
     output.write_text("precious")
@@ -220,13 +222,13 @@ def test_onnx_graphs_answer_as_the_network_and_the_folder_says_what_it_holds(exp
         with torch.inference_mode():
             code = code_tensors(model.network.encode(cloud, torch.zeros(1, 3)))
         for name, tensor in code.items():
-            np.testing.assert_allclose(given[name], tensor.numpy(), atol=TOLERANCE, err_msg=name)
+            assert_allclose(given[name], tensor.numpy(), atol=TOLERANCE, err_msg=name)
         given |= {"cloud": cloud.numpy(), "viewpoint": np.array([[0.1, -0.2, -8.0]], np.float32)}
         given["points"] = places.numpy()
         found = query.run(ANSWERS, {entry.name: given[entry.name] for entry in query.get_inputs()})
         agree(dict(zip(ANSWERS, found, strict=True)), answers_of(model, cloud, places))
     assert {"encoder.onnx", "query.onnx", "model.json", "mereo_onnx.py"} <= {path.name for path in folder.iterdir()}
-    settings = json.loads((folder / "model.json").read_text())
+    settings = read_json(folder / "model.json")
     assert settings["points"] == model.network.config.points
     assert settings["names"] == (list(model.names) if model.segmented else ["object"])
     assert len(settings["colors"]) == len(settings["names"])
@@ -245,7 +247,7 @@ def test_the_runner_answers_as_the_model_without_torch(exported: tuple[Model, Pa
     model, folder = exported
     cloud = raw_cloud(3000)
     low, high, size = cloud.min(axis=0), cloud.max(axis=0), np.ptp(cloud, axis=0).max()
-    queries = np.random.default_rng(2).uniform(low - 0.3 * size, high + 0.3 * size, (20_000, 3))
+    queries = default_rng(2).uniform(low - 0.3 * size, high + 0.3 * size, (20_000, 3))
     np.save(folder / "frame.npy", cloud)
     np.save(folder / "queries.npy", queries)
     run = subprocess.run([sys.executable, "-c", ALONE], cwd=folder, capture_output=True, text=True)
@@ -256,7 +258,7 @@ def test_the_runner_answers_as_the_model_without_torch(exported: tuple[Model, Pa
         assert len(np.unique(found["labels"])) > 1
         # a query may have another nearest point by rounding, where two are as near
         for name, wanted, unit in (("distances", expected.distance, size), ("directions", expected.direction, 1.0)):
-            np.testing.assert_array_equal(np.isnan(found[name]), np.isnan(wanted))
+            assert_array_equal(np.isnan(found[name]), np.isnan(wanted))
             difference = np.abs(np.nan_to_num(found[name]) - np.nan_to_num(wanted))
             assert (difference <= TOLERANCE * unit).mean() >= 0.999, f"{name}: {difference.max()}"
         assert tuple(found["names"]) == (model.names if model.segmented else ("object",))

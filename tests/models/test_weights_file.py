@@ -69,7 +69,7 @@ def test_what_is_wrong_with_weights_is_one_sentence(text: str, tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_names_that_look_like_markup_are_printed_unchanged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_names_that_look_like_markup_are_printed_unchanged(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     weights = changed(tmp_path, lambda h, t: h.update(names=["[/x]", ":heart:[red]"]))
     cloud = tmp_path / "[red] [y].npy"
     np.save(cloud, np.random.default_rng(0).normal((0, 0, 20), 1, (200, 3)))
@@ -79,12 +79,12 @@ def test_names_that_look_like_markup_are_printed_unchanged(tmp_path: Path, capsy
     assert all(text in printed for text in ("[red] [y].npy", "[/x]", ":heart:[red]"))
 
 
-def said(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+def said(capsys: pytest.CaptureFixture, *arguments: str | Path) -> str:
     assert command_line.main(["weights", *map(str, arguments)]) == 0
     return capsys.readouterr().out
 
 
-def test_every_shipped_file_is_listed_with_the_scores_of_its_card(capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_shipped_file_is_listed_with_the_scores_of_its_card(capsys: pytest.CaptureFixture) -> None:
     rows = {line.split()[1]: line for line in said(capsys, "list").splitlines() if line.startswith("│")}
     assert tuple(rows) == shipped_names()
     for name, row in rows.items():
@@ -92,7 +92,7 @@ def test_every_shipped_file_is_listed_with_the_scores_of_its_card(capsys: pytest
     assert "0.973 0.904" in rows["bunny"]
 
 
-def test_show_prints_the_unit_and_the_card_or_all_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+def test_show_prints_the_unit_and_the_card_or_all_as_json(capsys: pytest.CaptureFixture) -> None:
     text = said(capsys, "show", "tumor")
     assert "8.134 mm to a scene unit" in text and (SHIPPED / "tumor.md").read_text("utf-8") in text
     assert sha256((SHIPPED / "tumor.safetensors").read_bytes()).hexdigest() in text.split("# tumor")[0]
@@ -102,7 +102,7 @@ def test_show_prints_the_unit_and_the_card_or_all_as_json(capsys: pytest.Capture
     assert facts["card"] == (SHIPPED / "bunny.md").read_text("utf-8")
 
 
-def test_weights_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_weights_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """Neither card nor statistical model, and unknown provenance; a checkpoint beside it is no weights."""
     save_model(untrained(("one", "two")), tmp_path / "mine.safetensors")
     (tmp_path / "checkpoint.safetensors").write_bytes(b"something else")

@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from manifold3d import Manifold
+from numpy.random import Generator, default_rng
 from solid_pairs import gap, overlapping_pairs
 
 from mereo.deformation.maps import Deformation, jacobian_determinant
@@ -77,7 +78,7 @@ def test_valves_move_only_along_their_stems_and_each_by_its_own_lift() -> None:
         for at, reach, expected in zip(x, widest, drop, strict=True):
             points = np.array([[at - reach, 0.0, 22.0], [at, 0.5, 25.0], [at + reach, 0.0, 28.0]])
             assert np.allclose(motion(points) - points, [0.0, 0.0, expected])
-        anywhere = np.random.default_rng(1).uniform([-25, -5, 15], [25, 5, 35], size=(500, 3))
+        anywhere = default_rng(1).uniform([-25, -5, 15], [25, 5, 35], size=(500, 3))
         assert np.allclose(jacobian_determinant(motion, anywhere), 1.0, atol=1e-4)
 
 
@@ -89,7 +90,7 @@ LINKS = ("base", "column", "upper_arm", "elbow", "forearm", "wrist", "hand")
 
 @pytest.fixture(scope="module")
 def states() -> list[State]:
-    scene, rng = load_scene("robot"), np.random.default_rng(1)
+    scene, rng = load_scene("robot"), default_rng(1)
     return [scene.sample_state(rng) for _ in range(40)]
 
 
@@ -154,7 +155,7 @@ def test_poses_in_which_parts_meet_are_refused(angles_deg: tuple[float, ...], pa
 # --- lizard -----------------------------------------------------------------------------------------------------------
 
 
-def extreme_pose(rng: np.random.Generator) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def extreme_pose(rng: Generator) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     limits = np.column_stack([np.full((len(SPINE), 2), lizard.SPINE_PLAY_RAD), lizard.SPINE_LIMIT_RAD])
     swing = np.array([[lizard.LEG_PLAY_RAD] * 2 + [limit] for limit in (lizard.SWING_RAD, lizard.FOOT_RAD)])
     legs = {name: rng.choice([-1.0, 1.0], size=(2, 3)) * swing for name in lizard.LEGS}
@@ -175,7 +176,7 @@ def neighbours(
 
 
 def test_links_keep_clear_of_each_other_at_the_limits() -> None:
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     for _ in range(3):
         for socket, knob, before, after in neighbours(*extreme_pose(rng)):
             common = socket.transform(before[:3]) ^ knob.transform(after[:3])
@@ -183,7 +184,7 @@ def test_links_keep_clear_of_each_other_at_the_limits() -> None:
 
 
 def test_a_chain_of_knuckles_moves_every_link_rigidly() -> None:
-    vectors, _ = extreme_pose(np.random.default_rng(2))
+    vectors, _ = extreme_pose(default_rng(2))
     chain, motion = Hinged(SPINE, vectors), np.eye(4)
     for number, link in enumerate(spine_links()):
         if number > 0:

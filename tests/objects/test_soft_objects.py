@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from scipy.spatial import cKDTree
 
 from mereo.deformation.maps import Deformation, jacobian
@@ -21,7 +22,7 @@ STATES = 100
 
 @pytest.fixture(scope="module")
 def states() -> list[SegmentedMesh]:
-    scene, rng = load_scene("rope"), np.random.default_rng(1)
+    scene, rng = load_scene("rope"), default_rng(1)
     return [scene.sample_state(rng).mesh for _ in range(STATES)]
 
 
@@ -73,7 +74,7 @@ def test_clearance_test_sees_a_rope_through_itself_or_the_base() -> None:
 
 
 def test_rope_leaves_its_plane_as_far_as_it_moves_in_it() -> None:
-    rng = np.random.default_rng(4)
+    rng = default_rng(4)
     centers = np.stack([rope.sample_centerline(rng) for _ in range(600)])
     tangents = np.diff(centers, axis=1)
     sideways, forwards = (np.abs(tangents[..., axis]).mean() for axis in (1, 2))
@@ -139,7 +140,7 @@ def underside_share(deformation: Deformation) -> float:
 
 
 def first_of_kind(kind: str, seed: int) -> Deformation:
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     return next(found for found in iter(lambda: sheet.sample_deformation(rng, kind), object()) if found is not None)
 
 

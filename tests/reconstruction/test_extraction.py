@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from analytic import Distance, ball, half, logits_of, plate, union
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mereo.geometry.mesh import PALETTE, Segment
 from mereo.reconstruction.isosurfaces import Extraction, Field, _grid, extract, extract_whole, locate
@@ -46,8 +47,8 @@ def test_coarse_to_fine_is_the_dense_grid(name: str) -> None:
     assert (fine.grid.labels == dense.grid.labels).all()
     assert dense.grid.labels.any() and dense.evaluated == dense.grid.labels.size
     for a, b in zip(fine.surfaces.segments, dense.surfaces.segments, strict=True):
-        np.testing.assert_array_equal(a.vertices, b.vertices)
-        np.testing.assert_array_equal(a.faces, b.faces)
+        assert_array_equal(a.vertices, b.vertices)
+        assert_array_equal(a.faces, b.faces)
 
 
 def test_a_surface_once_met_is_followed_to_its_end() -> None:
@@ -57,7 +58,7 @@ def test_a_surface_once_met_is_followed_to_its_end() -> None:
     plain = logits_of(union(ball((0.62, 0.0, -0.3), 0.2), wire))
     field: Field = lambda points: 8.0 * np.sign(plain(points))  # noqa: E731
     fine, dense = run(field), run(field, dense=True)
-    np.testing.assert_array_equal(fine.grid.labels, dense.grid.labels)
+    assert_array_equal(fine.grid.labels, dense.grid.labels)
     assert fine.grid.labels[:, :, -7:].any(), "the wire reaches up"
 
 
@@ -85,7 +86,7 @@ def test_neighbours_share_their_interface_and_volumes_add_up() -> None:
         on_wall = (np.abs(segment.vertices[:, 0]) < 1e-5) & (np.linalg.norm(segment.vertices, axis=1) < 0.7 - 2 * voxel)
         walls.append(np.unique(segment.vertices[on_wall].round(5), axis=0))
     assert len(walls[0]) > 200
-    np.testing.assert_allclose(walls[0], walls[1], atol=2e-5 * voxel + 1e-9)
+    assert_allclose(walls[0], walls[1], atol=2e-5 * voxel + 1e-9)
     assert left.volume + right.volume == pytest.approx(together.volume, rel=3e-3)  # gaps below a voxel along the rim
 
 
@@ -94,7 +95,7 @@ def test_a_segment_that_fills_the_box_is_closed_half_a_voxel_outside() -> None:
     segment = found.surfaces.segments[0]
     assert found.grid.touched_sides().all()
     assert segment.edge_imbalance() == (0, 0)
-    np.testing.assert_allclose(segment.bounds, [[-1.05] * 3, [1.05] * 3], rtol=1e-6)
+    assert_allclose(segment.bounds, [[-1.05] * 3, [1.05] * 3], rtol=1e-6)
     assert 0.99 * 2.1**3 < segment.volume < 2.1**3
 
 
@@ -102,8 +103,8 @@ def test_voxels_are_cubes_and_the_resolution_is_that_of_the_longest_side() -> No
     box = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 0.55]])
     grid = run(logits_of(ball((0.5, 1.0, 0.3), 0.2)), resolution=20, box=box).grid
     assert grid.labels.shape == (11, 21, 7)
-    np.testing.assert_allclose(grid.spacing, 0.1)
-    np.testing.assert_allclose(grid.positions(np.array([[10, 20, 0]])), [[1.0, 2.0, 0.0]])
+    assert_allclose(grid.spacing, 0.1)
+    assert_allclose(grid.positions(np.array([[10, 20, 0]])), [[1.0, 2.0, 0.0]])
 
 
 def test_locate_grows_until_the_object_is_inside() -> None:

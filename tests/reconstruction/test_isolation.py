@@ -5,12 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
+from numpy.testing import assert_array_equal
 from two_balls import front
 
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.downsampling import random_subset, thin_to_grid
 from mereo.geometry.solids import Solids
-from mereo.geometry.surface_patches import longest_side
+from mereo.geometry.transforms import longest_side
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.isolation import IsolationStep, Reading, clusters, largest_plane, readings
 from mereo.reconstruction.observation import find_object, observe
@@ -26,12 +28,12 @@ def half_ball(count: int = 3000, center: tuple[float, float, float] = (0.0, 0.0,
 
 
 def wall(count: int = 6000, z: float = 1.5) -> np.ndarray:
-    x, y = np.random.default_rng(1).uniform(-0.6, 0.6, (2, count))
-    return np.column_stack([x, y, z + 0.1 * x + np.random.default_rng(2).normal(0, 0.002, count)])
+    x, y = default_rng(1).uniform(-0.6, 0.6, (2, count))
+    return np.column_stack([x, y, z + 0.1 * x + default_rng(2).normal(0, 0.002, count)])
 
 
 BALL, WALL = half_ball(), wall()
-STRAYS = np.random.default_rng(3).uniform((-0.5, -0.5, 0.5), (0.5, 0.5, 1.2), (40, 3))
+STRAYS = default_rng(3).uniform((-0.5, -0.5, 0.5), (0.5, 0.5, 1.2), (40, 3))
 EVERYTHING = np.concatenate([BALL, WALL, STRAYS])
 
 
@@ -72,13 +74,13 @@ def test_the_largest_plane_goes_and_the_object_stays(factor: float) -> None:
 
 
 def test_the_plane_is_the_one_of_least_squares() -> None:
-    plane = largest_plane(EVERYTHING, np.full(len(EVERYTHING), 0.01), np.random.default_rng(5))
+    plane = largest_plane(EVERYTHING, np.full(len(EVERYTHING), 0.01), default_rng(5))
     expected = np.array([-0.1, 0.0, 1.0]) / np.hypot(0.1, 1.0)
     assert abs(plane.normal @ expected) == pytest.approx(1.0, abs=1e-5)
     least = np.linalg.eigvalsh(np.cov(WALL.T, bias=True))[0]
     assert (plane.distance(WALL) ** 2).mean() < 1.01 * least
     line = np.outer(np.arange(50.0), [1.0, 2.0, 3.0])
-    assert largest_plane(line, np.full(50, 0.1), np.random.default_rng(5)) is None
+    assert largest_plane(line, np.full(50, 0.1), default_rng(5)) is None
 
 
 def test_outliers_go_and_the_object_stays() -> None:
@@ -97,7 +99,7 @@ def test_clusters_follow_neighbours_not_distance() -> None:
     """Two dense sheets 5 spacings apart are two; a sheet whose rows are 5 spacings apart is one."""
     dense = np.stack(np.meshgrid(np.arange(60.0), np.arange(50.0), [0.0]), axis=-1).reshape(-1, 3)
     sheets = np.concatenate([dense[:1500] + np.array([0, 0, 5.0]), dense])
-    np.testing.assert_array_equal(clusters(sheets), np.repeat([1, 0], [1500, 3000]))
+    assert_array_equal(clusters(sheets), np.repeat([1, 0], [1500, 3000]))
     assert (clusters(dense * [1.0, 5.0, 1.0]) == 0).all()
     assert (clusters(dense * [1.0, 10.1, 1.0]) > 0).any(), "rows farther apart than the gap"
     for count in (1, 2, 5):
@@ -139,7 +141,7 @@ def test_too_little_left_names_the_step_and_its_cure() -> None:
 
 def test_thinning_is_even_and_keeps_measurements() -> None:
     """Nine tenths of the points are in one corner; a tenth of the cells is there."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     sheet = np.concatenate([rng.uniform(0, 1, (20000, 2)), rng.uniform(0, 0.3, (180000, 2))])
     points = np.column_stack([sheet, np.ones(len(sheet))])
     rows = thin_to_grid(points, 5000)
@@ -180,7 +182,7 @@ def wall_behind_plate(rim: int = 2, fragments: int = 8) -> tuple[np.ndarray, np.
 def test_scattered_strays_are_dropped_and_said() -> None:
     points, genuine = wall_behind_plate()
     taken, other = readings(PointCloud(points))
-    np.testing.assert_array_equal(taken.cloud.points, points[genuine])
+    assert_array_equal(taken.cloud.points, points[genuine])
     assert other.cloud.points is points and (other.dropped, other.step, str(other)) == (0, None, "")
     assert taken.dropped == (~genuine).sum() and taken.step is not None
     assert (taken.step.name, taken.step.before, taken.step.kept) == ("strays", len(points), genuine.sum())
@@ -197,7 +199,7 @@ def test_one_piece_that_lies_apart_stays_and_is_left_open() -> None:
     points, genuine = wall_behind_plate(fragments=1)
     taken, other = readings(points)
     assert taken.dropped == 0 and taken.cloud.points is points
-    np.testing.assert_array_equal(other.cloud.points, points[genuine])
+    assert_array_equal(other.cloud.points, points[genuine])
 
 
 def test_what_lies_before_a_gap_in_range_is_a_reading_too() -> None:
@@ -205,14 +207,14 @@ def test_what_lies_before_a_gap_in_range_is_a_reading_too() -> None:
     points, genuine = wall_behind_plate(rim=20, fragments=1)
     *others, nearer = readings(points)
     assert max(other.dropped for other in others) < (~genuine).sum()
-    np.testing.assert_array_equal(nearer.cloud.points, points[genuine])
+    assert_array_equal(nearer.cloud.points, points[genuine])
 
 
 def test_everything_is_kept_where_asked_or_where_nothing_can_be_told() -> None:
     points, _ = wall_behind_plate()
     (everything,) = readings(points, keep_all=True)
     assert everything.cloud.points is points
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     for cloud in (points[:31], rng.uniform((-1, -1, 4), (1, 1, 6), (3000, 3)), np.ones((50, 3)), np.zeros((0, 3))):
         assert [reading.dropped for reading in readings(cloud)] == [0]
 
@@ -243,8 +245,8 @@ def test_a_scan_is_seen_along_its_estimated_lines_of_sight() -> None:
     """Where it was taken from is not said; points that float about a plate are off it from anywhere in front."""
     line = np.linspace(-0.1, 0.1, 40)
     plate = np.stack(np.meshgrid(line, line, [5.0]), axis=-1).reshape(-1, 3)
-    floating = np.random.default_rng(0).uniform((-0.1, -0.1, 4.2), (0.1, 0.1, 4.8), (20, 3))
+    floating = default_rng(0).uniform((-0.1, -0.1, 4.2), (0.1, 0.1, 4.8), (20, 3))
     scan = np.concatenate([plate, floating])
     taken, other = readings(PointCloud(scan), "scanner")
-    np.testing.assert_array_equal(taken.cloud.points, plate)
+    assert_array_equal(taken.cloud.points, plate)
     assert other.dropped == 0 and taken.stretch == pytest.approx(np.ptp(scan[:, 2]) / 0.2)

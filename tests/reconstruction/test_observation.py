@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 import trimesh
 from camera_files import write_camera
+from folder_contents import read_json
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from point_files import save_pcd
 from scipy.spatial.transform import Rotation
@@ -44,8 +47,8 @@ def test_a_depth_image_becomes_the_points_it_shows(folder: Path) -> None:
     seen = find_object(read_frame(folder / "d.png", InputConfig(intrinsics=folder / "k.json", depth_scale=5000.0)))
     points = seen.cloud.points
     assert len(points) == 50 and seen.frame.unit_m == 1.0 and seen.depth_m == (0.5, 0.5, 0.5)
-    np.testing.assert_allclose(points[:, 2], 0.5)
-    np.testing.assert_allclose(CAMERA.project(points)[0], [5.5, 2.5])
+    assert_allclose(points[:, 2], 0.5)
+    assert_allclose(CAMERA.project(points)[0], [5.5, 2.5])
     assert seen.size_m == pytest.approx((0.15, 4 / 60, 0.0))
     assert str(seen).splitlines() == [
         "the object has 50 points, depth 0.5 to 0.5 m (middle 0.5 m)",
@@ -63,9 +66,9 @@ def test_lengths_along_rays_become_depths(folder: Path) -> None:
         mereo.load_frame(lengths, intrinsics=CAMERA, depth_along="ray"),
         mereo.load_frame(DepthImage(lengths, CAMERA), depth_along="ray"),
     ):
-        np.testing.assert_allclose(frame.cloud.points[:, 2], 0.5)
+        assert_allclose(frame.cloud.points[:, 2], 0.5)
         assert frame.whole is not None
-        np.testing.assert_allclose(frame.whole.depth, 0.5)
+        assert_allclose(frame.whole.depth, 0.5)
     assert np.ptp(read_frame(folder / "r.npy", replace(reading, depth_along="z")).cloud.points[:, 2]) > 0.02
     with pytest.raises(ValueError, match="depth_along is given for points"):
         mereo.load_frame(frame.cloud, depth_along="ray")
@@ -88,7 +91,7 @@ def test_the_objects_id_in_a_mask(folder: Path) -> None:
 
 
 def test_the_depth_scale_of_the_intrinsics_is_for_integers_and_gives_way(folder: Path) -> None:
-    fields = json.loads((folder / "k.json").read_text())
+    fields = read_json(folder / "k.json")
     (folder / "bop.json").write_text(json.dumps({**fields, "depth_scale": 0.2}))
     for name, scale, expected in (("d.png", None, 0.5), ("d.png", 2500.0, 1), ("d.npy", None, 0.5), ("d.npy", 0.5, 1)):
         seen = find_object(read_frame(folder / name, InputConfig(intrinsics=folder / "bop.json", depth_scale=scale)))
@@ -121,7 +124,7 @@ def test_contradictory_inputs(name: str, options: dict[str, Any], text: str) -> 
 BASE = rigid(Rotation.from_euler("xyz", [-110.0, 20.0, 5.0], degrees=True).as_matrix(), np.array([1.5, -0.5, 0.3]))
 """Pose of a camera in a robot's base frame, at the side of the points."""
 
-CAP = np.random.default_rng(3).uniform((-0.1, -0.1, 0.5), (0.1, 0.1, 0.7), (60, 3)).astype(np.float32)
+CAP = default_rng(3).uniform((-0.1, -0.1, 0.5), (0.1, 0.1, 0.7), (60, 3)).astype(np.float32)
 
 
 def stored_at(pose: np.ndarray, points: np.ndarray) -> bytes:
@@ -139,15 +142,15 @@ def test_a_stated_viewpoint_is_used_where_the_points_fit_it(tmp_path: Path) -> N
         InputWarning, match=r"c.pcd states a camera's pose \(VIEWPOINT\); .* moved into the camera's axes"
     ):
         frame = read_frame(path)
-    np.testing.assert_allclose(frame.cloud.points, CAP, atol=1e-6)
-    np.testing.assert_allclose(find_object(frame).facts()["T_input_result"], BASE, atol=1e-9)
-    np.testing.assert_allclose(read_frame(path, InputConfig(viewpoint="pose")).cloud.points, CAP, atol=1e-6)
+    assert_allclose(frame.cloud.points, CAP, atol=1e-6)
+    assert_allclose(find_object(frame).facts()["T_input_result"], BASE, atol=1e-9)
+    assert_allclose(read_frame(path, InputConfig(viewpoint="pose")).cloud.points, CAP, atol=1e-6)
     ignored = read_frame(path, InputConfig(viewpoint="ignored"))
-    np.testing.assert_allclose(ignored.cloud.points, based, atol=1e-6)
+    assert_allclose(ignored.cloud.points, based, atol=1e-6)
     assert ignored.T_input_result is None and find_object(ignored).facts()["T_input_result"] is None
     path.write_bytes(stored_at(BASE, CAP))  # next to what the sensor measured, as other programs do
     with pytest.warns(InputWarning, match="its points are taken to be in the camera's axes$"):
-        np.testing.assert_array_equal(read_frame(path).cloud.points, CAP)
+        assert_array_equal(read_frame(path).cloud.points, CAP)
     ahead = rigid(np.eye(3), np.array([0.0, 0.0, -0.2]))
     for points, fit in ((CAP, "both"), (-CAP, "neither")):
         path.write_bytes(stored_at(ahead, points))
@@ -168,8 +171,8 @@ def test_a_camera_pose_moves_any_cloud_into_the_cameras_axes(folder: Path) -> No
         mereo.load_frame(based, camera_pose=folder / "pose.txt"),
         mereo.load_frame(PointCloud(based), camera_pose=BASE.tolist()),
     ):
-        np.testing.assert_allclose(frame.cloud.points, CAP, atol=1e-7)
-        np.testing.assert_allclose(frame.T_input_result, BASE)
+        assert_allclose(frame.cloud.points, CAP, atol=1e-7)
+        assert_allclose(frame.T_input_result, BASE)
     for name, options in (("d.png", {"intrinsics": folder / "k.json"}), ("c.npy", {"frame": "scanner"})):
         with pytest.raises(ValueError, match="a camera pose is given, but .* leave out --camera-pose"):
             read_frame(folder / name, InputConfig(camera_pose=folder / "pose.txt", **options))
@@ -191,7 +194,7 @@ def test_coordinates_of_a_map_keep_their_digits(tmp_path: Path) -> None:
     assert scan.T_input_result is not None
     for frame in (scan, mereo.load_frame(CAP + offset, camera_pose=rigid(np.eye(3), offset))):
         assert np.abs(frame.cloud.points).max() < 1.0
-        np.testing.assert_allclose(transform_points(frame.T_input_result, frame.cloud.points), CAP + offset, atol=1e-6)
+        assert_allclose(transform_points(frame.T_input_result, frame.cloud.points), CAP + offset, atol=1e-6)
     with pytest.raises(ValueError, match="they|times their extent"):
         mereo.load_frame(CAP + offset, camera_pose=BASE)
 
@@ -214,14 +217,14 @@ def test_points_behind_the_camera_get_the_cure_of_their_axes(turn: list[list[int
     rows = str(caught.value).partition("rows ")[2].partition(" and")[0].split(", ")
     pose = np.array([row.split() for row in [*rows, "0 0 0 1"]], dtype=np.float64)
     frame = mereo.load_frame(CAP @ matrix.T, camera_pose=pose)
-    np.testing.assert_allclose(checked_points(frame.cloud), CAP)
+    assert_allclose(checked_points(frame.cloud), CAP)
     with pytest.raises(ValueError, match=r"--camera-pose FILE\) for a cloud in a robot's base or a map, or .*scanner"):
         checked_points(PointCloud(CAP - CAP.mean(axis=0)))
 
 
 def test_a_merged_cloud_is_known_by_what_it_hides() -> None:
     """Of a sphere's surface all but the cap that faces the camera is hidden; a single view hides nothing of itself."""
-    rng, (x, y) = np.random.default_rng(0), np.meshgrid(*[(np.arange(80) - 39.5) / 200] * 2)
+    rng, (x, y) = default_rng(0), np.meshgrid(*[(np.arange(80) - 39.5) / 200] * 2)
     normals = rng.normal(size=(6000, 3))
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     sphere = normals + np.array([0.0, 0.0, 5.0])
@@ -258,7 +261,7 @@ def test_a_merged_cloud_is_known_by_what_it_hides() -> None:
 
 
 def test_a_scan_has_no_depth(tmp_path: Path) -> None:
-    np.save(tmp_path / "c.npy", np.random.default_rng(0).normal(size=(100, 3)))
+    np.save(tmp_path / "c.npy", default_rng(0).normal(size=(100, 3)))
     with pytest.raises(ValueError, match="scanner's frame, in which depth is not known.*crop with --box"):
         find_object(read_frame(tmp_path / "c.npy", InputConfig(frame="scanner")), IsolationConfig(depth_range=(0.1, 1)))
     seen = find_object(read_frame(tmp_path / "c.npy", InputConfig(frame="scanner")))
@@ -267,7 +270,7 @@ def test_a_scan_has_no_depth(tmp_path: Path) -> None:
 
 def test_size_against_training(tmp_path: Path) -> None:
     """The Stanford Bunny is 15 cm long; the same cloud read as millimetres cannot be it."""
-    np.save(tmp_path / "c.npy", np.random.default_rng(0).uniform((0, 0, 1), (0.1, 0.05, 1.1), (400, 3)))
+    np.save(tmp_path / "c.npy", default_rng(0).uniform((0, 0, 1), (0.1, 0.05, 1.1), (400, 3)))
     seen = find_object(read_frame(tmp_path / "c.npy", InputConfig(unit_m=1.0)))
     unknown = find_object(read_frame(tmp_path / "c.npy"))
     for visible_m, fits in (([0.08, 0.2], True), ([0.15, 0.3], True), ([0.25, 0.5], False), ([0.01, 0.04], False)):
@@ -288,7 +291,7 @@ def test_missing_extras_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_surface_that_no_camera_can_have_seen_is_known_by_its_normals() -> None:
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     normals = rng.normal(size=(3000, 3))
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     sphere = normals + np.array([0.0, 0.0, 5.0])
@@ -333,13 +336,11 @@ def test_mesh_files_are_frames_with_the_normals_of_their_faces(tmp_path: Path) -
         cloud = read_frame(tmp_path / name).cloud
         assert cloud.normals is not None
         side = np.abs(cloud.points / [1.0, 2.0, 3.0]).argmax(axis=1)
-        np.testing.assert_allclose(
-            np.abs(cloud.points[np.arange(len(cloud)), side]), np.array([1, 2, 3])[side], atol=1e-6
-        )
+        assert_allclose(np.abs(cloud.points[np.arange(len(cloud)), side]), np.array([1, 2, 3])[side], atol=1e-6)
         assert len(cloud) == (2500 if mesh is box else len(fine.vertices))
         assert ((cloud.normals * cloud.points).sum(axis=1) > 0).all()
         again = read_frame(tmp_path / name).cloud
-        np.testing.assert_array_equal(cloud.points, again.points)
+        assert_array_equal(cloud.points, again.points)
         assert find_object(read_frame(tmp_path / name)).extent == "surface"
     far = trimesh.Trimesh(fine.vertices + np.array([1e6, 0, 0]), fine.faces, process=False)
     far.export(tmp_path / "far.ply")

@@ -13,7 +13,9 @@ import pytest
 import trimesh
 from analytic import AnalyticModel, ball, logits_of, union
 from answers import answer_to, reconstruct
+from folder_contents import read_json
 from many_frames import content, frames, loads, run
+from numpy.testing import assert_allclose, assert_array_equal
 from two_balls import BIG, NAMES, SMALL, front, scene, two_balls
 
 import mereo
@@ -54,13 +56,13 @@ def test_segments_are_where_they_are_and_an_absent_one_is_listed(answer: Answer)
     assert np.isnan(absent.confidence) and np.isnan(absent.box).all()
     assert len(found.surfaces.segments[2].faces) == 0
     for segment, surface, (center, radius) in zip(found.segments, found.surfaces.segments, (BIG, SMALL), strict=False):
-        np.testing.assert_allclose(segment.centroid, center, atol=0.001)
-        np.testing.assert_allclose(segment.box, np.add(center, [[-radius] * 3, [radius] * 3]), atol=0.0005)
+        assert_allclose(segment.centroid, center, atol=0.001)
+        assert_allclose(segment.box, np.add(center, [[-radius] * 3, [radius] * 3]), atol=0.0005)
         assert segment.volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.02)
         assert segment.volume == pytest.approx(surface.volume)
         assert surface.edge_imbalance() == (0, 0)
         assert segment.components == 1 and 0.5 < segment.confidence <= 1.0
-        np.testing.assert_allclose(surface.bounds, segment.box, atol=1e-9)
+        assert_allclose(surface.bounds, segment.box, atol=1e-9)
 
 
 def test_components_are_counted_and_nothing_is_removed() -> None:
@@ -78,19 +80,19 @@ def test_files(answer: Answer, tmp_path: Path) -> None:
     files = {"labels.npz", "preview.png", "report.html", "segments.glb", "summary.json"}
     assert {path.name for path in (tmp_path / "out").glob("[!.]*")} == files
     with np.load(tmp_path / "out/labels.npz") as stored:
-        np.testing.assert_array_equal(stored["labels"], result.labels.labels)
-        np.testing.assert_array_equal(stored["origin"], result.labels.origin)
+        assert_array_equal(stored["labels"], result.labels.labels)
+        assert_array_equal(stored["origin"], result.labels.origin)
         assert tuple(stored["names"]) == NAMES
-    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    summary = read_json(tmp_path / "out/summary.json")
     assert [(s["name"], s["volume"] > 0) for s in summary["segments"]] == [("big", 1), ("small", 1), ("absent", 0)]
     assert summary["segments"][2]["confidence"] is None and summary["frame"] == frame
     assert set(summary["timings_s"]) == {"encode", "locate", "extract", "measure", "write"}
     loaded = trimesh.load_scene(tmp_path / "out/segments.glb")
     assert set(loaded.geometry) == {"big", "small"}
-    np.testing.assert_allclose(loaded.geometry["big"].vertices.mean(axis=0), BIG[0], atol=0.002)
+    assert_allclose(loaded.geometry["big"].vertices.mean(axis=0), BIG[0], atol=0.002)
     # the root node turns the frame for viewers: y up in both cases, z toward the viewer
     place = loaded.graph.get("big")[0] @ [*BIG[0], 1.0]
-    np.testing.assert_allclose(place[:3], np.array(BIG[0]) * ([1, -1, -1] if frame == "camera" else 1), atol=1e-6)
+    assert_allclose(place[:3], np.array(BIG[0]) * ([1, -1, -1] if frame == "camera" else 1), atol=1e-6)
 
 
 FAR_BEHIND = np.random.default_rng(1).uniform((-0.3, -0.3, 0.9), (0.3, 0.3, 1.3), (30, 3))
@@ -112,7 +114,7 @@ def read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Recon
 
 
 def test_what_is_read_and_left_out_is_printed_and_kept(
-    read: Callable[..., Reconstruction], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    read: Callable[..., Reconstruction], tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     cloud = scene("camera")[0]
     crowded = np.concatenate([cloud, front((0.9, 0.0, 0.9), 0.03, -1.0)])
@@ -122,29 +124,29 @@ def test_what_is_read_and_left_out_is_printed_and_kept(
     with pytest.warns(SizeWarning, match="the visible part is 0.1[0-9]* m long"):
         read("alone", crowded, [2, 3], largest_cluster=True, cluster_gap=0.02)
     assert "largest cluster: 1200 of 1800 points kept (1 of 2 clusters" in capsys.readouterr().out
-    summary = json.loads((tmp_path / "alone/summary.json").read_text())
+    summary = read_json(tmp_path / "alone/summary.json")
     assert summary["points"] == 1200 and summary["isolation"][-1]["name"] == "largest cluster"
-    np.testing.assert_allclose(summary["depth_m"], np.quantile(cloud[:, 2], [0, 0.5, 1]))
+    assert_allclose(summary["depth_m"], np.quantile(cloud[:, 2], [0, 0.5, 1]))
     assert max(summary["visible_size_m"]) == pytest.approx(np.ptp(cloud[:, 1]), rel=1e-6)
 
 
 def test_strays_are_dropped_and_said_unless_all_are_to_be_kept(
-    read: Callable[..., Reconstruction], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    read: Callable[..., Reconstruction], tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     own, model = scene("camera")
     cloud = np.concatenate([own, FAR_BEHIND])
     result = read("out", cloud, [0.1, 0.2])
     said = capsys.readouterr().out
     assert "strays: 30 of 1230 points dropped, the longest side was" in said and "(--keep-all keeps them)" in said
-    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    summary = read_json(tmp_path / "out/summary.json")
     assert summary["points"] == 1200 and max(summary["visible_size_m"]) < 0.2
     (step,) = summary["isolation"]
     assert (step["name"], step["before"], step["kept"]) == ("strays", 1230, 1200)
-    np.testing.assert_array_equal(result.labels.labels, reconstruct(own, model, resolution=16).labels.labels)
+    assert_array_equal(result.labels.labels, reconstruct(own, model, resolution=16).labels.labels)
     with pytest.warns(SizeWarning, match="the visible part is 0.[5-9][0-9]* m long"):
         read("all", cloud, [0.1, 0.2], keep_all=True)
     assert "strays:" not in capsys.readouterr().out
-    assert json.loads((tmp_path / "all/summary.json").read_text())["points"] == 1230
+    assert read_json(tmp_path / "all/summary.json")["points"] == 1230
     for keep_all, strays in ((False, 30), (True, 0)):  # a stream counts them
         isolation = IsolationConfig(keep_all=keep_all)
         stream_reconstructions(StreamCommand(str(tmp_path), weights="any", resolution=16, isolation=isolation))
@@ -165,7 +167,7 @@ __all__ = ["loads"]  # a fixture
 
 
 def test_each_frame_of_a_folder_gets_what_it_gets_alone(
-    tmp_path: Path, loads: list[str], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, loads: list[str], capsys: pytest.CaptureFixture
 ) -> None:
     folder = frames(tmp_path / "frames", "a.npy", "b.npy")
     (folder / "notes.md").write_text("no frame")
@@ -179,7 +181,7 @@ def test_each_frame_of_a_folder_gets_what_it_gets_alone(
     assert content(tmp_path / "one") == content(tmp_path / "all/b")
 
 
-def test_a_bad_frame_is_its_own(tmp_path: Path, loads: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bad_frame_is_its_own(tmp_path: Path, loads: list[str], capsys: pytest.CaptureFixture) -> None:
     folder = frames(tmp_path / "frames", "good.npy")
     (folder / "bad.ply").write_text("nonsense")
     assert run(folder, tmp_path / "missing.npy", "--output", tmp_path / "out") == 2
@@ -193,7 +195,7 @@ def test_a_bad_frame_is_its_own(tmp_path: Path, loads: list[str], capsys: pytest
 
 
 def test_results_that_are_there_are_kept_without_force(
-    tmp_path: Path, loads: list[str], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, loads: list[str], capsys: pytest.CaptureFixture
 ) -> None:
     folder, out = frames(tmp_path / "frames", "a.npy"), tmp_path / "out"
     (out / "a").mkdir(parents=True)
@@ -204,7 +206,7 @@ def test_results_that_are_there_are_kept_without_force(
 
 
 def test_what_is_no_frames_fault_stops_before_the_work(
-    tmp_path: Path, loads: list[str], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, loads: list[str], capsys: pytest.CaptureFixture
 ) -> None:
     folder = frames(tmp_path / "frames", "a.npy", "b.npy")
     out = tmp_path / "out"

@@ -7,6 +7,8 @@ from typing import Literal
 import numpy as np
 import pytest
 from camera_files import write_camera
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from scipy.ndimage import distance_transform_edt
 
@@ -85,7 +87,7 @@ def kinds(lines: SightLines, camera: Camera) -> np.ndarray:
 
 def occlude(view: View, kind: Cut, sensor: SensorConfig = SENSORS["paper"], wall: bool = True) -> Occluded:
     """The same state before a far wall, alone or behind the tool or hand that hides most."""
-    solids, camera, rng = Solids(view.mesh), view.depth.camera, np.random.default_rng(1)
+    solids, camera, rng = Solids(view.mesh), view.depth.camera, default_rng(1)
     rays = camera.directions().reshape(-1, 3)
     backdrop = Backdrop(AWAY, farthest(solids, AWAY) + 60.0) if wall else None
     choices = [Surroundings((), backdrop)]
@@ -111,7 +113,7 @@ def test_each_line_is_empty_up_to_what_it_met_be_that_an_occluder_or_a_wall(view
         seen, lines = cut.seen, cut.found.lines
         rows, columns = pixels(lines.past, seen.whole.camera)
         # each past line ends at what was measured there, and no part of the true object is before that
-        np.testing.assert_allclose(lines.past[:, 2], seen.whole.depth[rows, columns])
+        assert_allclose(lines.past[:, 2], seen.whole.depth[rows, columns])
         alone = cut.alone.depth[rows, columns]
         assert ((alone == 0) | (alone >= lines.past[:, 2])).all()
         labels = kinds(lines, seen.whole.camera)
@@ -255,7 +257,7 @@ def test_a_scanner_has_the_lines_of_a_camera() -> None:
     assert {tuple(np.round(point, 9)) for point in (*lines.past, *lines.unknown)} <= everything
     assert (lines.past[:, 2] == -2.0).sum() > 500 and (np.isclose(lines.past[:, 2], -0.8)).sum() > 100
     turned = SightLines(lines.past, lines.unknown, "past").transformed(axes)
-    np.testing.assert_allclose(turned.past, lines.past * [1, -1, -1])
+    assert_allclose(turned.past, lines.past * [1, -1, -1])
     assert turned.other_lines == "past"
 
 
@@ -277,7 +279,7 @@ def test_points_that_were_only_thinned_out_are_the_objects() -> None:
 
 @pytest.mark.parametrize(("extent", "other_lines"), [("whole", "past"), ("partial", "unknown"), ("auto", None)])
 def test_the_extent_can_be_stated(extent: Extent, other_lines: str | None) -> None:
-    cloud = PointCloud(np.random.default_rng(0).normal((0, 0, 10), size=(50, 3)))
+    cloud = PointCloud(default_rng(0).normal((0, 0, 10), size=(50, 3)))
     lines = observation.observe(cloud, extent=extent).lines
     assert lines.other_lines == other_lines and len(lines.past) == len(lines.unknown) == 0
     lines = find_object(CUT, IsolationConfig(extent=extent)).lines
@@ -292,14 +294,14 @@ def test_a_file_keeps_what_its_mask_leaves_out(tmp_path: Path) -> None:
     Image.fromarray(SHOWN).save(tmp_path / "m.png")
     frame = read_frame(tmp_path / "d.png", InputConfig(intrinsics=tmp_path / "k.json", mask=tmp_path / "m.png"))
     assert frame.depth is not None and frame.whole is not None and len(frame.cloud) == 400
-    np.testing.assert_allclose(frame.whole.depth, scene())
+    assert_allclose(frame.whole.depth, scene())
     seen = find_object(frame)
     assert len(seen.lines.past) > 500 and seen.lines.other_lines == "unknown"
     # strays are dropped from the points, and remain lines of sight that met something
     fewer = seen.read_as(Reading(seen.cloud, np.arange(400) > 20))
     assert len(fewer.cloud) == 379
-    np.testing.assert_array_equal(fewer.lines.past, seen.lines.past)
+    assert_array_equal(fewer.lines.past, seen.lines.past)
     unmasked = read_frame(tmp_path / "d.png", InputConfig(intrinsics=tmp_path / "k.json"))
     isolated = find_object(unmasked, IsolationConfig(depth_range=(0.9, 1.1)))
-    np.testing.assert_array_equal(isolated.lines.past, seen.lines.past)
-    np.testing.assert_array_equal(isolated.lines.unknown, seen.lines.unknown)
+    assert_array_equal(isolated.lines.past, seen.lines.past)
+    assert_array_equal(isolated.lines.unknown, seen.lines.unknown)

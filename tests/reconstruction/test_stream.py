@@ -179,7 +179,7 @@ def test_an_empty_or_restless_file_is_waited_for_within_bounds(watched: WatchedF
 
 
 def test_watching_ends_with_ctrl_c(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     np.save(tmp_path / "a.npy", np.random.default_rng(0).uniform(1, 2, (500, 3)))
     monkeypatch.setattr("mereo.cli.stream.answer_frame", Mock(side_effect=KeyboardInterrupt))
@@ -218,7 +218,7 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, InputConfi
     return folder / FRAMES, InputConfig(intrinsics=folder / CAMERA)
 
 
-def streamed(capsys: pytest.CaptureFixture[str], folder: Path, **options: Any) -> tuple[Summary, list[dict], str]:
+def streamed(capsys: pytest.CaptureFixture, folder: Path, **options: Any) -> tuple[Summary, list[dict], str]:
     """Summary of a stream of the rope's network, the lines that it prints, and what it says beside them."""
     summary = stream_reconstructions(
         StreamCommand(str(folder), weights="rope", resolution=24, method="network", **options)
@@ -228,7 +228,7 @@ def streamed(capsys: pytest.CaptureFixture[str], folder: Path, **options: Any) -
 
 
 def test_every_frame_is_answered_but_the_bad_one(
-    sequence: tuple[Path, InputConfig], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    sequence: tuple[Path, InputConfig], tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     folder, reading = sequence
     summary, lines, err = streamed(capsys, folder, every_frame=True, reading=reading, surfaces=tmp_path / "glb")
@@ -296,7 +296,7 @@ def run(monkeypatch: pytest.MonkeyPatch, surfaces: Path, frames: tuple[str, ...]
 
 
 def test_a_stream_replaces_no_surfaces_unless_forced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     out = tmp_path / "out"
     out.mkdir()
@@ -312,7 +312,7 @@ def test_a_stream_replaces_no_surfaces_unless_forced(
 
 
 def test_a_frame_replaces_its_own_file_and_no_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     assert run(monkeypatch, tmp_path / "out", ("c d.npy", "c d.npy", "c_d.npy")) == 0
     first, again, other = (json.loads(line).get("error", "") for line in capsys.readouterr().out.splitlines())
@@ -321,7 +321,7 @@ def test_a_frame_replaces_its_own_file_and_no_other(
 
 
 def test_a_sequence_that_breaks_off_is_told_after_its_frames_and_their_summary(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     def frames(*_: object) -> Iterator[StreamFrame]:
         yield StreamFrame("first", 0.0, lambda: PointCloud(np.ones((40, 3))))

@@ -1,6 +1,5 @@
 """Carrying what is defined in the rest model to where the object is: theorems."""
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 from analytic import untrained
+from folder_contents import read_json
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from scene_files import write_bar
 from scipy.spatial.transform import Rotation
 from toy_scene import Lift, Shear, toy_scene
@@ -78,13 +80,13 @@ def placed_one(registrar: Registrar, content: Surfaces | Positions | PoseTable, 
 
 
 def test_a_rigid_pose_carries_everything_rigidly(model: StatisticalModel, registrar: Registrar) -> None:
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     points = rng.uniform(*model.rest.bounds, size=(200, 3)) * 1.3
     turns = Rotation.random(200, rng=rng).as_matrix()
     here = registered(model, transform_points(T, model.rest_points), 0.001)
     found = carry(placed_one(registrar, table(points, turns)), here)
-    np.testing.assert_allclose(found.content.points, 0.001 * transform_points(T, points), atol=1.5e-5)
-    np.testing.assert_allclose(found.content.rotations, T[:3, :3] @ turns, atol=5e-3)
+    assert_allclose(found.content.points, 0.001 * transform_points(T, points), atol=1.5e-5)
+    assert_allclose(found.content.rotations, T[:3, :3] @ turns, atol=5e-3)
     labels = Solids(model.rest).label(points)
     distance = Solids(model.rest).nearest(points).distance * (labels == 0)
     assert found.inside == (labels > 0).sum() and 0 < found.inside < 200
@@ -92,7 +94,7 @@ def test_a_rigid_pose_carries_everything_rigidly(model: StatisticalModel, regist
 
 
 def test_interior_points_follow_the_scenes_own_maps(registrar: Registrar, state: State, bent: Registration) -> None:
-    points = np.random.default_rng(1).uniform(*SCENE.rest.bounds, size=(500, 3))
+    points = default_rng(1).uniform(*SCENE.rest.bounds, size=(500, 3))
     labels = Solids(SCENE.rest).label(points)
     found = carry(placed_one(registrar, Positions(points)), bent)
     for label in range(1, 5):
@@ -108,7 +110,7 @@ def polar(motion: Deformation, points: np.ndarray) -> np.ndarray:
 
 
 def test_poses_turn_as_their_surroundings_do(state: State, bent: Registration) -> None:
-    points = np.random.default_rng(2).uniform((-15, -4, -3), (15, 4, 3), size=(50, 3))
+    points = default_rng(2).uniform((-15, -4, -3), (15, 4, 3), size=(50, 3))
     shares = np.eye(4)[nearest_labels(bent.rest_solids, points) - 1]
     found = local_rotations(bent, points, shares)
     truth = T[:3, :3] @ polar(state.deformations[0], points)
@@ -127,7 +129,7 @@ def test_a_surface_outside_does_not_tear(registrar: Registrar, bent: Registratio
     # shares fall with the fourth power of the distance
     distance = np.stack([Solids(SCENE.rest).segment_distance(i, placed.content.points) for i in range(4)], axis=1)
     relative, nearer = placed.shares / placed.shares.max(axis=1, keepdims=True), distance.min(axis=1, keepdims=True)
-    np.testing.assert_allclose(relative, (nearer / distance) ** 4, atol=2e-3)
+    assert_allclose(relative, (nearer / distance) ** 4, atol=2e-3)
     found, faces = carry(placed, bent).content.points, placed.content.mesh.segments[0].faces
     nearest = bent.to_camera(placed.content.points)
 
@@ -139,7 +141,7 @@ def test_a_surface_outside_does_not_tear(registrar: Registrar, bent: Registratio
 
 
 def test_far_away_things_are_refused(registrar: Registrar) -> None:
-    points = np.random.default_rng(0).uniform(*SCENE.rest.bounds, size=(100, 3))
+    points = default_rng(0).uniform(*SCENE.rest.bounds, size=(100, 3))
     with pytest.raises(ValueError, match="of 100 points of one are farther from the object than it is long"):
         placed_one(registrar, Positions(1000 * points))
     assert placed_one(registrar, Positions(points)).distance.max() < 20
@@ -150,11 +152,11 @@ def test_the_frame_of_the_files_must_be_known(registrar: Registrar) -> None:
     points = Positions(SCENE.rest.segments[0].vertices)
     with pytest.raises(ValueError, match="do not say how the object's own files lie in the scene: .* with --scene, or"):
         placed_one(older, points, "source")
-    np.testing.assert_array_equal(placed_one(older, points, "scene").content.points, points.points)
+    assert_array_equal(placed_one(older, points, "scene").content.points, points.points)
     frame = replace(SCENE, T_scene_source=np.diag([10.0, 10.0, 10.0, 1.0]))
     tenth = Positions(points.points / 10)
     named = placed_one(replace(older, given=frame), tenth, "source")
-    np.testing.assert_allclose(named.content.points, points.points)
+    assert_allclose(named.content.points, points.points)
 
 
 def test_files_in_millimetres_come_to_the_scene(tmp_path: Path) -> None:
@@ -162,7 +164,7 @@ def test_files_in_millimetres_come_to_the_scene(tmp_path: Path) -> None:
     for name, part in zip(("left", "right"), scene.rest.segments, strict=True):
         own = read_segmented_mesh(tmp_path / f"{name}.stl").segments[0].vertices
         # long faces are divided, which adds vertices after the file's own
-        np.testing.assert_allclose(transform_points(scene.T_scene_source, own), part.vertices[: len(own)], atol=1e-9)
+        assert_allclose(transform_points(scene.T_scene_source, own), part.vertices[: len(own)], atol=1e-9)
     assert scene.source_frame.scale == pytest.approx(2.0)  # 10 mm become 20 units
     assert scene.source_frame.unit_m * scene.source_frame.scale == pytest.approx(0.001)
     model = scene_model(scene, 20)
@@ -170,7 +172,7 @@ def test_files_in_millimetres_come_to_the_scene(tmp_path: Path) -> None:
     registrar = Registrar(untrained(scene.rest.names, "bar"), model)
     middle = Positions(np.array([[120.0, 5.0, 5.0]]))
     (found,) = place([Attachment("middle", middle)], registrar)
-    np.testing.assert_allclose(found.content.points, [[0, 0, 0]], atol=1e-9)
+    assert_allclose(found.content.points, [[0, 0, 0]], atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -197,7 +199,7 @@ def test_the_frame_survives_weights_and_older_ones_have_none(tmp_path: Path) -> 
     model = scene_model(replace(load_scene("rope"), unit_m=0.25, T_scene_source=np.diag([2.0, 2.0, 2.0, 1.0])), 10)
     save_model(replace(untrained(model.rest.names), statistical_model=model), tmp_path / "w.safetensors")
     read = load_model(tmp_path / "w.safetensors").statistical_model
-    np.testing.assert_array_equal(read.source_frame.T_scene_source, model.source_frame.T_scene_source)
+    assert_array_equal(read.source_frame.T_scene_source, model.source_frame.T_scene_source)
     assert read.source_frame.unit_m == 0.25 and read.source_frame.scale == pytest.approx(2.0)
     tensors, facts = pack_model(model)
     assert unpack_model(tensors, {key: value for key, value in facts.items() if key != "frame"}).source_frame is None
@@ -217,7 +219,7 @@ def in_patient(registrar: Registrar, space: str | None) -> tuple[Registrar, np.n
 @pytest.mark.parametrize("other, space", [("LPS", "RAS"), ("RAS", "LPS")])
 def test_what_names_the_other_space_is_turned(registrar: Registrar, other: str, space: str) -> None:
     mine, points = in_patient(registrar, space)
-    turns = Rotation.random(len(points), rng=np.random.default_rng(0)).as_matrix()
+    turns = Rotation.random(len(points), rng=default_rng(0)).as_matrix()
     half = HALF_TURN[:3, :3]
     matrix = HALF_TURN @ rigid(np.eye(3), points.min(axis=0))
     volume = Volume(np.ones((40, 30, 30), np.uint8), matrix)
@@ -229,9 +231,9 @@ def test_what_names_the_other_space_is_turned(registrar: Registrar, other: str, 
     for frame in ("source", space):
         (poses, ct), plain = place(turned, mine, frame), place(straight, mine, frame)  # type: ignore[arg-type]
         for each in (poses, *plain):
-            np.testing.assert_allclose(each.content.points, mine.model.nodes, atol=1e-9)
-            np.testing.assert_allclose(each.content.rotations, turns, atol=1e-9)
-        np.testing.assert_allclose(ct.content.bounds[0], mine.model.nodes.min(axis=0) - 0.5)
+            assert_allclose(each.content.points, mine.model.nodes, atol=1e-9)
+            assert_allclose(each.content.rotations, turns, atol=1e-9)
+        assert_allclose(ct.content.bounds[0], mine.model.nodes.min(axis=0) - 0.5)
         assert poses.note == ct.note == f" (turned from {other} to {space})" and {each.note for each in plain} == {""}
     still = registered(mine.model, mine.model.rest_points)
     assert carry(poses, still).description.startswith(f"carried t.csv (turned from {other} to {space}): 600 points, ")
@@ -252,7 +254,7 @@ def test_a_space_that_no_file_names_is_stated_or_refused_where_the_other_fits(re
         SpaceWarning, match="^ct.nii is in RAS, and the object's own files are taken to be in it too, for"
     ):
         (taken,) = place([ct], mine)
-    np.testing.assert_array_equal(taken.content.T_world_index, source @ matrix)
+    assert_array_equal(taken.content.T_world_index, source @ matrix)
     plan = Attachment("plan.csv", table(points))
     assert place([plan, replace(ct, content=replace(ct.content), space=None)], mine)[0].note == ""
     wrong = [
@@ -265,7 +267,7 @@ def test_a_space_that_no_file_names_is_stated_or_refused_where_the_other_fits(re
         ):
             place([each], mine)
     (stated,) = place(wrong[1:], mine, "LPS")
-    np.testing.assert_allclose(stated.content.T_world_index, source @ matrix)
+    assert_allclose(stated.content.T_world_index, source @ matrix)
     with pytest.raises(ValueError, match='with files="RAS" or files="LPS", or export both'), python_words():
         place(wrong[1:], mine)
 
@@ -321,8 +323,8 @@ def at_points(volume: Volume, points: np.ndarray) -> np.ndarray:
 def test_a_material_point_keeps_its_value(resized: Registration) -> None:
     found = resampled(ramp(), resized)
     assert found.interpolation == "linear" and found.within == found.inside > 5000
-    np.testing.assert_allclose(found.content.spacing, 10 * SPACING)
-    points = np.random.default_rng(0).uniform((-15, -4, -4), (15, 4, 4), size=(300, 3))
+    assert_allclose(found.content.spacing, 10 * SPACING)
+    points = default_rng(0).uniform((-15, -4, -4), (15, 4, 4), size=(300, 3))
     index = np.rint(found.content.index_of(resized.to_camera(points)))
     centers = transform_points(found.content.T_world_index, index.astype(float))
     truth = resized.to_rest(centers) @ RAMP + 100
@@ -355,9 +357,9 @@ def test_labels_keep_their_values(resized: Registration) -> None:
     found = resampled(source, resized)
     assert found.interpolation == "nearest" and found.content.values.dtype == np.int16
     assert set(np.unique(found.content.values)) == {0, 3, 7}
-    points = np.random.default_rng(2).uniform((-15, -4, -4), (15, 4, 4), size=(300, 3))
+    points = default_rng(2).uniform((-15, -4, -4), (15, 4, 4), size=(300, 3))
     points = points[np.abs(points[:, 0]) > 1.5]
-    np.testing.assert_array_equal(at_points(found.content, resized.to_camera(points)), np.where(points[:, 0] < 0, 3, 7))
+    assert_array_equal(at_points(found.content, resized.to_camera(points)), np.where(points[:, 0] < 0, 3, 7))
 
 
 def test_the_grid_has_so_many_voxels_at_most(resized: Registration) -> None:
@@ -392,14 +394,14 @@ def test_a_file_comes_back_in_its_format_and_overlays_the_labels(
     found = carry(placed, resized)
     assert isinstance(found, CarriedVolume) and isinstance(found.content, Volume)
     direct = resampled(ramp("int16"), resized).content
-    np.testing.assert_array_equal(found.content.values, direct.values)
+    assert_array_equal(found.content.values, direct.values)
     out = tmp_path / "out" / name
     write_attachment(out, found.content, 1000.0, np.eye(3), 0.01)
     again = read_volume(out)
     assert again.values.dtype == np.int16
-    np.testing.assert_array_equal(again.values, direct.values)
+    assert_array_equal(again.values, direct.values)
     in_mm = np.diag([10.0, 10, 10, 1]) @ direct.T_world_index
-    np.testing.assert_allclose(RAS_OF_LPS @ again.T_world_index, in_mm, rtol=1e-5, atol=1e-3)
+    assert_allclose(RAS_OF_LPS @ again.T_world_index, in_mm, rtol=1e-5, atol=1e-3)
     first = out.read_bytes()
     write_attachment(out, found.content, 1000.0, np.eye(3), 0.01)
     assert out.read_bytes() == first
@@ -432,7 +434,7 @@ def test_a_volume_beside_the_object_is_refused(registrar: Registrar) -> None:
 
 
 def test_labels_are_told_from_intensities() -> None:
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     blocks = np.kron(rng.permutation(216).reshape(6, 6, 6), np.ones((8, 8, 8), dtype=int))
     noise = rng.integers(0, 256, size=(40, 40, 40))
 
@@ -451,7 +453,7 @@ def test_nifti_keeps_its_scaling(tmp_path: Path, registrar: Registrar, resized: 
     (placed,) = place(read_attachments([tmp_path / "ct.nii.gz"]), registrar, "scene")
     write_attachment(tmp_path / "out.nii.gz", carry(placed, resized).content, 1.0, np.eye(3), 1.0)
     again = nibabel.load(tmp_path / "out.nii.gz")
-    np.testing.assert_allclose(again.get_fdata(), 0.5 * resampled(volume, resized).content.values - 1024)
+    assert_allclose(again.get_fdata(), 0.5 * resampled(volume, resized).content.values - 1024)
 
 
 def test_a_volume_that_cannot_be_carried_says_why(tmp_path: Path) -> None:
@@ -512,14 +514,14 @@ def test_the_command_carries_in_the_frame_and_unit_of_its_other_files(folder: Pa
     options += ["--carry-frame", "RAS"]  # as ct.nrrd comes out
     files, out = ("own.ply", "own.glb", "grasp.csv", "ct.nrrd"), folder / "out"
     assert run(folder, files, *options) == 0
-    summary = json.loads((out / "summary.json").read_text())
+    summary = read_json(out / "summary.json")
     assert tuple(one["file"] for one in summary["carried"]) == files
     assert all(one["farthest"] < 0.01 for one in summary["carried"][:3]) and summary["registration"]["unit"] == "known"
     own = read_segmented_mesh(out / "segments.glb").segments[1].vertices
     carried = read_segmented_mesh(out / "carried/own.glb").segments[0].vertices
     assert np.linalg.norm(carried[: len(own)] - own, axis=1).max() < 0.3
     in_mm = read_segmented_mesh(out / "carried/own.ply").segments[0].vertices
-    np.testing.assert_allclose(in_mm, 10 * carried, rtol=1e-4, atol=1e-3)
+    assert_allclose(in_mm, 10 * carried, rtol=1e-4, atol=1e-3)
     grasp = read_pose_table(out / "carried/grasp.csv")
     assert np.linalg.norm(grasp.points[0] / 10 - own.mean(axis=0)) < 1.0
     assert grasp.rows[0][-1] == "0.02" and grasp.rotations is not None
@@ -539,7 +541,7 @@ def test_a_wrong_unit_is_not_believed(weights: Model) -> None:
     # the cloud is said to be in metres
     wrong = registrar.fit_modes(CloudToFit(cloud.points, scene_unit=metres, is_unit_certain=False)).registration
     right = registrar.fit_modes(CloudToFit(cloud.points, scene_unit=true, is_unit_certain=False)).registration
-    np.testing.assert_array_equal(wrong.material, free.material)
+    assert_array_equal(wrong.material, free.material)
     assert not wrong.unit_known and not free.unit_known
     assert right.unit_known and right.scene_unit == pytest.approx(1.0, rel=1e-4)
     stated = CloudToFit(cloud.points, scene_unit=0.95, is_unit_certain=False)
@@ -556,7 +558,7 @@ def test_a_wrong_unit_is_not_believed(weights: Model) -> None:
     ],
 )
 def test_the_command_refuses_before_any_work(
-    folder: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
+    folder: Path, capsys: pytest.CaptureFixture, options: list[str], message: str
 ) -> None:
     assert run(folder, ("grasp.csv",), *options, cloud="no-such-cloud.npy", output="refused") != 0
     assert message in " ".join(capsys.readouterr().err.split()) and not (folder / "refused").exists()
@@ -564,7 +566,7 @@ def test_the_command_refuses_before_any_work(
 
 @pytest.mark.slow
 def test_without_a_registration_nothing_is_written(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    folder: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Registrar, "takes", lambda *_: False)  # as of a frame that no state explains
     assert run(folder, ("grasp.csv",), output="none") != 0

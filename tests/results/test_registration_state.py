@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from folder_contents import read_json
+from numpy.testing import assert_allclose, assert_array_equal
 from registered_states import SCENE, T, by_modes, placed
 
 from mereo.fitting.draws.playback import Drawn, material_moved
@@ -43,7 +45,7 @@ def assert_same(again: Registration, before: Registration) -> None:
     assert np.abs(again.material - before.material).max() <= 1e-6 * size
     assert (again.method, again.scene_unit, again.explained) == (before.method, before.scene_unit, before.explained)
     assert (again.accepted, again.seconds, again.unit_known) == (before.accepted, before.seconds, True)
-    np.testing.assert_array_equal(again.z, before.z)
+    assert_array_equal(again.z, before.z)
 
 
 @pytest.mark.parametrize("make", [by_modes, by_draws])
@@ -56,9 +58,9 @@ def test_a_state_gives_the_same_material_points_again(
     assert_same(again, before)
     state = read_state(tmp_path / STATE)
     assert (state.scene, state.weights, state.frame, state.unit_m) == ("toy", "toy", "scanner", 0.001)
-    np.testing.assert_allclose(np.array(state.T_camera_model), T, atol=1e-9)
+    assert_allclose(np.array(state.T_camera_model), T, atol=1e-9)
     points = model.rest_points[::50]
-    np.testing.assert_allclose(again.to_camera(points), before.to_camera(points), atol=1e-6)
+    assert_allclose(again.to_camera(points), before.to_camera(points), atol=1e-6)
     assert (tmp_path / STATE).stat().st_size < 5000
 
 
@@ -115,7 +117,7 @@ WRONG: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
 def test_a_wrong_value_is_refused_in_one_sentence(kind: str, model: StatisticalModel, tmp_path: Path) -> None:
     path, (change, where) = tmp_path / STATE, WRONG[kind]
     save_state(path, state_of(by_modes(model), "toy"))
-    path.write_text(json.dumps(change(json.loads(path.read_text()))))
+    path.write_text(json.dumps(change(read_json(path))))
     with pytest.raises(ValueError, match="is no state of a registration.*: give the state.json of") as error:
         read_state(path)
     assert where in str(error.value) and "\n" not in str(error.value) and len(str(error.value)) < 400

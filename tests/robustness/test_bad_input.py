@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from analytic import untrained
+from numpy.random import default_rng
 from scene_files import HEAD, write_mesh
 from shapes import ball, box
 
@@ -19,7 +20,7 @@ from mereo.io.atomic_files import atomic_file, check_new_directory, new_director
 from mereo.io.object_storage import claim
 
 
-def refused(capsys: pytest.CaptureFixture[str], folder: Path, text: str, *arguments: object) -> None:
+def refused(capsys: pytest.CaptureFixture, folder: Path, text: str, *arguments: object) -> None:
     """The command fails with one line that contains ``text`` and makes no output."""
     before = sorted(folder.rglob("*"))
     code = command_line.main([str(a) for a in arguments])
@@ -31,7 +32,7 @@ def refused(capsys: pytest.CaptureFixture[str], folder: Path, text: str, *argume
 
 
 def cloud(count: int = 200) -> np.ndarray:
-    return np.random.default_rng(0).normal(loc=(0.0, 0.0, 20.0), size=(count, 3))
+    return default_rng(0).normal(loc=(0.0, 0.0, 20.0), size=(count, 3))
 
 
 BAD_CLOUDS = {
@@ -46,7 +47,7 @@ BAD_CLOUDS = {
 
 
 @pytest.mark.parametrize("case", BAD_CLOUDS)
-def test_bad_clouds(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_clouds(case: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     points, text = BAD_CLOUDS[case]
     path = tmp_path / "missing.npy"
     if points is not None:
@@ -55,7 +56,7 @@ def test_bad_clouds(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 
 @pytest.mark.parametrize("number", ["1e400", "1e300", "nan"])
-def test_a_mesh_beyond_all_numbers(number: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_mesh_beyond_all_numbers(number: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     places, faces = f"v 0 0 0\nv {number} 0 0\nv 0 1 0\nv 0 0 1\n", "f 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
     (tmp_path / "part.obj").write_text(places + faces)
     text = "part.obj cannot be read as a mesh (its part 'part' has vertices that are NaN, infinite or beyond 1e+12)"
@@ -91,7 +92,7 @@ def test_nothing_is_found_where_nothing_ever_was_in_training() -> None:
     """An untrained network says anything anywhere; outside its domain the answer is empty all the same."""
     wild = untrained(("a", "b"))
     code = wild.encode(cloud())
-    places = code.normalizer.invert(np.random.default_rng(1).uniform(-4, 4, size=(3000, 3)))
+    places = code.normalizer.invert(default_rng(1).uniform(-4, 4, size=(3000, 3)))
     outside = (np.abs(code.normalizer.apply(places)) > 1.5).any(axis=1)
     said = wild.query(code, places).label
     answer = replace(wild, domain=((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5))).query(code, places)
@@ -116,17 +117,16 @@ NO_PLACES = {
 @pytest.mark.parametrize("name", NO_PLACES)
 @pytest.mark.parametrize("make", [new_directory, atomic_file], ids=["folder", "file"])
 def test_what_is_no_place_for_an_output_is_refused_before_the_work(
-    make: Callable[..., AbstractContextManager[Path]], name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    make: Callable[..., AbstractContextManager[Path]], name: str, working_folder: Path
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     Path("target").mkdir()
     Path("link").symlink_to("target")
     os.mkfifo("pipe")
-    before = sorted(tmp_path.rglob("*"))
+    before = sorted(working_folder.rglob("*"))
     for force in (True, False):
         with pytest.raises(ValueError, match=NO_PLACES[name]), make(name, force=force):
             pytest.fail("the work was begun")
-    assert sorted(tmp_path.rglob("*")) == before
+    assert sorted(working_folder.rglob("*")) == before
 
 
 def test_a_run_may_lie_behind_a_link(tmp_path: Path) -> None:
@@ -162,10 +162,7 @@ def test_a_mount_point_is_no_place_for_a_new_folder(tmp_path: Path, monkeypatch:
         "demo --output {}",
     ],
 )
-def test_every_command_refuses_a_pipe_first(
-    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_every_command_refuses_a_pipe_first(command: str, working_folder: Path, capsys: pytest.CaptureFixture) -> None:
     os.mkfifo("pipe")
     assert command_line.main(command.format("pipe").split()) == 2
     assert "mereo: error: pipe is a device or pipe" in capsys.readouterr().err
@@ -184,11 +181,10 @@ def test_every_command_refuses_a_pipe_first(
     ],
 )
 def test_not_even_force_replaces_an_input(
-    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    command: str, working_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     """By whatever name: the mesh of a scene file, the file itself, an asset of a built-in scene, weights."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("MEREO_ASSETS", str(tmp_path / "assets"))
+    monkeypatch.setenv("MEREO_ASSETS", str(working_folder / "assets"))
     for name, low in (("left", 0), ("right", 20)):
         write_mesh(box((low, 0, 0), (low + 20, 10, 10), name), Path(f"{name}.ply"))
     Path("bar.yaml").write_text(HEAD.replace(".stl", ".ply"))
@@ -196,7 +192,7 @@ def test_not_even_force_replaces_an_input(
     Path("assets/bunny").mkdir(parents=True)
     for name in ("weights.safetensors", "assets/bunny/bunny.off"):
         Path(name).write_text("precious")
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    assert command_line.main([*command.format(tmp_path).split(), "--force"]) == 2
+    before = {path: path.read_bytes() for path in working_folder.rglob("*") if path.is_file()}
+    assert command_line.main([*command.format(working_folder).split(), "--force"]) == 2
     assert re.search("is read.*; it is not replaced.*: choose another", capsys.readouterr().err)
-    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    assert {path: path.read_bytes() for path in working_folder.rglob("*") if path.is_file()} == before

@@ -38,7 +38,7 @@ def run(work: Callable[[], object], monkeypatch: pytest.MonkeyPatch, *arguments:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, *STOPPING])
 def test_a_signal_leaves_nothing_half_written(
-    number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     def write() -> None:
         with atomic_file(tmp_path / "results" / "table.md") as partial:
@@ -126,7 +126,7 @@ def test_what_is_ignored_stays_ignored() -> None:
         signal.signal(number, before)
 
 
-def test_a_stream_sums_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_stream_sums_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     (tmp_path / "a.npy").touch()
     with monkeypatch.context() as patched:
         nothing = SimpleNamespace(network=None, registrar=lambda _: None)
@@ -196,7 +196,7 @@ def test_every_error_is_one_line_which_names_command_and_files_where_it_is_not_f
     code: int,
     end: str,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    capsys: pytest.CaptureFixture,
     tmp_path: Path,
 ) -> None:
     def fail() -> None:
@@ -213,7 +213,7 @@ def test_every_error_is_one_line_which_names_command_and_files_where_it_is_not_f
 
 
 def test_what_a_library_says_of_its_arguments_is_no_sentence_for_users(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     """``json`` names neither the file nor a cure, and a ``ValueError`` of its own is a ``ValueError``."""
     monkeypatch.delenv(command_line.TRACEBACK_VARIABLE, raising=False)

@@ -19,6 +19,8 @@ import numpy as np
 import pytest
 import torch
 from fuzz import TARGETS, fault_of, inputs, limits, listing, zipped
+from numpy.random import default_rng
+from numpy.testing import assert_array_equal
 from PIL import Image
 from safetensors import numpy as arrays
 from safetensors.torch import load_file, save_file
@@ -41,7 +43,7 @@ COUNT |= {"bar.yaml": 3, "left.stl": 3, "truth.json": 3, "weights.safetensors": 
 """Inputs of a kind in the fast test: fewer where one takes long."""
 
 
-def check_kind(name: str, folder: Path, capfd: pytest.CaptureFixture[str], count: int, seed: int, end: float) -> None:
+def check_kind(name: str, folder: Path, capfd: pytest.CaptureFixture, count: int, seed: int, end: float) -> None:
     for content, _, fault in islice(inputs(name, folder / "in", seed), count):
         if fault:
             (kept := folder / Path(name).name).write_bytes(content)
@@ -53,13 +55,13 @@ def check_kind(name: str, folder: Path, capfd: pytest.CaptureFixture[str], count
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_damaged_files_are_taken_or_refused(name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_damaged_files_are_taken_or_refused(name: str, tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
     check_kind(name, tmp_path, capfd, COUNT[name], SEED, float("inf"))
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", TARGETS)
-def test_many_damaged_files(name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_many_damaged_files(name: str, tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
     check_kind(name, tmp_path, capfd, 10**9, SEED + 1, time.monotonic() + 60 * MINUTES / len(TARGETS))
 
 
@@ -77,24 +79,23 @@ COMMANDS: dict[str, str] = {
 
 @pytest.mark.parametrize("name", [name for name in COMMANDS if name in TARGETS])
 def test_what_a_reader_refuses_the_command_refuses(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    name: str, working_folder: Path, capfd: pytest.CaptureFixture
 ) -> None:
     """Exit code 2, one line, nothing written. Inputs that are taken are left out: their commands work."""
-    monkeypatch.chdir(tmp_path)
-    for content, _, _ in islice((case for case in inputs(name, tmp_path, SEED) if not case[1]), 3):
+    for content, _, _ in islice((case for case in inputs(name, working_folder, SEED) if not case[1]), 3):
         for kind, file in (("weights.safetensors", "tiny.safetensors"), ("depth.png",) * 2, ("bar.yaml",) * 2):
             if not Path(file).exists():
-                TARGETS[kind].write(tmp_path / file)
-        np.save("cloud.npy", np.random.default_rng(0).normal((0, 0, 20), 1, (200, 3)))
-        (tmp_path / name).write_bytes(content)
-        before = listing(tmp_path)
+                TARGETS[kind].write(working_folder / file)
+        np.save("cloud.npy", default_rng(0).normal((0, 0, 20), 1, (200, 3)))
+        (working_folder / name).write_bytes(content)
+        before = listing(working_folder)
         capfd.readouterr()
         with limits():
             code = command_line.main(COMMANDS[name].format(name).split())
         printed = capfd.readouterr().err
         lines = [line for line in printed.splitlines() if not line.startswith("mereo: warning: ")]
         assert code == 2 and len(lines) == 1 and lines[0].startswith("mereo: error: "), (code, printed[:2000])
-        assert lines[0].isprintable() and listing(tmp_path) == before
+        assert lines[0].isprintable() and listing(working_folder) == before
 
 
 # --- what damage once got through, as small as it can be, and what is said of it now ----------------------------------
@@ -165,7 +166,7 @@ CASES: dict[str, tuple[str, Callable[[bytes], bytes], str | None]] = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_it_is_one_sentence_now(case: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_it_is_one_sentence_now(case: str, tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
     name, change, expected = CASES[case]
     if name not in TARGETS:
         pytest.skip(f"nothing is installed that reads {name}")
@@ -189,7 +190,7 @@ def test_a_checkpoint_of_another_run_is_refused_before_training_begins(tmp_path:
             target.read(path)
 
 
-def test_a_librarys_text_is_short_and_its_output_is_dropped(capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_librarys_text_is_short_and_its_output_is_dropped(capfd: pytest.CaptureFixture) -> None:
     error = ValueError("the segment \x1b[31mred\x07 is unknown;\n\u2028correct it")
     assert words_of(error) == r"the segment \x1b[31mred\x07 is unknown; correct it"
     assert len(reason(ValueError("a" * 5000))) == 303
@@ -204,7 +205,7 @@ def test_a_librarys_text_is_short_and_its_output_is_dropped(capfd: pytest.Captur
 # --- headers that lie, and files that unpack to far more than they are ------------------------------------------------
 
 
-POINTS = np.random.default_rng(0).normal(size=(57, 3)).astype(np.float32)
+POINTS = default_rng(0).normal(size=(57, 3)).astype(np.float32)
 
 
 def nifti(*sizes: int) -> bytes:
@@ -336,7 +337,7 @@ def test_the_limit_is_a_positive_number(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_no_flipped_bit_of_a_png_makes_another_image(tmp_path: Path) -> None:
     """Pillow alone returns other depths for some of them."""
-    values = np.random.default_rng(0).integers(500, 900, (8, 8)).astype(np.uint16)
+    values = default_rng(0).integers(500, 900, (8, 8)).astype(np.uint16)
     path = tmp_path / "a.png"
     Image.fromarray(values).save(path)
     whole = path.read_bytes()
@@ -346,4 +347,4 @@ def test_no_flipped_bit_of_a_png_makes_another_image(tmp_path: Path) -> None:
             found = read_raw_depth(path)
         except ValueError:
             continue
-        np.testing.assert_array_equal(found, values)
+        assert_array_equal(found, values)

@@ -62,7 +62,7 @@ def test_odd_values_of_options_are_refused(
     examples: int,
     tmp_path_factory: pytest.TempPathFactory,
     monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
+    capfd: pytest.CaptureFixture,
 ) -> None:
     folder, read_only = tmp_path_factory.mktemp("options"), command in ONLY_READ
     monkeypatch.chdir(folder)

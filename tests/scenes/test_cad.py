@@ -10,6 +10,8 @@ import pytest
 import trimesh
 from cad_objects import tongs, write_parts, write_pliers
 from manifold3d import Manifold
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from scene_files import write_bar, write_mesh
 from shapes import ball, box
 
@@ -48,7 +50,7 @@ def pliers(written: Path) -> Scene:
 
 
 def test_every_edge_follows_its_curve(pliers: Scene) -> None:
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     away = []
     for index in range(4):  # the very states that edges are compared in
         maps = pliers.sample_deformations(example_rng(0, index))
@@ -95,7 +97,7 @@ def test_overlaps_of_solids_are_exact_and_those_of_other_meshes_measured_on_a_gr
     assert found.share == pytest.approx(5 / 16, abs=0.01)
 
 
-def test_an_overlap_in_states_names_its_cause(written: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_overlap_in_states_names_its_cause(written: Path, capsys: pytest.CaptureFixture) -> None:
     head = written.read_text().split("deformations:")[0]
     away = written.with_name("away.yaml")
     joint = "{{type: joint, segments: [{}], pivot: [{}, 0, 0], axis: [0, 0, 1], angle: [-{a}, {a}]}}"
@@ -115,7 +117,7 @@ def test_an_overlap_in_states_names_its_cause(written: Path, capsys: pytest.Capt
         assert (cause or "") in printed and "nothing to repair" not in printed
 
 
-def test_parts_that_all_overlap_are_not_in_one_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_parts_that_all_overlap_are_not_in_one_frame(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     files = [write_mesh(box((0, 0, 0), (20, 10, 10 + k)), tmp_path / f"{k}.stl") for k in range(3)]
     for count, faults in ((2, "1 fault,"), (3, "3 faults,")):  # random states count no pair again
         with pytest.raises(ValueError, match=f"has {faults} listed above: repair the meshes with --repair"):
@@ -146,7 +148,7 @@ def test_surface_points_lie_evenly_on_the_surface_and_cubes_fill_the_box_around_
     assert np.isclose(np.abs(first[~ends, 1:] - 0.5).max(axis=1), 0.5).all()
     bounds, cells = cubic_cells(np.array([[0.0, 0, 0], [10, 4, 1]]), 5.0)
     assert cells == (2, 1, 1)
-    np.testing.assert_allclose(bounds, [[0, -0.5, -2], [10, 4.5, 3]])
+    assert_allclose(bounds, [[0, -0.5, -2], [10, 4.5, 3]])
 
 
 def test_the_picture_is_filled_and_nothing_is_cut(pliers: Scene) -> None:
@@ -164,7 +166,7 @@ def test_the_picture_is_filled_and_nothing_is_cut(pliers: Scene) -> None:
     assert max(reach) > 0.75 and min(inside) > 0.95 and np.mean(inside) > 0.998
 
 
-def test_up_is_told_by_the_kind_of_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_up_is_told_by_the_kind_of_file(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     for suffix, axis in (("stl", [0, 0, 1]), ("obj", [0, 1, 0])):
         file = write_mesh(ball((0, 0, 0), 3.0, level=1), tmp_path / f"a.{suffix}")
         path = write_scene_file([file], tmp_path / f"{suffix}.yaml", aperture=140.0)
@@ -196,7 +198,7 @@ def test_a_flat_base_is_found_in_any_position_and_of_a_box_the_side_that_is_down
     for up in ((0, 0, 1), (0, -1, 0)):
         base = flat_base(SegmentedMesh((box((0, 0, 0), (4, 3, 3)),)), up)
         assert base is not None and base.share == pytest.approx(12 / 66)
-        np.testing.assert_array_equal(base.normal, -np.array(up))
+        assert_array_equal(base.normal, -np.array(up))
 
 
 def test_what_is_round_or_falls_over_has_no_base() -> None:
@@ -210,7 +212,7 @@ def test_what_is_round_or_falls_over_has_no_base() -> None:
     assert base is not None and abs(base.normal[2]) < 0.5, "it lies on a side"
 
 
-def test_a_base_is_named_where_the_camera_looks_from_below(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_base_is_named_where_the_camera_looks_from_below(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     file = write_mesh(dome(), tmp_path / "dome.obj")
     sentences: list[str] = []
     path = write_scene_file([file], tmp_path / "dome.yaml", report=sentences.append)
@@ -231,14 +233,14 @@ def test_a_base_is_named_where_the_camera_looks_from_below(tmp_path: Path, capsy
 # --- joints -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_word_says_how_the_object_moves(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_word_says_how_the_object_moves(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     files, said = write_pliers(tmp_path), list[str]()
     scene = load_scene(write_scene_file(files, tmp_path / "auto.yaml", report=said.append))
     assert said[0] == "deformations: by its joints, for its parts touch like 2 hinges"
     hinge = "- type: joint  # turns on the round contact, radius 4.98, of pin and lower\n    segments: [lower]"
     assert hinge in (tmp_path / "auto.yaml").read_text()
     middle = scene.T_scene_source[:3, 3]
-    for deform in scene.sample_deformations(np.random.default_rng(0))[:2]:  # the pin's axis stays
+    for deform in scene.sample_deformations(default_rng(0))[:2]:  # the pin's axis stays
         assert np.linalg.norm((deform(middle[None]) - middle)[0, :2]) < 0.05 * scene.T_scene_source[0, 0]
     assert scene.definition != load_scene(write_scene_file(files, tmp_path / "s.yaml", deformations="stiff")).definition
     check_scene(str(tmp_path / "auto.yaml"))
@@ -246,7 +248,7 @@ def test_a_word_says_how_the_object_moves(tmp_path: Path, capsys: pytest.Capture
     text = write_scene_file(files, tmp_path / "r.yaml", deformations="rigid").read_text()
     assert "\ndeformations: rigid\n#" in text
     rest = load_scene(tmp_path / "r.yaml")
-    assert np.array_equal(rest.sample_state(np.random.default_rng(0)).mesh.merged()[0], rest.rest.merged()[0])
+    assert np.array_equal(rest.sample_state(default_rng(0)).mesh.merged()[0], rest.rest.merged()[0])
     bar = write_mesh(box((0, 0, 0), (40, 10, 10)), tmp_path / "bar.stl")
     write_scene_file([bar], tmp_path / "bar.yaml", report=said.append)
     assert "deformations: as a soft elastic solid, for no parts of it touch like a hinge" in said
@@ -255,7 +257,7 @@ def test_a_word_says_how_the_object_moves(tmp_path: Path, capsys: pytest.Capture
     assert not (tmp_path / "b.yaml").exists()
 
 
-def test_joints_are_narrowed_until_no_combination_collides(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_joints_are_narrowed_until_no_combination_collides(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     path = write_scene_file(write_parts(tmp_path, tongs()), tmp_path / "tongs.yaml")
     check_scene(str(path))
     assert "fault" not in capsys.readouterr().out
@@ -270,7 +272,7 @@ def test_joints_are_narrowed_until_no_combination_collides(tmp_path: Path, capsy
             (replace(sampler, angle_rad=(angle, angle)), members)  # type: ignore[type-var]
             for (sampler, members), angle in zip(draw.steps, chosen, strict=True)
         ]
-        mesh = scene.deform(replace(draw, steps=tuple(steps))(np.random.default_rng(1))).mesh
+        mesh = scene.deform(replace(draw, steps=tuple(steps))(default_rng(1))).mesh
         assert not overlaps(mesh, STATE_TOLERANCE)
     former = path.with_name("former.yaml")
     former.write_text(reason.sub(r"angle: \2", path.read_text()))
@@ -300,7 +302,7 @@ def test_planes_cylinders_and_other_contacts() -> None:
     assert abs(found[frozenset(("body", "lid"))].axis @ axis) > 0.9999
 
 
-def test_a_check_names_parts_that_no_frame_tells_apart(written: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_check_names_parts_that_no_frame_tells_apart(written: Path, capsys: pytest.CaptureFixture) -> None:
     sentence = "the object looks the same turned by 180 degrees about x: no frame tells upper and lower apart"
     check_scene(str(written))
     assert f"symmetry: {sentence}" in capsys.readouterr().out.splitlines()

@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from fit_cases import IN_FRONT, said, seen
+from numpy.random import Generator, default_rng
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
 from shapes import box
@@ -38,7 +40,7 @@ class Pushed:
         return self.then(points + np.array([0.0, self.distance, 0.0]))
 
 
-def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
+def sample_deformations(rng: Generator) -> tuple[Deformation, ...]:
     shear = Shear(*(named(rng, "shear").uniform(-1, 1, size=3) * [3.0, 0.3, 0.2]))
     box = int(named(rng, "box").choice(SIDES))
     maps: list[Deformation] = [shear] * 4
@@ -62,11 +64,11 @@ def test_all_but_the_choice_and_what_it_asks_for_is_kept(seed: int) -> None:
     others = redraw_choices(SCENE, drawn, 40)
     assert {box_of(other) for other in others} == set(range(SIDES))
     for other in others:
-        np.testing.assert_allclose(other.z[:3], drawn.z[:3])
+        assert_allclose(other.z[:3], drawn.z[:3])
         assert len(other.z) == (4 if box_of(other) == 3 else 5)
         assert other.deformations(SCENE, other.z) is not None
         if box_of(other) == box_of(drawn):
-            np.testing.assert_allclose(other.z[4:], drawn.z[4:])
+            assert_allclose(other.z[4:], drawn.z[4:])
 
 
 def test_a_scene_without_discrete_draws_has_no_others() -> None:
@@ -101,7 +103,7 @@ REFUSES = {"human": 7, "robot": 3, "rope": 1, "sheet": 5}
 @pytest.mark.parametrize("name", [*REFUSES, "lizard"])
 def test_a_scene_that_tests_its_states_plays_their_neighbours_without(name: str) -> None:
     scene = load_scene(name)
-    drawn, rng, refused = Drawn.of(scene, REFUSES.get(name, 7)), np.random.default_rng(0), 0
+    drawn, rng, refused = Drawn.of(scene, REFUSES.get(name, 7)), default_rng(0), 0
     points = [segment.vertices[::50] for segment in scene.rest.segments]
     for _ in range(15):
         z = np.where(drawn.smooth, drawn.z + 3.0 * rng.normal(size=len(drawn.z)), drawn.z)
@@ -132,7 +134,7 @@ def arm() -> StatisticalModel:
     """Three boxes in a row; the second turns about z at x = 6, the third about x at x = 18."""
     rest = SegmentedMesh(tuple(box((12 * i - 6, -2, -3), (12 * i + 6, 2, 3), f"box_{i}", i) for i in range(3)))
     base, middle, hand = (segment.vertices.copy() for segment in rest.segments)
-    states, rng = [], np.random.default_rng(0)
+    states, rng = [], default_rng(0)
     for bend, turn in rng.uniform([-0.6, -np.pi], [0.6, np.pi], size=(300, 2)):
         about_z = Rotation.from_euler("z", bend)
         elbow = np.array([6.0, 0, 0])
@@ -153,12 +155,12 @@ def test_one_joint_of_segments_that_touch_moves_and_the_rest_stays(arm: Statisti
     opposite = half.apply(here[2] - here[2].mean(axis=0)) + here[2].mean(axis=0)
     best = min(moved, key=lambda parts: float(np.linalg.norm(parts[2] - opposite, axis=1).max()))
     assert np.linalg.norm(best[2] - opposite, axis=1).max() < 1.5
-    np.testing.assert_allclose(best[0], here[0], atol=0.3)
-    np.testing.assert_allclose(best[1], here[1], atol=0.3)
+    assert_allclose(best[0], here[0], atol=0.3)
+    assert_allclose(best[1], here[1], atol=0.3)
 
 
 def test_an_object_of_one_segment_has_no_joints() -> None:
     rest = SegmentedMesh((box((-6, -2, -3), (6, 2, 3), "box", 0),))
-    states = rest.segments[0].vertices * np.random.default_rng(0).uniform(0.8, 1.2, size=(50, 1, 3))
+    states = rest.segments[0].vertices * default_rng(0).uniform(0.8, 1.2, size=(50, 1, 3))
     model = build_model(rest, *NONE, states.astype(np.float32))
     assert Joints.of(model).others(Posed(np.eye(3), np.zeros(3), np.zeros(model.count)), 4) == []

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fit_cases import IN_FRONT, seen
+from numpy.testing import assert_allclose, assert_array_equal
 from scene_files import HEAD, write_bar, write_mesh
 from scipy.spatial.transform import Rotation
 from shapes import box
@@ -140,14 +141,14 @@ def test_a_volume_mesh_takes_the_place_of_the_lattice(tmp_path: Path, volume: Te
     path = write_bar(tmp_path, write_volume(tmp_path, np.vstack([np.zeros(3), volume.nodes]), volume.elements + 1))
     scene = load_scene(path)
     solid = scene.sample_deformations.steps[0][0].solid
-    np.testing.assert_allclose(solid.mesh.nodes, transform_points(scene.T_scene_source, volume.nodes), atol=1e-9)
+    assert_allclose(solid.mesh.nodes, transform_points(scene.T_scene_source, volume.nodes), atol=1e-9)
     assert solid.volumes.sum() == pytest.approx(np.ptp(scene.rest.bounds, axis=0).prod()), "all of it is filled"
     assert path.parent / "bar.npz" in files_of(path), "a copy of the object needs it"
 
     path.write_text(path.read_text() + "    stiffness: {right: 100}\n")
     stiff = load_scene(str(path)).sample_deformations.steps[0][0].solid
     right = stiff.mesh.nodes[stiff.mesh.elements].mean(axis=1)[:, 0] > scene.rest.bounds[:, 0].mean()
-    np.testing.assert_array_equal(stiff.stiffness, np.where(right, 100, 1))
+    assert_array_equal(stiff.stiffness, np.where(right, 100, 1))
 
     np.savez(tmp_path / "bar.npz", rest_nodes=volume.nodes * [1, 1, 1.01], tetrahedra=volume.elements)
     assert load_scene(str(path)).definition != scene.definition, "other tetrahedra are another object"
@@ -160,7 +161,7 @@ def test_nodes_are_held_by_their_numbers_or_by_points_near_them(tmp_path: Path, 
     numbers = (np.flatnonzero(at_end) + 1).tolist()
     for held in (f"nodes: {numbers}", "points: fixed.csv", "center: [139, 0, 0], direction: [1, 0, 0]"):
         path = write_bar(tmp_path, block + f"    held: [{{{held}}}]\n")
-        np.testing.assert_array_equal(load_scene(path).sample_deformations.steps[0][0].held, at_end)
+        assert_array_equal(load_scene(path).sample_deformations.steps[0][0].held, at_end)
         assert (tmp_path / "fixed.csv" in files_of(path)) == (held == "points: fixed.csv")
     for held, message in (
         ("nodes: [0, 1, 2, 3]", "no tetrahedron has the node 0; they are 1 to"),
@@ -196,7 +197,7 @@ def test_a_volume_mesh_that_does_not_fit_is_refused_with_its_line(
 
 def test_the_model_has_the_modes_of_the_solid(scene: Scene, model: StatisticalModel, tmp_path: Path) -> None:
     assert model.is_normal and not model.is_held and model.count == 12 and len(model.pairs) == 0
-    np.testing.assert_array_equal(model.mean, model.rest_points)
+    assert_array_equal(model.mean, model.rest_points)
     assert np.abs(model.library.std(axis=0) - 1).max() < 0.35
     state = scene.sample_state(example_rng(5, 0))
     points = state_points(state, model.nodes, model.node_labels)
@@ -204,7 +205,7 @@ def test_the_model_has_the_modes_of_the_solid(scene: Scene, model: StatisticalMo
     assert off(model, transform_points(T, model.material(z)), points) < 3 * model.residue / model.half
     assert model.residue < 0.02 * model.half
     prior = Prior.near(model, z)
-    np.testing.assert_array_equal(prior.precision, np.eye(12))
+    assert_array_equal(prior.precision, np.eye(12))
     save_statistical_model(model, tmp_path / "m.safetensors")
     again = load_statistical_model(tmp_path / "m.safetensors")
     assert again.is_normal and not again.is_held
@@ -243,7 +244,7 @@ def test_a_given_pose_starts_the_fit_and_holds_what_is_held(held: tuple[Scene, S
     cloud, true = seen(state.mesh.transformed(T)), transform_points(T, true)
     T_files = rigid(IN_FRONT[:3, :3], transform_points(IN_FRONT, scene.source_frame.T_scene_source[:3, 3]))
     start = initial_state(T_files, model, 1.0)
-    np.testing.assert_allclose(start.place(model.mean), transform_points(IN_FRONT, model.mean), atol=1e-6)
+    assert_allclose(start.place(model.mean), transform_points(IN_FRONT, model.mean), atol=1e-6)
     wrong = Posed(Rotation.from_rotvec([0.0, 0.0, 0.02]).as_matrix() @ start.rotation, start.translation, start.z)
     fitted = search_modes(CloudToFit(cloud, 1.0), model, ELASTIC, [wrong])
     assert fitted.problem.given is not None
@@ -260,7 +261,7 @@ def test_a_given_pose_weighs_as_its_error_says(held: tuple[Scene, StatisticalMod
     gradient = problem.known(moved, prior, 0.0).gradient
     assert gradient[3] == pytest.approx(0.3 / 0.5**2, rel=1e-9), "of (0.3 / 0.5)^2 / 2"
     step = problem.known(moved, prior, 0.0).step(0.0)
-    np.testing.assert_allclose(moved.moved(step).translation, start.translation, atol=1e-3)
+    assert_allclose(moved.moved(step).translation, start.translation, atol=1e-3)
 
 
 def test_pairs_by_direction_tell_the_sides_of_a_thin_part_apart(model: StatisticalModel) -> None:

@@ -1,12 +1,11 @@
 """Further observations: the same example seen by other sensors, with its own cloud and queries untouched."""
 
-import json
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from folder_contents import contents
+from folder_contents import contents, read_json
 from safetensors.numpy import load_file
 from toy_data import SMALL, make_small_datasets, small_shards
 from toy_scene import toy_scene
@@ -59,7 +58,7 @@ def test_state_first_cloud_and_queries_are_those_without_and_the_manifest_has_se
         plain, seen = (load_file(directory / shard.name) for directory in data)
         assert seen.keys() - plain.keys() == {"seen", "seen_count"}
         assert all(seen[key].tobytes() == value.tobytes() for key, value in plain.items())
-    plain, seen = (json.loads((directory / "manifest.json").read_text())["settings"] for directory in data)
+    plain, seen = (read_json(directory / "manifest.json")["settings"] for directory in data)
     assert not plain.keys() & {"observations", "sensors"} and seen["observations"] == list(SEEN.further)
     assert seen["sensors"] == {name: asdict(sensor) for name, sensor in SEEN.further.items()}
 

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
 from overlapping import check_overlap
 
 from mereo.geometry.mesh_check import solid_of
@@ -54,7 +56,7 @@ def test_the_repaired_liver_is_the_known_one() -> None:
     solid = solid_of(vertices, faces)
     assert len(faces) == 28_560 and solid.genus() == 0 and len(solid.decompose()) == 1
     assert solid.volume() == pytest.approx(1_762_141.0, abs=0.1)  # cubic millimetres
-    np.testing.assert_allclose(np.ptp(vertices, axis=0), [162.675, 202.286, 197.815], atol=1e-3)
+    assert_allclose(np.ptp(vertices, axis=0), [162.675, 202.286, 197.815], atol=1e-3)
 
 
 # --- skull ------------------------------------------------------------------------------------------------------------
@@ -88,7 +90,7 @@ def test_the_jaw_never_touches_the_skull() -> None:
 @pytest.mark.usefixtures("bones")
 def test_a_closed_jaw_neither_slides_nor_turns() -> None:
     assert skull.jaw_state(0.0, 1.0, 1.0) == (0.0, 0.0, 0.0)
-    states = np.array([skull.sample_jaw(np.random.default_rng(seed)) for seed in range(400)])
+    states = np.array([skull.sample_jaw(default_rng(seed)) for seed in range(400)])
     assert 0.08 < (states[:, 0] == 0).mean() < 0.22
     assert states[:, 0].max() <= skull.OPEN_RAD and states[:, 1].min() >= 0
     assert np.abs(states[:, 2]).max() <= skull.LATERAL_RAD
@@ -99,7 +101,7 @@ def test_a_closed_jaw_neither_slides_nor_turns() -> None:
 
 @pytest.mark.usefixtures("organs")
 def test_the_tumour_stays_hidden_in_the_liver() -> None:
-    scene, rng = load_scene("tumor"), np.random.default_rng(2)
+    scene, rng = load_scene("tumor"), default_rng(2)
     assert scene.rest.nested == (("tumor", "liver"),)
     depth = Solids(scene.rest).segment_distance(1, scene.rest.segments[0].vertices) / _liver_parts.MM
     assert depth.min() > 20
@@ -111,7 +113,7 @@ def test_the_tumour_stays_hidden_in_the_liver() -> None:
 
 @pytest.mark.usefixtures("organs")
 def test_the_tumours_place_and_size_vary_within_their_bounds() -> None:
-    rng, rest = np.random.default_rng(3), tumor.rest_mesh()
+    rng, rest = default_rng(3), tumor.rest_mesh()
     inner, outer = rest.segments[0].vertices, rest.segments[1].vertices
     shifts, factors = [], []
     for _ in range(60):

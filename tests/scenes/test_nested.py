@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from analytic import ball as distance_to_ball
 from analytic import logits_of
+from numpy.random import Generator, default_rng
+from numpy.testing import assert_allclose
 from overlapping import check_overlap
 from scipy.spatial import cKDTree
 from shapes import ball, box
@@ -52,8 +54,8 @@ def true_labels(points: np.ndarray) -> np.ndarray:
 def test_what_is_nested_in_a_nested_segment_is_nested_too_and_owns_its_shell() -> None:
     assert onion().nesting == ((0, 1), (0, 2), (1, 2)) and organ(()).nesting == ()
     meshes = np.array([segment.volume for segment in onion().segments])
-    np.testing.assert_allclose(onion().owned_volumes, np.diff(meshes, prepend=0.0))
-    np.testing.assert_allclose(onion().owned_volumes / (4 / 3 * np.pi), [1, 7, 19], rtol=0.01)
+    assert_allclose(onion().owned_volumes, np.diff(meshes, prepend=0.0))
+    assert_allclose(onion().owned_volumes / (4 / 3 * np.pi), [1, 7, 19], rtol=0.01)
 
 
 @pytest.mark.parametrize(
@@ -87,13 +89,13 @@ def test_declared_pairs_may_overlap_and_no_others_and_the_inner_segment_must_be_
 
 
 def test_distance_and_direction_lead_to_the_surface_of_what_the_owner_owns() -> None:
-    points, solids = np.random.default_rng(0).uniform(-6, 6, size=(5000, 3)), Solids(organ())
+    points, solids = default_rng(0).uniform(-6, 6, size=(5000, 3)), Solids(organ())
     points = points[clear_of(points, 0.02)]
     labels = solids.label(points)
     distance, direction = signed_distance_and_direction(solids, points, labels)
     to_core, to_organ = radius(points, CORE) - CORE[1], radius(points, ORGAN) - ORGAN[1]
     expected = np.select([labels == 1, labels == 2], [to_core, -np.minimum(-to_organ, to_core)], to_organ)
-    np.testing.assert_allclose(distance, expected, atol=0.02)  # facets lie up to 0.01 inside the ball
+    assert_allclose(distance, expected, atol=0.02)  # facets lie up to 0.01 inside the ball
     wall = (labels == 1) | ((labels == 2) & (to_core < -to_organ))
     center = np.where(wall[:, None], CORE[0], ORGAN[0])
     outward = (points - center) / np.linalg.norm(points - center, axis=1, keepdims=True)
@@ -110,13 +112,13 @@ def test_the_template_has_the_signed_distance_to_what_each_segment_owns() -> Non
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3) * half + center
     to_core, to_organ = radius(points, CORE) - CORE[1], radius(points, ORGAN) - ORGAN[1]
     grid = rest_distances(mesh)[:, ::3, ::3, ::3].reshape(2, -1).astype(float) * half
-    np.testing.assert_allclose(grid[0], to_core, atol=0.03)
-    np.testing.assert_allclose(grid[1], np.maximum(to_organ, -to_core), atol=0.03)
+    assert_allclose(grid[0], to_core, atol=0.03)
+    assert_allclose(grid[1], np.maximum(to_organ, -to_core), atol=0.03)
 
 
 def test_the_outside_of_a_nested_segment_is_the_segment_around_it() -> None:
     solids, keep = Solids(organ()), 200
-    samples = sort_sample(solids, keep, 2 * keep, np.random.default_rng(0))
+    samples = sort_sample(solids, keep, 2 * keep, default_rng(0))
     core_in, core_out, organ_in, organ_out = np.split(samples.labels, 4)
     assert (core_in == 1).all() and (organ_in == 2).all() and (organ_out == 0).all()
     assert (core_out == 2).mean() > 0.9 and set(core_out) <= {0, 2}  # a part of its draw box reaches out of the organ
@@ -129,7 +131,7 @@ def test_the_outside_of_a_nested_segment_is_the_segment_around_it() -> None:
 @pytest.mark.parametrize("sampler", ["volume-uniform", "label-uniform", "sort-sample", "nested-sort-sample"])
 def test_every_sampler_gives_points_to_their_owner(sampler: str) -> None:
     settings = SamplingConfig(sampler=sampler, per_segment=128, uniform_fraction=1.0)  # type: ignore[arg-type]
-    samples = sample_queries(Solids(organ()), settings, np.random.default_rng(2))
+    samples = sample_queries(Solids(organ()), settings, default_rng(2))
     assert len(samples.points) == settings.total(2)
     clear = clear_of(samples.points, 0.02)
     assert np.array_equal(samples.labels[clear], true_labels(samples.points[clear]))
@@ -160,7 +162,7 @@ def test_a_declared_outer_surface_leaves_out_the_wall_of_the_cavity(nested: tupl
 
 
 def test_rest_coordinates_lie_in_the_owner_at_rest() -> None:
-    def move_together(rng: np.random.Generator) -> tuple[Deformation, ...]:
+    def move_together(rng: Generator) -> tuple[Deformation, ...]:
         return (Shear(*(rng.uniform(-1, 1, size=3) * [1.5, 0.2, 0.15])),) * 2
 
     scene, settings = Scene("organ", organ(), move_together), GenerateConfig(sampling=SamplingConfig(per_segment=128))

@@ -4,6 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from numpy.random import Generator, default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import kstest
 from toy_scene import rest_mesh, toy_scene
 
@@ -28,7 +30,7 @@ from mereo.scenes.scene import Scene
 STILL = np.zeros(3)
 
 
-def scene_of(sample: Callable[[np.random.Generator], tuple[Deformation, ...]]) -> Scene:
+def scene_of(sample: Callable[[Generator], tuple[Deformation, ...]]) -> Scene:
     return Scene("drawn", rest_mesh(), sample)
 
 
@@ -72,7 +74,7 @@ def test_a_recorder_draws_whole_numbers_and_choices_as_numpy_does() -> None:
 
 
 def test_moving_one_number_moves_nothing_else() -> None:
-    def sample(rng: np.random.Generator) -> tuple[Deformation, ...]:
+    def sample(rng: Generator) -> tuple[Deformation, ...]:
         along, across = named(rng, "along").uniform(-5.0, 5.0), named(rng, "across").uniform(1.0, 2.0)
         return shifted(along, across, rng.normal())
 
@@ -80,14 +82,14 @@ def test_moving_one_number_moves_nothing_else() -> None:
     played = random_state(scene, 4)
     before = shift_of(played)
     moved = set_value(scene, played, slider(played, "along"), 3.25)
-    np.testing.assert_allclose(shift_of(moved), [3.25, *before[1:]], atol=1e-12)
+    assert_allclose(shift_of(moved), [3.25, *before[1:]], atol=1e-12)
     assert slider(moved, "along").value == pytest.approx(3.25)
     beyond = set_value(scene, moved, slider(moved, "across"), 99.0)
-    np.testing.assert_allclose(shift_of(beyond), [3.25, 2.0, before[2]], atol=1e-8)
+    assert_allclose(shift_of(beyond), [3.25, 2.0, before[2]], atol=1e-8)
 
 
 def test_draws_that_a_choice_brings_come_and_go_and_come_back_the_same() -> None:
-    def sample(rng: np.random.Generator) -> tuple[Deformation, ...]:
+    def sample(rng: Generator) -> tuple[Deformation, ...]:
         first = rng.uniform(0.0, 1.0) if rng.random() < 0.5 else 7.0 + rng.normal()
         last = rng.uniform(0.0, 1.0)
         return shifted(first, last)
@@ -100,11 +102,11 @@ def test_draws_that_a_choice_brings_come_and_go_and_come_back_the_same() -> None
     back = set_value(scene, high, parameters(high)[0], 0.3)
     assert low.keys != high.keys
     assert shift_of(low)[0] < 1 < 2 < shift_of(high)[0]
-    np.testing.assert_array_equal(shift_of(back), shift_of(low))
+    assert_array_equal(shift_of(back), shift_of(low))
     assert shift_of(high)[1] == shift_of(low)[1]  # drawn after the choice, and not touched by it
 
 
-def rejecting(rng: np.random.Generator) -> tuple[Deformation, ...]:
+def rejecting(rng: Generator) -> tuple[Deformation, ...]:
     while True:
         one, other = named(rng, "one").uniform(0.0, 1.0), named(rng, "other").uniform(0.0, 1.0)
         if one + other > 1.5:
@@ -125,7 +127,7 @@ def test_attempts_that_the_scene_threw_away_have_no_sliders() -> None:
         again = Recorder(seed, {c.key: c.shares for c in played.calls})
         deformations = play(scene, again)
         assert len(again.calls) == 3
-        np.testing.assert_array_equal(deformations[0](np.zeros((1, 3)))[0], shift_of(played))
+        assert_array_equal(deformations[0](np.zeros((1, 3)))[0], shift_of(played))
     assert max(attempts) > 9
 
 
@@ -134,13 +136,13 @@ def test_a_refused_value_is_said_and_an_allowed_one_taken() -> None:
     played = random_state(scene, 1)
     for name, value in (("one", 0.99), ("other", 0.6)):
         played = set_value(scene, played, slider(played, name), value)
-    np.testing.assert_allclose(shift_of(played)[:2], [0.99, 0.6], atol=1e-8)
+    assert_allclose(shift_of(played)[:2], [0.99, 0.6], atol=1e-8)
     with pytest.raises(Refused, match="the scene refuses this value of 'other'"):
         set_value(scene, played, slider(played, "other"), 0.4)
 
 
 def test_loops_that_keep_what_they_draw_keep_their_sliders() -> None:
-    def sample(rng: np.random.Generator) -> tuple[Deformation, ...]:
+    def sample(rng: Generator) -> tuple[Deformation, ...]:
         steps = [rng.uniform(0.0, 1.0) for _ in range(3)]
         while rng.random() < 0.8:
             steps.append(rng.uniform(0.0, 1.0))
@@ -152,14 +154,14 @@ def test_loops_that_keep_what_they_draw_keep_their_sliders() -> None:
         deformations = play(scene, recorder)
         played = random_state(scene, seed)
         assert len(played.calls) == len(recorder.calls)
-        np.testing.assert_array_equal(deformations[0](np.zeros((1, 3)))[0], shift_of(played))
+        assert_array_equal(deformations[0](np.zeros((1, 3)))[0], shift_of(played))
 
 
 def test_many_numbers_move_together_and_stay_as_random_as_they_were() -> None:
-    shares = np.random.default_rng(0).random(4000)
+    shares = default_rng(0).random(4000)
     for turn in (0.1, 0.3, 0.77):
         assert kstest(turned(shares, turn, 5), "uniform").pvalue > 0.01
-    np.testing.assert_allclose(turned(shares, 1.0, 5), shares, atol=1e-9)
+    assert_allclose(turned(shares, 1.0, 5), shares, atol=1e-9)
     assert np.abs(turned(shares, 0.01, 5) - shares).max() < 0.1
     assert np.abs(np.corrcoef(turned(shares, 0.25, 5), shares)[0, 1]) < 0.05
 
@@ -172,19 +174,19 @@ def test_an_array_of_many_numbers_has_one_slider() -> None:
     moved = set_value(scene, played, whole, 0.2)
     assert shift_of(moved)[0] != shift_of(played)[0]
     home = set_value(scene, moved, parameters(moved)[0], 1.0)
-    np.testing.assert_allclose(shift_of(home), shift_of(played), atol=1e-6)
+    assert_allclose(shift_of(home), shift_of(played), atol=1e-6)
 
 
 def test_bounds_in_either_order_are_one_slider() -> None:
-    def sample(rng: np.random.Generator) -> tuple[Deformation, ...]:
+    def sample(rng: Generator) -> tuple[Deformation, ...]:
         return shifted(named(rng, "down").uniform(5.0, -1.0), *named(rng, "mixed").uniform([0.0, 4.0], [2.0, 3.0]))
 
     scene = scene_of(sample)
     played = random_state(scene, 0)
     assert [(f.low, f.high) for f in parameters(played)] == [(-1.0, 5.0), (0.0, 2.0), (3.0, 4.0)]
-    np.testing.assert_allclose([f.value for f in parameters(played)], shift_of(played), atol=1e-8)
+    assert_allclose([f.value for f in parameters(played)], shift_of(played), atol=1e-8)
     moved = set_value(scene, set_value(scene, played, slider(played, "down"), 4.5), slider(played, "mixed 2"), 3.1)
-    np.testing.assert_allclose(shift_of(moved)[[0, 2]], [4.5, 3.1], atol=1e-8)
+    assert_allclose(shift_of(moved)[[0, 2]], [4.5, 3.1], atol=1e-8)
     assert slider(moved, "down").value == pytest.approx(4.5)
 
 
@@ -200,7 +202,7 @@ def test_a_choice_of_unequal_options_is_the_option_that_its_slider_shows() -> No
 
 
 def test_a_scene_names_its_draws_and_the_source_names_the_others() -> None:
-    def sample(rng: np.random.Generator) -> tuple[Deformation, ...]:
+    def sample(rng: Generator) -> tuple[Deformation, ...]:
         with part(rng, "arm"):
             with part(rng, "left"):
                 first = named(rng, "bend", "rad").uniform(0.0, np.pi)
@@ -215,7 +217,7 @@ def test_a_scene_names_its_draws_and_the_source_names_the_others() -> None:
 
 
 def test_draws_of_one_name_are_counted() -> None:
-    def sample(rng: np.random.Generator) -> tuple[Deformation, ...]:
+    def sample(rng: Generator) -> tuple[Deformation, ...]:
         steps = [named(rng, "step").uniform(0.0, 1.0, size=2).sum() for _ in range(3)]
         return shifted(*steps[:2], named(rng, "other").uniform())
 
@@ -224,7 +226,7 @@ def test_draws_of_one_name_are_counted() -> None:
 
 
 def test_names_change_no_number_and_are_taken_once() -> None:
-    plain, told = np.random.default_rng(5), np.random.default_rng(5)
+    plain, told = default_rng(5), default_rng(5)
     with part(told, "arm"):
         assert plain.uniform() == named(told, "bend").uniform()
     recorder = Recorder(0, {})
@@ -239,7 +241,7 @@ def test_names_change_no_number_and_are_taken_once() -> None:
 def test_draws_keep_their_values_with_their_names() -> None:
     """Two tools take turns at one line of the source; each is remembered by its name, not by its turn."""
 
-    def sample(rng: np.random.Generator) -> tuple[Deformation, ...]:
+    def sample(rng: Generator) -> tuple[Deformation, ...]:
         order = ("hook", "probe") if named(rng, "probe first above 0.5").random() < 0.5 else ("probe", "hook")
         depth = {}
         for tool in order:
@@ -252,7 +254,7 @@ def test_draws_keep_their_values_with_their_names() -> None:
     before = shift_of(played)
     for value in (0.2, 0.8):
         played = set_value(scene, played, parameters(played)[0], value)
-        np.testing.assert_array_equal(shift_of(played), before)
+        assert_array_equal(shift_of(played), before)
 
 
 def places(scene: Scene, played: Played) -> np.ndarray:
@@ -264,11 +266,11 @@ def test_the_same_draws_give_the_same_state_and_sliders_that_move_it(name: str) 
     scene = toy_scene() if name == "toy" else load_scene(name)
     before = random_state(scene, 7)
     again = played_back(scene, 7, [call.shares for call in before.calls])
-    np.testing.assert_array_equal(places(scene, again), places(scene, before))
+    assert_array_equal(places(scene, again), places(scene, before))
     assert again.keys == before.keys and parameters(again) == parameters(before)
     first = parameters(again)[0]
     moved = [set_value(scene, played, first, (first.low + first.high) / 2) for played in (again, before)]
-    np.testing.assert_array_equal(*(places(scene, played) for played in moved))
+    assert_array_equal(*(places(scene, played) for played in moved))
 
 
 def test_every_number_has_the_name_of_its_slider_and_those_of_one_are_counted() -> None:

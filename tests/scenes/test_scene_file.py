@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 from label_cases import halves, write_nifti
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from overlapping import check_overlap
 from scene_code import CODE, EVERYTHING
 from scene_files import HEAD, write_bar, write_mesh
@@ -37,7 +39,7 @@ def test_the_scene_has_the_files_segments_in_scene_units(tmp_path: Path) -> None
     scene = load_scene(write_bar(tmp_path, "size: 15\ncamera: {field_of_view: 30, distance: [90, 95], roll: true}\n"))
     assert (scene.name, scene.rest.names) == ("bar", ("left", "right"))
     assert scene.rest.colors == (PALETTE[0], (1, 2, 3))
-    np.testing.assert_allclose(scene.rest.bounds, [[-30, -7.5, -7.5], [30, 7.5, 7.5]], atol=1e-4)
+    assert_allclose(scene.rest.bounds, [[-30, -7.5, -7.5], [30, 7.5, 7.5]], atol=1e-4)
     assert scene.unit_m == pytest.approx(0.010 / 15)
     assert scene.workspace.fov_rad == pytest.approx(np.deg2rad(30))
     assert (scene.workspace.distance, scene.workspace.any_roll) == ((90.0, 95.0), True)
@@ -63,13 +65,13 @@ def test_a_scene_that_is_loaded_again_is_not_refined_again(tmp_path: Path, monke
         scenes.append(load_scene(write_bar(tmp_path / folder, text)))
     assert len(calls) == 2
     meshes = [scene.rest.merged()[0] for scene in scenes]
-    np.testing.assert_array_equal(meshes[0], meshes[1])
+    assert_array_equal(meshes[0], meshes[1])
     assert meshes[2].shape != meshes[0].shape
 
 
 def test_every_deformation_keeps_space_from_folding(tmp_path: Path) -> None:
     scene = load_scene(write_bar(tmp_path, EVERYTHING))
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     assert isinstance(scene.sample_deformations, RandomMotion) and len(scene.sample_deformations.steps) == 8
     moved = 0.0
     for _ in range(40):
@@ -95,11 +97,11 @@ def test_sliders_are_named_after_the_files_deformations(tmp_path: Path) -> None:
 def test_a_joint_turns_about_the_place_that_the_file_names(tmp_path: Path) -> None:
     joint = "- {type: joint, segments: [right], pivot: [120, 5, 0], axis: [0, 0, 2], angle: [90, 90]}"
     scene = load_scene(write_bar(tmp_path, f"deformations:\n  {joint}\n"))
-    left, right = scene.sample_deformations(np.random.default_rng(0))
+    left, right = scene.sample_deformations(default_rng(0))
     pivot = np.array([[0.0, 0.0, -10.0]])  # 120, 5, 0 in scene units: the box is centred at 120, 5, 5 and doubled
-    np.testing.assert_allclose(right(pivot), pivot, atol=1e-4)
-    np.testing.assert_allclose(right(pivot + np.array([10, 0, 0])), pivot + np.array([0, 10, 0]), atol=1e-4)
-    np.testing.assert_array_equal(left(pivot + 1), pivot + 1)
+    assert_allclose(right(pivot), pivot, atol=1e-4)
+    assert_allclose(right(pivot + np.array([10, 0, 0])), pivot + np.array([0, 10, 0]), atol=1e-4)
+    assert_array_equal(left(pivot + 1), pivot + 1)
 
 
 def test_segments_with_the_same_deformations_stay_in_contact(tmp_path: Path) -> None:
@@ -108,11 +110,11 @@ def test_segments_with_the_same_deformations_stay_in_contact(tmp_path: Path) -> 
     given = len(trimesh.load_mesh(tmp_path / "left.stl").vertices)  # others divide long edges, to each side its own
     touching = [np.isclose(s.vertices[:, 0], 0) & (np.arange(len(s.vertices)) < given) for s in scene.rest.segments]
     before = [s.vertices[rows] for s, rows in zip(scene.rest.segments, touching, strict=True)]
-    mesh = scene.sample_state(np.random.default_rng(0)).mesh
+    mesh = scene.sample_state(default_rng(0)).mesh
     faces = [moved.vertices[rows] for moved, rows in zip(mesh.segments, touching, strict=True)]
     order = [np.lexsort(np.round(points, 5).T) for points in before]
     assert len(order[0]) > 20
-    np.testing.assert_allclose(faces[0][order[0]], faces[1][order[1]], atol=1e-9)
+    assert_allclose(faces[0][order[0]], faces[1][order[1]], atol=1e-9)
     check_overlap(mesh)
 
 
@@ -270,7 +272,7 @@ def test_every_example_in_the_comments_is_valid(tmp_path: Path) -> None:
     path.write_text(re.sub(r"^#  ", "  ", path.read_text(), flags=re.MULTILINE))
     scene = load_scene(path)
     assert isinstance(scene.sample_deformations, RandomMotion) and len(scene.sample_deformations.steps) == 6
-    scene.sample_state(np.random.default_rng(0)).mesh.check()
+    scene.sample_state(default_rng(0)).mesh.check()
 
 
 @pytest.mark.slow
@@ -332,7 +334,7 @@ def test_every_name_of_a_part_is_a_segment(tmp_path: Path) -> None:
     assert not (tmp_path / "b.yaml").exists()
 
 
-def test_the_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     monkeypatch.setattr(check, "STATES", 3)
     write_mesh(ball((0, 0, 0), 30.0), tmp_path / "a.ply")
     monkeypatch.chdir(tmp_path)

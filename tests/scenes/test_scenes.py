@@ -5,6 +5,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from numpy.random import Generator, default_rng
 from overlapping import check_overlap
 from scipy.spatial import ConvexHull, cKDTree
 from solid_pairs import crowded
@@ -51,11 +52,11 @@ def scene(request: pytest.FixtureRequest) -> Scene:
 
 @pytest.fixture(scope="module")
 def states(scene: Scene) -> list[State]:
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     return [scene.sample_state(rng) for _ in range(STATES)]
 
 
-def interior_points(scene: Scene, rng: np.random.Generator, count: int = 300) -> list[np.ndarray]:
+def interior_points(scene: Scene, rng: Generator, count: int = 300) -> list[np.ndarray]:
     solids, points = Solids(scene.rest), []
     for index, segment in enumerate(scene.rest.segments):
         draws = rng.uniform(*segment.bounds, size=(4000, 3))
@@ -72,7 +73,7 @@ def smallest_determinant(state: State, points: list[np.ndarray]) -> float:
     return min(jacobian_determinant(maps[key], np.concatenate(parts)).min() for key, parts in groups.items())
 
 
-def assert_in_view(scene: Scene, mesh: SegmentedMesh, rng: np.random.Generator) -> None:
+def assert_in_view(scene: Scene, mesh: SegmentedMesh, rng: Generator) -> None:
     """Whole, from random cameras; the corners of the convex hull decide, as all of it is in front of them."""
     vertices, size = np.concatenate([segment.vertices for segment in mesh.segments]), GenerateConfig().image_size
     hull = vertices[ConvexHull(vertices).vertices]
@@ -96,7 +97,7 @@ def test_rest_pose_is_sound_and_of_its_stated_size(scene: Scene) -> None:
 
 
 def test_deformations_can_be_undone(scene: Scene, states: list[State]) -> None:
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     inner = interior_points(scene, rng, 150)
     for state in states[:4]:
         for rest, deformation in zip(inner, state.deformations, strict=True):
@@ -128,7 +129,7 @@ def test_touching_segments_keep_touching(scene: Scene, states: list[State]) -> N
 def test_random_states_are_sound_apart_smooth_and_in_view(
     scene: Scene, count: int, volumes: tuple[float, float]
 ) -> None:
-    rng, size = np.random.default_rng(8), GenerateConfig().image_size
+    rng, size = default_rng(8), GenerateConfig().image_size
     inner = interior_points(scene, rng, 100)
     vertices = [rng.permutation(segment.vertices)[:300] for segment in scene.rest.segments]
     points = [np.concatenate(pair) for pair in zip(inner, vertices, strict=True)]
@@ -152,7 +153,7 @@ def test_random_states_are_sound_apart_smooth_and_in_view(
 
 
 def test_workspace_is_a_cone_of_the_stated_aperture_and_distance() -> None:
-    rng = np.random.default_rng(6)
+    rng = default_rng(6)
     workspace, target = Workspace(axis=(0.0, 1.0, 0.0)), np.array([3.0, -2.0, 1.0])
     poses = [workspace.sample(rng, target) for _ in range(1500)]
     offset = np.stack([pose[:3, 3] - target for pose in poses])
@@ -169,7 +170,7 @@ def test_workspace_is_a_cone_of_the_stated_aperture_and_distance() -> None:
 
 
 def test_whole_sphere_with_any_roll_prefers_no_direction() -> None:
-    rng = np.random.default_rng(7)
+    rng = default_rng(7)
     workspace = Workspace(aperture_rad=2 * np.pi, any_roll=True)
     poses = np.stack([workspace.sample(rng, np.zeros(3)) for _ in range(3000)])
     for column in range(3):  # x, y and z axes of the camera are each uniform on the sphere
@@ -193,7 +194,7 @@ def test_every_number_that_a_scene_draws_has_a_name_of_its_own(scene: Scene, see
 
 
 def test_nobody_changes_the_rest_pose_or_a_state_in_place(scene: Scene) -> None:
-    for segment in (*scene.rest.segments, *scene.sample_state(np.random.default_rng(0)).mesh.segments):
+    for segment in (*scene.rest.segments, *scene.sample_state(default_rng(0)).mesh.segments):
         with pytest.raises(ValueError, match="read-only"):
             segment.vertices += 1.0
         with pytest.raises(ValueError, match="read-only"):

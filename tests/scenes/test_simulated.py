@@ -8,6 +8,8 @@ import pytest
 import trimesh
 from analytic import untrained
 from lattice import SIZE, boxes, lattice, pvd_text, states
+from numpy.random import Generator, default_rng
+from numpy.testing import assert_allclose
 from scene_files import write_bar
 from shapes import ball
 from toy_scene import toy_scene
@@ -31,7 +33,7 @@ def test_an_affine_motion_of_the_nodes_is_one_of_all_space() -> None:
     matrix, shift = np.array([[1.1, 0.2, 0.0], [-0.1, 0.9, 0.1], [0.0, 0.3, 1.0]]), np.array([1.0, -2.0, 3.0])
     mesh = lattice()
     deformation = TetrahedralMap(mesh, mesh.nodes @ matrix.T + shift)
-    points = np.random.default_rng(0).uniform(-2, 7, size=(400, 3))  # most of them outside
+    points = default_rng(0).uniform(-2, 7, size=(400, 3))  # most of them outside
     assert np.allclose(deformation(points), points @ matrix.T + shift, atol=1e-12)
 
 
@@ -54,7 +56,7 @@ def test_tetrahedra_have_the_jacobian_of_their_volumes() -> None:
 
 def test_inverse_is_exact_inside_and_found_outside() -> None:
     deformation = TetrahedralMap(lattice(), states()[-1])
-    inner = np.random.default_rng(1).uniform(0.0, SIZE, size=(500, 3))
+    inner = default_rng(1).uniform(0.0, SIZE, size=(500, 3))
     points = np.concatenate([inner, inner * [1, 1, 0] + [0, 0, -0.1]])
     # a useless guess: where the point lies inside a tetrahedron none is needed
     guess = np.concatenate([np.full((500, 3), 40.0), points[500:] + 0.05])
@@ -82,13 +84,13 @@ def test_a_surface_alone_is_met_exactly_and_affine_motions_throughout() -> None:
     moved = part.vertices + 0.5 * np.sin(part.vertices[:, [1, 2, 0]])
     assert np.abs(SurfaceMap(Surface(part.vertices, part.faces), moved)(part.vertices) - moved).max() < 1e-9
     matrix = np.array([[0.0, -1.1, 0.0], [0.9, 0.0, 0.2], [0.0, 0.0, 1.0]])
-    points = np.random.default_rng(0).uniform([-1, 0, 1], [3, 4, 5], size=(200, 3))
+    points = default_rng(0).uniform([-1, 0, 1], [3, 4, 5], size=(200, 3))
     affine = SurfaceMap(Surface(part.vertices, part.faces), part.vertices @ matrix.T + 5)
     assert np.abs(affine(points) - points @ matrix.T - 5).max() < 1e-8
 
 
 def test_the_interior_estimate_is_near_the_solid_that_made_the_surface() -> None:
-    part, rng = boxes().segments[0], np.random.default_rng(2)
+    part, rng = boxes().segments[0], default_rng(2)
     points = rng.uniform(*part.bounds, size=(400, 3))
     surface = Surface(part.vertices, part.faces)
     for nodes in states()[[0, -1]]:
@@ -109,7 +111,7 @@ def test_only_test_seeds_take_held_out_states_which_are_of_the_same_object(
 ) -> None:
     monkeypatch.setattr(shards, "rest_distances", lambda rest: np.zeros((4, 2, 2, 2), dtype=np.float16))  # slow
 
-    def forbidden(rng: np.random.Generator) -> tuple:
+    def forbidden(rng: Generator) -> tuple:
         raise AssertionError("drawn from the wrong states")
 
     toy = toy_scene()
@@ -157,14 +159,14 @@ def bar(tmp_path: Path) -> Path:
 def drawn(path: Path, seed: int) -> set[int]:
     """The frames that a seed draws, told by the height of the bow, after checking each of them exactly."""
     scene = load_scene(path).for_seed(seed)
-    rng, found = np.random.default_rng(0), set()
+    rng, found = default_rng(0), set()
     scale, center = 2.0, np.array([120, 5, 5])  # the shortest side, 10 mm, becomes 20 units
     files = [read_segmented_mesh(path.parent / f"{name}.stl").segments[0].vertices for name in ("left", "right")]
     for _ in range(60):
         mesh = scene.sample_state(rng).mesh
         number = round((mesh.segments[0].bounds[1, 1] / scale + center[1] - 10) / 0.3)
         for segment, vertices in zip(mesh.segments, files, strict=True):
-            np.testing.assert_allclose(segment.vertices, (frame(vertices, number) - center) * scale, atol=1e-4)
+            assert_allclose(segment.vertices, (frame(vertices, number) - center) * scale, atol=1e-4)
         found.add(number)
     return found
 

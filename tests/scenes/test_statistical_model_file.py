@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from analytic import untrained
+from numpy.testing import assert_allclose
 
 from mereo import __main__ as command_line
 from mereo.cli.scenes import SceneModes
@@ -71,7 +72,7 @@ def test_an_object_that_does_not_deform_has_no_modes_and_another_file_is_refused
     save_statistical_model(scene_model(still, 20), tmp_path / "m.safetensors")
     read = load_statistical_model(tmp_path / "m.safetensors")
     assert read.count == 0 and read.residue < 1e-5
-    np.testing.assert_allclose(read.material(np.zeros(0)), read.rest_points, atol=1e-4)
+    assert_allclose(read.material(np.zeros(0)), read.rest_points, atol=1e-4)
     (tmp_path / "m.safetensors").write_bytes(b"nothing")
     with pytest.raises(ValueError, match=r"m.safetensors is no statistical model of mereo \(.*\); delete it and run"):
         load_statistical_model(tmp_path / "m.safetensors")
@@ -84,7 +85,7 @@ def test_the_number_of_modes_needed_is_the_smallest_that_is_enough(rope: Statist
 
 
 def test_the_command_says_how_many_also_of_weights(
-    rope: StatisticalModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    rope: StatisticalModel, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     assert command_line.main(["scene", "modes", "rope", "--states", "100"]) == 0
     assert "modes leave" in capsys.readouterr().out

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 pytest.importorskip("fastapi", reason="fastapi (extra `serve`) is not installed")
 pytest.importorskip("python_multipart", reason="python-multipart (extra `serve`) is not installed")
@@ -396,7 +397,7 @@ async def test_a_frame_that_ends_its_process_costs_no_other(tmp_path: Path, capl
         assert [answer.status_code for answer in answers] == [200, 200, 500, 200, 200]
         assert "has ended over it" in answers[2].json()["error"]
         depths = [figures(answer)["segments"][0]["centroid"][2] for answer in answers if answer.status_code == 200]
-        np.testing.assert_allclose(np.diff(depths), 1.0, atol=0.01)
+        assert_allclose(np.diff(depths), 1.0, atol=0.01)
         assert worker.restarts == 1
         assert server.dispatcher.ready and not list(tmp_path.iterdir())
     assert "it is started again" in caplog.text
@@ -454,7 +455,7 @@ def listening(folder: Path) -> Iterator[int]:
 
 
 def test_the_documented_client_works(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     (code,) = re.findall(r"```python\n(.*?)```", (Path(__file__).parents[2] / "docs/serving.md").read_text(), re.DOTALL)
     assert len(code.splitlines()) <= 16

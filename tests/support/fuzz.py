@@ -36,6 +36,7 @@ import trimesh
 import yaml
 from camera_files import write_camera
 from lattice import pvd_text, xdmf_text
+from numpy.random import default_rng
 from PIL import Image
 from point_files import save_pcd, save_ply
 from robot_files import LAPTOP, LAPTOP_SDF
@@ -254,8 +255,8 @@ def _changed(tree: Any, rng: Random) -> Any:
 
 # --- small valid files ------------------------------------------------------------------------------------------------
 
-POINTS = np.random.default_rng(0).normal((0, 0, 2), 0.2, (40, 3)).round(3)
-DEPTH = np.random.default_rng(0).integers(500, 900, (12, 16)).astype(np.uint16)
+POINTS = default_rng(0).normal((0, 0, 2), 0.2, (40, 3)).round(3)
+DEPTH = default_rng(0).integers(500, 900, (12, 16)).astype(np.uint16)
 CAMERA = Camera(16, 12, 20.0, 20.0, 8.0, 6.0)
 NODES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
 FRAMES = np.stack([NODES, NODES * 1.1, NODES + 1])

@@ -33,6 +33,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from folder_contents import read_json
 from golden_objects import FOLDER, OWN, weights_of
 
 import mereo
@@ -217,7 +218,7 @@ def is_same(kept: dict[str, Any], now: dict[str, Any]) -> bool:
 
 
 def kept_of(name: str) -> dict[str, dict[str, Any]]:
-    kept: dict[str, dict[str, Any]] = json.loads((FOLDER / f"{name}.json").read_text("utf-8"))
+    kept: dict[str, dict[str, Any]] = read_json(FOLDER / f"{name}.json")
     return kept
 
 

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from numpy.random import Generator, default_rng
 from safetensors.numpy import save_file
 from toy_scene import toy_scene
 
@@ -53,11 +54,11 @@ def write_toy_dataset(
     examples: int = 64,
     points: int = 96,
     queries: int = 128,
-    example: Callable[[np.random.Generator, int, int], dict[str, np.ndarray]] | None = None,
+    example: Callable[[Generator, int, int], dict[str, np.ndarray]] | None = None,
 ) -> Path:
     """Write the dataset and return its directory; ``example(rng, points, queries)`` makes one of another kind."""
     directory.mkdir(parents=True)
-    rng = np.random.default_rng(5)
+    rng = default_rng(5)
     for number in range(0, examples, SHARD):
         rows = [(example or half_balls)(rng, points, queries) for _ in range(min(SHARD, examples - number))]
         tensors = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
@@ -85,34 +86,48 @@ def _template() -> np.ndarray:
     return np.stack([np.maximum(ball, x), np.maximum(ball, -x)]).astype(np.float16)
 
 
-def half_balls(rng: np.random.Generator, points: int, queries: int) -> dict[str, np.ndarray]:
+def half_balls(rng: Generator, points: int, queries: int) -> dict[str, np.ndarray]:
     radius, center = rng.uniform(5.0, 10.0), np.array([rng.uniform(-5, 5), rng.uniform(-5, 5), rng.uniform(100, 200)])
     front = rng.normal(size=(points, 3))
     front /= np.linalg.norm(front, axis=1, keepdims=True)
     front[:, 2] = -np.abs(front[:, 2])
     cloud = center + radius * front
-    low, high = cloud.min(axis=0), cloud.max(axis=0)
-    middle, scale = (low + high) / 2, 2 / (high - low).max()
     places = center + radius * rng.uniform(-1.4, 1.4, size=(queries, 3))
     offset = (places - center) / radius
     reach = np.linalg.norm(offset, axis=1)
     # distance to the nearest of the sphere and, inside, the wall between the halves
     wall = np.where(reach < 1, np.abs(offset[:, 0]), np.inf)
-    distance = np.minimum(np.abs(reach - 1), wall) * np.where(reach < 1, -1, 1) * radius * scale
+    distance = np.minimum(np.abs(reach - 1), wall) * np.where(reach < 1, -1, 1) * radius
     labels = np.where(reach >= 1, 0, np.where(offset[:, 0] < 0, 1, 2))
     radial = offset / reach[:, None] * np.where(reach < 1, 1, -1)[:, None]
     across = np.stack([-np.sign(offset[:, 0]), 0 * reach, 0 * reach], axis=1)
     direction = np.where((wall < np.abs(reach - 1))[:, None], across, radial)
+    rest = np.where(labels[:, None] > 0, offset, np.nan)
+    return example_of(cloud, places, labels=labels, distances=distance, directions=direction, rest=rest)
+
+
+def example_of(
+    cloud: np.ndarray,
+    places: np.ndarray,
+    *,
+    labels: np.ndarray,
+    distances: np.ndarray,
+    directions: np.ndarray,
+    rest: np.ndarray,
+) -> dict[str, np.ndarray]:
+    """Arrays of an example as they are stored, of points and distances in the camera's frame and unit."""
+    low, high = cloud.min(axis=0), cloud.max(axis=0)
+    middle, scale = (low + high) / 2, 2 / (high - low).max()
     return {
         "cloud": ((cloud - middle) * scale).astype(np.float32),
-        "cloud_count": np.array(points, dtype=np.int32),
+        "cloud_count": np.array(len(cloud), dtype=np.int32),
         "center": middle,
         "scale": np.array(scale),
         "positions": ((places - middle) * scale).astype(np.float32),
         "labels": labels.astype(np.uint8),
-        "distances": distance.astype(np.float32),
-        "directions": direction.astype(np.float16),
-        "rest": np.where(labels[:, None] > 0, offset, np.nan).astype(np.float16),
+        "distances": (distances * scale).astype(np.float32),
+        "directions": directions.astype(np.float16),
+        "rest": rest.astype(np.float16),
     }
 
 

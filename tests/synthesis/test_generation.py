@@ -9,7 +9,8 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from folder_contents import contents
+from folder_contents import contents, read_json
+from numpy.random import Generator
 from safetensors.numpy import load_file
 from scene_code import CODE
 from scene_files import write_bar, write_mesh
@@ -63,7 +64,7 @@ def test_killed_and_resumed_equals_uninterrupted(
 ) -> None:
     made = 0
 
-    def stops(scene: Scene, settings: GenerateConfig, rng: np.random.Generator) -> Example:
+    def stops(scene: Scene, settings: GenerateConfig, rng: Generator) -> Example:
         nonlocal made
         if made == calls:
             raise KeyboardInterrupt
@@ -103,7 +104,7 @@ def test_tensors_are_as_documented_and_a_paper_size_dataset_fits_in_2_5_gigabyte
 
 
 def test_manifest_tells_how_to_make_it_again_and_files_have_the_users_permissions(whole: Path) -> None:
-    manifest = json.loads((whole / "manifest.json").read_text())
+    manifest = read_json(whole / "manifest.json")
     assert (manifest["scene"], manifest["seed"], manifest["examples"]) == ("toy", 3, 10)
     assert manifest["settings"]["sampling"]["per_segment"] == 16
     assert [part["name"] for part in manifest["segments"]] == list(TOY.rest.names)
@@ -236,7 +237,7 @@ def test_terms_are_added_to_a_sensor_and_all_are_off_by_default() -> None:
     ],
 )
 def test_unknown_and_contradictory_options_are_refused_before_anything_is_written(
-    options: str, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    options: str, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     try:
         code = command_line.main([*options.split(), "--output", str(tmp_path / "out")])
@@ -349,7 +350,7 @@ def test_views_that_see_too_little_are_drawn_again_and_a_scene_out_of_sight_is_n
     with pytest.raises(ValueError, match=rf"'toy' showed fewer than {MIN_POINTS} points in 100 random views"):
         sample_view(far, SETTINGS, example_rng(0, 0))
 
-    def sometimes_tiny(rng: np.random.Generator) -> tuple:
+    def sometimes_tiny(rng: Generator) -> tuple:
         tiny = bool(rng.random() < 0.5)
         return tuple((lambda p, d=d: 1e-3 * p) if tiny else d for d in sample_deformations(rng))
 

@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
+from numpy.testing import assert_array_equal
 from shapes import box
 
 from mereo.geometry.mesh import SegmentedMesh
@@ -59,10 +61,10 @@ def shapes() -> dict[str, Shape]:
 
 def one_at_a_time(shape: Shape, keep: int, draw: int, seed: int, nested: bool) -> Samples:
     """The paper's loop, one draw after the other."""
-    seeds = np.random.default_rng(seed).integers(0, 2**32, size=(shape.count, 4), dtype=np.uint32)
+    seeds = default_rng(seed).integers(0, 2**32, size=(shape.count, 4), dtype=np.uint32)
     points, labels = [], []
     for index, (low, high) in enumerate(extended_boxes(shape)):
-        stream = np.random.default_rng(seeds[index])
+        stream = default_rng(seeds[index])
         inside: list[tuple[np.ndarray, int]] = []
         outside: list[tuple[np.ndarray, int]] = []
         while len(inside) < draw or len(outside) < draw:
@@ -85,10 +87,10 @@ def one_at_a_time(shape: Shape, keep: int, draw: int, seed: int, nested: bool) -
 def test_equals_drawing_one_point_at_a_time(name: str, nested: bool) -> None:
     sampler = nested_sort_sample if nested else sort_sample
     for keep, draw in ((12, 12), (9, 30)):
-        fast = sampler(shapes()[name], keep, draw, np.random.default_rng(5))
+        fast = sampler(shapes()[name], keep, draw, default_rng(5))
         slow = one_at_a_time(shapes()[name], keep, draw, 5, nested)
-        np.testing.assert_array_equal(fast.points, slow.points)
-        np.testing.assert_array_equal(fast.labels, slow.labels)
+        assert_array_equal(fast.points, slow.points)
+        assert_array_equal(fast.labels, slow.labels)
 
 
 def test_batch_size_changes_no_bit_and_the_generator_advances_alike_whatever_is_drawn(
@@ -96,13 +98,13 @@ def test_batch_size_changes_no_bit_and_the_generator_advances_alike_whatever_is_
 ) -> None:
     """So the uniform points after it are comparable between samplers' settings."""
     shape = shapes()["balls"]
-    usual = sort_sample(shape, 40, 80, np.random.default_rng(1))
+    usual = sort_sample(shape, 40, 80, default_rng(1))
     for first, largest in ((1, 1 << 17), (300, 1 << 17), (8, 7)):
         monkeypatch.setattr(query_sampling, "_FIRST_BATCH", first)
         monkeypatch.setattr(query_sampling, "_LARGEST_BATCH", largest)
-        other = sort_sample(shape, 40, 80, np.random.default_rng(1))
-        np.testing.assert_array_equal(usual.points, other.points)
-    rngs = [np.random.default_rng(3) for _ in range(2)]
+        other = sort_sample(shape, 40, 80, default_rng(1))
+        assert_array_equal(usual.points, other.points)
+    rngs = [default_rng(3) for _ in range(2)]
     for rng, draw in zip(rngs, (20, 200), strict=True):
         sort_sample(shape, 20, draw, rng)
     assert rngs[0].random() == rngs[1].random()
@@ -110,30 +112,30 @@ def test_batch_size_changes_no_bit_and_the_generator_advances_alike_whatever_is_
 
 def test_the_nearest_surface_owns_nested_and_overlapping_solids() -> None:
     nested = Balls(((0, 0, 0), 3.0), ((0, 0, 0), 2.0), ((0, 0, 0), 1.0))
-    points = np.random.default_rng(0).uniform(-3.2, 3.2, size=(5000, 3))
+    points = default_rng(0).uniform(-3.2, 3.2, size=(5000, 3))
     radius = np.linalg.norm(points, axis=1)
     # the innermost ball that holds it, also just outside ball 3, whose surface is then the nearest of all
-    np.testing.assert_array_equal(owner_labels(nested, points), (radius < 3).astype(int) + (radius < 2) + (radius < 1))
+    assert_array_equal(owner_labels(nested, points), (radius < 3).astype(int) + (radius < 2) + (radius < 1))
     overlapping = Balls(((-0.6, 0, 0), 1.0), ((0.6, 0, 0), 1.0))
     points = points / 3.2
     lens = points[overlapping.inside(0, points) & overlapping.inside(1, points)]
     assert len(lens) > 100
     # equal radii: the first ball's surface is nearer where its centre is farther
-    np.testing.assert_array_equal(owner_labels(overlapping, lens), np.where(lens[:, 0] > 0, 1, 2))
+    assert_array_equal(owner_labels(overlapping, lens), np.where(lens[:, 0] > 0, 1, 2))
 
 
 @pytest.mark.parametrize("sampler", ["volume-uniform", "label-uniform", "sort-sample", "nested-sort-sample"])
 def test_queries_of_an_example(sampler: str) -> None:
     shape = shapes()["balls"]
     settings = replace(SamplingConfig(), sampler=sampler, per_segment=64, uniform_fraction=0.5)
-    samples = sample_queries(shape, settings, np.random.default_rng(2))
-    again = sample_queries(shape, settings, np.random.default_rng(2))
-    np.testing.assert_array_equal(samples.points, again.points)
+    samples = sample_queries(shape, settings, default_rng(2))
+    again = sample_queries(shape, settings, default_rng(2))
+    assert_array_equal(samples.points, again.points)
     assert len(samples.points) == len(samples.labels) == settings.total(3) == 64 * 3 + 96
     assert samples.labels.dtype == np.uint8
-    np.testing.assert_array_equal(samples.labels, shape.label(samples.points))
+    assert_array_equal(samples.labels, shape.label(samples.points))
     low, high = joint_box(shape)
-    np.testing.assert_array_equal([low, high], [[-1, -1, -1], [3.05, 1.75, 1]])
+    assert_array_equal([low, high], [[-1, -1, -1], [3.05, 1.75, 1]])
     unit = (samples.points[64 * 3 :] - low) / (high - low)
     assert 0 < unit.min() < unit.max() < 1
     assert np.abs(unit.mean(axis=0) - 0.5).max() < 4 * np.sqrt(1 / 12 / 96)
@@ -145,9 +147,9 @@ def test_settings_reach_the_sampler_and_uniform_points_are_the_papers_share_of_a
         total, near = SamplingConfig().total(segments), 256 * segments
         assert abs((total - near) - 0.15 * total) < 1
     shape, config = shapes()["balls"], SamplingConfig(per_segment=80, oversample=3, box_margin=0.8, uniform_fraction=0)
-    queries = sample_queries(shape, config, np.random.default_rng(4))
-    direct = sort_sample(shape, 40, 120, np.random.default_rng(4), extended_boxes(shape, 0.8))
-    np.testing.assert_array_equal(queries.points, direct.points)
+    queries = sample_queries(shape, config, default_rng(4))
+    direct = sort_sample(shape, 40, 120, default_rng(4), extended_boxes(shape, 0.8))
+    assert_array_equal(queries.points, direct.points)
 
 
 def test_bad_settings() -> None:
@@ -156,7 +158,7 @@ def test_bad_settings() -> None:
     with pytest.raises(ValueError, match=r"box_margin is 0.0; it must be greater than 0: give for example 0.5"):
         replace(SamplingConfig(), box_margin=0.0)
     with pytest.raises(ValueError, match="keep is 9 and draw is 8; .* pass keep <= draw"):
-        sort_sample(shapes()["balls"], 9, 8, np.random.default_rng(0))
+        sort_sample(shapes()["balls"], 9, 8, default_rng(0))
 
 
 @pytest.mark.parametrize(
@@ -179,4 +181,4 @@ def test_segments_that_are_never_hit_or_never_missed(
 ) -> None:
     monkeypatch.setattr(query_sampling, "MAX_DRAWS", 30_000)
     with pytest.raises(ValueError, match=f"^{message}$"):
-        sort_sample(Balls(*(((0, 0, 0), radius) for radius in radii)), 128, 128, np.random.default_rng(0))
+        sort_sample(Balls(*(((0, 0, 0), radius) for radius in radii)), 128, 128, default_rng(0))

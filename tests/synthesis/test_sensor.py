@@ -6,6 +6,7 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 import trimesh
+from numpy.random import default_rng
 from shapes import ball, box, one, segment
 from toy_scene import toy_scene
 
@@ -50,7 +51,7 @@ def slant(tilt_deg: float) -> np.ndarray:
 
 
 def look(solids: Solids, seed: int = 0, noise_std: float = 0.0, **terms: object) -> SimulatedView:
-    return observe(solids, CAMERA, noise_std, replace(OFF, **terms), np.random.default_rng(seed))  # type: ignore[arg-type]
+    return observe(solids, CAMERA, noise_std, replace(OFF, **terms), default_rng(seed))  # type: ignore[arg-type]
 
 
 def test_published_values() -> None:
@@ -94,7 +95,7 @@ def test_lateral_noise_reads_depth_beside_the_pixel(model: SensorModel) -> None:
 
 
 def test_depth_has_the_steps_of_whole_disparities_in_the_image_after_all_noise() -> None:
-    z_m = np.random.default_rng(0).uniform(0.4, 5.0, size=5000)
+    z_m = default_rng(0).uniform(0.4, 5.0, size=5000)
     steps = quantize(z_m, 1.0)
     disparity = 351.3 / steps
     assert np.allclose(disparity, np.rint(disparity))
@@ -127,7 +128,7 @@ def test_flying_pixels_lie_between_the_two_depths_at_an_edge_and_nowhere_else() 
         assert np.array_equal(look(solids, flying=1.0).whole.depth, look(solids).whole.depth)
     depth = np.zeros((5, 5))
     depth[2, 2] = 100.0
-    assert np.array_equal(mix_edges(depth, 150.0, 1.0, np.random.default_rng(0)), depth)
+    assert np.array_equal(mix_edges(depth, 150.0, 1.0, default_rng(0)), depth)
 
 
 @pytest.mark.parametrize("tilt_deg", [40.0, 65.0, 72.0])
@@ -150,7 +151,7 @@ def test_holes_take_the_expected_area() -> None:
 
 
 def masks(seen: np.ndarray, count: int = 300, **terms: float) -> np.ndarray:
-    drawn = (dict(zip(SENSOR_TERMS, np.random.default_rng(i).spawn(11), strict=True)) for i in range(count))
+    drawn = (dict(zip(SENSOR_TERMS, default_rng(i).spawn(11), strict=True)) for i in range(count))
     return np.stack([sample_mask(seen, replace(OFF, **terms), rngs) for rngs in drawn])
 
 
@@ -174,7 +175,7 @@ def test_the_mask_is_off_and_shifted_as_probably_as_asked() -> None:
 @pytest.mark.parametrize("name", [name for name in SENSORS if name != "paper"])
 def test_any_sensor_leaves_later_draws_as_they_were(name: str) -> None:
     solids = Solids(one(ball((0, 0, 150), 25.0)))
-    rngs = [np.random.default_rng(3) for _ in range(2)]
+    rngs = [default_rng(3) for _ in range(2)]
     for sensor, rng in zip((OFF, SENSORS[name]), rngs, strict=True):  # type: ignore[index]
         observe(solids, CAMERA, 0.1, sensor, rng)
     assert rngs[0].random() == rngs[1].random()
@@ -208,7 +209,7 @@ def test_depth_of_a_sphere_is_the_smaller_root_of_the_ray_equation() -> None:
 
 def test_noise_has_its_deviation_on_hits_only_and_neither_loses_nor_invents_any() -> None:
     image = render_depth(one(ball((0, 0, 150), 30.0)), NARROW)
-    draws = [add_depth_noise(image, 0.1, np.random.default_rng(seed)).depth - image.depth for seed in range(40)]
+    draws = [add_depth_noise(image, 0.1, default_rng(seed)).depth - image.depth for seed in range(40)]
     noise = np.stack(draws)
     assert (noise[:, ~image.valid] == 0).all()
     hits = noise[:, image.valid]
@@ -216,10 +217,10 @@ def test_noise_has_its_deviation_on_hits_only_and_neither_loses_nor_invents_any(
     assert abs(hits.std() / 0.1 - 1) < 5 / np.sqrt(2 * hits.size)
     # Gaussian tails: P(|x| > 2 sd) = 0.0455
     assert abs((np.abs(hits) > 0.2).mean() - 0.0455) < 5 * np.sqrt(0.0455 / hits.size)
-    assert np.array_equal(add_depth_noise(image, 500.0, np.random.default_rng(0)).valid, image.valid)
+    assert np.array_equal(add_depth_noise(image, 500.0, default_rng(0)).valid, image.valid)
     for std in (-0.1, float("nan"), float("inf")):
         with pytest.raises(ValueError, match=r"depth noise is .*; it is a standard deviation, finite and at least 0"):
-            add_depth_noise(image, std, np.random.default_rng(0))
+            add_depth_noise(image, std, default_rng(0))
 
 
 SIGHT = RAYS.reshape(-1, 3)
@@ -228,7 +229,7 @@ PAIR = Solids(SegmentedMesh((ball((-5, 0, 150), 15.0), box((12, -15, 140), (30, 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_rays_hit_a_capsule_where_they_hit_its_triangles(seed: int) -> None:
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     low, high = (-30, -30, 100), (30, 30, 160)
     start, end, radius = rng.uniform(low, high), rng.uniform(low, high), rng.uniform(3, 10)
     rows, hits = Capsule(start, end, radius).first_hit(SIGHT)
@@ -257,8 +258,7 @@ def test_a_capsule_without_length_is_a_ball_and_behind_the_camera_nothing() -> N
 
 
 BOXES = [
-    box(low, low + np.array([20, 12, 15]))
-    for low in np.random.default_rng(0).uniform((-40, -40, 90), (20, 20, 190), (8, 3))
+    box(low, low + np.array([20, 12, 15])) for low in default_rng(0).uniform((-40, -40, 90), (20, 20, 190), (8, 3))
 ]
 
 

@@ -5,6 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from folder_contents import read_json
+from numpy.random import Generator
+from numpy.testing import assert_allclose, assert_array_equal
 from toy_scene import Shear, rest_mesh, toy_scene
 
 from mereo import __main__ as command_line
@@ -38,18 +41,18 @@ def test_a_walk_starts_in_the_state_of_its_seed_and_moves_on_smoothly() -> None:
     scene = toy_scene()
     coarse, fine = (places(scene, 3, np.arange(0.0, 2.0, step)) for step in (0.1, 0.05))
     start = scene.deform(random_state(scene, 3).deformations).mesh.merged()[0]
-    np.testing.assert_allclose(coarse[0], start, atol=1e-9)
-    np.testing.assert_allclose(coarse, fine[::2])
+    assert_allclose(coarse[0], start, atol=1e-9)
+    assert_allclose(coarse, fine[::2])
     largest = [np.linalg.norm(np.diff(one, axis=0), axis=2).max() for one in (coarse, fine)]
     assert 0.4 < largest[1] / largest[0] < 0.65  # half the time, half the way
     assert np.linalg.norm(coarse[-1] - coarse[0], axis=1).max() > 1.0
     assert not np.allclose(places(scene, 4, np.array([0.0, 1.0])), coarse[[0, 10]])
     weights = process_weights(np.linspace(0.0, 5.3, 50))
-    np.testing.assert_allclose((weights**2).sum(axis=1), 1.0)
+    assert_allclose((weights**2).sum(axis=1), 1.0)
     assert weights.min() >= 0 and (np.count_nonzero(weights, axis=1) <= 4).all()
 
 
-def bent_or_not(rng: np.random.Generator) -> tuple[Deformation, ...]:
+def bent_or_not(rng: Generator) -> tuple[Deformation, ...]:
     shear = 3.0 * float(rng.uniform(-1.0, 1.0))
     is_bent = float(rng.uniform()) < 0.5
     bend = float(rng.uniform(0.1, 0.3)) if is_bent else 0.0
@@ -70,7 +73,7 @@ def test_draws_that_decide_what_else_is_drawn_stay_as_they_are(seed: int) -> Non
 def refusing(most: float) -> Scene:
     """A scene that draws again until its shear is small, and so refuses most of what lies between its states."""
 
-    def draw(rng: np.random.Generator) -> tuple[Deformation, ...]:
+    def draw(rng: Generator) -> tuple[Deformation, ...]:
         for _ in range(2000):
             a = float(rng.uniform(-1.0, 1.0))
             if abs(abs(a) - 0.5) < most:
@@ -87,7 +90,7 @@ def test_a_walk_goes_round_what_the_scene_refuses_and_tells_where_that_is_everyt
     assert (np.abs(np.abs(drawn) - 0.5) < 0.2).all() and len(np.unique(np.sign(drawn))) == 1 and np.ptp(drawn) > 0.01
     allowed: list[float] = []
 
-    def draw(rng: np.random.Generator) -> tuple[Deformation, ...]:
+    def draw(rng: Generator) -> tuple[Deformation, ...]:
         a = float(rng.uniform(-1.0, 1.0))
         allowed.append(a) if not allowed else None
         if a != allowed[0]:
@@ -99,7 +102,7 @@ def test_a_walk_goes_round_what_the_scene_refuses_and_tells_where_that_is_everyt
 
 
 def test_a_walk_does_not_jump_between_states_that_are_far_apart() -> None:
-    def draw(rng: np.random.Generator) -> tuple[Deformation, ...]:
+    def draw(rng: Generator) -> tuple[Deformation, ...]:
         return 4 * (Shear(90.0 * float(np.sign(rng.uniform(-1.0, 1.0))), 0.0, 0.0),)
 
     states = walk(Scene("sides", rest_mesh(), draw), 0, np.arange(20) / 10, 1.0)
@@ -121,7 +124,7 @@ def test_a_tool_passes_in_the_middle_and_the_camera_stays_near(moments: list[Mom
     assert min(turns) > np.cos(0.6) and moments[3].time_s == pytest.approx(0.25)
 
 
-def test_a_sequence_of_one_frame_and_test_seeds_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_sequence_of_one_frame_and_test_seeds_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     with pytest.raises(ValueError, match="0.01 s at 30 frames a second are 0 frames; a sequence has at least 2"):
         SequenceConfig(seconds=0.01)
     out = ["scene", "record", "rope", "--output", str(tmp_path / "x"), "--seed", "1000000"]
@@ -132,24 +135,24 @@ def test_a_sequence_of_one_frame_and_test_seeds_are_refused(tmp_path: Path, caps
 def test_a_recording_holds_frames_and_their_truth_to_be_played_again(tmp_path: Path, moments: list[Moment]) -> None:
     scene = toy_scene()
     write_recording(tmp_path, scene, SHORT, ("paper", SENSORS["paper"]), 5)
-    index, truth = json.loads((tmp_path / "recording.json").read_text()), np.load(tmp_path / "truth.npz")
+    index, truth = read_json(tmp_path / "recording.json"), np.load(tmp_path / "truth.npz")
     assert is_recording_folder(tmp_path) and len(index["frames"]) == 12 and index["unit_m"] == 0.005
     assert truth["counts"].tolist() == [[len(s.vertices), len(s.faces)] for s in moments[0].mesh.segments]
-    np.testing.assert_array_equal(truth["faces"], moments[0].mesh.merged()[1])
+    assert_array_equal(truth["faces"], moments[0].mesh.merged()[1])
     for number, (moment, frame) in enumerate(zip(moments, index["frames"], strict=True)):
         assert frame["time_s"] == moment.time_s and frame["points"] == moment.seen.object_points
-        np.testing.assert_allclose(truth["vertices"][number], moment.mesh.merged()[0], rtol=1e-5, atol=1e-5)
+        assert_allclose(truth["vertices"][number], moment.mesh.merged()[0], rtol=1e-5, atol=1e-5)
         image = InputConfig(intrinsics=tmp_path / "camera.json")
         cloud = read_frame(tmp_path / "frames" / frame["file"], image).cloud
-        np.testing.assert_allclose(cloud.points, 0.005 * moment.seen.image.to_points().points, atol=1e-4)
+        assert_allclose(cloud.points, 0.005 * moment.seen.image.to_points().points, atol=1e-4)
     shares = np.split(truth["draws"][7], np.cumsum(truth["sizes"])[:-1])
     mesh = scene.deform(played_back(scene, 5, shares).deformations).mesh.transformed(
         inverse_rigid(truth["T_world_camera"][7])
     )
-    np.testing.assert_allclose(mesh.merged()[0], truth["vertices"][7], atol=1e-4)
+    assert_allclose(mesh.merged()[0], truth["vertices"][7], atol=1e-4)
 
 
-def test_the_command_records_what_stream_answers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_records_what_stream_answers(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     out = tmp_path / "rope"
     small = ["--seconds", "0.2", "--rate", "10", "--seed", "3"]
     assert command_line.main(["scene", "record", "rope", "--output", str(out), *small]) == 0

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from answers import fit_correspondences
 from fit_cases import IN_FRONT, said, shown
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mereo.fitting.problem.residuals import Surface
 from mereo.geometry.transforms import transform_points
@@ -61,8 +62,8 @@ def test_what_a_line_of_sight_misses_or_meets_far_off_is_compared_with_the_neare
     beside, middle = high + np.array([1.0, 1.0, 0.0]), (low + high) / 2 + np.array([0.0, 0.0, 4.0])
     points = np.stack([beside, middle])
     for found, nearest in zip(at_rest.along_sight(points, 0.5), at_rest.nearest(points), strict=True):
-        np.testing.assert_array_equal(found, nearest)
+        assert_array_equal(found, nearest)
     distance, face, place = at_rest.along_sight(points, 100.0)
-    np.testing.assert_allclose(np.cross(place[1], middle), 0.0, atol=1e-9 * np.linalg.norm(middle) ** 2)
+    assert_allclose(np.cross(place[1], middle), 0.0, atol=1e-9 * np.linalg.norm(middle) ** 2)
     offset = np.einsum("i,i->", at_rest.normals[face[1]], middle - place[1])
     assert distance[1] == pytest.approx(abs(offset)) and distance[1] > at_rest.nearest(points)[0][1]

@@ -19,6 +19,7 @@ import pytest
 import trimesh
 from answers import answer_to
 from browser import Page, needs_browser, pixels_of, until
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from reported_scenes import ball, example, wall
 from toy_scene import rest_mesh, toy_scene
@@ -222,7 +223,7 @@ def test_the_command_prints_where_the_page_is_and_ends_cleanly(tmp_path: Path) -
 
 
 def test_without_viser_one_sentence_names_the_extra(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
     assert main(["view"]) == 2
@@ -264,7 +265,7 @@ def test_the_camera_stands_where_its_place_says_and_sees_the_state() -> None:
     assert np.arccos(offset[2] / 140.0) == pytest.approx(0.5)
     expected = laboratory.scene.deform(played.deformations).mesh
     for shown, wanted in zip(world.segments, expected.segments, strict=True):
-        np.testing.assert_allclose(shown.vertices, wanted.vertices, atol=1e-9)
+        assert_allclose(shown.vertices, wanted.vertices, atol=1e-9)
     # what was measured lies on the object, within the sensor's noise
     points = transform_points(view.T_world_camera, view.depth.to_points().points)
     low, high = expected.bounds
@@ -275,7 +276,7 @@ def test_pictures_do_not_flicker_and_follow_a_slider() -> None:
     laboratory = Laboratory(toy_scene(), None, None)
     played, place = random_state(laboratory.scene, 2), laboratory.first_place
     first, again = (laboratory.look(played, place).depth.depth for _ in range(2))
-    np.testing.assert_array_equal(first, again)
+    assert_array_equal(first, again)
     moved = set_value(laboratory.scene, played, parameters(played)[-1], 0.5)
     assert (laboratory.look(moved, place).depth.depth != first).any()
 
@@ -421,12 +422,12 @@ def test_a_page_that_is_damaged_or_another_one_is_none(folder: Path, old: str, n
 def test_our_own_glb_is_in_the_frame_of_the_input(folder: Path) -> None:
     scene = read_glb(folder / "segments.glb")
     assert scene.is_ours and scene.unit_m == pytest.approx(0.001) and scene.colors == (None, None)
-    np.testing.assert_allclose(scene.rotation, GLTF_CAMERA_ROTATION, atol=1e-12)
+    assert_allclose(scene.rotation, GLTF_CAMERA_ROTATION, atol=1e-12)
     assert scene.mesh.names == ("head", "tail") and scene.mesh.colors == found().colors
     for shown, segment in zip(scene.mesh.segments, found().segments, strict=True):
-        np.testing.assert_allclose(shown.vertices, segment.vertices, atol=1e-6)
+        assert_allclose(shown.vertices, segment.vertices, atol=1e-6)
     assert scene.radii is not None and scene.radii.calibrated
-    np.testing.assert_allclose(scene.radii.values, radii_of(found()).values, rtol=1e-5)
+    assert_allclose(scene.radii.values, radii_of(found()).values, rtol=1e-5)
 
 
 def write_strange(path: Path) -> None:
@@ -471,7 +472,7 @@ def test_a_folder_is_shown_with_all_that_its_files_keep(folder: Path) -> None:
     assert content.title == "frame <7>" and "2 segments" in content.facts and not content.is_doubtful
     assert content.verdict.startswith("Network alone") and content.unit.metres == pytest.approx(0.001)
     assert content.cloud is not None and content.depth is not None and content.depth[1] == ("500 mm", "700 mm")
-    np.testing.assert_allclose(content.cloud.points, example()[0].points, atol=1e-5)
+    assert_allclose(content.cloud.points, example()[0].points, atol=1e-5)
     assert content.depth[0].shape == (19, 24, 3) and content.verdict.endswith("may be cut off there.")
     assert tuple(content.colorings) == ("distance", SURE)
     colors, scale = content.colorings[SURE]()
@@ -505,7 +506,7 @@ def test_places_are_asked_of_a_results_surfaces(folder: Path) -> None:
     assert inside.distance[0] == pytest.approx(-size, rel=0.1) and outside.distance[0] > 4
     assert outside.radius95 is None and on_it.radius95 is not None
     assert on_it.radius95[0] == pytest.approx(0.001, rel=0.01)
-    np.testing.assert_allclose(rim, middle + inside.direction[0] * size, atol=3 * size)
+    assert_allclose(rim, middle + inside.direction[0] * size, atol=3 * size)
 
 
 def test_weights_without_a_model_are_asked_alone_and_it_is_said(rope: Model) -> None:
@@ -544,7 +545,7 @@ def test_what_cannot_be_shown_is_said_in_one_sentence(
     sentence: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    capsys: pytest.CaptureFixture,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for module in ("mereo_viewer.result_page", "mereo.api.view"):

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 from answers import answer_to
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from shapes import ball as round_ball
 
@@ -77,11 +79,11 @@ def test_an_orthographic_ball_has_its_closed_form_depth_and_area() -> None:
     x, y = (column + 0.5 - 80) * side, (row + 0.5 - 60) * side
     inner = x**2 + y**2 < 0.9
     # depth in the view frame, whose origin is the middle of the box
-    np.testing.assert_allclose(canvas.depth[seen][inner], -np.sqrt(1 - x**2 - y**2)[inner], atol=6e-3)
+    assert_allclose(canvas.depth[seen][inner], -np.sqrt(1 - x**2 - y**2)[inner], atol=6e-3)
     view = Viewpoint.along(np.array([[-1.0, -1, 4], [1, 1, 6]]), (0.0, 0.0, 2.0), (0.0, 0.0, 1.0))
     rotation = view.T_view_world[:3, :3]
-    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(rotation[2], [0, 0, 1])
+    assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert_allclose(rotation[2], [0, 0, 1])
 
 
 def test_a_pinhole_picture_is_the_camera_depth_image_in_colour() -> None:
@@ -92,7 +94,7 @@ def test_a_pinhole_picture_is_the_camera_depth_image_in_colour() -> None:
     row, column = np.nonzero(np.isfinite(canvas.depth))
     pixel = np.column_stack([column + 0.5, row + 0.5]) / SUPERSAMPLE
     points = camera.unproject(pixel, canvas.depth[row, column])
-    np.testing.assert_allclose(np.linalg.norm(points - [0.1, -0.2, 3], axis=1), 0.7, atol=4e-3)
+    assert_allclose(np.linalg.norm(points - [0.1, -0.2, 3], axis=1), 0.7, atol=4e-3)
 
 
 def test_nearer_things_hide_farther_ones() -> None:
@@ -115,7 +117,7 @@ def test_points_are_hidden_by_surfaces_and_by_nearer_points() -> None:
     colors = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 1]])
     canvas.draw_points(points, colors)
     picture = canvas.picture()
-    np.testing.assert_array_equal(picture[25, 25], [255, 0, 0])
+    assert_array_equal(picture[25, 25], [255, 0, 0])
     assert hue_is(picture, (0, 0, 255)).any()
     assert not hue_is(picture[15:35, 15:35], (0, 0, 255)).any()
 
@@ -126,7 +128,7 @@ def test_normals_are_smooth_on_a_ball_and_sharp_on_a_box() -> None:
     assert (normals * round_one.vertices[round_one.faces]).sum(axis=-1).min() > 0.9999
     box = trimesh.creation.box()
     sharp = corner_normals(np.array(box.vertices), np.array(box.faces))
-    np.testing.assert_allclose(sharp, np.repeat(box.face_normals[:, None], 3, axis=1), atol=1e-12)
+    assert_allclose(sharp, np.repeat(box.face_normals[:, None], 3, axis=1), atol=1e-12)
 
 
 def test_depth_colours_show_near_bright_and_missing_grey_and_sheets_hold_every_image_unchanged() -> None:
@@ -144,15 +146,15 @@ def test_depth_colours_show_near_bright_and_missing_grey_and_sheets_hold_every_i
 
 
 def test_voxel_faces_are_a_closed_outward_surface_of_the_right_volume() -> None:
-    grid = (np.random.default_rng(3).random((6, 5, 4)) > 0.6).astype(np.uint8)
+    grid = (default_rng(3).random((6, 5, 4)) > 0.6).astype(np.uint8)
     spacing = np.array([0.5, 1.0, 2.0])
     shown = voxel_triangles(grid, np.ones((1, 3)), np.array([3.0, 2.0, 1.0]), spacing)
     surface = Segment("voxels", PALETTE[0], shown.vertices, shown.faces)
     assert surface.volume == pytest.approx(grid.sum() * spacing.prod())
     low, high = surface.bounds
     filled = np.argwhere(grid)
-    np.testing.assert_allclose(low, [3, 2, 1] + (filled.min(axis=0) - 0.5) * spacing)
-    np.testing.assert_allclose(high, [3, 2, 1] + (filled.max(axis=0) + 0.5) * spacing)
+    assert_allclose(low, [3, 2, 1] + (filled.min(axis=0) - 0.5) * spacing)
+    assert_allclose(high, [3, 2, 1] + (filled.max(axis=0) + 0.5) * spacing)
 
 
 def labelled(
@@ -165,7 +167,7 @@ def labelled(
 
 
 def test_the_segmentation_is_wrong_anywhere_it_differs() -> None:
-    rng = np.random.default_rng(4)
+    rng = default_rng(4)
     truth, found = (rng.integers(0, 4, (8, 9, 10)).astype(np.uint8) for _ in range(2))
     error = segmentation_error(labelled(truth, found))
     assert np.array_equal(error >= 2, truth != found), "the paper's definition"
@@ -195,7 +197,7 @@ def test_a_comparison_has_the_reference_and_a_column_for_each_answer(tmp_path: P
 
 def test_offsets_are_pale_within_the_tolerance_and_for_rounding_and_full_at_the_end_of_the_scale() -> None:
     shown = offset_colors(np.array([-9.0, -FULL_CELLS, -TOLERANCE_CELLS, 0.0, TOLERANCE_CELLS, FULL_CELLS, 9.0]))
-    np.testing.assert_array_equal(shown, [UNDER, UNDER, PALE, PALE, PALE, OVER, OVER])
+    assert_array_equal(shown, [UNDER, UNDER, PALE, PALE, PALE, OVER, OVER])
     ramp = offset_colors(np.linspace(TOLERANCE_CELLS, FULL_CELLS, 9))
     assert (np.diff(ramp[:, 0]) < 0).all()  # the red of blue falls
     grid = np.indices((40, 40, 40)).transpose(1, 2, 3, 0)
@@ -205,7 +207,7 @@ def test_offsets_are_pale_within_the_tolerance_and_for_rounding_and_full_at_the_
     pale = np.isclose(offset_triangles(labelled(truth, moved)).colors, np.asarray(PALE) / 255, atol=0.08).all(axis=1)
     assert pale.mean() > 0.99
     exact = offset_triangles(labelled(truth, truth)).colors
-    np.testing.assert_allclose(exact, np.broadcast_to(np.asarray(PALE) / 255, exact.shape))
+    assert_allclose(exact, np.broadcast_to(np.asarray(PALE) / 255, exact.shape))
 
 
 def strips(picture: np.ndarray) -> int:
@@ -259,7 +261,7 @@ def test_a_preview_of_states_has_three_pictures_for_each_state(tmp_path: Path) -
     assert [red > 50 for red in reds[:6]] == [True, True, False] * 2
     toward = np.array([0.0, 0.6, 0.8])
     arrow = previews._arrow(np.ones(3), toward, 2.0).vertices - 1  # from the camera's side to the object
-    np.testing.assert_allclose(sorted({round(far, 6) for far in arrow @ toward}), [1.7, 2.06, 2.7])
+    assert_allclose(sorted({round(far, 6) for far in arrow @ toward}), [1.7, 2.06, 2.7])
     assert np.linalg.norm(arrow - np.outer(arrow @ toward, toward), axis=1).max() < 0.17
 
 
@@ -275,7 +277,7 @@ def ball_cells(radius: float) -> np.ndarray:
 
 
 def directions() -> np.ndarray:
-    drawn = np.random.default_rng(5).normal(size=(400, 3))
+    drawn = default_rng(5).normal(size=(400, 3))
     return np.asarray(drawn / np.linalg.norm(drawn, axis=1, keepdims=True))
 
 
@@ -295,8 +297,8 @@ def test_what_is_missing_is_the_farther_off_the_longer_it_is() -> None:
     found[20:] = False
     places = np.array([[x, 7.5, 9.5] for x in (10.0, 22.0, 26.0, 30.0)])
     offset = surface_offset(truth, found, np.ones(3), places)
-    np.testing.assert_allclose(offset, [0.0, -2.5, -6.5, -10.5], atol=0.3)
-    np.testing.assert_array_equal(surface_offset(found, truth, np.ones(3), places), -offset)
+    assert_allclose(offset, [0.0, -2.5, -6.5, -10.5], atol=0.3)
+    assert_array_equal(surface_offset(found, truth, np.ones(3), places), -offset)
 
 
 GREYS = ColorScale("grey", 1.0, 3.0, ((0, 0, 0), (100, 100, 100), (250, 250, 250)), ("low", "high"))
@@ -312,7 +314,7 @@ def test_a_scale_is_linear_between_its_stops_and_vertex_normals_of_a_ball_point_
     values = np.array([-5.0, 1.0, 1.5, 2.0, 2.5, 3.0, 9.0, np.nan])
     assert GREYS.colors(values)[:, 0].tolist() == [0, 0, 50, 100, 175, 250, 250, 128]
     segment = round_ball((1, 2, 3), 2.0, "one", 0, level=3)
-    np.testing.assert_allclose(vertex_normals(segment), (segment.vertices - [1, 2, 3]) / 2.0, atol=0.02)
+    assert_allclose(vertex_normals(segment), (segment.vertices - [1, 2, 3]) / 2.0, atol=0.02)
 
 
 def test_confidence_is_the_drop_of_probability_across_the_surface() -> None:
@@ -326,14 +328,14 @@ def test_confidence_is_the_drop_of_probability_across_the_surface() -> None:
         return Answer(probability.argmax(axis=1).astype(np.uint8), probability, nothing, np.zeros_like(points))
 
     sure, guessed = confidence(two_balls(), ask)
-    np.testing.assert_array_equal(sure, 1.0)
-    np.testing.assert_array_equal(guessed, 0.0)
+    assert_array_equal(sure, 1.0)
+    assert_array_equal(guessed, 0.0)
 
 
 def test_distance_to_what_was_observed_tells_seen_from_guessed() -> None:
     mesh = two_balls()
     one, two = observed_distance(mesh, mesh.segments[0].vertices)
-    np.testing.assert_array_equal(one, 0.0)
+    assert_array_equal(one, 0.0)
     assert two.min() == pytest.approx(2.0, abs=0.05)
     assert two.max() == pytest.approx(6.0, abs=0.05)
     scale = distance_scale([one, two], " mm")
@@ -346,8 +348,8 @@ def test_distance_to_what_was_observed_tells_seen_from_guessed() -> None:
 
 def test_a_ray_meets_the_nearest_surface_that_is_shown() -> None:
     mesh, origin, along = two_balls(), np.array([-9.0, 0.01, 0.02]), np.array([2.0, 0.0, 0.0])
-    np.testing.assert_allclose(first_point(mesh, origin, along, [True, True]), [-2.0, 0.01, 0.02], atol=0.05)
-    np.testing.assert_allclose(first_point(mesh, origin, along, [False, True]), [4.0, 0.01, 0.02], atol=0.05)
+    assert_allclose(first_point(mesh, origin, along, [True, True]), [-2.0, 0.01, 0.02], atol=0.05)
+    assert_allclose(first_point(mesh, origin, along, [False, True]), [4.0, 0.01, 0.02], atol=0.05)
     assert first_point(mesh, origin, along, [False, False]) is None
     assert first_point(mesh, origin, -along, [True, True]) is None
 
@@ -393,7 +395,7 @@ def test_the_colours_are_matplotlibs() -> None:
 
     values = np.concatenate([np.linspace(-0.2, 1.2, 5000), np.arange(257) / 256, [0.0, 1.0]])
     theirs = matplotlib.colormaps["viridis"](values, bytes=True)[:, :3]
-    np.testing.assert_array_equal(viridis(values), theirs)
+    assert_array_equal(viridis(values), theirs)
     assert viridis(np.full((2, 3), np.nan)).tolist() == [[TABLE[0].tolist()] * 3] * 2
 
 
@@ -405,7 +407,7 @@ def record(run: Path) -> MetricsLog:
 
 
 @pytest.mark.usefixtures("no_matplotlib")
-def test_a_run_without_curves_is_whole_and_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_without_curves_is_whole_and_says_why(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     log = record(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["metrics.csv"]
     assert log.is_written(3)
@@ -414,7 +416,7 @@ def test_a_run_without_curves_is_whole_and_says_why(tmp_path: Path, capsys: pyte
     )
 
 
-def test_a_run_with_curves_says_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_with_curves_says_nothing(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     log = record(tmp_path)
     with Image.open(tmp_path / "curves.png") as image:
         assert image.size == (1210, 440)
@@ -425,7 +427,7 @@ def test_a_run_with_curves_says_nothing(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 @pytest.mark.usefixtures("no_matplotlib")
-def test_an_experiment_asks_for_the_extra_before_it_starts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_experiment_asks_for_the_extra_before_it_starts(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert command_line.main(["experiment", "sampling", "--output", str(tmp_path / "out")]) == 2
     assert capsys.readouterr().err == (
         "mereo: error: matplotlib, which draws charts, is not installed: pip install 'mereo[plots]'\n"

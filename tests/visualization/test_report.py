@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from browser import Page, needs_browser, pixels_of, until
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from reported_scenes import ball, example, page_data, positions, wall
 
@@ -27,11 +28,11 @@ def test_the_page_holds_the_shapes_to_16_bits_of_the_box_and_needs_nothing_from_
     Report(cloud, mesh, summary).write(tmp_path / "r.html")
     data = page_data(tmp_path / "r.html")
     step = (np.asarray(data["high"]) - data["low"]).max() / 65535
-    np.testing.assert_allclose(positions(data, data["cloud"]["positions"]), cloud.points, atol=step)
+    assert_allclose(positions(data, data["cloud"]["positions"]), cloud.points, atol=step)
     for shown, segment in zip(data["segments"], mesh.segments, strict=True):
-        np.testing.assert_allclose(positions(data, shown["positions"]), segment.vertices, atol=step)
+        assert_allclose(positions(data, shown["positions"]), segment.vertices, atol=step)
         indices = np.frombuffer(base64.b64decode(shown["indices"]), "<u4").reshape(-1, 3)
-        np.testing.assert_array_equal(indices, segment.faces)
+        assert_array_equal(indices, segment.faces)
         assert (shown["name"], tuple(shown["color"])) == (segment.name, segment.color)
     assert not data["coarsened"]
     assert data["words"]["rows"][2] == ["\N{EN DASH}", "0", None]
@@ -108,7 +109,7 @@ def test_a_large_reconstruction_stays_under_the_budget_and_in_shape(tmp_path: Pa
     assert data["coarsened"]
     for i, shown in enumerate(data["segments"]):
         distance = np.linalg.norm(positions(data, shown["positions"]) - [0.2 * i, 0, 0.5], axis=1)
-        np.testing.assert_allclose(distance, 0.1, atol=0.002)
+        assert_allclose(distance, 0.1, atol=0.002)
     with pytest.raises(ValueError, match="at most 5000000: shorten the summary"):
         Report(cloud, mesh, {"title": "x" * BUDGET_BYTES}).write(tmp_path / "r2.html")
     assert not (tmp_path / "r2.html").exists()

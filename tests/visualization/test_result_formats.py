@@ -13,6 +13,8 @@ import trimesh
 from analytic import AnalyticModel, ball, logits_of, untrained
 from analytic import ball as distance_to_ball
 from answers import answer_to
+from folder_contents import read_json
+from numpy.testing import assert_allclose, assert_array_equal
 from overlapping import check_overlap
 from PIL import Image
 from reported_scenes import page_data
@@ -67,7 +69,7 @@ def test_every_format_is_written_where_the_table_says(answer: Answer, tmp_path: 
     second = {"segments.mtl", "points.npz"}
     assert names == {writer.file for writer in WRITERS.values()} | second | {"preview.png", "report.html"}
     assert sorted(path.name for path in (tmp_path / "all/stl").glob("[!.]*")) == ["1-big.stl", "2-small.stl"]
-    assert json.loads((tmp_path / "all/summary.json").read_text())["unit_m"] == 0.01
+    assert read_json(tmp_path / "all/summary.json")["unit_m"] == 0.01
 
 
 @pytest.mark.parametrize("millimetres, factor", [(False, 1.0), (True, 10.0)])
@@ -79,37 +81,37 @@ def test_units(found: Reconstruction, tmp_path: Path, millimetres: bool, factor:
     write_formats(out, formats, Results(*parts, GLTF_CAMERA_ROTATION, 0.01, millimetres))
     glb = trimesh.load_scene(out / "segments.glb")
     place = trimesh.transform_points(glb.geometry["big"].vertices, glb.graph["big"][0]).mean(axis=0)
-    np.testing.assert_allclose(place, 0.01 * center * [1, -1, -1], atol=1e-5)
+    assert_allclose(place, 0.01 * center * [1, -1, -1], atol=1e-5)
     for path in (out / "segments.ply", out / "segments.obj"):
         bounds = trimesh.load_mesh(path, process=False).bounds
-        np.testing.assert_allclose(bounds[0], factor * (center - BIG[1]), atol=0.002 * factor)
+        assert_allclose(bounds[0], factor * (center - BIG[1]), atol=0.002 * factor)
     stl = trimesh.load_mesh(out / "stl/1-big.stl")
-    np.testing.assert_allclose(stl.centroid, factor * center, atol=0.002 * factor)
+    assert_allclose(stl.centroid, factor * center, atol=0.002 * factor)
     points = trimesh.load(out / "points.ply", process=False).vertices
-    np.testing.assert_allclose(points, factor * view(), atol=1e-6 * factor)
+    assert_allclose(points, factor * view(), atol=1e-6 * factor)
     with np.load(out / "points.npz") as stored:
-        np.testing.assert_allclose(stored["points"], view())
+        assert_allclose(stored["points"], view())
     origin = re.search(r'Origin="(.*?)"', (out / "labels.vti").read_text())
     assert origin is not None
-    np.testing.assert_allclose([float(value) for value in origin[1].split()], factor * found.labels.origin)
+    assert_allclose([float(value) for value in origin[1].split()], factor * found.labels.origin)
     head = (out / "labels.seg.nrrd").read_bytes().partition(b"\n\n")[0].decode()
     origin = re.search(r"space origin: \((.*)\)", head)
     assert origin is not None
-    np.testing.assert_allclose([float(value) for value in origin[1].split(",")], 10.0 * found.labels.origin)
+    assert_allclose([float(value) for value in origin[1].split(",")], 10.0 * found.labels.origin)
 
 
 def test_observed_points_have_the_segment_they_lie_on(found: Reconstruction) -> None:
     """Although half of them are outside of the surface by rounding, where empty space is the most likely class."""
     cloud = found.observed
     assert cloud is not None and cloud.names == NAMES
-    np.testing.assert_array_equal(cloud.labels, np.repeat([1, 2], 600))
-    np.testing.assert_allclose(cloud.occupancy[cloud.points[:, 1] < 0.22], 0.5, atol=0.01)
-    np.testing.assert_array_equal(cloud.points, view())
+    assert_array_equal(cloud.labels, np.repeat([1, 2], 600))
+    assert_allclose(cloud.occupancy[cloud.points[:, 1] < 0.22], 0.5, atol=0.01)
+    assert_array_equal(cloud.points, view())
     logits = np.log(np.array([[0.5, 0.4, 0.1], [0.98, 0.005, 0.015]], dtype=np.float32))
     cloud = segment_points(logits, np.zeros((2, 3)), NAMES, PALETTE[:2])
-    np.testing.assert_array_equal(cloud.labels, [1, 2])
-    np.testing.assert_allclose(cloud.confidence, [0.8, 0.75], rtol=1e-5)
-    np.testing.assert_allclose(cloud.occupancy, [0.5, 0.02], rtol=1e-5)
+    assert_array_equal(cloud.labels, [1, 2])
+    assert_allclose(cloud.confidence, [0.8, 0.75], rtol=1e-5)
+    assert_allclose(cloud.occupancy, [0.5, 0.02], rtol=1e-5)
 
 
 def test_points_without_labels_are_refused(tmp_path: Path) -> None:
@@ -120,7 +122,7 @@ def test_points_without_labels_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_missing_extra_is_said_before_the_work(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     monkeypatch.setitem(sys.modules, "nibabel", None)
     arguments = ["reconstruct", "absent.ply", "--weights", "rope", "--output", str(tmp_path / "o"), "--formats", "all"]
@@ -179,7 +181,7 @@ def test_files_show_the_inner_segment_through_the_outer_one(
     assert outer["alphaMode"] == "BLEND" and outer["pbrMetallicRoughness"]["baseColorFactor"][3] == OUTER_OPACITY < 1
     page = page_data(tmp_path / "out" / "report.html")
     assert [segment["opacity"] for segment in page["segments"]] == [1.0, OUTER_OPACITY]
-    assert json.loads((tmp_path / "out" / "summary.json").read_text())["nested"] == [["core", "organ"]]
+    assert read_json(tmp_path / "out" / "summary.json")["nested"] == [["core", "organ"]]
     picture = np.asarray(Image.open(tmp_path / "out" / "preview.png")).astype(int)
     alone = replace(result.surfaces, nested=())
     render_cloud_and_segments(tmp_path / "opaque.png", PointCloud(CLOUD), alone, "mereo reconstruction")
@@ -189,7 +191,7 @@ def test_files_show_the_inner_segment_through_the_outer_one(
 
 def test_weights_remember_it(tmp_path: Path) -> None:
     data = write_toy_dataset(tmp_path / "data")
-    manifest = json.loads((data / "manifest.json").read_text())
+    manifest = read_json(data / "manifest.json")
     first, second = (segment["name"] for segment in manifest["segments"][:2])
     (data / "manifest.json").write_text(json.dumps({**manifest, "nested": [[first, second]]}))
     assert load_model(train(data, tmp_path / "run", replace(RECIPE, epochs=1))).nested == ((first, second),)

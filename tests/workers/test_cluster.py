@@ -168,7 +168,7 @@ def test_precision_is_decided_once(rope: Model) -> None:
     ],
 )
 def test_a_wrong_address_is_one_sentence(
-    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'mereo[cluster]'")
     monkeypatch.chdir(tmp_path)
@@ -184,13 +184,10 @@ def test_a_wrong_address_is_one_sentence(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_single_frame_is_no_task(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_single_frame_is_no_task(working_folder: Path, capsys: pytest.CaptureFixture) -> None:
     for line, sentence in (
-        (f"reconstruct {tmp_path}/a.ply --weights rope --output out --ray local", "--ray is for several frames"),
-        (f"learn {tmp_path}/a.stl --output out --ray local", "--ray is for a folder of objects"),
+        (f"reconstruct {working_folder}/a.ply --weights rope --output out --ray local", "--ray is for several frames"),
+        (f"learn {working_folder}/a.stl --output out --ray local", "--ray is for a folder of objects"),
         ("evaluate bunny --output out --scans --ray local", "--scans are few and are scored here: leave out --ray"),
         ("evaluate bunny --output out --gpus-per-task 1", "are for tasks of a cluster"),
     ):
@@ -217,7 +214,7 @@ def test_objects_of_a_folder(tmp_path: Path) -> None:
 
 
 def test_a_failed_object_stops_no_other_and_the_same_call_continues(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     learnt: list[str] = []
 

@@ -20,7 +20,7 @@ import psutil
 import pytest
 from angle import write_angle
 from browser import until
-from folder_contents import contents
+from folder_contents import contents, read_json
 from many_frames import content, frames, loads, run
 from toy_data import SMALL
 from toy_scene import toy_scene
@@ -168,13 +168,13 @@ def test_scores_are_those_of_one_process(rope: Model, tmp_path: Path) -> None:
     for name, workers in places.items():
         config = EvaluationConfig(examples=5, cells=24, method="modes")
         evaluate_weights(rope, tmp_path / name, config, workers=workers)
-    here, one, two = (without_seconds(json.loads((tmp_path / name / "metrics.json").read_text())) for name in places)
+    here, one, two = (without_seconds(read_json(tmp_path / name / "metrics.json")) for name in places)
     assert here == one == two and here["examples"] == 5
     assert (tmp_path / "one/errors.png").read_bytes() == (tmp_path / "two/errors.png").read_bytes()
 
 
 def test_frames_have_the_answers_of_one_process(
-    tmp_path: Path, loads: list[str], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, loads: list[str], capsys: pytest.CaptureFixture
 ) -> None:
     folder = frames(tmp_path / "frames", "a.npy", "b.npy", "c.npy")
     (folder / "bad.ply").write_text("nonsense")

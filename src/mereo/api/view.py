@@ -3,13 +3,11 @@
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-from jaxtyping import Float
-
 from mereo.api.objects import Source, object_of
 from mereo.api.reconstruct import reconstruct_observation
 from mereo.api.words import python_words
 from mereo.fitting.registration.answer import Answer
+from mereo.geometry.transforms import Vector
 from mereo.io.bounds import Port, check_value
 from mereo.io.config import InputConfig
 from mereo.io.errors import checked_path
@@ -87,7 +85,7 @@ def view(
                 seen = find_object(frame, isolation)
                 return reconstruct_observation(seen, known, resolution=resolution, isolation=isolation)
 
-            def answer_at(place: Float[np.ndarray, "3"]) -> Answer:
+            def answer_at(place: Vector) -> Answer:
                 assert image is not None
                 column, row = image.camera.project(place[None])[0].tolist()
                 return answer(replace(stated, point=(column, row)))

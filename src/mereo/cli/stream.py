@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from mereo.cli.answers import StreamCommand
 from mereo.cli.options import check_named, loaded_object
@@ -35,6 +34,7 @@ from mereo.fitting.tracking import SynchronousExecutor
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import owned_centroids
+from mereo.geometry.transforms import Transform, Vector
 from mereo.io.atomic_files import atomic_file, check_place, remove_abandoned, to_json
 from mereo.io.config import InputConfig
 from mereo.io.errors import is_foreseen, words_of
@@ -494,11 +494,11 @@ class FrameAnswer:
         return cls(mesh, {**facts, "strays": strays, "segments": segments})
 
 
-def _rows(pose: Float[np.ndarray, "4 4"]) -> list[list[float]]:
+def _rows(pose: Transform) -> list[list[float]]:
     return [[round(value, DIGITS) for value in row] for row in pose.tolist()]
 
 
-def _facts(centroid: Float[np.ndarray, "3"], volume: float) -> dict[str, Any]:
+def _facts(centroid: Vector, volume: float) -> dict[str, Any]:
     return {"centroid": [round(float(value), DIGITS) for value in centroid], "volume": volume}
 
 

@@ -13,8 +13,10 @@ from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Integer
 from scipy.spatial.transform import Rotation
+
+from mereo.geometry.transforms import Points, Vector
 
 STEP, TOLERANCE = 1e-6, 1e-7
 """Step of finite differences, which err by 1e-6 in truncation, 1e-10 in rounding, and tolerance at which Newton's
@@ -27,7 +29,7 @@ ITERATIONS, LEAST_DETERMINANT = 30, 0.02
 class Deformation(Protocol):
     """Map of space, for any number of points at once, each moved independently of the others."""
 
-    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, points: Points) -> Points:
         """Images of points, in the points' unit."""
 
 
@@ -35,9 +37,7 @@ class Deformation(Protocol):
 class Invertible(Protocol):
     """Deformation that can undo itself better than Newton's method: exactly, or where finite differences mislead."""
 
-    def rest_points(
-        self, points: Float[np.ndarray, "n 3"], guess: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    def rest_points(self, points: Points, guess: Points) -> tuple[Points, Bool[np.ndarray, " n"]]:
         """Rest points whose image is ``points``, and which of them were found; arguments as for ``invert``."""
 
 
@@ -45,7 +45,7 @@ class Invertible(Protocol):
 class Identity:
     """Deformation that leaves every point where it is."""
 
-    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, points: Points) -> Points:
         """The points themselves."""
         return points
 
@@ -54,11 +54,11 @@ class Identity:
 class Rigid:
     """Rigid motion: a turn about ``center`` by ``rotation_vector`` (axis times radians), then ``translation``."""
 
-    rotation_vector: Float[np.ndarray, "3"]
-    translation: Float[np.ndarray, "3"]
-    center: Float[np.ndarray, "3"]
+    rotation_vector: Vector
+    translation: Vector
+    center: Vector
 
-    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, points: Points) -> Points:
         """Points after the turn and the shift."""
         return (points - self.center) @ self._matrix.T + (self.center + self.translation)
 
@@ -74,7 +74,7 @@ class Compose:
 
     parts: tuple[Deformation, ...]
 
-    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, points: Points) -> Points:
         """Points after all parts."""
         for part in self.parts:
             points = part(points)
@@ -93,7 +93,7 @@ class Localized:
     """
 
     inner: Deformation
-    center: Float[np.ndarray, "3"]
+    center: Vector
     inner_radius: float
     outer_radius: float
     samples: int = 13
@@ -115,7 +115,7 @@ class Localized:
                 "over: make its displacement smaller or its transition wider"
             )
 
-    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, points: Points) -> Points:
         """Points after the part of ``inner`` that reaches them."""
         distance = np.linalg.norm(points - self.center, axis=1, keepdims=True)
         weight = 1.0 - smooth_step((distance - self.inner_radius) / (self.outer_radius - self.inner_radius))
@@ -128,7 +128,16 @@ def smooth_step(t: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     return t * t * t * (t * (6.0 * t - 15.0) + 10.0)
 
 
-def unit(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+def moved_by(points: Points, owner: Integer[np.ndarray, " n"], deformations: tuple[Deformation, ...]) -> Points:
+    """Images of points, each by the deformation of its ``owner``'s number."""
+    result = np.empty_like(points)
+    for index in np.unique(owner):
+        rows = owner == index
+        result[rows] = deformations[index](points[rows])
+    return result
+
+
+def unit(vector: Vector) -> Vector:
     """Unit vector along ``vector``. Raises ``ValueError`` when it has no direction."""
     length = float(np.linalg.norm(vector))
     if not (np.isfinite(length) and length > 0):
@@ -137,11 +146,11 @@ def unit(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
 
 
 def turn(
-    points: Float[np.ndarray, "n 3"],
-    center: Float[np.ndarray, "3"],
-    axis: Float[np.ndarray, "3"],
+    points: Points,
+    center: Vector,
+    axis: Vector,
     angle_rad: np.ndarray,
-) -> Float[np.ndarray, "n 3"]:
+) -> Points:
     """Points turned about the line through ``center`` along the unit ``axis``, each by its own angle ("n").
 
     Rodrigues' formula; one axis for all makes it several times faster than a rotation object for each point.
@@ -162,9 +171,7 @@ def crossing(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
     return result
 
 
-def jacobian(
-    deformation: Deformation, points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
+def jacobian(deformation: Deformation, points: Points) -> tuple[Points, Float[np.ndarray, "n 3 3"]]:
     """Images ``f(x)`` and Jacobians ``J[:, i, j] = df_i / dx_j`` of a map, by forward differences.
 
     One call of the map with four times the points.
@@ -175,14 +182,12 @@ def jacobian(
     return value[0], np.moveaxis((value[1:] - value[0]) / step, 0, -1)
 
 
-def jacobian_determinant(deformation: Deformation, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+def jacobian_determinant(deformation: Deformation, points: Points) -> Float[np.ndarray, " n"]:
     """Growth of volume at each point: 1 is rigid or volume preserving, 0 or less folds space over."""
     return np.linalg.det(jacobian(deformation, points)[1])
 
 
-def invert(
-    deformation: Deformation, points: Float[np.ndarray, "n 3"], guess: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+def invert(deformation: Deformation, points: Points, guess: Points) -> tuple[Points, Bool[np.ndarray, " n"]]:
     """Rest points whose image is ``points``: by the deformation itself where it is ``Invertible``, else by ``newton``.
 
     It starts at ``guess``, for example the rest positions of the nearest deformed vertices. Returns also for each
@@ -193,9 +198,7 @@ def invert(
     return newton(deformation, points, guess)
 
 
-def newton(
-    deformation: Deformation, points: Float[np.ndarray, "n 3"], guess: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+def newton(deformation: Deformation, points: Points, guess: Points) -> tuple[Points, Bool[np.ndarray, " n"]]:
     """Rest points found by damped Newton's method with finite differences, all points at once; see ``invert``.
 
     A step is kept where the distance to the target falls by at least half of what the linear model promises; else
@@ -222,7 +225,7 @@ def newton(
     return rest, error <= tolerance
 
 
-def _solve(matrix: Float[np.ndarray, "n 3 3"], right: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def _solve(matrix: Float[np.ndarray, "n 3 3"], right: Points) -> Points:
     """Cramer's rule, with a zero step where the matrix is singular (LAPACK would refuse the whole batch)."""
     a, b, c = (np.ascontiguousarray(matrix[:, :, k]) for k in range(3))
     bc = np.cross(b, c)
@@ -233,7 +236,7 @@ def _solve(matrix: Float[np.ndarray, "n 3 3"], right: Float[np.ndarray, "n 3"]) 
     return np.where(regular[:, None], solution / np.where(regular, determinant, 1.0)[:, None], 0.0)
 
 
-def _magnitude(points: Float[np.ndarray, "n 3"]) -> float:
+def _magnitude(points: Points) -> float:
     """The largest coordinate, the scale of rounding errors; 1 where there is none."""
     largest = float(np.abs(points).max(initial=0.0))
     return largest if largest > 0 else 1.0

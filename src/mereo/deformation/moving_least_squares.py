@@ -17,6 +17,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from mereo.geometry.downsampling import farthest_point_order
+from mereo.geometry.transforms import Points, longest_side
 
 ANCHORS = 200
 """Surface vertices of each segment that points may follow, spread evenly: the nearest of all lie on one small patch,
@@ -61,11 +62,11 @@ class Anchors:
         """Search tree over the positions."""
         return cKDTree(self.position)
 
-    def weights(self, points: Float[np.ndarray, "n 3"]) -> PointWeights:
+    def weights(self, points: Points) -> PointWeights:
         """Weights by which points move with the anchors; an anchor's falls with the fourth power of its distance."""
         count = min(FOLLOWED, len(self.index))
         distance, near = self.tree.query(points, k=range(1, count + 1))
-        size = float(np.ptp(self.position, axis=0).max())
+        size = longest_side(self.position)
         influence = 1.0 / (distance**2 + (SOFTENING * size) ** 2) ** 2
         influence /= influence.sum(axis=1, keepdims=True)
         offset = (self.position[near] - points[:, None]) / size
@@ -78,6 +79,6 @@ class Anchors:
         return PointWeights(self.index[near], weight / weight.sum(axis=1, keepdims=True))
 
 
-def spread(points: Float[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, " m"]:
+def spread(points: Points, count: int) -> Int[np.ndarray, " m"]:
     """Indices of at most ``count`` points, evenly spread (farthest-point order)."""
     return farthest_point_order(points.astype(np.float32), min(count, len(points)))

@@ -20,9 +20,9 @@ from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, Localized, Rigid, unit
 from mereo.deformation.warps import Bend, FreeFormLattice, SmoothField, Squash, Taper, Twist
 from mereo.geometry.mesh import SegmentedMesh, vertex_normals
+from mereo.geometry.transforms import Corners, Points, Vector
 
 Range = tuple[float, float]
-Vector = Float[np.ndarray, "3"]
 
 Surface = Callable[[], tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 3"]]]
 """Vertices of what is to be moved, as the maps before have left them, and outward unit normals."""
@@ -44,7 +44,7 @@ class DeformationSampler(Protocol):
 class LatticeSampler:
     """Free-form lattices over a box; the control points move by at most ``strength`` of what is injective."""
 
-    bounds: Float[np.ndarray, "2 3"]
+    bounds: Corners
     cells: tuple[int, int, int]
     strength: float
 
@@ -282,23 +282,21 @@ def _surface(
     return np.concatenate([s.vertices for s in moved]), np.concatenate([vertex_normals(s) for s in moved])
 
 
-def distance_from_line(points: Float[np.ndarray, "n 3"], origin: Vector, axis: Vector) -> float:
+def distance_from_line(points: Points, origin: Vector, axis: Vector) -> float:
     """Largest distance of the points; that of all of a mesh is at a vertex, because the distance is convex."""
     local = points - origin
     across = local - np.outer(local @ unit(axis), unit(axis))
     return float(np.linalg.norm(across, axis=1).max())
 
 
-def default_cells(bounds: Float[np.ndarray, "2 3"]) -> tuple[int, int, int]:
+def default_cells(bounds: Corners) -> tuple[int, int, int]:
     """Cells of a lattice over a box: roughly cubes, two along the shortest side and at most six along the longest."""
     sides = bounds[1] - bounds[0]
     x, y, z = np.clip(np.rint(2 * sides / sides.min()), 2, 6).astype(int)
     return int(x), int(y), int(z)
 
 
-def cubic_cells(
-    bounds: Float[np.ndarray, "2 3"], spacing: float
-) -> tuple[Float[np.ndarray, "2 3"], tuple[int, int, int]]:
+def cubic_cells(bounds: Corners, spacing: float) -> tuple[Corners, tuple[int, int, int]]:
     """Box around a box, with its middle, that whole cubes fill, and how many of them go along each side."""
     x, y, z = np.maximum(np.ceil((bounds[1] - bounds[0]) / spacing - 1e-6), 1).astype(int)
     half = np.array([x, y, z]) * spacing / 2

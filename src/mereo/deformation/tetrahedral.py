@@ -22,6 +22,8 @@ from mereo.deformation.maps import newton, smooth_step
 from mereo.geometry.downsampling import farthest_point_order
 from mereo.geometry.mesh import barycentric
 from mereo.geometry.read_only import read_only, read_only_view
+from mereo.geometry.solids import search_tree
+from mereo.geometry.transforms import Points, longest_side
 
 
 class Tetrahedra:
@@ -30,7 +32,7 @@ class Tetrahedra:
     Raises ``ValueError`` for NaN, indices that do not exist, and tetrahedra without volume.
     """
 
-    def __init__(self, nodes: Float[np.ndarray, "n 3"], elements: Int[np.ndarray, "m 4"]) -> None:
+    def __init__(self, nodes: Points, elements: Int[np.ndarray, "m 4"]) -> None:
         if len(elements) == 0:
             raise ValueError("there are no tetrahedra; at least one is needed: export the volume mesh")
         if not np.isfinite(nodes).all():
@@ -45,7 +47,7 @@ class Tetrahedra:
         self.elements = read_only_view(np.ascontiguousarray(elements, dtype=np.int64))
         edges = _edges(self.nodes, self.elements)
         self.volumes = np.linalg.det(edges) / 6
-        size = float(np.ptp(self.nodes, axis=0).max())
+        size = longest_side(self.nodes)
         if (flat := np.abs(self.volumes) <= 1e-12 * size**3).any():
             raise ValueError(
                 f"tetrahedron {np.argmax(flat)} has no volume at rest; it must have some: remove it from the mesh"
@@ -58,7 +60,7 @@ class Tetrahedra:
 
     @cached_property
     def _tree(self) -> igl.AABB:
-        return _tree(self.nodes, self.elements)
+        return search_tree(self.nodes, self.elements)
 
     @cached_property
     def surface(self) -> Int[np.ndarray, "f 3"]:
@@ -68,7 +70,7 @@ class Tetrahedra:
 
     @cached_property
     def _surface_tree(self) -> igl.AABB:
-        return _tree(self.nodes, self.surface)
+        return search_tree(self.nodes, self.surface)
 
     @cached_property
     def _node_mean(self) -> csr_array:
@@ -83,11 +85,11 @@ class Tetrahedra:
         """Gradients of the linear functions that are 1 at a tetrahedron's corner and 0 at its others."""
         return np.concatenate([-self._rest_inverse.sum(axis=1, keepdims=True), self._rest_inverse], axis=1)
 
-    def volume_ratios(self, nodes: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " m"]:
+    def volume_ratios(self, nodes: Points) -> Float[np.ndarray, " m"]:
         """Volume of each tetrahedron at other node positions, of that at rest; 0 or less where it is inverted."""
         return np.linalg.det(_edges(nodes, self.elements)) / (6 * self.volumes)
 
-    def gradients(self, nodes: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3 3"]:
+    def gradients(self, nodes: Points) -> Float[np.ndarray, "m 3 3"]:
         """Deformation gradients A of all tetrahedra at other node positions."""
         return _edges(nodes, self.elements) @ self._rest_inverse
 
@@ -132,7 +134,7 @@ class TetrahedralMap:
     """
 
     rest: Tetrahedra
-    nodes: Float[np.ndarray, "n 3"]
+    nodes: Points
 
     @cached_property
     def _gradients(self) -> Float[np.ndarray, "m 3 3"]:
@@ -168,7 +170,7 @@ class TetrahedralMap:
         Where the deformed mesh overlaps itself one of the answers is given.
         """
         elements = self.rest.elements
-        element = _locate(_tree(self.nodes, elements), self.nodes, elements, points)
+        element = _locate(search_tree(self.nodes, elements), self.nodes, elements, points)
         inside = element >= 0
         rest, converged = np.empty_like(points, dtype=np.float64), inside.copy()
         first = elements[element[inside], 0]
@@ -179,21 +181,15 @@ class TetrahedralMap:
         return rest, converged
 
 
-def _edges(nodes: Float[np.ndarray, "n 3"], elements: Int[np.ndarray, "m 4"]) -> Float[np.ndarray, "m 3 3"]:
+def _edges(nodes: Points, elements: Int[np.ndarray, "m 4"]) -> Float[np.ndarray, "m 3 3"]:
     """Edges from the first node as columns."""
     corners = nodes[elements]
     return np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
 
 
-def _tree(vertices: Float[np.ndarray, "n 3"], elements: Int[np.ndarray, "m k"]) -> igl.AABB:
-    tree = igl.AABB()
-    tree.init(vertices, elements)
-    return tree
-
-
 def _locate(
     tree: igl.AABB,
-    nodes: Float[np.ndarray, "n 3"],
+    nodes: Points,
     elements: Int[np.ndarray, "m 4"],
     points: Float[np.ndarray, "p 3"],
 ) -> Int[np.ndarray, " p"]:
@@ -241,7 +237,7 @@ class Surface:
 
     @cached_property
     def _tree(self) -> igl.AABB:
-        return _tree(self.vertices, self.faces)
+        return search_tree(self.vertices, self.faces)
 
     @cached_property
     def solver(self) -> Float[np.ndarray, "k c"]:

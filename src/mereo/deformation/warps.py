@@ -14,6 +14,7 @@ from scipy.ndimage import map_coordinates
 
 from mereo.deformation.draw_names import named
 from mereo.deformation.maps import crossing, smooth_step, turn, unit
+from mereo.geometry.transforms import Corners, Points, Vector, unit_rows
 
 LATTICE_LIMIT = 1 / 2.48
 """Choi & Lee, "Injectivity conditions of 2D and 3D uniform cubic B-spline functions", Graphical Models 62, 2000."""
@@ -32,9 +33,9 @@ class Bend:
             which keeps the Jacobian, 1 minus curvature times the offset toward the centre, positive.
     """
 
-    origin: Float[np.ndarray, "3"]
-    axis: Float[np.ndarray, "3"]
-    toward: Float[np.ndarray, "3"]
+    origin: Vector
+    axis: Vector
+    toward: Vector
     length: float
     angle_rad: float
     radius: float
@@ -42,7 +43,7 @@ class Bend:
     def __post_init__(self) -> None:
         _check_curvature(abs(self.angle_rad) / self.length, self.radius)
 
-    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, points: Points) -> Points:
         """Images of points, in the points' unit."""
         axis = unit(self.axis)
         side = unit(self.toward - (self.toward @ axis) * axis)
@@ -66,12 +67,12 @@ class Twist:
     Preserves volume exactly, whatever the angle: the Jacobian is 1 (Barr 1984).
     """
 
-    origin: Float[np.ndarray, "3"]
-    axis: Float[np.ndarray, "3"]
+    origin: Vector
+    axis: Vector
     length: float
     angle_rad: float
 
-    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, points: Points) -> Points:
         """Images of points, in the points' unit."""
         axis = unit(self.axis)
         weight = smooth_step((points - self.origin) @ axis / self.length)
@@ -85,15 +86,15 @@ class Taper:
     The Jacobian is the square of the local factor.
     """
 
-    origin: Float[np.ndarray, "3"]
-    axis: Float[np.ndarray, "3"]
+    origin: Vector
+    axis: Vector
     length: float
     factor: float
 
     def __post_init__(self) -> None:
         _check_factor(self.factor)
 
-    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, points: Points) -> Points:
         """Images of points, in the points' unit."""
         axis = unit(self.axis)
         local = points - self.origin
@@ -106,14 +107,14 @@ class Taper:
 class Squash:
     """Scaling by ``factor`` > 0 along ``axis`` and by its inverse square root across: volume is preserved."""
 
-    center: Float[np.ndarray, "3"]
-    axis: Float[np.ndarray, "3"]
+    center: Vector
+    axis: Vector
     factor: float
 
     def __post_init__(self) -> None:
         _check_factor(self.factor)
 
-    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, points: Points) -> Points:
         """Images of points, in the points' unit."""
         axis, across = unit(self.axis), self.factor**-0.5
         matrix = across * np.eye(3) + (self.factor - across) * np.outer(axis, axis)
@@ -153,13 +154,12 @@ class SmoothField:
     ) -> "SmoothField":
         """Field of ``modes`` random waves, wavelengths uniform in a range, with gradient bound ``strength``."""
         directions, amplitudes = named(rng, "pattern").normal(size=(2, modes, 3))
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        frequencies = directions * 2 * np.pi / named(rng, "wavelength").uniform(*wavelength, size=(modes, 1))
+        frequencies = unit_rows(directions) * 2 * np.pi / named(rng, "wavelength").uniform(*wavelength, size=(modes, 1))
         shares = np.linalg.norm(amplitudes, axis=1) @ np.linalg.norm(frequencies, axis=1)
         phases = named(rng, "phase", "rad").uniform(0, 2 * np.pi, size=modes)
         return cls(amplitudes * (strength / shares), frequencies, phases)
 
-    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, points: Points) -> Points:
         """Images of points, in the points' unit."""
         return points + np.sin(points @ self.frequencies.T + self.phases) @ self.amplitudes
 
@@ -174,8 +174,8 @@ class FreeFormLattice:
     ``origin`` is the position of control point (0, 0, 0), ``spacing`` that between them along x, y, z.
     """
 
-    origin: Float[np.ndarray, "3"]
-    spacing: Float[np.ndarray, "3"]
+    origin: Vector
+    spacing: Vector
     displacements: Float[np.ndarray, "a b c 3"]
 
     def __post_init__(self) -> None:
@@ -188,7 +188,7 @@ class FreeFormLattice:
 
     @classmethod
     def sample(
-        cls, rng: np.random.Generator, bounds: Float[np.ndarray, "2 3"], cells: tuple[int, int, int], strength: float
+        cls, rng: np.random.Generator, bounds: Corners, cells: tuple[int, int, int], strength: float
     ) -> "FreeFormLattice":
         """Random control points over a box of ``cells`` and one spacing around; ``strength`` in [0, 1) of the limit."""
         spacing = (bounds[1] - bounds[0]) / np.array(cells)
@@ -196,7 +196,7 @@ class FreeFormLattice:
         limit = strength * LATTICE_LIMIT * spacing
         return cls(bounds[0] - spacing, spacing, named(rng, "control points").uniform(-limit, limit, size=shape))
 
-    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, points: Points) -> Points:
         """Images of points, in the points' unit."""
         at = ((points - self.origin) / self.spacing).T
         moves = [
@@ -225,7 +225,7 @@ class CurveSweep:
         cls,
         nodes: Float[np.ndarray, " m"],
         centers: Float[np.ndarray, "m 3"],
-        normal: Float[np.ndarray, "3"],
+        normal: Vector,
         radius: float,
     ) -> "CurveSweep":
         """Sweep onto the cubic spline through ``centers`` at ascending arc lengths, its frame free of twist.
@@ -242,7 +242,7 @@ class CurveSweep:
         curve = CubicSpline(nodes, np.concatenate([centers, frames[:, 1], frames[:, 2]], axis=1))
         return cls(curve, (float(nodes[0]), float(nodes[-1])))
 
-    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, points: Points) -> Points:
         """Images of points, in the points' unit."""
         s = np.clip(points[:, 0], *self.ends)
         values = self.curve(s)
@@ -254,7 +254,7 @@ class CurveSweep:
         return moved
 
 
-def transport_frames(tangents: Float[np.ndarray, "m 3"], normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "m 3 3"]:
+def transport_frames(tangents: Float[np.ndarray, "m 3"], normal: Vector) -> Float[np.ndarray, "m 3 3"]:
     """Frames along a curve, rows tangent, normal, binormal, by parallel transport.
 
     From one tangent to the next the frame turns by the smallest rotation, so it never twists about the curve (Bergou

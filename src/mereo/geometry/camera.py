@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from mereo.geometry.brief import counted, sides
 from mereo.geometry.conventions import CloudAxes, check_real
 from mereo.geometry.read_only import read_only
-from mereo.geometry.transforms import Normalizer, rigid, transform_points
+from mereo.geometry.transforms import Normalizer, Points, Transform, rigid, transform_points, unit_rows
 
 
 @dataclass(frozen=True)
@@ -81,13 +81,13 @@ class Camera:
         grid_y, grid_x = np.meshgrid(y, x, indexing="ij")
         return np.stack([grid_x, grid_y, np.ones_like(grid_x)], axis=-1)
 
-    def project(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+    def project(self, points: Points) -> Float[np.ndarray, "n 2"]:
         """Pixel coordinates (u, v) of points in the camera frame, z > 0."""
         u = self.focal_x_px * points[:, 0] / points[:, 2] + self.center_x_px
         v = self.focal_y_px * points[:, 1] / points[:, 2] + self.center_y_px
         return np.stack([u, v], axis=-1)
 
-    def unproject(self, pixels: Float[np.ndarray, "n 2"], depth: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+    def unproject(self, pixels: Float[np.ndarray, "n 2"], depth: Float[np.ndarray, " n"]) -> Points:
         """Points in the camera frame from pixel coordinates and depth (z)."""
         x = (pixels[:, 0] - self.center_x_px) / self.focal_x_px * depth
         y = (pixels[:, 1] - self.center_y_px) / self.focal_y_px * depth
@@ -104,7 +104,7 @@ class PointCloud:
             surface that no single camera saw, and tell that one is (``IsolationConfig.extent``).
     """
 
-    points: Float[np.ndarray, "n 3"]
+    points: Points
     normals: Float[np.ndarray, "_ 3"] | None = None
 
     @classmethod
@@ -112,8 +112,7 @@ class PointCloud:
         """Cloud of rows with three numbers, or with six where a normal of any length follows each position."""
         if rows.shape[1] == 3:
             return cls(rows)
-        normals = rows[:, 3:]
-        return cls(rows[:, :3].copy(), normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30))
+        return cls(rows[:, :3].copy(), unit_rows(rows[:, 3:]))
 
     def __post_init__(self) -> None:
         if self.normals is not None and np.shape(self.normals) != np.shape(self.points):
@@ -137,7 +136,7 @@ class PointCloud:
             return self
         return PointCloud(self.points[keep], None if self.normals is None else self.normals[keep])
 
-    def transformed(self, T_new_old: Float[np.ndarray, "4 4"]) -> "PointCloud":
+    def transformed(self, T_new_old: Transform) -> "PointCloud":
         """The same in another frame."""
         normals = None if self.normals is None else self.normals @ T_new_old[:3, :3].T
         return PointCloud(transform_points(T_new_old, self.points), normals)
@@ -235,7 +234,7 @@ class SightLines:
         """Lines of sight around a bare cloud, all of one kind, or of an undecided one."""
         return cls(np.empty((0, 3)), np.empty((0, 3)), other_lines)
 
-    def transformed(self, T_new_old: Float[np.ndarray, "4 4"]) -> "SightLines":
+    def transformed(self, T_new_old: Transform) -> "SightLines":
         """Lines of sight in another frame, whose origin is the camera as well."""
         past, unknown = (transform_points(T_new_old, points) for points in (self.past, self.unknown))
         return replace(self, past=past, unknown=unknown)
@@ -255,7 +254,7 @@ VIEW_DISTANCE = 8.5
 """Assumed distance of a scanner, in half longest sides of the visible part; 7 to 16 give the same IoU to 0.002."""
 
 
-def into_camera(points: Float[np.ndarray, "n 3"], frame: CloudAxes) -> Float[np.ndarray, "4 4"]:
+def into_camera(points: Points, frame: CloudAxes) -> Transform:
     """Transform ``T_camera_input`` of a cloud in either frame: a scan is turned, and put on the optical axis.
 
     The network looks along lines of sight from the camera, but a scan does not say where the scanner stood; it is
@@ -268,6 +267,6 @@ def into_camera(points: Float[np.ndarray, "n 3"], frame: CloudAxes) -> Float[np.
     return rigid(SCANNER_TO_CAMERA, target - SCANNER_TO_CAMERA @ normalizer.center)
 
 
-def camera_axes(frame: CloudAxes) -> Float[np.ndarray, "4 4"]:
+def camera_axes(frame: CloudAxes) -> Transform:
     """Turn of a frame's axes into a camera's, about its own origin: for looking, where distance does not matter."""
     return rigid(SCANNER_TO_CAMERA if frame == "scanner" else np.eye(3), np.zeros(3))

@@ -4,6 +4,8 @@ import numpy as np
 from jaxtyping import Float, Int, Real, Shaped
 from scipy.spatial import cKDTree
 
+from mereo.geometry.transforms import Points, longest_side
+
 MAX_POINTS = 50_000
 """Many times what any network is trained on; comparing neighbours takes a fraction of a second."""
 
@@ -18,7 +20,7 @@ def random_subset(rows: Shaped[np.ndarray, "n *r"], limit: int) -> Shaped[np.nda
     return rows[np.random.default_rng(0).choice(len(rows), limit, replace=False)]
 
 
-def thin_to_grid(points: Float[np.ndarray, "n 3"], limit: int) -> Int[np.ndarray, " m"]:
+def thin_to_grid(points: Points, limit: int) -> Int[np.ndarray, " m"]:
     """Rows of at most ``limit`` of the points, one per cell of a cubic grid, in their order; all where they are few.
 
     Single measurements are kept, not means of cells: a mean of both sides of an edge would lie on neither. The first
@@ -27,7 +29,7 @@ def thin_to_grid(points: Float[np.ndarray, "n 3"], limit: int) -> Int[np.ndarray
     """
     if len(points) <= limit:
         return np.arange(len(points))
-    low, side = points.min(axis=0), float(np.ptp(points, axis=0).max())
+    low, side = points.min(axis=0), longest_side(points)
     if side == 0:
         return np.arange(limit)
     # a surface through a cube of c^3 cells occupies about c^2 of them
@@ -44,7 +46,7 @@ def thin_to_grid(points: Float[np.ndarray, "n 3"], limit: int) -> Int[np.ndarray
         cell, rows = finer, more
 
 
-def means_along_sight(points: Float[np.ndarray, "n 3"], limit: int) -> Float[np.ndarray, "m 3"]:
+def means_along_sight(points: Points, limit: int) -> Float[np.ndarray, "m 3"]:
     """At most ``limit`` points, each the mean of neighbours on one surface; the cloud itself where it has no more.
 
     Neighbours are seen from the origin within one cell of a grid of lines of sight, the smallest cells that suffice; a
@@ -83,7 +85,7 @@ def _surfaces_in_cells(
     return group
 
 
-def first_in_cell(offsets: Float[np.ndarray, "n 3"], cell: float) -> Int[np.ndarray, " m"]:
+def first_in_cell(offsets: Points, cell: float) -> Int[np.ndarray, " m"]:
     """Rows of the first point in each occupied cell of a grid, in their order; ``offsets`` are not negative."""
     index = np.floor(offsets / cell).astype(np.int64)
     counts = index.max(axis=0) + 1
@@ -91,7 +93,7 @@ def first_in_cell(offsets: Float[np.ndarray, "n 3"], cell: float) -> Int[np.ndar
     return np.sort(np.unique(key, return_index=True)[1])
 
 
-def spacing(points: Float[np.ndarray, "n 3"]) -> float:
+def spacing(points: Points) -> float:
     """Median distance from a point to its nearest neighbour at another place; 0 where all coincide."""
     sample = points[:: max(1, len(points) // 1000)]  # whose median is good to a few percent
     distance = cKDTree(points).query(sample, k=min(8, len(points)))[0].reshape(len(sample), -1)

@@ -7,6 +7,12 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.mesh import Color
+from mereo.geometry.transforms import Points, Vector
+
+
+def part_of_grid(low: Int[np.ndarray, "3"], end: Int[np.ndarray, "3"]) -> tuple[slice, ...]:
+    """Index of the voxels from ``low`` to before ``end``."""
+    return tuple(slice(first, after) for first, after in zip(low, end, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,8 +27,8 @@ class LabelGrid:
     """
 
     labels: UInt8[np.ndarray, "x y z"]
-    origin: Float[np.ndarray, "3"]
-    spacing: Float[np.ndarray, "3"]
+    origin: Vector
+    spacing: Vector
     names: tuple[str, ...]
 
     def __repr__(self) -> str:
@@ -59,7 +65,7 @@ class SegmentedCloud:
         names, colors: of the segments; ``names[k]`` has label k + 1.
     """
 
-    points: Float[np.ndarray, "n 3"]
+    points: Points
     labels: UInt8[np.ndarray, " n"]
     confidence: Float[np.ndarray, " n"]
     occupancy: Float[np.ndarray, " n"]

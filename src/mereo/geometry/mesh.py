@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from mereo.geometry.brief import counted, listed, sides
 from mereo.geometry.read_only import read_only_view
-from mereo.geometry.transforms import transform_points
+from mereo.geometry.transforms import Corners, Points, Transform, transform_points, unit_rows
 
 Color = tuple[int, int, int]
 """Red, green, blue in 0..255."""
@@ -65,7 +65,7 @@ class Segment:
         return f"Segment({self.name!r}, {size}, {sides(self.vertices)})"
 
     @property
-    def bounds(self) -> Float[np.ndarray, "2 3"]:
+    def bounds(self) -> Corners:
         """Lower and upper corner of the axis-aligned box; infinite, upside down, without vertices."""
         return np.stack([self.vertices.min(axis=0, initial=np.inf), self.vertices.max(axis=0, initial=-np.inf)])
 
@@ -77,8 +77,7 @@ class Segment:
 
     def edge_imbalance(self) -> tuple[int, int]:
         """Numbers of open and of misoriented edges: both zero exactly when the mesh is closed and oriented alike."""
-        _, uses, unbalanced = edge_uses(self.faces)
-        return int((uses % 2 == 1).sum()), int((unbalanced & (uses % 2 == 0)).sum())
+        return edge_imbalance(self.faces)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +131,7 @@ class SegmentedMesh:
         return tuple(segment.color for segment in self.segments)
 
     @property
-    def bounds(self) -> Float[np.ndarray, "2 3"]:
+    def bounds(self) -> Corners:
         """Joint axis-aligned box of all segments."""
         boxes = np.stack([segment.bounds for segment in self.segments])
         return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
@@ -165,7 +164,7 @@ class SegmentedMesh:
         moved = tuple(replace(s, vertices=v) for s, v in zip(self.segments, vertices, strict=True))
         return replace(self, segments=moved)
 
-    def transformed(self, transform: Float[np.ndarray, "4 4"]) -> "SegmentedMesh":
+    def transformed(self, transform: Transform) -> "SegmentedMesh":
         """Mesh with all vertices mapped by a homogeneous transform."""
         return self.with_vertices([transform_points(transform, segment.vertices) for segment in self.segments])
 
@@ -222,6 +221,30 @@ def edge_uses(
     return np.stack(np.divmod(keys, size), axis=1), uses, unbalanced
 
 
+def edge_imbalance(faces: Int[np.ndarray, "f 3"]) -> tuple[int, int]:
+    """Numbers of open and of misoriented edges: both zero exactly when a mesh is closed and oriented alike."""
+    _, uses, unbalanced = edge_uses(faces)
+    return int((uses % 2 == 1).sum()), int((unbalanced & (uses % 2 == 0)).sum())
+
+
+def three_cornered(faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
+    """Which faces have three different vertices."""
+    return np.asarray((faces != np.roll(faces, 1, axis=1)).all(axis=1))
+
+
+def with_used_vertices(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f k"]
+) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "f k"]]:
+    """Mesh without the vertices that no face has; the others stay in their order."""
+    used, kept = np.unique(faces, return_inverse=True)  # flat before numpy 2
+    return vertices[used], kept.reshape(faces.shape)
+
+
+def palette_color(index: int) -> Color:
+    """Colour of the palette, which starts again after its last."""
+    return PALETTE[index % len(PALETTE)]
+
+
 def area_vectors(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
     """Normals of faces, each as long as twice the face's area."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
@@ -236,7 +259,7 @@ def connected(pairs: Int[np.ndarray, "p 2"], count: int) -> Int[np.ndarray, " n"
 
 def surface_points(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], count: int
-) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
+) -> tuple[Points, Int[np.ndarray, " n"]]:
     """Points evenly spread over a surface, the same in every call, and the face of each.
 
     Vertices are not: a CAD program's are where a surface is round, none where it is flat.
@@ -266,7 +289,7 @@ def oriented_points(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "
     return np.hstack([points, area_vectors(vertices, faces)[face]])
 
 
-def barycentric(triangles: Float[np.ndarray, "n 3 3"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def barycentric(triangles: Float[np.ndarray, "n 3 3"], points: Points) -> Points:
     """Barycentric coordinates of points in the planes of their triangles."""
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
     normal = np.cross(b - a, c - a)
@@ -281,4 +304,4 @@ def vertex_normals(segment: Segment) -> Float[np.ndarray, "v 3"]:
     normals = np.zeros_like(segment.vertices)
     for k in range(3):
         np.add.at(normals, segment.faces[:, k], area_vectors(segment.vertices, segment.faces))
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    return unit_rows(normals)

@@ -11,8 +11,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mereo.geometry.brief import counted
-from mereo.geometry.mesh import Segment, SegmentedMesh, area_vectors, connected, edge_uses
+from mereo.geometry.mesh import (
+    Segment,
+    SegmentedMesh,
+    area_vectors,
+    connected,
+    edge_imbalance,
+    edge_uses,
+    three_cornered,
+)
 from mereo.geometry.solids import label_grid
+from mereo.geometry.transforms import Corners, Vector, longest_side
 
 Vertices = Float[np.ndarray, "_ 3"]
 Faces = Int[np.ndarray, "_ 3"]
@@ -73,7 +82,7 @@ def examine(segment: Segment, unit: str = "") -> Health:
     extent = np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)
     if len(corners) < 4 or not extent[2] > FLAT * extent[0]:  # in any direction: of float32, a plane is this rough
         return Health(hopeless=(*hopeless, "is flat, without any volume"), mendable=False)
-    collapsed = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    collapsed = ~three_cornered(faces)
     dirty = []
     if collapsed.any():
         where = near(vertices[faces[collapsed][0]].mean(axis=0), unit)
@@ -162,7 +171,7 @@ def _notes(vertices: Vertices, faces: Faces, surface: "_FrontWinding", unit: str
     return tuple(notes)
 
 
-def near(point: Float[np.ndarray, "3"], unit: str) -> str:
+def near(point: Vector, unit: str) -> str:
     """Phrase for a place, such as "near [1.5, 0, -2] mm"."""
     digits = 4 - int(np.floor(np.log10(max(float(np.abs(point).max()), 1e-300))))  # of the largest coordinate, for all
     return f"near [{', '.join(f'{round(float(value), digits) + 0.0:.4g}' for value in point)}]{unit and f' {unit}'}"
@@ -171,7 +180,7 @@ def near(point: Float[np.ndarray, "3"], unit: str) -> str:
 def faces_astray(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> bool:
     """Whether neighbouring faces disagree in orientation, or some face inwards."""
     surface = _front_winding(vertices, faces)
-    disagree = Segment("", (0, 0, 0), vertices, faces).edge_imbalance()[1] > 0
+    disagree = edge_imbalance(faces)[1] > 0
     return disagree or surface.share_where(surface.winding < -0.5) > 1e-3
 
 
@@ -241,9 +250,9 @@ def fragments(vertices: Vertices, faces: Faces, unit: str = "") -> tuple[Bool[np
     return stray, f"{count}, {which}, {where}"
 
 
-def likely_unit(bounds: Float[np.ndarray, "2 3"]) -> str:
+def likely_unit(bounds: Corners) -> str:
     """Guess of a mesh's unit from its longest side: CAD and scanners write millimetres, robots and glTF metres."""
-    longest = float((bounds[1] - bounds[0]).max())
+    longest = longest_side(bounds)
     return "m" if longest < 3 else "mm"
 
 

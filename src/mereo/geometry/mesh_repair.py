@@ -16,7 +16,16 @@ from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
 from mereo.geometry.brief import counted
-from mereo.geometry.mesh import Segment, SegmentedMesh, area_vectors, connected, surface_points
+from mereo.geometry.mesh import (
+    Segment,
+    SegmentedMesh,
+    area_vectors,
+    connected,
+    edge_imbalance,
+    surface_points,
+    three_cornered,
+    with_used_vertices,
+)
 from mereo.geometry.mesh_check import (
     Faces,
     Vertices,
@@ -29,6 +38,8 @@ from mereo.geometry.mesh_check import (
     pieces,
     solid_of,
 )
+from mereo.geometry.solids import search_tree
+from mereo.geometry.transforms import Vector, longest_side, unit_rows
 
 MERGED_WITHIN = (1e-6, 1e-4)
 """Vertices of open edges this near to each other, in diagonals of the box, count as one; the less, where it helps."""
@@ -77,14 +88,13 @@ def _drop_unusable(vertices: Vertices, faces: Faces, unit: str) -> Step:
     """Faces without place or area, and repeated ones."""
     usable = np.all((faces >= 0) & (faces < len(vertices)), axis=1)
     usable[usable] = np.isfinite(vertices[faces[usable]]).all(axis=(1, 2))
-    usable &= (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    usable &= three_cornered(faces)
     kept = faces[usable]
     _, first = np.unique(np.sort(kept, axis=1), axis=0, return_index=True)
     kept = kept[np.sort(first)]
     dropped = len(faces) - len(kept)
     change = f"dropped {counted(dropped, 'unusable or repeated face')}" if dropped else ""
-    used, kept = np.unique(kept, return_inverse=True)  # flat before numpy 2
-    return vertices[used], kept.reshape(-1, 3), change
+    return *with_used_vertices(vertices, kept), change
 
 
 def _merge_near(vertices: Vertices, faces: Faces, unit: str) -> Step:
@@ -107,15 +117,14 @@ def _merged(vertices: Vertices, faces: Faces, distance: float) -> tuple[Vertices
     group = connected(pairs, len(vertices))
     _, first = np.unique(group, return_index=True)
     merged = group[faces]
-    return vertices[first], merged[(merged != np.roll(merged, 1, axis=1)).all(axis=1)]
+    return vertices[first], merged[three_cornered(merged)]
 
 
 def _drop_fragments(vertices: Vertices, faces: Faces, unit: str) -> Step:
     stray, what = fragments(vertices, faces, unit)
     if not stray.any():
         return vertices, faces, ""
-    used, kept = np.unique(faces[~stray], return_inverse=True)
-    return vertices[used], kept.reshape(-1, 3), f"removed {what}"
+    return *with_used_vertices(vertices, faces[~stray]), f"removed {what}"
 
 
 def _orient(vertices: Vertices, faces: Faces, unit: str) -> Step:
@@ -186,7 +195,7 @@ MOST_SAMPLES = 100_000
 def _remesh(vertices: Vertices, faces: Faces, unit: str) -> Step:
     """A new surface where the winding number is one half, smooth because it is found by distances near the old one."""
     low = vertices.min(axis=0)
-    step = float(np.ptp(vertices, axis=0).max()) / CELLS
+    step = longest_side(vertices) / CELLS
     body = _Body((vertices - low) / step + 2.5, faces)
     solid, cell, lost = _with_thin_parts(body, _even_surface(body))
     behind = unit and f" {unit}"
@@ -196,8 +205,7 @@ def _remesh(vertices: Vertices, faces: Faces, unit: str) -> Step:
     if lost:
         where = f"{near((lost[1] - 2.5) * step + low, unit)}, {lost[0] * step:.2g}{behind} from it"
         places, face = surface_points(body.vertices, body.faces, MOST_SAMPLES)
-        normals = area_vectors(body.vertices, body.faces)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        normals = unit_rows(area_vectors(body.vertices, body.faces))
         share = 100 * _cut_off(body, solid, places, normals[face])[1].mean()
         change += f"; also lost is {share:.2g} % of the surface, which lies {where}, too thin or inside out: thicken "
         change += "it, turn its faces around, or make it a segment of its own, which has finer cells"
@@ -210,9 +218,8 @@ class _Body:
 
     def __init__(self, vertices: Vertices, faces: Faces) -> None:
         self.vertices, self.faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces, dtype=np.int64)
-        self._closed = Segment("", (0, 0, 0), vertices, faces).edge_imbalance() == (0, 0)
-        self._tree = igl.AABB()
-        self._tree.init(self.vertices, self.faces)
+        self._closed = edge_imbalance(faces) == (0, 0)
+        self._tree = search_tree(self.vertices, self.faces)
 
     def inside(self, places: Vertices) -> Bool[np.ndarray, " n"]:
         """Whether the mesh winds around each place."""
@@ -305,7 +312,7 @@ def _even_surface(body: _Body) -> manifold3d.Manifold:
 
 def _with_thin_parts(
     body: _Body, solid: manifold3d.Manifold
-) -> tuple[manifold3d.Manifold, float, tuple[float, Float[np.ndarray, "3"]] | None]:
+) -> tuple[manifold3d.Manifold, float, tuple[float, Vector] | None]:
     """Solid with finer cells where the old surface is far from it; the least cell; the most still lost, and where.
 
     What is thin breaks into dashes before it vanishes. They are near it, so shells of few cells do not count.
@@ -414,7 +421,7 @@ def simplified(segment: Segment) -> tuple[Segment, float]:
     except ValueError:
         return segment, 0.0
     for share in WITHIN:
-        vertices, faces = mesh_of(solid.simplify(share * float(np.ptp(segment.vertices, axis=0).max())))
+        vertices, faces = mesh_of(solid.simplify(share * longest_side(segment.vertices)))
         if len(faces) <= MOST_FACES:
             break
     fewer = replace(segment, vertices=vertices, faces=faces)
@@ -423,7 +430,7 @@ def simplified(segment: Segment) -> tuple[Segment, float]:
 
 # --- what a repair moved ----------------------------------------------------------------------------------------------
 
-Reach = tuple[float, Float[np.ndarray, "3"]]
+Reach = tuple[float, Vector]
 """A distance, and the place where it is."""
 
 
@@ -480,10 +487,9 @@ def _without_flecks(vertices: Vertices, faces: Faces) -> Step:
     a, b, c = (vertices[faces[:, k]] - vertices.mean(axis=0) for k in range(3))
     volume = np.abs(np.bincount(piece, weights=np.einsum("ij,ij->i", a, np.cross(b, c))))
     kept = volume > 1e-5 * volume.max()
-    used, left = np.unique(faces[kept[piece]], return_inverse=True)
     share = 100 * volume[~kept].sum() / volume.sum()
     dropped = f" and dropped {counted(int((~kept).sum()), 'fleck')}, {share:.2g} % of it" if not kept.all() else ""
-    return vertices[used], left.reshape(-1, 3), dropped
+    return *with_used_vertices(vertices, faces[kept[piece]]), dropped
 
 
 # --- the largest piece, and holes -------------------------------------------------------------------------------------
@@ -492,8 +498,7 @@ def _without_flecks(vertices: Vertices, faces: Faces) -> Step:
 def largest_piece(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
     """Piece of the most faces; unused vertices are left out."""
     piece = pieces(faces, len(vertices))
-    used, kept = np.unique(faces[piece == np.bincount(piece).argmax()], return_inverse=True)
-    return vertices[used], kept.reshape(-1, 3)
+    return with_used_vertices(vertices, faces[piece == np.bincount(piece).argmax()])
 
 
 def open_edges(vertices: Vertices, faces: Faces) -> Int[np.ndarray, "_ 2"]:

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import Color
+from mereo.geometry.transforms import Points
 
 STOPS: tuple[Color, ...] = ((214, 224, 234), (250, 205, 120), (226, 98, 62), (122, 24, 70))
 """Colours from a radius of none to ``Radii.high``: pale is sure, dark red is not."""
@@ -57,7 +58,7 @@ class Radii:
         each = {int(label): np.flatnonzero(self.labels == label) for label in np.unique(self.labels)}
         return {label: (cKDTree(self.points[rows]), self.values[rows]) for label, rows in each.items()}
 
-    def at(self, places: Float[np.ndarray, "n 3"], label: int) -> Float[np.ndarray, " n"]:
+    def at(self, places: Points, label: int) -> Float[np.ndarray, " n"]:
         """Radii at places in or near a segment, between its nearest points by the inverse of the squared distance."""
         tree, values = self._trees[label]
         distance, near = tree.query(places, k=range(1, min(4, len(values)) + 1))  # a radius is smooth

@@ -22,6 +22,7 @@ from scipy.sparse import csr_array
 
 from mereo.geometry.mesh import Segment, SegmentedMesh, area_vectors
 from mereo.geometry.read_only import read_only
+from mereo.geometry.transforms import Points, Vector, unit_rows
 
 _DIRECTIONS = read_only(np.array([[0.4637, 0.5718, 0.6767], [-0.7301, 0.3469, -0.5887]], dtype=np.float32))
 """Two generic directions: not along any axis, face diagonal or each other."""
@@ -41,7 +42,7 @@ class Hits(NamedTuple):
     """
 
     distance: Float[np.ndarray, " n"]
-    normal: Float[np.ndarray, "n 3"]
+    normal: Points
 
     def nearer(self, rows: Int[np.ndarray, " m"], others: "Hits") -> Int[np.ndarray, " k"]:
         """Rows of ``rows`` on which the ``others`` meet something nearer, which these hits take over, in place."""
@@ -59,7 +60,7 @@ def ray_scene(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"])
 
 
 def first_faces(
-    scene: EmbreeScene, center: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]
+    scene: EmbreeScene, center: Vector, directions: Points
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
     """Rays that hit a scene whose coordinates are relative to ``center``, and the face that each hits first."""
     face = scene.run(*_rays(center, directions))
@@ -67,17 +68,13 @@ def first_faces(
     return rows, face[rows].astype(np.int64)
 
 
-def _rays(
-    center: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"]
-) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
+def _rays(center: Vector, directions: Points) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
     """Origins and directions in the single precision that Embree wants."""
     single = np.ascontiguousarray(directions, dtype=np.float32)
     return np.broadcast_to(-center.astype(np.float32), single.shape).copy(), single
 
 
-def toward(
-    directions: Float[np.ndarray, "n 3"], low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]
-) -> Int[np.ndarray, " m"]:
+def toward(directions: Points, low: Vector, high: Vector) -> Int[np.ndarray, " m"]:
     """Rays that may hit the box from ``low`` to ``high``: all of them where it is not wholly in front of the camera.
 
     A segment covers a small part of an image, and a ray that misses costs as much as one that hits.
@@ -90,6 +87,13 @@ def toward(
     least, most = (np.stack([corner[:2] / low[2], corner[:2] / high[2]]) for corner in (low, high))
     (x0, y0), (x1, y1) = least.min(axis=0) - margin, most.max(axis=0) + margin
     return np.flatnonzero((x >= x0) & (x <= x1) & (y >= y0) & (y <= y1))
+
+
+def search_tree(vertices: Float[np.ndarray, "v 3"], elements: Int[np.ndarray, "m k"]) -> igl.AABB:
+    """Tree in which libigl finds the nearest of triangles, or the tetrahedron around a point."""
+    tree = igl.AABB()
+    tree.init(vertices, elements)
+    return tree
 
 
 # --- segments and objects ---------------------------------------------------------------------------------------------
@@ -112,18 +116,16 @@ class _Solid:
 
     @cached_property
     def tree(self) -> igl.AABB:
-        tree = igl.AABB()
-        tree.init(self.vertices, self.faces)
-        return tree
+        return search_tree(self.vertices, self.faces)
 
-    def in_box(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    def in_box(self, points: Points) -> Bool[np.ndarray, " n"]:
         """Whether points lie strictly in the segment's box, outside of which nothing is inside."""
         result = np.ones(len(points), dtype=bool)
         for axis in range(3):  # several times faster than all three at once
             result &= (points[:, axis] > self.low[axis]) & (points[:, axis] < self.high[axis])
         return result
 
-    def holds(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    def holds(self, points: Points) -> Bool[np.ndarray, " n"]:
         """Whether points, already known to lie in the box, are inside."""
         if len(points) == 0:
             return np.zeros(0, dtype=bool)
@@ -135,7 +137,7 @@ class _Solid:
             first[doubtful] = igl.fast_winding_number(self.vertices, self.faces, points[doubtful]) > 0.5
         return first
 
-    def _behind_first_hit(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "2 n"]:
+    def _behind_first_hit(self, points: Points) -> Bool[np.ndarray, "2 n"]:
         """For each of two rays whether the first face it hits is seen from behind."""
         origins = np.tile((points - self.center).astype(np.float32), (2, 1))
         directions = np.repeat(_DIRECTIONS, len(points), axis=0)
@@ -144,16 +146,14 @@ class _Solid:
         behind = np.stack([normal @ direction for normal, direction in zip(normals, _DIRECTIONS, strict=True)]) > 0
         return behind & (hits["primID"].reshape(2, -1) >= 0)
 
-    def first_hit(self, directions: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Hits]:
+    def first_hit(self, directions: Points) -> tuple[Int[np.ndarray, " m"], Hits]:
         """Which rays from the origin hit the segment, and where each of them does first."""
         rows = toward(directions, self.low, self.high)
         hits = self.rays.run(*_rays(self.center, directions[rows]), output=True)
         hit = np.flatnonzero(hits["primID"] >= 0)
         return rows[hit], Hits(hits["tfar"][hit].astype(np.float64), hits["Ng"][hit].astype(np.float64))
 
-    def closest(
-        self, points: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    def closest(self, points: Points) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"], Points]:
         """Squared distance to the surface, face and place of the closest surface point."""
         squared, face, place = self.tree.squared_distance(self.vertices, self.faces, np.ascontiguousarray(points))
         return squared, face.astype(np.int64), place  # libigl's faces are C's long long, which numpy tells apart
@@ -173,7 +173,7 @@ class Nearest(NamedTuple):
     """
 
     distance: Float[np.ndarray, " n"]
-    point: Float[np.ndarray, "n 3"]
+    point: Points
     face: Int[np.ndarray, " n"]
     owner: Int[np.ndarray, " n"]
 
@@ -198,14 +198,14 @@ class Solids:
         """Axis-aligned boxes of the segments."""
         return np.stack([[solid.low, solid.high] for solid in self._solids])
 
-    def inside(self, index: int, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    def inside(self, index: int, points: Points) -> Bool[np.ndarray, " n"]:
         """Whether each point lies in segment ``index``."""
         solid = self._solids[index]
         result = solid.in_box(points)
         result[result] = solid.holds(points[result])
         return result
 
-    def label(self, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
+    def label(self, points: Points) -> UInt8[np.ndarray, " n"]:
         """Labels of points: 0 in empty space, else index + 1; of overlapping segments the first (so a nested one).
 
         Rays are cast in single precision, so nearer to a surface than two millionths of its segment's longest side the
@@ -220,11 +220,11 @@ class Solids:
             labels[candidates[solid.holds(points[candidates])]] = index + 1
         return labels
 
-    def segment_distance(self, index: int, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def segment_distance(self, index: int, points: Points) -> Float[np.ndarray, " n"]:
         """Distance of points, without sign, to the surface of segment ``index``."""
         return np.sqrt(self._solids[index].closest(points)[0])
 
-    def nearest(self, points: Float[np.ndarray, "n 3"]) -> Nearest:
+    def nearest(self, points: Points) -> Nearest:
         """Closest points over the surfaces of all segments."""
         # of the squared distances: that from the box, 0 inside of it
         outside = (np.maximum(np.maximum(each.low - points, points - each.high), 0.0) for each in self._solids)
@@ -244,26 +244,25 @@ class Solids:
                 face[kept] = first_faces[index] + faces[nearer]
         return Nearest(np.sqrt(squared), place, face, owner)
 
-    def first_hit(self, directions: Float[np.ndarray, "n 3"]) -> Hits:
+    def first_hit(self, directions: Points) -> Hits:
         """First meetings of rays ``t * direction`` from the origin with any surface, t > 0; directions have z = 1."""
         hits = Hits(np.full(len(directions), np.inf), np.zeros((len(directions), 3)))
         for solid in self._solids:
             hits.nearer(*solid.first_hit(directions))
         return hits
 
-    def face_normals(self, face: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+    def face_normals(self, face: Int[np.ndarray, " n"]) -> Points:
         """Unit normals of faces of ``mesh.merged()``."""
         vertices, faces, _ = self._merged
-        normal = area_vectors(vertices, faces[face])
-        return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+        return unit_rows(area_vectors(vertices, faces[face]))
 
 
 def signed_distance_and_direction(
     solids: Solids,
-    points: Float[np.ndarray, "n 3"],
+    points: Points,
     labels: UInt8[np.ndarray, " n"],
     nearest: Nearest | None = None,
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+) -> tuple[Float[np.ndarray, " n"], Points]:
     """Distance (negative where ``labels`` is not 0) and unit direction to the closest surface point.
 
     ``nearest`` is ``solids.nearest(points)`` where the caller has it already. A point on the surface has no direction
@@ -379,7 +378,7 @@ def owned_centroids(mesh: SegmentedMesh) -> Float[np.ndarray, "s 3"]:
     return np.asarray(moments / volumes[:, None])
 
 
-def _first_moment(segment: Segment) -> Float[np.ndarray, "3"]:
+def _first_moment(segment: Segment) -> Vector:
     """Volume times centroid of a closed mesh (divergence theorem), by tetrahedra with one corner at its middle."""
     middle = segment.vertices.mean(axis=0)
     a, b, c = (segment.vertices[segment.faces[:, i]] - middle for i in range(3))
@@ -407,7 +406,7 @@ def owned_gradients(mesh: SegmentedMesh) -> Float[np.ndarray, "s 4 v 3"]:
     return result
 
 
-def _gradients(segment: Segment, origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 v 3"]:
+def _gradients(segment: Segment, origin: Vector) -> Float[np.ndarray, "4 v 3"]:
     """Derivatives of a mesh's volume, and of its first moment about an origin, by its vertices."""
     corners = segment.vertices[segment.faces] - origin
     area = np.cross(corners[:, [1, 2, 0]], corners[:, [2, 0, 1]]) / 6.0  # of the volume, by each corner

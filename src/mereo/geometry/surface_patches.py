@@ -14,6 +14,7 @@ from scipy.stats import median_abs_deviation
 
 from mereo.geometry.downsampling import MAX_POINTS, thin_to_grid
 from mereo.geometry.mesh import connected
+from mereo.geometry.transforms import Points, longest_side
 
 NEIGHBORS = 24
 """Neighbours that are looked at: in an image, the 5 x 5 pixels around one."""
@@ -39,12 +40,12 @@ STRETCH = 1.03
 """Times by which points off all surfaces must lengthen the cloud's box, by which a network is normalized, to matter."""
 
 
-def surface_points(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+def surface_points(points: Points) -> Bool[np.ndarray, " n"]:
     """Whether each point belongs to a patch of surface, as in ``surface_patches``."""
     return surface_patches(points)[1]
 
 
-def surface_patches(points: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+def surface_patches(points: Points) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Number of each point's patch, and whether it belongs to one that is a surface; all do where too few can tell.
 
     Points are seen from the origin (camera frame), in any unit and density. Of more than ``MAX_POINTS``, points evenly
@@ -65,7 +66,7 @@ def surface_patches(points: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, "
 
 
 def _patches(
-    points: Float[np.ndarray, "n 3"],
+    points: Points,
 ) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Number of the patch of each of many different points, whether it is an inner one, and its largest step."""
     distance = np.linalg.norm(points, axis=1)
@@ -85,17 +86,12 @@ def _patches(
     return patch, same.sum(axis=1) >= INNER, tall
 
 
-def longest_side(points: Float[np.ndarray, "n 3"]) -> float:
-    """Longest side of the points' box, parallel to the axes."""
-    return float(np.ptp(points, axis=0).max())
-
-
-def stretch(points: Float[np.ndarray, "n 3"], keep: Bool[np.ndarray, " n"]) -> float:
+def stretch(points: Points, keep: Bool[np.ndarray, " n"]) -> float:
     """Times that the longest side of the points' box is as long as that of those that are kept, from 1 up."""
     return longest_side(points) / max(longest_side(points[keep]), np.finfo(float).tiny)
 
 
-def without_strays(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+def without_strays(points: Points) -> Bool[np.ndarray, " n"]:
     """Whether each point is left where strays are removed: all are, unless strays make the box ``STRETCH`` longer."""
     keep = surface_points(points)
     if keep.all() or stretch(points, keep) <= STRETCH:
@@ -120,7 +116,7 @@ FEWEST = 4
 """A point with fewer neighbours on its surface, itself among them, stays where it is."""
 
 
-def smoothed(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def smoothed(points: Points) -> Points:
     """Points moved along their lines of sight, from the origin, to where their neighbours on the surface say it is."""
     if len(points) < FEWEST:
         return points
@@ -141,7 +137,7 @@ ROUGH_NEIGHBORS, CALM = 12, 0.1
 """Points of each local patch, itself among them, and the share of a cloud that is its calmest part."""
 
 
-def roughness(points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"] | None = None) -> float:
+def roughness(points: Points, normals: Points | None = None) -> float:
     """Bound on the noise of a cloud along its lines of sight, in its unit: how rough its calmest part is.
 
     With ``normals`` it is that along them, of a surface that has no lines of sight. The ``CALM`` quantile of the
@@ -189,7 +185,7 @@ def _fit_patches(
 
 
 def _quadratic(
-    places: Float[np.ndarray, "n 3"], axis: Float[np.ndarray, "n 3"], neighbor: Int[np.ndarray, "n k"], radius: float
+    places: Points, axis: Points, neighbor: Int[np.ndarray, "n k"], radius: float
 ) -> Float[np.ndarray, "n k 6"]:
     """Terms (1, u, v, u^2, uv, v^2) of each neighbour's place (or direction), u and v across the axis, in radii."""
     across = np.cross(axis, np.eye(3)[np.abs(axis).argmin(axis=1)])

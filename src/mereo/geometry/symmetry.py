@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import transform_points
+from mereo.geometry.mesh import SegmentedMesh, area_vectors
+from mereo.geometry.solids import Solids, search_tree
+from mereo.geometry.transforms import Points, Transform, Vector, longest_side, transform_points
 
 TOLERANCE = 0.45
 """Scene units up to which a turned surface looks the same: a fit explains a point by a surface up to there."""
@@ -49,9 +49,9 @@ class Symmetry:
             a tumour in one half of a ball.
     """
 
-    turn: Float[np.ndarray, "4 4"]
+    turn: Transform
     angle: float | None
-    axis: Float[np.ndarray, "3"] | None
+    axis: Vector | None
     lands_on: tuple[int | None, ...]
 
     @property
@@ -139,32 +139,29 @@ class _Surface:
 
     mesh: SegmentedMesh
     tolerance: float
-    points: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
+    points: Points
+    normals: Points
     visible: Int[np.ndarray, " v"]
 
     @classmethod
     def of(cls, mesh: SegmentedMesh, tolerance: float) -> "_Surface":
         vertices, faces, _ = mesh.merged()
-        corners = vertices[faces]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals = area_vectors(vertices, faces)
         area = np.linalg.norm(normals, axis=1)
         rng, total = np.random.default_rng(0), np.cumsum(area)
         face = np.searchsorted(total, (np.arange(SAMPLES) + rng.random(SAMPLES)) * total[-1] / SAMPLES)
         face = np.minimum(face, len(faces) - 1)
         share = rng.dirichlet((1.0, 1.0, 1.0), SAMPLES)
-        points = np.einsum("nk,nki->ni", share, corners[face])
+        points = np.einsum("nk,nki->ni", share, vertices[faces[face]])
         normals = normals[face] / area[face, None]
-        size = float(np.ptp(vertices, axis=0).max())
+        size = longest_side(vertices)
         outside = Solids(mesh).label(points + 1e-3 * size * normals) == 0
         return cls(mesh, tolerance, points, normals, np.flatnonzero(outside))
 
     @cached_property
     def _tree(self) -> tuple[igl.AABB, np.ndarray, np.ndarray]:
         vertices, faces, _ = self.mesh.merged()
-        tree = igl.AABB()
-        tree.init(vertices, faces)
-        return tree, vertices, faces
+        return search_tree(vertices, faces), vertices, faces
 
     def nearest(self, points: Float[np.ndarray, "p 3"]) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
         """Distance and place of the nearest point of all surfaces."""
@@ -172,14 +169,14 @@ class _Surface:
         squared, _, place = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
         return np.sqrt(squared), place
 
-    def moments(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    def moments(self) -> tuple[Vector, Vector, Float[np.ndarray, "3 3"]]:
         """Centroid of the visible surface, its second moments, ascending, and their axes as rows."""
         seen = self.points[self.visible]
         center = seen.mean(axis=0)
         values, vectors = np.linalg.eigh((seen - center).T @ (seen - center))
         return center, values, vectors.T
 
-    def off(self, turn: Float[np.ndarray, "4 4"]) -> float:
+    def off(self, turn: Transform) -> float:
         """Root mean square distance of a few turned samples from the surface."""
         return float(np.sqrt((self.nearest(transform_points(turn, self._few))[0] ** 2).mean()))
 
@@ -188,12 +185,12 @@ class _Surface:
         few: np.ndarray = self.points[self.visible[:: max(1, len(self.visible) // FEW)]]
         return few
 
-    def is_kept(self, turn: Float[np.ndarray, "4 4"]) -> bool:
+    def is_kept(self, turn: Transform) -> bool:
         """Whether the turned visible surface lies on the surface."""
         distance = self.nearest(transform_points(turn, self.points[self.visible]))[0]
         return bool((distance > self.tolerance).mean() <= BEYOND)
 
-    def settle(self, turn: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    def settle(self, turn: Transform) -> Transform:
         """The turn near a given one that brings a few samples nearest to the planes they come to lie on."""
         few, step = self._few, max(1, len(self.visible) // FEW)
         normals = self.normals[self.visible[::step]]
@@ -207,7 +204,7 @@ class _Surface:
             turn = _about(center, change[:3], change[3:]) @ turn
         return turn
 
-    def landing(self, turn: Float[np.ndarray, "4 4"]) -> tuple[int | None, ...]:
+    def landing(self, turn: Transform) -> tuple[int | None, ...]:
         """For each segment the one on whose surface most of its vertices come to lie."""
         segments, limit = self.mesh.segments, (2 * self.tolerance) ** 2
         result = list[int | None]()
@@ -218,9 +215,7 @@ class _Surface:
         return tuple(result) if len(set(result)) == len(result) or None in result else (None,) * len(result)
 
 
-def _settled(
-    surface: _Surface, center: Float[np.ndarray, "3"], turns: Float[np.ndarray, "t 3"]
-) -> tuple[Symmetry, ...]:
+def _settled(surface: _Surface, center: Vector, turns: Float[np.ndarray, "t 3"]) -> tuple[Symmetry, ...]:
     """Symmetries near to turns about a centre, each once."""
     starts = [_about(center, turn) for turn in turns]
     order = np.argsort([surface.off(start) for start in starts], kind="stable")[:60]
@@ -234,9 +229,7 @@ def _settled(
     return tuple(result)
 
 
-def _about(
-    center: Float[np.ndarray, "3"], turn: Float[np.ndarray, "3"], shift: Float[np.ndarray, "3"] | float = 0.0
-) -> Float[np.ndarray, "4 4"]:
+def _about(center: Vector, turn: Vector, shift: Vector | float = 0.0) -> Transform:
     """Rigid transform that turns about a centre by a rotation vector, and then shifts."""
     result = np.eye(4)
     result[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
@@ -244,13 +237,13 @@ def _about(
     return result
 
 
-def _axis_of(turn: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "3"]:
+def _axis_of(turn: Transform) -> Vector:
     """Axis of a turn, a unit vector."""
     vector = Rotation.from_matrix(turn[:3, :3]).as_rotvec()
     return vector / max(float(np.linalg.norm(vector)), 1e-12)
 
 
-def _fixed_point(turns: list[Float[np.ndarray, "4 4"]]) -> Float[np.ndarray, "3"]:
+def _fixed_point(turns: list[Transform]) -> Vector:
     """Find the point that turns move least; of those of one axis the nearest to the origin."""
     rows = np.concatenate([np.eye(3) - turn[:3, :3] for turn in turns])
     point: np.ndarray = np.linalg.lstsq(rows, np.concatenate([turn[:3, 3] for turn in turns]), rcond=1e-6)[0]
@@ -261,7 +254,7 @@ def _angle(rotation: Float[np.ndarray, "3 3"]) -> float:
     return float(Rotation.from_matrix(rotation).magnitude())
 
 
-def _about_axis(axis: Float[np.ndarray, "3"]) -> str:
+def _about_axis(axis: Vector) -> str:
     """Name of an axis of the object's frame, or its direction."""
     main = int(np.abs(axis).argmax())
     if abs(axis[main]) > 0.995:

@@ -9,21 +9,32 @@ from numpy.typing import ArrayLike
 
 from mereo.geometry.conventions import LARGEST
 
+Points = Float[np.ndarray, "n 3"]
+"""Positions or vectors in rows: as many as whatever else has the axis ``n`` in a signature."""
 
-def rigid(rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+Vector = Float[np.ndarray, "3"]
+
+Transform = Float[np.ndarray, "4 4"]
+"""Homogeneous matrix of a map between two frames."""
+
+Corners = Float[np.ndarray, "2 3"]
+"""Lower and upper corner of a box along the axes."""
+
+
+def rigid(rotation: Float[np.ndarray, "3 3"], translation: Vector) -> Transform:
     """Homogeneous transform from a rotation and a translation."""
     transform = np.eye(4)
     transform[:3, :3], transform[:3, 3] = rotation, translation
     return transform
 
 
-def inverse_rigid(transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+def inverse_rigid(transform: Transform) -> Transform:
     """Inverse of a rigid transform."""
     rotation = transform[:3, :3].T
     return rigid(rotation, -rotation @ transform[:3, 3])
 
 
-def is_rigid(transform: Float[np.ndarray, "4 4"], tolerance: float = 1e-6) -> bool:
+def is_rigid(transform: Transform, tolerance: float = 1e-6) -> bool:
     """Whether a transform is a rotation and a translation, up to rounding; finite, and with 0 0 0 1 below."""
     if transform.shape != (4, 4) or not np.isfinite(transform).all():
         return False
@@ -32,7 +43,7 @@ def is_rigid(transform: Float[np.ndarray, "4 4"], tolerance: float = 1e-6) -> bo
     return bool(is_rotation and transform[3].tolist() == [0, 0, 0, 1])
 
 
-def checked_pose(pose: ArrayLike) -> Float[np.ndarray, "4 4"]:
+def checked_pose(pose: ArrayLike) -> Transform:
     """A rigid pose as numbers, of a few printed digits or more; ``ValueError`` for what is none."""
     entries: np.ndarray = np.asarray(pose, dtype=object)  # of which rows may differ in length
     what = f"of the shape {entries.shape}"
@@ -49,14 +60,12 @@ def checked_pose(pose: ArrayLike) -> Float[np.ndarray, "4 4"]:
     )
 
 
-def transform_points(
-    transform: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "*n 3"]
-) -> Float[np.ndarray, "*n 3"]:
+def transform_points(transform: Transform, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     """Points mapped by a homogeneous transform."""
     return points @ transform[:3, :3].T + transform[:3, 3]
 
 
-def rotation_along(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+def rotation_along(axis: Vector) -> Float[np.ndarray, "3 3"]:
     """Rotation whose third column is along ``axis``."""
     z = axis / np.linalg.norm(axis)
     helper = np.eye(3)[np.argmin(np.abs(z))]
@@ -65,9 +74,7 @@ def rotation_along(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-def look_at(
-    eye: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"], roll_rad: float = 0.0
-) -> Float[np.ndarray, "4 4"]:
+def look_at(eye: Vector, target: Vector, up: Vector, roll_rad: float = 0.0) -> Transform:
     """Pose ``T_world_camera`` at ``eye``, optical axis through ``target``, image up along ``up`` before the roll."""
     z = target - eye
     z = z / np.linalg.norm(z)
@@ -78,6 +85,16 @@ def look_at(
     y = np.cross(z, x)
     cosine, sine = np.cos(roll_rad), np.sin(roll_rad)
     return rigid(np.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=1), eye)
+
+
+def longest_side(points: Float[np.ndarray, "_ 3"]) -> float:
+    """Longest side of the points' box, parallel to the axes."""
+    return float(np.ptp(points, axis=0).max())
+
+
+def unit_rows(vectors: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+    """Vectors of length 1 along each row; rows of zeros stay so."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)
 
 
 def finite_svd(
@@ -93,9 +110,7 @@ def finite_svd(
     return u, s, v
 
 
-def fit_rigid(
-    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, " n"] | None = None
-) -> Float[np.ndarray, "4 4"]:
+def fit_rigid(source: Points, target: Points, weights: Float[np.ndarray, " n"] | None = None) -> Transform:
     """``T_target_source`` that brings ``source`` nearest to ``target`` in least squares (Kabsch, 1976), never mirrored.
 
     Of points on a line any turn about it is as good, and one is taken. ``weights`` are of the squared distances, not
@@ -123,11 +138,11 @@ class Normalizer:
         scale: one over half the box's longest side (the paper's s), in 1/unit.
     """
 
-    center: Float[np.ndarray, "3"]
+    center: Vector
     scale: float
 
     @classmethod
-    def fit(cls, points: Float[np.ndarray, "n 3"]) -> "Normalizer":
+    def fit(cls, points: Points) -> "Normalizer":
         """Normalizer of a cloud, the paper's t and s. Raises ``ValueError`` when the cloud has no extent."""
         if len(points) == 0:
             raise ValueError("the point cloud is empty; it needs points on the object: check the mask and the units")
@@ -146,14 +161,14 @@ class Normalizer:
         return points / self.scale + self.center
 
     @property
-    def matrix(self) -> Float[np.ndarray, "4 4"]:
+    def matrix(self) -> Transform:
         """Homogeneous transform that ``apply`` is."""
         result = np.diag([self.scale, self.scale, self.scale, 1.0])
         result[:3, 3] = -self.scale * self.center
         return result
 
     @property
-    def viewpoint(self) -> Float[np.ndarray, "3"]:
+    def viewpoint(self) -> Vector:
         """Position of the camera (the origin of the camera frame) in normalized coordinates."""
         return -self.center * self.scale
 
@@ -170,11 +185,11 @@ def best_rotations(covariance: Float[np.ndarray, "*s 3 3"]) -> Float[np.ndarray,
 
 
 def robust_rigid(
-    source: Float[np.ndarray, "n 3"],
-    target: Float[np.ndarray, "n 3"],
+    source: Points,
+    target: Points,
     weight: Float[np.ndarray, " n"],
     sigma: float,
-) -> Float[np.ndarray, "4 4"]:
+) -> Transform:
     """``fit_rigid`` under a Cauchy loss whose scale falls from the residuals' own median to ``sigma``."""
     T = fit_rigid(source, target, weight)
     for _ in range(20):  # it has converged by then
@@ -186,7 +201,7 @@ def robust_rigid(
 
 def align_all(
     shapes: Float[np.ndarray, "s n 3"], rounds: int, tolerance: float
-) -> tuple[Float[np.ndarray, "s 3 3"], Float[np.ndarray, "s 3"], Float[np.ndarray, "n 3"]]:
+) -> tuple[Float[np.ndarray, "s 3 3"], Float[np.ndarray, "s 3"], Points]:
     """Rotations and centres that bring shapes to their mean: generalized Procrustes alignment without scale (Gower).
 
     ``(shapes - center) @ R.T`` are the aligned shapes. It must converge (the mean moves by less than ``tolerance``):

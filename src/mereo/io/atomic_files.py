@@ -193,6 +193,12 @@ def atomic_file(path: str | Path, *, force: bool = True, inputs: Iterable[str | 
             os.rename(partial, path)
 
 
+def write_file(path: str | Path, content: str | bytes, *, force: bool = True) -> None:
+    """Write a file of this content, whole or not at all; text in UTF-8; raises as ``atomic_file``."""
+    with atomic_file(path, force=force) as partial:
+        partial.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
+
+
 def check_file_place(path: str | Path | None, *, force: bool = True, inputs: Iterable[str | Path] = ()) -> None:
     """Raise as ``atomic_file`` does for a place where no file can be put: before the work, not after. None is none.
 
@@ -313,8 +319,7 @@ def _stamps(folder: Path) -> dict[str, list[int] | None]:
 
 def write_json(path: str | Path, value: Any, *, force: bool = True) -> None:
     """Write ``to_json`` of a value, indented, whole or not at all; ``force`` as in ``atomic_file``."""
-    with atomic_file(path, force=force) as partial:
-        partial.write_text(json_text(value), "utf-8")
+    write_file(path, json_text(value), force=force)
 
 
 def json_text(value: Any) -> str:

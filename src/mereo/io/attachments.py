@@ -17,7 +17,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.io.atomic_files import atomic_file
+from mereo.geometry.transforms import Points, longest_side
+from mereo.io.atomic_files import atomic_file, write_file
 from mereo.io.config import CarryFrame, Space
 from mereo.io.errors import check_suffix, readable
 from mereo.io.mesh_formats import read_segmented_mesh
@@ -42,11 +43,11 @@ class Surfaces:
     rotations = None
 
     @property
-    def points(self) -> Float[np.ndarray, "n 3"]:
+    def points(self) -> Points:
         """All vertices."""
         return np.concatenate([part.vertices for part in self.mesh.segments])
 
-    def at(self, points: Float[np.ndarray, "n 3"], rotations: Float[np.ndarray, "n 3 3"] | None) -> "Surfaces":
+    def at(self, points: Points, rotations: Float[np.ndarray, "n 3 3"] | None) -> "Surfaces":
         """The surfaces with other vertices."""
         ends = np.cumsum([len(part.vertices) for part in self.mesh.segments])[:-1]
         return Surfaces(self.mesh.with_vertices(np.split(points, ends)))
@@ -56,10 +57,10 @@ class Surfaces:
 class Positions:
     """Points of a cloud, without anything else that its file may say about them."""
 
-    points: Float[np.ndarray, "n 3"]
+    points: Points
     rotations = None
 
-    def at(self, points: Float[np.ndarray, "n 3"], rotations: Float[np.ndarray, "n 3 3"] | None) -> "Positions":
+    def at(self, points: Points, rotations: Float[np.ndarray, "n 3 3"] | None) -> "Positions":
         """Other points."""
         return replace(self, points=points)
 
@@ -79,10 +80,10 @@ class PoseTable:
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     delimiter: str
-    points: Float[np.ndarray, "n 3"]
+    points: Points
     rotations: Float[np.ndarray, "n 3 3"] | None
 
-    def at(self, points: Float[np.ndarray, "n 3"], rotations: Float[np.ndarray, "n 3 3"] | None) -> "PoseTable":
+    def at(self, points: Points, rotations: Float[np.ndarray, "n 3 3"] | None) -> "PoseTable":
         """The table with other positions and orientations."""
         return replace(self, points=points, rotations=rotations)
 
@@ -134,9 +135,7 @@ NEAR, FARTHER, SHARE, MORE = 0.15, 3.0, 0.6, 0.3
 then lies in the other one; share of an object in a volume's tissue that is no sign either, and how much more is one."""
 
 
-def turned_attachment(
-    attachment: Attachment, frame: CarryFrame, named: Space | None, inside: Float[np.ndarray, "n 3"]
-) -> Attachment:
+def turned_attachment(attachment: Attachment, frame: CarryFrame, named: Space | None, inside: Points) -> Attachment:
     """Attachment in the space of an object's own files, turned where it names the other one.
 
     Args:
@@ -179,13 +178,13 @@ def turned_attachment(
     return attachment
 
 
-def _fits_better(turned: Content, content: Content, inside: Float[np.ndarray, "n 3"]) -> bool:
+def _fits_better(turned: Content, content: Content, inside: Points) -> bool:
     """Whether content fits an object far better when it is turned."""
     if isinstance(turned, Volume) and isinstance(content, Volume):
         share = content.tissue_share(inside)
         return share < SHARE and turned.tissue_share(inside) > share + MORE
     assert not isinstance(turned, Volume) and not isinstance(content, Volume)
-    tree, size = cKDTree(inside), float(np.ptp(inside, axis=0).max())
+    tree, size = cKDTree(inside), longest_side(inside)
     away, other = (float(np.median(tree.query(each.points)[0])) for each in (content, turned))
     return away > NEAR * size and away > FARTHER * other
 
@@ -234,8 +233,7 @@ def write_attachment(
     if isinstance(content, Volume):
         write_volume(path, content, unit_m)
     elif isinstance(content, PoseTable):
-        with atomic_file(path) as partial:
-            partial.write_text(content.text(factor), encoding="utf-8")
+        write_file(path, content.text(factor))
     elif isinstance(content, Positions) and suffix == ".ply":
         write_positions_ply(path, factor * content.points)
     elif isinstance(content, Positions):

@@ -23,9 +23,19 @@ import trimesh
 from jaxtyping import Float, Int, UInt8
 
 from mereo.geometry.conventions import LARGEST
-from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh, edge_uses
+from mereo.geometry.mesh import (
+    PALETTE,
+    Color,
+    Segment,
+    SegmentedMesh,
+    edge_imbalance,
+    palette_color,
+    three_cornered,
+    with_used_vertices,
+)
 from mereo.geometry.mesh_repair import simplified
 from mereo.geometry.radii import Radii
+from mereo.geometry.transforms import Points, transform_points
 from mereo.io.errors import check_count, check_size, check_suffix, readable
 from mereo.io.extras import library
 from mereo.io.progress import stage
@@ -74,7 +84,7 @@ def read_segmented_mesh(*paths: str | Path) -> SegmentedMesh:
             raise ValueError(f"{path} has no mesh files; a {', '.join(MESH_SUFFIXES)} per segment is needed: add them")
         parts += [part for file in files for part in _parts(file)]
     segments = (
-        Segment(name, color or PALETTE[index % len(PALETTE)], vertices, faces)
+        Segment(name, color or palette_color(index), vertices, faces)
         for index, (name, color, vertices, faces) in enumerate(parts)
     )
     return SegmentedMesh(tuple(segments))
@@ -197,17 +207,11 @@ def _material_parts(
         return []
     index = np.array([names.index(material) for _, _, material in owners])
     _, place = _distinct(vertices)
-    if all(_is_closed(place[faces[index == each]]) for each in range(len(names))):
+    if all(edge_imbalance(place[faces[index == each]]) == (0, 0) for each in range(len(names))):
         return [(material or path.stem, "", material) for _, _, material in owners]
     text = f"{path} has {len(names)} materials, which are no closed parts, but no objects or groups; it is one segment"
     warnings.warn(f"{text}: where it is several, export each as an object", MeshWarning, stacklevel=5)
     return []
-
-
-def _is_closed(faces: Int[np.ndarray, "f 3"]) -> bool:
-    """Whether each edge has as many faces on its one side as on its other."""
-    _, uses, unbalanced = edge_uses(faces)
-    return not (unbalanced | (uses % 2 == 1)).any()
 
 
 def _obj_index(cell: str, count: int) -> int:
@@ -232,11 +236,10 @@ def _split_parts(
     names, parts = list(dict.fromkeys(labels)), list[Part]()
     for name in names:
         rows = [row for row, label in enumerate(labels) if label == name]
-        used, local = np.unique(faces[rows], return_inverse=True)
         worn = {colors.get(owners[row][2]) for row in rows}
         color = worn.pop() if len(worn) == 1 else None
         title = name if name and len(names) > 1 else stem
-        parts.append((title, color, *merge_positions(vertices[used], local.reshape(-1, 3))))
+        parts.append((title, color, *merge_positions(*with_used_vertices(vertices, faces[rows]))))
     return parts
 
 
@@ -319,7 +322,7 @@ def _joined(name: str) -> str:
 
 def _whole_parts(materials: list[Part]) -> list[Part]:
     """Materials of a node where each is closed by itself, else all of them as one part."""
-    if len(materials) == 1 or all(_is_closed(faces) for _, _, _, faces in materials):
+    if len(materials) == 1 or all(edge_imbalance(faces) == (0, 0) for _, _, _, faces in materials):
         return [(_joined(name), *rest) for name, *rest in materials]  # type: ignore[misc]
     pieces = [Segment(name, color or PALETTE[0], vertices, faces) for name, color, vertices, faces in materials]
     vertices, faces, _ = SegmentedMesh(tuple(pieces)).merged()
@@ -345,7 +348,7 @@ def _in_frame(scene: Any, node: str, base: str) -> tuple[Float[np.ndarray, "v 3"
     """Vertices of a node in the frame of another one, its faces, and trimesh's geometry."""
     transform, key = scene.graph.get(node, frame_from=base)
     geometry = scene.geometry[key]
-    vertices = np.asarray(geometry.vertices, dtype=np.float64) @ transform[:3, :3].T + transform[:3, 3]
+    vertices = transform_points(transform, np.asarray(geometry.vertices, dtype=np.float64))
     faces = np.asarray(geometry.faces, dtype=np.int64)
     if np.linalg.det(transform[:3, :3]) < 0:
         faces = faces[:, ::-1]
@@ -371,8 +374,7 @@ def merge_positions(
     if len(first) == len(vertices):
         return vertices, faces
     merged = index[faces]
-    proper = (merged != np.roll(merged, 1, axis=1)).all(axis=1)
-    return vertices[first], merged[proper]
+    return vertices[first], merged[three_cornered(merged)]
 
 
 def _distinct(rows: Float[np.ndarray, "v k"]) -> tuple[Int[np.ndarray, " w"], Int[np.ndarray, " v"]]:
@@ -459,7 +461,7 @@ def _values(tree: dict[str, Any], buffers: Buffers, accessor: dict[str, Any]) ->
     return np.maximum(values / np.iinfo(kind).max, -1.0) if accessor.get("normalized") else values
 
 
-def _stored(tree: dict[str, Any], buffers: Buffers, values: Float[np.ndarray, "n 3"]) -> dict[str, Any]:
+def _stored(tree: dict[str, Any], buffers: Buffers, values: Points) -> dict[str, Any]:
     """Accessor of values in a new buffer."""
     content = values.astype("<f4").tobytes()
     tree["bufferViews"].append({"buffer": len(buffers), "byteLength": len(content)})
@@ -553,7 +555,7 @@ def _glb_part(
     """Segment of a node with faces, colours of its vertices, their radii, and whether these are calibrated."""
     vertices, faces, geometry = _in_frame(scene, node, base)
     _check_places(node, vertices)
-    color, colors = _colors(geometry, PALETTE[number % len(PALETTE)])
+    color, colors = _colors(geometry, palette_color(number))
     radii = geometry.vertex_attributes.get("_RADIUS95")
     facts = geometry.metadata.get("radius95")
     name = stem if node.startswith("geometry_") else _joined(node)

@@ -21,7 +21,8 @@ from PIL import Image
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import DepthImage, PointCloud
 from mereo.geometry.conventions import LARGEST, check_real
-from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.mesh import Segment, SegmentedMesh, palette_color
+from mereo.geometry.transforms import Points
 from mereo.io.errors import reason
 from mereo.io.readers import InputWarning, valid_points
 from mereo.io.ros_recordings import cloud_points, depth_pixels
@@ -64,7 +65,7 @@ def points_of(source: object, drop_invalid: bool = False) -> tuple[PointCloud | 
     return PointCloud.of(kept), len(points) - len(kept)
 
 
-def _with_normals(points: Float[np.ndarray, "n 3"], source: Any) -> Float[np.ndarray, "n c"]:
+def _with_normals(points: Points, source: Any) -> Float[np.ndarray, "n c"]:
     """Points, with the normals that an object of Open3D or trimesh has for each of them, if it has."""
     for name in ("normals", "vertex_normals"):
         with suppress(Exception):  # of what else has such a name
@@ -74,7 +75,7 @@ def _with_normals(points: Float[np.ndarray, "n 3"], source: Any) -> Float[np.nda
     return points
 
 
-def model_points(source: object) -> Float[np.ndarray, "n 3"]:
+def model_points(source: object) -> Points:
     """Points of a model, of whatever ``points_of`` takes but depth images; its origin is a point like any other.
 
     Raises ``ValueError`` as that does, and for points that are not finite.
@@ -114,7 +115,7 @@ def _is_frame(item: object) -> bool:
     return _is_cloud_message(item) or _carried(item) is not None
 
 
-def _positions(source: Any) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"] | None, str, bool]:
+def _positions(source: Any) -> tuple[Points, Points | None, str, bool]:
     """All points of a source, normals in its rows, what to call it in sentences, and whether it is a grid of pixels."""
     kind = f"the {type(source).__name__}"
     if is_frame_list(source):
@@ -151,7 +152,7 @@ def _positions(source: Any) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray,
     return _floats(values).reshape(-1, 3), normals, name, values.ndim == 3
 
 
-def _normals(columns: Float[np.ndarray, "n 3"], name: str) -> Float[np.ndarray, "n 3"] | None:
+def _normals(columns: Points, name: str) -> Points | None:
     """Normals that three more columns of points are; None of colours. Rows that are not finite or 0 say nothing."""
     known = columns[np.isfinite(columns).all(axis=1) & columns.any(axis=1)]
     if (known < 0).any():
@@ -191,7 +192,7 @@ def _carried(source: Any) -> Any:
     return next((values for values in attributes if values is not None and not callable(values)), None)
 
 
-def _structured_points(records: np.ndarray, name: str) -> Float[np.ndarray, "n 3"]:
+def _structured_points(records: np.ndarray, name: str) -> Points:
     fields = records.dtype.names or ()
     if not {"x", "y", "z"} <= set(fields):
         raise ValueError(f"{name} has the fields {listed(fields)}; x, y and z are needed: rename the fields")
@@ -282,7 +283,7 @@ def mesh_of(source: Any) -> SegmentedMesh | None:
         known = getattr(part, "metadata", None) or {}
         file = known.get("file_name") or f"part{index + 1}"
         name = key if isinstance(key, str) else getattr(part, "name", None) or known.get("name") or Path(file).stem
-        color = getattr(part, "color", PALETTE[index % len(PALETTE)])
+        color = getattr(part, "color", palette_color(index))
         segments.append(Segment(name, color, *mesh, solid=getattr(part, "solid", False)))
     return SegmentedMesh(tuple(segments)) if segments else None
 

@@ -23,7 +23,7 @@ from mereo.geometry.brief import listed
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import LARGEST
 from mereo.geometry.mesh import with_normals
-from mereo.geometry.transforms import checked_pose, rigid
+from mereo.geometry.transforms import Points, Transform, checked_pose, rigid
 from mereo.io.errors import check_count, check_suffix, limited_memory, quiet, readable, without_output
 from mereo.io.extras import library
 
@@ -410,7 +410,7 @@ def check_ply(path: Path) -> dict[str, int]:
     return counts
 
 
-def _text_points(path: Path) -> Float[np.ndarray, "n 3"]:
+def _text_points(path: Path) -> Points:
     """Rows of a text file; comment lines (# or //) and others before the first row of numbers are skipped."""
     lines = [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
     first = next((i for i, line in enumerate(lines[:100]) if _is_row(line)), None)
@@ -455,7 +455,7 @@ def _is_row(line: str) -> bool:
     return numbers >= 3 and not line.lstrip().startswith(("#", "//"))
 
 
-def _array_points(path: Path) -> Float[np.ndarray, "n 3"]:
+def _array_points(path: Path) -> Points:
     with path.open("rb") as file:  # by its name, numpy would leave a damaged archive open
         loaded = np.load(file, allow_pickle=False)
         if isinstance(loaded, np.ndarray):
@@ -468,7 +468,7 @@ def _array_points(path: Path) -> Float[np.ndarray, "n 3"]:
     return _check_array(fitting[0])
 
 
-def _check_array(array: np.ndarray) -> Float[np.ndarray, "n 3"]:
+def _check_array(array: np.ndarray) -> Points:
     if array.ndim not in (2, 3) or array.shape[-1] != 3:
         raise ValueError(f"its shape is {array.shape}, not [n, 3] or [h, w, 3]")
     if array.dtype.kind not in "fiu":
@@ -479,7 +479,7 @@ def _check_array(array: np.ndarray) -> Float[np.ndarray, "n 3"]:
 # --- PCD (Point Cloud Library, https://pointclouds.org/documentation/tutorials/pcd_file_format.html) -----------------
 
 
-def _pcd_points(path: Path) -> Float[np.ndarray, "n 3"]:
+def _pcd_points(path: Path) -> Points:
     """Points of a PCD file: ascii, binary, binary_compressed; organized clouds come row by row, with their NaN rows."""
     header, body = _pcd_parts(path.read_bytes())
     if missing := [key for key in ("FIELDS", "SIZE", "TYPE", "POINTS") if key not in header]:
@@ -511,7 +511,7 @@ def _pcd_parts(content: bytes) -> tuple[dict[str, list[str]], bytes]:
     return {line[0]: line[1:] for line in lines if len(line) > 1}, content[match.end() :]
 
 
-def read_viewpoint(path: Path) -> Float[np.ndarray, "4 4"] | None:
+def read_viewpoint(path: Path) -> Transform | None:
     """Pose of the camera by a PCD file's header; None where that is the identity, or missing, and for other files.
 
     Raises ``ValueError`` for one that is no position and unit quaternion (x y z, qw qx qy qz).
@@ -539,7 +539,7 @@ def _pcd_row(header: dict[str, list[str]]) -> np.dtype:
     return np.dtype(fields)
 
 
-def _pcd_ascii(body: bytes, row: np.dtype, count: int) -> Float[np.ndarray, "n 3"]:
+def _pcd_ascii(body: bytes, row: np.dtype, count: int) -> Points:
     names = [name for name in row.names or () for _ in range(int(np.prod(row[name].shape)))]  # of the columns
     lines = [line for line in body.decode("ascii").splitlines() if line.strip()]
     check_count(count, len(lines), "points")
@@ -548,7 +548,7 @@ def _pcd_ascii(body: bytes, row: np.dtype, count: int) -> Float[np.ndarray, "n 3
     return np.loadtxt(lines[:count], usecols=[names.index(axis) for axis in "xyz"], ndmin=2)
 
 
-def _pcd_compressed(body: bytes, row: np.dtype, count: int) -> Float[np.ndarray, "n 3"]:
+def _pcd_compressed(body: bytes, row: np.dtype, count: int) -> Points:
     """Points of a compressed body: two sizes, then LZF data with all values of one field together."""
     if len(body) < 8:
         raise ValueError("it is truncated after its header")
@@ -584,7 +584,7 @@ def _lzf_decompress(data: bytes, size: int) -> bytes:
     return bytes(output)
 
 
-def _zdf_points(path: Path) -> Float[np.ndarray, "n 3"]:
+def _zdf_points(path: Path) -> Points:
     with library("netCDF4", "sensors", path).Dataset(path) as file:
         cloud = file["data"]["pointcloud"][:]
     return _check_array(np.ma.filled(np.ma.asarray(cloud, dtype=np.float64), np.nan))
@@ -600,7 +600,7 @@ CLOUD_READERS: dict[str, Callable[[Path], Float[np.ndarray, "n c"]]] = {
 """Parser of each suffix of point clouds."""
 
 
-def read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
+def read_pose(path: Path) -> Transform:
     """Rigid pose of a file: 4 x 4 numbers as text or NPY, or ``pose`` of a result's summary.json."""
     with readable(path, "pose"):
         if path.suffix.lower() == ".npy":

@@ -14,22 +14,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from mereo.geometry.conventions import LARGEST
-from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, palette_color
 from mereo.geometry.mesh_check import united
-from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
+from mereo.geometry.transforms import Transform, Vector, inverse_rigid, rigid, transform_points
 from mereo.io.errors import readable
 from mereo.io.extras import library
 from mereo.io.mesh_formats import ROBOT_SUFFIXES, read_object_mesh
 
 KINDS = ("revolute", "continuous", "prismatic", "fixed")
 """Kinds of joints that are known."""
-
-Matrix = Float[np.ndarray, "4 4"]
-Vector = Float[np.ndarray, "3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +143,7 @@ def _read_sdf(yourdfpy: Any, root: Any) -> Any:
     names = {"link": "", "joint": "child", "frame": "attached_to"}
     poses, pending = {"": np.eye(4), "__model__": np.eye(4)}, set[str]()
 
-    def pose_of(name: str) -> Matrix:
+    def pose_of(name: str) -> Transform:
         """Pose of a link, joint or frame in the model."""
         if name not in poses:
             if name in pending or name not in elements:
@@ -158,7 +154,7 @@ def _read_sdf(yourdfpy: Any, root: Any) -> Any:
             poses[name] = pose(element, (element.findtext(base) or element.get(base, "")) if base else "")
         return poses[name]
 
-    def pose(element: Any, base: str) -> Matrix:
+    def pose(element: Any, base: str) -> Transform:
         place = element.find("pose")
         if place is None:
             return pose_of(base.strip())
@@ -195,22 +191,21 @@ def _with_axis(yourdfpy: Any, joint: Any, axis: Any, pose_of: Any) -> Any:
         base = "__model__"
     turn = pose_of(joint.name)[:3, :3].T @ pose_of(base)[:3, :3]
     joint.axis = turn @ _numbers(axis.findtext("xyz"), 3)
-    lower, upper = (_numbers(axis.findtext(f"limit/{key}") or value, 1)[0] for key, value in LIMITS.items())
+    lower, upper = _number(axis, "limit/lower", "-inf"), _number(axis, "limit/upper", "inf")
     joint.limit = yourdfpy.Limit(lower=lower, upper=upper)
     if (leader := axis.find("mimic")) is not None:
-        factor, offset, start = (
-            _numbers(leader.findtext(key) or value, 1)[0]
-            for key, value in (("multiplier", "1"), ("offset", "0"), ("reference", "0"))
-        )
-        joint.mimic = yourdfpy.Mimic(leader.get("joint"), factor, offset - factor * start)
+        factor, start = _number(leader, "multiplier", "1"), _number(leader, "reference", "0")
+        offset = _number(leader, "offset", "0") - factor * start
+        joint.mimic = yourdfpy.Mimic(leader.get("joint"), factor, offset)
     return joint
 
 
-LIMITS = {"lower": "-inf", "upper": "inf"}
-"""Limits of a joint of an SDF file that states none."""
+def _number(element: Any, key: str, default: str) -> float:
+    """Number of an element within another one, ``default`` where there is none."""
+    return _numbers(element.findtext(key) or default, 1)[0]
 
 
-def _geometries(yourdfpy: Any, element: Any) -> Iterator[tuple[Matrix, Any]]:
+def _geometries(yourdfpy: Any, element: Any) -> Iterator[tuple[Transform, Any]]:
     """Shapes of a visual or collision element of an SDF file, and where they are in it."""
     shape = element.find("geometry/*")
     if shape is None:
@@ -265,7 +260,7 @@ class _Shape(NamedTuple):
     """Shape of a link: a solid, or a mesh's file with its scale."""
 
     link: str
-    T_link_shape: Matrix
+    T_link_shape: Transform
     content: trimesh.Trimesh | Path
     scale: Vector | None = None
 
@@ -309,7 +304,7 @@ def _assembled(content: _Described) -> Robot:
             pieces.append(Segment(str(len(pieces)), PALETTE[0], vertices, faces))
     if not parts:
         raise ValueError(f"{path} has no link with a shape, of which a camera could see something: add meshes")
-    colors = (PALETTE[index % len(PALETTE)] for index in range(len(parts)))
+    colors = (palette_color(index) for index in range(len(parts)))
     segments = (Segment(name, color, *united(each)) for (name, each), color in zip(parts.items(), colors, strict=True))
     moved = {joint: tuple(name for chain, name in names.items() if joint in chain) for joint in limits}
     kept = {joint: each for joint, each in moved.items() if 0 < len(each) < len(names)}
@@ -335,7 +330,7 @@ def _check_numbers(path: Path, name: str, values: np.ndarray) -> None:
         )
 
 
-def _origin(element: Any) -> Matrix:
+def _origin(element: Any) -> Transform:
     return np.eye(4) if element.origin is None else np.asarray(element.origin)
 
 

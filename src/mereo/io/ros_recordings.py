@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Num, UInt8
+from jaxtyping import Num, UInt8
 
 from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.transforms import Points
 from mereo.io.errors import check_count, is_foreseen, limited_memory, reason
 from mereo.io.extras import library
 from mereo.io.intrinsics import camera_from_fields, warn_of_distortion
@@ -37,7 +38,7 @@ DEPTH_ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Numpy type of each datatype of sensor_msgs/PointField."""
 
-Content = DepthImage | Float[np.ndarray, "n 3"]
+Content = DepthImage | Points
 """Content of a message: depth in metres, or points in metres with NaN where nothing was measured."""
 
 
@@ -156,9 +157,7 @@ def _messages(reader: Any, connections: list[Any], source: str | Path) -> Iterat
 
 def _depth_topic(reader: Any, path: Path) -> str:
     """Topic of depth: the first of images whose first message is one, else of compressed ones, else of clouds."""
-    images, compressed, clouds = (
-        sorted({c.topic for c in reader.connections if c.msgtype == kind and c.msgcount}) for kind in FRAMES
-    )
+    images, compressed, clouds = (_topics(reader, kind) for kind in FRAMES)
     depths = [topic for topic in images if _first(reader, topic).encoding in DEPTH_ENCODINGS]
     depths = depths or [topic for topic in compressed if COMPRESSED_DEPTH in _first(reader, topic).format] or clouds
     if not depths:
@@ -168,6 +167,11 @@ def _depth_topic(reader: Any, path: Path) -> str:
             "depth topic and its camera_info"
         )
     return depths[0]
+
+
+def _topics(reader: Any, kind: str) -> list[str]:
+    """Topics on which there are messages of a type, by name."""
+    return sorted({c.topic for c in reader.connections if c.msgtype == kind and c.msgcount})
 
 
 def _first(reader: Any, topic: str) -> Any:
@@ -185,7 +189,7 @@ def _realsense_scale(reader: Any, topic: str) -> float | None:
 
 def _camera(reader: Any, topic: str, path: Path) -> Camera:
     """Camera from the CameraInfo topic that shares the most leading names with ``topic``."""
-    infos = sorted({c.topic for c in reader.connections if c.msgtype == INFO and c.msgcount})
+    infos = _topics(reader, INFO)
     if not infos:
         raise ValueError(f"{path} has no CameraInfo; the intrinsics of {topic} are needed: give --intrinsics FILE")
     nearest = max(infos, key=lambda info: len(commonpath([f"/{info}", f"/{topic}"])))
@@ -275,7 +279,7 @@ def _rows(message: Any, step: int, item: int) -> UInt8[np.ndarray, "h s"]:
     return data[: message.height * step].reshape(message.height, step)
 
 
-def cloud_points(message: Any) -> Float[np.ndarray, "n 3"]:
+def cloud_points(message: Any) -> Points:
     """Points of a PointCloud2 message of ROS 1 or 2, row by row, NaN where nothing was measured.
 
     Args:

@@ -16,7 +16,7 @@ from mereo.geometry.brief import counted
 from mereo.geometry.camera import Camera, DepthImage, PointCloud, camera_axes
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import FEW_VERTICES, oriented_points
-from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
+from mereo.geometry.transforms import Points, Transform, inverse_rigid, longest_side, rigid, transform_points
 from mereo.io.bounds import PositiveOrUnknown, check_bounds
 from mereo.io.config import InputConfig
 from mereo.io.intrinsics import intrinsics_of, read_intrinsics
@@ -73,8 +73,8 @@ class SensorFrame:
     message: str = ""
     invalid: int = 0
     whole: DepthImage | None = None
-    T_input_result: Float[np.ndarray, "4 4"] | None = None
-    T_result_seen: Float[np.ndarray, "4 4"] | None = None
+    T_input_result: Transform | None = None
+    T_result_seen: Transform | None = None
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -84,7 +84,7 @@ class SensorFrame:
         points = counted(len(self.cloud), "point")
         return f"SensorFrame({self.source!r}, {points}, {size} {self.length_name}, {self.axes} axes)"
 
-    def seen_from(self, T_input_camera: Float[np.ndarray, "4 4"]) -> "SensorFrame":
+    def seen_from(self, T_input_camera: Transform) -> "SensorFrame":
         """Frame with its cloud in the axes of a camera of this pose; ``ValueError`` where axes are known already."""
         if self.axes != "camera" or self.depth is not None:
             raise ValueError(
@@ -94,7 +94,7 @@ class SensorFrame:
         cloud = self.cloud.transformed(np.linalg.inv(T_input_camera))  # its digits may be few
         return replace(self, cloud=cloud, T_input_result=T_input_camera)
 
-    def transformed(self, T_new_result: Float[np.ndarray, "4 4"]) -> "SensorFrame":
+    def transformed(self, T_new_result: Transform) -> "SensorFrame":
         """Frame in other coordinates, in which it has no pixels."""
         T_input_result, T_result_seen = (
             np.eye(4) if T is None else T for T in (self.T_input_result, self.T_result_seen)
@@ -109,7 +109,7 @@ class SensorFrame:
         )
 
     @property
-    def T_camera_result(self) -> Float[np.ndarray, "4 4"]:
+    def T_camera_result(self) -> Transform:
         """From the coordinates of ``cloud`` into the axes of a camera that looks at it (``camera_axes``)."""
         turn = camera_axes(self.axes)
         return turn if self.T_result_seen is None else turn @ inverse_rigid(self.T_result_seen)
@@ -133,7 +133,7 @@ class SensorFrame:
 def read_frame(
     path: str | Path,
     reading: InputConfig = InputConfig(),  # noqa: B008 (frozen)
-    T_input_camera: Float[np.ndarray, "4 4"] | None = None,
+    T_input_camera: Transform | None = None,
     camera: Any = None,
 ) -> SensorFrame:
     """Frame that a depth image, point cloud, mesh or ROS recording holds, or that ``reading`` picks from it.
@@ -177,7 +177,7 @@ def _cloud_rows(path: Path) -> Float[np.ndarray, "n c"]:
     return oriented_points(vertices, faces)
 
 
-def in_camera(frame: SensorFrame, reading: InputConfig, pose: Float[np.ndarray, "4 4"] | None = None) -> SensorFrame:
+def in_camera(frame: SensorFrame, reading: InputConfig, pose: Transform | None = None) -> SensorFrame:
     """Frame in the camera's axes, where its pose is given, by an option or by the file."""
     if pose is None:
         pose = _stated_pose(frame, reading) if reading.camera_pose is None else read_pose(reading.camera_pose)
@@ -189,7 +189,7 @@ def _near_origin(frame: SensorFrame) -> SensorFrame:
 
     A scan is moved by whole units, where the origin means nothing. Raises ``ValueError`` where it is to be the camera.
     """
-    points, size = frame.cloud.points, float(np.ptp(frame.cloud.points, axis=0).max())
+    points, size = frame.cloud.points, longest_side(frame.cloud.points)
     middle = np.median(points, axis=0)
     times = float(np.linalg.norm(middle)) / size if size > 0 else 0.0
     if frame.depth is not None or times <= FAR:
@@ -210,7 +210,7 @@ def _near_origin(frame: SensorFrame) -> SensorFrame:
     return replace(frame, cloud=replace(frame.cloud, points=points - offset), T_input_result=rigid(np.eye(3), offset))
 
 
-def _stated_pose(frame: SensorFrame, reading: InputConfig) -> Float[np.ndarray, "4 4"] | None:
+def _stated_pose(frame: SensorFrame, reading: InputConfig) -> Transform | None:
     """Pose of the camera that the file states, where its points are in the frame of that; None where they are not.
 
     Some programs store points as the sensor measured them next to its pose, others points in the frame of the pose.
@@ -237,7 +237,7 @@ def _stated_pose(frame: SensorFrame, reading: InputConfig) -> Float[np.ndarray, 
     return pose if moved else None
 
 
-def _is_in_view(points: Float[np.ndarray, "n 3"]) -> bool:
+def _is_in_view(points: Points) -> bool:
     """Whether a camera at the origin that looks along z may see these points."""
     return bool((points[:, 2] > IN_VIEW * np.linalg.norm(points, axis=1)).mean() >= MOST_IN_VIEW)
 

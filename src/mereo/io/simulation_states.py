@@ -13,6 +13,8 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
+from mereo.geometry.mesh import with_used_vertices
+from mereo.geometry.transforms import Points, longest_side
 from mereo.io.errors import readable
 from mereo.io.readers import read_arrays
 from mereo.io.vtk_frames import (
@@ -51,7 +53,7 @@ class TetrahedralRecord:
         frames: their names, for messages.
     """
 
-    rest_nodes: Float[np.ndarray, "n 3"]
+    rest_nodes: Points
     tetrahedra: Int[np.ndarray, "m 4"]
     displacements: Float[np.ndarray, "f n 3"]
     frames: tuple[str, ...]
@@ -96,7 +98,7 @@ def read_states(path: Path, names: tuple[str, ...], mesh: Path | None = None) ->
     return _sequence(path, names, mesh)
 
 
-def read_tetrahedra(path: Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 4"], Int[np.ndarray, " n"]]:
+def read_tetrahedra(path: Path) -> tuple[Points, Int[np.ndarray, "m 4"], Int[np.ndarray, " n"]]:
     """Nodes, tetrahedra, four node indices each, and the nodes' numbers in a VTK, VTU, MSH or INP file, or an NPZ.
 
     An NPZ has them as `rest_nodes` and `tetrahedra`.
@@ -126,8 +128,7 @@ def read_tetrahedra(path: Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarra
         raise ValueError(f"{path} has no tetrahedra, nor other solid cells: export the volume mesh, not its surface")
     if elements.min() < 0 or elements.max() >= len(nodes):
         return nodes, elements, np.arange(len(nodes))  # the mesh's own check names the index
-    used, packed = np.unique(elements, return_inverse=True)
-    return nodes[used], packed.reshape(-1, 4), used
+    return *with_used_vertices(nodes, elements), np.unique(elements)
 
 
 def frame_files(path: Path) -> list[Path]:
@@ -189,16 +190,14 @@ def _sequence(path: Path, names: tuple[str, ...], mesh: Path | None) -> Tetrahed
     )
 
 
-def _positions(
-    path: Path, frames: MeshFrames, rest: Float[np.ndarray, "n 3"] | None
-) -> tuple[Float[np.ndarray, "f n 3"], Float[np.ndarray, "n 3"] | None]:
+def _positions(path: Path, frames: MeshFrames, rest: Points | None) -> tuple[Float[np.ndarray, "f n 3"], Points | None]:
     """Positions in all frames, and those at rest where displacements say them.
 
     Points that stay are moved by their displacements. Of points that move, displacements tell the rest, if they agree.
     """
     points, moved = frames.points, frames.displacements
     start = points[0] if rest is None else rest
-    size = float(np.ptp(start, axis=0).max())
+    size = longest_side(start)
     if np.abs(points - start).max() <= STILL * size:
         if moved is not None:
             return points + moved, points[0]
@@ -290,7 +289,7 @@ def _tetrahedral(path: Path, arrays: dict[str, np.ndarray]) -> TetrahedralRecord
     return TetrahedralRecord(rest, elements, moved - rest if key == "nodes" else moved, frames)
 
 
-def _volume(path: Path, arrays: dict[str, np.ndarray]) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 4"]]:
+def _volume(path: Path, arrays: dict[str, np.ndarray]) -> tuple[Points, Int[np.ndarray, "m 4"]]:
     """Nodes and tetrahedra of an archive."""
     rest = _floats(path, "rest_nodes", arrays["rest_nodes"], 2).astype(np.float64)
     elements = arrays["tetrahedra"]

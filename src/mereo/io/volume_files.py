@@ -15,13 +15,14 @@ from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, Integer, Shaped
+from jaxtyping import Bool, Float32, Int, Integer, Shaped
 from scipy.ndimage import gaussian_filter
 from skimage.measure import marching_cubes
 
 from mereo.geometry.brief import listed
-from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh
-from mereo.geometry.transforms import transform_points
+from mereo.geometry.labels import part_of_grid
+from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh, palette_color
+from mereo.geometry.transforms import Corners, Points, Transform, Vector, transform_points
 from mereo.io.config import Space
 from mereo.io.errors import check_size, limited_memory, quiet, readable
 from mereo.io.extras import library
@@ -48,32 +49,32 @@ class Volume:
     """
 
     values: Shaped[np.ndarray, "..."]
-    T_world_index: Float[np.ndarray, "4 4"]
+    T_world_index: Transform
     slope: float = 1.0
     intercept: float = 0.0
     header: Any = field(default=None, repr=False)
 
     @property
-    def spacing(self) -> Float[np.ndarray, "3"]:
+    def spacing(self) -> Vector:
         """Distance between voxel centres along each axis."""
         return np.linalg.norm(self.T_world_index[:3, :3], axis=0)
 
     @property
-    def bounds(self) -> Float[np.ndarray, "2 3"]:
+    def bounds(self) -> Corners:
         """Axis-aligned box of the voxels, their own extent included."""
         ends = np.stack(np.meshgrid(*([-0.5, n - 0.5] for n in self.values.shape), indexing="ij"), axis=-1)
         corners = transform_points(self.T_world_index, ends.reshape(-1, 3))
         return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
-    def index_of(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def index_of(self, points: Points) -> Points:
         """Voxel indices, with fractions, of positions."""
         return transform_points(np.linalg.inv(self.T_world_index), points)
 
-    def holds(self, index: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    def holds(self, index: Points) -> Bool[np.ndarray, " n"]:
         """Whether indices with fractions lie in a voxel."""
         return np.all((index >= -0.5) & (index <= np.array(self.values.shape) - 0.5), axis=1)
 
-    def tissue_share(self, points: Float[np.ndarray, "n 3"]) -> float:
+    def tissue_share(self, points: Points) -> float:
         """Share of points that lie in voxels above the mean: in tissue, and not in air or empty space."""
         index = np.rint(self.index_of(points)).astype(np.int64)
         held = np.all((index >= 0) & (index < self.values.shape), axis=1)
@@ -167,7 +168,7 @@ def file_space(path: Path) -> Space | None:
     return None if space is None else "LPS" if space[1] == "LPS" else "RAS"
 
 
-def _to_ras(space: str) -> Float[np.ndarray, "4 4"]:
+def _to_ras(space: str) -> Transform:
     """Transform to RAS from an anatomical frame, such as left-posterior-superior or LPS; others stay as they are."""
     axes = ANATOMICAL.fullmatch(space.lower())
     return np.diag([*(-1.0 if axis in "lpi" else 1.0 for axis in ("ras" if axes is None else axes.groups())), 1.0])
@@ -224,7 +225,7 @@ class LabelVolume:
     """
 
     labels: Integer[np.ndarray, "l x y z"]
-    T_world_index: Float[np.ndarray, "4 4"]
+    T_world_index: Transform
     names: Mapping[int, str]
     colors: Mapping[int, Color] = field(default_factory=dict)
 
@@ -425,7 +426,7 @@ def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) 
     margins = _margins(_in_partition([grid.share(mask) for mask in masks], parents), parents)
     thin, parts, cell = dict[str, str](), list[Segment](), abs(float(np.linalg.det(volume.T_world_index[:3, :3])))
     for index, (name, margin) in enumerate(zip(segments, margins, strict=True)):
-        part = grid.surface(margin, name, volume.colors.get(labels[index][0], PALETTE[index % len(PALETTE)]))
+        part = grid.surface(margin, name, volume.colors.get(labels[index][0], palette_color(index)))
         kept = 0.0 if part is None else part.volume / (float(masks[index].sum()) * cell)
         if part is None or kept < LEAST_VOLUME:
             thin[name] = (
@@ -502,13 +503,13 @@ class _Grid:
     first: Int[np.ndarray, "3"]
     counts: Int[np.ndarray, "3"]
     block: Int[np.ndarray, "3"]
-    T_world_index: Float[np.ndarray, "4 4"]
+    T_world_index: Transform
 
     @classmethod
     def around(
         cls,
         mask: Mask,
-        transform: Float[np.ndarray, "4 4"],
+        transform: Transform,
         cells: int,
     ) -> "_Grid":
         """Grid over all that is set, with about ``cells`` along the longest side; cells are whole numbers of voxels."""
@@ -522,7 +523,7 @@ class _Grid:
     def share(self, mask: Mask) -> tuple[Share, float]:
         """Share of each cell that is set, smoothed, with ``MARGIN`` empty cells around; and the one at the surface."""
         end = np.minimum(self.first + self.counts * self.block, mask.shape)
-        part = mask[tuple(slice(a, b) for a, b in zip(self.first, end, strict=True))]
+        part = mask[part_of_grid(self.first, end)]
         part = np.pad(part, [(0, int(n)) for n in self.counts * self.block - part.shape])
         (a, b, c), (i, j, k) = self.counts, self.block
         means = np.pad(part.reshape(a, i, b, j, c, k).mean(axis=(1, 3, 5), dtype=np.float32), MARGIN)
@@ -543,8 +544,8 @@ class _Grid:
         inside = np.argwhere(share > 0.5)
         if len(inside) == 0:
             return 0.0
-        box = tuple(slice(a - 1, b + 2) for a, b in zip(inside.min(axis=0), inside.max(axis=0), strict=True))
-        part = self.surface(share[box] - np.float32(0.5), "", PALETTE[0])
+        near = part_of_grid(inside.min(axis=0) - 1, inside.max(axis=0) + 2)
+        part = self.surface(share[near] - np.float32(0.5), "", PALETTE[0])
         return 0.0 if part is None else part.volume
 
     def surface(self, margin: Share, name: str, color: Color) -> Segment | None:
@@ -553,7 +554,7 @@ class _Grid:
             return None
         vertices, faces, _, _ = marching_cubes(margin, 0.0, gradient_direction="ascent")
         index = (vertices - MARGIN + 0.5) * self.block - 0.5 + self.first
-        world = index @ self.T_world_index[:3, :3].T + self.T_world_index[:3, 3]
+        world = transform_points(self.T_world_index, index)
         # voxel axes may be left-handed
         turned = -1 if np.linalg.det(self.T_world_index[:3, :3]) < 0 else 1
         return Segment(name, color, world, faces[:, ::turned].astype(np.int64))

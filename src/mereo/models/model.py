@@ -22,7 +22,7 @@ from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.downsampling import farthest_point_order, random_subset
 from mereo.geometry.mesh import Color
-from mereo.geometry.transforms import Normalizer
+from mereo.geometry.transforms import Normalizer, Points
 from mereo.models.calibration import Calibration, Scaling
 from mereo.models.config import Precision, Supervision
 from mereo.models.decoder import ConditionedMLP, Prediction
@@ -120,7 +120,7 @@ class Model:
         """Name of ``working_dtype``."""
         return str(self.working_dtype).removeprefix("torch.")
 
-    def encode(self, cloud: PointCloud | Float[np.ndarray, "n 3"]) -> EncodedCloud:
+    def encode(self, cloud: PointCloud | Points) -> EncodedCloud:
         """Encoded cloud of points in a camera frame (z forward), any unit, any density.
 
         Raises ``ValueError`` on unusable clouds.
@@ -145,7 +145,7 @@ class Model:
         seen = normalized[farthest_point_order(normalized, limit)]
         return torch.from_numpy(seen[np.arange(limit) % len(seen)][None]), normalizer
 
-    def query(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Answer:
+    def query(self, code: EncodedCloud, points: Points) -> Answer:
         """Segment, probabilities, signed distance and direction at each point.
 
         Raises ``ValueError`` for no points, and for what is no position.
@@ -162,7 +162,7 @@ class Model:
         label, probability, distance, direction = self._chunked(code, points, answer)
         return Answer(label, probability, distance / np.float32(code.normalizer.scale), direction)
 
-    def logits(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n c"]:
+    def logits(self, code: EncodedCloud, points: Points) -> Float[np.ndarray, "n c"]:
         """Class logits at each point, without the rest of the answer: what surface extraction needs."""
         return self._chunked(code, points, lambda *answer: (self.class_logits(*answer),))[0]
 
@@ -171,9 +171,7 @@ class Model:
         """Whether probabilities are calibrated: by the temperature, and biases, of the weights' calibration."""
         return self.calibration is not None and self.calibration.temperature is not None
 
-    def correspond(
-        self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, "n c"], Float[np.ndarray, "n 3"]] | None:
+    def correspond(self, code: EncodedCloud, points: Points) -> tuple[Float[np.ndarray, "n c"], Points] | None:
         """Class probabilities, not calibrated, and rest coordinates of points; None from a model without template."""
         if self.network.decoder.lookup is None:
             return None
@@ -228,7 +226,7 @@ class Model:
     def _chunked(
         self,
         code: EncodedCloud,
-        points: Float[np.ndarray, "n 3"],
+        points: Points,
         answer: Callable[[Prediction, Tensor], tuple[Tensor, ...]],
     ) -> list[np.ndarray]:
         """Parts of the answers at all points, computed chunk by chunk."""

@@ -13,6 +13,8 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from mereo.geometry.transforms import Points
+
 # PyTorch 2.6 cannot tell exporting from compiling, and compiles what is exported
 is_exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)
 
@@ -58,7 +60,7 @@ def _by_pairs(centers: Tensor, points: Tensor, radius: float, limit: int) -> Ten
 
 
 def _first_in_ball(
-    centers: Float[np.ndarray, "m 3"], points: Float[np.ndarray, "n 3"], radius: float, limit: int
+    centers: Float[np.ndarray, "m 3"], points: Points, radius: float, limit: int
 ) -> Int[np.ndarray, "m k"]:
     # |c - p|^2 - r^2 as one product of five columns with five rows; in double precision nothing is lost
     lengths = (centers * centers).sum(axis=1) - radius * radius

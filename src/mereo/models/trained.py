@@ -16,7 +16,7 @@ from mereo.geometry.brief import counted
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import Color
-from mereo.geometry.transforms import Normalizer
+from mereo.geometry.transforms import Normalizer, Points
 from mereo.models.calibration import Calibration
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -33,7 +33,7 @@ class EncodedCloud:
 
     code: Any
     normalizer: Normalizer
-    cloud: Float[np.ndarray, "n 3"]
+    cloud: Points
 
     def __repr__(self) -> str:
         return f"EncodedCloud({counted(len(self.cloud), 'point')})"
@@ -54,7 +54,7 @@ class Answer:
     label: UInt8[np.ndarray, " n"]
     probability: Float[np.ndarray, "n c"]
     distance: Float[np.ndarray, " n"]
-    direction: Float[np.ndarray, "n 3"]
+    direction: Points
 
     def __repr__(self) -> str:
         return f"Answer({counted(len(self.label), 'point')}, {int((self.label > 0).sum()):,} in a segment)"
@@ -111,15 +111,13 @@ class Trained(Protocol):
     def encode(self, cloud: PointCloud) -> EncodedCloud:
         """Encoded cloud of points in a camera frame; ``ValueError`` for unusable ones."""
 
-    def query(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Answer:
+    def query(self, code: EncodedCloud, points: Points) -> Answer:
         """Segment, probabilities, signed distance and direction at each point."""
 
-    def logits(self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n c"]:
+    def logits(self, code: EncodedCloud, points: Points) -> Float[np.ndarray, "n c"]:
         """Class logits at each point."""
 
-    def correspond(
-        self, code: EncodedCloud, points: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, "n c"], Float[np.ndarray, "n 3"]] | None:
+    def correspond(self, code: EncodedCloud, points: Points) -> tuple[Float[np.ndarray, "n c"], Points] | None:
         """Class probabilities and rest coordinates of points; None from a network without them."""
 
 
@@ -132,7 +130,7 @@ def check_enough(count: int, message: str) -> None:
         )
 
 
-def checked_points(cloud: PointCloud) -> Float[np.ndarray, "n 3"]:
+def checked_points(cloud: PointCloud) -> Points:
     """Points of a cloud as float64, or ``ValueError`` with one sentence on why they cannot be used."""
     points = np.asarray(cloud.points, dtype=np.float64)
     check_enough(len(points), f"the cloud has {len(points)} points")
@@ -152,7 +150,7 @@ FORWARD = {
 """Direction in which a camera looks along other usual axes, and its pose in them (the first three rows)."""
 
 
-def _cure_of_axes(points: Float[np.ndarray, "n 3"]) -> str:
+def _cure_of_axes(points: Points) -> str:
     """Advice for a cloud that is not in front of a camera, by the axes in which it is in front of the origin."""
     ahead = points.mean(axis=0)
     axes = max(FORWARD, key=lambda name: ahead @ FORWARD[name][0])

@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from mereo.io.atomic_files import atomic_file
+from mereo.io.atomic_files import write_file
 from mereo.io.errors import reason
 from mereo.models.calibration import Calibration
 from mereo.models.config import InferenceConfig, Loss, NetworkConfig, Supervision
@@ -155,8 +155,7 @@ def save_model(model: Model, path: Path, dtype: torch.dtype = torch.float32) -> 
 
     An autodecoder's codes of training examples are left out: using a network needs their mean, and at most their axes.
     """
-    with atomic_file(path) as partial:
-        partial.write_bytes(weights_bytes(model, dtype))
+    write_file(path, weights_bytes(model, dtype))
 
 
 def weights_bytes(model: Model, dtype: torch.dtype = torch.float32) -> bytes:

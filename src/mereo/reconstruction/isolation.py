@@ -22,7 +22,7 @@ from mereo.geometry.camera import PointCloud, into_camera
 from mereo.geometry.conventions import MIN_POINTS, CloudAxes
 from mereo.geometry.downsampling import MAX_POINTS, spacing, thin_to_grid
 from mereo.geometry.surface_patches import STRETCH, stretch, surface_patches
-from mereo.geometry.transforms import transform_points
+from mereo.geometry.transforms import Points, Vector, transform_points
 from mereo.reconstruction.config import IsolationConfig
 
 PLANE_SPACINGS = 3.0
@@ -87,7 +87,7 @@ class Selection:
     thinned: Bool[np.ndarray, " n"]
     steps: tuple[IsolationStep, ...]
 
-    def of_object(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    def of_object(self, points: Points) -> Bool[np.ndarray, " n"]:
         """Points of the object, also those that were thinned out: their nearest compared point is the object's."""
         whole = self.keep.copy()
         if self.thinned.any():
@@ -165,7 +165,7 @@ def _steps(config: IsolationConfig, unit_m: float, frame: CloudAxes) -> Iterator
 # --- steps -----------------------------------------------------------------------------------------------------------
 
 
-def _off_plane(points: Float[np.ndarray, "n 3"], unit_m: float, frame: CloudAxes) -> Keep:
+def _off_plane(points: Points, unit_m: float, frame: CloudAxes) -> Keep:
     tolerance = np.full(len(points), PLANE_SPACINGS * spacing(points))
     middle = np.median(points[:, 2])
     if frame == "camera" and middle > 0:  # what lies behind the camera is refused later
@@ -182,19 +182,19 @@ def _off_plane(points: Float[np.ndarray, "n 3"], unit_m: float, frame: CloudAxes
     return off, f"the plane with normal {normal}, {2e3 * tolerance.min() * unit_m:.2g} mm thick"
 
 
-def _thinned(points: Float[np.ndarray, "n 3"]) -> Keep:
+def _thinned(points: Points) -> Keep:
     keep = np.zeros(len(points), dtype=bool)
     keep[thin_to_grid(points, MAX_POINTS)] = True
     return keep, "one in each cell of a grid"
 
 
-def _inliers(points: Float[np.ndarray, "n 3"]) -> Keep:
+def _inliers(points: Points) -> Keep:
     """Points that are no outliers, see ``OUTLIER_STD``."""
     distance = cKDTree(points).query(points, k=min(OUTLIER_NEIGHBORS, len(points) - 1) + 1)[0][:, 1:].mean(axis=1)
     return distance <= distance.mean() + OUTLIER_STD * distance.std(), ""
 
 
-def clusters(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+def clusters(points: Points) -> Int[np.ndarray, " n"]:
     """Number of each point's cluster, the largest being 0; see ``CLUSTER_NEIGHBORS``."""
     count = min(CLUSTER_NEIGHBORS, len(points) - 1) + 1
     gap = CLUSTER_GAP * spacing(points)
@@ -208,7 +208,7 @@ def clusters(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
     return np.asarray(rank[label], dtype=np.int64)
 
 
-def _largest_cluster(points: Float[np.ndarray, "n 3"], gap: float) -> Keep:
+def _largest_cluster(points: Points, gap: float) -> Keep:
     """Points of the largest cluster, of those nearer than ``gap`` to it, of those nearer to these, and so on.
 
     Clusters of fewer than ``MIN_POINTS`` are floating points and do not count.
@@ -252,17 +252,15 @@ class Plane:
         offset: in the points' unit.
     """
 
-    normal: Float[np.ndarray, "3"]
+    normal: Vector
     offset: float
 
-    def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def distance(self, points: Points) -> Float[np.ndarray, " n"]:
         """Distance of points from the plane, without sign."""
         return np.abs(points @ self.normal - self.offset)
 
 
-def largest_plane(
-    points: Float[np.ndarray, "n 3"], tolerance: Float[np.ndarray, " n"], rng: np.random.Generator
-) -> Plane | None:
+def largest_plane(points: Points, tolerance: Float[np.ndarray, " n"], rng: np.random.Generator) -> Plane | None:
     """Plane with the most points within ``tolerance``; None where no three points span one.
 
     Args:
@@ -367,9 +365,7 @@ class Reading:
         return f"{dropped} times as long with them (--keep-all keeps them)"
 
 
-def readings(
-    cloud: PointCloud | Float[np.ndarray, "n 3"], axes: CloudAxes = "camera", keep_all: bool = False
-) -> tuple[Reading, ...]:
+def readings(cloud: PointCloud | Points, axes: CloudAxes = "camera", keep_all: bool = False) -> tuple[Reading, ...]:
     """Readings of a cloud, one to three, the more likely first: take that one where nothing else is known.
 
     One, with every point, where the points off all surfaces do not stretch the cloud's box by more than ``STRETCH``, or
@@ -399,7 +395,7 @@ def readings(
     return (surfaces, everything, *nearer) if scattered else (everything, surfaces, *nearer)
 
 
-def nearer_layer(points: Float[np.ndarray, "n 3"], patch: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+def nearer_layer(points: Points, patch: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
     """Mark the points before the largest gap in range between patches of surface; all where there is no gap.
 
     A mask that is too wide lets in what is behind the object, which may be as many points as the object's own where it

@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from skimage.measure import marching_cubes
 
-from mereo.geometry.labels import LabelGrid
+from mereo.geometry.labels import LabelGrid, part_of_grid
 from mereo.geometry.mesh import Color, Segment, SegmentedMesh
+from mereo.geometry.transforms import Corners, Points, Vector, longest_side
 
 # --- coarse to fine ---------------------------------------------------------------------------------------------------
 
@@ -33,7 +34,7 @@ from mereo.geometry.mesh import Color, Segment, SegmentedMesh
 #
 # Notation: nodes are points of the grid, cells are the boxes between eight nodes; c classes; class 0 is empty space.
 
-Field = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n c"]]
+Field = Callable[[Points], Float[np.ndarray, "n c"]]
 """Function from points to their class logits."""
 
 COARSE = 4
@@ -61,7 +62,7 @@ class Sampled:
 class _Evaluator:
     """Field at nodes of the finest grid; keeps every answer."""
 
-    def __init__(self, field: Field, origin: Float[np.ndarray, "3"], spacing: Float[np.ndarray, "3"]) -> None:
+    def __init__(self, field: Field, origin: Vector, spacing: Vector) -> None:
         self.field, self.origin, self.spacing = field, origin, spacing
         self.chunks: list[Float[np.ndarray, "m c"]] = []
         self.count = 0
@@ -79,18 +80,14 @@ class _Evaluator:
         return np.concatenate(self.chunks)
 
 
-def sample_dense(
-    field: Field, origin: Float[np.ndarray, "3"], spacing: Float[np.ndarray, "3"], shape: tuple[int, int, int]
-) -> Sampled:
+def sample_dense(field: Field, origin: Vector, spacing: Vector, shape: tuple[int, int, int]) -> Sampled:
     """Field evaluated at every node ``origin + [i, j, k] * spacing``."""
     evaluate = _Evaluator(field, origin, spacing)
     labels, rows = evaluate(_all_nodes(shape))
     return Sampled(labels.reshape(shape), rows.reshape(shape), evaluate.logits())
 
 
-def sample_coarse_to_fine(
-    field: Field, origin: Float[np.ndarray, "3"], spacing: Float[np.ndarray, "3"], shape: tuple[int, int, int]
-) -> Sampled:
+def sample_coarse_to_fine(field: Field, origin: Vector, spacing: Vector, shape: tuple[int, int, int]) -> Sampled:
     """Labels of ``sample_dense`` from few evaluations; every cell with a change of label is known exactly."""
     evaluate = _Evaluator(field, origin, spacing)
     # whole coarse cells: up to three nodes beyond the grid are evaluated too and cut off at the end
@@ -132,9 +129,7 @@ def _sloping_cells(rows: Int[np.ndarray, "x y z"], logits: Float[np.ndarray, "m 
     change = np.zeros_like(lead)
     for axis in range(3):
         steps = np.nan_to_num(np.abs(np.diff(lead, axis=axis)))
-        before, after = [(0, 0)] * 3, [(0, 0)] * 3
-        before[axis], after[axis] = (1, 0), (0, 1)
-        change += np.maximum(np.pad(steps, before), np.pad(steps, after))
+        change += _on_both_sides(steps, axis, np.maximum)
     # NaN compares as False: a cell all of whose corners were skipped stays as it is
     return over_corners(lead <= REACH * 0.5 * change, np.logical_or)
 
@@ -172,7 +167,7 @@ def _halve(
         place = tuple(wanted.T)
         fine_labels[place], fine_rows[place] = evaluate(step * wanted)
         low, high = np.maximum(wanted.min(axis=0) - 1, 0), wanted.max(axis=0) + 2
-        part = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+        part = part_of_grid(low, high)
         wanted = low + np.argwhere(_contradicted(fine_labels[part], fine_rows[part] < 0, wanted - low))
     return fine_labels, fine_rows
 
@@ -180,11 +175,15 @@ def _halve(
 def _nodes_of(cells: Bool[np.ndarray, "i j k"]) -> Bool[np.ndarray, "u v w"]:
     """Nodes of the lattice half as wide that lie in or on these cells."""
     for axis in range(3):
-        doubled = np.repeat(cells, 2, axis=axis)
-        before, after = [(0, 0)] * 3, [(0, 0)] * 3
-        before[axis], after[axis] = (1, 0), (0, 1)
-        cells = np.pad(doubled, after) | np.pad(doubled, before)
+        cells = _on_both_sides(np.repeat(cells, 2, axis=axis), axis, np.logical_or)
     return cells
+
+
+def _on_both_sides(values: np.ndarray, axis: int, combine: np.ufunc) -> np.ndarray:
+    """Values that lie between nodes along an axis, at the nodes: those of both sides joined by ``combine``."""
+    before, after = [(0, 0)] * 3, [(0, 0)] * 3
+    before[axis], after[axis] = (1, 0), (0, 1)
+    return combine(np.pad(values, before), np.pad(values, after))
 
 
 def _contradicted(
@@ -246,7 +245,7 @@ class Extraction:
 
 def extract(
     field: Field,
-    box: Float[np.ndarray, "2 3"],
+    box: Corners,
     resolution: int,
     names: Sequence[str],
     colors: Sequence[Color],
@@ -280,9 +279,7 @@ def extract(
     return Extraction(replace(empty, segments=tuple(segments)), grid, len(sampled.logits))
 
 
-def _grid(
-    box: Float[np.ndarray, "2 3"], resolution: int
-) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], tuple[int, int, int]]:
+def _grid(box: Corners, resolution: int) -> tuple[Vector, Vector, tuple[int, int, int]]:
     """Origin, spacing and number of nodes of a grid, which may end up to one cell behind the box."""
     size = box[1] - box[0]
     if resolution < 4:
@@ -303,7 +300,7 @@ def check_nodes(resolution: int, x: int, y: int, z: int) -> None:
         )
 
 
-def locate(field: Field, box: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "2 3"]:
+def locate(field: Field, box: Corners) -> Corners:
     """Box of all segments, with a margin of two coarse voxels, found on a coarse grid.
 
     ``box`` is where to look first; a side that a segment touches moves out by a quarter of the box, ``GROWTHS`` times
@@ -324,7 +321,7 @@ def locate(field: Field, box: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "2 
 
 def extract_whole(
     field: Field,
-    box: Float[np.ndarray, "2 3"],
+    box: Corners,
     resolution: int,
     names: Sequence[str],
     colors: Sequence[Color],
@@ -353,8 +350,8 @@ def _check_occupied(grid: LabelGrid) -> None:
         )
 
 
-def _grown(box: Float[np.ndarray, "2 3"], sides: Bool[np.ndarray, "2 3"], fraction: float) -> Float[np.ndarray, "2 3"]:
-    step = fraction * float((box[1] - box[0]).max())
+def _grown(box: Corners, sides: Bool[np.ndarray, "2 3"], fraction: float) -> Corners:
+    step = fraction * longest_side(box)
     return box + step * sides * np.array([[-1.0], [1.0]])
 
 

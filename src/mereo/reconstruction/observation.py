@@ -19,7 +19,7 @@ from mereo.geometry.camera import DepthImage, PointCloud, SightKind, SightLines,
 from mereo.geometry.conventions import MIN_POINTS, CloudAxes
 from mereo.geometry.downsampling import MAX_POINTS, STEEPEST, random_subset
 from mereo.geometry.surface_patches import noise_of_differences, second_differences
-from mereo.geometry.transforms import transform_points
+from mereo.geometry.transforms import Points, Transform, longest_side, transform_points
 from mereo.io.sensor_frame import SensorFrame
 from mereo.reconstruction.config import Extent, IsolationConfig
 from mereo.reconstruction.isolation import (
@@ -83,7 +83,7 @@ class Observation:
     steps: tuple[IsolationStep, ...] = ()
     selection: Selection | None = None
     extent: Extent = "auto"
-    initial_pose: Float[np.ndarray, "4 4"] | None = None
+    initial_pose: Transform | None = None
     point: tuple[int, int] | None = None
 
     @cached_property
@@ -216,9 +216,9 @@ class Observation:
         return f"{points}, depth {near:.3g} to {far:.3g} {unit} (middle {middle:.3g} {unit})"
 
 
-def main_length(points: Float[np.ndarray, "n 3"]) -> float:
+def main_length(points: Points) -> float:
     """Length of the box of some points, without the outermost hundredths."""
-    return float(np.ptp(np.quantile(points, (0.01, 0.99), axis=0), axis=0).max())
+    return longest_side(np.quantile(points, (0.01, 0.99), axis=0))
 
 
 def depths(cloud: PointCloud, factor: float) -> tuple[float, float, float]:
@@ -261,7 +261,7 @@ def find_object(
     return Observation(frame, cloud, selection.steps, selection, extent, point=point)
 
 
-def _is_straight(points: Float[np.ndarray, "n 3"]) -> bool:
+def _is_straight(points: Points) -> bool:
     """Whether enough points lie on a line or at one place; fewer are refused by that."""
     if len(points) < MIN_POINTS:
         return False
@@ -340,7 +340,7 @@ from front and back, .29 to .39 from all sides, .11 to .28 in two views at a rig
 pixels has less, and bars or holes of one or two pixels have more."""
 
 
-def hidden_share(points: Float[np.ndarray, "n 3"]) -> float:
+def hidden_share(points: Points) -> float:
     """Share of points that other points hide from a camera at the origin, by the pitch of the points in the picture.
 
     0 for fewer than ``RING`` points; ``points`` are in the camera frame, in any unit.
@@ -494,7 +494,7 @@ def shared_noise(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> float:
         return np.inf
     distance = float(np.median(depth[shown & whole.valid]))
 
-    def terms(pixels: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+    def terms(pixels: Int[np.ndarray, " n"]) -> Points:
         """What inverse depth is linear in along a plane."""
         return np.stack([pixels % width, pixels // width, np.full(len(pixels), width)], axis=1) / width
 
@@ -561,7 +561,7 @@ def _on_grids(
 # --- clouds ----------------------------------------------------------------------------------------------------------
 
 
-def lines_of_points(points: Float[np.ndarray, "n 3"], is_object: Bool[np.ndarray, " n"]) -> SightLines:
+def lines_of_points(points: Points, is_object: Bool[np.ndarray, " n"]) -> SightLines:
     """Lines of sight to the points of a cloud that are not the object's; the rest is left open.
 
     Args:
@@ -576,7 +576,7 @@ def lines_of_points(points: Float[np.ndarray, "n 3"], is_object: Bool[np.ndarray
     tree = cKDTree(sight[is_object])
     # the fourth neighbour of a pixel is one pitch away, as the first is
     pitch = float(np.median(tree.query(tree.data, k=[min(len(tree.data), 5)])[0]))
-    size = float(np.ptp(tree.data, axis=0).max())
+    size = longest_side(tree.data)
     angle = tree.query(sight[others], distance_upper_bound=max(size, pitch))[0]
     # along a line that met the object, nothing else is said
     is_free = (angle > 0.5 * pitch) & np.isfinite(angle)

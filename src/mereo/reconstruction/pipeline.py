@@ -22,10 +22,10 @@ from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud, into_camera
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.downsampling import random_subset
-from mereo.geometry.labels import LabelGrid, SegmentedCloud
+from mereo.geometry.labels import LabelGrid, SegmentedCloud, part_of_grid
 from mereo.geometry.mesh import PALETTE, Color, SegmentedMesh
 from mereo.geometry.solids import label_grid
-from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.geometry.transforms import Corners, Points, Transform, Vector, inverse_rigid, transform_points
 from mereo.models.calibration import Calibration
 from mereo.models.trained import EncodedCloud, Trained, checked_points
 from mereo.reconstruction.isolation import Reading
@@ -56,8 +56,8 @@ class SegmentFacts:
     name: str
     label: int
     volume: float
-    centroid: Float[np.ndarray, "3"]
-    box: Float[np.ndarray, "2 3"]
+    centroid: Vector
+    box: Corners
     confidence: float
     voxels: int
     components: int
@@ -95,12 +95,12 @@ class Reconstruction:
     evaluated: int
     clipped: bool
     code: EncodedCloud | None
-    T_camera_input: Float[np.ndarray, "4 4"]
+    T_camera_input: Transform
     reading: Reading
     observed: SegmentedCloud | None = None
     calibrated: bool = False
 
-    def transformed(self, T_new_input: Float[np.ndarray, "4 4"]) -> "Reconstruction":
+    def transformed(self, T_new_input: Transform) -> "Reconstruction":
         """The same in another frame, by a rigid transform; its label grid lies along the new axes."""
         surfaces, spacing = self.surfaces.transformed(T_new_input), self.labels.spacing
         low, high = surfaces.bounds
@@ -154,12 +154,12 @@ class EncodedFrame:
 
     reading: Reading
     axes: CloudAxes
-    T_camera_input: Float[np.ndarray, "4 4"]
+    T_camera_input: Transform
     code: EncodedCloud | None
     timings_s: dict[str, float]
 
     @property
-    def points(self) -> Float[np.ndarray, "n 3"]:
+    def points(self) -> Points:
         """The object's points, in the input's frame and unit."""
         return self.reading.cloud.points
 
@@ -267,7 +267,7 @@ def turned_back(result: Reconstruction) -> Reconstruction:
 
 def segment_points(
     logits: Float[np.ndarray, "n c"],
-    points: Float[np.ndarray, "n 3"],
+    points: Points,
     names: tuple[str, ...],
     colors: tuple[Color, ...],
     calibration: Calibration | None = None,
@@ -314,8 +314,7 @@ def measure(extraction: Extraction, model: Trained | None, code: EncodedCloud | 
         if model is not None and code is not None:
             chosen = random_subset(voxels, CONFIDENCE_VOXELS)
             confidence = float(model.query(code, grid.positions(chosen)).probability[:, label].mean())
-        low, high = voxels.min(axis=0), voxels.max(axis=0) + 1
-        part = grid.labels[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+        part = grid.labels[part_of_grid(voxels.min(axis=0), voxels.max(axis=0) + 1)]
         measured.append(
             SegmentFacts(
                 name=segment.name,

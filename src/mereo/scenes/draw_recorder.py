@@ -118,8 +118,7 @@ class Recorder(NamedGenerator):
         """Uniform numbers in 0..1; recorded, unless they are drawn into ``out``."""
         if out is not None:
             return super().random(size, dtype, out)
-        shape = _shape(size)
-        return _plain(self._take("uniform", shape, 0.0, 1.0).reshape(shape).astype(dtype))
+        return _plain(np.asarray(self.uniform(size=size), dtype))
 
     def normal(self, loc: Any = 0.0, scale: Any = 1.0, size: Any = None) -> Any:
         """Normal numbers of mean ``loc`` and standard deviation ``scale``; recorded."""
@@ -130,8 +129,7 @@ class Recorder(NamedGenerator):
         """Standard normal numbers; recorded, unless they are drawn into ``out``."""
         if out is not None:
             return super().standard_normal(size, dtype, out)
-        shape = _shape(size)
-        return _plain(ndtri(self._take("normal", shape, -np.inf, np.inf)).reshape(shape).astype(dtype))
+        return _plain(np.asarray(self.normal(size=size), dtype))
 
     def triangular(self, left: Any, mode: Any, right: Any, size: Any = None) -> Any:
         """Numbers of the triangular distribution; recorded."""
@@ -158,7 +156,7 @@ class Recorder(NamedGenerator):
         """Random elements of ``a``; recorded, unless they are drawn without replacement."""
         if not replace and size is not None:
             return super().choice(a, size, replace, p, axis, shuffle)
-        options = np.arange(a) if np.ndim(a) == 0 else np.asarray(a)
+        options = _options(a)
         count, shape = options.shape[axis], _shape(size)
         self._ends = ends = np.cumsum(np.full(count, 1 / count) if p is None else p)
         shares = self._take("choice", shape, 0, count).reshape(shape)
@@ -167,7 +165,7 @@ class Recorder(NamedGenerator):
 
     def permutation(self, x: Any, axis: int = 0) -> Any:
         """The elements of ``x`` in random order; recorded as sort keys."""
-        items = np.arange(x) if np.ndim(x) == 0 else np.asarray(x)
+        items = _options(x)
         order = np.argsort(self._take("permutation", (items.shape[axis],), 0.0, 1.0), kind="stable")
         return np.take(items, order, axis=axis)
 
@@ -176,6 +174,11 @@ def _shape(size: Any, *parameters: Any) -> tuple[int, ...]:
     if size is None:
         return np.broadcast_shapes(*(np.shape(p) for p in parameters))
     return (int(size),) if np.ndim(size) == 0 else tuple(int(n) for n in size)
+
+
+def _options(given: Any) -> np.ndarray:
+    """What numpy's generators choose from: an array, or the numbers below one."""
+    return np.arange(given) if np.ndim(given) == 0 else np.asarray(given)
 
 
 def _plain(values: Any) -> Any:

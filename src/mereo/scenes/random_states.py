@@ -11,10 +11,11 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
 from mereo.deformation.elastic import ElasticSampler, elastic_motion
+from mereo.deformation.maps import moved_by
 from mereo.deformation.moving_least_squares import spread
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import align_all, fit_rigid
+from mereo.geometry.transforms import align_all, fit_rigid, longest_side
 from mereo.io.cores import limit_blas_threads
 from mereo.io.errors import limited_memory, words_of
 from mereo.io.progress import stage, tracked
@@ -64,11 +65,7 @@ def state_points(
     state: State, nodes: Float[np.ndarray, "j 3"], labels: UInt8[np.ndarray, " j"]
 ) -> Float[np.ndarray, "m 3"]:
     """Positions to which a state has moved all material points, in the scene's frame."""
-    moved = np.empty_like(nodes)
-    for label in np.unique(labels):
-        rows = labels == label
-        moved[rows] = state.deformations[label - 1](nodes[rows])
-    return material_points(state.mesh, moved)
+    return material_points(state.mesh, moved_by(nodes, labels - 1, state.deformations))
 
 
 def sample_states(
@@ -206,7 +203,7 @@ def _aligned(
 ) -> tuple[Float[np.ndarray, "m 3"], Float32[np.ndarray, "n c"]]:
     """The mean, turned as the rest pose, and the aligned states' differences from it."""
     few = spread(rest, PROCRUSTES_POINTS)
-    rotation, center, mean = align_all(states[:, few], PROCRUSTES_ROUNDS, 1e-5 * float(np.ptp(rest, axis=0).max()))
+    rotation, center, mean = align_all(states[:, few], PROCRUSTES_ROUNDS, 1e-5 * longest_side(rest))
     T = fit_rigid(mean.astype(np.float64), rest[few])
     rotation = (T[:3, :3] @ rotation).astype(np.float32)
     aligned = np.matmul(states - center[:, None], rotation.transpose(0, 2, 1)) + T[:3, 3].astype(np.float32)

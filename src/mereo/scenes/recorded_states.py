@@ -15,6 +15,7 @@ from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Deformation
 from mereo.deformation.tetrahedral import Surface, SurfaceMap, Tetrahedra, TetrahedralMap
 from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.transforms import Points, Vector, longest_side
 from mereo.io.simulation_states import SurfaceRecord, TetrahedralRecord, read_states
 from mereo.scenes.scene import Scene, Workspace
 
@@ -122,7 +123,7 @@ class TetrahedralFrames:
         """Number of frames."""
         return len(self.displacements)
 
-    def nodes(self, frame: int) -> Float[np.ndarray, "n 3"]:
+    def nodes(self, frame: int) -> Points:
         """Node positions in scene units."""
         return self.mesh.nodes + self.scale * self.displacements[frame].astype(np.float64)
 
@@ -131,13 +132,7 @@ class TetrahedralFrames:
         return (TetrahedralMap(self.mesh, self.nodes(frame)),) * self.segments
 
 
-FAR = 0.1
-"""A surface that lies mostly farther from the tetrahedra than this, of their longest side, is not theirs."""
-
-
-def tetrahedra_around(
-    path: Path, nodes: Float[np.ndarray, "n 3"], elements: Int[np.ndarray, "m 4"], rest: SegmentedMesh
-) -> Tetrahedra:
+def tetrahedra_around(path: Path, nodes: Points, elements: Int[np.ndarray, "m 4"], rest: SegmentedMesh) -> Tetrahedra:
     """Tetrahedra of a file around an object, both in scene units.
 
     Raises ``ValueError`` naming the file for tetrahedra that are none, and for a mesh far from ``rest``.
@@ -146,7 +141,7 @@ def tetrahedra_around(
         mesh = Tetrahedra(nodes, elements)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    size = float(np.ptp(mesh.nodes, axis=0).max())
+    size = longest_side(mesh.nodes)
     for segment in rest.segments:
         away = segment.vertices[mesh.locate(segment.vertices) < 0]
         distance = np.linalg.norm(away - mesh.closest(away)[2], axis=1) if len(away) else np.zeros(0)
@@ -159,7 +154,7 @@ def tetrahedra_around(
 
 
 def _tetrahedral_frames(
-    path: Path, record: TetrahedralRecord, rest: SegmentedMesh, scale: float, shift: Float[np.ndarray, "3"]
+    path: Path, record: TetrahedralRecord, rest: SegmentedMesh, scale: float, shift: Vector
 ) -> TetrahedralFrames:
     """Frames; ``ValueError`` for a mesh far from ``rest`` and for the first frame that inverts a tetrahedron."""
     mesh = tetrahedra_around(path, record.rest_nodes * scale + shift, record.tetrahedra, rest)
@@ -185,7 +180,7 @@ class SurfaceFrames:
     surfaces: tuple[Surface, ...]
     vertices: tuple[Float[np.ndarray, "f _ 3"], ...]
     scale: float
-    shift: Float[np.ndarray, "3"]
+    shift: Vector
 
     @property
     def count(self) -> int:
@@ -202,7 +197,7 @@ class SurfaceFrames:
 
 
 def _surface_frames(
-    path: Path, record: SurfaceRecord, rest: SegmentedMesh, scale: float, shift: Float[np.ndarray, "3"]
+    path: Path, record: SurfaceRecord, rest: SegmentedMesh, scale: float, shift: Vector
 ) -> SurfaceFrames:
     """Frames; ``ValueError`` for vertices that do not match ``rest`` and for the first frame that is inside out."""
     ordered = []
@@ -243,7 +238,7 @@ def _order(
             "be the same vertices: export both from the same mesh"
         )
     distance, nearest = cKDTree(known).query(segment.vertices)
-    size = float(np.ptp(segment.vertices, axis=0).max())
+    size = longest_side(segment.vertices)
     if distance.max() > MATCHED * size:
         raise ValueError(
             f"{path}: the rest positions of {segment.name!r} miss a vertex of its mesh by {distance.max():.3g}, of "

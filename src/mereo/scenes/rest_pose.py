@@ -7,10 +7,11 @@ the object fills [-1, 1] along its longest side.
 import hashlib
 
 import numpy as np
-from jaxtyping import Float, Float16
+from jaxtyping import Float16
 
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
+from mereo.geometry.transforms import Vector
 
 TEMPLATE_NODES, TEMPLATE_REACH = 64, 1.25
 """Nodes of the grid along each axis, 0.04 apart, and the largest rest coordinate: what is farther is far outside."""
@@ -20,7 +21,7 @@ ROUNDED_TO = 7.3e-7
 numbers of a design would lie halfway between two steps."""
 
 
-def rest_frame(rest: SegmentedMesh) -> tuple[Float[np.ndarray, "3"], float]:
+def rest_frame(rest: SegmentedMesh) -> tuple[Vector, float]:
     """Centre and half of the longest side of the joint rest box."""
     low, high = rest.bounds
     return (low + high) / 2, float((high - low).max() / 2)

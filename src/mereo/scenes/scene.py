@@ -12,7 +12,7 @@ from mereo.deformation.maps import Deformation
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.conventions import WorkspaceName
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.transforms import look_at, rotation_along
+from mereo.geometry.transforms import Transform, Vector, look_at, rotation_along
 from mereo.io.config import Space
 from mereo.scenes.seeds import TEST_SEED_START
 
@@ -24,7 +24,7 @@ class SourceFrame:
     ``space`` is the anatomical frame that the files name, if any.
     """
 
-    T_scene_source: Float[np.ndarray, "4 4"]
+    T_scene_source: Transform
     unit_m: float | None
     space: Space | None = None
 
@@ -85,7 +85,7 @@ class Workspace:
         """Whether it is the whole sphere, which has no middle."""
         return self.aperture_rad >= WHOLE_SPHERE_RAD
 
-    def sample(self, rng: np.random.Generator, target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+    def sample(self, rng: np.random.Generator, target: Vector) -> Transform:
         """Pose ``T_world_camera`` of a camera aimed at ``target``, uniform in direction and in distance."""
         cosine = rng.uniform(np.cos(min(self.aperture_rad / 2, np.pi)), 1.0)
         azimuth = rng.uniform(0.0, 2 * np.pi)
@@ -94,8 +94,8 @@ class Workspace:
         return self.pose(target, cosine, azimuth, distance, roll)
 
     def pose(
-        self, target: Float[np.ndarray, "3"], cosine: float, azimuth_rad: float, distance: float, roll_rad: float = 0.0
-    ) -> Float[np.ndarray, "4 4"]:
+        self, target: Vector, cosine: float, azimuth_rad: float, distance: float, roll_rad: float = 0.0
+    ) -> Transform:
         """Pose ``T_world_camera`` of a camera aimed at ``target``, by its azimuth and the cosine of its tilt."""
         sine = np.sqrt(1.0 - cosine**2)
         local = np.array([sine * np.cos(azimuth_rad), sine * np.sin(azimuth_rad), cosine])
@@ -140,7 +140,7 @@ class Scene:
     source: str = "modelled in mereo's own code, MIT licence"
     held_out: "Scene | None" = None
     unit_m: float | None = None
-    T_scene_source: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
+    T_scene_source: Transform = field(default_factory=lambda: np.eye(4))
     definition: str = ""
     cone: Workspace | None = None
     file: Path | None = None

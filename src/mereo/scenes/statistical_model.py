@@ -21,7 +21,7 @@ from mereo.deformation.moving_least_squares import ANCHORS, Anchors, PointWeight
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.symmetry import TOLERANCE, Symmetry, find_symmetries
-from mereo.geometry.transforms import fit_rigid, transform_points
+from mereo.geometry.transforms import Points, Transform, Vector, fit_rigid, transform_points
 from mereo.io.checked_tensors import Tensors, pack_tensors, read_content, unpack_tensors
 from mereo.io.errors import reason
 from mereo.io.object_storage import Place, write_whole
@@ -207,7 +207,7 @@ class StatisticalModel:
         return rest_frame(self.rest)[1]
 
     @cached_property
-    def rest_center(self) -> Float[np.ndarray, "3"]:
+    def rest_center(self) -> Vector:
         """Middle of the rest box."""
         return rest_frame(self.rest)[0]
 
@@ -305,11 +305,11 @@ class StatisticalModel:
         ends = np.cumsum(self.vertex_counts)
         return self.rest.with_vertices(np.split(material[: ends[-1]].astype(np.float64), ends[:-1]))
 
-    def weights(self, points: Float[np.ndarray, "n 3"], labels: UInt8[np.ndarray, " n"]) -> PointWeights:
+    def weights(self, points: Points, labels: UInt8[np.ndarray, " n"]) -> PointWeights:
         """Weights by which points at rest, of the segments ``labels`` (1 or more), follow the material points."""
         return following(self.rest_anchors, points, labels)
 
-    def project(self, material: Float[np.ndarray, "m 3"]) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, " k"]]:
+    def project(self, material: Float[np.ndarray, "m 3"]) -> tuple[Transform, Float[np.ndarray, " k"]]:
         """Pose and coefficients of a state: ``T_state_model`` and z of (nearly) least squared distance."""
         flat = self.modes.reshape(3 * len(self.modes), self.count).astype(np.float64)
         normal = flat.T @ flat + 1e-9 * np.trace(flat.T @ flat) * np.eye(self.count)
@@ -326,9 +326,7 @@ def material_points(mesh: SegmentedMesh, nodes: Float[np.ndarray, "j 3"]) -> Flo
     return np.concatenate([*(segment.vertices for segment in mesh.segments), nodes])
 
 
-def following(
-    anchors: tuple[Anchors, ...], points: Float[np.ndarray, "n 3"], labels: UInt8[np.ndarray, " n"]
-) -> PointWeights:
+def following(anchors: tuple[Anchors, ...], points: Points, labels: UInt8[np.ndarray, " n"]) -> PointWeights:
     """Weights of points by the anchors of their own segments."""
     width = max((min(len(a.index), 32) for a in anchors), default=1)
     index = np.zeros((len(points), width), dtype=np.int64)

@@ -10,12 +10,11 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from mereo.geometry.solids import Hits, Solids, toward
+from mereo.geometry.transforms import Points, Vector
 from mereo.synthesis.config import Occluder, SensorConfig
 
 NOTHING, OBJECT, OCCLUDER, BACKGROUND = range(4)
 """What a pixel's ray meets first."""
-
-Vector = Float[np.ndarray, "3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +25,7 @@ class Capsule:
     end: Vector
     radius: float
 
-    def first_hit(self, directions: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Hits]:
+    def first_hit(self, directions: Points) -> tuple[Int[np.ndarray, " m"], Hits]:
         """Rows of the rays from the origin that hit the capsule, and where each of them does first."""
         low, high = np.minimum(self.start, self.end) - self.radius, np.maximum(self.start, self.end) + self.radius
         rows = toward(directions, low, high)
@@ -38,12 +37,12 @@ class Capsule:
         share = np.clip((place - self.start) @ axis / max(float(axis @ axis), 1e-300), 0.0, 1.0)
         return rows[hit], Hits(distance[hit], place - (self.start + share[:, None] * axis))  # from the axis outwards
 
-    def _end_hit(self, center: Vector, rays: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def _end_hit(self, center: Vector, rays: Points) -> Float[np.ndarray, " n"]:
         """Entry into the ball around one end: the smaller root of |t ray - center| = radius."""
         a, b, c = np.einsum("ij,ij->i", rays, rays), rays @ center, center @ center - self.radius**2
         return _entry(a, b, np.full(len(rays), c))
 
-    def _side_hit(self, rays: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def _side_hit(self, rays: Points) -> Float[np.ndarray, " n"]:
         """Entry through the cylinder's side: the same equation for the parts perpendicular to the axis."""
         axis = self.end - self.start
         length = float(np.linalg.norm(axis))
@@ -75,7 +74,7 @@ class Backdrop:
     normal: Vector
     offset: float
 
-    def first_hit(self, directions: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Hits]:
+    def first_hit(self, directions: Points) -> tuple[Int[np.ndarray, " m"], Hits]:
         """Rows of the rays from the origin that hit the plane, and where."""
         slope = directions @ self.normal
         rows = np.flatnonzero(slope > 1e-6)
@@ -89,7 +88,7 @@ class Surroundings:
     occluders: tuple[Capsule, ...] = ()
     background: Backdrop | None = None
 
-    def join(self, hits: Hits, directions: Float[np.ndarray, "n 3"]) -> tuple[Hits, UInt8[np.ndarray, " n"]]:
+    def join(self, hits: Hits, directions: Points) -> tuple[Hits, UInt8[np.ndarray, " n"]]:
         """First hits of rays among object and surroundings, and what is hit; ``hits`` are those of the object alone."""
         first = Hits(hits.distance.copy(), hits.normal.copy())
         source = np.where(np.isfinite(hits.distance), OBJECT, NOTHING).astype(np.uint8)

@@ -17,6 +17,7 @@ from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Hits, Solids
+from mereo.geometry.transforms import Points, unit_rows
 from mereo.synthesis.clutter import NOTHING, OBJECT, Surroundings, sample_surroundings
 from mereo.synthesis.config import SENSOR_TERMS, SensorConfig, SensorModel
 
@@ -120,7 +121,7 @@ def _look(
     return around.join(solids.first_hit(moved), moved)
 
 
-def _incidence(hits: Hits, directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+def _incidence(hits: Hits, directions: Points) -> Float[np.ndarray, " n"]:
     """Angle between ray and surface normal in radians, from 0 to pi / 2; 0 where nothing is hit."""
     along = np.abs(np.einsum("ij,ij->i", hits.normal, directions))
     squared = np.einsum("ij,ij->i", hits.normal, hits.normal) * np.einsum("ij,ij->i", directions, directions)
@@ -267,7 +268,7 @@ def _bumps(size: int, nodes: int) -> Float[np.ndarray, "s n"]:
     """Weights of the nodes at each pixel; their squares sum to 1."""
     pixels, centers = np.arange(size)[:, None] / max(size - 1, 1), np.linspace(0, 1, nodes)
     weights = np.exp(-0.5 * ((pixels - centers) * (nodes - 1) / 0.7) ** 2)
-    return np.asarray(weights / np.linalg.norm(weights, axis=1, keepdims=True))
+    return unit_rows(weights)
 
 
 # --- rendering (paper, appendix B) ------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from mereo.geometry.downsampling import farthest_point_order
 from mereo.geometry.mesh import SegmentedMesh, barycentric
 from mereo.geometry.solids import Nearest, Solids, signed_distance_and_direction
 from mereo.geometry.surface_patches import without_strays
-from mereo.geometry.transforms import Normalizer, inverse_rigid, transform_points
+from mereo.geometry.transforms import Normalizer, Points, Transform, inverse_rigid, transform_points, unit_rows
 from mereo.scenes.rest_pose import rest_frame
 from mereo.scenes.scene import Scene
 from mereo.synthesis.clutter import OBJECT
@@ -45,7 +45,7 @@ class View:
 
     mesh: SegmentedMesh
     depth: DepthImage
-    T_world_camera: Float[np.ndarray, "4 4"]
+    T_world_camera: Transform
     deformations: tuple[Deformation, ...]
 
 
@@ -166,10 +166,10 @@ def rest_coordinates(scene: Scene, view: View, samples: Samples, nearest: Neares
 def _rest_guess(
     rest: SegmentedMesh,
     deformed: SegmentedMesh,
-    points: Float[np.ndarray, "n 3"],
-    closest: Float[np.ndarray, "n 3"],
+    points: Points,
+    closest: Points,
     face: Int[np.ndarray, " n"],
-) -> Float[np.ndarray, "n 3"]:
+) -> Points:
     """First guess of rest positions: the closest surface point's, and the offset from it turned as its triangle was.
 
     ``closest`` lies on ``face`` of ``deformed.merged()``. The interface of two neighbours is the same in both, so it
@@ -186,7 +186,7 @@ def _triangle_frames(triangles: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray,
     """Rotations whose columns are each triangle's first edge, its normal, and the direction across."""
     along = triangles[:, 1] - triangles[:, 0]
     normal = np.cross(along, triangles[:, 2] - triangles[:, 0])
-    along, normal = (v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-30) for v in (along, normal))
+    along, normal = (unit_rows(vectors) for vectors in (along, normal))
     return np.stack([along, normal, np.cross(along, normal)], axis=2)
 
 
@@ -224,7 +224,7 @@ def _further_observations(
 
 def _observed_points(
     solids: Solids, first: DepthImage, noise_std: float, sensor: SensorConfig, rng: np.random.Generator
-) -> Float[np.ndarray, "n 3"] | None:
+) -> Points | None:
     """Points that a sensor sees in place of ``first``, in the camera frame; None where too few show the object."""
     way = rng.random()
     seen = observe(solids, first.camera, noise_std, sensor, rng)

@@ -30,7 +30,7 @@ from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import inverse_rigid
+from mereo.geometry.transforms import Transform, Vector, inverse_rigid, unit_rows
 from mereo.io.atomic_files import write_json
 from mereo.io.intrinsics import written_intrinsics
 from mereo.scenes.draw_recorder import SMOOTH, Key, OutOfDraws, Recorder
@@ -100,7 +100,7 @@ def process_weights(times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:
     away = np.abs(times[:, None] - nodes)
     near, far = 2 / 3 - away**2 + away**3 / 2, np.maximum(2 - away, 0.0) ** 3 / 6
     weights = np.where(away < 1, near, far)
-    return np.asarray(weights / np.linalg.norm(weights, axis=1, keepdims=True))
+    return unit_rows(weights)
 
 
 def switches(scene: Scene, start: Played) -> set[Key]:
@@ -211,7 +211,7 @@ class Moment:
     time_s: float
     played: Played
     mesh: SegmentedMesh
-    T_world_camera: Float[np.ndarray, "4 4"]
+    T_world_camera: Transform
     seen: SimulatedView
 
 
@@ -268,9 +268,9 @@ class _Around(NamedTuple):
     """
 
     occluder: tuple[Capsule, ...]
-    away: Float[np.ndarray, "3"]
+    away: Vector
     span_s: tuple[float, float]
-    normal: Float[np.ndarray, "3"] | None = None
+    normal: Vector | None = None
     gap: float = 0.0
 
     @classmethod
@@ -278,7 +278,7 @@ class _Around(NamedTuple):
         cls,
         solids: Solids,
         camera: Camera,
-        T_world_camera: Float[np.ndarray, "4 4"],
+        T_world_camera: Transform,
         settings: SequenceConfig,
         sensor: SensorConfig,
         rng: np.random.Generator,
@@ -302,7 +302,7 @@ class _Around(NamedTuple):
         gap = plane.offset - farthest(solids, plane.normal)
         return cls(occluder, away, settings.hidden_s, T_world_camera[:3, :3] @ plane.normal, gap)
 
-    def at(self, time_s: float, solids: Solids, T_world_camera: Float[np.ndarray, "4 4"]) -> Surroundings | None:
+    def at(self, time_s: float, solids: Solids, T_world_camera: Transform) -> Surroundings | None:
         """Surroundings at a time; None where there are none."""
         background = None
         if self.normal is not None:
@@ -318,7 +318,7 @@ class _Around(NamedTuple):
         return Surroundings(moved, background)
 
 
-def _way_out(occluder: tuple[Capsule, ...], reach: float) -> Float[np.ndarray, "3"]:
+def _way_out(occluder: tuple[Capsule, ...], reach: float) -> Vector:
     """Shift along the image that takes an occluder out of view, the way its far end lies."""
     if not occluder:
         return np.zeros(3)

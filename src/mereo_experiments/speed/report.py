@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from mereo.geometry.labels import LabelGrid
-from mereo.geometry.mesh import PALETTE
+from mereo.geometry.mesh import palette_color
 from mereo.geometry.transforms import Normalizer
 from mereo.io.atomic_files import write_json
 from mereo.io.cores import cores
@@ -177,7 +177,7 @@ def fitted_model(preset: str, view: SampleView) -> Model:
     grid, kept = view.truth.grid, view.truth.kept
     torch.manual_seed(0)
     network = Network(PRESETS[preset].network.changed(dropout=0.0), len(grid.names))
-    model = Model(network, grid.names, tuple(PALETTE[i % len(PALETTE)] for i in range(len(grid.names))))
+    model = Model(network, grid.names, tuple(palette_color(i) for i in range(len(grid.names))))
     cloud, normalizer = model.normalized_cloud(view.depth.to_points())
     model = replace(model, domain=_domain(grid, normalizer))
     viewpoint = torch.from_numpy(normalizer.viewpoint[None].astype(np.float32))

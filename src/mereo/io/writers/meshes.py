@@ -13,14 +13,13 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, Int, UInt8
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from jaxtyping import Int, UInt8
 
 from mereo.geometry.labels import SegmentedCloud
-from mereo.geometry.mesh import Color, Segment, SegmentedMesh
+from mereo.geometry.mesh import Color, Segment, SegmentedMesh, connected, edge_uses, three_cornered
 from mereo.geometry.radii import Radii
-from mereo.io.atomic_files import atomic_file, new_directory
+from mereo.geometry.transforms import Points
+from mereo.io.atomic_files import atomic_file, new_directory, write_file
 from mereo.io.mesh_formats import STL_NAME
 
 OUTER_OPACITY = 0.35
@@ -57,12 +56,10 @@ def settled(segment: Segment) -> Segment:
     short = edges[away < max(MERGED_WITHIN, 4 * float(np.finfo(np.float32).eps) * extent)]
     if not len(short):
         return segment
-    count = len(segment.vertices)
-    graph = coo_array((np.ones(len(short)), (short[:, 0], short[:, 1])), shape=(count, count))
-    place = connected_components(graph, directed=False)[1]
-    first, local = np.unique(place, return_index=True, return_inverse=True)[1:]
-    faces = local.reshape(-1)[segment.faces]
-    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    place = connected(short, len(segment.vertices))
+    _, first = np.unique(place, return_index=True)
+    faces = place[segment.faces]
+    faces = faces[three_cornered(faces)]
     if not len(faces) or (_is_closed(segment.faces) and not _is_closed(faces)):
         return segment
     return Segment(segment.name, segment.color, segment.vertices[first], faces)
@@ -70,11 +67,8 @@ def settled(segment: Segment) -> Segment:
 
 def _is_closed(faces: Int[np.ndarray, "f 3"]) -> bool:
     """Whether each edge has two faces, which run along it in opposite directions."""
-    edges = np.concatenate([faces[:, pair] for pair in ((0, 1), (1, 2), (2, 0))]).astype(np.int64)
-    base = int(edges.max(initial=0)) + 1
-    forth, back = edges[:, 0] * base + edges[:, 1], edges[:, 1] * base + edges[:, 0]
-    unique = np.unique(forth)
-    return len(unique) == len(forth) and np.array_equal(unique, np.unique(back))
+    _, uses, unbalanced = edge_uses(faces)
+    return bool(((uses == 2) & ~unbalanced).all())
 
 
 def segment_table(names: Sequence[str], colors: Sequence[Color]) -> list[dict[str, Any]]:
@@ -116,7 +110,7 @@ def write_points_ply(path: str | Path, cloud: SegmentedCloud) -> None:
     _write(path, _comments(cloud.names, cloud.colors), {"vertex": vertices})
 
 
-def write_positions_ply(path: str | Path, points: Float[np.ndarray, "n 3"], comment: str = "") -> None:
+def write_positions_ply(path: str | Path, points: Points, comment: str = "") -> None:
     """Write a cloud's positions alone, as float32; ``comment`` is for people who open the file."""
     _write(path, [comment] if comment else [], {"vertex": _records(_positions(points))})
 
@@ -125,7 +119,7 @@ Columns = dict[str, tuple[str, np.ndarray]]
 """Type and values of each property, in the order of the file."""
 
 
-def _positions(points: Float[np.ndarray, "n 3"]) -> Columns:
+def _positions(points: Points) -> Columns:
     return {axis: ("f4", points[:, k]) for k, axis in enumerate("xyz")}
 
 
@@ -219,8 +213,7 @@ def write_segments_stl(directory: str | Path, surfaces: SegmentedMesh, force: bo
 def write_surface_stl(path: str | Path, surfaces: SegmentedMesh) -> None:
     """Write all segments as one nameless surface; positions are float32."""
     vertices, faces, _ = surfaces.merged()
-    with atomic_file(path) as partial:
-        partial.write_bytes(_stl(Segment("", surfaces.colors[0], vertices, faces)))
+    write_file(path, _stl(Segment("", surfaces.colors[0], vertices, faces)))
 
 
 def stl_name(label: int, name: str) -> str:

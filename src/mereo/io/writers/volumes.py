@@ -19,11 +19,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float32
 
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import Color
-from mereo.io.atomic_files import atomic_file
+from mereo.geometry.transforms import Transform, Vector
+from mereo.io.atomic_files import atomic_file, write_file
 from mereo.io.extras import library
 from mereo.io.volume_files import Volume, segment_fields
 from mereo.io.writers.meshes import segment_table
@@ -108,8 +109,7 @@ def write_labels_vti(
         labels=_compressed(grid.labels),
         radii="" if radii is None else array.format(_compressed(radii.astype("<f4"))),
     )
-    with atomic_file(path) as partial:
-        partial.write_text(text, "utf-8")
+    write_file(path, text)
 
 
 def _compressed(values: np.ndarray) -> str:
@@ -164,10 +164,9 @@ def _write_nifti(path: Path, image: Any, level: int) -> None:
     image.set_qform(image.affine, code="scanner")
     image.set_sform(image.affine, code="scanner")
     content = image.to_bytes()
-    with atomic_file(path) as partial:
-        # mtime: the same result gives the same bytes
-        is_packed = path.suffix.lower() == ".gz"
-        partial.write_bytes(gzip.compress(content, level, mtime=0) if is_packed else content)
+    # mtime: the same result gives the same bytes
+    is_packed = path.suffix.lower() == ".gz"
+    write_file(path, gzip.compress(content, level, mtime=0) if is_packed else content)
 
 
 def nibabel() -> Any:
@@ -175,7 +174,7 @@ def nibabel() -> Any:
     return library("nibabel", "medical", "NIfTI")
 
 
-def _T_lps_index(grid: LabelGrid, unit_m: float) -> Float[np.ndarray, "4 4"]:
+def _T_lps_index(grid: LabelGrid, unit_m: float) -> Transform:
     """Transform from voxel indices to LPS coordinates in millimetres; ``unit_m`` is metres per unit of the grid."""
     transform = np.eye(4)
     transform[:3, :3] = np.diag(grid.spacing)
@@ -198,14 +197,10 @@ def write_labels_seg_nrrd(path: str | Path, grid: LabelGrid, colors: Sequence[Co
         "Segmentation_MasterRepresentation": "Binary labelmap",
         "Segmentation_ReferenceImageExtentOffset": "0 0 0",
     }
-    content = _nrrd("NRRD0004", grid.labels, _T_lps_index(grid, unit_m), fields, 9)
-    with atomic_file(path) as partial:
-        partial.write_bytes(content)
+    write_file(path, _nrrd("NRRD0004", grid.labels, _T_lps_index(grid, unit_m), fields, 9))
 
 
-def _nrrd(
-    magic: str, values: np.ndarray, T_lps_index: Float[np.ndarray, "4 4"], fields: dict[str, str], level: int
-) -> bytes:
+def _nrrd(magic: str, values: np.ndarray, T_lps_index: Transform, fields: dict[str, str], level: int) -> bytes:
     header = NRRD_HEADER.format(
         magic=magic,
         type={"float32": "float", "float64": "double"}.get(values.dtype.name, values.dtype.name),
@@ -234,7 +229,7 @@ def _segment_fields(grid: LabelGrid, index: int, color: Color) -> dict[str, str]
     return {f"Segment{index}_{key}": value for key, value in values.items()}
 
 
-def _vector(values: Float[np.ndarray, "3"]) -> str:
+def _vector(values: Vector) -> str:
     return f"({','.join(map(repr, values.tolist()))})"
 
 
@@ -260,11 +255,10 @@ def write_volume(path: Path, volume: Volume, unit_m: float = 1.0) -> None:
     whole = " ".join(f"0 {n - 1}" for n in volume.values.shape)  # of 3D Slicer's segments
     fields |= {key: whole for key in fields if key.endswith("_Extent")}
     fields |= {key: "0 0 0" for key in fields if key.endswith("Segmentation_ReferenceImageExtentOffset")}
-    with atomic_file(path) as partial:
-        partial.write_bytes(_nrrd("NRRD0005", volume.values, T_lps_index, fields, LEVEL))
+    write_file(path, _nrrd("NRRD0005", volume.values, T_lps_index, fields, LEVEL))
 
 
-def _write_volume_nifti(path: Path, volume: Volume, T_ras_index: Float[np.ndarray, "4 4"]) -> None:
+def _write_volume_nifti(path: Path, volume: Volume, T_ras_index: Transform) -> None:
     nifti: Any = nibabel()
     header = volume.header if isinstance(volume.header, nifti.Nifti1Header) else None
     image = nifti.Nifti1Image(volume.values, T_ras_index, header, dtype=volume.values.dtype)

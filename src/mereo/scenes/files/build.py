@@ -17,10 +17,10 @@ from jaxtyping import Bool, Float
 from mereo.deformation.elastic import ElasticSampler
 from mereo.deformation.maps import Deformation
 from mereo.deformation.samplers import RandomMotion
-from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
+from mereo.geometry.mesh import Segment, SegmentedMesh, palette_color
 from mereo.geometry.mesh_check import examine, united
 from mereo.geometry.subdivision import TooManyFaces, split_edges
-from mereo.geometry.transforms import Normalizer
+from mereo.geometry.transforms import Normalizer, longest_side
 from mereo.io.config import Space
 from mereo.io.mesh_formats import MeshWarning, read_object_mesh
 from mereo.io.simulation_states import files_of_states, frame_files
@@ -110,7 +110,7 @@ def _with_warnings(document: Document, mesh: SegmentedMesh) -> SegmentedMesh:
 def build(document: Document, file: SceneFile, mesh: SegmentedMesh) -> Scene:
     """Scene of a mesh in the file's unit: scaled to ``size`` and centred, with its deformations."""
     placement = placed(mesh, file.size)
-    if (longest := placement.scale * float(np.ptp(mesh.bounds, axis=0).max())) < SMALLEST:
+    if (longest := placement.scale * longest_side(mesh.bounds)) < SMALLEST:
         raise document.error(
             ("size",),
             f"`size` is {file.size:g}, which makes the object {longest:.3g} scene units long; {SMALLEST:g} is the "
@@ -309,7 +309,7 @@ def _assembled(document: Document, key: str, parts: Sequence[PartLook], segments
     nested = tuple((part.name, part.nested_in) for part in parts if part.nested_in is not None)
     colors = [segment.color for segment in segments]
     if len(set(colors)) < len(colors):  # the meshes' own do not tell the segments apart
-        colors = [PALETTE[index % len(PALETTE)] for index in range(len(colors))]
+        colors = [palette_color(index) for index in range(len(colors))]
     colored = (
         replace(segment, color=part.color or color)
         for segment, part, color in zip(segments, parts, colors, strict=True)

@@ -18,8 +18,8 @@ from mereo.geometry.mesh_check import PLAUSIBLE_M, Health, Overlap, examine, gri
 from mereo.geometry.mesh_repair import farthest, repaired, without_overlaps
 from mereo.geometry.solids import Solids
 from mereo.geometry.symmetry import TOLERANCE, describe_symmetries, find_symmetries
-from mereo.geometry.transforms import inverse_rigid
-from mereo.io.atomic_files import atomic_file, check_file_place, remove_abandoned
+from mereo.geometry.transforms import inverse_rigid, longest_side
+from mereo.io.atomic_files import check_file_place, remove_abandoned, write_file
 from mereo.io.yaml_document import Document
 from mereo.scenes.files.build import build, read, read_segments
 from mereo.scenes.files.deformation_blocks import is_robot_joint
@@ -153,7 +153,7 @@ def _difference(before: Segment, health: Health, after: Segment) -> str:
 def _moved(before: Segment, kept: Segment, after: Segment, unit: str) -> str:
     """How the longest side changed, and how far the two surfaces are apart, each from the other where that is more."""
     finite = before.vertices[np.isfinite(before.vertices).all(axis=1)]
-    was, now = (float(np.ptp(vertices, axis=0).max()) for vertices in (finite, after.vertices))
+    was, now = (longest_side(vertices) for vertices in (finite, after.vertices))
     (lost, where), (filled, within) = farthest(kept, after)
     new, place = max(farthest(after, kept), key=lambda reach: reach[0])
     text = f"longest side {was:.5g} {unit} before, {now:.5g} now; the old surface reaches at most "
@@ -183,10 +183,8 @@ def _write(document: Document, mesh: SegmentedMesh, changed: set[str]) -> Path:
         if place.exists():
             raise FileExistsError(f"{place} exists; it is not overwritten: move or remove it")
     for place, content in missing.items():
-        with atomic_file(place, force=False) as temporary:
-            temporary.write_bytes(content)
-    with atomic_file(path, force=False) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        write_file(place, content, force=False)
+    write_file(path, text, force=False)
     return path
 
 

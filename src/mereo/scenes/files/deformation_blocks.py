@@ -32,7 +32,7 @@ from mereo.deformation.samplers import DeformationSampler
 from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import Normalizer
+from mereo.geometry.transforms import Corners, Normalizer, Points, Vector, longest_side
 from mereo.io.point_arrays import model_points
 from mereo.io.readers import read_points
 from mereo.io.simulation_states import read_tetrahedra
@@ -106,7 +106,7 @@ class Target:
     """
 
     moved: SegmentedMesh
-    whole: Float[np.ndarray, "2 3"]
+    whole: Corners
     placement: Normalizer
     folder: Path = Path()
 
@@ -115,9 +115,9 @@ class Target:
         """Scene units per unit of the file, by which its lengths are multiplied."""
         return self.placement.scale
 
-    def point(self, place: Point) -> Float[np.ndarray, "3"]:
+    def point(self, place: Point) -> Vector:
         """Place of the file in the scene's frame."""
-        moved: Float[np.ndarray, "3"] = self.placement.apply(np.array(place))
+        moved: Vector = self.placement.apply(np.array(place))
         return moved
 
 
@@ -163,7 +163,7 @@ class LatticeBlock(DeformationBlock):
         bounds = target.moved.bounds
         if self.spacing is None:
             return samplers.LatticeSampler(bounds, self.cells or samplers.default_cells(bounds), self.strength)
-        longest = float((bounds[1] - bounds[0]).max()) / target.unit
+        longest = longest_side(bounds) / target.unit
         if longest > MOST_CELLS * self.spacing:
             raise Misfit(
                 "spacing",
@@ -356,7 +356,7 @@ class HeldPlace(Block):
     nodes: Annotated[list[NonNegativeInt], Field(min_length=1)] | None = None
 
     @model_validator(mode="after")
-    def _is_one_kind(self) -> "HeldPlace":
+    def _has_single_kind(self) -> "HeldPlace":
         given = self.model_fields_set
         if given not in ({"center", "radius"}, {"center", "direction"}, {"points"}, {"nodes"}):
             raise ValueError(
@@ -372,9 +372,7 @@ class HeldPlace(Block):
             return "the list of nodes" if self.points is None else f"the file {self.points}"
         return f"the place at {list(self.center)}"
 
-    def depth(
-        self, nodes: Float[np.ndarray, "n 3"], numbers: Int[np.ndarray, " n"] | None, target: Target
-    ) -> Float[np.ndarray, " n"]:
+    def depth(self, nodes: Points, numbers: Int[np.ndarray, " n"] | None, target: Target) -> Float[np.ndarray, " n"]:
         """How far nodes of a solid, in the scene's frame, are inside, scene units; below 0 outside.
 
         ``numbers`` are those in their file. ``Misfit`` for points that cannot be read, and for numbers of no node.
@@ -387,9 +385,7 @@ class HeldPlace(Block):
             return np.asarray(offset @ unit(np.array(self.direction)))
         return np.asarray((self.radius or 0.0) * target.unit - np.linalg.norm(offset, axis=1))
 
-    def _rows(
-        self, nodes: Float[np.ndarray, "n 3"], numbers: Int[np.ndarray, " n"] | None, target: Target
-    ) -> Int[np.ndarray, " r"]:
+    def _rows(self, nodes: Points, numbers: Int[np.ndarray, " n"] | None, target: Target) -> Int[np.ndarray, " r"]:
         """Rows of the nodes that are held one by one."""
         if self.nodes is None:
             try:
@@ -525,7 +521,7 @@ class ElasticBlock(DeformationBlock):
                 )
             held = inside if held is None else held | inside
         count = min(self.modes, solid.most_modes(held))
-        motion = self.motion * float((bounds[1] - bounds[0]).max()) / 2
+        motion = self.motion * longest_side(bounds) / 2
         return ElasticSampler(solid, Material(self.poisson), count, motion, held)
 
 

@@ -8,13 +8,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 
-import igl
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mereo.deformation.maps import Compose, Rigid
 from mereo.geometry.mesh import Segment, SegmentedMesh, area_vectors, connected, surface_points
 from mereo.geometry.mesh_check import overlaps
+from mereo.geometry.solids import search_tree
+from mereo.geometry.transforms import Points, Vector, longest_side, unit_rows
 
 # --- contacts ---------------------------------------------------------------------------------------------------------
 
@@ -36,9 +37,6 @@ SAME_NORMAL = float(np.cos(np.deg2rad(3.0)))
 FLATTEST, LEAST_ARC, MISFIT = 0.02, 0.1, 0.05
 """Mean square cosine of a cylinder's normals with its axis at most, and of them across their main direction at least
 (an arc of 80 degrees or so); root mean square distance of the points from the cylinder at most, in radii."""
-
-Points = Float[np.ndarray, "n 3"]
-Vector = Float[np.ndarray, "3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +65,7 @@ class Contact:
 
 def contacts(mesh: SegmentedMesh) -> tuple[Contact, ...]:
     """All contacts between segments, which need not be solids. Lengths are in the mesh's unit."""
-    reach = CLEARANCE * float((mesh.bounds[1] - mesh.bounds[0]).max())
+    reach = CLEARANCE * longest_side(mesh.bounds)
     vectors = [area_vectors(segment.vertices, segment.faces) for segment in mesh.segments]
     areas = [float(np.linalg.norm(each, axis=1).sum()) for each in vectors]
     touching: list[Contact] = []
@@ -81,16 +79,13 @@ def contacts(mesh: SegmentedMesh) -> tuple[Contact, ...]:
 
 def _normals(segment: Segment, face: Int[np.ndarray, " n"]) -> Points:
     """Unit normals of faces."""
-    vectors = area_vectors(segment.vertices, segment.faces[face])
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)
+    return unit_rows(area_vectors(segment.vertices, segment.faces[face]))
 
 
 def _distance(points: Points, segment: Segment) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
     """Distance of points to a surface, and the nearest face."""
     vertices, faces = np.array(segment.vertices), np.array(segment.faces, dtype=np.int64)
-    tree = igl.AABB()
-    tree.init(vertices, faces)
-    squared, face, _ = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
+    squared, face, _ = search_tree(vertices, faces).squared_distance(vertices, faces, np.ascontiguousarray(points))
     return np.sqrt(squared), face.astype(np.int64)
 
 
@@ -298,7 +293,7 @@ class _CollisionTest:
 
     def __init__(self, mesh: SegmentedMesh) -> None:
         self.mesh = mesh
-        self.reach = CLEARANCE * float((mesh.bounds[1] - mesh.bounds[0]).max())
+        self.reach = CLEARANCE * longest_side(mesh.bounds)
         self._known = dict[tuple[tuple[int, int], tuple[Chain, Chain]], bool]()
 
     def free(self, joint: Joint, steps: Sequence[float]) -> float:

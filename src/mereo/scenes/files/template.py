@@ -18,17 +18,26 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 import yaml
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from scipy.spatial import ConvexHull, QhullError
 
-from mereo.deformation.maps import Deformation, unit
+from mereo.deformation.maps import Deformation, moved_by, unit
 from mereo.deformation.samplers import RandomMotion, distance_from_line
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.conventions import UNITS_M, Way
-from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, surface_points
+from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, palette_color, surface_points
 from mereo.geometry.mesh_check import examine, likely_unit, overlaps
-from mereo.geometry.transforms import Normalizer, fit_rigid, inverse_rigid, transform_points
-from mereo.io.atomic_files import atomic_file, check_file_place
+from mereo.geometry.transforms import (
+    Corners,
+    Normalizer,
+    Points,
+    Vector,
+    fit_rigid,
+    inverse_rigid,
+    longest_side,
+    transform_points,
+)
+from mereo.io.atomic_files import check_file_place, write_file
 from mereo.io.mesh_formats import ROBOT_SUFFIXES, read_object_mesh
 from mereo.io.robots import RobotJoint, is_robot, read_robot
 from mereo.io.volume_files import (
@@ -71,23 +80,13 @@ class Motion(NamedTuple):
 def measure_motion(rest: SegmentedMesh, draw: Draw) -> Motion:
     """Motion of an object in random states, which are the same in every call, beyond turns and shifts of the whole."""
     points, owner = material_points(rest, POINTS)
-    states = [_moved(points, owner, draw(example_rng(0, index))) for index in range(STATES)]
+    states = [moved_by(points, owner, draw(example_rng(0, index))) for index in range(STATES)]
     ways = [moved - transform_points(fit_rigid(points, moved), points) for moved in states]
-    shares = np.linalg.norm(ways, axis=2) / float((rest.bounds[1] - rest.bounds[0]).max())
+    shares = np.linalg.norm(ways, axis=2) / longest_side(rest.bounds)
     return Motion(float(np.median(np.sqrt(np.mean(shares**2, axis=1)))), float(np.median(shares.max(axis=1))))
 
 
-def _moved(
-    points: Float[np.ndarray, "n 3"], owner: Int[np.ndarray, " n"], deformations: tuple[Deformation, ...]
-) -> Float[np.ndarray, "n 3"]:
-    result = np.empty_like(points)
-    for index in np.unique(owner):
-        rows = owner == index
-        result[rows] = deformations[index](points[rows])
-    return result
-
-
-def material_points(mesh: SegmentedMesh, count: int) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
+def material_points(mesh: SegmentedMesh, count: int) -> tuple[Points, Int[np.ndarray, " n"]]:
     """Points evenly spread over the surface of all segments, and the index of the segment of each."""
     vertices, faces, owner = mesh.merged()
     points, face = surface_points(vertices, faces, count)
@@ -187,7 +186,7 @@ class FlatBase:
         share: of the area of the object's convex hull that lies within the outline of the face, from 0 to 1.
     """
 
-    normal: Float[np.ndarray, "3"]
+    normal: Vector
     share: float
 
     def describe(self, workspace: Workspace) -> str:
@@ -225,7 +224,7 @@ def flat_base(mesh: SegmentedMesh, up: Sequence[float]) -> FlatBase | None:
     return max(lowest or bases, key=lambda base: base.share, default=None)
 
 
-def _base(solid: trimesh.Trimesh, hull: trimesh.Trimesh, normal: Float[np.ndarray, "3"]) -> FlatBase | None:
+def _base(solid: trimesh.Trimesh, hull: trimesh.Trimesh, normal: Vector) -> FlatBase | None:
     heights = solid.vertices @ normal
     top = heights.max() - THICKNESS_SHARE * hull.volume / hull.area
     crossed = solid.triangles_cross * np.sign(solid.triangles_cross @ normal)[:, None]
@@ -265,7 +264,7 @@ def _default_view(rest: SegmentedMesh, draw: Draw, workspace: Workspace) -> tupl
     corners = [segment.vertices[:: 1 + len(segment.vertices) // FRAMED] for segment in rest.segments]
     owner = np.concatenate([owner, np.repeat(np.arange(len(corners)), [len(part) for part in corners])])
     points = np.concatenate([points, *corners])
-    moved = [_moved(points, owner, draw(example_rng(0, index))) for index in range(STATES_SEEN)]
+    moved = [moved_by(points, owner, draw(example_rng(0, index))) for index in range(STATES_SEEN)]
     # the camera aims at the middle of their box
     states = [(places, (places.min(axis=0) + places.max(axis=0)) / 2) for places in moved]
     reach = max(float(np.linalg.norm(points - center, axis=1).max()) for points, center in states)
@@ -358,8 +357,7 @@ def write_scene_file(
             "scene file without it, and name that"
         )
     text, notes = _draft(name, source, units, aperture, deformations)
-    with atomic_file(path, force=False) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_file(path, text, force=False)
     if report is not None:
         for note in (*(f"left out: {text}" for text in source.lost), *source.notes, *notes):
             report(note)
@@ -401,7 +399,7 @@ def _source(files: Sequence[Path], folder: Path) -> _Source:
     mesh = SegmentedMesh(tuple(parts))
     lines = ["segments:  # one closed mesh for each; their order is that of the labels"]
     for number, (name, text) in enumerate(zip(names, relative, strict=True)):
-        color = list(PALETTE[number % len(PALETTE)])
+        color = list(palette_color(number))
         lines += [f"  - name: {quoted(name)}", f"    file: {quoted(text)}", f"    color: {color}"]
     lines.append("    # nested_in: NAME  # for a segment that lies inside another one, which has to come after it")
     return _Source("\n".join(lines), mesh, *_likely_frame(files[0], mesh.bounds))
@@ -435,7 +433,7 @@ def _from_model(file: Path, relative: str, mesh: SegmentedMesh, what: str = "") 
     for number, (part, name) in enumerate(zip(mesh.names, names, strict=True)):
         lines.append(f"  - name: {quoted(name)}")
         lines += [f"    parts: [{quoted(part)}]"] if part != name else []
-        lines.append(f"    color: {list(PALETTE[number % len(PALETTE)])}")
+        lines.append(f"    color: {list(palette_color(number))}")
     mesh = SegmentedMesh(tuple(replace(part, name=name) for part, name in zip(mesh.segments, names, strict=True)))
     lines.append("    # parts: [A, B]  # parts of the model to join into this segment, instead of the one of its name")
     return _Source("\n".join(lines), mesh, *_likely_frame(file, mesh.bounds))
@@ -485,10 +483,10 @@ def _surfaces(
     raise ThinSegmentError(thin)
 
 
-def _likely_frame(file: Path, bounds: Float[np.ndarray, "2 3"]) -> tuple[str, str, int, str]:
+def _likely_frame(file: Path, bounds: Corners) -> tuple[str, str, int, str]:
     """Unit of a mesh file, and why; the axis that points upwards in it, and why."""
     kind, guess = file.suffix.lower().lstrip("."), likely_unit(bounds)
-    longest_m = float((bounds[1] - bounds[0]).max()) * UNITS_M[guess]
+    longest_m = longest_side(bounds) * UNITS_M[guess]
     robots = dict.fromkeys((suffix[1:] for suffix in ROBOT_SUFFIXES), ("m", "the rule of URDF and SDF"))
     known = robots | {
         "glb": ("m", "the rule of glTF"),
@@ -650,7 +648,7 @@ def _soft(mesh: SegmentedMesh, blocks: Blocks) -> str:
             stiff=STIFF,
             part=quoted(mesh.names[-1]),
             end=_numbers(vertices[vertices[:, longest].argmin()]),
-            held=0.15 * np.ptp(mesh.bounds, axis=0).max(),
+            held=0.15 * longest_side(mesh.bounds),
         )
     bend, lattice = blocks[0], blocks[-1]
     assert isinstance(bend, BendBlock) and isinstance(lattice, LatticeBlock)
@@ -695,7 +693,7 @@ def quoted(text: str) -> str:
     return listed.strip()[1:-1]
 
 
-def _numbers(values: Float[np.ndarray, "3"]) -> str:
+def _numbers(values: Vector) -> str:
     largest = max(float(np.abs(values).max()), 1e-12)  # what is nothing compared with it is rounding
     return "[" + ", ".join(f"{value if abs(value) > 1e-4 * largest else 0.0:.4g}" for value in values) + "]"
 
