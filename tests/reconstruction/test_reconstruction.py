@@ -96,6 +96,7 @@ def test_files(answer: Answer, tmp_path: Path) -> None:
     summary = json.loads((tmp_path / "out/summary.json").read_text())
     assert [(s["name"], s["volume"] > 0) for s in summary["segments"]] == [("big", 1), ("small", 1), ("absent", 0)]
     assert summary["segments"][2]["confidence"] is None and summary["frame"] == frame
+    assert list(summary)[:7] == ["title", "verdict", "recognition", "frame", "unit_m", "pose", "segments"]
     assert set(summary["timings_s"]) == {"encode", "locate", "extract", "measure", "write"}
     loaded = trimesh.load_scene(tmp_path / "out/segments.glb")
     assert set(loaded.geometry) == {"big", "small"}
