@@ -23,7 +23,7 @@ from mereo.geometry.radii import Radii
 from mereo.io.atomic_files import atomic_file, new_directory
 from mereo.io.mesh_formats import STL_NAME
 
-OUTER_OPACITY = 0.35
+OUTER_OPACITY = 0.4
 """Opacity of segments with others nested in them, which viewers draw see-through."""
 
 MERGED_WITHIN = 2e-8
