@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import trimesh
 from jaxtyping import Float, UInt8
-from scipy.spatial import cKDTree
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color, Segment, SegmentedMesh, vertex_normals
@@ -19,28 +20,31 @@ from mereo.geometry.metrics import Scores, format_score
 from mereo.geometry.subdivision import split_at_creases
 from mereo.visualization.color_scales import ColorScale
 from mereo.visualization.contact_sheets import Picture, enlarge
+from mereo.visualization.renderer import opacities
 
 CLOUD_COLOR = (244, 246, 250)
-CLOUD_SIZES = (0.001, 0.012)
-"""Smallest and largest size at which points start: what still shows, and what would be blobs in a sparse cloud."""
-
-POINT_SHARE = 0.2
-"""Share of the spacing of points that one takes, so that the surface is seen between them."""
+MOST_SIZE = 0.012
+"""Largest size at which points start on the stage: sparse ones would be blobs."""
 
 FOV_RAD = float(np.deg2rad(40.0))
 """Angle of view of the page's own camera."""
+
+AXIS_COLORS: tuple[Color, ...] = ((229, 72, 77), (70, 167, 88), (76, 141, 245))
+"""Of x, y, z."""
+
+MOST_BUTTONS = 12
+"""Segments from which on their folder is folded at first: it would fill the panel."""
+
+EYES = "eye-off", "eye"
+"""Icons of segments that are hidden and shown."""
 
 PICTURE_PX = 320
 """Width of a picture in the panel, to which small ones are enlarged: a browser would blur their pixels."""
 
 
-def point_size(points: Float[np.ndarray, "n 3"]) -> float:
-    """Size of points on the stage, from their median distance to the nearest neighbour, within ``CLOUD_SIZES``."""
-    some = points[:: max(1, len(points) // 1000)]
-    apart = cKDTree(points).query(some, k=2)[0][:, 1] if len(points) > 1 else np.zeros(0)
-    apart = apart[np.isfinite(apart) & (apart > 0)]  # repeated points have no spacing
-    smallest, largest = CLOUD_SIZES
-    return float(np.clip(POINT_SHARE * np.median(apart), smallest, largest)) if len(apart) else largest
+def point_size(count: int) -> float:
+    """Size on the stage of so many points: a tenth of their spacing, so that the surface is seen between them."""
+    return min(0.2 / max(count, 1) ** 0.5, MOST_SIZE)
 
 
 class Display:
@@ -59,6 +63,7 @@ class Display:
         self.scale = 2.0 / max(float((bounds[1] - bounds[0]).max()), 1e-12)
         self.up = up / np.linalg.norm(up)
         server.scene.set_up_direction(tuple(self.up))
+        server.on_client_connect(lambda client: self._turn(client.camera, client.camera.aspect))
 
     def place(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """Points of the input's frame in stage coordinates."""
@@ -68,26 +73,44 @@ class Display:
         """Points of the stage in the input's frame."""
         return points / self.scale + self.center
 
+    def add_panel(self, title: str) -> Any:
+        """Add a panel at the right and return its tab, a context; pages as narrow as a phone show it folded."""
+        panel = self.server.gui.add_panel()
+        panel.dock_right()
+        return panel.add_tab(title)
+
+    def add_axes(self, corner: Float[np.ndarray, "3"], length: float, text: str) -> None:
+        """Draw the axes of the input's frame from a corner, each as long as ``length``, for which ``text`` stands."""
+        ends = self.place(corner + length * np.eye(3))
+        lines = np.stack([np.broadcast_to(self.place(corner), (3, 3)), ends], axis=1)
+        scene, colors = self.server.scene, np.repeat(np.array(AXIS_COLORS)[:, None], 2, axis=1)
+        scene.add_line_segments("/axes", lines, colors, thickness=3.0, thickness_units="screen")
+        for name, end in zip("xyz", ends, strict=True):
+            scene.add_label(f"/axes/{name}", f"{name} {text}", position=tuple(end), anchor="center-center")
+
     def look_from(self, direction: Float[np.ndarray, "3"], bounds: Float[np.ndarray, "2 3"]) -> None:
         """Turn every open page, and those to come, to what lies within ``bounds``, from this direction."""
         low, high = self.place(bounds)
-        target = (low + high) / 2
-        distance = 1.35 * float(np.linalg.norm(high - low)) / 2 / np.sin(FOV_RAD / 2)
-        position = tuple(target + distance * direction / np.linalg.norm(direction))
+        self._view = direction / np.linalg.norm(direction), (low + high) / 2, float(np.linalg.norm(high - low)) / 2
         first = self.server.initial_camera
-        first.position, first.look_at, first.up, first.fov = position, tuple(target), tuple(self.up), FOV_RAD
+        first.up, first.fov = tuple(self.up), FOV_RAD
+        self._turn(first, 1.0)
         for client in self.server.get_clients().values():
             with client.atomic():
-                client.camera.position, client.camera.look_at = position, tuple(target)
-                client.camera.up_direction = tuple(self.up)
+                self._turn(client.camera, client.camera.aspect)
+
+    def _turn(self, camera: Any, aspect: float) -> None:
+        """Turn the camera of a page of this width by height, which is narrow on a phone, to what is looked at."""
+        ahead, target, radius = self._view
+        half_angle = np.arctan(min(aspect, 1.0) * np.tan(FOV_RAD / 2))
+        camera.position, camera.look_at = tuple(target + radius / np.sin(half_angle) * ahead), tuple(target)
 
     def add_views(
         self,
         toward: Callable[[], Float[np.ndarray, "3"]],
         bounds: Callable[[], Float[np.ndarray, "2 3"]],
-        first: str = "camera",
     ) -> Callable[[str], None]:
-        """Add buttons that turn the page to ``bounds`` as seen from ``toward`` (``first``), its side and its back.
+        """Add buttons that turn the page to ``bounds`` as seen from ``toward``, its side and its back.
 
         The page is turned to the first view at once. All are a little from above and from the side. Returns what turns
         the page to a view by its name.
@@ -96,39 +119,51 @@ class Display:
         def look(name: str) -> None:
             ahead = toward()
             side = np.cross(self.up, ahead)
-            direction = {first: ahead, "side": side, "behind": -ahead}[name]
+            direction = {"front": ahead, "side": side, "behind": -ahead}[name]
             self.look_from(direction + 0.28 * (np.cross(self.up, direction) + self.up), bounds())
 
-        view = self.server.gui.add_button_group("View", (first, "side", "behind"))
+        view = self.server.gui.add_button_group("View", ("front", "side", "behind"))
         view.on_click(lambda _: look(view.value))
-        look(first)
+        look("front")
         return look
 
 
 class SegmentControls:
-    """Controls with a check box and an opacity slider for each segment."""
+    """Controls with a button in each segment's colour, which is the legend and shows or hides it, and its opacity."""
 
     def __init__(self, gui: Any, mesh: SegmentedMesh, changed: Callable[[], None]) -> None:
-        with gui.add_folder("Segments", expand_by_default=len(mesh.segments) <= 6):  # or all would be boxes
-            self._boxes = [gui.add_checkbox(segment.name, True) for segment in mesh.segments]
+        self._colors, self._shown, self._changed = mesh.colors, [True] * len(mesh.segments), changed
+        with gui.add_folder("Segments", expand_by_default=len(mesh.segments) <= MOST_BUTTONS):
+            self._buttons = [gui.add_button(s.name, color=s.color, icon=EYES[1]) for s in mesh.segments]
         with gui.add_folder("Opacity", expand_by_default=False):
-            self._all = gui.add_slider("all", 0.0, 1.0, 0.05, 1.0)
-            # what holds nested segments is see-through, or they would never be seen
-            start = [1.0 if opaque else 0.35 for opaque in mesh.opaque]
+            # what is around others is see-through, or they would never be seen
             self._sliders = [
                 gui.add_slider(segment.name, 0.0, 1.0, 0.05, value)
-                for segment, value in zip(mesh.segments, start, strict=True)
+                for segment, value in zip(mesh.segments, opacities(mesh), strict=True)
             ]
-        for handle in (*self._boxes, self._all, *self._sliders):
-            handle.on_update(lambda _: changed())
+        for index, button in enumerate(self._buttons):
+            button.on_click(lambda _, index=index: self.switch(index))
+        for slider in self._sliders:
+            slider.on_update(lambda _: changed())
+
+    def switch(self, index: int) -> None:
+        """Hide a segment that is shown, and show one that is not."""
+        self._shown[index] = not self._shown[index]
+        self._buttons[index].icon = EYES[self._shown[index]]
+        self._changed()
+
+    def name_colors(self, are_shown: bool) -> None:
+        """Let the buttons have the segments' colours or none: where colours are numbers, these have the only legend."""
+        for button, color in zip(self._buttons, self._colors, strict=True):
+            button.color = color if are_shown else "gray"
 
     def visible(self) -> list[bool]:
-        """Whether each segment is shown: its box is checked, and it is not wholly transparent."""
-        return [bool(box.value) and value > 0 for box, value in zip(self._boxes, self.opacity(), strict=True)]
+        """Whether each segment is shown, and not wholly transparent."""
+        return [shown and value > 0 for shown, value in zip(self._shown, self.opacity(), strict=True)]
 
     def opacity(self) -> list[float]:
-        """Opacity of each segment, 0 to 1: its own slider's times that of all."""
-        return [float(self._all.value * slider.value) for slider in self._sliders]
+        """Opacity of each segment, 0 to 1."""
+        return [float(slider.value) for slider in self._sliders]
 
 
 class SegmentLayer:
@@ -190,8 +225,11 @@ def _painted(
     screen = colors / 255.0
     linear = np.where(screen <= 0.04045, screen / 12.92, ((screen + 0.055) / 1.055) ** 2.4)
     rgba = np.column_stack([linear, np.full(len(linear), opacity)])
+    # without a material it would shine as metal does, whose colours are none of a legend's
+    visual = TextureVisuals(material=PBRMaterial(metallicFactor=0.0))
+    visual.vertex_attributes["color"] = np.rint(255 * rgba).astype(np.uint8)
     return trimesh.Trimesh(
-        vertices, segment.faces, vertex_normals=vertex_normals(segment), vertex_colors=rgba, process=False
+        vertices, segment.faces, vertex_normals=vertex_normals(segment), visual=visual, process=False
     )
 
 
@@ -203,7 +241,7 @@ class PointLayer:
         gui = stage.server.gui
         with gui.add_folder("Observed points"):
             self.box = gui.add_checkbox("show", True)
-            self._size = gui.add_slider("size (%)", 0.05, 4.0, 0.05, 100 * CLOUD_SIZES[0])
+            self._size = gui.add_slider("size (%)", 0.05, 4.0, 0.05, 100 * MOST_SIZE)
         self._cloud: Any = None
         self.box.on_update(lambda _: self._update())
         self._size.on_update(lambda _: self._update())
@@ -212,7 +250,7 @@ class PointLayer:
         """Replace the points; the first ones set the size. ``shift`` is on the stage."""
         points = self.stage.place(cloud.points) + (np.zeros(3) if shift is None else shift)
         if self._cloud is None:
-            self._size.value = round(100 * point_size(points), 2)
+            self._size.value = round(100 * point_size(len(points)), 2)
         self._cloud = self.stage.server.scene.add_point_cloud(
             "/cloud", points, CLOUD_COLOR, point_size=0.01, point_shape="circle", precision="float32"
         )
@@ -250,29 +288,32 @@ def heading(title: str, text: str) -> str:
     )
 
 
+def hint(text: str) -> str:
+    """How to turn a page, by mouse or by hand, and a line below."""
+    hidden = "{display:none}"
+    return (
+        f"<style>@media(pointer:coarse){{.mouse{hidden}}}@media not (pointer:coarse){{.fingers{hidden}}}</style>"
+        f'<div style="{BOX};{SOFT}">drag to turn · <span class="mouse">scroll to zoom · right-drag to move</span>'
+        f'<span class="fingers">pinch to zoom · two fingers to move</span><br>{escape(text)}</div>'
+    )
+
+
 def message(text: str, bad: bool = False) -> str:
     """Line on what is going on; "" is an empty line, so that nothing jumps."""
     color = "color:#e5484d" if bad else SOFT
     return f'<div style="{BOX};min-height:1.9em;{color}">{escape(text) or "&nbsp;"}</div>'
 
 
-def chips(names: Sequence[str], colors: Sequence[Color]) -> str:
-    """Chips that name the segments' colours."""
-    each = "".join(
-        f'<span style="white-space:nowrap;margin-right:11px"><span style="display:inline-block;width:10px;height:10px;'
-        f'border-radius:3px;background:{css(color)};margin-right:5px"></span>{escape(name)}</span> '
-        for name, color in zip(names, colors, strict=True)
-    )
-    return f'<div style="{BOX}">{each}</div>'
-
-
 def color_bar(scale: ColorScale) -> str:
-    """Bar with all colours of a scale, and what its ends mean."""
-    stops = ",".join(css(color) for color in scale.stops)
+    """Bar with all colours of a scale, and what stands below it."""
+    stops, words = (
+        ",".join(css(color) for color in scale.stops),
+        "".join(f"<span>{escape(w)}</span>" for w in scale.words),
+    )
     return (
         f'<div style="{BOX}"><div>{escape(scale.title)}</div><div style="height:9px;border-radius:5px;margin:3px 0;'
         f'background:linear-gradient(90deg,{stops})"></div><div style="display:flex;justify-content:space-between;'
-        f'{SOFT}"><span>{escape(scale.words[0])}</span><span>{escape(scale.words[1])}</span></div></div>'
+        f'{SOFT}">{words}</div></div>'
     )
 
 

@@ -37,7 +37,6 @@ from mereo_viewer.display import (
     PointLayer,
     SegmentControls,
     SegmentLayer,
-    chips,
     enlarged,
     heading,
     message,
@@ -265,24 +264,24 @@ class LabPage:
 
     def _build(self) -> None:
         gui, rest = self.server.gui, self.laboratory.scene.rest
+        network = self.laboratory.network
+        facts = "no weights: a search finds the object" if network is None else f"weights {network.name}"
+        gui.add_html(heading(f"Laboratory: {self.laboratory.scene.name}", facts))
         panel = gui.add_panel()
         panel.dock_left()
         panel.set_width(300)
-        network = self.laboratory.network
-        facts = "no weights: a search finds the object" if network is None else f"weights {network.name}"
         with panel.add_tab("Frame"):
-            gui.add_html(heading(f"Laboratory: {self.laboratory.scene.name}", facts))
             self.picture = gui.add_image(np.zeros((320, 320, 3), dtype=np.uint8), format="png")
             self.scores = gui.add_html("")
             self.status = gui.add_html(message("starting"))
-        gui.add_html(chips(rest.names, rest.colors))
-        gui.add_button("Random state").on_click(lambda _: self.randomize())
-        gui.add_button("Reconstruct").on_click(lambda _: self.reconstruct())
-        self._build_camera()
-        self.sliders = ParameterSliders(gui, self.move)
-        self.points = PointLayer(self.stage)
-        self.controls = SegmentControls(gui, rest, self._draw)
-        self._look = self.stage.add_views(self._toward, self._bounds)
+        with self.stage.add_panel("Controls"):
+            gui.add_button("Random state").on_click(lambda _: self.randomize())
+            gui.add_button("Reconstruct").on_click(lambda _: self.reconstruct())
+            self._build_camera()
+            self.sliders = ParameterSliders(gui, self.move)
+            self.points = PointLayer(self.stage)
+            self.controls = SegmentControls(gui, rest, self._draw)
+            self._look = self.stage.add_views(self._toward, self._bounds)
 
     def _build_camera(self) -> None:
         gui, first, laboratory = self.server.gui, self.laboratory.first_place, self.laboratory
@@ -349,7 +348,7 @@ class LabPage:
             self.scores.content = score_table(self.trial.scores, surfaces.names, surfaces.colors)
             self._say(f"{self.trial.source}; {self.trial.seconds:.1f} s; scored on {CELLS}³ points")
             self._draw()
-            self._look("camera")
+            self._look("front")
 
     # --- what is shown ------------------------------------------------------------------------------------------------
 
@@ -365,7 +364,7 @@ class LabPage:
         self._say(f"{len(self.view.depth.to_points()):,} points seen")
         self._draw()
         if is_first:
-            self._look("camera")
+            self._look("front")
 
     def _say(self, text: str, bad: bool = False) -> None:
         self.status.content = message(text, bad)

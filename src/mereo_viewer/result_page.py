@@ -18,7 +18,7 @@ from jaxtyping import Float, UInt8
 
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.registration import nearest_labels
-from mereo.geometry.brief import counted, rounded
+from mereo.geometry.brief import as_exact_as, counted, rounded
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color, SegmentedMesh
 from mereo.geometry.radii import Radii
@@ -27,6 +27,7 @@ from mereo.geometry.transforms import inverse_rigid, rigid, rotation_along, tran
 from mereo.io.errors import words_of
 from mereo.io.mesh_formats import GlbScene, is_glb, read_glb
 from mereo.io.writers.formats import WRITERS
+from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
 from mereo.models.trained import Answer as NetworkAnswer
 from mereo.results.state import STATE
 from mereo.visualization.color_scales import (
@@ -49,10 +50,10 @@ from mereo_viewer.display import (
     SegmentControls,
     SegmentLayer,
     bars,
-    chips,
     color_bar,
     enlarged,
     heading,
+    hint,
     message,
 )
 from mereo_viewer.server import OpenPage, import_viser, start_server
@@ -176,8 +177,9 @@ def probe_html(
     elif np.isnan(distance):
         text = "distance not trained"
     else:
-        length = f"{rounded(abs(distance) * unit.length_factor)} {unit.length_name}"
-        text = f"{length} {'inside' if distance < 0 else 'outside'} the nearest surface"
+        off = abs(distance) * unit.length_factor
+        (length,) = as_exact_as(unit.length_factor * (radius or 0.0), off)
+        text = f"{length} {unit.length_name} {'inside' if distance < 0 else 'outside'} the nearest surface"
     toward = "" if np.isnan(direction).any() else f"towards {_vector(direction)}"
     rest = "" if probed.rest is None else f"<br>at rest at {_vector(probed.rest[0])} scene units"
     likeliest = ""
@@ -226,7 +228,6 @@ class Content:
         colorings: other colours than those of the segments, by name; the first shown first where it is ``VERTEX``.
         ask: what is known of places; None where there is nothing to probe.
         is_doubtful: whether the verdict is that the surfaces are not to be trusted.
-        first_view: name of the view from ahead.
         picks: what a click can say where the object is in; None where nothing is looked for.
     """
 
@@ -241,7 +242,6 @@ class Content:
     colorings: Mapping[str, Coloring] = field(default_factory=dict)
     ask: Callable[[Float[np.ndarray, "n 3"]], Probed] | None = None
     is_doubtful: bool = False
-    first_view: str = "camera"
     picks: Picks | None = None
 
     @property
@@ -343,7 +343,6 @@ def content_of_files(path: Path) -> Content:
         colorings=colorings,
         ask=partial(probe_surfaces, Solids(scene.mesh), scene.radii) if scene.is_ours else None,
         is_doubtful=report is not None and report.level == "no",
-        first_view="camera" if scene.is_ours else "front",
     )
 
 
@@ -362,6 +361,16 @@ def _facts(scene: GlbScene, unit: Unit, points: int | None) -> str:
     parts = counted(len(scene.mesh.segments), "segment" if scene.is_ours else "part")
     faces = sum(len(segment.faces) for segment in scene.mesh.segments)
     return " · ".join([*([] if points is None else [f"{points:,} points"]), parts, f"{faces:,} faces", size])
+
+
+def round_length(most: float, unit: Unit) -> tuple[float, str]:
+    """Greatest length of 1, 2 or 5 times a power of ten up to ``most``, and its words: in mm, cm, m, or units."""
+    metres = unit.metres or 1.0
+    power = 10.0 ** np.floor(np.log10(most * metres))
+    length = float(max(k * power for k in (1, 2, 5) if k * power <= most * metres))
+    names = ((1000, "mm"), (100, "cm"), (1, "m")) if unit.metres else ((1, "units"),)
+    factor, name = next((each for each in names if each[0] * length < 100), names[-1])
+    return length / metres, f"{factor * length:g} {name}"
 
 
 # --- colours ----------------------------------------------------------------------------------------------------------
@@ -416,7 +425,10 @@ class ResultPage:
         self.heading = gui.add_html(heading(content.title, content.facts))
         if content.verdict:
             self.verdict = gui.add_html(message(content.verdict, bad=content.is_doubtful))
-        gui.add_html(chips(content.mesh.names, content.mesh.colors))
+        with self.stage.add_panel("Show"):
+            self._fill(gui, content)
+
+    def _fill(self, gui: Any, content: Content) -> None:
         colorings = (SEGMENT, *content.colorings)
         first = VERTEX if VERTEX in colorings else SEGMENT
         self.coloring = gui.add_dropdown("Colour", colorings, initial_value=first, visible=len(colorings) > 1)
@@ -432,7 +444,8 @@ class ResultPage:
             self.picking = gui.add_checkbox("Find what I click", False)
             self.picking.on_update(lambda _: self._show_points())
         toward = content.rotation.T @ [0.0, 0.0, 1.0]
-        self._look = self.stage.add_views(lambda: toward, lambda: self.content.bounds, content.first_view)
+        self._look = self.stage.add_views(lambda: toward, lambda: self.content.bounds)
+        self.hint = gui.add_html(self._add_axes())
         if content.ask is not None:
             self._build_probe()
         if content.depth is not None:
@@ -440,6 +453,15 @@ class ResultPage:
                 gui.add_image(enlarged(content.depth[0]), format="png")
                 if len(content.depth[1]) == 2:
                     gui.add_html(message("bright: {}; dark: {}".format(*content.depth[1])))
+
+    def _add_axes(self) -> str:
+        """Draw the axes of the input's frame, and return what to do on the page, and whose axes they are."""
+        content, (low, high) = self.content, self.content.bounds
+        length, text = round_length(float((high - low).max()) / 3, content.unit)
+        self.stage.add_axes(low, length, text)
+        is_camera = np.allclose(content.rotation, GLTF_CAMERA_ROTATION)
+        whose = "the camera's: x right, y down, z away" if is_camera else "the input's"
+        return hint(f"axes: {whose}; each {text} long")
 
     def _build_probe(self) -> None:
         gui = self.server.gui
@@ -463,6 +485,7 @@ class ResultPage:
             colors, scale = (None, None) if name == SEGMENT else self._known_colors[name]
             self.legend.content = "" if scale is None else color_bar(scale)
             self.legend.visible = scale is not None
+            self.controls.name_colors(scale is None)
             self.layer.show(self.content.mesh, self.controls, colors)
 
     # --- picking ------------------------------------------------------------------------------------------------------
@@ -485,8 +508,9 @@ class ResultPage:
             self._known_colors.clear()
             self.coloring.options, self.coloring.value = (SEGMENT, *self.content.colorings), SEGMENT
             self.picking.value = False
-            self._look(self.content.first_view)
+            self._look("front")
             self._draw()
+            self.hint.content = self._add_axes()
             self.heading.content = heading(self.content.title, self.content.facts)
             self.verdict.content = message(self.content.verdict, bad=self.content.is_doubtful)
         except Exception as error:  # whatever it is, the page must live on and say it

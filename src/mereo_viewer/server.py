@@ -57,7 +57,7 @@ def start_server(port: int) -> Any:
     server.gui.configure_theme(
         dark_mode=True, show_logo=False, show_share_button=False, control_width="medium", brand_color=(86, 180, 233)
     )
-    server.gui.main_panel.dock_right()
+    server.gui.main_panel.float(x=15, y=15, width=300)
     # neutral and dark, as the palette's yellow is hard to see on white, with a share of viser's surrounding light, in
     # all of which the palette's colours would fade to white
     share = np.linspace(0.0, 1.0, 256)[:, None, None]

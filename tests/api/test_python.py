@@ -322,8 +322,8 @@ def test_a_notebook_shows_pictures_and_figures(result: Result) -> None:
     assert dots[0] > 1.5 * dots[1] > 0, "the camera sees all that it has measured, its right half of it"
     rows = re.findall(r"<tr>(.*?)</tr>", page)[1:]
     assert ["&lt;small&gt;" in row for row in rows] == [False, True, False] and "<small>" not in page
-    assert "not found" in rows[2] and "volume, cm³" in page and "centre, mm" in page
-    volume, _, place = re.findall(r"<td>(.*?)</td>", rows[0])
+    assert "<td>\N{EN DASH}</td><td>0</td>" in rows[2] and "volume (cm³)" in page and "centre x, y, z (mm)" in page
+    place, volume, _ = re.findall(r"<td>(.*?)</td>", rows[0])
     assert float(volume) == pytest.approx(4 / 3 * np.pi * 6**3, rel=0.02)
     assert_allclose([float(value) for value in place.split()], [20, -30, 600], atol=2)
 

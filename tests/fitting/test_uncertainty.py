@@ -307,6 +307,7 @@ def test_the_summary_tells_centroids_volumes_and_the_whole(told: Uncertainty, ra
     summary = read_json(folder / "summary.json")
     lengths = {"median": pytest.approx(np.median(radii)), "max": pytest.approx(radii.max())}
     assert summary["radius95"] == {**lengths, "calibrated": False, "unit_m": 0.5}
+    assert [*summary, *summary["registration"]][-1] == "coefficients" and list(summary)[-1] == "registration"
     for row, one in zip(summary["segments"], told.segments, strict=True):
         assert row["centroid_radius95"] == pytest.approx(one.centroid_radius95)
         assert row["volume95"] == pytest.approx(list(one.volume95))

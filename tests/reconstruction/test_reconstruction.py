@@ -28,7 +28,7 @@ from mereo.io.atomic_files import MARKER
 from mereo.io.config import InputConfig
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import SizeWarning
-from mereo.reconstruction.pipeline import Reconstruction
+from mereo.reconstruction.pipeline import Reconstruction, count_parts
 from mereo.visualization.result_files import write_answer
 
 pytestmark = pytest.mark.usefixtures("small_previews")
@@ -65,12 +65,24 @@ def test_segments_are_where_they_are_and_an_absent_one_is_listed(answer: Answer)
         assert_allclose(surface.bounds, segment.box, atol=1e-9)
 
 
-def test_components_are_counted_and_nothing_is_removed() -> None:
+def test_parts_are_counted_as_a_person_would_and_nothing_is_removed() -> None:
+    """Two balls; the third one, shorter than a tenth of the first, is a speck."""
     apart = logits_of(union(ball((0.0, 0.0, 5.0), 0.5), ball((0.0, 1.0, 5.0), 0.1), ball((0.8, 0.0, 5.0), 0.04)))
     cloud = np.concatenate([front((0.0, 0.0, 5.0), 0.5, -1.0), front((0.0, 1.0, 5.0), 0.1, -1.0)])
     segment = reconstruct(cloud, AnalyticModel.of(apart, ("one",)), resolution=96).segments[0]
-    assert segment.components == 3
+    assert segment.components == 2
     assert segment.volume == pytest.approx(4 / 3 * np.pi * (0.5**3 + 0.1**3 + 0.04**3), rel=0.02)
+
+
+def test_specks_and_gaps_below_a_voxel_are_no_parts() -> None:
+    mask = np.zeros((40, 8, 8), dtype=bool)
+    mask[:20, 2:5, 2:5] = mask[20:30, 5:7, 5:7] = True  # they touch at a corner
+    assert count_parts(mask) == 1
+    mask[38, 0, 0] = True
+    assert count_parts(mask) == 1, "a speck"
+    mask[34:38, 0, 0] = True
+    assert count_parts(mask) == 2
+    assert count_parts(mask[38:39]) == 1, "a single voxel, where it is all"
 
 
 def test_files(answer: Answer, tmp_path: Path) -> None:
@@ -86,6 +98,7 @@ def test_files(answer: Answer, tmp_path: Path) -> None:
     summary = read_json(tmp_path / "out/summary.json")
     assert [(s["name"], s["volume"] > 0) for s in summary["segments"]] == [("big", 1), ("small", 1), ("absent", 0)]
     assert summary["segments"][2]["confidence"] is None and summary["frame"] == frame
+    assert list(summary)[:7] == ["title", "verdict", "recognition", "frame", "unit_m", "pose", "segments"]
     assert set(summary["timings_s"]) == {"encode", "locate", "extract", "measure", "write"}
     loaded = trimesh.load_scene(tmp_path / "out/segments.glb")
     assert set(loaded.geometry) == {"big", "small"}

@@ -41,7 +41,7 @@ from mereo.visualization.reconstruction_report import Report, read_report
 from mereo.visualization.units import UNKNOWN, Unit
 from mereo_viewer import result_page
 from mereo_viewer import server as viewer_server
-from mereo_viewer.display import chips, heading, message
+from mereo_viewer.display import color_bar, heading, hint, message
 from mereo_viewer.laboratory import CameraPlace, Laboratory, LabPage, Trial, slider_range
 from mereo_viewer.result_page import (
     SURE,
@@ -52,6 +52,7 @@ from mereo_viewer.result_page import (
     content_of_answer,
     content_of_files,
     probe_html,
+    round_length,
 )
 
 needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser (extra `view`) is not installed")
@@ -141,6 +142,41 @@ def test_a_click_on_what_the_camera_saw_has_it_answered_there(server: object, mo
     assert len(cloud["/cloud"].points) == len(page.content.cloud.points)  # type: ignore[union-attr]
     page.answer_at(around.points[0])
     assert len(clicked) == 2 and "nothing there" in page.verdict.content and page.content.title == "again"
+
+
+@needs_viser
+def test_one_legend_at_a_time_names_colours_and_hides_segments(server: object) -> None:
+    page = ResultPage(server, toy_content())
+    buttons = page.controls._buttons
+    assert [(button.label, button.color) for button in buttons] == [(s.name, s.color) for s in rest_mesh().segments]
+    page.controls.switch(1)
+    assert not page.layer.handles[1].visible and page.layer.handles[2].visible and buttons[1].icon == "eye-off"
+    page.coloring.value = "depth"
+    assert {button.color for button in buttons} == {"gray"} and page.legend.visible
+
+
+@needs_viser
+def test_what_is_around_others_is_seen_through_and_axes_are_of_a_round_length(server: object) -> None:
+    inner = ball("inner", 0.0, 0)
+    mesh = SegmentedMesh((inner, replace(inner, name="outer", vertices=2 * inner.vertices - [0, 0, 0.5])))
+    page = ResultPage(server, replace(toy_content(), mesh=mesh, cloud=None, unit=Unit(1.0)))
+    assert page.controls.opacity() == [1.0, 0.4]
+    nodes = server.scene._handle_from_node_name  # type: ignore[attr-defined]
+    ends = page.stage.back(nodes["/axes"].points[:, 1].astype(float))
+    np.testing.assert_allclose(ends - page.content.bounds[0], 0.1 * np.eye(3), atol=1e-5)
+    assert nodes["/axes/y"].text == "y 10 cm" and "x right, y down, z away; each 10 cm long" in page.hint.content
+    assert round_length(0.3, UNKNOWN) == (0.2, "0.2 units") and round_length(70, Unit(0.001)) == (50, "50 mm")
+
+
+@needs_viser
+@pytest.mark.parametrize("aspect", [390 / 844, 1.5])
+def test_a_page_looks_at_the_middle_of_the_object_from_where_all_of_it_is_seen(server: object, aspect: float) -> None:
+    stage, camera, bounds = ResultPage(server, toy_content()).stage, SimpleNamespace(), toy_content().bounds
+    stage._turn(camera, aspect)
+    np.testing.assert_allclose(camera.look_at, stage.place(bounds.mean(axis=0)), atol=1e-9)
+    half_angle = np.arctan(np.tan(np.deg2rad(20)) * min(aspect, 1))
+    radius = np.linalg.norm(np.subtract(camera.position, camera.look_at)) * np.sin(half_angle)
+    assert radius == pytest.approx(np.linalg.norm(np.ptp(bounds, axis=0)) / 2 * stage.scale), "of the ball around it"
 
 
 def first_message(port: int, host: str, origin: str | None) -> bytes:
@@ -242,7 +278,7 @@ def test_names_cannot_break_the_panels() -> None:
     place = np.array([0.001, 0.002, 0.003])
     text = probe_html(answer, ("empty", name), ((0, 0, 0), (1, 2, 3)), place, Unit(1.0))
     shown = re.sub(r"<[^>]+>", " ", text)
-    assert "<script" not in text + chips((name,), ((1, 2, 3),)) + heading(name, name) + message(name)
+    assert "<script" not in text + heading(name, name) + message(name) + hint(name)
     for told in (
         "0.75",
         "2 mm inside the nearest surface",
@@ -462,7 +498,7 @@ def test_any_glb_is_read_with_its_places_and_colours(tmp_path: Path) -> None:
     assert parts["plain"][0].color == (255, 0, 0) and parts["plain"][1] is None
     assert len(parts["plain"][0].vertices) == 8 and parts["round"][0].color == (0, 128, 255)
     content = content_of_files((tmp_path / "s.glb").rename(tmp_path / "s.GLB"))
-    assert content.ask is None and content.first_view == "front" and content.facts.startswith("3 parts")
+    assert content.ask is None and content.facts.startswith("3 parts")
     shown, scale = content.colorings[VERTEX]()
     assert scale is None and [len(part) for part in shown] == [len(s.vertices) for s in content.mesh.segments]
 
@@ -476,7 +512,9 @@ def test_a_folder_is_shown_with_all_that_its_files_keep(folder: Path) -> None:
     assert content.depth[0].shape == (19, 24, 3) and content.verdict.endswith("may be cut off there.")
     assert tuple(content.colorings) == ("distance", SURE)
     colors, scale = content.colorings[SURE]()
-    assert [len(part) for part in colors] == [len(s.vertices) for s in content.mesh.segments] and scale is not None
+    assert [len(part) for part in colors] == [len(s.vertices) for s in content.mesh.segments]
+    assert scale is not None and color_bar(scale).count("<span>") == len(scale.stops)
+    assert scale.words[-1] == "\N{GREATER-THAN OR EQUAL TO} 3.9 mm"
     cloud, mesh, summary = example()
     Report(cloud, mesh, summary).write(folder / "report.html")
     assert content_of_files(folder).unit == UNKNOWN

@@ -3,6 +3,7 @@
 import base64
 import io
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -19,6 +20,7 @@ from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.visualization.contact_sheets import MISSING, MOST_DEPTH_PX, depth_data
 from mereo.visualization.reconstruction_report import BUDGET_BYTES, VERDICTS, Report, page_words, trust
+from mereo.visualization.renderer import enclosed
 from mereo.visualization.units import Unit
 from mereo_learning.evaluation_report import write_evaluation_report
 
@@ -65,11 +67,10 @@ def test_the_page_counts_the_points_once_and_has_no_words_of_programs(tmp_path: 
     cloud, mesh, summary = example()
     told = {"answer": "registration", "explained": 0.973}
     said = {"recognition": {"known": "unsure", "reason": "a part is bent: look at it", "signs": {"size": 0.1}}}
-    Report(cloud, mesh, {**summary, **said, "registration": told, "patient_pose": "supine"}).write(tmp_path / "r.html")
+    Report(cloud, mesh, {**summary, **said, "registration": told}).write(tmp_path / "r.html")
     data = page_data(tmp_path / "r.html")
     words = data["words"]
     assert words["facts"][0] == "your model, registered: it explains 97.3% of the points"
-    assert "patient pose: supine" in words["facts"]
     text = " ".join(words["facts"])
     assert not re.search(r"float32|camera|clipped|points:|104|_", text), text
     assert data["cloud"]["count"] == len(cloud)
@@ -113,6 +114,42 @@ def test_a_large_reconstruction_stays_under_the_budget_and_in_shape(tmp_path: Pa
     with pytest.raises(ValueError, match="at most 5000000: shorten the summary"):
         Report(cloud, mesh, {"title": "x" * BUDGET_BYTES}).write(tmp_path / "r2.html")
     assert not (tmp_path / "r2.html").exists()
+
+
+@needs_browser
+@pytest.mark.parametrize("width, is_phone", [(1200, False), (390, True)])
+def test_a_page_has_one_legend_and_a_scale_bar_and_is_folded_on_a_phone(
+    tmp_path: Path, width: int, is_phone: bool
+) -> None:
+    cloud, mesh, summary = example()
+    Report(cloud, mesh, summary, unit=Unit(1.0)).write(tmp_path / "r.html")
+    with Page(tmp_path, "about:blank", (width, 844)) as page:
+        page.call("Emulation.setTouchEmulationEnabled", enabled=is_phone, maxTouchPoints=2)
+        page.call("Page.navigate", url=(tmp_path / "r.html").as_uri())
+        until(lambda: page.evaluate("document.querySelectorAll('#scale line').length") == 6)
+        is_open, swatches, hint, label = page.evaluate(
+            "[$('settings').open, document.querySelectorAll('td .swatch').length, $('hint').innerText, "
+            "$('scale').getAttribute('aria-label')]"
+        )
+        assert is_open is not is_phone and swatches == 0 and ("pinch to zoom" in hint) is is_phone
+        told = re.fullmatch(r"scale bar and axes of the camera: x right, y down, z away, each (\d+) cm long", label)
+        # as many pixels as the length has at the depth of the object's middle
+        pixels, per_metre = page.evaluate(
+            "[190 - $('scale').querySelector('.bar').x1.baseVal.value, "
+            "lens()[0] / view.distance / radius * canvas.clientWidth / 2]"
+        )
+        assert told and pixels == pytest.approx(int(told[1]) / 100 * per_metre)
+
+
+def test_a_segment_around_another_one_is_seen_through_though_it_is_not_declared(tmp_path: Path) -> None:
+    inner = ball("inner", 0.0, 0)
+    middle = inner.vertices.mean(axis=0)
+    around = replace(inner, name="around", vertices=middle + 2 * (inner.vertices - middle))
+    cup = replace(around, faces=around.faces[(around.vertices[around.faces] - middle)[:, :, 0].max(axis=1) < 0.1])
+    assert enclosed(SegmentedMesh((around, inner))) == {(1, 0)}, "in any order"
+    assert enclosed(SegmentedMesh((inner, cup))) == set()
+    Report(example()[0], SegmentedMesh((inner, around)), {}).write(tmp_path / "r.html")
+    assert [segment["opacity"] for segment in page_data(tmp_path / "r.html")["segments"]] == [1.0, 0.4]
 
 
 @pytest.mark.slow

@@ -445,8 +445,7 @@ class Result(Answer, SegmentedResult):
         surfaces = self.reconstruction.surfaces.transformed(to_camera)
         doubt = None if self.registrar is None else self.recognition.description
         lines = [self.source, *([] if doubt is None else [doubt])]
-        segments, calibrated = self.reconstruction.segments, self.reconstruction.calibrated
-        return result_html(self.seen.frame.source, lines, points, surfaces, segments, Unit(self.unit_m), calibrated)
+        return result_html(summary_of(self), lines, points, surfaces, Unit(self.unit_m))
 
 
 def _check_list(formats: object) -> None:

@@ -32,8 +32,6 @@ from mereo.cli.stream import frame_error, frames_in
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
-from mereo.geometry.brief import rounded
-from mereo.geometry.radii import describe_level
 from mereo.geometry.symmetry import describe_symmetries
 from mereo.io.atomic_files import MARKER, check_new_directory, check_place, new_directory, write_json
 from mereo.io.attachments import Attachment, read_attachments
@@ -49,7 +47,7 @@ from mereo.models.trained import Trained
 from mereo.reconstruction.observation import FrameWarning, find_object
 from mereo.results.carry import Placed, carry, place
 from mereo.scenes.registry import files_of
-from mereo.visualization.reconstruction_report import confidence_title, trust
+from mereo.visualization.reconstruction_report import confidence_title, radius_words, trust
 from mereo.visualization.result_files import INSTANCE, summary_of, write_answer
 from mereo.visualization.units import Unit
 from mereo.workers.spread import Cluster, spread
@@ -439,10 +437,7 @@ def print_uncertainty(registered: Registration | None, unit: Unit) -> None:
     """Print how far off the surface of a registered model may be; nothing for the network's answer."""
     if registered is None or registered.uncertainty is None:
         return
-    radii = registered.uncertainty.summary()
-    middle, most = (f"{rounded(radii[key] * unit.length_factor)} {unit.length_name}" for key in ("median", "max"))
-    level = describe_level(registered.uncertainty.calibrated)
-    print(f"its points are within {middle} of their true places in the median, {most} where it is least sure ({level})")
+    print(radius_words(registered.uncertainty.summary(), unit))
 
 
 def print_segments(result: Result) -> None:
@@ -454,11 +449,14 @@ def print_segments(result: Result) -> None:
     confidence = [confidence_title(reconstruction.calibrated)] if has_confidence else []
     for column in (f"volume ({unit.volume_name})", *confidence, "components", f"centroid ({unit.length_name})"):
         table.add_column(column, justify="right")
+    sure = None if result.registered is None else result.registered.uncertainty
     for segment in reconstruction.segments:
-        # the radius gives the digits; it is in the report, and would break the lines of 80 columns
+        # radii give the digits, three at most of a volume; they are in the report, and would break lines of 80 columns
+        between = None if sure is None else sure.segments[segment.label - 1].volume95
+        volume = min(unit.volume(segment.volume), unit.volume(segment.volume, between).partition(" (")[0], key=len)
         centroid = unit.place(segment.centroid, result[segment.name].error_radius).partition(" ±")[0]
         confidence = [f"{segment.confidence:.2f}"] if has_confidence else []
-        row = (unit.volume(segment.volume), *confidence, str(segment.components), centroid)
+        row = (volume, *confidence, str(segment.components), centroid)
         table.add_row(segment.name, *(row if segment.voxels else ("0", "not found", "0", "")))
     Console(markup=False, emoji=False).print(table)
     stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in reconstruction.timings_s.items())

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
+from mereo.geometry.brief import as_exact_as
 from mereo.geometry.mesh import Color, Segment, SegmentedMesh, vertex_normals
 from mereo.geometry.radii import STOPS, Radii, between_stops, describe_level
 from mereo.models.trained import Answer
@@ -59,14 +60,14 @@ class ColorScale:
         low: number at the scale's lower end.
         high: number at its upper end.
         stops: colours at equal distances from one end to the other.
-        words: what the two ends mean.
+        words: what stands below it, at equal distances from one end to the other.
     """
 
     title: str
     low: float
     high: float
     stops: tuple[Color, ...]
-    words: tuple[str, str]
+    words: tuple[str, ...]
 
     def colors(self, values: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
         """Colours (red, green, blue) of numbers, linear between the stops; NaN is grey."""
@@ -93,9 +94,11 @@ def distance_scale(values: Sequence[Float[np.ndarray, " _"]], unit: str) -> Colo
 
 
 def radius_scale(radii: Radii, unit: str) -> ColorScale:
-    """Scale for radii of 95 % in the unit that is named."""
-    title = f"true places are within ({describe_level(radii.calibrated)})"
-    return ColorScale(title, 0.0, max(radii.high, 1e-9), STOPS, (f"0{unit}, sure", f"{radii.high:.3g}{unit}"))
+    """Scale for radii of 95 % in the unit that is named, with a number at each of its colours."""
+    title = f"error radius: the true place is within it ({describe_level(radii.calibrated)})"
+    high = max(radii.high, 1e-9)
+    *less, most = as_exact_as(high, *np.linspace(0.0, high, len(STOPS)))
+    return ColorScale(title, 0.0, high, STOPS, (*less, f"\N{GREATER-THAN OR EQUAL TO} {most}{unit}"))
 
 
 def confidence(surfaces: SegmentedMesh, ask: Ask) -> list[Float[np.ndarray, " _"]]:

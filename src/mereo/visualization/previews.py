@@ -52,11 +52,10 @@ def render_cloud_and_segments(
         title: one line above.
         size: width and height of each of the six pictures in pixels.
     """
-    solid = _with_faces(surfaces)
-    bounds = _joint_bounds(cloud.points, solid)
+    bounds = _joint_bounds(cloud.points, surfaces)
     views = {name: Viewpoint.along(bounds, *pair) for name, pair in CAMERA_VIEWS.items()}
     clouds = [cloud_picture(cloud.points, view, (size, size)) for view in views.values()]
-    shaded = [shade(solid, view, (size, size)) for view in views.values()]
+    shaded = [shade(surfaces, view, (size, size)) for view in views.values()]
     captions = [f"input, {name}" for name in views] + [f"segments, {name}" for name in views]
     sheet = contact_sheet(clouds + shaded, captions, 3, title)
     save_png(path, np.concatenate([sheet, legend(surfaces.names, surfaces.colors, sheet.shape[1])]))
@@ -73,22 +72,15 @@ def points_on_segments(
         sides: viewing direction and up of each, as in ``CAMERA_VIEWS``.
         size: width and height in pixels; what is shown fills it.
     """
-    solid, pictures = _with_faces(surfaces), []
-    bounds = _joint_bounds(points, solid)
+    pictures, bounds = list[Picture](), _joint_bounds(points, surfaces)
     for direction, up in sides:
         view = Viewpoint.along(bounds, direction, up)
-        canvas = shaded_canvas(solid, view, (size, size))
+        canvas = shaded_canvas(surfaces, view, (size, size))
         # nearer by a share of the picture's height, or noise would hide half of them
         lifted = points - 0.012 * 2 * view.half_size * np.asarray(direction)
         canvas.draw_points(lifted, np.tile((0.09, 0.1, 0.13), (len(points), 1)), 0.75)
         pictures.append(canvas.picture())
     return pictures
-
-
-def _with_faces(surfaces: SegmentedMesh) -> SegmentedMesh:
-    kept = tuple(segment for segment in surfaces.segments if len(segment.faces)) or surfaces.segments[:1]
-    names = [segment.name for segment in kept]
-    return SegmentedMesh(kept, tuple(pair for pair in surfaces.nested if set(pair) <= set(names)))
 
 
 def _joint_bounds(points: Float[np.ndarray, "n 3"], solid: SegmentedMesh) -> Float[np.ndarray, "2 3"]:

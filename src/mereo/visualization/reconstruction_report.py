@@ -31,14 +31,14 @@ from mereo.geometry.brief import rounded
 from mereo.geometry.camera import DepthImage, PointCloud
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.mesh import Color, Segment, SegmentedMesh
-from mereo.geometry.radii import STOPS, Radii, describe_level
+from mereo.geometry.radii import Radii, describe_level
 from mereo.geometry.subdivision import split_at_creases
 from mereo.io.atomic_files import atomic_file
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
-from mereo.io.writers.meshes import OUTER_OPACITY
-from mereo.reconstruction.pipeline import SegmentFacts
+from mereo.visualization.color_scales import radius_scale
 from mereo.visualization.contact_sheets import MOST_DEPTH_PX, PNG_URL, Picture, data_url, depth_data
 from mereo.visualization.previews import CAMERA_VIEWS, points_on_segments
+from mereo.visualization.renderer import opacities
 from mereo.visualization.units import UNKNOWN, Unit
 
 REPORT = "report.html"
@@ -66,7 +66,7 @@ class Report:
             one are drawn see-through.
         summary: what the page says in words; every key may be missing. ``title`` is text; ``segments`` is a list of
             ``{"name", "centroid" [3], "volume", "confidence" in 0..1}`` in the order of ``surfaces``; ``timings_s``
-            maps stages to seconds; of the other texts and numbers those for people are listed (``page_words``).
+            maps stages to seconds; facts of it are listed (``page_words``).
         rotation: rotation from the input's frame to the viewer's (x right, y up, z toward the viewer).
         unit: of the cloud's lengths; the page has millimetres and cubic centimetres where it is known.
         registered: the model that the last of ``surfaces`` are, in the cloud's frame, to show how sure they are.
@@ -108,7 +108,11 @@ class Report:
         registered, full = self.registered, self.surfaces.segments
         sure = None if registered is None else registered.uncertainty
         radii = None if registered is None or sure is None else sure.radii(registered.material)
+        scale = (
+            None if radii is None else radius_scale(radii.scaled(self.unit.length_factor), f" {self.unit.length_name}")
+        )
         return {
+            "metres": self.unit.metres,
             "low": low.tolist(),
             "high": high.tolist(),
             "rotation": np.asarray(self.rotation).tolist(),
@@ -121,25 +125,25 @@ class Report:
                 {
                     "name": segment.name,
                     "color": list(segment.color),
-                    "opacity": 1.0 if opaque else OUTER_OPACITY,
+                    "opacity": opacity,
                     "faces": len(segment.faces),
                     "positions": _base64(_quantize(part.vertices, low, high)),
                     "indices": _base64(part.faces.astype("<u4")),
                     "sure": None if radii is None else _radius_bytes(radii, tuple(centroids), part),
                 }
-                for segment, part, opaque in zip(full, shown, self.surfaces.opaque, strict=True)
+                for segment, part, opacity in zip(full, shown, opacities(self.surfaces), strict=True)
             ],
             "coarsened": any(len(a.faces) != len(b.faces) for a, b in zip(full, shown, strict=True)),
             "words": words,
             "depth": depth,
             "sure": None
-            if radii is None
+            if scale is None
             else {
-                "stops": [list(color) for color in STOPS],
+                "stops": [list(color) for color in scale.stops],
                 "weights": [list(color) for color in WEIGHTS],
                 "unexplained": list(RED),
-                "ends": ["0", f"{rounded(radii.high * self.unit.length_factor)} {self.unit.length_name}"],
-                "title": f"the true place is so far away at most ({describe_level(radii.calibrated)})",
+                "ends": list(scale.words),
+                "title": scale.title,
                 "centroids": [
                     {"name": name, "marks": _base64(marks[name]), "shares": describe_shares(explanation)}
                     for name, explanation in centroids.items()
@@ -298,14 +302,6 @@ STAGES = {
 }
 """What each stage of ``timings_s`` does; another one keeps its name."""
 
-NO_FACTS = (
-    *("title", "recognition", "radius95", "unit", "unit_m", "source", "frame", "points", "segments", "nested"),
-    *("timings_s", "registration", "weights", "spacing", "device", "resolution", "clipped", "calibrated"),
-    *("precision", "evaluated_points", "depth_m", "visible_size_m", "invalid_points", "isolation", "carried"),
-    *("scene_file", "verdict"),
-)
-"""Keys of a summary that the page shows in another place, and those that only summary.json has."""
-
 DEVICES = {"cpu": "the processor", "cuda": "the GPU"}
 DASH, GAP = "\N{EN DASH}", 3 * "\N{NO-BREAK SPACE}"
 """For what there is no number of; between coordinates, which have commas at their thousands."""
@@ -354,25 +350,26 @@ def _heads(summary: Mapping[str, Any], unit: Unit) -> list[str]:
 
 
 def _facts(summary: Mapping[str, Any], unit: Unit, verdict: Trust) -> list[str]:
-    """Where the answer comes from, what it was made with, then whatever else a caller has to say."""
+    """Where the answer comes from, how sure it is, and what it was made with."""
     registration, radius95 = summary.get("registration"), summary.get("radius95")
     facts = [_answer(registration, verdict)] if isinstance(registration, Mapping) else []
     source, spacing = summary.get("source"), _number(summary.get("spacing"))
     if source is not None and str(source) != str(summary.get("title")):
         facts.append(f"from {source}")
     if isinstance(radius95, Mapping):
-        middle, most = (rounded(float(radius95[key]) * unit.length_factor) for key in ("median", "max"))
-        level = describe_level(bool(radius95.get("calibrated")))
-        facts.append(f"surface within {middle} {unit.length_name} in the median, {most} at most ({level})")
+        facts.append(radius_words(radius95, unit))
     if spacing is not None:
         facts.append(f"voxels of {rounded(spacing * unit.length_factor)} {unit.length_name}")
     if summary.get("device"):
         facts.append(f"computed on {DEVICES.get(str(summary['device']), str(summary['device']))}")
-    for key, value in summary.items():
-        number = _number(value)
-        if key not in NO_FACTS and (number is not None or isinstance(value, str)):
-            facts.append(f"{key.replace('_', ' ')}: {value if number is None else rounded(number)}")
     return facts
+
+
+def radius_words(radius95: Mapping[str, Any], unit: Unit) -> str:
+    """How far off the surface of a registered model may be, in the words of its ``radius95`` in a summary."""
+    middle, most = (f"{rounded(radius95[key] * unit.length_factor)} {unit.length_name}" for key in ("median", "max"))
+    level = describe_level(bool(radius95.get("calibrated")))
+    return f"its points are within {middle} of their true places in the median, {most} where it is least sure ({level})"
 
 
 def _answer(registration: Mapping[str, Any], verdict: Trust) -> str:
@@ -398,7 +395,9 @@ def _warnings(summary: Mapping[str, Any], verdict: Trust) -> list[str]:
 def _row(segment: Mapping[str, Any], unit: Unit) -> list[Any]:
     centre, volume = segment.get("centroid"), _number(segment.get("volume"))
     radius = _number(segment.get("centroid_radius95"))
-    words = DASH if centre is None else unit.place(np.asarray(centre, dtype=float), radius)
+    words = (
+        DASH if centre is None or _number(centre[0]) is None else unit.place(np.asarray(centre, dtype=float), radius)
+    )
     place, sign, off = words.partition(" ± ")
     # a narrow page breaks these lines at their plain spaces
     place = GAP.join(place.split()) + (f"{GAP} ±\N{NO-BREAK SPACE}{off}" if sign else "")
@@ -544,24 +543,20 @@ PICTURE_PX = 300
 
 
 def result_html(
-    title: str,
+    summary: Mapping[str, Any],
     lines: Sequence[str],
     points: Float[np.ndarray, "n 3"],
     surfaces: SegmentedMesh,
-    segments: Sequence[SegmentFacts],
     unit: Unit,
-    calibrated: bool = False,
 ) -> str:
     """HTML of a result.
 
     Args:
-        title: what was seen.
+        summary: as a ``Report`` has it.
         lines: where the answer comes from.
         points: observed, camera frame.
         surfaces: found, camera frame.
-        segments: in figures, in the frame of the input.
-        unit: of these.
-        calibrated: whether their confidences are.
+        unit: of the lengths in the summary.
     """
     pictures = points_on_segments(points, surfaces, [CAMERA_VIEWS[name] for name in SIDES], PICTURE_PX)
     shown = np.flatnonzero(np.any([(picture < 255).any(axis=(1, 2)) for picture in pictures], axis=0))
@@ -572,24 +567,21 @@ def result_html(
         f'<figcaption style="text-align:center;font-size:smaller">{escape(name)}</figcaption></figure>'
         for name, picture in zip(SIDES, pictures, strict=True)
     )
-    text = "<br>".join(escape(line) for line in lines)
+    title, text = escape(summary["title"]), "<br>".join(escape(line) for line in lines)
     return (
-        f'<div><p style="margin:0 0 6px"><b>{escape(title)}</b><br>{text}</p>'
+        f'<div><p style="margin:0 0 6px"><b>{title}</b><br>{text}</p>'
         f'<div style="display:flex;gap:8px;flex-wrap:wrap">{figures}</div>'
-        f"{_table(segments, surfaces, unit, calibrated)}</div>"
+        f"{_table(summary, surfaces, unit)}</div>"
     )
 
 
-def _table(segments: Sequence[SegmentFacts], surfaces: SegmentedMesh, unit: Unit, calibrated: bool) -> str:
-    has_confidence = not all(np.isnan(segment.confidence) for segment in segments)
-    sure = [confidence_title(calibrated)] if has_confidence else []
-    heads = ("segment", f"volume, {unit.volume_name}", *sure, f"centre, {unit.length_name}")
-    rows = []
-    for segment, (red, green, blue) in zip(segments, surfaces.colors, strict=True):
+def _table(summary: Mapping[str, Any], surfaces: SegmentedMesh, unit: Unit) -> str:
+    heads, rows = _heads(summary, unit), []
+    for segment, (red, green, blue) in zip(summary["segments"], surfaces.colors, strict=True):
         swatch = f'<span style="color:rgb({red},{green},{blue})">&#9632;</span>'
-        confidence = [f"{segment.confidence:.2f}"] if has_confidence else []
-        values = (unit.volume(segment.volume), *confidence, unit.place(segment.centroid))
-        cells = "".join(f"<td>{value}</td>" for value in (values if segment.voxels else ("0", "not found", "")))
-        rows.append(f'<tr><td style="text-align:left">{swatch} {escape(segment.name)}</td>{cells}</tr>')
+        *lengths, sure = _row(segment, unit)
+        values = [*lengths, DASH if sure is None else f"{sure:.2f}"][: len(heads) - 1]
+        cells = "".join(f"<td>{value}</td>" for value in values)
+        rows.append(f'<tr><td style="text-align:left">{swatch} {escape(segment["name"])}</td>{cells}</tr>')
     head = "".join(f"<th>{name}</th>" for name in heads)
     return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"

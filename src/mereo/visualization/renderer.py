@@ -5,6 +5,7 @@ camera's.
 """
 
 from dataclasses import dataclass
+from itertools import permutations
 
 import numpy as np
 from embreex import rtcore
@@ -16,14 +17,12 @@ from scipy.sparse import csr_array
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import Color, SegmentedMesh
 from mereo.geometry.transforms import inverse_rigid, look_at, rigid
+from mereo.io.writers.meshes import OUTER_OPACITY
 
 Vector = tuple[float, float, float]
 
 SUPERSAMPLE = 2
 BACKGROUND = 1.0
-SEE_THROUGH = 0.55
-"""Share of a nested segment's colour that shows through the one around it."""
-
 CREASE_COSINE = 0.6
 """Cosine of the angle, about 53 degrees, from which on an edge is not smoothed: cuts and box edges stay sharp."""
 
@@ -200,7 +199,7 @@ class Canvas:
     def let_through(self, inner: "Canvas") -> None:
         """Mix in what another canvas of the same view shows behind what is drawn here."""
         hidden = np.isfinite(inner.depth) & (inner.depth > self.depth + 1e-6)
-        self.rgb[hidden] = (1 - SEE_THROUGH) * self.rgb[hidden] + SEE_THROUGH * inner.rgb[hidden]
+        self.rgb[hidden] = OUTER_OPACITY * self.rgb[hidden] + (1 - OUTER_OPACITY) * inner.rgb[hidden]
 
     def picture(self) -> UInt8[np.ndarray, "h w 3"]:
         """Finished picture, averaged down to the requested size."""
@@ -229,6 +228,30 @@ def _cast(
     return face, distance, np.stack([1 - u - v, u, v], axis=1)
 
 
+def enclosed(mesh: SegmentedMesh) -> set[tuple[int, int]]:
+    """Pairs (inner, outer) of segments' indices: those declared nested, and those of which one is around the other.
+
+    It is around a point where it is met from there in six directions, along the axes and against them. So it may have
+    holes, or the other one's shape as a cavity. A segment without faces is in none.
+    """
+    solid = [(index, segment) for index, segment in enumerate(mesh.segments) if len(segment.faces)]
+    pairs = {(inner, outer) for inner, outer in mesh.nesting if len(mesh.segments[inner].faces)}
+    for (inner, part), (outer, around) in permutations(solid, 2):
+        (low, high), (least, most) = part.bounds, around.bounds
+        if (least <= low).all() and (high <= most).all():
+            places = part.vertices[:: 1 + len(part.vertices) // 200]
+            ways = np.tile(np.vstack([np.eye(3), -np.eye(3)]), (len(places), 1))
+            if (_cast(around.vertices, around.faces, np.repeat(places, 6, axis=0), ways)[0] >= 0).all():
+                pairs.add((inner, outer))
+    return pairs
+
+
+def opacities(mesh: SegmentedMesh) -> list[float]:
+    """Opacity of each segment: ``OUTER_OPACITY`` around another one, which would never be seen, else 1."""
+    outer = {index for _, index in enclosed(mesh)}
+    return [OUTER_OPACITY if index in outer else 1.0 for index in range(len(mesh.segments))]
+
+
 def _light(normal: Float[np.ndarray, "n 3"], ray: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
     """Diffuse factor and added highlight: a key light from above left, a fill from the viewer, some ambient."""
     facing = np.where((normal * ray).sum(axis=1, keepdims=True) > 0, -normal, normal)
@@ -243,7 +266,7 @@ def shade(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Shaded picture of ``size`` (width, height) pixels on white, each segment in its colour (or ``colors``).
 
-    Segments that are declared nested shine through those around them.
+    Segments inside others shine through them (``enclosed``).
     """
     return shaded_canvas(mesh, view, size, colors).picture()
 
@@ -254,7 +277,7 @@ def shaded_canvas(
     """``shade`` before it is finished: more can be drawn on it."""
     canvas, colors = Canvas.empty(view, size), list(mesh.colors) if colors is None else colors
     canvas.draw_triangles(Triangles.of(mesh, colors))
-    if inner := sorted({index for index, _ in mesh.nesting}):
+    if inner := sorted({index for index, _ in enclosed(mesh)}):
         within = Canvas.empty(view, size)
         parts = SegmentedMesh(tuple(mesh.segments[index] for index in inner))
         within.draw_triangles(Triangles.of(parts, [colors[index] for index in inner]))

@@ -3,7 +3,7 @@
 import hashlib
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,70 +37,19 @@ INSTANCE = "instance{}"
 def summary_of(
     answer: Answer, carried: Sequence[Carried] = (), timings_s: Mapping[str, float] | None = None
 ) -> dict[str, Any]:
-    """Content of ``summary.json``: facts of the frame, how sure the answer is, each segment, the stages' seconds.
+    """Content of ``summary.json``: what people read first, then facts of answer and frame, the coefficients last.
 
-    Of a lost object without an answer these are the facts of the frame, and no segments.
+    Of a lost object without an answer there are no segments.
     """
-    facts, frame = frame_facts(answer, carried), answer.seen.frame
-    axes = frame.axes if frame.T_result_seen is None else "other"
-    head = {"frame": axes, "unit_m": frame.unit_m, "verdict": trust(facts).level, **facts}
-    if answer.is_missing:
-        return {**head, "tracking": answer.tracking, "pose": None, "segments": []}
-    result, fit = answer.reconstruction, answer.registered
-    segments: list[dict[str, Any]] = [
-        {
-            "name": segment.name,
-            "label": segment.label,
-            "color": list(color),
-            "volume": segment.volume,
-            "centroid": segment.centroid.tolist(),
-            "box": segment.box.tolist(),
-            "confidence": segment.confidence,
-            "voxels": segment.voxels,
-            "components": segment.components,
-            **({} if fit is None else {"pose": fit.segment_pose(segment.label).tolist()}),
-        }
-        for segment, color in zip(result.segments, result.surfaces.colors, strict=True)
-    ]
-    radii, sure = dict[str, Any](), None if fit is None else fit.uncertainty
-    if fit is not None and sure is not None:
-        radii["radius95"] = {**sure.summary(), "unit_m": frame.unit_m}
-        for row, segment in zip(segments, sure.segments, strict=True):
-            row |= {"centroid_radius95": segment.centroid_radius95, "volume95": list(segment.volume95)}
-        radii["pose_covariance"] = pose_covariance(fit)
-    joints = measure_joints(answer)
-    return {
-        **head,
-        **radii,
-        **({"joints": {name: joint.facts() for name, joint in joints.items()}} if joints else {}),
-        "pose": None if fit is None else fit.pose().tolist(),
-        "model_scale": None if fit is None else fit.model_scale,
-        "nested": [list(pair) for pair in result.surfaces.nested],
-        "spacing": float(result.labels.spacing[0]),
-        "evaluated_points": result.evaluated,
-        "clipped": result.clipped,
-        "calibrated": result.calibrated,
-        "segments": segments,
-        "timings_s": dict(result.timings_s if timings_s is None else timings_s),
-        **({"further_instances": [summary_of(each) for each in answer.further]} if answer.further else {}),
-    }
-
-
-def frame_facts(answer: Answer, carried: Sequence[Carried] = ()) -> dict[str, object]:
-    """Facts of a summary about the frame, what answered it, and whether it shows the object."""
-    seen, model, registrar = answer.seen, answer.model, answer.registrar
-    facts: dict[str, object] = {
+    seen, frame = answer.seen, answer.seen.frame
+    model, registrar = answer.model, answer.registrar
+    facts: dict[str, Any] = {
         "title": seen.frame.source,
         "weights": None if model is None else model.name,
         "resolution": answer.resolution,
         "points": len(seen.cloud),
+        "recognition": answer.recognition.facts(),
     }
-    if registrar is not None:
-        kind = "registration" if answer.taken else None if answer.is_missing else "network"
-        source = {"answer": kind, "located_by": answer.located_by}
-        fit = answer.registration
-        facts["registration"] = source | ({"refusal": answer.refusal} if fit is None else describe(fit))
-    facts["recognition"] = answer.recognition.facts()
     if model is not None:
         facts |= {"device": model.device_type, "precision": model.working_precision}
     if carried:
@@ -111,7 +60,43 @@ def frame_facts(answer: Answer, carried: Sequence[Carried] = ()) -> dict[str, ob
         # of what the file states and of the segments at rest
         digest = hashlib.sha256((rest_digest(scene.rest) + scene.definition).encode()).hexdigest()
         facts["scene_file"] = {"path": str(scene.file), "sha256": digest}
-    return facts
+    if registrar is not None:
+        kind = "registration" if answer.taken else None if answer.is_missing else "network"
+        source, fit = {"answer": kind, "located_by": answer.located_by}, answer.registration
+        facts["registration"] = source | ({"refusal": answer.refusal} if fit is None else describe(fit))
+    axes = frame.axes if frame.T_result_seen is None else "other"
+    # the first mention of a key is its place; what it is comes from the facts
+    head = {"title": None, "verdict": trust(facts).level, "recognition": None, "frame": axes, "unit_m": None}
+    if answer.is_missing:
+        return {**head, "pose": None, "segments": [], "tracking": answer.tracking, **facts}
+    result, fit = answer.reconstruction, answer.registered
+    segments: list[dict[str, Any]] = [
+        {**asdict(segment), **({} if fit is None else {"pose": fit.segment_pose(segment.label)}), "color": color}
+        for segment, color in zip(result.segments, result.surfaces.colors, strict=True)
+    ]
+    radii, sure = dict[str, Any](), None if fit is None else fit.uncertainty
+    if fit is not None and sure is not None:
+        radii["radius95"] = {**sure.summary(), "unit_m": frame.unit_m}
+        for row, segment in zip(segments, sure.segments, strict=True):
+            row |= {"centroid_radius95": segment.centroid_radius95, "volume95": segment.volume95}
+        radii["pose_covariance"] = pose_covariance(fit)
+    joints = {name: joint.facts() for name, joint in measure_joints(answer).items()}
+    return {
+        **head,
+        "pose": None if fit is None else fit.pose(),
+        "segments": segments,
+        **({"joints": joints} if joints else {}),
+        **radii,
+        "model_scale": None if fit is None else fit.model_scale,
+        "nested": result.surfaces.nested,
+        "spacing": float(result.labels.spacing[0]),
+        "evaluated_points": result.evaluated,
+        "clipped": result.clipped,
+        "calibrated": result.calibrated,
+        "timings_s": dict(result.timings_s if timings_s is None else timings_s),
+        **({"further_instances": [summary_of(each) for each in answer.further]} if answer.further else {}),
+        **facts,
+    }
 
 
 def write_answer(

@@ -535,6 +535,6 @@ def describe(registration: Registration) -> dict[str, object]:
         "symmetries": describe_symmetries(registration.model.symmetries, registration.model.rest.names),
         "scene_unit": registration.scene_unit,
         "unit": "known" if registration.unit_known else "found",
-        "coefficients": registration.z.tolist(),
         "seconds": registration.seconds,
+        "coefficients": registration.z.tolist(),
     }

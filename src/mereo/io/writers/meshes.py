@@ -22,7 +22,7 @@ from mereo.geometry.transforms import Points
 from mereo.io.atomic_files import atomic_file, new_directory, write_file
 from mereo.io.mesh_formats import STL_NAME
 
-OUTER_OPACITY = 0.35
+OUTER_OPACITY = 0.4
 """Opacity of segments with others nested in them, which viewers draw see-through."""
 
 MERGED_WITHIN = 2e-8
