@@ -514,7 +514,7 @@ def test_a_folder_is_shown_with_all_that_its_files_keep(folder: Path) -> None:
     colors, scale = content.colorings[SURE]()
     assert [len(part) for part in colors] == [len(s.vertices) for s in content.mesh.segments]
     assert scale is not None and color_bar(scale).count("<span>") == len(scale.stops)
-    assert scale.words[-1] == "\N{GREATER-THAN OR EQUAL TO} 3.9 mm"
+    assert scale.words[-1] == "\N{GREATER-THAN OR EQUAL TO} 0.0039 mm"
     cloud, mesh, summary = example()
     Report(cloud, mesh, summary).write(folder / "report.html")
     assert content_of_files(folder).unit == UNKNOWN
