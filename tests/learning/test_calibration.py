@@ -132,7 +132,7 @@ def test_radii_between_points_are_between_theirs_and_their_scale_ends_at_all_but
     scale = radius_scale(radii, " mm")
     assert scale.high == pytest.approx(np.quantile(radii.values[:20], 0.95)) and "not calibrated" in scale.title
     assert_array_equal(scale.colors(radii.values), radii.colors(radii.values))
-    assert scale.words[1].endswith(" mm")
+    assert scale.words[-1].endswith(" mm")
     assert_allclose(rounded_to(np.array([0.0123456, 98765.0, 1.0]), 3), [0.0123, 98800.0, 1.0], rtol=1e-9)
 
 
