@@ -567,11 +567,11 @@ class Trail:
 
     def with_shared_noise(self) -> "Trail":
         """The same with all noise that the best fit leaves over, where nothing else explains the frame."""
-        problem = self.problem.with_noise(noise_of(self.problem.offsets(self.best.surface))).by_every_point
+        problem = self.problem.with_noise(noise_of(self.problem.offsets(self.best.surface)))
         is_close = self.is_explained or self.best.misfit.cloud < problem.config.unexplained
         if is_close or problem.noise <= self.problem.noise:
             return self
-        trail = self.in_problem(problem)
+        trail = self.in_problem(problem.by_every_point)
         if not trail.leaves_noise:
             return self
         trail.shake()
