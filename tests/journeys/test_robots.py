@@ -20,7 +20,7 @@ from mereo.cli.stream import FrameAnswer
 from mereo.deformation.samplers import RandomMotion
 from mereo.geometry.camera import Camera
 from mereo.geometry.transforms import inverse_rigid
-from mereo.io.robots import read_robot
+from mereo.io.robots import is_robot, read_robot
 from mereo.io.writers.meshes import write_positions_ply
 from mereo.results.joints import JointValue
 from mereo.scenes.files.object_files import scene_of_meshes
@@ -106,6 +106,56 @@ def test_a_link_without_visual_shapes_has_those_for_collisions(tmp_path: Path) -
         robot = read_robot(path)
         assert_allclose(np.ptp(robot.mesh.segments[0].bounds, axis=0), [0.3, 0.2, 0.02], atol=1e-9)
         assert robot.mesh.names == ("base", "lid") and robot.notes == notes
+
+
+MJCF = """<mujoco><compiler angle="radian"/><worldbody><geom type="plane" size="1 1 .1"/>
+<body name="palm" pos="0 0 .5"><freejoint/><geom type="box" size=".05 .02 .01"/><body name="left" pos="-.03 0 .01">
+<joint name="finger" type="slide" axis="1 0 0" range="0 .02"/><geom type="capsule" size=".005 .04" pos="0 0 .04"/>
+</body><body name="right" pos=".03 0 .01"><joint name="other" type="slide" axis="-1 0 0" range="0 .02"/>
+<geom type="cylinder" size=".005 .04" pos="0 0 .04"/><geom type="mesh" mesh="tip" contype="0" conaffinity="0"/>
+<body name="nail" pos="0 0 .085" euler="0 .2 0"><joint name="bend" axis="0 1 0" range="-.5 .5" ref=".2"/>
+<joint name="twist" axis="0 0 1" range="-1 1"/><geom type="ellipsoid" size=".006 .007 .008"/></body></body></body>
+</worldbody><asset><mesh name="tip" vertex="0 0 0  .01 0 0  0 .02 0  0 0 .03"/></asset>
+<equality><joint joint1="other" joint2="finger" polycoef="0 .5 0 0 0"/></equality></mujoco>"""
+"""A gripper with shapes of each kind, a finger that follows another, and a joint that is not zero where it is drawn."""
+
+
+def test_a_simulators_robot_has_its_joints_at_zero(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco", reason="mujoco is not installed: pip install 'mereo[simulation]'")
+    path = tmp_path / "gripper.xml"
+    path.write_text(MJCF)
+    robot = read_robot(path)
+    assert is_robot(path) and robot.mesh.names == ("palm", "left", "right", "nail")
+    bounds = [
+        [[-0.05, -0.02, 0.49], [0.05, 0.02, 0.51]],
+        [[-0.035, -0.005, 0.505], [-0.025, 0.005, 0.595]],
+        [[0.03, 0, 0.51], [0.04, 0.02, 0.54]],  # what is drawn, without what collides
+        [[0.024, -0.007, 0.587], [0.036, 0.007, 0.603]],  # .2 rad back
+    ]
+    for segment, expected in zip(robot.mesh.segments, bounds, strict=True):
+        assert_allclose(segment.bounds, expected, atol=2e-4)
+    joints = {joint.name: joint for joint in robot.joints}
+    assert {name: joint.moved for name, joint in joints.items()} == {
+        "finger": ("left",), "other": ("right", "nail"), "bend": ("nail",), "twist": ("nail",)
+    }  # fmt: skip
+    assert joints["other"].follows == "finger" and not joints["other"].turns and joints["bend"].turns
+    assert_allclose(joints["other"].limits, [0, 0.01])
+    assert_allclose([joints["twist"].pivot, joints["twist"].axis], [[0.03, 0, 0.595], [0, 0, 1]], atol=1e-9)
+    assert_allclose(joints["bend"].limits, [-0.5, 0.5])
+    for old, new, message in (
+        (
+            '<joint name="finger"',
+            '<joint name="ball" type="ball"/><joint name="finger"',
+            "joint 'ball' turns or moves freely",
+        ),
+        ("</worldbody>", '<body><freejoint/><geom size=".1"/></body></worldbody>', "turns or moves freely"),
+        ("<freejoint/>", "<motor/>", "cannot be read as a robot in MJCF"),
+    ):
+        path.write_text(MJCF.replace(old, new))
+        with pytest.raises(ValueError, match=message):
+            read_robot(path)
+    path.write_text("<package/>")
+    assert not is_robot(path), "as of ROS"
 
 
 WEDGE = """<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">

@@ -36,9 +36,9 @@ class ReconstructCommand:
         inputs: depth images (PNG, TIFF, EXR, NPY), point clouds (PLY, PCD, XYZ, NPY, NPZ, ZDF), meshes (STL, OBJ, GLB,
             PLY) of surfaces that no single camera saw, ROS recordings (bag, MCAP; one frame of each), or folders of
             images and clouds; results are in each one's frame and units.
-        object: what is looked for: its meshes, one file for each segment, one file of named parts, a robot's URDF or
-            SDF file or a label volume; a scene file, a built-in scene's name, or the folder of `mereo learn`. Nothing
-            is trained for it.
+        object: what is looked for: its meshes, one file for each segment, one file of named parts, a robot's URDF,
+            SDF or MJCF file or a label volume; a scene file, a built-in scene's name, or the folder of `mereo learn`.
+            Nothing is trained for it.
         weights: a shipped name or a file; with --object they start the fit, without they say what is looked for.
         units: of the object's meshes; guessed where not given.
         deformations: how an object of meshes moves, as for `mereo scene new`: rigid, soft, stiff or articulated.

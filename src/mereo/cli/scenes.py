@@ -40,7 +40,7 @@ class SceneNew:
 
     Attributes:
         files: one mesh for each segment (STL, PLY, OBJ, OFF), one file of named parts (GLB, OBJ, 3MF), a robot (URDF,
-            SDF), one label volume (NIfTI, NRRD), or one for each segment.
+            SDF, MJCF), one label volume (NIfTI, NRRD), or one for each segment.
         output: the YAML file; by default called after the first file, in the working directory.
         units: of the files; guessed where not given.
         aperture: of the cone of directions from which your camera looks, about the side that is up, in degrees; 360 is

@@ -53,7 +53,7 @@ MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", ".3mf", ".dae"
 EXTRAS = {".3mf": ("lxml", "cad"), ".dae": ("collada", "robot")}
 """Libraries that some need, and the extras that have them."""
 
-ROBOT_SUFFIXES = (".urdf", ".sdf")
+ROBOT_SUFFIXES = (".urdf", ".sdf", ".xml")
 """Suffixes of files of robots, whose links are meshes."""
 
 

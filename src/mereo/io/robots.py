@@ -1,8 +1,8 @@
-"""Robots of URDF and SDF files: their links as segments where all joints are zero, and the joints that move them.
+"""Robots of URDF, SDF and MJCF files: links as segments where all joints are zero, and the joints that move them.
 
-file -yourdfpy, _read_sdf-> yourdfpy's Robot (links, joints) -_assembled-> Robot (segments, joints between them)
+file -yourdfpy, _read_sdf, _read_mjcf-> yourdfpy's Robot (links, joints) -_assembled-> Robot (segments, joints)
 
-Lengths are metres and angles radians, as both formats have them; positions are in the frame of the base.
+Lengths are metres and angles radians, as all three formats have them; positions are in the frame of the base.
 """
 
 from collections.abc import Iterator, Sequence
@@ -11,6 +11,7 @@ from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
+from zlib import crc32
 
 import numpy as np
 import trimesh
@@ -23,6 +24,9 @@ from mereo.geometry.transforms import Transform, Vector, inverse_rigid, rigid, t
 from mereo.io.errors import readable
 from mereo.io.extras import library
 from mereo.io.mesh_formats import ROBOT_SUFFIXES, read_object_mesh
+
+HEAD_BYTES = 4096
+"""Bytes at the beginning of an XML file, comments before its first element included, that say whether it is MJCF."""
 
 KINDS = ("revolute", "continuous", "prismatic", "fixed")
 """Kinds of joints that are known."""
@@ -68,28 +72,35 @@ class Robot:
 
 
 def is_robot(path: Path) -> bool:
-    """Whether a path names a URDF or SDF file."""
-    return path.suffix.lower() in ROBOT_SUFFIXES
+    """Whether a path names a URDF, SDF or MJCF file; other XML files are none."""
+    if path.suffix.lower() != ".xml":
+        return path.suffix.lower() in ROBOT_SUFFIXES
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return b"<mujoco" in file.read(HEAD_BYTES)
 
 
 def read_robot(path: str | Path) -> Robot:
-    """Read a robot from a URDF or SDF file, with the meshes that it names.
+    """Read a robot from a URDF, SDF or MJCF file, with the meshes that it names.
 
     Shapes are those of the visual elements, and of links that have none, of the collision elements.
     ``package://NAME/...`` and ``model://NAME/...`` are looked for in the folders above the file.
 
     Raises ``FileNotFoundError`` for a missing file or mesh; ``ValueError`` for a damaged file, a joint that is neither
     revolute, continuous, prismatic nor fixed, links that form no tree, and a robot without shapes; ``ImportError``
-    without the extra `robot`.
+    without the extra `robot`, and of an MJCF file without `simulation`.
     """
     path = Path(path)
-    kind = path.suffix[1:].upper()
+    kind = "MJCF" if path.suffix.lower() == ".xml" else path.suffix[1:].upper()
     yourdfpy, etree = library("yourdfpy", "robot", path), library("lxml.etree", "robot", path)
     with readable(path, f"robot in {kind}"):
         parser = etree.XMLParser(resolve_entities=False, remove_comments=True, remove_pis=True)
         root = etree.parse(BytesIO(path.read_bytes()), parser).getroot()
         if any("xacro" in element.tag for element in root.iter(etree.Element)):
             raise ValueError("it is a macro file, whose links are known once `xacro` has expanded it")
+        if kind == "MJCF":
+            return _assembled(_read_mjcf(path, yourdfpy, library("mujoco", "simulation", path)))
         if kind == "URDF":
             described = _read_urdf(yourdfpy, root, etree.tostring(root, encoding="utf-8"))
         else:
@@ -226,6 +237,94 @@ def _geometries(yourdfpy: Any, element: Any) -> Iterator[tuple[Transform, Any]]:
             yield rigid(np.eye(3), np.array([0.0, 0.0, end])), yourdfpy.Geometry(sphere=yourdfpy.Sphere(radius))
     else:
         raise ValueError(f"its <{element.tag}> {element.get('name')!r} is a {shape.tag}, which is not known")
+
+
+# --- MJCF, which its own library reads and compiles -------------------------------------------------------------------
+
+
+def _read_mjcf(path: Path, yourdfpy: Any, mujoco: Any) -> "_Described":
+    """Robot of an MJCF file: each body is a link, each of its joints carries a frame of its own.
+
+    All frames have the axes of the world where all joints are zero. What is fixed in the world is no part of it; its
+    only body there may be free, as the camera may see it from anywhere.
+    """
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    kinds = {int(mujoco.mjtJoint.mjJNT_HINGE): "revolute", int(mujoco.mjtJoint.mjJNT_SLIDE): "prismatic"}
+    for number in range(model.njnt):
+        if int(model.jnt_type[number]) in kinds:
+            data.qpos[model.jnt_qposadr[number]] = 0.0
+    mujoco.mj_kinematics(model, data)
+    names = [model.body(number).name or f"body {number}" for number in range(model.nbody)]
+    links, joints, place = {name: yourdfpy.Link(name) for name in names}, list[Any](), {names[0]: np.zeros(3)}
+    is_alone = int((model.body_parentid[1:] == 0).sum()) == 1
+    for body in range(1, model.nbody):
+        carrier, own = names[model.body_parentid[body]], list[Any]()
+        for number in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
+            joint = model.joint(number)
+            name = joint.name or f"joint {number}"
+            kind = kinds.get(int(model.jnt_type[number]))
+            if kind is not None:
+                lower, upper = joint.range if model.jnt_limited[number] else (-np.inf, np.inf)
+                limit = yourdfpy.Limit(lower=float(lower), upper=float(upper))
+                mimic = _mjcf_leader(model, mujoco, number)
+                mimic = None if mimic is None else yourdfpy.Mimic(*mimic)
+                each = yourdfpy.Joint(name, kind, axis=data.xaxis[number].copy(), limit=limit, mimic=mimic)
+                own.append((each, data.xanchor[number].copy()))
+            elif int(model.jnt_type[number]) == int(mujoco.mjtJoint.mjJNT_BALL) or body != 1 or not is_alone:
+                raise ValueError(f"its joint {name!r} turns or moves freely, which no joint with one value does")
+        own = own or [
+            (yourdfpy.Joint(f"fixed {names[body]}", "fixed", axis=np.array([1.0, 0, 0])), data.xpos[body].copy())
+        ]
+        for index, (joint, at) in enumerate(own):
+            frame = names[body] if index == len(own) - 1 else f"{names[body]} {index}"
+            links.setdefault(frame, yourdfpy.Link(frame))
+            joint.parent, joint.child, joint.origin = carrier, frame, rigid(np.eye(3), at - place[carrier])
+            place[frame], carrier = at, frame
+            joints.append(joint)
+    shapes = list[_Shape]()
+    for body in range(1, model.nbody):
+        geoms = np.arange(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
+        is_drawn = (model.geom_contype[geoms] == 0) & (model.geom_conaffinity[geoms] == 0)
+        for geom in geoms[is_drawn] if is_drawn.any() else geoms:
+            T = rigid(data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom] - place[names[body]])
+            shapes += [_Shape(names[body], T, solid) for solid in _mjcf_solids(model, mujoco, int(geom))]
+    compiled = np.empty(mujoco.mj_sizeModel(model), dtype=np.uint8)
+    mujoco.mj_saveModel(model, None, compiled)
+    robot = yourdfpy.Robot(path.stem, list(links.values()), joints)
+    return _Described(path, robot, shapes, ((str(path), crc32(compiled.tobytes()), len(compiled), 0),))
+
+
+def _mjcf_leader(model: Any, mujoco: Any, number: int) -> tuple[str, float, float] | None:
+    """Joint that another one follows, by which factor and offset; None where no linear constraint says so."""
+    for row in np.flatnonzero(model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)):
+        first, second, (offset, factor, *curved) = model.eq_obj1id[row], model.eq_obj2id[row], model.eq_data[row, :5]
+        if first == number and second >= 0 and not any(curved):
+            zero, leader_zero = (model.qpos0[model.jnt_qposadr[each]] for each in (first, second))
+            return (
+                model.joint(second).name or f"joint {second}",
+                float(factor),
+                float(offset + zero - factor * leader_zero),
+            )
+    return None
+
+
+def _mjcf_solids(model: Any, mujoco: Any, geom: int) -> Iterator[trimesh.Trimesh]:
+    """Solids of a shape, as its library has compiled it; none of planes and height fields, which are no part of it."""
+    kind, (x, y, z) = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom]
+    if kind == mujoco.mjtGeom.mjGEOM_MESH:
+        mesh = model.mesh(model.geom_dataid[geom])
+        vertices = model.mesh_vert[mesh.vertadr[0] :][: mesh.vertnum[0]]
+        yield trimesh.Trimesh(vertices, model.mesh_face[mesh.faceadr[0] :][: mesh.facenum[0]], process=False)
+    elif kind == mujoco.mjtGeom.mjGEOM_BOX:
+        yield trimesh.creation.box(2 * np.array([x, y, z]))
+    elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+        yield trimesh.creation.cylinder(x, 2 * y)
+    elif kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        yield trimesh.creation.capsule(2 * y, x)
+    elif kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_ELLIPSOID):
+        ball = trimesh.creation.icosphere(3)
+        yield trimesh.Trimesh(ball.vertices * ([x, y, z] if y else x), ball.faces, process=False)
 
 
 def _numbers(text: str | None, count: int) -> list[float]:

@@ -487,7 +487,7 @@ def _likely_frame(file: Path, bounds: Corners) -> tuple[str, str, int, str]:
     """Unit of a mesh file, and why; the axis that points upwards in it, and why."""
     kind, guess = file.suffix.lower().lstrip("."), likely_unit(bounds)
     longest_m = longest_side(bounds) * UNITS_M[guess]
-    robots = dict.fromkeys((suffix[1:] for suffix in ROBOT_SUFFIXES), ("m", "the rule of URDF and SDF"))
+    robots = dict.fromkeys((suffix[1:] for suffix in ROBOT_SUFFIXES), ("m", "the rule of robots' files"))
     known = robots | {
         "glb": ("m", "the rule of glTF"),
         "gltf": ("m", "the rule of glTF"),
