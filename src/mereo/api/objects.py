@@ -177,11 +177,12 @@ def load_object(
 
     Args:
         source: its meshes, one file for each segment, one file of named parts, a robot's URDF, SDF or MJCF file, a
-            folder of any of these, or label volumes, one or one for each segment; meshes in memory, of trimesh, Open3D,
-            PyVista or (vertices, faces), as a dict by the segments' names or a list; a scene file, a built-in scene's name
-            or a scene; the folder that ``mereo learn`` has written; or weights: a shipped name, a file, or some that are
-            loaded already. A name that both weights and a scene have means the weights, which know that scene; without
-            PyTorch the object is searched by the model that they carry, with a ``WithoutWeightsWarning``.
+            folder of any of these, or label volumes, one or one for each segment; meshes in memory, of trimesh,
+            Open3D, PyVista or (vertices, faces), as a dict by the segments' names or a list; a scene file, a built-in
+            scene's name or a scene; the folder that ``mereo learn`` has written; or weights: a shipped name, a file,
+            or some that are loaded already. A name that both weights and a scene have means the weights, which know
+            that scene; without PyTorch the object is searched by the model that they carry, with a
+            ``WithoutWeightsWarning``.
         scene: of weights: the object's scene, its name or its file, where it is not the built-in one of the weights.
         weights: to start the fit with, where ``source`` is meshes or a scene, or none of them.
         units: of meshes: "mm", "cm", "m" or "in"; guessed where not given.

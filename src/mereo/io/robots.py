@@ -259,7 +259,7 @@ def _read_mjcf(path: Path, yourdfpy: Any, mujoco: Any) -> "_Described":
     links, joints, place = {name: yourdfpy.Link(name) for name in names}, list[Any](), {names[0]: np.zeros(3)}
     is_alone = int((model.body_parentid[1:] == 0).sum()) == 1
     for body in range(1, model.nbody):
-        carrier, own = names[model.body_parentid[body]], list[Any]()
+        carrier, chain = names[model.body_parentid[body]], list[Any]()
         for number in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
             joint = model.joint(number)
             name = joint.name or f"joint {number}"
@@ -270,14 +270,14 @@ def _read_mjcf(path: Path, yourdfpy: Any, mujoco: Any) -> "_Described":
                 mimic = _mjcf_leader(model, mujoco, number)
                 mimic = None if mimic is None else yourdfpy.Mimic(*mimic)
                 each = yourdfpy.Joint(name, kind, axis=data.xaxis[number].copy(), limit=limit, mimic=mimic)
-                own.append((each, data.xanchor[number].copy()))
+                chain.append((each, data.xanchor[number].copy()))
             elif int(model.jnt_type[number]) == int(mujoco.mjtJoint.mjJNT_BALL) or body != 1 or not is_alone:
                 raise ValueError(f"its joint {name!r} turns or moves freely, which no joint with one value does")
-        own = own or [
+        chain = chain or [
             (yourdfpy.Joint(f"fixed {names[body]}", "fixed", axis=np.array([1.0, 0, 0])), data.xpos[body].copy())
         ]
-        for index, (joint, at) in enumerate(own):
-            frame = names[body] if index == len(own) - 1 else f"{names[body]} {index}"
+        for index, (joint, at) in enumerate(chain):
+            frame = names[body] if index == len(chain) - 1 else f"{names[body]} {index}"
             links.setdefault(frame, yourdfpy.Link(frame))
             joint.parent, joint.child, joint.origin = carrier, frame, rigid(np.eye(3), at - place[carrier])
             place[frame], carrier = at, frame
