@@ -71,7 +71,7 @@ class Signs:
         size: logarithm, without its sign, of the size found over the one that the frame's unit says; None where no
             unit is stated.
         unexplained: share of the observed points that the model does not explain, in shares that a believed fit may
-            leave (5 % of a clean frame, 25 % of a noisy one).
+            leave (5 % of a clean frame, 15 % of a noisy one).
         ruled_out: share of the model's surface that the frame rules out.
         beyond: how far the state lies outside all that were learned, scene units; None at rest.
         unusual: ``StatisticalModel.unusual``, which needs no usual value; None at rest.
