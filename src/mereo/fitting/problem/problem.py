@@ -379,7 +379,7 @@ SHARED = 1.05
 """Misfit of a noisy cloud, in misfits of what neighbours do not share, up to which nothing more is to be explained."""
 
 ACCEPTED = 0.85
-"""Share of a camera's points that a fit must explain to be believed: of 110 right fits 95 % explain .94, and none that
+"""Share of a camera's points that a fit must explain to be believed: of 209 right fits 95 % explain .94, and none that
 was believed less than .88; wrong ones of thin objects .76 to .81 (docs/experiments/085.md)."""
 
 
