@@ -81,8 +81,8 @@ def shaken(problem: Problem, best: "ScoredFit") -> "ScoredFit":
     """
     rng, is_patient = np.random.default_rng(0), problem.config.retries and not problem.is_scale_open
     for _ in range(SHAKES if is_patient and has_many_optima(problem) else 0):
-        is_hopeless = best.misfit.cloud > HOPELESS or (problem.is_noisy and not problem.explains_noise(best.surface))
-        if is_hopeless or best.explains(problem):
+        is_over = best.explains(problem) or best.misfit.cloud > HOPELESS
+        if is_over or (problem.is_noisy and not problem.explains_noise(best.surface)):
             break
         before, z = best, best.posed.z
         starts = [replace(best.posed, z=z + rng.standard_normal(len(z))) for _ in range(SHAKEN)]
@@ -329,11 +329,11 @@ def fit_seen(
     fits = [(problem, correspondences, fit_modes(problem))]
     if problem.is_noisy and predict is not None:
         other = predict(smoothed(means_along_sight(points, MOST_POINTS)))
-        again = replace(problem, network=NetworkTerm.of(problem.model, other))
+        again = problem.changed(network=NetworkTerm.of(problem.model, other))
         fits.append((again, other, fit_modes(again)))
     problem, correspondences, best = min(fits, key=lambda fit: fit[2].misfit.without_network)
     if problem.is_noisy:
-        problem = problem.with_noise(min(problem.noise, problem.left_noise(best.surface))).by_its_points
+        problem = problem.quieted(problem.left_noise(best.surface))
         best = refined(problem, best.posed)
     return problem, correspondences, best
 

@@ -40,7 +40,7 @@ from mereo.fitting.problem.gauss_newton import DAMPING, Posed, cross
 from mereo.fitting.problem.problem import Problem, is_normal, noise_of
 from mereo.fitting.problem.residuals import ROBUST, Prior, SampledSurface
 from mereo.fitting.problem.segments import diverse_rows, rms_distance
-from mereo.geometry.transforms import rotation_along
+from mereo.geometry.transforms import rotation_along, unit_rows
 from mereo.io.cores import cores
 from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
 
@@ -84,7 +84,7 @@ class ShapeTables:
         frame = surface.mean + flat.reshape(len(z), *surface.mean.shape)
         position = np.ascontiguousarray(frame[:, :, 0])
         normal = cross(frame[:, :, 1].reshape(-1, 3), frame[:, :, 2].reshape(-1, 3))
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+        normal = unit_rows(normal)
         margin = np.float32(0.5 * model.half)  # beyond, all points are outliers
         low, high = position.min(axis=1) - margin, position.max(axis=1) + margin
         cell = (high - low).max(axis=1) / CELLS
@@ -554,7 +554,7 @@ class Trail:
         problem, best = self.problem, self.best
         if not problem.model.is_normal or self.is_explained:
             return None
-        problem = replace(problem, config=replace(problem.config, cloud_weight=HEAVY))
+        problem = problem.changed(config=replace(problem.config, cloud_weight=HEAVY))
         heavier = ScoredFit.of(problem, fit_cloud(problem, best.posed, Prior.whole(problem.model), *HEAVIER_STEPS, 0.0))
         return Trail(problem, 0.0, [heavier]) if heavier.misfit.cloud < HELPS * best.misfit.cloud else None
 
@@ -639,8 +639,8 @@ def with_left_noise(trails: list[Trail]) -> list[Trail]:
     chosen = likelier(trails)
     if not chosen.problem.is_noisy:
         return trails
-    noise = min(chosen.problem.noise, chosen.problem.left_noise(chosen.best.surface))
-    return [trail.in_problem(trail.problem.with_noise(noise).by_its_points) for trail in trails]
+    noise = chosen.problem.left_noise(chosen.best.surface)
+    return [trail.in_problem(trail.problem.quieted(noise)) for trail in trails]
 
 
 def screen_poses(problem: Problem, stage: SearchRound) -> list[Posed]:

@@ -92,9 +92,9 @@ def longest_side(points: Float[np.ndarray, "_ 3"]) -> float:
     return float(np.ptp(points, axis=0).max())
 
 
-def unit_rows(vectors: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+def unit_rows(vectors: Float[np.ndarray, "*n k"]) -> Float[np.ndarray, "*n k"]:
     """Vectors of length 1 along each row; rows of zeros stay so."""
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)
 
 
 def finite_svd(

@@ -132,7 +132,8 @@ class StatisticalModel:
         is_normal: whether the states are the normal distribution of the modes itself, as those of an elastic solid, so
             that a fit's surroundings in the library say nothing more.
         is_held: whether parts of the object at rest do not move in its states, so that a pose of it is that of theirs.
-        rests: whether the rest pose is one of its states; not where joints are known to be elsewhere. No file has it.
+        rests: whether the rest pose is one of its states; not where joints have other values, as is known. No file
+            has it.
     """
 
     rest: SegmentedMesh

@@ -16,7 +16,7 @@ from scipy.sparse import csr_array
 
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import Color, SegmentedMesh
-from mereo.geometry.transforms import inverse_rigid, look_at, rigid
+from mereo.geometry.transforms import inverse_rigid, look_at, rigid, unit_rows
 from mereo.io.writers.meshes import OUTER_OPACITY
 
 Vector = tuple[float, float, float]
@@ -112,20 +112,16 @@ class Triangles:
 
 def corner_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3 3"]:
     """Normal at each corner of each face: the mean, weighted by angle, of those faces there that no crease parts."""
-    edges = [_unit(vertices[np.roll(faces, -k, axis=1)] - vertices[faces]) for k in (1, 2)]
+    edges = [unit_rows(vertices[np.roll(faces, -k, axis=1)] - vertices[faces]) for k in (1, 2)]
     angle = np.arccos(np.clip((edges[0] * edges[1]).sum(axis=-1), -1, 1)).ravel()
-    flat = np.repeat(_unit(np.cross(edges[0][:, 0], edges[1][:, 0])), 3, axis=0)
+    flat = np.repeat(unit_rows(np.cross(edges[0][:, 0], edges[1][:, 0])), 3, axis=0)
     corners = np.arange(faces.size)
     at_vertex = csr_array((np.ones(faces.size), (corners, faces.ravel())), shape=(faces.size, len(vertices)))
     pairs = (at_vertex @ at_vertex.T).tocoo()
     same = (flat[pairs.row] * flat[pairs.col]).sum(axis=1) > CREASE_COSINE
     row, col = pairs.row[same], pairs.col[same]
     weights = csr_array((angle[col], (row, col)), shape=pairs.shape)
-    return _unit(weights @ flat).reshape(-1, 3, 3)
-
-
-def _unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)
+    return unit_rows(weights @ flat).reshape(-1, 3, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,8 +149,8 @@ class Canvas:
         z = (origins[:, 2] + distance).reshape(height, width)
         nearer = (face >= 0) & (z.ravel() < self.depth.ravel())
         index = np.flatnonzero(nearer)
-        normal = _unit(np.einsum("nk,nkd->nd", bary[index], normals[face[index]]))
-        light = _light(normal, _unit(directions[index]))
+        normal = unit_rows(np.einsum("nk,nkd->nd", bary[index], normals[face[index]]))
+        light = _light(normal, unit_rows(directions[index]))
         rgb, depth = self.rgb.reshape(-1, 3), self.depth.reshape(-1)
         rgb[index] = np.clip(shown.colors[face[index]] * light[:, :1] + light[:, 1:], 0, 1)
         depth[index] = z.ravel()[index]
@@ -255,9 +251,9 @@ def opacities(mesh: SegmentedMesh) -> list[float]:
 def _light(normal: Float[np.ndarray, "n 3"], ray: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
     """Diffuse factor and added highlight: a key light from above left, a fill from the viewer, some ambient."""
     facing = np.where((normal * ray).sum(axis=1, keepdims=True) > 0, -normal, normal)
-    key = _unit(np.array([-0.5, -0.8, -0.9]))
+    key = unit_rows(np.array([-0.5, -0.8, -0.9]))
     diffuse = 0.34 + 0.52 * np.clip(facing @ key, 0, 1) + 0.26 * np.clip(-facing[:, 2], 0, 1)
-    highlight = 0.16 * np.clip(facing @ _unit(key - np.array([0.0, 0.0, 1.0])), 0, 1) ** 24
+    highlight = 0.16 * np.clip(facing @ unit_rows(key - np.array([0.0, 0.0, 1.0])), 0, 1) ** 24
     return np.stack([diffuse, highlight], axis=1)
 
 

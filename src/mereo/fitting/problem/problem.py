@@ -186,12 +186,12 @@ class Problem:
         alone = (self.cloud_sigma / SIGMAS) ** 2  # variance of a point of which neighbours share nothing
         share = min(alone / shared_variance(offset, self.evidence, POSE + self.model.count), 1.0)
         weight, outside = SIGMAS**2 * share * len(offset), FitConfig.silhouette_weight * share
-        return replace(self, config=replace(config, cloud_weight=weight, silhouette_weight=outside))
+        return self.changed(config=replace(config, cloud_weight=weight, silhouette_weight=outside))
 
-    @property
-    def by_its_points(self) -> "Problem":
-        """The problem with as many observed samples as its noise asks for."""
-        return self.by_every_point if self.is_noisy else self
+    def quieted(self, noise: float) -> "Problem":
+        """The problem with no more than a noise, and by every point where that is still a camera's."""
+        quiet = self.with_noise(min(self.noise, noise))
+        return quiet.by_every_point if quiet.is_noisy else quiet
 
     @property
     def by_every_point(self) -> "Problem":

@@ -19,7 +19,8 @@ from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.evidence import Directions, Evidence, Observed
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, Rows, along, cross, geman_mcclure, in_space
 from mereo.geometry.mesh import barycentric
-from mereo.geometry.solids import first_faces, ray_scene
+from mereo.geometry.solids import first_faces, ray_scene, search_tree
+from mereo.geometry.transforms import unit_rows
 from mereo.scenes.statistical_model import StatisticalModel
 
 # --- the surface as samples -------------------------------------------------------------------------------------------
@@ -147,16 +148,12 @@ class Surface:
         a, b, c = (material[model.faces[:, i]] for i in range(3))
         normal = cross(b - a, c - a)
         facing = np.flatnonzero(shows(normal, a))
-        normal = normal[facing]
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-        return cls(model, material, facing, normal)
+        return cls(model, material, facing, unit_rows(normal[facing]))
 
     @cached_property
     def _tree(self) -> tuple[igl.AABB, Float[np.ndarray, "m 3"], Int[np.ndarray, "g 3"]]:
         vertices, faces = np.ascontiguousarray(self.material), np.ascontiguousarray(self.model.faces[self.facing])
-        tree = igl.AABB()
-        tree.init(vertices, faces)
-        return tree, vertices, faces
+        return search_tree(vertices, faces), vertices, faces
 
     def nearest(
         self, points: Float[np.ndarray, "p 3"]
