@@ -53,9 +53,6 @@ MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", ".3mf", ".dae"
 EXTRAS = {".3mf": ("lxml", "cad"), ".dae": ("collada", "robot")}
 """Libraries that some need, and the extras that have them."""
 
-ROBOT_SUFFIXES = (".urdf", ".sdf", ".xml")
-"""Suffixes of files of robots, whose links are meshes."""
-
 
 class MeshWarning(UserWarning):
     """Warning that a mesh is used, but not as its file may mean it."""
@@ -93,15 +90,10 @@ def read_segmented_mesh(*paths: str | Path) -> SegmentedMesh:
 def read_object_mesh(path: str | Path) -> SegmentedMesh:
     """Segments of a file, or of a folder's files, for an object that is to be found; raises as ``read_segmented_mesh``.
 
-    Those of a robot's file are its links where all joints are zero, see ``io.robots``. Solids of more than
-    ``mesh_repair.MOST_FACES`` faces are simplified, and a ``MeshWarning`` says how far. What was read before is kept,
-    as long as its files are the same.
+    Solids of more than ``mesh_repair.MOST_FACES`` faces are simplified, and a ``MeshWarning`` says how far. What was
+    read before is kept, as long as its files are the same.
     """
     path = Path(path)
-    if path.suffix.lower() in ROBOT_SUFFIXES:
-        from mereo.io.robots import read_robot  # which reads its meshes by this function
-
-        return read_robot(path).mesh
     states = [
         (file.name, file.stat()) for file in (sorted(path.iterdir()) if path.is_dir() else [path]) if file.exists()
     ]

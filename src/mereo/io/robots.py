@@ -23,7 +23,10 @@ from mereo.geometry.mesh_check import united
 from mereo.geometry.transforms import Transform, Vector, inverse_rigid, rigid, transform_points
 from mereo.io.errors import readable
 from mereo.io.extras import library
-from mereo.io.mesh_formats import ROBOT_SUFFIXES, read_object_mesh
+from mereo.io.mesh_formats import read_object_mesh
+
+ROBOT_SUFFIXES = (".urdf", ".sdf", ".xml")
+"""Suffixes of files of robots, whose links are meshes."""
 
 HEAD_BYTES = 4096
 """Bytes at the beginning of an XML file, comments before its first element included, that say whether it is MJCF."""
@@ -79,6 +82,14 @@ def is_robot(path: Path) -> bool:
         return False
     with path.open("rb") as file:
         return b"<mujoco" in file.read(HEAD_BYTES)
+
+
+def read_object_file(path: Path) -> SegmentedMesh:
+    """Segments of an object's file: the links of a robot where all joints are zero, else as ``read_object_mesh``.
+
+    Raises as ``read_robot`` and ``read_segmented_mesh`` do.
+    """
+    return read_robot(path).mesh if path.suffix.lower() in ROBOT_SUFFIXES else read_object_mesh(path)
 
 
 def read_robot(path: str | Path) -> Robot:

@@ -22,7 +22,8 @@ from mereo.geometry.mesh_check import examine, united
 from mereo.geometry.subdivision import TooManyFaces, split_edges
 from mereo.geometry.transforms import Normalizer, longest_side
 from mereo.io.config import Space
-from mereo.io.mesh_formats import MeshWarning, read_object_mesh
+from mereo.io.mesh_formats import MeshWarning
+from mereo.io.robots import read_object_file
 from mereo.io.simulation_states import files_of_states, frame_files
 from mereo.io.volume_files import file_space, read_label_volume, segment_surfaces
 from mereo.io.yaml_document import Document, similar
@@ -278,7 +279,7 @@ def read_segments(document: Document, file: SceneFile) -> SegmentedMesh:
 def _read(document: Document, place: Sequence[int | str], path: Path) -> SegmentedMesh:
     """A mesh file; errors say which line names it."""
     with document.named_at(place):
-        return read_object_mesh(path)
+        return read_object_file(path)
 
 
 def _from_model(document: Document, parts: Sequence[ModelPart], model: SegmentedMesh) -> list[Segment]:

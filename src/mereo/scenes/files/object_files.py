@@ -11,9 +11,9 @@ from tempfile import TemporaryDirectory
 
 from mereo.geometry.conventions import Way
 from mereo.geometry.mesh_check import examine
-from mereo.io.mesh_formats import MESH_SUFFIXES, MeshWarning, read_object_mesh
+from mereo.io.mesh_formats import MESH_SUFFIXES, MeshWarning
 from mereo.io.readers import check_ply
-from mereo.io.robots import is_robot
+from mereo.io.robots import is_robot, read_object_file
 from mereo.io.volume_files import is_volume
 from mereo.scenes.files.template import write_scene_file
 from mereo.scenes.registry import is_yaml, load_scene
@@ -77,7 +77,7 @@ def scene_of_meshes(files: Sequence[Path], units: str | None = None, deformation
     with TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", MeshWarning)
         for file in () if is_volume(files[0]) else files:
-            for part in read_object_mesh(file).segments:
+            for part in read_object_file(file).segments:
                 health = examine(part)
                 if refusal := health.refusal(len(part.faces)):
                     solid = "name a file of its whole, closed surface" + (f", or {cure}" if health.mendable else "")

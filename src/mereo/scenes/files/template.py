@@ -38,8 +38,8 @@ from mereo.geometry.transforms import (
     transform_points,
 )
 from mereo.io.atomic_files import check_file_place, write_file
-from mereo.io.mesh_formats import ROBOT_SUFFIXES, read_object_mesh
-from mereo.io.robots import RobotJoint, is_robot, read_robot
+from mereo.io.mesh_formats import read_object_mesh
+from mereo.io.robots import ROBOT_SUFFIXES, RobotJoint, is_robot, read_robot
 from mereo.io.volume_files import (
     LabelVolume,
     LabelWarning,
