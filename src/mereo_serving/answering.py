@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
-from mereo.api.objects import Object, load_object
+from mereo.api.objects import Object, load_object, load_weights
 from mereo.api.reconstruct import reconstruct_observation
 from mereo.api.result import Result
 from mereo.api.words import option_words
@@ -27,7 +27,6 @@ from mereo.io.sensor_frame import read_frame
 from mereo.io.writers.glb import viewer_rotation, write_segments_glb
 from mereo.models.config import Precision
 from mereo.models.trained import Trained
-from mereo.models.weights_place import load_weights
 from mereo.reconstruction.observation import find_object
 from mereo.visualization.result_files import radii_of, summary_of
 from mereo_serving.messages import FAULT, JSON, FrameRequest, Ready, Reply, Served, Setup, failed

@@ -22,14 +22,14 @@ from mereo.geometry.conventions import LengthUnit, Way
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.bounds import check_value
 from mereo.io.errors import checked_path
-from mereo.io.extras import has_network
+from mereo.io.extras import has_network, network_needed
 from mereo.io.mesh_formats import MESH_SUFFIXES
 from mereo.io.point_arrays import mesh_of
 from mereo.io.progress import stage
 from mereo.io.writers.meshes import write_segments_obj
 from mereo.models.config import Device, InferenceConfig, Precision
 from mereo.models.trained import Trained
-from mereo.models.weights_place import is_weights, load_weights, shipped_names, statistical_model_in
+from mereo.models.weights_place import is_weights, shipped_names, statistical_model_in
 from mereo.scenes.files.object_files import SCENE, names_scene, scene_of_folder, scene_of_meshes, shapes_in
 from mereo.scenes.parameters import parameters, random_state, with_joints
 from mereo.scenes.random_states import OBJECT_STATES, STATES_SEED, kept_model, scene_model
@@ -224,6 +224,18 @@ def load_object(
     if loaded.statistical_model is not None and (fault := other_mesh(scene, loaded.statistical_model)):
         raise ValueError(f"{fault}; both must be of one object: name the weights of this one, or leave them out")
     return Object(loaded, scene)
+
+
+def load_weights(given: Trained | str | Path, inference: InferenceConfig) -> Trained:
+    """Weights by their name or file, on the device and in the precision that are asked for; loaded ones as they are.
+
+    Raises as ``models.weights.load_model`` does, and ``ImportError`` without the extra `network`.
+    """
+    if isinstance(given, Trained):
+        return given
+    with network_needed():
+        from mereo.models.weights import load_for
+    return load_for(given, inference)
 
 
 def _built_in_by_model(name: str) -> Object:

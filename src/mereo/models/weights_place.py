@@ -1,4 +1,4 @@
-"""Where weights are, and loading them only then: what names them needs no torch, what loads them does."""
+"""Where weights are, and what is read of them without torch; ``models.weights`` loads them."""
 
 import json
 from pathlib import Path
@@ -7,9 +7,6 @@ from typing import Any
 from safetensors import SafetensorError, safe_open
 
 from mereo.io.errors import reason
-from mereo.io.extras import network_needed
-from mereo.models.config import InferenceConfig
-from mereo.models.trained import Trained
 from mereo.scenes.statistical_model import StatisticalModel, unpack_model
 
 SHIPPED = Path(__file__).parents[1] / "weights"
@@ -67,18 +64,6 @@ def is_weights(name: str | Path) -> bool:
         return find_weights(name).suffix == ".safetensors"
     except FileNotFoundError:
         return Path(name).suffix == ".safetensors"  # a missing file is reported where it is loaded
-
-
-def load_weights(given: Trained | str | Path, inference: InferenceConfig) -> Trained:
-    """Weights by their name or file, on the device and in the precision that are asked for; loaded ones as they are.
-
-    Raises as ``weights.load_model`` does, and ``ImportError`` without the extra `network`.
-    """
-    if isinstance(given, Trained):
-        return given
-    with network_needed():
-        from mereo.models.weights import load_for
-    return load_for(given, inference)
 
 
 def statistical_model_in(name: str | Path) -> StatisticalModel:
