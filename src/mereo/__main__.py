@@ -10,10 +10,11 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout, suppress
 from dataclasses import MISSING, fields
+from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any, Protocol, TypeVar, Union, runtime_checkable
+from typing import Annotated, Any, TypeVar, Union
 
 import tyro
 from tyro.conf import subcommand
@@ -76,7 +77,14 @@ COMMANDS: dict[str, Any] = {
     "bench": tools.BenchCommand,
     "release": weights.Release,
 }
-"""Class of each command; a group of commands has a description and its own."""
+"""Class of each command, whose fields are the options; a group of commands has a description and its own.
+
+``run`` does the work, and prints what a person wants to know of it. It imports what it needs itself, so that ``mereo
+--help`` answers without loading torch.
+"""
+
+WORK = {answers.ReconstructCommand: "mereo.cli.reconstruct", answers.StreamCommand: "mereo.cli.stream"}
+"""Module whose function ``run`` does the work of a command that is options alone, as the module knows its class."""
 
 CONFIGURABLE = ("generate", "train", "evaluate", "reconstruct", "learn")
 """Commands with the option --config."""
@@ -89,17 +97,6 @@ STOPPING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasa
 
 USER_ERROR, FAULT, INTERRUPTED, BROKEN_PIPE = 2, 70, 130, 141
 """Exit codes; 70 is EX_SOFTWARE of sysexits.h, the last two are 128 plus the signal's number, as shells report them."""
-
-
-@runtime_checkable
-class Command(Protocol):
-    """Command that arguments are read into: a dataclass, its fields the options.
-
-    ``run`` imports what it needs itself, so that ``mereo --help`` answers without loading torch.
-    """
-
-    def run(self) -> Outcome | None:
-        """Do the work, and print what a person wants to know of it."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -141,11 +138,12 @@ def main(arguments: list[str] | None = None) -> int:
     return status
 
 
-def _run(command: Command) -> int:
+def _run(command: Any) -> int:
     """Run a command, and return its exit status; with ``--json`` standard output gets one object and nothing else."""
     as_json = getattr(command, "json", False)
     with redirect_stdout(sys.stderr) if as_json else nullcontext():
-        outcome = command.run()
+        work = WORK.get(type(command))
+        outcome: Outcome | None = command.run() if work is None else import_module(work).run(command)
     if outcome is None:
         return 0
     if as_json:
@@ -292,7 +290,7 @@ def _command(arguments: list[str]) -> str:
 # --- from arguments to a command --------------------------------------------------------------------------------------
 
 
-def parse(arguments: list[str]) -> Command:
+def parse(arguments: list[str]) -> Any:
     """Command that these arguments mean; exits with 0 after a help that they ask for, with 2 where they mean none.
 
     Raises ``ValueError`` for settings that are refused, such as a number out of its bounds.
@@ -314,7 +312,7 @@ def parse(arguments: list[str]) -> Command:
     box = io.StringIO()
     try:
         with redirect_stderr(box):
-            command: Command = tyro.cli(
+            command = tyro.cli(
                 _syntax(COMMANDS, starts),
                 args=arguments or ["--help"],
                 prog="mereo",

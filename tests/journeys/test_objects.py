@@ -353,10 +353,10 @@ def test_a_network_cannot_answer_for_an_object_without(angle: mereo.Object, poin
 
 
 def test_a_built_in_scene_is_named_like_a_file() -> None:
-    rope = loaded_object(StreamCommand("-", ("rope",)))
+    rope = loaded_object(StreamCommand("-", object=("rope",)))
     assert rope.network is None and rope.scene is not None and rope.name == "rope"
     with pytest.raises(ValueError, match="--scene is rope, but --object says what the object is"):
-        loaded_object(ReconstructCommand((), ("rope",), scene="rope"))
+        loaded_object(ReconstructCommand((), object=("rope",), scene="rope"))
 
 
 def test_folders_of_meshes_and_scene_files_are_objects(folder: Path, tmp_path: Path) -> None:

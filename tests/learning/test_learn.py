@@ -418,7 +418,7 @@ def test_a_folder_is_an_object(small: None, tmp_path: Path, capsys: pytest.Captu
     assert command_line.main(command) == 0
     assert (out / "search.json").read_bytes() == scores
     assert 0.5 < read_json(out / "metrics.json")["iou"] <= 1
-    angle = loaded_object(StreamCommand("-", (str(out),)))  # as every command with --object has it
+    angle = loaded_object(StreamCommand("-", object=(str(out),)))  # as every command with --object has it
     assert angle.network is None and angle.names == ("long", "short")
 
 

@@ -1,6 +1,9 @@
-"""The commands that answer frames: reconstruct, view, stream, serve."""
+"""The commands that answer frames: reconstruct, view, stream, serve.
 
-import os
+Those of reconstruct and stream are options alone, so that help is instant: their work lies in the modules of these
+names, which know them, and ``__main__`` joins both.
+"""
+
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -8,13 +11,11 @@ from typing import Annotated
 
 from tyro.conf import UseAppendAction, arg
 
-from mereo.cli.options import ConfigFile, InputName, InputOrNone, Inputs, MeshUnits, Outcome, loaded_object
+from mereo.cli.options import ConfigFile, FrameOptions, InputName, InputOrNone, Inputs, loaded_object
 from mereo.fitting.config import AnswerMethod, StreamMethod
-from mereo.geometry.conventions import Way
 from mereo.io.bounds import Cells, Instances, Port, Positive, Threads, Workers
-from mereo.io.config import CarryFrame, FilesConfig, InputConfig
+from mereo.io.config import CarryFrame, FilesConfig
 from mereo.models.config import InferenceConfig
-from mereo.reconstruction.config import IsolationConfig
 from mereo.workers.spread import DEFAULT_TASK, RayAddress, TaskResources
 from mereo_serving.config import ServeConfig
 
@@ -23,7 +24,7 @@ SERVE_MODULES = ("fastapi", "uvicorn", "prometheus_client", "python_multipart")
 
 
 @dataclass(frozen=True)
-class ReconstructCommand:
+class ReconstructCommand(FrameOptions):
     """Reconstruct all segments from a frame, a depth image, point cloud or ROS recording, or from many frames.
 
     Several frames, or folders of them, share one loading of the weights and all options. Each gets a folder of its own
@@ -39,15 +40,9 @@ class ReconstructCommand:
         object: what is looked for: its meshes, one file for each segment, one file of named parts, a robot's URDF,
             SDF or MJCF file or a label volume; a scene file, a built-in scene's name, or the folder of `mereo learn`.
             Nothing is trained for it.
-        weights: a shipped name or a file; with --object they start the fit, without they say what is looked for.
-        units: of the object's meshes; guessed where not given.
-        deformations: how an object of meshes moves, as for `mereo scene new`: rigid, soft, stiff or articulated.
         output: folder to create, by default result, result2, ...; of several frames, the folder in which each one's is
             created.
         resolution: grid cells along the longest side.
-        reading: how the frame is read.
-        isolation: what of the frame is left out.
-        inference: where and how exactly the network computes.
         files: which files, and in which unit.
         method: register the object's own deformation model to the frame: auto takes the registered model where it
             explains the frame, if the weights carry one; network leaves the network's answer, search the network out;
@@ -77,20 +72,12 @@ class ReconstructCommand:
     """
 
     inputs: Inputs
-    object: tuple[str, ...] = ()
-    weights: str | None = None
-    units: MeshUnits = None
-    deformations: Way = "auto"
     output: Path | None = None
     resolution: Cells = 128
-    reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
-    isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
-    inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
     files: Annotated[FilesConfig, arg(name="")] = field(default_factory=FilesConfig)
     method: AnswerMethod = "auto"
     scene: str | None = None
     initial_pose: Path | None = None
-    joints: Path | None = None
     instances: Instances = 1
     carry: UseAppendAction[tuple[Path, ...]] = ()
     carry_frame: CarryFrame = "source"
@@ -101,23 +88,9 @@ class ReconstructCommand:
     json: bool = False
     options_from: ConfigFile = None
 
-    def run(self) -> Outcome:
-        """Write the folder of results and print the segments."""
-        from mereo.api.result import free_folder
-        from mereo.cli.reconstruct import FrameJob, reconstruct_inputs
-        from mereo.workers.spread import choose_cluster
-
-        cluster, inference = choose_cluster(self.ray, self.threads, self.task), self.inference
-        if cluster is not None and self.weights is not None:
-            from mereo.models.weights import settings_for
-
-            inference = settings_for(inference, cluster)
-        job = FrameJob(self, inference)
-        return reconstruct_inputs(self.inputs, self.output or free_folder(), job, cluster)
-
 
 @dataclass(frozen=True)
-class ViewCommand:
+class ViewCommand(FrameOptions):
     """Look at a frame and its reconstruction in a browser, or try an object (--object): needs the extra `view`.
 
     Only this machine reaches the page; from another one use a tunnel: ssh -L 8080:127.0.0.1:8080 HOST.
@@ -129,27 +102,13 @@ class ViewCommand:
             the laboratory of this object is opened: states of its are shown to a simulated camera, and what is found in
             its image next to the truth.
         weights: a shipped name or a file; by default those of the shipped frame, or none.
-        units: of the object's meshes; guessed where not given.
-        deformations: how an object of meshes moves, as for `mereo scene new`: rigid, soft, stiff or articulated.
-        joints: file of joints whose values are known, as for `mereo reconstruct`.
         port: where the page is; 0 takes any that is free.
         resolution: grid cells along the longest side.
-        reading: how the frame is read.
-        isolation: what of the frame is left out.
-        inference: where and how exactly the network computes.
     """
 
     input: InputOrNone = None
-    object: tuple[str, ...] = ()
-    weights: str | None = None
-    units: MeshUnits = None
-    deformations: Way = "auto"
-    joints: Path | None = None
     port: Port = 8080
     resolution: Cells = 128
-    reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
-    isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
-    inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
 
     def run(self) -> None:
         """Open a page, and keep it until Ctrl-C."""
@@ -182,7 +141,7 @@ class ViewCommand:
 
 
 @dataclass(frozen=True)
-class StreamCommand:
+class StreamCommand(FrameOptions):
     """Reconstruct frames as they come: the latest one wins, a bad one is reported and passed over.
 
     Each answer is one line of JSON on standard output, in the input's frame and units; rate and latency come at the
@@ -194,10 +153,6 @@ class StreamCommand:
         input: a folder of depth images or point clouds, a ROS recording, or - for file names on standard input;
             realsense for a camera that is connected, realsense:SERIAL for a certain one, realsense:FILE for a recording
             of its SDK: these need the extra `realsense`.
-        object: what is looked for, as for `mereo reconstruct`: its meshes or its scene.
-        weights: a shipped name or a file; with --object they start the fit, without they say what is looked for.
-        units: of the object's meshes; guessed where not given.
-        deformations: how an object of meshes moves, as for `mereo scene new`: rigid, soft, stiff or articulated.
         joints: file of joints whose values are known and stay as they are, as for `mereo reconstruct`.
         resolution: grid cells along the longest side of the network's surfaces: fewer are faster.
         method: auto follows the registered model where it explains the frame, if the weights carry one, and else asks
@@ -211,18 +166,10 @@ class StreamCommand:
         align_color: of a RealSense, take depth as its colour camera sees it: results are in the axes of that.
         surfaces: folder for the surfaces of each answered frame, one GLB file each; one with content is refused.
         force: write into a folder with content, and replace the files of the same names in it.
-        reading: how a frame is read.
-        isolation: what is left out of it.
-        inference: where and how exactly the network computes.
         threads: of torch and all else that computes; 0 means one per core.
     """
 
     input: InputName
-    object: tuple[str, ...] = ()
-    weights: str | None = None
-    units: MeshUnits = None
-    deformations: Way = "auto"
-    joints: Path | None = None
     resolution: Cells = 48
     method: StreamMethod = "auto"
     radius: bool = True
@@ -233,18 +180,7 @@ class StreamCommand:
     align_color: bool = False
     surfaces: Path | None = None
     force: bool = False
-    reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
-    isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
-    inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
     threads: Threads = 0
-
-    def run(self) -> None:
-        """Print a line of JSON for each frame, and the summary at the end."""
-        # read when torch is loaded; clouds of ever other sizes would fill it with products that do not come again
-        os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "4")
-        from mereo.cli.stream import stream_reconstructions
-
-        stream_reconstructions(self)
 
 
 @dataclass(frozen=True)

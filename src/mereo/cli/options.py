@@ -13,7 +13,7 @@ ASSET    a name from `mereo assets list`
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
@@ -21,14 +21,15 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 from tyro.conf import Positional, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
-from mereo.geometry.conventions import LengthUnit
+from mereo.geometry.conventions import LengthUnit, Way
 from mereo.io.bounds import check_values
+from mereo.io.config import InputConfig
 from mereo.io.object_storage import Place, place_of
 from mereo.models.config import InferenceConfig
+from mereo.reconstruction.config import IsolationConfig
 
 if TYPE_CHECKING:
     from mereo.api.objects import Object
-    from mereo.cli.answers import ReconstructCommand, StreamCommand, ViewCommand
 
 
 @dataclass(frozen=True)
@@ -92,6 +93,31 @@ ConfigFile = Annotated[Path | None, arg(name="config")]
 # --- the object that options name -------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, kw_only=True)
+class FrameOptions:
+    """Options of the commands that look for an object in frames.
+
+    Attributes:
+        object: what is looked for, as for `mereo reconstruct`: its meshes or its scene.
+        weights: a shipped name or a file; with --object they start the fit, without they say what is looked for.
+        units: of the object's meshes; guessed where not given.
+        deformations: how an object of meshes moves, as for `mereo scene new`: rigid, soft, stiff or articulated.
+        joints: file of joints whose values are known, as for `mereo reconstruct`.
+        reading: how a frame is read.
+        isolation: what of a frame is left out.
+        inference: where and how exactly the network computes.
+    """
+
+    object: tuple[str, ...] = ()
+    weights: str | None = None
+    units: MeshUnits = None
+    deformations: Way = "auto"
+    joints: Path | None = None
+    reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
+    isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
+    inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
+
+
 def check_named(command: str, object: Sequence[str], weights: str | Path | None) -> None:
     """Raise ``ValueError`` where neither an object nor weights are named."""
     if not object and weights is None:
@@ -101,9 +127,7 @@ def check_named(command: str, object: Sequence[str], weights: str | Path | None)
         )
 
 
-def loaded_object(
-    command: "ReconstructCommand | ViewCommand | StreamCommand", inference: InferenceConfig | None = None
-) -> "Object":
+def loaded_object(command: FrameOptions, inference: InferenceConfig | None = None) -> "Object":
     """Object that a command's options name, with the joints that are known; raises as ``load_object`` does.
 
     One word of ``--object`` that is a built-in scene's name is that scene; its weights are named by ``--weights``.
@@ -205,14 +229,14 @@ def _replaced(settings: Any, options: dict[str, Any], prefix: str, known: list[s
     from pydantic import TypeAdapter, ValidationError
 
     changes = dict[str, Any]()
-    for field, name, kind, value in _items(settings, prefix):
+    for attribute, name, kind, value in _items(settings, prefix):
         if is_dataclass(value):
-            changes[field] = _replaced(value, options, name, known)
+            changes[attribute] = _replaced(value, options, name, known)
             continue
         known.append(name)
         if name in options:
             try:
-                changes[field] = TypeAdapter(kind).validate_python(options[name])
+                changes[attribute] = TypeAdapter(kind).validate_python(options[name])
             except ValidationError as error:
                 raise ValueError(
                     f"{name} is {options[name]!r}, which cannot be ({error.errors()[0]['msg']}): correct it"
@@ -224,11 +248,11 @@ def _replaced(settings: Any, options: dict[str, Any], prefix: str, known: list[s
 def _items(settings: Any, prefix: str) -> Iterator[tuple[str, str, Any, Any]]:
     """Field, name of its option, kind and value; the name of a group ends with a dot, or is the prefix alone."""
     kinds = get_type_hints(type(settings), include_extras=True)
-    for field in (item.name for item in fields(settings) if item.name != "options_from"):
-        kind, value = kinds[field], getattr(settings, field)
+    for attribute in (item.name for item in fields(settings) if item.name != "options_from"):
+        kind, value = kinds[attribute], getattr(settings, attribute)
         names = [getattr(extra, "name", None) for extra in getattr(kind, "__metadata__", ())]
-        name = next((each for each in names if isinstance(each, str)), field)
-        yield field, prefix + name + "." * (is_dataclass(value) and name != ""), kind, value
+        name = next((each for each in names if isinstance(each, str)), attribute)
+        yield attribute, prefix + name + "." * (is_dataclass(value) and name != ""), kind, value
 
 
 def options_of(command: Any, name: str) -> dict[str, Any]:
@@ -238,8 +262,8 @@ def options_of(command: Any, name: str) -> dict[str, Any]:
 
 def _stated(settings: Any) -> dict[str, Any]:
     stated = dict[str, Any]()
-    for field, name, _, value in _items(settings, ""):
-        if field in NOT_RESULT:
+    for attribute, name, _, value in _items(settings, ""):
+        if attribute in NOT_RESULT:
             continue
         if is_dataclass(value):
             stated |= {name.rstrip("."): _stated(value)} if name else _stated(value)

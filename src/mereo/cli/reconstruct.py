@@ -24,7 +24,7 @@ from rich.table import Table
 
 from mereo.api.objects import Object
 from mereo.api.reconstruct import reconstruct_observation
-from mereo.api.result import Pose, Result, registration_of
+from mereo.api.result import Pose, Result, free_folder, registration_of
 from mereo.api.words import option_words
 from mereo.cli.answers import ReconstructCommand
 from mereo.cli.options import Outcome, check_named, files_read, loaded_object, options_of
@@ -50,7 +50,7 @@ from mereo.scenes.registry import files_of
 from mereo.visualization.reconstruction_report import confidence_title, radius_words, trust
 from mereo.visualization.result_files import INSTANCE, summary_of, write_answer
 from mereo.visualization.units import Unit
-from mereo.workers.spread import Cluster, spread
+from mereo.workers.spread import Cluster, choose_cluster, spread
 
 Summary = Mapping[str, Any]
 """Content of a summary.json."""
@@ -187,6 +187,16 @@ def reconstruct_frame(frame: SensorFrame, directory: Path, job: FrameJob, path: 
 
 
 # --- several frames ---------------------------------------------------------------------------------------------------
+
+
+def run(command: ReconstructCommand) -> Outcome:
+    """Write the folder of results and print the segments."""
+    cluster, inference = choose_cluster(command.ray, command.threads, command.task), command.inference
+    if cluster is not None and command.weights is not None:
+        from mereo.models.weights import settings_for
+
+        inference = settings_for(inference, cluster)
+    return reconstruct_inputs(command.inputs, command.output or free_folder(), FrameJob(command, inference), cluster)
 
 
 def reconstruct_inputs(inputs: Sequence[Path], output: Path, job: FrameJob, cluster: Cluster | None = None) -> Outcome:

@@ -10,6 +10,7 @@ grows, however slow the machine is. A bad frame is reported and passed over.
 
 import io
 import json
+import os
 import queue
 import re
 import sys
@@ -359,6 +360,13 @@ def _loader(read: Callable[[], SensorFrame], isolation: IsolationConfig) -> Call
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
+
+
+def run(command: StreamCommand) -> None:
+    """Print a line of JSON for each frame, and the summary at the end."""
+    # read when torch is loaded; clouds of ever other sizes would fill it with products that do not come again
+    os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "4")
+    stream_reconstructions(command)
 
 
 def stream_reconstructions(command: StreamCommand) -> Summary:
