@@ -150,8 +150,10 @@ def test_a_broken_rule_is_noticed(number: int, tmp_path: Path) -> None:
     assert all(fault.startswith(start) for fault, start in zip(faults, expected, strict=True)), faults
 
 
-def test_a_circle_is_found(tmp_path: Path) -> None:
-    (circle,) = cycles(package_of(tmp_path, {"io/a.py": "import mereo.io.b", "io/b.py": "import mereo.io.a"}))
+@pytest.mark.parametrize("indented", ["", "def f():\n    ", "if TYPE_CHECKING:\n    "])
+def test_a_circle_is_found(indented: str, tmp_path: Path) -> None:
+    back = indented + "from mereo.io.a import A"
+    (circle,) = cycles(package_of(tmp_path, {"io/a.py": "import mereo.io.b", "io/b.py": back}))
     assert set(circle.split(" -> ")) == {"io/a", "io/b"}
 
 

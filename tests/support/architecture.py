@@ -14,15 +14,11 @@ MODULE_NAME = re.compile(r"\w+\.[\w.]*")
 
 @dataclass(frozen=True)
 class Import:
-    """One place where a module names another one, or a library (``torch``), in an import statement or in a string.
-
-    ``at_start`` it is a statement of the module itself, which importing it executes.
-    """
+    """One place where a module names another one, or a library (``torch``), in an import statement or in a string."""
 
     source: str
     line: int
     target: str
-    at_start: bool
 
     @property
     def place(self) -> str:
@@ -65,7 +61,7 @@ def _imports(package: str, source: str, tree: ast.Module, modules: Mapping[str, 
         for name in names:
             library = name.partition(".")[0]
             target = _module_of(name, modules) if library == package else library
-            yield Import(source, node.lineno, target, node in tree.body)  # type: ignore[attr-defined]
+            yield Import(source, node.lineno, target)  # type: ignore[attr-defined]
 
 
 def _spelled(name: str, package: str, modules: Mapping[str, str]) -> list[str]:
@@ -187,10 +183,10 @@ def guarded_imports(package: Package) -> list[str]:
 
 
 def cycles(package: Package) -> list[str]:
-    """A circle of modules that import each other at the start, if there is one."""
+    """A circle of modules that name each other, if there is one: lazily, for type checkers and in strings included."""
     graph = {module: set[str]() for module in package.trees}
     for found in package:
-        if found.at_start and found.target in graph and found.target != found.source:
+        if found.target in graph and found.target != found.source:
             graph[found.source].add(found.target)
     try:
         TopologicalSorter(graph).prepare()
