@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-from mereo.io.atomic_files import atomic_file
+from mereo.io.atomic_files import atomic_file, write_file
 from mereo.io.extras import CURE, has_plots, pyplot
 
 FIELDS = ("step", "rate", "loss", "ce", "l1", "cd", "align", "rest", "code", "val_iou", "val_miou")
@@ -69,8 +69,7 @@ class MetricsLog:
         writer = csv.DictWriter(text, self.fields, restval="", lineterminator="\n")
         writer.writeheader()
         writer.writerows({k: int(v) if k == "step" else repr(v) for k, v in row.items()} for row in self.rows)
-        with atomic_file(self.run_dir / TABLE) as temporary:
-            temporary.write_text(text.getvalue())
+        write_file(self.run_dir / TABLE, text.getvalue())
         if self.draws:
             with atomic_file(self.run_dir / CURVES) as temporary:
                 draw_curves(self.rows, temporary)

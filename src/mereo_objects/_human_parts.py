@@ -86,7 +86,7 @@ def base() -> Base:
     rows: list[list[float]] = []
     quads: list[list[int]] = []
     group = ""
-    for line in assets.get("human/makehuman_base.obj").read_text().splitlines():
+    for line in assets.get("human/makehuman_base.obj").read_text("utf-8").splitlines():
         kind, _, rest = line.partition(" ")
         if kind == "v":
             rows.append([float(word) for word in rest.split()])
@@ -114,7 +114,7 @@ def to_scene(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 @cache
 def joints() -> Mapping[str, Float[np.ndarray, "3"]]:
     """Heads and tails of the bones by MakeHuman's names (``upperarm01.L____head``), in scene coordinates."""
-    skeleton = json.loads(assets.get("human/makehuman_default.mhskel").read_text())
+    skeleton = json.loads(assets.get("human/makehuman_default.mhskel").read_bytes())
     places: dict[str, list[int]] = skeleton["joints"]
     middles = {name: base().vertices[rows].mean(axis=0, keepdims=True) for name, rows in places.items()}
     return {name: read_only(to_scene(middle)[0]) for name, middle in middles.items()}
@@ -123,7 +123,7 @@ def joints() -> Mapping[str, Float[np.ndarray, "3"]]:
 @cache
 def skin_weights() -> Mapping[str, tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"]]]:
     """Base vertices that each bone moves, and its share in each."""
-    stored: dict[str, list[Any]] = json.loads(assets.get("human/makehuman_default_weights.mhw").read_text())["weights"]
+    stored: dict[str, list[Any]] = json.loads(assets.get("human/makehuman_default_weights.mhw").read_bytes())["weights"]
     weights = {}
     for bone, pairs in stored.items():
         rows, shares = zip(*pairs, strict=True)

@@ -10,6 +10,7 @@ import errno
 import re
 import secrets
 import socket
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -69,7 +70,8 @@ def bound_socket(host: str, port: int) -> socket.socket:
     except (OSError, UnicodeError):
         raise OSError(f"{host!r} is no name of this machine; choose another --host, or leave it out") from None
     bound = socket.socket(family)
-    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    if sys.platform != "win32":  # a port in use a minute ago will do; Windows would share a taken one
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         bound.bind(place)
     except OSError as error:

@@ -77,7 +77,8 @@ def stop_server(server: Any) -> None:
 def free_port(port: int) -> int:
     """Port of this machine that can be listened at, any free one for 0; raises ``OSError`` where it is taken."""
     with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if sys.platform != "win32":  # Windows would share a port that is taken
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((LOOPBACK, port))
         except OSError:

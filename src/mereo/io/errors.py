@@ -37,6 +37,9 @@ LIBRARIES = tuple(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", 
 MOST_CHARACTERS = 300
 """Length of what is quoted of a library's text, which may quote all that it has read."""
 
+C_LIBRARY = "ucrtbase" if sys.platform == "win32" else None
+"""Library of C that Python and what it loads print by; None is what this process has loaded already."""
+
 LIMIT_VARIABLE = "MEREO_MAX_FILE_GB"
 
 DEFAULT_GB = 8.0
@@ -243,7 +246,7 @@ def without_output() -> Iterator[None]:
     def flush() -> None:
         sys.stdout.flush()
         sys.stderr.flush()
-        ctypes.CDLL(None).fflush(None)
+        ctypes.CDLL(C_LIBRARY).fflush(None)
 
     flush()
     kept = [os.dup(stream) for stream in (1, 2)]
