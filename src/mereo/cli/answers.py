@@ -8,11 +8,10 @@ from typing import Annotated
 
 from tyro.conf import UseAppendAction, arg
 
-from mereo.cli.options import ConfigFile, InputName, InputOrNone, Inputs, MeshUnits, Outcome, loaded_object
+from mereo.cli.options import ConfigFile, InputName, InputOrNone, Inputs, Outcome, loaded_object
 from mereo.fitting.config import AnswerMethod, StreamMethod
-from mereo.geometry.conventions import Way
 from mereo.io.bounds import Cells, Instances, Port, Positive, Threads, Workers
-from mereo.io.config import CarryFrame, FilesConfig, InputConfig
+from mereo.io.config import CarryFrame, FilesConfig, InputConfig, MeshesConfig
 from mereo.models.config import InferenceConfig
 from mereo.reconstruction.config import IsolationConfig
 from mereo.workers.spread import DEFAULT_TASK, RayAddress, TaskResources
@@ -40,8 +39,7 @@ class ReconstructCommand:
             SDF or MJCF file or a label volume; a scene file, a built-in scene's name, or the folder of `mereo learn`.
             Nothing is trained for it.
         weights: a shipped name or a file; with --object they start the fit, without they say what is looked for.
-        units: of the object's meshes; guessed where not given.
-        deformations: how an object of meshes moves, as for `mereo scene new`: rigid, soft, stiff or articulated.
+        meshes: what files of meshes do not say.
         output: folder to create, by default result, result2, ...; of several frames, the folder in which each one's is
             created.
         resolution: grid cells along the longest side.
@@ -79,8 +77,7 @@ class ReconstructCommand:
     inputs: Inputs
     object: tuple[str, ...] = ()
     weights: str | None = None
-    units: MeshUnits = None
-    deformations: Way = "auto"
+    meshes: Annotated[MeshesConfig, arg(name="")] = field(default_factory=MeshesConfig)
     output: Path | None = None
     resolution: Cells = 128
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
@@ -129,8 +126,7 @@ class ViewCommand:
             the laboratory of this object is opened: states of its are shown to a simulated camera, and what is found in
             its image next to the truth.
         weights: a shipped name or a file; by default those of the shipped frame, or none.
-        units: of the object's meshes; guessed where not given.
-        deformations: how an object of meshes moves, as for `mereo scene new`: rigid, soft, stiff or articulated.
+        meshes: what files of meshes do not say.
         joints: file of joints whose values are known, as for `mereo reconstruct`.
         port: where the page is; 0 takes any that is free.
         resolution: grid cells along the longest side.
@@ -142,8 +138,7 @@ class ViewCommand:
     input: InputOrNone = None
     object: tuple[str, ...] = ()
     weights: str | None = None
-    units: MeshUnits = None
-    deformations: Way = "auto"
+    meshes: Annotated[MeshesConfig, arg(name="")] = field(default_factory=MeshesConfig)
     joints: Path | None = None
     port: Port = 8080
     resolution: Cells = 128
@@ -196,8 +191,7 @@ class StreamCommand:
             of its SDK: these need the extra `realsense`.
         object: what is looked for, as for `mereo reconstruct`: its meshes or its scene.
         weights: a shipped name or a file; with --object they start the fit, without they say what is looked for.
-        units: of the object's meshes; guessed where not given.
-        deformations: how an object of meshes moves, as for `mereo scene new`: rigid, soft, stiff or articulated.
+        meshes: what files of meshes do not say.
         joints: file of joints whose values are known and stay as they are, as for `mereo reconstruct`.
         resolution: grid cells along the longest side of the network's surfaces: fewer are faster.
         method: auto follows the registered model where it explains the frame, if the weights carry one, and else asks
@@ -220,8 +214,7 @@ class StreamCommand:
     input: InputName
     object: tuple[str, ...] = ()
     weights: str | None = None
-    units: MeshUnits = None
-    deformations: Way = "auto"
+    meshes: Annotated[MeshesConfig, arg(name="")] = field(default_factory=MeshesConfig)
     joints: Path | None = None
     resolution: Cells = 48
     method: StreamMethod = "auto"

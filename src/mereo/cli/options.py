@@ -122,10 +122,8 @@ def loaded_object(
         command.joints,
         scene=scene,
         weights=command.weights,
-        units=command.units,
-        deformations=command.deformations,
-        device=inference.device,
-        precision=inference.precision,
+        **vars(command.meshes),
+        **vars(inference),
     )
 
 

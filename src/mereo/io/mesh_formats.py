@@ -36,6 +36,7 @@ from mereo.geometry.mesh import (
 from mereo.geometry.mesh_repair import simplified
 from mereo.geometry.radii import Radii
 from mereo.geometry.transforms import Points, transform_points
+from mereo.io.config import RobotMeshes
 from mereo.io.errors import check_count, check_size, check_suffix, readable
 from mereo.io.extras import library
 from mereo.io.progress import stage
@@ -90,10 +91,11 @@ def read_segmented_mesh(*paths: str | Path) -> SegmentedMesh:
     return SegmentedMesh(tuple(segments))
 
 
-def read_object_mesh(path: str | Path) -> SegmentedMesh:
+def read_object_mesh(path: str | Path, robot_meshes: RobotMeshes = "visual") -> SegmentedMesh:
     """Segments of a file, or of a folder's files, for an object that is to be found; raises as ``read_segmented_mesh``.
 
-    Those of a robot's file are its links where all joints are zero, see ``io.robots``. Solids of more than
+    Those of a robot's file are its links where all joints are zero, see ``io.robots``, which alone has collision
+    meshes. Solids of more than
     ``mesh_repair.MOST_FACES`` faces are simplified, and a ``MeshWarning`` says how far. What was read before is kept,
     as long as its files are the same.
     """
@@ -101,7 +103,9 @@ def read_object_mesh(path: str | Path) -> SegmentedMesh:
     if path.suffix.lower() in ROBOT_SUFFIXES:
         from mereo.io.robots import read_robot  # which reads its meshes by this function
 
-        return read_robot(path).mesh
+        return read_robot(path, robot_meshes).mesh
+    if robot_meshes != "visual":
+        raise ValueError(f"--robot-meshes is {robot_meshes}, but {path} is no robot's file: leave it out")
     states = [
         (file.name, file.stat()) for file in (sorted(path.iterdir()) if path.is_dir() else [path]) if file.exists()
     ]
