@@ -545,12 +545,32 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "a mask's id without one": (lambda: load_frame(seen(), mask_value=1), "mask_value is given for a frame"),
     "three masks": (lambda: masked(np.ones((3, 32, 32), bool)), r"\(3, 32, 32\) .* masks\[scores.argmax\(\)\]"),
     "floats of a byte": (lambda: masked(np.eye(32) * 255), "from 0 to 255; they must be logits, or probabilities from"),
-    "a small mask": (lambda: masked(np.eye(16, dtype=bool)), "^the mask is 16 x 16 pixels but the depth image is 32 x"),
+    "a small mask": (lambda: masked(np.arange(4).reshape(2, 2)), "^the mask is 2 x 2 pixels but the depth image is "),
     "an empty mask": (lambda: masked(np.zeros((32, 32))), "measures 0 pixels inside the mask"),
     "ids": (lambda: masked(np.arange(1024).reshape(32, 32)), "^the mask has the values 0, .* give mask_value=1023 or"),
     "a mask that is none": (lambda: masked([[1], [1, 0]]), "^the mask, a list, is no array .*: give h x w truth"),
     "a mask of a cloud": (lambda: load_frame(seen(), mask=np.eye(32)), "is a point cloud, which has no pixels"),
     "a point in space": (lambda: IsolationConfig(point=(1, 2, 3)), "it must be the column and the row of a pixel"),
+    "axes of a frame": (
+        lambda: reconstruct(load_frame("rope"), MODEL, axes="scanner"),
+        "axes is given for a frame that is read already: give it where",
+    ),
+    "a misspelled method": (
+        lambda: answered(method="fulll"), "^method is 'fulll'; it must be one of auto, .*: give for example 'auto'"
+    ),
+    "a unit below zero": (lambda: answered(unit_m=-1), "the unit is -1 m; it must be positive"),
+    "a misspelled frame": (lambda: load_frame("bunnny"), "there is no frame 'bunnny'; give a file or one of the sh"),
+    "a unit of a shipped frame": (
+        lambda: load_frame("rope", unit_m=0.001), "the shipped frame 'rope' is in metres and needs no options"
+    ),
+    "a mask's file": (lambda: load_frame(seen(), mask="m.png"), "mask is given for a frame that is no file's: leave"),
+    "a preset": (lambda: mereo.train("x", "x", "tinny"), "the preset is 'tinny'; it must be one of paper, .*: correct"),
+    "a train": (lambda: mereo.learn("rope", "x", train="once"), "train is 'once'; it must be one of auto, always, n"),
+    "a suffix": (lambda: Result.save(MagicMock(), "x", formats=("plx",)), "there is no format 'plx'"),
+    "a matrix by its name": (lambda: load_frame(METRES, K=K), "there is no option 'K' here: intrinsics=K has it"),
+    "a masked array": (lambda: load(K, np.ma.masked_all((24, 32))), "depth image measures 0 pixels in the image"),
+    "no vertex": (lambda: load_object((POINTS, [[0, 1, 7]])), "^segment 'part1' has a face that refers to vertex 7 of"),
+    "no face": (lambda: load_object({"lid": trimesh.Trimesh()}), "^segment 'lid' has no faces; it must be"),
     "a negative unit": (lambda: replace(load_frame(seen()), unit_m=-1.0), "unit_m is -1.0; it must be greater"),
 }  # fmt: skip
 
@@ -559,6 +579,6 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
 def test_what_cannot_be_is_refused_in_a_sentence(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # the check of types that tests put before it
     call, sentence = REFUSED[line]
-    with pytest.raises((ValueError, TypeError), match=sentence) as caught:
+    with pytest.raises((ValueError, TypeError, OSError), match=sentence) as caught:
         call()
     assert len(str(caught.value).splitlines()) == 1

@@ -58,6 +58,7 @@ RECONSTRUCT_OPTIONS = {
 
 PLACES = {
     "frame": "axes='scanner' states the axes",
+    **dict.fromkeys(("K", "camera"), "intrinsics=K has it"),
     **dict.fromkeys(
         ("output", "formats", "millimetres", "force"), "result.save(path, formats=..., overwrite=True) has it"
     ),

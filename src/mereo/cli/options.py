@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 from tyro.conf import Positional, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
-from mereo.geometry.conventions import LengthUnit
 from mereo.io.bounds import check_values
 from mereo.io.object_storage import Place, place_of
 from mereo.models.config import InferenceConfig
@@ -81,9 +80,6 @@ InputOrNone = Annotated[Positional[Path | None], arg(metavar="[INPUT]", help_beh
 InputName = Annotated[Positional[str], arg(metavar="INPUT")]
 ScanCloud = Annotated[Positional[Path], arg(metavar="SCAN")]
 AssetNames = Annotated[Positional[tuple[str, ...]], arg(metavar="[ASSET ...]", help_behavior_hint="")]
-
-MeshUnits = LengthUnit | None
-"""Unit of meshes; None guesses."""
 
 ConfigFile = Annotated[Path | None, arg(name="config")]
 """Option of commands that read their options from a file."""

@@ -251,9 +251,7 @@ def _read_mjcf(path: Path, yourdfpy: Any, mujoco: Any, robot_meshes: RobotMeshes
     model = mujoco.MjModel.from_xml_path(str(path))
     data = mujoco.MjData(model)
     kinds = {int(mujoco.mjtJoint.mjJNT_HINGE): "revolute", int(mujoco.mjtJoint.mjJNT_SLIDE): "prismatic"}
-    for number in range(model.njnt):
-        if int(model.jnt_type[number]) in kinds:
-            data.qpos[model.jnt_qposadr[number]] = 0.0
+    data.qpos[model.jnt_qposadr[np.isin(model.jnt_type, list(kinds))]] = 0.0
     mujoco.mj_kinematics(model, data)
     names = [model.body(number).name or f"body {number}" for number in range(model.nbody)]
     links, joints, place = {name: yourdfpy.Link(name) for name in names}, list[Any](), {names[0]: np.zeros(3)}
@@ -267,8 +265,7 @@ def _read_mjcf(path: Path, yourdfpy: Any, mujoco: Any, robot_meshes: RobotMeshes
             if kind is not None:
                 lower, upper = joint.range if model.jnt_limited[number] else (-np.inf, np.inf)
                 limit = yourdfpy.Limit(lower=float(lower), upper=float(upper))
-                mimic = _mjcf_leader(model, mujoco, number)
-                mimic = None if mimic is None else yourdfpy.Mimic(*mimic)
+                mimic = _mjcf_mimic(model, mujoco, yourdfpy, number)
                 each = yourdfpy.Joint(name, kind, axis=data.xaxis[number].copy(), limit=limit, mimic=mimic)
                 chain.append((each, data.xanchor[number].copy()))
             elif int(model.jnt_type[number]) == int(mujoco.mjtJoint.mjJNT_BALL) or body != 1 or not is_alone:
@@ -297,17 +294,14 @@ def _read_mjcf(path: Path, yourdfpy: Any, mujoco: Any, robot_meshes: RobotMeshes
     return _Described(path, robot, shapes, states, robot_meshes)
 
 
-def _mjcf_leader(model: Any, mujoco: Any, number: int) -> tuple[str, float, float] | None:
+def _mjcf_mimic(model: Any, mujoco: Any, yourdfpy: Any, number: int) -> Any:
     """Joint that another one follows, by which factor and offset; None where no linear constraint says so."""
     for row in np.flatnonzero(model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)):
         first, second, (offset, factor, *curved) = model.eq_obj1id[row], model.eq_obj2id[row], model.eq_data[row, :5]
         if first == number and second >= 0 and not any(curved):
             zero, leader_zero = (model.qpos0[model.jnt_qposadr[each]] for each in (first, second))
-            return (
-                model.joint(second).name or f"joint {second}",
-                float(factor),
-                float(offset + zero - factor * leader_zero),
-            )
+            offset += zero - factor * leader_zero
+            return yourdfpy.Mimic(model.joint(second).name or f"joint {second}", float(factor), float(offset))
     return None
 
 
