@@ -485,8 +485,15 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "formats": (
         lambda: Result.save(MagicMock(), "x", formats="glb"), "^formats is 'glb'; it must be a list of names: g"
     ),
-    "an object of None": (lambda: load_object([None]), r"^the object is \[None\]; it must be the path of a"),
-    "an object of a number": (lambda: load_object(3), "^the object is 3; it must be the path of a file"),
+    **{
+        f"an object of {given!r}": (lambda given=given: load_object(given), "^(the|no) object is .*; .*name its meshes")
+        for given in ([None], b"bytes", [], {}, {"a.stl"}, 3, "", ["a.stl", ""], [b"a.stl"])
+    },
+    "no object's name": (lambda: load_object("nothing"), "there is no object 'nothing': name its meshes, its scene fi"),
+    "no file": (lambda: load_object("missing.stl"), "missing.stl does not exist"),
+    "a folder of others": (
+        lambda: load_object(Path(__file__).parent), "holds no meshes .*: name the folder of an object, or its files"
+    ),
     "weights": (lambda: load_object(weights=3), "^weights is 3; it must be a path"),
     "a scene": (lambda: load_object("rope", scene=3), "^scene is 3; it must be a path"),
     "units": (
@@ -566,7 +573,11 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "a mask's file": (lambda: load_frame(seen(), mask="m.png"), "mask is given for a frame that is no file's: leave"),
     "a preset": (lambda: mereo.train("x", "x", "tinny"), "the preset is 'tinny'; it must be one of paper, .*: correct"),
     "a train": (lambda: mereo.learn("rope", "x", train="once"), "train is 'once'; it must be one of auto, always, n"),
-    "a suffix": (lambda: Result.save(MagicMock(), "x", formats=("plx",)), "there is no format 'plx'"),
+    "another suffix": (
+        lambda: Result.save(MagicMock(), "x.stl"), r"x.stl has the suffix '.stl'; one file is .glb, .ply, .*: choose"
+    ),
+    "two formats": (lambda: Result.save(MagicMock(), "x.glb", formats=("ply",)), "one file, whose suffix says its"),
+    "a format's name": (lambda: Result.save(MagicMock(), "x", formats=("plx",)), "there is no format 'plx'"),
     "a matrix by its name": (lambda: load_frame(METRES, K=K), "there is no option 'K' here: intrinsics=K has it"),
     "a masked array": (lambda: load(K, np.ma.masked_all((24, 32))), "depth image measures 0 pixels in the image"),
     "no vertex": (lambda: load_object((POINTS, [[0, 1, 7]])), "^segment 'part1' has a face that refers to vertex 7 of"),

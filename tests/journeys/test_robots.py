@@ -1,5 +1,6 @@
 """Robots of URDF and SDF files: their joints are found in frames by name, and bad files are one sentence."""
 
+import json
 import pickle
 import re
 from pathlib import Path
@@ -344,6 +345,19 @@ def test_the_commands_of_the_page_give_the_joints_of_a_gripper(
     assert result.joints["finger"].value == pytest.approx(facts["finger"]["value"], abs=1e-6)
     assert isinstance(held := variables["held"], mereo.Result) and held.known is True
     assert held.joints["finger"].interval == pytest.approx((true, true), abs=1e-12)
+
+
+def test_each_frame_of_a_stream_has_the_joints_of_its_moment(
+    gripper: Path, working_folder: Path, capsys: pytest.CaptureFixture
+) -> None:
+    Path("frames").mkdir()
+    scene = scene_of_meshes([gripper])
+    true = [write_frame(Path(f"frames/{i}.ply"), scene, 0.4 + 0.03 * i, 5) for i in range(6)]
+    command_line.main(["stream", "frames", "--object", str(gripper), "--unit-m", "1", "--every-frame"])
+    lines = [*map(json.loads, capsys.readouterr().out.splitlines())]
+    assert [line["tracking"] for line in lines] == ["found", *["followed"] * 5]
+    fingers = [[line["joints"][name]["value"] for line in lines] for name in ("finger", "other finger")]
+    assert_allclose(fingers, [true, 0.5 * np.array(true) + 0.002], atol=2e-4)
 
 
 # --- joints whose values are known ------------------------------------------------------------------------------------
