@@ -27,6 +27,7 @@ from mereo.api import reconstruct, steps, view
 from mereo.api.result import SINGLE, Result
 from mereo.api.words import SPEAKS_OPTIONS, in_python, option_words, python_words
 from mereo.cli.answers import ReconstructCommand
+from mereo.cli.options import flat_options, options_of
 from mereo.cli.reconstruct import FrameJob, reconstruct_file
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Located
@@ -34,7 +35,7 @@ from mereo.geometry.camera import SCANNER_TO_CAMERA, Camera, DepthImage, PointCl
 from mereo.geometry.conventions import CloudAxes, Way
 from mereo.geometry.transforms import transform_points
 from mereo.io.atomic_files import MARKER
-from mereo.io.config import InputConfig
+from mereo.io.config import InputConfig, MeshesConfig
 from mereo.io.sensor_frame import SensorFrame
 from mereo.models.model import Model
 from mereo.reconstruction.config import IsolationConfig
@@ -102,6 +103,7 @@ def test_one_file_is_that_of_the_folder(result: Result, tmp_path: Path) -> None:
         (tmp_path / suffix).mkdir()
         path.rename(tmp_path / suffix / name)
         assert contents(tmp_path / suffix) == {name: folder[name]}, suffix
+    assert result.save(tmp_path / "take-1.2", formats=("npz",)).is_dir()
 
 
 def test_nobodys_files_are_replaced(result: Result, tmp_path: Path) -> None:
@@ -119,10 +121,6 @@ def test_nobodys_files_are_replaced(result: Result, tmp_path: Path) -> None:
     np.savez(tmp_path / "frame.npz", points=seen())
     with pytest.raises(FileExistsError, match="frame.npz"):
         mereo.reconstruct(tmp_path / "frame.npz", MODEL, resolution=8).save(tmp_path / "frame.npz", overwrite=True)
-
-
-def test_a_folder_may_have_a_dot_in_its_name(result: Result, tmp_path: Path) -> None:
-    assert result.save(tmp_path / "take-1.2", formats=("npz",)).is_dir()
 
 
 def test_values_tell_themselves_in_one_line(result: Result) -> None:
@@ -186,6 +184,8 @@ def test_fields_of_isolation_are_arguments_by_themselves(monkeypatch: pytest.Mon
     with pytest.raises(ValueError, match="isolation is given for an object that is isolated already"):
         mereo.reconstruct(observed, MODEL, extent="whole")
     assert {item.name for item in fields(IsolationConfig)}.isdisjoint(item.name for item in fields(InputConfig))
+    stated = dict(flat_options(options_of(ReconstructCommand(()), "reconstruct"))).keys()
+    assert stated - reconstruct.RECONSTRUCT_OPTIONS - reconstruct.PLACES.keys() == {"command", "inputs", "object"}
 
 
 def test_a_tracker_begins_at_a_pose_and_leaves_out_what_it_is_told(rope: Model, registrar: Registrar) -> None:
@@ -216,7 +216,7 @@ def test_meshes_deform_as_their_user_says(way: Way, tmp_path: Path, monkeypatch:
     assert_array_equal(ours, theirs)
     moved = np.abs(ours - known.scene.rest.merged()[0]).max()
     assert moved == 0 if way == "rigid" else moved > 0
-    command = ReconstructCommand((), object=tuple(map(str, files)), units="mm", deformations=way)
+    command = ReconstructCommand((), object=tuple(map(str, files)), meshes=MeshesConfig("mm", way))
     loaded = FrameJob(command).object.scene
     assert loaded is not None
     assert_array_equal(loaded.sample_state(example_rng(0, 7)).mesh.merged()[0], theirs)

@@ -213,7 +213,12 @@ def test_every_kind_of_meshes_is_one_object(line: str, boxes: mereo.Object) -> N
 
 
 def test_one_mesh_is_an_object_too(boxes: mereo.Object) -> None:
-    for line, name in ((LEFT, "left"), ([LEFT], "left"), (legacy(LEFT), "part1"), ([arrays(LEFT)], "part1")):
+    for line, name in (
+        (LEFT, "left"),
+        ({7: LEFT}, "7"),
+        (legacy(LEFT), "part1"),
+        ([arrays(LEFT)], "part1"),
+    ):
         assert load_object(line, units="mm", deformations="rigid").names == (name,)
 
 
@@ -508,13 +513,10 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
         lambda: load_object(toy_scene(), deformations="stiff"),
         "^the deformations are stiff, but .* says its own: l"
     ),
-    "deformations of weights": (
-        lambda: load_object(MODEL, deformations="stiff"),
-        "^the deformations are stiff, but .* says its own: leave"
-    ),
     "units of weights": (
         lambda: load_object("rope", units="mm"), "^the units are mm, but rope says its own: leave"
     ),
+    "units of a scene": (lambda: load_object("rope.yaml", units="mm"), "rope.yaml says its own: leave them out"),
     "isolation": (
         lambda: answered(isolation=3), "^isolation is 3; it must be an IsolationConfig"
     ),

@@ -333,8 +333,6 @@ def test_folders_of_meshes_and_scene_files_are_objects(folder: Path, tmp_path: P
         (parts / f"{name}.stl").write_bytes((folder / f"{name}.stl").read_bytes())
     known = mereo.load_object(parts, units="mm")
     assert known.names == ("long", "short") and known.scene is not None and known.scene.file is None
-    with pytest.raises(ValueError, match="says its own: leave them out"):
-        mereo.load_object("rope.yaml", units="mm")
 
 
 # --- every kind of deformation ----------------------------------------------------------------------------------------

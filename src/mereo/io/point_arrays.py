@@ -274,7 +274,7 @@ def mesh_of(source: Any) -> SegmentedMesh | None:
     if isinstance(source, SegmentedMesh):
         return source
     named: Any = parts_of_scene(source)
-    if not isinstance(named, Mapping):
+    if not (is_named := isinstance(named, Mapping)):
         is_list = isinstance(source, list | tuple) and _triangles(source) is None
         named = dict(enumerate(source if is_list else [source]))
         if _triangles(named.get(0)) is None:
@@ -285,7 +285,7 @@ def mesh_of(source: Any) -> SegmentedMesh | None:
             raise ValueError(f"the part {key!r} of the object is no mesh, as all must be: give its vertices and faces")
         known = getattr(part, "metadata", None) or {}
         file = known.get("file_name") or f"part{index + 1}"
-        name = key if isinstance(key, str) else getattr(part, "name", None) or known.get("name") or Path(file).stem
+        name = str(key) if is_named else getattr(part, "name", None) or known.get("name") or Path(file).stem
         color = getattr(part, "color", palette_color(index))
         check_segment(open_segment := Segment(name, color, *mesh, solid=False))
         segments.append(replace(open_segment, solid=getattr(part, "solid", False)))
