@@ -58,7 +58,7 @@ def main(folder: Path = FOLDER) -> Path:
     for name, mesh in parts().items():
         files.append(folder / f"{name}.stl")
         mesh.export(files[-1])
-    path = write_scene_file(files, folder / "lamp.yaml", "mm", aperture=140.0)  # a lamp stands
+    path = write_scene_file(files, folder / "lamp.yaml", units="mm", aperture=140.0)  # a lamp stands
     text = path.read_text("utf-8")  # a new file bends as rubber does; a lamp has joints instead
     path.write_text(text[: text.index("deformations:")] + JOINTS, "utf-8")
     print(f"wrote {path}; then: mereo learn {path} --output learned")

@@ -696,7 +696,7 @@ def scene_for(files: Sequence[Path], folder: Path, units: str | None, quiet: boo
     path = folder / SCENE
     if not path.is_file():
         report = None if quiet else print
-        write_scene_file(files, path, units, name=files[0].name.split(".")[0], report=report)
+        write_scene_file(files, path, units=units, name=files[0].name.split(".")[0], report=report)
         if not quiet:
             print(
                 f"wrote {path}; where the object moves in other ways, stop with Ctrl-C, say so in that file "

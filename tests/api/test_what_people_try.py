@@ -15,29 +15,35 @@ from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import jaxtyping
 import numpy as np
 import pytest
 import torch
 import trimesh
+from analytic import untrained
 from answers import answer_to
 from memory_frames import Tensor, TensorMap, Vectors
 from numpy.testing import assert_allclose, assert_equal
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from toy_frames import MODEL, seen
+from toy_frames import MODEL, NAMES, seen
+from toy_scene import toy_scene
 
 import mereo
+from mereo import load_frame, load_object, reconstruct
 from mereo.api.result import Result, StoredResult
 from mereo.fitting.registration.register import Registrar
-from mereo.geometry.camera import SCANNER_TO_CAMERA, Camera, DepthImage
+from mereo.geometry.camera import SCANNER_TO_CAMERA, Camera, DepthImage, PointCloud
+from mereo.geometry.labels import SegmentedCloud
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.transforms import fit_rigid, rigid, transform_points
 from mereo.io.readers import InputWarning
 from mereo.io.sensor_frame import SensorFrame
 from mereo.models.model import Model
+from mereo.reconstruction.config import IsolationConfig
 from mereo.scenes.random_states import CACHE_VARIABLE
 from mereo.scenes.scene import SourceFrame
 from mereo.synthesis.sample_views import load_view
@@ -69,7 +75,7 @@ def depth_message(values: np.ndarray, encoding: str) -> SimpleNamespace:
 
 
 def load(intrinsics: Any, depth: Any = METRES) -> SensorFrame:
-    return mereo.load_frame(depth, intrinsics=intrinsics)
+    return load_frame(depth, intrinsics=intrinsics)
 
 
 OPEN3D = {"intrinsic": {"intrinsic_matrix": K.T.ravel().tolist(), **SIZE}}
@@ -91,7 +97,7 @@ DEPTH: dict[str, tuple[Any, Any]] = {
     "intrinsics of Open3D": (METRES, SimpleNamespace(intrinsic_matrix=K, **SIZE)),
     "intrinsics of RealSense": (METRES, SimpleNamespace(**REALSENSE)),
     "a camera": (METRES, IMAGE.camera),
-    "a camera of a matrix": (METRES, mereo.Camera.from_K(K, WIDTH, HEIGHT)),
+    "a camera of a matrix": (METRES, Camera.from_K(K, WIDTH, HEIGHT)),
 }
 
 
@@ -101,9 +107,25 @@ def test_every_depth_image_with_every_camera_is_one_frame(line: str, tmp_path: P
     file = tmp_path / "depth.png"
     Image.fromarray(MILLIMETRES).save(file)
     for source in (depth, file):
-        frame = mereo.load_frame(source, intrinsics=intrinsics)
+        frame = load_frame(source, intrinsics=intrinsics)
         assert frame.whole is not None and frame.whole.camera == IMAGE.camera
         assert_allclose(frame.cloud.points, IMAGE.to_points().points, rtol=1e-6)
+
+
+def test_masks_of_all_kinds_in_memory_agree() -> None:
+    truth = np.zeros((32, 32), bool)
+    truth[4:20, 6:17] = True
+    logits = np.where(truth, 3.5, -8.0).astype(np.float32)
+    for mask in (
+        *(truth, truth[None], truth.astype(np.uint8), 255 * truth.astype(np.uint8), 7 * truth.astype(np.int64)),
+        *(logits, logits[None, None], torch.tensor(logits[None]), truth.astype(np.float32), 0.9 * truth + 0.05),
+        *(Image.fromarray(truth), Image.fromarray(truth).convert("RGB"), truth.tolist()),
+    ):
+        frame = masked(mask)
+        assert frame.depth is not None and np.array_equal(frame.depth.valid, truth)
+        assert frame.whole is ONES and len(frame.cloud) == truth.sum()
+    ids = masked(np.where(truth, 3, 5), mask_value=3)
+    assert ids.depth is not None and np.array_equal(ids.depth.valid, truth)
 
 
 # --- what goes in: clouds with more columns ---------------------------------------------------------------------------
@@ -114,11 +136,11 @@ NORMALS = np.array([0.0, 0.6, -0.8]) * np.ones((1200, 1))
 def test_columns_behind_positions_are_normals_or_colours() -> None:
     points = seen()
     oriented = np.hstack([points, NORMALS])
-    cloud = mereo.load_frame(oriented.reshape(30, 40, 6)).cloud
+    cloud = load_frame(oriented.reshape(30, 40, 6)).cloud
     assert_allclose(np.hstack([cloud.points, cloud.normals]), oriented)
     for colors in (np.abs(NORMALS), 255 * (NORMALS > 0)):
         with pytest.warns(InputWarning, match="^the last three columns of the ndarray .* are colours, which are lef"):
-            cloud = mereo.load_frame(np.hstack([points, colors])).cloud
+            cloud = load_frame(np.hstack([points, colors])).cloud
         assert cloud.normals is None and np.array_equal(cloud.points, points)
 
 
@@ -179,20 +201,25 @@ MESHES: dict[str, Any] = {
 def boxes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[mereo.Object]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(CACHE_VARIABLE, str(tmp_path_factory.mktemp("cache")))
-        yield mereo.load_object(BOXES, units="mm", deformations="rigid")
+        yield load_object(BOXES, units="mm", deformations="rigid")
 
 
 @pytest.mark.parametrize("line", MESHES)
 def test_every_kind_of_meshes_is_one_object(line: str, boxes: mereo.Object) -> None:
-    known = mereo.load_object(MESHES[line], units="mm", deformations="rigid")
+    known = load_object(MESHES[line], units="mm", deformations="rigid")
     assert known.names == ("left", "right") and known.scene is not None and known.scene.file is None
     assert known.model is not None and boxes.model is not None
     assert_allclose(known.model.rest_points, boxes.model.rest_points, rtol=1e-6)
 
 
 def test_one_mesh_is_an_object_too(boxes: mereo.Object) -> None:
-    for line, name in ((LEFT, "left"), ([LEFT], "left"), (legacy(LEFT), "part1"), ([arrays(LEFT)], "part1")):
-        assert mereo.load_object(line, units="mm", deformations="rigid").names == (name,)
+    for line, name in (
+        (LEFT, "left"),
+        ({7: LEFT}, "7"),
+        (legacy(LEFT), "part1"),
+        ([arrays(LEFT)], "part1"),
+    ):
+        assert load_object(line, units="mm", deformations="rigid").names == (name,)
 
 
 # --- what comes out ---------------------------------------------------------------------------------------------------
@@ -220,7 +247,7 @@ def results(rope: Model) -> dict[str, Any]:
         answer_to(cloud, rope, Registrar(rope, free, "modes"), 16),
     )
     made: dict[str, Any] = dict(zip(FITTED, map(Result.of, answers), strict=True))
-    made["a network"] = mereo.reconstruct(seen(), MODEL, resolution=24, unit_m=1.0, label_points=True)
+    made["a network"] = answered(resolution=24, unit_m=1.0, label_points=True)
     waiting = type("Waiting", (Executor,), {"submit": lambda *_, **__: Future()})()
     alone, pose = mereo.Object(None, None, model=sized), made["metres"].pose
     with mereo.Tracker(alone, "modes", executor=waiting, initial_pose=pose) as tracker:
@@ -359,6 +386,29 @@ def test_a_result_in_a_robots_frame_is_the_same_there(kind: str, results: dict[s
 
 OPEN = trimesh.Trimesh(LEFT.vertices[:3], [[0, 1, 2]])
 
+LINE = np.linspace(0.1, 1.0, 99)[:, None] * [1.0, 0.5, 2.0]
+SQUARE = Camera(32, 32, 40.0, 40.0, 16.0, 16.0)
+ONES = DepthImage(np.ones((32, 32)), SQUARE)
+
+
+def masked(mask: object, **options: object) -> SensorFrame:
+    """The image of ones within a mask."""
+    return load_frame(ONES, mask=mask, **options)
+
+
+def queried(points: np.ndarray) -> object:
+    """Answer of a network at these points."""
+    model = untrained(NAMES)
+    return model.query(model.encode(seen()), points)
+
+
+def answered(**options: Any) -> Result:
+    return reconstruct(seen(), MODEL, **options)
+
+
+GRID = "resolution is .*; it must be a whole number, from 4 to 4096: give for example 128"
+
+
 REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "a camera of a cloud": (lambda: load(K, "bun000.ply"), "bun000.ply is read as a point cloud; leave out intrinsics"),
     "distortion": (
@@ -371,28 +421,170 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "a color message": (
         lambda: load(K, depth_message(MILLIMETRES, "bgr8")), "^the Image message cannot be read .*'bgr8'"
     ),
-    "columns of anything": (lambda: mereo.load_frame(np.hstack([seen(), 7.5 * NORMALS])), "six columns.* as points"),
-    "an open mesh": (lambda: mereo.load_object({"lid": OPEN}, units="mm"), "^segment 'lid' of lid.obj .* solids"),
+    "columns of anything": (lambda: load_frame(np.hstack([seen(), 7.5 * NORMALS])), "six columns.* as points"),
+    "an open mesh": (lambda: load_object({"lid": OPEN}, units="mm"), "^segment 'lid' of lid.obj .* solids"),
     "a dict of other things": (
-        lambda: mereo.load_object({"left": LEFT, "right": 3}), "^the part 'right' of the object is no mesh, as"
+        lambda: load_object({"left": LEFT, "right": 3}), "^the part 'right' of the object is no mesh, as"
     ),
     "quadrangles": (
-        lambda: mereo.load_object((LEFT.vertices, [[0, 1, 2, 3]])), r"faces of \(1, 4\); they must be v x 3 "
+        lambda: load_object((LEFT.vertices, [[0, 1, 2, 3]])), r"faces of \(1, 4\); they must be v x 3 "
     ),
     "units of a loaded object": (
-        lambda: mereo.reconstruct(seen(), mereo.Object(MODEL), units="mm"),
+        lambda: reconstruct(seen(), mereo.Object(MODEL), units="mm"),
         "^units is given for an object that is loaded already: give it to load_object$",
     ),
     "a misspelled option": (
-        lambda: mereo.reconstruct(seen(), MODEL, unitm=1.0), "^there is no option 'unitm' here: is unit_m meant"
+        lambda: answered(unitm=1.0), "^there is no option 'unitm' here: is unit_m meant"
     ),
     "a misspelled step": (
-        lambda: mereo.reconstruct(seen(), MODEL, isolation={"largest_clusters": True}), "is largest_cluster meant"
+        lambda: answered(isolation={"largest_clusters": True}), "is largest_cluster meant"
     ),
     "a misspelled field": (lambda: mereo.evaluate(MODEL, exmples=1), "^there is no option 'exmples' here: is examples"),
-    "axes as the command has them": (lambda: mereo.load_frame(seen(), frame="scanner"), "axes='scanner' states"),
-    "an output": (lambda: mereo.reconstruct(seen(), MODEL, output="x"), r"'output' here: result.save\(path, "),
-    "an unlike name": (lambda: mereo.load_frame(seen(), xyzzy=1), "'xyzzy' here: the options are axes, camera_pose, d"),
+    "axes as the command has them": (lambda: load_frame(seen(), frame="scanner"), "axes='scanner' states"),
+    "an output": (lambda: answered(output="x"), r"'output' here: result.save\(path, "),
+    "an unlike name": (lambda: load_frame(seen(), xyzzy=1), "'xyzzy' here: the options are axes, camera_pose, d"),
+    **{
+        f"axes {axes!r}": (lambda axes=axes: load_frame(seen(), axes=axes), "^axes is .* one of camera, scanner")
+        for axes in ("Camera", 3, "")
+    },
+    **{
+        f"resolution {n}": (lambda n=n: answered(resolution=n), GRID)
+        for n in (0.5, np.nan, -5, True, 1_000_000, None)
+    },
+    "a large grid": (lambda: answered(resolution=4096).surfaces, "at most 80000000 fit: lower"),
+    "an index": (lambda: load_frame(seen(), frame_index=-1), "^frame_index is -1; it must be a whole number, at"),
+    "a complex cloud": (lambda: PointCloud(seen() * 1j), "values of type complex128; they must be real numbers"),
+    "a boolean cloud": (lambda: PointCloud(seen() > 0), "values of type bool; they must be real numbers"),
+    "pairs": (lambda: PointCloud(seen()[:, :2]), r"have the shape \(\d+, 2\); they must be n x 3"),
+    "complex depth": (lambda: DepthImage(np.ones((32, 32)) * 1j, SQUARE), "the depth image has values of type complex"),
+    "boolean depth": (
+        lambda: load_frame(np.ones((32, 32), bool), intrinsics=SQUARE), "the depth image has values of type bool"
+    ),
+    "a line": (lambda: reconstruct(LINE, MODEL), "the 99 points of cloud lie on a line or at one place; the obj"),
+    "one place": (lambda: reconstruct(np.ones((500, 3)), MODEL), "the 500 points of .* at one place"),
+    **{
+        f"an image of {width} columns": (lambda width=width: replace(SQUARE, width=width), f"size is {width} x 32;")
+        for width in (2.5, True, 0, "32", None)
+    },
+    "a complex focal length": (lambda: replace(SQUARE, focal_x_px=40j), "the camera has values of type complex128"),
+    "a matrix of four": (lambda: Camera.from_K(np.eye(4), 32, 32), "the camera matrix is .*; it must be 3 x 3 numbers"),
+    "a column-wise matrix": (lambda: Camera.from_K([40, 0, 0, 0, 40, 0, 16, 16, 1], 32, 32), "0 0 1 in the last row"),
+    "depths in a row": (lambda: DepthImage(np.ones(5), SQUARE), r"has the shape \(5,\); it must be rows of pixels"),
+    "depths in layers": (lambda: DepthImage(np.ones((32, 32, 1)), SQUARE), "must be rows of pixels"),
+    "another image's mask": (lambda: ONES.to_points(np.ones((3, 4), bool)), r"has the shape \(3, 4\)"),
+    "a mask of numbers": (lambda: ONES.to_points(np.ones((32, 32), int)), "type int64; it must be .* mask > 0"),
+    "a complex pose": (lambda: load_frame(seen(), camera_pose=np.eye(4) * 1j), "the pose is not of real numbers"),
+    "a far pose": (
+        lambda: load_frame(seen(), camera_pose=np.eye(4) + np.eye(4, k=3) * 1e300), "translation of 1e.12 at most"
+    ),
+    "a ragged pose": (lambda: load_frame(seen(), camera_pose=[[1, 2], [3]]), "the pose is of the shape"),
+    "a pose of words": (lambda: load_frame(seen(), camera_pose=[["a"] * 4] * 4), "is not of real numbers"),
+    "labels of other points": (
+        lambda: SegmentedCloud(seen(), np.ones(4, np.uint8), np.ones(4), np.ones(4), ("a",), ((0, 0, 0),)),
+        "points have 4 labels, 4 confidences and 4 occupancies; each point needs one"
+    ),
+    "no query": (lambda: queried(np.empty((0, 3))), "0 points are queried; at least one is needed"),
+    "a query of NaN": (lambda: queried(np.full((2, 3), np.nan)), "2 of 2 points are NaN or infinite"),
+    "a query of pairs": (lambda: queried(np.ones((2, 2))), r"the shape \(2, 2\); they must be n x 3"),
+    "no path": (lambda: Result.save(MagicMock(), 3), "^path is 3; it must be a path: give a text or a p"),
+    "formats": (
+        lambda: Result.save(MagicMock(), "x", formats="glb"), "^formats is 'glb'; it must be a list of names: g"
+    ),
+    **{
+        f"an object of {given!r}": (lambda given=given: load_object(given), "^(the|no) object is .*; .*name its meshes")
+        for given in ([None], b"bytes", [], {}, {"a.stl"}, 3, "", ["a.stl", ""], [b"a.stl"])
+    },
+    "no object's name": (lambda: load_object("nothing"), "there is no object 'nothing': name its meshes, its scene fi"),
+    "no file": (lambda: load_object("missing.stl"), "missing.stl does not exist"),
+    "a folder of others": (
+        lambda: load_object(Path(__file__).parent), "holds no meshes .*: name the folder of an object, or its files"
+    ),
+    "weights": (lambda: load_object(weights=3), "^weights is 3; it must be a path"),
+    "a scene": (lambda: load_object("rope", scene=3), "^scene is 3; it must be a path"),
+    "units": (
+        lambda: load_object("x.stl", units="feet"), "^units is 'feet'; it must be one of mm, cm, m, in: give"
+    ),
+    "deformations": (
+        lambda: load_object("x.stl", deformations="hard"),
+        "^deformations is 'hard'; it must be one of auto, rigid, soft, stiff, articulated: give for example 'auto'$",
+    ),
+    "robot meshes": (lambda: load_object("x.urdf", robot_meshes=3), "is 3; it must be one of visual, collision"),
+    "deformations of a scene": (
+        lambda: load_object(toy_scene(), deformations="stiff"),
+        "^the deformations are stiff, but .* says its own: l"
+    ),
+    "units of weights": (
+        lambda: load_object("rope", units="mm"), "^the units are mm, but rope says its own: leave"
+    ),
+    "units of a scene": (lambda: load_object("rope.yaml", units="mm"), "rope.yaml says its own: leave them out"),
+    "isolation": (
+        lambda: answered(isolation=3), "^isolation is 3; it must be an IsolationConfig"
+    ),
+    "an extent": (
+        lambda: answered(extent="half"),
+        "^extent is 'half'; it must be one of auto, whole, partial"
+    ),
+    "a box": (
+        lambda: answered(box=3), r"^the box is 3; it must be 6 numbers: give them in metres$"
+    ),
+    "a short range": (
+        lambda: answered(depth_range=(1,)), r"^the depth range is \(1,\); it must be 2 numbers"
+    ),
+    "a pose": (
+        lambda: answered(initial_pose="x"), "^the pose is of the shape .*must be 4 x 4 finite"
+    ),
+    "a ragged pose of a tracker": (
+        lambda: mereo.Tracker(MODEL, initial_pose=[[1], [1, 2]]), "^the pose is of the shape .*must be 4 x"
+    ),
+    "what to view": (lambda: mereo.view(3, block=False), "^input is 3; it must be a path"),
+    "a port": (
+        lambda: mereo.view("x.glb", port=-1), "^port is -1; it must be a whole number, from 0 to 65535: give for"
+    ),
+    "a folder": (lambda: mereo.generate("rope", 3, examples=1), "^the folder is 3; it must be a path: give a text"),
+    "minutes": (lambda: mereo.learn("rope", "x", minutes=-1), "^minutes is -1; it must be greater than 0: give for"),
+    "what to learn": (lambda: mereo.learn(3, "x"), "^object is 3; it must be a path"),
+    "a unit of what is learned": (
+        lambda: mereo.learn("rope", "x", units="feet"), "^units is 'feet'; it must be one of mm, cm"
+    ),
+    "a format": (
+        lambda: mereo.export("rope", "x", "onxx"), "^format is 'onxx'; it must be one of onnx, torch: give for"
+    ),
+    "a unit in words": (lambda: load_frame(seen(), unit_m="mm"), "^unit_m is 'mm'; it must be greater than 0"),
+    "a negative id": (lambda: load_frame(seen(), mask_value=-1), "values are .-1,.; they must be whole numb"),
+    "a mask's id without one": (lambda: load_frame(seen(), mask_value=1), "mask_value is given for a frame"),
+    "three masks": (lambda: masked(np.ones((3, 32, 32), bool)), r"\(3, 32, 32\) .* masks\[scores.argmax\(\)\]"),
+    "floats of a byte": (lambda: masked(np.eye(32) * 255), "from 0 to 255; they must be logits, or probabilities from"),
+    "a small mask": (lambda: masked(np.arange(4).reshape(2, 2)), "^the mask is 2 x 2 pixels but the depth image is "),
+    "an empty mask": (lambda: masked(np.zeros((32, 32))), "measures 0 pixels inside the mask"),
+    "ids": (lambda: masked(np.arange(1024).reshape(32, 32)), "^the mask has the values 0, .* give mask_value=1023 or"),
+    "a mask that is none": (lambda: masked([[1], [1, 0]]), "^the mask, a list, is no array .*: give h x w truth"),
+    "a mask of a cloud": (lambda: load_frame(seen(), mask=np.eye(32)), "is a point cloud, which has no pixels"),
+    "a point in space": (lambda: IsolationConfig(point=(1, 2, 3)), "it must be the column and the row of a pixel"),
+    "axes of a frame": (
+        lambda: reconstruct(load_frame("rope"), MODEL, axes="scanner"),
+        "axes is given for a frame that is read already: give it where",
+    ),
+    "a misspelled method": (
+        lambda: answered(method="fulll"), "^method is 'fulll'; it must be one of auto, .*: give for example 'auto'"
+    ),
+    "a unit below zero": (lambda: answered(unit_m=-1), "the unit is -1 m; it must be positive"),
+    "a misspelled frame": (lambda: load_frame("bunnny"), "there is no frame 'bunnny'; give a file or one of the sh"),
+    "a unit of a shipped frame": (
+        lambda: load_frame("rope", unit_m=0.001), "the shipped frame 'rope' is in metres and needs no options"
+    ),
+    "a mask's file": (lambda: load_frame(seen(), mask="m.png"), "mask is given for a frame that is no file's: leave"),
+    "a preset": (lambda: mereo.train("x", "x", "tinny"), "the preset is 'tinny'; it must be one of paper, .*: correct"),
+    "a train": (lambda: mereo.learn("rope", "x", train="once"), "train is 'once'; it must be one of auto, always, n"),
+    "another suffix": (
+        lambda: Result.save(MagicMock(), "x.stl"), r"x.stl has the suffix '.stl'; one file is .glb, .ply, .*: choose"
+    ),
+    "two formats": (lambda: Result.save(MagicMock(), "x.glb", formats=("ply",)), "one file, whose suffix says its"),
+    "a format's name": (lambda: Result.save(MagicMock(), "x", formats=("plx",)), "there is no format 'plx'"),
+    "a matrix by its name": (lambda: load_frame(METRES, K=K), "there is no option 'K' here: intrinsics=K has it"),
+    "a masked array": (lambda: load(K, np.ma.masked_all((24, 32))), "depth image measures 0 pixels in the image"),
+    "no vertex": (lambda: load_object((POINTS, [[0, 1, 7]])), "^segment 'part1' has a face that refers to vertex 7 of"),
+    "no face": (lambda: load_object({"lid": trimesh.Trimesh()}), "^segment 'lid' has no faces; it must be"),
+    "a negative unit": (lambda: replace(load_frame(seen()), unit_m=-1.0), "unit_m is -1.0; it must be greater"),
 }  # fmt: skip
 
 
@@ -400,6 +592,6 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
 def test_what_cannot_be_is_refused_in_a_sentence(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # the check of types that tests put before it
     call, sentence = REFUSED[line]
-    with pytest.raises((ValueError, TypeError), match=sentence) as caught:
+    with pytest.raises((ValueError, TypeError, OSError), match=sentence) as caught:
         call()
     assert len(str(caught.value).splitlines()) == 1

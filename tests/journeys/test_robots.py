@@ -1,5 +1,6 @@
 """Robots of URDF and SDF files: their joints are found in frames by name, and bad files are one sentence."""
 
+import json
 import pickle
 import re
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 import yaml
 from folder_contents import read_json
 from numpy.random import default_rng
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from page_blocks import blocks
 from robot_files import LAPTOP, LAPTOP_SDF, write_gripper
 
@@ -96,16 +97,33 @@ def test_shapes_of_collisions_stand_in_where_none_are_visual(tmp_path: Path) -> 
         assert high[2] == pytest.approx(0.041, abs=1e-4)  # a round part that is joined to the lid
 
 
-def test_a_link_without_visual_shapes_has_those_for_collisions(tmp_path: Path) -> None:
-    base, lid = LAPTOP.split('<link name="lid">')
-    ball = "<collision><geometry><sphere radius='0.4'/></geometry></collision></link>"
-    note = "link 'base' has no visual shape, so those for collisions are taken"
-    for first, notes in ((base.replace("visual", "collision"), (note,)), (base.replace("</link>", ball), ())):
-        path = tmp_path / "laptop.urdf"
+BALL = "<collision><geometry><sphere radius='0.4'/></geometry></collision></link>"
+
+
+def test_a_link_has_the_meshes_that_are_named_or_else_the_others(tmp_path: Path) -> None:
+    (base, lid), box, path = LAPTOP.split('<link name="lid">'), [0.3, 0.2, 0.02], tmp_path / "laptop.urdf"
+    bare, both = base.replace("visual", "collision"), base.replace("</link>", BALL)
+    for first, meshes, sides, lacking in (
+        (bare, "visual", box, ["base"]),
+        (both, "visual", box, []),
+        (both, "collision", [0.8] * 3, ["lid"]),
+    ):
         path.write_text(f'{first}<link name="lid">{lid}')
-        robot = read_robot(path)
-        assert_allclose(np.ptp(robot.mesh.segments[0].bounds, axis=0), [0.3, 0.2, 0.02], atol=1e-9)
-        assert robot.mesh.names == ("base", "lid") and robot.notes == notes
+        robot = read_robot(path, meshes)
+        assert_allclose(np.ptp(robot.mesh.segments[0].bounds, axis=0), sides, atol=2e-3)
+        assert robot.notes == tuple(f"link {name!r} has no {meshes} shape, so its others are taken" for name in lacking)
+
+
+def test_an_option_names_the_meshes_and_a_scene_file_keeps_it(
+    working_folder: Path, capsys: pytest.CaptureFixture
+) -> None:
+    Path("laptop.urdf").write_text(LAPTOP.replace("</link>", BALL, 1))
+    command_line.main(["scene", "new", "laptop.urdf", "--robot-meshes", "collision"])
+    scene = mereo.load_object("laptop.urdf", robot_meshes="collision").scene
+    assert_array_equal(load_scene("laptop.yaml").rest.merged()[0], scene.rest.merged()[0])
+    assert np.ptp(scene.rest.bounds[:, 0]) * scene.unit_m == pytest.approx(0.8, abs=1e-3)
+    assert command_line.main(["scene", "new", "box.obj", "--robot-meshes", "collision"]) == 2
+    assert "--robot-meshes is collision, but box.obj is no robot's file: leave it out" in capsys.readouterr().err
 
 
 MJCF = """<mujoco><compiler angle="radian"/><worldbody><geom type="plane" size="1 1 .1"/>
@@ -134,6 +152,9 @@ def test_a_simulators_robot_has_its_joints_at_zero(tmp_path: Path) -> None:
     ]
     for segment, expected in zip(robot.mesh.segments, bounds, strict=True):
         assert_allclose(segment.bounds, expected, atol=2e-4)
+    assert_allclose(
+        read_robot(path, "collision").mesh.segments[2].bounds, [[0.025, -0.005, 0.51], [0.035, 0.005, 0.59]]
+    )
     joints = {joint.name: joint for joint in robot.joints}
     assert {name: joint.moved for name, joint in joints.items()} == {
         "finger": ("left",), "other": ("right", "nail"), "bend": ("nail",), "twist": ("nail",)
@@ -322,6 +343,19 @@ def test_the_commands_of_the_page_give_the_joints_of_a_gripper(
     assert result.joints["finger"].value == pytest.approx(facts["finger"]["value"], abs=1e-6)
     assert isinstance(held := variables["held"], mereo.Result) and held.known is True
     assert held.joints["finger"].interval == pytest.approx((true, true), abs=1e-12)
+
+
+def test_each_frame_of_a_stream_has_the_joints_of_its_moment(
+    gripper: Path, working_folder: Path, capsys: pytest.CaptureFixture
+) -> None:
+    Path("frames").mkdir()
+    scene = scene_of_meshes([gripper])
+    true = [write_frame(Path(f"frames/{i}.ply"), scene, 0.4 + 0.03 * i, 5) for i in range(6)]
+    command_line.main(["stream", "frames", "--object", str(gripper), "--unit-m", "1", "--every-frame"])
+    lines = [*map(json.loads, capsys.readouterr().out.splitlines())]
+    assert [line["tracking"] for line in lines] == ["found", *["followed"] * 5]
+    fingers = [[line["joints"][name]["value"] for line in lines] for name in ("finger", "other finger")]
+    assert_allclose(fingers, [true, 0.5 * np.array(true) + 0.002], atol=2e-4)
 
 
 # --- joints whose values are known ------------------------------------------------------------------------------------

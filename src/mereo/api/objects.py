@@ -14,20 +14,21 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from mereo.api.words import python_words
+from mereo.api.words import check_names, names_of, python_words
 from mereo.deformation.samplers import RandomMotion, Range
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.register import Registrar, other_mesh, registrar_for, statistical_model_of
 from mereo.geometry.conventions import LengthUnit, Way
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.bounds import check_value
+from mereo.io.config import MeshesConfig, RobotMeshes
 from mereo.io.errors import checked_path
 from mereo.io.extras import has_network, network_needed
 from mereo.io.mesh_formats import MESH_SUFFIXES
 from mereo.io.point_arrays import mesh_of
 from mereo.io.progress import stage
 from mereo.io.writers.meshes import write_segments_obj
-from mereo.models.config import Device, InferenceConfig, Precision
+from mereo.models.config import InferenceConfig
 from mereo.models.trained import Trained
 from mereo.models.weights_place import is_weights, shipped_names, statistical_model_in
 from mereo.scenes.files.object_files import SCENE, names_scene, scene_of_folder, scene_of_meshes, shapes_in
@@ -40,7 +41,7 @@ from mereo.scenes.statistical_model import StatisticalModel
 Source = Any
 """An ``Object``, or what it is loaded from: a scene, weights, files, or meshes in memory."""
 
-OPTIONS = ("scene", "weights", "units", "deformations", "device", "precision")
+OPTIONS = ("scene", "weights", *names_of(MeshesConfig), *names_of(InferenceConfig))
 """Options of ``load_object``."""
 
 
@@ -170,8 +171,8 @@ def load_object(
     weights: Trained | str | Path | None = None,
     units: LengthUnit | None = None,
     deformations: Way = "auto",
-    device: Device = "auto",
-    precision: Precision = "auto",
+    robot_meshes: RobotMeshes = "visual",
+    **inference: Any,
 ) -> Object:
     """Load an object that can be found in frames.
 
@@ -189,36 +190,37 @@ def load_object(
         deformations: how an object of meshes moves, as in ``mereo scene new``: "rigid", "soft" or "stiff" (as an
             elastic solid), or "articulated" (by the joints that its contacts suggest); "auto" is articulated where it
             has such joints, else soft.
-        device: where a network computes; "auto" takes a CUDA device where there is one.
-        precision: of its products; "float32" is exact.
+        robot_meshes: which meshes of a robot's file stand for its links, "visual" or "collision"; a link without them
+            has the others.
+        inference: ``device``, where a network computes; "auto" takes a CUDA device where there is one; and
+            ``precision`` of its products; "float32" is exact.
 
     Objects without weights get a statistical model of their scene's random states, in seconds, which is kept in the
     user's cache for the next time. Raises ``FileNotFoundError`` where there is no such file or name, ``ValueError`` for
-    other files and for meshes without volume, ``ImportError`` for weights without the extra `network`.
+    other files and for meshes without volume, ``ImportError`` for weights without the extra `network`, and
+    ``TypeError`` for an option that there is none of.
     """
-    if units is not None:
-        check_value("units", units, LengthUnit, "mm")
-    check_value("deformations", deformations, Way, "rigid")
-    inference = InferenceConfig(device, precision)
+    check_names(inference, OPTIONS)
+    meshes, computing = MeshesConfig(units, deformations, robot_meshes), InferenceConfig(**inference)
     network = weights if source is None else source
     if isinstance(network, Trained) or (isinstance(network, str | Path) and (source is None or is_weights(network))):
         if source is not None and weights is not None:
             raise ValueError(f"{source} has weights, and weights are named too: name one of them")
-        _check_meshless(network.name if isinstance(network, Trained) else network, units, deformations)
+        _check_meshless(network.name if isinstance(network, Trained) else network, meshes)
         if scene is None and str(source) in SCENES and not has_network():
             return _built_in_by_model(str(source))
         scene = _learned_scene(network) if scene is None else scene
         if not isinstance(scene, Scene | None):
             scene = load_scene(str(checked_path(scene, "scene")))
-        return Object(load_weights(network, inference), scene)
+        return Object(load_weights(network, computing), scene)
     if weights is not None and not isinstance(weights, Trained):
         checked_path(weights, "weights")
     if source is None:
         raise ValueError("no object is given; name its meshes, its scene or its weights")
     if scene is not None:
         raise ValueError(f"{source} is no weights and has its own scene, but another one is named: leave it out")
-    loaded = None if weights is None else load_weights(weights, inference)  # first, for a scene may take long
-    scene = _scene(source, units, deformations)
+    loaded = None if weights is None else load_weights(weights, computing)  # first, for a scene may take long
+    scene = _scene(source, meshes)
     if loaded is None:
         return Object(None, scene, model=kept_model(scene))
     if loaded.statistical_model is not None and (fault := other_mesh(scene, loaded.statistical_model)):
@@ -266,14 +268,16 @@ def _learned_scene(weights: Trained | str | Path) -> str | None:
     return scene if scene is not None and (scene in SCENES or Path(scene).is_file()) else None
 
 
-def _check_meshless(source: object, units: LengthUnit | None, deformations: Way) -> None:
+def _check_meshless(source: object, meshes: MeshesConfig) -> None:
     """Raise ``ValueError`` for what is stated of meshes, where the object is of none."""
-    for what, value in (("units", units), ("deformations", None if deformations == "auto" else deformations)):
-        if value is not None:
-            raise ValueError(f"the {what} are {value}, but {source or 'the object'} says its own: leave them out")
+    for what, value in vars(meshes).items():
+        if value != getattr(MeshesConfig, what):
+            raise ValueError(
+                f"the {what.replace('_', ' ')} are {value}, but {source or 'the object'} says its own: leave them out"
+            )
 
 
-def _scene_in_memory(mesh: SegmentedMesh, units: LengthUnit | None, deformations: Way) -> Scene:
+def _scene_in_memory(mesh: SegmentedMesh, meshes: MeshesConfig) -> Scene:
     """Scene of a mesh that no file has; sentences about it name one, object.obj, or that of its one segment."""
     with TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -281,7 +285,7 @@ def _scene_in_memory(mesh: SegmentedMesh, units: LengthUnit | None, deformations
         path = Path(folder) / f"{name}.obj"
         write_segments_obj(path, mesh)
         try:
-            scene = scene_of_meshes([path], units, deformations)
+            scene = scene_of_meshes([path], **vars(meshes))
         except ValueError as error:
             raise ValueError(str(error).replace(str(path), path.name)) from None
     for warning in caught:
@@ -289,14 +293,14 @@ def _scene_in_memory(mesh: SegmentedMesh, units: LengthUnit | None, deformations
     return scene
 
 
-def _scene(source: Source, units: LengthUnit | None, deformations: Way) -> Scene:
+def _scene(source: Source, meshes: MeshesConfig) -> Scene:
     """Scene of what has no weights."""
     if isinstance(source, Scene):
-        _check_meshless(source.name, units, deformations)
+        _check_meshless(source.name, meshes)
         return source
     assert not isinstance(source, Trained)
     if (mesh := mesh_of(source)) is not None:
-        return _scene_in_memory(mesh, units, deformations)
+        return _scene_in_memory(mesh, meshes)
     given: Sequence[object] = [source] if isinstance(source, str | Path) else source
     if not isinstance(given, Sequence) or not all(isinstance(file, str | Path) and str(file) for file in given):
         raise ValueError(
@@ -315,11 +319,11 @@ def _scene(source: Source, units: LengthUnit | None, deformations: Way) -> Scene
     if not files:
         raise ValueError("no object is given; name its meshes, one file for each segment, or its scene file")
     if names_scene(files):
-        _check_meshless(files[0], units, deformations)
+        _check_meshless(files[0], meshes)
         return load_scene(files[0] if files[0].suffix else str(files[0]))
     if len(files) == 1 and files[0].suffix == "" and not files[0].exists():
         raise FileNotFoundError(
             f"there is no object {str(files[0])!r}: name its meshes, its scene file, a folder of mereo learn, a "
             f"built-in scene ({', '.join(SCENES)}), or weights ({', '.join(shipped_names())}, or a .safetensors file)"
         )
-    return scene_of_meshes(files, units, deformations)
+    return scene_of_meshes(files, **vars(meshes))

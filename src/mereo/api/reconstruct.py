@@ -58,11 +58,14 @@ RECONSTRUCT_OPTIONS = {
 
 PLACES = {
     "frame": "axes='scanner' states the axes",
+    **dict.fromkeys(("K", "camera"), "intrinsics=K has it"),
     **dict.fromkeys(
         ("output", "formats", "millimetres", "force"), "result.save(path, formats=..., overwrite=True) has it"
     ),
     **dict.fromkeys(("carry", "carry_frame"), "result.carry(what, files=...) has it"),
-    **dict.fromkeys(("json", "threads", "ray", "task", "options_from"), "the command alone has it"),
+    **dict.fromkeys(
+        ("json", "threads", "ray", "cpus_per_task", "gpus_per_task", "options_from"), "the command alone has it"
+    ),
 }
 """Where options of `mereo reconstruct` are in Python that are none of ``reconstruct``."""
 

@@ -21,9 +21,8 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 from tyro.conf import Positional, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
-from mereo.geometry.conventions import LengthUnit, Way
 from mereo.io.bounds import check_values
-from mereo.io.config import InputConfig
+from mereo.io.config import InputConfig, MeshesConfig
 from mereo.io.object_storage import Place, place_of
 from mereo.models.config import InferenceConfig
 from mereo.reconstruction.config import IsolationConfig
@@ -83,9 +82,6 @@ InputName = Annotated[Positional[str], arg(metavar="INPUT")]
 ScanCloud = Annotated[Positional[Path], arg(metavar="SCAN")]
 AssetNames = Annotated[Positional[tuple[str, ...]], arg(metavar="[ASSET ...]", help_behavior_hint="")]
 
-MeshUnits = LengthUnit | None
-"""Unit of meshes; None guesses."""
-
 ConfigFile = Annotated[Path | None, arg(name="config")]
 """Option of commands that read their options from a file."""
 
@@ -100,8 +96,7 @@ class FrameOptions:
     Attributes:
         object: what is looked for, as for `mereo reconstruct`: its meshes or its scene.
         weights: a shipped name or a file; with --object they start the fit, without they say what is looked for.
-        units: of the object's meshes; guessed where not given.
-        deformations: how an object of meshes moves, as for `mereo scene new`: rigid, soft, stiff or articulated.
+        meshes: what files of meshes do not say.
         joints: file of joints whose values are known, as for `mereo reconstruct`.
         reading: how a frame is read.
         isolation: what of a frame is left out.
@@ -110,8 +105,7 @@ class FrameOptions:
 
     object: tuple[str, ...] = ()
     weights: str | None = None
-    units: MeshUnits = None
-    deformations: Way = "auto"
+    meshes: Annotated[MeshesConfig, arg(name="")] = field(default_factory=MeshesConfig)
     joints: Path | None = None
     reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
     isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
@@ -146,10 +140,8 @@ def loaded_object(command: FrameOptions, inference: InferenceConfig | None = Non
         command.joints,
         scene=scene,
         weights=command.weights,
-        units=command.units,
-        deformations=command.deformations,
-        device=inference.device,
-        precision=inference.precision,
+        **vars(command.meshes),
+        **vars(inference),
     )
 
 

@@ -461,9 +461,9 @@ def print_segments(result: Result) -> None:
         table.add_column(column, justify="right")
     sure = None if result.registered is None else result.registered.uncertainty
     for segment in reconstruction.segments:
-        # radii give the digits, three at most of a volume; they are in the report, and would break lines of 80 columns
+        # radii give the digits; they are in the report, and would break lines of 80 columns
         between = None if sure is None else sure.segments[segment.label - 1].volume95
-        volume = min(unit.volume(segment.volume), unit.volume(segment.volume, between).partition(" (")[0], key=len)
+        volume = unit.volume(segment.volume, between).partition(" (")[0]
         centroid = unit.place(segment.centroid, result[segment.name].error_radius).partition(" ±")[0]
         confidence = [f"{segment.confidence:.2f}"] if has_confidence else []
         row = (volume, *confidence, str(segment.components), centroid)

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
-from mereo.cli.options import AssetNames, MeshUnits, ObjectFiles, SceneName
-from mereo.geometry.conventions import Way
+from mereo.cli.options import AssetNames, ObjectFiles, SceneName
 from mereo.io.bounds import Aperture, CountOrNone, States
+from mereo.io.config import MeshesConfig
 from mereo.synthesis.config import SENSORS, Sensor, SequenceConfig
 
 if TYPE_CHECKING:
@@ -42,31 +42,21 @@ class SceneNew:
         files: one mesh for each segment (STL, PLY, OBJ, OFF), one file of named parts (GLB, OBJ, 3MF), a robot (URDF,
             SDF, MJCF), one label volume (NIfTI, NRRD), or one for each segment.
         output: the YAML file; by default called after the first file, in the working directory.
-        units: of the files; guessed where not given.
         aperture: of the cone of directions from which your camera looks, about the side that is up, in degrees; 360 is
             all around, with any roll.
-        deformations: how the object moves: rigid, soft or stiff (as an elastic solid), or articulated (by the joints
-            that its contacts suggest); auto is articulated where there are such joints, else soft.
+        meshes: what the files do not say.
     """
 
     files: ObjectFiles
     output: Path | None = None
-    units: MeshUnits = None
     aperture: Aperture = 360.0
-    deformations: Way = "auto"
+    meshes: Annotated[MeshesConfig, arg(name="")] = field(default_factory=MeshesConfig)
 
     def run(self) -> None:
         """Write the scene file, and print what was found and what to do next."""
         from mereo.scenes.files.template import write_scene_file
 
-        path = write_scene_file(
-            self.files,
-            self.output,
-            self.units,
-            aperture=self.aperture,
-            report=print,
-            deformations=self.deformations,
-        )
+        path = write_scene_file(self.files, self.output, aperture=self.aperture, report=print, **vars(self.meshes))
         named = shlex.quote(str(path))
         print(f"wrote {path}; read it, then:")
         print(f"  mereo scene check {named}")

@@ -9,7 +9,6 @@ from tyro.conf import arg
 from mereo.cli.options import (
     ConfigFile,
     DatasetFolder,
-    MeshUnits,
     ObjectFiles,
     Outcome,
     PlaceOption,
@@ -19,7 +18,7 @@ from mereo.cli.options import (
     options_of,
 )
 from mereo.fitting.config import AnswerMethod
-from mereo.geometry.conventions import WorkspaceName
+from mereo.geometry.conventions import LengthUnit, WorkspaceName
 from mereo.io.bounds import Count, CountOrNone, ImageSize, NotNegative, Positive, Threads, Workers
 from mereo.io.config import CONFIG
 from mereo.io.cores import workers_for
@@ -279,7 +278,7 @@ class LearnCommand:
     minutes: Positive = 10.0
     train: Literal["auto", "always", "never"] = "auto"
     init: str = ""
-    units: MeshUnits = None
+    units: LengthUnit | None = None
     workers: Workers = 0
     threads: Threads = 0
     ray: RayAddress = None

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from mereo.geometry.conventions import CloudAxes
-from mereo.io.bounds import IndexOrNone, PositiveOrUnknown, check_bounds
+from mereo.geometry.conventions import CloudAxes, LengthUnit, Way
+from mereo.io.bounds import IndexOrNone, PositiveOrUnknown, check_bounds, check_value
 
 CONFIG = "config.json"
 """Name of the file of options that a folder of results was made with; ``--config`` reads it."""
@@ -26,6 +26,32 @@ class FilesConfig:
 
     formats: tuple[Format | Literal["all"], ...] = ("glb", "npz", "json")
     millimetres: bool = False
+
+
+RobotMeshes = Literal["visual", "collision"]
+"""Meshes of a robot's links, see ``MeshesConfig.robot_meshes``."""
+
+
+@dataclass(frozen=True)
+class MeshesConfig:
+    """Settings of an object's meshes: what their files do not say.
+
+    Attributes:
+        units: of the object's meshes; guessed where not given.
+        deformations: how an object of meshes moves: rigid, soft or stiff (as an elastic solid), or articulated (by the
+            joints that its contacts suggest); auto is articulated where there are such joints, else soft.
+        robot_meshes: which of a robot's file stand for its links: visual, or collision; a link without them has the
+            others.
+    """
+
+    units: LengthUnit | None = None
+    deformations: Way = "auto"
+    robot_meshes: RobotMeshes = "visual"
+
+    def __post_init__(self) -> None:
+        if self.units is not None:
+            check_value("units", self.units, LengthUnit, "mm")
+        check_bounds(self)
 
 
 Space = Literal["RAS", "LPS"]

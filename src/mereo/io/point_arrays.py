@@ -10,6 +10,7 @@ is refused: an image of depths has no positions without its camera, and the colu
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from PIL import Image
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import DepthImage, PointCloud
 from mereo.geometry.conventions import LARGEST, check_real
-from mereo.geometry.mesh import Segment, SegmentedMesh, palette_color
+from mereo.geometry.mesh import Segment, SegmentedMesh, check_segment, palette_color
 from mereo.geometry.transforms import Points
 from mereo.io.errors import reason
 from mereo.io.readers import InputWarning, valid_points
@@ -240,14 +241,16 @@ def depth_values(source: Any) -> Num[np.ndarray, "h w"]:
 
     Args:
         source: h x w numbers, 1 x h x w or h x w x 1, of whatever library; an image of Pillow or Open3D, or the
-            ``depth`` of an RGB-D image; a message of the type sensor_msgs/Image.
+            ``depth`` of an RGB-D image; masked values are pixels without a measurement; a message
+            of the type sensor_msgs/Image.
 
     Raises ``ValueError`` for what is none of these, and for other shapes.
     """
     if all(hasattr(source, name) for name in ("encoding", "step", "data", "height", "width")):
         return _decoded(depth_pixels, source, "Image")
     source = getattr(source, "depth", source)
-    raw = _array(source, f"the depth image, a {type(source).__name__},", "pixels are needed: give h x w values")
+    kind = f"the depth image, a {type(source).__name__},"
+    raw = np.ma.filled(_array(source, kind, "pixels are needed: give h x w values"), 0)
     check_real(raw, "the depth image")
     values = raw.squeeze() if raw.ndim > 2 else raw  # of networks
     if values.ndim != 2:
@@ -266,12 +269,12 @@ def mesh_of(source: Any) -> SegmentedMesh | None:
             A part is a ``Segment``, an object with vertices and faces (trimesh, Open3D, PyVista), or a tuple (vertices,
             faces). Parts without a name are called part1, part2, ...
 
-    Raises ``ValueError`` for a mapping or list of which not all are parts, and for other faces than triangles.
+    Raises ``ValueError`` for a mapping or list of which not all are parts, for no faces and others than triangles.
     """
     if isinstance(source, SegmentedMesh):
         return source
     named: Any = parts_of_scene(source)
-    if not isinstance(named, Mapping):
+    if not (is_named := isinstance(named, Mapping)):
         is_list = isinstance(source, list | tuple) and _triangles(source) is None
         named = dict(enumerate(source if is_list else [source]))
         if _triangles(named.get(0)) is None:
@@ -282,9 +285,10 @@ def mesh_of(source: Any) -> SegmentedMesh | None:
             raise ValueError(f"the part {key!r} of the object is no mesh, as all must be: give its vertices and faces")
         known = getattr(part, "metadata", None) or {}
         file = known.get("file_name") or f"part{index + 1}"
-        name = key if isinstance(key, str) else getattr(part, "name", None) or known.get("name") or Path(file).stem
+        name = str(key) if is_named else getattr(part, "name", None) or known.get("name") or Path(file).stem
         color = getattr(part, "color", palette_color(index))
-        segments.append(Segment(name, color, *mesh, solid=getattr(part, "solid", False)))
+        check_segment(open_segment := Segment(name, color, *mesh, solid=False))
+        segments.append(replace(open_segment, solid=getattr(part, "solid", False)))
     return SegmentedMesh(tuple(segments)) if segments else None
 
 

@@ -269,6 +269,11 @@ def _chosen_pixels(
     channels = stored.reshape(*stored.shape[:2], -1)
     ids, has_ids = channels.max(axis=-1), bool((channels == channels[..., :1]).all())
     mask = np.asarray(shown.reshape(*shown.shape[:2], -1).any(axis=-1))
+    if size is not None and mask.shape != (size[1], size[0]):
+        raise ValueError(
+            f"{name} is {mask.shape[1]} x {mask.shape[0]} pixels but the depth image is "
+            f"{size[0]} x {size[1]}; they must agree: export the mask at the depth image's size"
+        )
     present, counts = np.unique(ids[mask], return_counts=True)
     seen = listed(f"{value:g}" for value in np.unique(ids))
     is_soft = is_lossy or (has_ids and len(present) > 1 and present[-1] == present[counts.argmax()] in FULL)
@@ -294,11 +299,6 @@ def _chosen_pixels(
         raise ValueError(
             f"{name} has the values {seen}, which may be ids of several things; the object's are needed: give "
             f"--mask-value {present[-1]:g} or others"
-        )
-    if size is not None and mask.shape != (size[1], size[0]):
-        raise ValueError(
-            f"{name} is {mask.shape[1]} x {mask.shape[0]} pixels but the depth image is "
-            f"{size[0]} x {size[1]}; they must agree: export the mask at the depth image's size"
         )
     return mask
 

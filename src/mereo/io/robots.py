@@ -21,6 +21,7 @@ from mereo.geometry.conventions import LARGEST
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, palette_color
 from mereo.geometry.mesh_check import united
 from mereo.geometry.transforms import Transform, Vector, inverse_rigid, rigid, transform_points
+from mereo.io.config import RobotMeshes
 from mereo.io.errors import readable
 from mereo.io.extras import library
 from mereo.io.mesh_formats import read_object_mesh
@@ -66,7 +67,7 @@ class Robot:
         mesh: a segment for each link that moves, with all links fixed to it, called after the first of them that has a
             shape; where all joints are zero.
         joints: those that move some of the segments against others, the tip of each chain first.
-        notes: sentences about joints that are left out, and about links with shapes for collisions alone.
+        notes: sentences about joints that are left out, and about links without shapes of the kind that is taken.
     """
 
     mesh: SegmentedMesh
@@ -84,18 +85,22 @@ def is_robot(path: Path) -> bool:
         return b"<mujoco" in file.read(HEAD_BYTES)
 
 
-def read_object_file(path: Path) -> SegmentedMesh:
+def read_object_file(path: Path, robot_meshes: RobotMeshes = "visual") -> SegmentedMesh:
     """Segments of an object's file: the links of a robot where all joints are zero, else as ``read_object_mesh``.
 
-    Raises as ``read_robot`` and ``read_segmented_mesh`` do.
+    Raises as ``read_robot`` and ``read_segmented_mesh`` do, and ``ValueError`` for collision meshes of another file.
     """
-    return read_robot(path).mesh if path.suffix.lower() in ROBOT_SUFFIXES else read_object_mesh(path)
+    if path.suffix.lower() in ROBOT_SUFFIXES:
+        return read_robot(path, robot_meshes).mesh
+    if robot_meshes != "visual":
+        raise ValueError(f"--robot-meshes is {robot_meshes}, but {path} is no robot's file: leave it out")
+    return read_object_mesh(path)
 
 
-def read_robot(path: str | Path) -> Robot:
+def read_robot(path: str | Path, robot_meshes: RobotMeshes = "visual") -> Robot:
     """Read a robot from a URDF, SDF or MJCF file, with the meshes that it names.
 
-    Shapes are those of the visual elements, and of links that have none, of the collision elements.
+    Shapes are those of the visual or of the collision elements, and of links that have none of these, the others.
     ``package://NAME/...`` and ``model://NAME/...`` are looked for in the folders above the file.
 
     Raises ``FileNotFoundError`` for a missing file or mesh; ``ValueError`` for a damaged file, a joint that is neither
@@ -111,11 +116,13 @@ def read_robot(path: str | Path) -> Robot:
         if any("xacro" in element.tag for element in root.iter(etree.Element)):
             raise ValueError("it is a macro file, whose links are known once `xacro` has expanded it")
         if kind == "MJCF":
-            return _assembled(_read_mjcf(path, yourdfpy, library("mujoco", "simulation", path)))
+            return _assembled(_read_mjcf(path, yourdfpy, library("mujoco", "simulation", path), robot_meshes))
         if kind == "URDF":
             described = _read_urdf(yourdfpy, root, etree.tostring(root, encoding="utf-8"))
         else:
             described = _read_sdf(yourdfpy, root)
+        for link in described.links if robot_meshes == "collision" else ():
+            link.visuals, link.collisions = link.collisions, link.visuals
         for joint in described.joints:
             joint.axis = np.reshape(joint.axis, 3)
         every = [(link.name, each) for link in described.links for each in (link.visuals or link.collisions)]
@@ -130,11 +137,13 @@ def read_robot(path: str | Path) -> Robot:
         else:
             shapes.append(_Shape(link, _origin(each), solid))
     known = tuple((name, state.st_ino, state.st_size, state.st_mtime_ns) for name, state in states)
-    return _assembled(_Described(path, described, shapes, known))
+    return _assembled(_Described(path, described, shapes, known, robot_meshes))
 
 
 def _solid(geometry: Any) -> trimesh.Trimesh | None:
-    """Solid of a box, cylinder or sphere; None of a mesh, whose scale gets three numbers."""
+    """Solid of a box, cylinder or sphere, or that it is; None of a mesh, whose scale gets three numbers."""
+    if isinstance(geometry, trimesh.Trimesh):
+        return geometry
     if geometry.mesh is not None:
         geometry.mesh.scale = np.ones(3) * (1.0 if geometry.mesh.scale is None else geometry.mesh.scale)
         return None
@@ -199,7 +208,7 @@ def _read_sdf(yourdfpy: Any, root: Any) -> Any:
         for kind, shapes in (("visual", link.visuals), ("collision", link.collisions)):
             for each in element.iterfind(kind):
                 place = inverse_rigid(frames[link.name]) @ pose(each, link.name)
-                shapes += [yourdfpy.Visual(None, place @ shift, what) for shift, what in _geometries(yourdfpy, each)]
+                shapes.append(yourdfpy.Visual(None, place, _geometry(yourdfpy, each)))
         links.append(link)
     return yourdfpy.Robot(model.get("name"), links, joints)
 
@@ -227,33 +236,28 @@ def _number(element: Any, key: str, default: str) -> float:
     return _numbers(element.findtext(key) or default, 1)[0]
 
 
-def _geometries(yourdfpy: Any, element: Any) -> Iterator[tuple[Transform, Any]]:
-    """Shapes of a visual or collision element of an SDF file, and where they are in it."""
+def _geometry(yourdfpy: Any, element: Any) -> Any:
+    """Shape of a visual or collision element of an SDF file: a solid, or yourdfpy's of one that names a mesh."""
     shape = element.find("geometry/*")
     if shape is None:
         raise ValueError(f"its <{element.tag}> {element.get('name')!r} has no geometry")
-    sizes = {each.tag: each.text for each in shape}
-    round_sizes = [_numbers(sizes[key], 1)[0] for key in ("radius", "length") if key in sizes]
     if shape.tag == "mesh":
-        mesh = yourdfpy.Mesh((sizes["uri"] or "").strip(), np.array(_numbers(sizes.get("scale", "1 1 1"), 3)))
-        yield np.eye(4), yourdfpy.Geometry(mesh=mesh)
-    elif shape.tag == "box":
-        yield np.eye(4), yourdfpy.Geometry(box=yourdfpy.Box(np.array(_numbers(sizes["size"], 3))))
-    elif shape.tag == "sphere":
-        yield np.eye(4), yourdfpy.Geometry(sphere=yourdfpy.Sphere(*round_sizes))
-    elif shape.tag in ("cylinder", "capsule"):
-        radius, length = round_sizes
-        yield np.eye(4), yourdfpy.Geometry(cylinder=yourdfpy.Cylinder(radius, length))
-        for end in (-length / 2, length / 2) if shape.tag == "capsule" else ():
-            yield rigid(np.eye(3), np.array([0.0, 0.0, end])), yourdfpy.Geometry(sphere=yourdfpy.Sphere(radius))
-    else:
-        raise ValueError(f"its <{element.tag}> {element.get('name')!r} is a {shape.tag}, which is not known")
+        scale = np.array(_numbers(shape.findtext("scale", "1 1 1"), 3))
+        return yourdfpy.Geometry(mesh=yourdfpy.Mesh(shape.findtext("uri", "").strip(), scale))
+    if shape.tag == "box":
+        return trimesh.creation.box(_numbers(shape.findtext("size"), 3))
+    if shape.tag == "sphere":
+        return trimesh.creation.icosphere(3, _number(shape, "radius", ""))
+    if shape.tag in ("cylinder", "capsule"):
+        radius, length = (_number(shape, key, "") for key in ("radius", "length"))
+        return getattr(trimesh.creation, shape.tag)(radius=radius, height=length)
+    raise ValueError(f"its <{element.tag}> {element.get('name')!r} is a {shape.tag}, which is not known")
 
 
 # --- MJCF, which its own library reads and compiles -------------------------------------------------------------------
 
 
-def _read_mjcf(path: Path, yourdfpy: Any, mujoco: Any) -> "_Described":
+def _read_mjcf(path: Path, yourdfpy: Any, mujoco: Any, robot_meshes: RobotMeshes) -> "_Described":
     """Robot of an MJCF file: each body is a link, each of its joints carries a frame of its own.
 
     All frames have the axes of the world where all joints are zero. What is fixed in the world is no part of it; its
@@ -262,9 +266,7 @@ def _read_mjcf(path: Path, yourdfpy: Any, mujoco: Any) -> "_Described":
     model = mujoco.MjModel.from_xml_path(str(path))
     data = mujoco.MjData(model)
     kinds = {int(mujoco.mjtJoint.mjJNT_HINGE): "revolute", int(mujoco.mjtJoint.mjJNT_SLIDE): "prismatic"}
-    for number in range(model.njnt):
-        if int(model.jnt_type[number]) in kinds:
-            data.qpos[model.jnt_qposadr[number]] = 0.0
+    data.qpos[model.jnt_qposadr[np.isin(model.jnt_type, list(kinds))]] = 0.0
     mujoco.mj_kinematics(model, data)
     names = [model.body(number).name or f"body {number}" for number in range(model.nbody)]
     links, joints, place = {name: yourdfpy.Link(name) for name in names}, list[Any](), {names[0]: np.zeros(3)}
@@ -278,8 +280,7 @@ def _read_mjcf(path: Path, yourdfpy: Any, mujoco: Any) -> "_Described":
             if kind is not None:
                 lower, upper = joint.range if model.jnt_limited[number] else (-np.inf, np.inf)
                 limit = yourdfpy.Limit(lower=float(lower), upper=float(upper))
-                mimic = _mjcf_leader(model, mujoco, number)
-                mimic = None if mimic is None else yourdfpy.Mimic(*mimic)
+                mimic = _mjcf_mimic(model, mujoco, yourdfpy, number)
                 each = yourdfpy.Joint(name, kind, axis=data.xaxis[number].copy(), limit=limit, mimic=mimic)
                 chain.append((each, data.xanchor[number].copy()))
             elif int(model.jnt_type[number]) == int(mujoco.mjtJoint.mjJNT_BALL) or body != 1 or not is_alone:
@@ -296,27 +297,26 @@ def _read_mjcf(path: Path, yourdfpy: Any, mujoco: Any) -> "_Described":
     shapes = list[_Shape]()
     for body in range(1, model.nbody):
         geoms = np.arange(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
-        is_drawn = (model.geom_contype[geoms] == 0) & (model.geom_conaffinity[geoms] == 0)
-        for geom in geoms[is_drawn] if is_drawn.any() else geoms:
+        collides = (model.geom_contype[geoms] != 0) | (model.geom_conaffinity[geoms] != 0)
+        is_taken = collides == (robot_meshes == "collision")
+        for geom in geoms[is_taken] if is_taken.any() else geoms:
             T = rigid(data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom] - place[names[body]])
             shapes += [_Shape(names[body], T, solid) for solid in _mjcf_solids(model, mujoco, int(geom))]
     compiled = np.empty(mujoco.mj_sizeModel(model), dtype=np.uint8)
     mujoco.mj_saveModel(model, None, compiled)
     robot = yourdfpy.Robot(path.stem, list(links.values()), joints)
-    return _Described(path, robot, shapes, ((str(path), crc32(compiled.tobytes()), len(compiled), 0),))
+    states = ((str(path), crc32(compiled.tobytes()), len(compiled), 0),)
+    return _Described(path, robot, shapes, states, robot_meshes)
 
 
-def _mjcf_leader(model: Any, mujoco: Any, number: int) -> tuple[str, float, float] | None:
+def _mjcf_mimic(model: Any, mujoco: Any, yourdfpy: Any, number: int) -> Any:
     """Joint that another one follows, by which factor and offset; None where no linear constraint says so."""
     for row in np.flatnonzero(model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)):
         first, second, (offset, factor, *curved) = model.eq_obj1id[row], model.eq_obj2id[row], model.eq_data[row, :5]
         if first == number and second >= 0 and not any(curved):
             zero, leader_zero = (model.qpos0[model.jnt_qposadr[each]] for each in (first, second))
-            return (
-                model.joint(second).name or f"joint {second}",
-                float(factor),
-                float(offset + zero - factor * leader_zero),
-            )
+            offset += zero - factor * leader_zero
+            return yourdfpy.Mimic(model.joint(second).name or f"joint {second}", float(factor), float(offset))
     return None
 
 
@@ -387,12 +387,13 @@ class _Shape(NamedTuple):
 
 @dataclass(frozen=True)
 class _Described:
-    """Content of a file: yourdfpy's robot and its shapes; equal where the ``states`` of all its files are."""
+    """Content of a file: yourdfpy's robot and its shapes; equal where ``states`` of files and ``robot_meshes`` are."""
 
     path: Path = field(compare=False)
     robot: Any = field(compare=False)
     shapes: list[_Shape] = field(compare=False)
     states: tuple[tuple[str, int, int, int], ...]
+    robot_meshes: RobotMeshes
 
 
 @lru_cache(maxsize=16)
@@ -419,8 +420,8 @@ def _assembled(content: _Described) -> Robot:
     moved = {joint: tuple(name for chain, name in names.items() if joint in chain) for joint in limits}
     kept = {joint: each for joint, each in moved.items() if 0 < len(each) < len(names)}
     notes = [f"joint {name!r} is left out, for it moves no segment against others" for name in limits.keys() - kept]
-    stood_in = (link.name for link in content.robot.links if link.collisions and not link.visuals)
-    notes += [f"link {name!r} has no visual shape, so those for collisions are taken" for name in stood_in]
+    stood_in = [link for link in content.robot.links if link.collisions and not link.visuals]
+    notes += [f"link {each.name!r} has no {content.robot_meshes} shape, so its others are taken" for each in stood_in]
     joined = []
     for joint in reversed(joints):
         if joint.name in kept:

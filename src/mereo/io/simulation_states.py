@@ -13,7 +13,6 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
-from mereo.geometry.mesh import with_used_vertices
 from mereo.geometry.transforms import Points, longest_side
 from mereo.io.errors import readable
 from mereo.io.readers import read_arrays
@@ -128,7 +127,8 @@ def read_tetrahedra(path: Path) -> tuple[Points, Int[np.ndarray, "m 4"], Int[np.
         raise ValueError(f"{path} has no tetrahedra, nor other solid cells: export the volume mesh, not its surface")
     if elements.min() < 0 or elements.max() >= len(nodes):
         return nodes, elements, np.arange(len(nodes))  # the mesh's own check names the index
-    return *with_used_vertices(nodes, elements), np.unique(elements)
+    used, corners = np.unique(elements, return_inverse=True)  # flat before numpy 2
+    return nodes[used], corners.reshape(elements.shape), used
 
 
 def frame_files(path: Path) -> list[Path]:

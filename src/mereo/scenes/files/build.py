@@ -21,7 +21,7 @@ from mereo.geometry.mesh import Segment, SegmentedMesh, palette_color
 from mereo.geometry.mesh_check import examine, united
 from mereo.geometry.subdivision import TooManyFaces, split_edges
 from mereo.geometry.transforms import Normalizer, longest_side
-from mereo.io.config import Space
+from mereo.io.config import RobotMeshes, Space
 from mereo.io.mesh_formats import MeshWarning
 from mereo.io.robots import read_object_file
 from mereo.io.simulation_states import files_of_states, frame_files
@@ -45,7 +45,7 @@ from mereo.scenes.seeds import example_rng
 SMALLEST = 1.0
 """Longest side in scene units at least."""
 
-SOURCES = {"source", "segments", "model", "parts", "labels", "names", "cells"}
+SOURCES = {"source", "segments", "model", "parts", "robot_meshes", "labels", "names", "cells"}
 """Keys that decide the meshes, which identify themselves, or nothing."""
 
 
@@ -266,7 +266,7 @@ def read_segments(document: Document, file: SceneFile) -> SegmentedMesh:
         joined = [_joined(part, mesh.segments) for part, mesh in zip(file.segments, meshes, strict=True)]
         return _assembled(document, "segments", file.segments, joined)
     if file.model is not None:
-        model = _read(document, ("model",), folder / file.model)
+        model = _read(document, ("model",), folder / file.model, file.robot_meshes)
         if file.parts is None:
             return model
         return _assembled(document, "parts", file.parts, _from_model(document, file.parts, model))
@@ -276,10 +276,12 @@ def read_segments(document: Document, file: SceneFile) -> SegmentedMesh:
         return segment_surfaces(volume, file.names, file.cells)
 
 
-def _read(document: Document, place: Sequence[int | str], path: Path) -> SegmentedMesh:
+def _read(
+    document: Document, place: Sequence[int | str], path: Path, robot_meshes: RobotMeshes = "visual"
+) -> SegmentedMesh:
     """A mesh file; errors say which line names it."""
     with document.named_at(place):
-        return read_object_file(path)
+        return read_object_file(path, robot_meshes)
 
 
 def _from_model(document: Document, parts: Sequence[ModelPart], model: SegmentedMesh) -> list[Segment]:

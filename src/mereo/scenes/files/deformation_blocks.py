@@ -33,6 +33,7 @@ from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import Corners, Normalizer, Points, Vector, longest_side
+from mereo.io.config import RobotMeshes
 from mereo.io.point_arrays import model_points
 from mereo.io.readers import read_points
 from mereo.io.simulation_states import read_tetrahedra
@@ -671,6 +672,7 @@ class SceneFile(Block):
         source: where they come from, and their licence.
         segments: a mesh file for each.
         model, parts: one file of named parts, and which of them to take; all where ``parts`` is absent.
+        robot_meshes: of a ``model`` that is a robot's file, as of ``MeshesConfig``.
         labels, names, cells: a label volume, or a list of them with a segment each, whose values count from 1; which
             values are which segments, and the number of cells along the longest side of the grid on which their
             surfaces are found.
@@ -686,6 +688,7 @@ class SceneFile(Block):
     segments: Annotated[list[FilePart], Field(min_length=1)] | None = None
     model: FileName | None = None
     parts: Annotated[list[ModelPart], Field(min_length=1)] | None = None
+    robot_meshes: RobotMeshes = "visual"
     labels: FileName | Annotated[list[FileName], Field(min_length=2)] | None = None
     names: Annotated[dict[Annotated[int, Field(ge=1)], Name], Field(min_length=1)] | None = None
     cells: Annotated[int, Field(ge=16, le=400)] = 64

@@ -9,8 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from mereo.geometry.conventions import Way
+from mereo.geometry.conventions import LengthUnit, Way
 from mereo.geometry.mesh_check import examine
+from mereo.io.config import RobotMeshes
 from mereo.io.mesh_formats import MESH_SUFFIXES, MeshWarning
 from mereo.io.readers import check_ply
 from mereo.io.robots import is_robot, read_object_file
@@ -66,8 +67,13 @@ def scene_of_folder(folder: Path) -> str | None:
     return None
 
 
-def scene_of_meshes(files: Sequence[Path], units: str | None = None, deformations: Way = "auto") -> Scene:
-    """Scene of meshes, whose file is not kept; ``units`` and ``deformations`` are those of ``write_scene_file``.
+def scene_of_meshes(
+    files: Sequence[Path],
+    units: LengthUnit | None = None,
+    deformations: Way = "auto",
+    robot_meshes: RobotMeshes = "visual",
+) -> Scene:
+    """Scene of meshes, whose file is not kept; other arguments are as of ``MeshesConfig``.
 
     Raises as ``write_scene_file`` does, and ``ValueError`` for a part without volume; a mesh that is no solid is used
     with a ``MeshWarning``.
@@ -77,14 +83,16 @@ def scene_of_meshes(files: Sequence[Path], units: str | None = None, deformation
     with TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", MeshWarning)
         for file in () if is_volume(files[0]) else files:
-            for part in read_object_file(file).segments:
+            for part in read_object_file(file, robot_meshes).segments:
                 health = examine(part)
                 if refusal := health.refusal(len(part.faces)):
                     solid = "name a file of its whole, closed surface" + (f", or {cure}" if health.mendable else "")
                     fault = f"segment {part.name!r} of {file} {refusal}"
                     raise ValueError(f"{fault}; an object's parts are solids: {solid}")
         name = files[0].name.split(".")[0]
-        path = write_scene_file(files, Path(folder) / SCENE, units, name=name, deformations=deformations)
+        path = write_scene_file(
+            files, Path(folder) / SCENE, name=name, units=units, deformations=deformations, robot_meshes=robot_meshes
+        )
         scene = load_scene(path)
     for warning in caught:  # which name the file that is gone
         text = str(warning.message).replace(f"{path}: ", "")

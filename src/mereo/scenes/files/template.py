@@ -38,8 +38,8 @@ from mereo.geometry.transforms import (
     transform_points,
 )
 from mereo.io.atomic_files import check_file_place, write_file
-from mereo.io.mesh_formats import read_object_mesh
-from mereo.io.robots import ROBOT_SUFFIXES, RobotJoint, is_robot, read_robot
+from mereo.io.config import MeshesConfig, RobotMeshes
+from mereo.io.robots import ROBOT_SUFFIXES, RobotJoint, is_robot, read_object_file, read_robot
 from mereo.io.volume_files import (
     LabelVolume,
     LabelWarning,
@@ -320,11 +320,11 @@ class _Source(NamedTuple):
 def write_scene_file(
     files: Sequence[Path],
     output: Path | None = None,
-    units: str | None = None,
+    *,
     name: str | None = None,
     aperture: float = 360.0,
     report: Callable[[str], None] | None = None,
-    deformations: Way = "auto",
+    **meshes: Any,
 ) -> Path:
     """Write a commented YAML file that names ``files`` relative to itself; returns its path.
 
@@ -332,11 +332,10 @@ def write_scene_file(
         files: one mesh for each segment, one file of named parts, a robot's file, one label volume, or one for each
             segment.
         output: by default ``NAME.yaml`` in the working directory, after the first file.
-        units: a key of ``geometry.conventions.UNITS_M``; None guesses.
         name: of the scene; by default that of ``output``.
         aperture: of the cone about the side that is up from which the camera looks, above 0 to 360 degrees: all around.
         report: called with each sentence about what was found, once the file is written.
-        deformations: how the object moves.
+        meshes: what the files do not say, the fields of ``MeshesConfig``.
 
     Raises ``FileExistsError`` where ``output`` exists, ``ValueError`` and ``FileNotFoundError`` for unusable files, and
     where a segment has to be left out and nobody is there for the ``report``.
@@ -350,13 +349,14 @@ def write_scene_file(
     check_file_place(path)
     if path.exists():
         raise FileExistsError(f"{path} exists; it is not overwritten: choose another --output")
-    source = _source(files, path.parent)
+    stated = MeshesConfig(**meshes)
+    source = _source(files, path.parent, stated.robot_meshes)
     if source.lost and report is None:
         raise ValueError(
             f"{source.lost[0]}, or let `mereo scene new {shlex.join(map(str, files))} --output object.yaml` write a "
             "scene file without it, and name that"
         )
-    text, notes = _draft(name, source, units, aperture, deformations)
+    text, notes = _draft(name, source, stated, aperture)
     write_file(path, text, force=False)
     if report is not None:
         for note in (*(f"left out: {text}" for text in source.lost), *source.notes, *notes):
@@ -370,7 +370,7 @@ def identifier(text: str) -> str:
     return f"my-{name}" if name in SCENES else name
 
 
-def _source(files: Sequence[Path], folder: Path) -> _Source:
+def _source(files: Sequence[Path], folder: Path, robot_meshes: RobotMeshes) -> _Source:
     relative = [Path(os.path.relpath(file, folder)).as_posix() for file in files]
     for file, text in zip(files, relative, strict=True):
         if text != text.encode("utf-8", "replace").decode():
@@ -385,12 +385,13 @@ def _source(files: Sequence[Path], folder: Path) -> _Source:
     if robots := [file for file in files if is_robot(file)]:
         if len(files) > 1:
             raise ValueError(f"{robots[0]} is a whole robot, and other files are named too: name it alone")
-        robot = read_robot(files[0])
+        robot = read_robot(files[0], robot_meshes)
         links = "the links of a robot, where all of its joints are zero"
+        links += f"\nrobot_meshes: {robot_meshes}  # of the links: visual, or collision"
         notes = (*robot.notes, *_overlap_note(robot.mesh))
         source = _from_model(files[0], relative[0], robot.mesh, links)
         return source._replace(robot=robot.joints, notes=notes)
-    meshes = [read_object_mesh(file) for file in files]
+    meshes = [read_object_file(file, robot_meshes) for file in files]
     if len(files) == 1 and len(meshes[0].segments) > 1:
         return _from_model(files[0], relative[0], meshes[0])
     # one segment for each file, called after it, with all of its parts
@@ -502,9 +503,9 @@ def _likely_frame(file: Path, bounds: Corners) -> tuple[str, str, int, str]:
 # --- the text ---------------------------------------------------------------------------------------------------------
 
 
-def _draft(name: str, source: _Source, units: str | None, aperture: float, way: Way) -> tuple[str, list[str]]:
+def _draft(name: str, source: _Source, meshes: MeshesConfig, aperture: float) -> tuple[str, list[str]]:
     """Text of a scene file, and sentences about what it proposes."""
-    sides = np.ptp(source.mesh.bounds, axis=0)
+    sides, way = np.ptp(source.mesh.bounds, axis=0), meshes.deformations
     size = rounded(min(SIZE, LONGEST * float(sides.min() / sides.max())), 3)
     placement = placed(source.mesh, size)
     robot = [_robot_block(joint) for joint in source.robot or ()]
@@ -522,7 +523,7 @@ def _draft(name: str, source: _Source, units: str | None, aperture: float, way: 
         up_reason, (x, y, z) = "it stands on its flat base", [rounded(value, 3) for value in -base.normal]
     workspace = Workspace(float(np.deg2rad(aperture)), axis=(x, y, z), any_roll=aperture == 360.0)
     near, far, view = _default_view(rest, moves.draw(rest, placement), workspace)
-    unit, reason = (units, "as you said") if units else (source.unit, source.reason)
+    unit, reason = (meshes.units, "as you said") if meshes.units else (source.unit, source.reason)
     text = TEMPLATE.format(
         name=quoted(name),
         block=source.block,
