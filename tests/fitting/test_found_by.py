@@ -18,7 +18,6 @@ from mereo.fitting.problem.problem import (
     CLEAN,
     SHARED,
     SIGMAS,
-    is_normal,
     noise_of,
     shared,
     shared_variance,
@@ -35,6 +34,7 @@ from mereo.fitting.registration.answer_frame import (
     search_modes,
 )
 from mereo.fitting.registration.register import Registrar
+from mereo.fitting.uncertainty import ModesOptimum
 from mereo.geometry.camera import PointCloud, SightLines
 from mereo.models.model import Model
 from mereo.models.weights import load_model
@@ -265,13 +265,6 @@ def test_what_neighbours_share_is_no_noise_of_points(points: np.ndarray) -> None
     assert shared(own + 0.5, around, 0.45) > 1.3 and shared(own + half, around, 0.45) > 1.3
 
 
-def test_noise_that_neighbours_share_is_spread_evenly_and_a_wrong_state_is_not() -> None:
-    rng = default_rng(0)
-    windows = 0.1 * np.repeat(rng.normal(size=300), 9)
-    assert is_normal(windows)
-    assert not is_normal(np.where(rng.random(2700) < 0.1, 0.6, windows))
-
-
 def plate(pixels: int = 64) -> np.ndarray:
     """Points of a plate, a pixel each, row by row."""
     line = 0.3 * (np.arange(pixels) - pixels / 2)
@@ -307,6 +300,21 @@ def test_a_noisy_cloud_is_worth_no_more_than_its_points_and_less_where_they_shar
         assert share == pytest.approx(config.cloud_weight / (2.25 * count))
         weights.append(config.cloud_weight)
     assert 0.3 * count < weights[0] <= 2.25 * count * (1 + 1e-9) and weights[1] < 0.3 * weights[0]
+
+
+def test_what_neighbours_share_is_told_from_what_points_have_alone(registrar: Registrar, points: np.ndarray) -> None:
+    """A smooth error that is known around the object is no noise of points, and leaves the object as unsure."""
+    modes = fitted(registrar, points).modes
+    evidence = replace(modes.problem.evidence, shared_noise=0.4, shared_over=0.05)
+    motion = evidence.shared_motion(evidence.points).astype(np.float64)
+    off = np.einsum("niw,w->ni", motion, default_rng(0).normal(size=motion.shape[2]))
+    shifted = replace(evidence, points=evidence.points + off)
+    not_known = replace(shifted, shared_noise=np.inf, shared_over=0.0)
+    problem = modes.problem.with_noise(0.4)
+    known, other = (problem.changed(evidence=each).worth(modes.surface) for each in (shifted, not_known))
+    assert known.unknown < 0.5 * other.unknown
+    forward = ModesOptimum(known, modes.posed, 1.0).posterior.factor[5]  # a shift along the line of sight
+    assert 0.1 < np.linalg.norm(forward) < 0.6
 
 
 def test_a_noisy_cloud_is_explained_where_only_noise_is_left(registrar: Registrar, points: np.ndarray) -> None:

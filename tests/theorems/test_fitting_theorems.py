@@ -1,11 +1,15 @@
 """Theorems on the fit of the modes: what it must find, and what it must say, of frames whose truth is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from answers import fit_correspondences
 from fit_cases import IN_FRONT, said, shown
 from numpy.testing import assert_allclose, assert_array_equal
 
+from mereo.fitting.problem.evidence import UNSEEN_PITCHES, Evidence
+from mereo.fitting.problem.gauss_newton import eliminate
 from mereo.fitting.problem.residuals import Surface
 from mereo.geometry.transforms import transform_points
 from mereo.scenes.statistical_model import StatisticalModel
@@ -67,3 +71,34 @@ def test_what_a_line_of_sight_misses_or_meets_far_off_is_compared_with_the_neare
     assert_allclose(np.cross(place[1], middle), 0.0, atol=1e-9 * np.linalg.norm(middle) ** 2)
     offset = np.einsum("i,i->", at_rest.normals[face[1]], middle - place[1])
     assert distance[1] == pytest.approx(abs(offset)) and distance[1] > at_rest.nearest(points)[0][1]
+
+
+def test_residuals_beside_a_nuisance_are_those_of_a_fit_that_has_it() -> None:
+    rng = np.random.default_rng(0)
+    jacobian, nuisance, residual = rng.normal(size=(40, 3)), rng.normal(size=(40, 5)), rng.normal(size=40)
+    weight = rng.random(40)
+    rows = np.block([[jacobian, nuisance], [np.zeros((5, 3)), np.eye(5)]]) * np.sqrt(np.r_[weight, np.ones(5)])[:, None]
+    whole = np.linalg.lstsq(rows, np.r_[residual * np.sqrt(weight), np.zeros(5)])
+    left, off, ones = eliminate((jacobian, residual, weight), nuisance)
+    step, square, *_ = np.linalg.lstsq(left, off)
+    assert_allclose(step, whole[0][:3])
+    assert_allclose(square, whole[1])
+    assert_array_equal(ones, 1.0)
+    alone, off, _ = eliminate((jacobian, residual, weight), nuisance[:, :0])
+    assert_allclose(alone.T, jacobian.T * np.sqrt(weight))
+    assert_allclose(off, residual * np.sqrt(weight))
+
+
+def test_noise_that_neighbours_share_is_alike_as_far_as_they_share_it() -> None:
+    """Along the line of sight by its own size, across it by pixels, and nothing where none is known."""
+    across = np.linspace(-1.0, 1.0, 41)
+    points = np.stack([*(each.ravel() for each in np.meshgrid(across, across)), np.full(41**2, 100.0)], axis=1)
+    evidence = Evidence.of(points)
+    assert evidence.shared_motion(points).shape == (41**2, 3, 0)
+    evidence = replace(evidence, shared_noise=0.5, shared_over=0.03)
+    vars(evidence)["roughness"] = 0.0
+    motion = evidence.shared_motion(points[20 * 41 : 21 * 41]).astype(np.float64)
+    along, aside = (np.einsum("iw,jw->ij", motion[:, axis], motion[:, axis]) for axis in (2, 0))
+    distance = np.abs(across[:, None] - across) / 100.0
+    assert_allclose(along, 0.25 * np.exp(-np.pi * (distance / 0.03) ** 2), atol=0.03)
+    assert_allclose(np.diag(aside), (UNSEEN_PITCHES * evidence.pitch * 100.0) ** 2, rtol=0.1)

@@ -82,7 +82,7 @@ def shaken(problem: Problem, best: "ScoredFit") -> "ScoredFit":
     rng, is_patient = np.random.default_rng(0), problem.config.retries and not problem.is_scale_open
     for _ in range(SHAKES if is_patient and has_many_optima(problem) else 0):
         is_over = best.explains(problem) or best.misfit.cloud > HOPELESS
-        if is_over or (problem.is_noisy and not problem.explains_noise(best.surface)):
+        if is_over or (problem.is_noisy and problem.share_on(best.surface) < problem.accepted):
             break
         before, z = best, best.posed.z
         starts = [replace(best.posed, z=z + rng.standard_normal(len(z))) for _ in range(SHAKEN)]

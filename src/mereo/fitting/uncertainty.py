@@ -10,7 +10,7 @@ Notation: m material points, n queried ones, k coefficients, p = 7 + k parameter
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -216,6 +216,23 @@ def covariance_factor(precision: Float[np.ndarray, "p p"]) -> Float[np.ndarray, 
     return factor
 
 
+def scattered(posterior: Posterior, terms: Terms, problem: Problem) -> Posterior:
+    """The posterior with the covariance that the noise gives the optimum; the same where all noise is of points alone.
+
+    The weights of a fit take points for independent. By what neighbours are known to share, and what is unknown beside
+    it, the gradient at the optimum scatters otherwise (sandwich estimator; White, Econometrica 1982).
+    """
+    if problem.unknown is None:
+        return posterior
+    jacobian, _, weight = terms.cloud
+    pull = jacobian.astype(np.float64) * weight[:, None]
+    shared = np.einsum("pi,piw->pw", jacobian[:, 3:6], problem.evidence.shared_motion(terms.observed_samples))
+    each = problem.unknown * len(weight) / len(problem.evidence.points)  # a sample stands for as many points
+    spread = terms.total.matrix - pull.T @ jacobian + each * pull.T @ pull + (pull.T @ shared) @ (pull.T @ shared).T
+    values, vectors = np.linalg.eigh(posterior.factor.T @ spread @ posterior.factor)
+    return replace(posterior, factor=posterior.factor @ (vectors * np.sqrt(np.maximum(values, 0.0))))
+
+
 # --- the optimum and its posterior ------------------------------------------------------------------------------------
 
 # ModesOptimum, DrawsOptimum -> Terms of the normal equations -> Posterior
@@ -274,7 +291,10 @@ class ModesOptimum:
         with limit_blas_threads():
             open = [turns_left_open(self.problem, material)]
             open += [] if self.bent is None else [(self.bent - material)[:, :, None]]
-            return Posterior.of(self.terms.total, self.posed, material, model.modes, model.residue, open, self.others)
+            posterior = Posterior.of(
+                self.terms.total, self.posed, material, model.modes, model.residue, open, self.others
+            )
+            return scattered(posterior, self.terms, self.problem)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -320,7 +340,8 @@ class DrawsOptimum:
         material: Float[np.ndarray, "m 3"] = self.fit.surface.material
         with limit_blas_threads():
             turns = turns_left_open(self.problem.base, material)
-            return Posterior.of(self.terms.total, self.fit.posed, material, modes, 0.0, [turns], self.others)
+            posterior = Posterior.of(self.terms.total, self.fit.posed, material, modes, 0.0, [turns], self.others)
+            return scattered(posterior, self.terms, self.problem.base)
 
 
 def turns_left_open(problem: Problem, material: Float[np.ndarray, "m 3"]) -> Float32[np.ndarray, "m 3 e"]:

@@ -222,12 +222,14 @@ class SightLines:
             the frame does not say, as a bare cloud does not, and then a fit has to decide.
         shared_noise: standard deviation, at the object, of what neighbours share of the camera's noise, by what was
             measured around it; infinite where the frame does not say.
+        shared_over: side, as an angle, of the square over which they share it; 0 where the frame does not say.
     """
 
     past: Float[np.ndarray, "p 3"]
     unknown: Float[np.ndarray, "u 3"]
     other_lines: SightKind | None = None
     shared_noise: float = np.inf
+    shared_over: float = 0.0
 
     @classmethod
     def of_cloud(cls, other_lines: SightKind | None = None) -> "SightLines":

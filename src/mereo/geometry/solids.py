@@ -59,15 +59,6 @@ def ray_scene(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"])
     return scene
 
 
-def first_faces(
-    scene: EmbreeScene, center: Vector, directions: Points
-) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
-    """Rays that hit a scene whose coordinates are relative to ``center``, and the face that each hits first."""
-    face = scene.run(*_rays(center, directions))
-    rows = np.flatnonzero(face >= 0)
-    return rows, face[rows].astype(np.int64)
-
-
 def _rays(center: Vector, directions: Points) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
     """Origins and directions in the single precision that Embree wants."""
     single = np.ascontiguousarray(directions, dtype=np.float32)

@@ -413,6 +413,9 @@ well mean that the image was cut out or rendered."""
 FEWEST, ENOUGH = 4000, 20_000
 """Pixels of a plane around the object that show a camera's noise; and pixels by which the plane is found."""
 
+ALIKE = 0.1
+"""Correlation of two pixels' noise, in that of neighbours, up to which it is told from chance."""
+
 ON_PLANE, FITS = 3.0, 8
 """Standard deviations from a plane up to which a pixel is on it, and fits to those that are."""
 
@@ -478,20 +481,24 @@ def lines_of_image(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SightLi
     u, v = u[kept], v[kept]
     met = past[v, u]
     places = whole.camera.unproject(np.stack([u + left + 0.5, v + top + 0.5], axis=1), np.where(met, depth[v, u], 1.0))
-    return SightLines(places[met], places[~met], None if silent else "unknown", shared_noise(whole, shown))
+    return SightLines(places[met], places[~met], None if silent else "unknown", *shared_noise(whole, shown))
 
 
-def shared_noise(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> float:
-    """Standard deviation of a camera's noise that neighbours share, at the distance of ``shown`` pixels.
+NOT_SHOWN = np.inf, 0.0
+"""``shared_noise`` of a frame that does not show it."""
+
+
+def shared_noise(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> tuple[float, float]:
+    """Standard deviation of a camera's noise that neighbours share, at the distance of ``shown`` pixels, and how far.
 
     What the largest plane around them leaves over beyond the noise of single pixels, where it is about as far away;
     infinite without such a plane. Noise is taken to grow as the square of the distance, and to fall as the distance: up
-    close something else than disparity limits a camera.
+    close something else than disparity limits a camera. It is shared over a square, whose side is an angle.
     """
     (height, width), depth = shown.shape, whole.depth
     others = np.flatnonzero(np.where(shown, 0.0, depth))
     if len(others) < FEWEST or not (shown & whole.valid).any():
-        return np.inf
+        return NOT_SHOWN
     distance = float(np.median(depth[shown & whole.valid]))
 
     def terms(pixels: Int[np.ndarray, " n"]) -> Points:
@@ -501,10 +508,11 @@ def shared_noise(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> float:
     some = others[:: 1 + len(others) // ENOUGH]
     places, inverse = terms(some), 1.0 / depth.ravel()[some]
     points = whole.camera.unproject(width * places[:, :2] + 0.5, 1.0 / inverse)
-    pixel = points[:, 2] / min(whole.camera.focal_x_px, whole.camera.focal_y_px)
+    focal_px = min(whole.camera.focal_x_px, whole.camera.focal_y_px)
+    pixel = points[:, 2] / focal_px
     plane = largest_plane(points, pixel, np.random.default_rng(0))
     if plane is None:
-        return np.inf
+        return NOT_SHOWN
     is_on = plane.distance(points) <= pixel
     for _ in range(FITS):
         linear = np.linalg.lstsq(places[is_on], inverse[is_on])[0]
@@ -512,9 +520,12 @@ def shared_noise(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> float:
         noise = float(np.sqrt(np.mean(off[is_on] ** 2)))
         is_on = np.abs(off) <= ON_PLANE * noise
     expected = terms(others) @ linear
-    rows = np.flatnonzero(np.abs(1.0 / depth.ravel()[others] - expected) <= ON_PLANE * noise)
+    off = 1.0 / depth.ravel()[others] - expected
+    rows = np.flatnonzero(np.abs(off) <= ON_PLANE * noise)
     if len(rows) < FEWEST:
-        return np.inf
+        return NOT_SHOWN
+    field = np.full(depth.size, np.nan)
+    field[others[rows]] = off[rows]
     near = np.argpartition(np.abs(np.log(expected[rows] * distance)), FEWEST - 1)[:FEWEST]
     rows = others[rows[near]]
     flat = np.zeros(depth.size)
@@ -524,7 +535,25 @@ def shared_noise(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> float:
     places, inverse = terms(rows), 1.0 / flat[rows]
     off = inverse - places @ np.linalg.lstsq(places, inverse)[0]
     shared = float(np.sqrt(max(np.mean(off**2) - alone**2, 0.0)))
-    return shared * distance * max(distance, float(np.median(flat[rows])))
+    over = shared_side(field.reshape(height, width)) / focal_px
+    return shared * distance * max(distance, float(np.median(flat[rows]))), over
+
+
+def shared_side(noise: Float[np.ndarray, "h w"]) -> float:
+    """Side, in pixels, of a square of as many pixels as share an error; NaN is where none is known.
+
+    That is the integral of the correlation, by its course along rows and columns, as far as it is not noise.
+    """
+    known, padded = np.isfinite(noise), [2 * side for side in noise.shape]
+    products, pairs = (
+        np.fft.irfft2(np.abs(np.fft.rfft2(image, padded)) ** 2, padded)
+        for image in (np.where(known, noise, 0.0), known.astype(float))
+    )
+    most = min(noise.shape) // 2
+    alike = [(products[line] / np.maximum(pairs[line], 1.0))[1:most] for line in (np.s_[0], np.s_[:, 0])]
+    together = np.mean(alike, axis=0)
+    along = np.arange(1, 1 + int(np.argmax(together < ALIKE * together[0])))
+    return float(np.sqrt(2 * np.pi * along @ together[: len(along)] / together[0]))
 
 
 def _evenly(

@@ -408,8 +408,8 @@ def refine_by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
 
 
 def settled(problem: DrawsProblem, fit: DrawsFit) -> tuple[DrawsProblem, DrawsFit]:
-    """Fit a noisy frame again with as many independent points as its cloud is worth, where the fit explains it."""
-    if not problem.base.explains_noise(fit.surface):
+    """Fit a noisy frame again with as many independent points as its cloud is worth."""
+    if not problem.base.shares_noise:
         return problem, fit
     worth = replace(problem, base=problem.base.worth(fit.surface))
     return worth, refine_by_sight(worth, fit)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float32, Int
 from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
@@ -22,7 +22,7 @@ from mereo.deformation.moving_least_squares import spread
 from mereo.geometry.camera import SightKind, SightLines
 from mereo.geometry.downsampling import means_along_sight, thin_to_grid
 from mereo.geometry.surface_patches import roughness
-from mereo.geometry.transforms import rotation_along
+from mereo.geometry.transforms import rotation_along, unit_rows
 
 MOST_POINTS = 6000
 """Denser clouds are averaged to so many points, which have less noise."""
@@ -44,7 +44,8 @@ With a pixel's own depth alone, 6 to 13 % of the true surface counted as in fron
 AROUND = 9
 
 UNSEEN_PITCHES = 2.0
-"""Farther from the nearest line of sight that met the object, nothing of it was seen: noise and small gaps stay out."""
+"""Farther from the nearest line of sight that met the object, nothing of it was seen: noise and small gaps stay out. By
+so much are edges off where a camera's neighbours share all noise."""
 
 NORMAL_POINTS = 12
 """Points by which the surface's direction at an observed one is estimated."""
@@ -58,6 +59,9 @@ ROUGHER = 1.4
 
 NOISIER = 2.0
 """Largest noise that neighbours share on the object, in that around it: dark and slanted surfaces have more."""
+
+WAVES = 8
+"""Waves along each side of the picture by which noise that neighbours share is described."""
 
 RIM_PITCHES, EDGE_PITCHES, EDGE_DIRECTIONS = 2.5, 3.5, 8
 """Angles from the observed points, in pixels, between which lines of sight around the object are sampled, and in how
@@ -182,6 +186,13 @@ class ObservedPoints(ABC):
         """Standard deviation of the noise that neighbours are known to share; 0 where none is known."""
         return 0.0
 
+    def shared_motion(self, places: Float[np.ndarray, "p 3"]) -> Float32[np.ndarray, "p 3 w"]:
+        """How places of the camera's picture are off with w amplitudes, each N(0, 1), of the noise neighbours share.
+
+        None where that is not known.
+        """
+        return np.zeros((len(places), 3, 0), dtype=np.float32)
+
     @property
     @abstractmethod
     def roughness(self) -> float:
@@ -225,7 +236,7 @@ class Evidence(ObservedPoints):
         pitch: angle between neighbouring lines of sight.
         past: lines of sight that went past the object to something that was measured; None without any.
         other_lines: kind of the lines of sight that are near none of all these.
-        shared_noise: ``SightLines.shared_noise``.
+        shared_noise, shared_over: of ``SightLines``.
     """
 
     sight: cKDTree
@@ -235,6 +246,7 @@ class Evidence(ObservedPoints):
     past: PastLines | None = None
     other_lines: SightKind = "past"
     shared_noise: float = np.inf
+    shared_over: float = 0.0
 
     @classmethod
     def of(
@@ -267,7 +279,19 @@ class Evidence(ObservedPoints):
             front = np.concatenate([front, np.zeros(len(toward))])
         chosen, around = points[spread(points, observed_samples)], near[:, 1:]
         past, other_lines = PastLines.of(lines.past, pitch), lines.other_lines or "past"
-        return cls(points, chosen, around, sight, ranges, front, pitch, past, other_lines, lines.shared_noise)
+        return cls(
+            points,
+            chosen,
+            around,
+            sight,
+            ranges,
+            front,
+            pitch,
+            past,
+            other_lines,
+            lines.shared_noise,
+            lines.shared_over,
+        )
 
     @property
     def distance(self) -> float:
@@ -283,6 +307,31 @@ class Evidence(ObservedPoints):
     def expected_noise(self) -> float:
         """As of ``ObservedPoints``."""
         return float(np.nan_to_num(self.shared_noise, posinf=0.0))
+
+    def shared_motion(self, places: Float[np.ndarray, "p 3"]) -> Float32[np.ndarray, "p 3 w"]:
+        """As of ``ObservedPoints``: by waves over the picture, so that errors correlate as a normal bell.
+
+        Solin and Saerkkae, Statistics and Computing 2020. A camera that shares errors looks at windows of pixels, so
+        that edges are off as well, across the line of sight.
+        """
+        shared, alone = self.expected_noise, self.roughness
+        if shared == 0.0 or self.shared_over == 0.0:
+            return np.zeros((len(places), 3, 0), dtype=np.float32)
+        slopes, cloud = (each[:, :2] / each[:, 2:] for each in (places, self.points))
+        low, high = cloud.min(axis=0) - self.shared_over, cloud.max(axis=0) + self.shared_over
+        number, length = np.arange(WAVES), (high - low)[:, None]
+        waves = np.pi * number / length
+        power = np.exp(-((self.shared_over * waves) ** 2) / (4 * np.pi)) * self.shared_over / length
+        along = np.cos((slopes - low).T[:, :, None] * waves[:, None])
+        x, y = along * np.sqrt(np.where(number == 0, 1.0, 2.0) * power)[:, None]
+        low_waves = number[:, None] + number < WAVES
+        field = (x[:, :, None] * y[:, None])[:, low_waves]
+        ranges = np.linalg.norm(places, axis=1)
+        aside = UNSEEN_PITCHES * self.pitch * ranges * shared / np.hypot(shared, alone)
+        sight = places / ranges[:, None]
+        first = unit_rows(np.cross(sight, [0.0, 1.0, 0.0]))
+        axes = (sight * shared, first * aside[:, None], np.cross(sight, first) * aside[:, None])
+        return np.concatenate([axis[:, :, None] * field[:, None] for axis in axes], axis=2, dtype=np.float32)
 
     @property
     def with_more_samples(self) -> "Evidence":

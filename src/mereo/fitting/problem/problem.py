@@ -17,9 +17,18 @@ from mereo.fitting.problem.evidence import (
     Observed,
     ObservedPoints,
 )
-from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, Rows, rigid_motion
+from mereo.fitting.problem.gauss_newton import (
+    POSE,
+    NormalEquations,
+    Posed,
+    Rows,
+    eliminate,
+    geman_mcclure,
+    rigid_motion,
+)
 from mereo.fitting.problem.residuals import (
     ROBUST,
+    Met,
     NetworkTerm,
     PairTerm,
     PosedSamples,
@@ -90,6 +99,7 @@ class Problem:
         config: constants, as a clean frame has them.
         noise: standard deviation of the observed points from the surface (``with_noise``).
         given: pose that is known; None where the frame alone says it.
+        unknown: variance of a point beside what neighbours are known to share (``worth``); None before it is asked for.
     """
 
     model: StatisticalModel
@@ -99,6 +109,7 @@ class Problem:
     config: FitConfig
     noise: float = 0.0
     given: GivenPose | None = None
+    unknown: float | None = None
 
     @classmethod
     def of(
@@ -152,6 +163,11 @@ class Problem:
         return self.noise > CLEAN
 
     @property
+    def shares_noise(self) -> bool:
+        """Whether a camera's noise is in the frame, be it that a fit has bent to it."""
+        return max(self.noise, self.evidence.expected_noise) > CLEAN
+
+    @property
     def cloud_sigma(self) -> float:
         """Last standard deviation of the cloud, scene units."""
         return max(SIGMAS * self.noise * self.is_noisy, self.config.cloud_sigma)
@@ -176,17 +192,28 @@ class Problem:
         """Share of the observed samples that lie on a surface, up to the tolerance."""
         return float((self.nearest(surface)[0] <= self.tolerance).mean())
 
-    def explains_noise(self, surface: Surface) -> bool:
-        """Whether the frame is noisy, and enough of its points lie on a surface for a fit to be believed."""
-        return self.is_noisy and self.share_on(surface) >= self.accepted
-
     def worth(self, surface: Surface) -> "Problem":
         """The problem with as many independent points as what a fit leaves over shows that the cloud is worth."""
-        config, offset = self.config, self.offsets(surface)
+        config, offset, freedom = self.config, self.offsets(surface), POSE + self.model.count
         alone = (self.cloud_sigma / SIGMAS) ** 2  # variance of a point of which neighbours share nothing
-        share = min(alone / shared_variance(offset, self.evidence, POSE + self.model.count), 1.0)
+        share = min(alone / shared_variance(offset, self.evidence, freedom), 1.0)
         weight, outside = SIGMAS**2 * share * len(offset), FitConfig.silhouette_weight * share
-        return self.changed(config=replace(config, cloud_weight=weight, silhouette_weight=outside))
+        config = replace(config, cloud_weight=weight, silhouette_weight=outside)
+        unknown = shared_variance(self.innovations(surface), self.evidence, freedom)
+        return self.changed(config=config, unknown=unknown)
+
+    def innovations(self, surface: Surface) -> Float[np.ndarray, " n"]:
+        """What a fit leaves over of all points beside what neighbours are known to share."""
+        points, evidence = self.evidence.points, self.evidence
+        distance, face, position = surface.compared(points, None, evidence.all_alike(self.normal_length))
+        normal = surface.normals[face]
+        offset = np.copysign(distance, np.einsum("pi,pi->p", points - position, normal))
+        alone = max(noise_of(offset, evidence.around), CLEAN)
+        # a point may be off by all that is shared, and is no outlier for that
+        most = ROBUST * SIGMAS * float(np.hypot(alone, evidence.expected_noise))
+        root = np.sqrt(geman_mcclure(offset, most)) / alone
+        nuisance = np.einsum("pi,piw->pw", normal.astype(np.float32), evidence.shared_motion(points))
+        return eliminate((np.empty((len(points), 0)), offset, root**2), nuisance)[1] / root
 
     def quieted(self, noise: float) -> "Problem":
         """The problem with no more than a noise, and by every point where that is still a camera's."""
@@ -218,13 +245,11 @@ class Problem:
         """Distance, in scene units, beyond which a point along a line of sight is of another surface than was seen."""
         return ROBUST * self.cloud_sigma
 
-    def met(self, surface: Surface) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
+    def met(self, surface: Surface) -> Met:
         """What of a surface each observed sample is compared with: ``Surface.compared``."""
         return surface.compared(self.evidence.observed_samples, self.far, self.alike)
 
-    def nearest(
-        self, surface: Surface
-    ) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
+    def nearest(self, surface: Surface) -> Met:
         """The same, without lines of sight."""
         return surface.compared(self.evidence.observed_samples, None, self.alike)
 
@@ -366,9 +391,6 @@ CLEAN = 0.15
 """Noise, in scene units, up to which the constants are as they are; more is a camera's. Clean frames have 0.05 to 0.1,
 and a clean frame's fit that is not quite right leaves less over, too."""
 
-NORMAL = 4.3
-"""The 95 % quantile of what a fit leaves over, in its median, up to which it looks like normal numbers, with 2.9."""
-
 SIGMAS = 1.5
 """Standard deviation that the cloud gets, in noises: mixed pixels are far beyond ``residuals.ROBUST`` of these."""
 
@@ -418,11 +440,6 @@ def noise_of(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"] | N
         around: indices of each point's neighbours.
     """
     return TO_STD * float(np.median(np.abs(offset if around is None else unshared(offset, around))))
-
-
-def is_normal(offset: Float[np.ndarray, " n"]) -> bool:
-    """Whether offsets are spread as normal numbers are; those of a wrong fit are small in most places, or large."""
-    return float(np.quantile(np.abs(offset), 0.95)) <= NORMAL * float(np.median(np.abs(offset)))
 
 
 def shared(

@@ -10,7 +10,6 @@ from functools import cached_property, lru_cache
 
 import igl
 import numpy as np
-from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float, Float32, Int
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
@@ -19,7 +18,7 @@ from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.evidence import Directions, Evidence, Observed
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, Rows, along, cross, geman_mcclure, in_space
 from mereo.geometry.mesh import barycentric
-from mereo.geometry.solids import first_faces, ray_scene, search_tree
+from mereo.geometry.solids import search_tree
 from mereo.geometry.transforms import unit_rows
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -105,6 +104,9 @@ class PosedSamples:
         return self.position[near].astype(np.float64), self.normal[near].astype(np.float64), self.surface.modes[near, 0]
 
 
+Met = tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]
+"""Distance, face among those that can be compared, and position of what each point is compared with."""
+
 Shows = Callable[[Float[np.ndarray, "f 3"], Float[np.ndarray, "f 3"]], Bool[np.ndarray, " f"]]
 """Says which faces can be compared, by their normals and a place on each."""
 
@@ -155,28 +157,25 @@ class Surface:
         vertices, faces = np.ascontiguousarray(self.material), np.ascontiguousarray(self.model.faces[self.facing])
         return search_tree(vertices, faces), vertices, faces
 
-    def nearest(
-        self, points: Float[np.ndarray, "p 3"]
-    ) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
+    def nearest(self, points: Float[np.ndarray, "p 3"]) -> Met:
         """Distance, face among the facing ones, and position of the nearest point of the facing surface."""
         tree, vertices, faces = self._tree
         squared, face, position = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
         return np.sqrt(squared), face.astype(np.int64), position
 
-    def along_sight(
-        self, points: Float[np.ndarray, "p 3"], far: float
-    ) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
+    def along_sight(self, points: Float[np.ndarray, "p 3"], far: float) -> Met:
         """Like ``nearest``, but of the point that each line of sight meets, and of the distance from its plane.
 
         A depth camera is off along the line of sight; noise across an edge would pull the nearest position along. Where
         nothing is met, or only a plane farther than ``far`` from the point, it is the nearest position all the same.
         """
-        rows, met = first_faces(*self._rays, points)
-        toward, normal = points[rows], self.normals[met]
-        corner = self.material[self.model.faces[self.facing[met], 0]]
-        shares = np.einsum("pi,pi->p", normal, corner) / np.einsum("pi,pi->p", normal, toward)
-        met_position = toward * shares[:, None]
-        off = np.abs(np.einsum("pi,pi->p", normal, toward - met_position))
+        tree, vertices, faces = self._tree
+        sight = np.ascontiguousarray(points)
+        met, share, _ = tree.intersect_ray_first(vertices, faces, np.zeros_like(sight), sight)
+        rows = np.flatnonzero(met >= 0)
+        met, toward = met[rows].astype(np.int64), points[rows]
+        met_position = toward * share[rows, None]
+        off = np.abs(np.einsum("pi,pi->p", self.normals[met], toward - met_position))
         near = off <= far
         rows = rows[near]
         other = np.setdiff1d(np.arange(len(points)), rows)
@@ -186,9 +185,7 @@ class Surface:
             distance[other], face[other], position[other] = self.nearest(points[other])
         return distance, face, position
 
-    def alike(
-        self, points: Float[np.ndarray, "p 3"], directions: Directions
-    ) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
+    def alike(self, points: Float[np.ndarray, "p 3"], directions: Directions) -> Met:
         """Like ``nearest``, but of a place whose normal agrees; where none is near, the distance counts normals too."""
         distance, face, position = self.nearest(points)
         rows = np.flatnonzero(directions.agreement(self.normals[face]) <= 0)
@@ -204,16 +201,11 @@ class Surface:
 
     def compared(
         self, points: Float[np.ndarray, "p 3"], far: float | None = None, directions: Directions | None = None
-    ) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
+    ) -> Met:
         """``alike`` with directions, ``along_sight`` with ``far`` alone, else ``nearest``."""
         if directions is not None:
             return self.alike(points, directions)
         return self.nearest(points) if far is None else self.along_sight(points, far)
-
-    @cached_property
-    def _rays(self) -> tuple[EmbreeScene, Float[np.ndarray, "3"]]:
-        center: Float[np.ndarray, "3"] = self.material.mean(axis=0)
-        return ray_scene(self.material - center, self.model.faces[self.facing]), center
 
     def offsets(
         self, points: Float[np.ndarray, "p 3"], far: float | None = None, directions: Directions | None = None

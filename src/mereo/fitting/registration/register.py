@@ -176,8 +176,8 @@ class ModesFit:
         return self._registration("modes", self.posed.z, end, self.posed, self.surface)
 
     def settled(self) -> "ModesFit":
-        """The same with as many independent points as the cloud of a noisy frame is worth, where it is explained."""
-        if not self.problem.explains_noise(self.surface):
+        """The same with as many independent points as the cloud of a noisy frame is worth."""
+        if not self.problem.shares_noise:
             return self
         with limit_blas_threads():
             problem, modes = settled(self.problem, self.posed)
