@@ -24,7 +24,7 @@ from mereo.geometry.transforms import rigid, transform_points
 from mereo.locating.outline import Jumps, Outline, compare_outline
 from mereo.locating.regions import connected_pixels, off_planes, regions, thinned
 from mereo.locating.whole_frame import BY_MASK, Place, WholeFrame, at_point, doubted, is_whole
-from mereo.reconstruction.observation import find_object, shared_noise
+from mereo.reconstruction.observation import find_object, shared_noise, shared_side
 from mereo.synthesis.depth_sensor import add_depth_noise, render_depth
 
 CAMERA = Camera(240, 180, 260.0, 260.0, 120.0, 90.0)
@@ -387,6 +387,7 @@ def test_noise_that_neighbours_share_is_measured_on_the_plane_around_the_object(
     if level > std:  # else what is left over is none of the field
         assert over * CAMERA.focal_x_px == pytest.approx(np.sqrt(np.pi) * 16, rel=0.3)
     assert shared_noise(noisy, np.ones_like(shown)) == (np.inf, 0.0), "nothing is around it"
+    assert shared_side(np.ones((40, 60))) > 30 and shared_side(rng.normal(size=(200, 300))) < 20
 
 
 # --- sequences --------------------------------------------------------------------------------------------------------

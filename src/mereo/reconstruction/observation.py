@@ -552,7 +552,7 @@ def shared_side(noise: Float[np.ndarray, "h w"]) -> float:
     most = min(noise.shape) // 2
     alike = [(products[line] / np.maximum(pairs[line], 1.0))[1:most] for line in (np.s_[0], np.s_[:, 0])]
     together = np.mean(alike, axis=0)
-    along = np.arange(1, 1 + int(np.argmax(together < ALIKE * together[0])))
+    along = np.arange(1, 1 + int(np.argmax(np.append(together, -np.inf) < ALIKE * together[0])))
     return float(np.sqrt(2 * np.pi * along @ together[: len(along)] / together[0]))
 
 
