@@ -18,6 +18,7 @@ from mereo.fitting.problem.problem import (
     CLEAN,
     SHARED,
     SIGMAS,
+    is_normal,
     noise_of,
     shared,
     shared_variance,
@@ -263,6 +264,13 @@ def test_what_neighbours_share_is_no_noise_of_points(points: np.ndarray) -> None
     assert noise_of(half, around) == 0.0
     assert 0.97 < shared(own, around, 0.45) < SHARED
     assert shared(own + 0.5, around, 0.45) > 1.3 and shared(own + half, around, 0.45) > 1.3
+
+
+def test_noise_that_neighbours_share_is_spread_evenly_and_a_wrong_state_is_not() -> None:
+    rng = default_rng(0)
+    windows = 0.1 * np.repeat(rng.normal(size=300), 9)
+    assert is_normal(windows)
+    assert not is_normal(np.where(rng.random(2700) < 0.1, 0.6, windows))
 
 
 def plate(pixels: int = 64) -> np.ndarray:

@@ -27,6 +27,7 @@ class FitConfig:
         cloud_weight: how many independent points the cloud is worth.
         network_weight: the same of the correspondences, at the first and at the last step with the cloud.
         explained: the cloud's misfit, in squared standard deviations of a sample, above which other states are tried.
+        unexplained: the same, above which a fit is likely wrong.
         samples: points of the surface that stand for it in most steps.
         silhouette_vertices: how many of them are compared with what the frame rules out.
         silhouette_weight: how many independent points one of them is worth, of ``SILHOUETTE_VERTICES``.
@@ -45,6 +46,7 @@ class FitConfig:
     cloud_weight: float = 3000.0
     network_weight: tuple[float, float] = (60.0, 10.0)
     explained: float = 0.147
+    unexplained: float = 0.3
     samples: int = 3000
     silhouette_vertices: int = 500
     silhouette_weight: float = 0.2
@@ -102,7 +104,9 @@ class DrawsConfig:
     every_point: bool = True
 
 
-ELASTIC = FitConfig(cloud_sigma=0.12, cloud_weight=250.0, explained=0.41, samples=10_000, by_normals=True)
+ELASTIC = FitConfig(
+    cloud_sigma=0.12, cloud_weight=250.0, explained=0.41, unexplained=0.83, samples=10_000, by_normals=True
+)
 """Constants for objects whose model is that of an elastic solid, which real states are near but never in.
 
 What they are off by is shared by many points, so the cloud is worth fewer; experiments, entry 68."""

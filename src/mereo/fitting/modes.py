@@ -54,7 +54,7 @@ def has_many_optima(problem: Problem) -> bool:
 
 def explored(problem: Problem, best: "ScoredFit") -> "ScoredFit":
     """Try states that agree with a fit or the network, while the best does not explain the cloud."""
-    for number in range(2 if has_many_optima(problem) else 0):
+    for number in range(2 * has_many_optima(problem)):
         if best.explains(problem):
             break
         before = best
@@ -80,7 +80,7 @@ def shaken(problem: Problem, best: "ScoredFit") -> "ScoredFit":
     where the unit is unknown: frames of other things are explained no less without it, and cost a third more with it.
     """
     rng, is_patient = np.random.default_rng(0), problem.config.retries and not problem.is_scale_open
-    for _ in range(SHAKES if is_patient and has_many_optima(problem) else 0):
+    for _ in range(SHAKES * (is_patient and has_many_optima(problem))):
         is_over = best.explains(problem) or best.misfit.cloud > HOPELESS
         if is_over or (problem.is_noisy and problem.share_on(best.surface) < problem.accepted):
             break

@@ -37,7 +37,7 @@ from mereo.fitting.modes import (
 )
 from mereo.fitting.problem.evidence import Evidence, Observed, SurfaceEvidence
 from mereo.fitting.problem.gauss_newton import DAMPING, Posed, cross
-from mereo.fitting.problem.problem import Problem
+from mereo.fitting.problem.problem import Problem, is_normal, noise_of
 from mereo.fitting.problem.residuals import ROBUST, Prior, SampledSurface
 from mereo.fitting.problem.segments import diverse_rows, rms_distance
 from mereo.geometry.transforms import rotation_along, unit_rows
@@ -565,6 +565,23 @@ class Trail:
         fits = [refined(problem, fit_wide(problem, states[row])) for row in rows]
         return Trail(problem, self.handicap, fits)
 
+    def with_shared_noise(self) -> "Trail":
+        """The same with all noise that the best fit leaves over, where nothing else explains the frame."""
+        problem = self.problem.with_noise(noise_of(self.problem.offsets(self.best.surface)))
+        is_close = self.is_explained or self.best.misfit.cloud < problem.config.unexplained
+        if is_close or problem.noise <= self.problem.noise:
+            return self
+        trail = self.in_problem(problem.by_every_point)
+        if not trail.leaves_noise:
+            return self
+        trail.shake()
+        return trail if trail.leaves_noise else self
+
+    @property
+    def leaves_noise(self) -> bool:
+        """Whether what the best fit leaves over is spread as noise is."""
+        return is_normal(self.problem.offsets(self.best.surface))
+
     @property
     def others(self) -> tuple[Float[np.ndarray, "m 3"], ...]:
         """Positions of the material points in other states that explain the frame alike."""
@@ -595,7 +612,7 @@ def search(
         for trail in trails:
             trail.fitted += [refined(trail.problem, fit_wide(trail.problem, start)) for start in starts]
         chosen = likelier(with_left_noise(trails))
-        return chosen.with_heavier_cloud() or chosen
+        return chosen.with_heavier_cloud() or chosen.with_shared_noise()
     for stage in rounds:
         for trail in trails:
             trail.go_on(stage)
@@ -609,7 +626,7 @@ def search(
         heavier = chosen.with_heavier_cloud()
         if heavier is not None and (stage is rounds[-1] or heavier.is_explained):
             return heavier
-    return chosen
+    return chosen.with_shared_noise()
 
 
 def likelier(trails: list[Trail]) -> Trail:

@@ -24,6 +24,7 @@ from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, geman_mcclure, in_space
 from mereo.fitting.problem.problem import Problem
 from mereo.fitting.problem.residuals import (
+    ROBUST,
     NetworkTerm,
     Surface,
     Terms,
@@ -249,9 +250,6 @@ def secant(
 SHAPE_WEIGHT = 500.0
 """How many independent points a shape is worth."""
 
-SHAPE_ROBUST = 2.5
-"""Points farther off than this many standard deviations count for little."""
-
 ENOUGH = 0.02
 """Relative gain of a step below which nothing more is tried."""
 
@@ -328,9 +326,9 @@ def lay_on_shape(states: DrawnStates, shape: Shape, drawn: Drawn, z: Float[np.nd
         rotation = best_rotations(((points - center) * share[:, None]).T @ (shape.points - goal))
         translation = goal - rotation @ center
         distance = np.linalg.norm(points @ rotation.T + translation - shape.points, axis=1)
-        weight = shape.weight * geman_mcclure(distance, SHAPE_ROBUST * max(shape.std, float(np.median(distance))))
+        weight = shape.weight * geman_mcclure(distance, ROBUST * max(shape.std, float(np.median(distance))))
     squared = distance**2
-    apart = float(shape.weight @ (squared / (1.0 + squared / (2 * SHAPE_ROBUST * shape.std) ** 2)))
+    apart = float(shape.weight @ (squared / (1.0 + squared / (2 * ROBUST * shape.std) ** 2)))
     return StateOnShape(drawn, z, positions, rotation, translation, apart + float(z @ z))
 
 
@@ -358,7 +356,7 @@ def _step(
     posed = Posed(state.rotation, state.translation, np.zeros(len(state.z)))
     points = posed.place(shape.at(state.points))
     offset = points - shape.points
-    weight = shape.weight * geman_mcclure(np.linalg.norm(offset, axis=1), 2 * SHAPE_ROBUST * shape.std)
+    weight = shape.weight * geman_mcclure(np.linalg.norm(offset, axis=1), 2 * ROBUST * shape.std)
     for _ in range(5):
         normal = prior_of_draws(state.z, motion, 0.0, 1e-6)
         jacobian = in_space(posed, points, shape.at(motion))

@@ -391,6 +391,9 @@ CLEAN = 0.15
 """Noise, in scene units, up to which the constants are as they are; more is a camera's. Clean frames have 0.05 to 0.1,
 and a clean frame's fit that is not quite right leaves less over, too."""
 
+NORMAL = 4.3
+"""The 95 % quantile of what a fit leaves over, in its median, up to which it looks like normal numbers, with 2.9."""
+
 SIGMAS = 1.5
 """Standard deviation that the cloud gets, in noises: mixed pixels are far beyond ``residuals.ROBUST`` of these."""
 
@@ -440,6 +443,11 @@ def noise_of(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"] | N
         around: indices of each point's neighbours.
     """
     return TO_STD * float(np.median(np.abs(offset if around is None else unshared(offset, around))))
+
+
+def is_normal(offset: Float[np.ndarray, " n"]) -> bool:
+    """Whether offsets are spread as normal numbers are; those of a wrong fit are small in most places, or large."""
+    return float(np.quantile(np.abs(offset), 0.95)) <= NORMAL * float(np.median(np.abs(offset)))
 
 
 def shared(
