@@ -112,7 +112,7 @@ def test_what_needs_torch_says_which_extra(tmp_path: Path) -> None:
     program = """
 import mereo
 from mereo.__main__ import main
-load = "load_object(weights='bunny')", "load_object('bunny', 'bunny')", "load_model('bunny')"
+load = "load_object(weights='bunny')", "load_object('rope', 'rope')", "load_model('bunny')"
 for call in (*load, "learn('rope', 'out')"):
     try:
         eval(f"mereo.{call}")
