@@ -226,9 +226,10 @@ def scattered(posterior: Posterior, terms: Terms, problem: Problem) -> Posterior
         return posterior
     jacobian, _, weight = terms.cloud
     pull = jacobian.astype(np.float64) * weight[:, None]
-    shared = np.einsum("pi,piw->pw", jacobian[:, 3:6], problem.evidence.shared_motion(terms.observed_samples))
+    normals = jacobian[:, 3:6]  # as a shift moves a residual
+    shared = pull.T @ np.einsum("pi,piw->pw", normals, problem.evidence.shared_motion(terms.observed_samples))
     each = problem.unknown * len(weight) / len(problem.evidence.points)  # a sample stands for as many points
-    spread = terms.total.matrix - pull.T @ jacobian + each * pull.T @ pull + (pull.T @ shared) @ (pull.T @ shared).T
+    spread = terms.total.matrix - pull.T @ jacobian + each * pull.T @ pull + shared @ shared.T
     values, vectors = np.linalg.eigh(posterior.factor.T @ spread @ posterior.factor)
     return replace(posterior, factor=posterior.factor @ (vectors * np.sqrt(np.maximum(values, 0.0))))
 

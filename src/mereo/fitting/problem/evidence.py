@@ -279,19 +279,8 @@ class Evidence(ObservedPoints):
             front = np.concatenate([front, np.zeros(len(toward))])
         chosen, around = points[spread(points, observed_samples)], near[:, 1:]
         past, other_lines = PastLines.of(lines.past, pitch), lines.other_lines or "past"
-        return cls(
-            points,
-            chosen,
-            around,
-            sight,
-            ranges,
-            front,
-            pitch,
-            past,
-            other_lines,
-            lines.shared_noise,
-            lines.shared_over,
-        )
+        shared = lines.shared_noise, lines.shared_over
+        return cls(points, chosen, around, sight, ranges, front, pitch, past, other_lines, *shared)
 
     @property
     def distance(self) -> float:
@@ -316,7 +305,7 @@ class Evidence(ObservedPoints):
         """
         shared, alone = self.expected_noise, self.roughness
         if shared == 0.0 or self.shared_over == 0.0:
-            return np.zeros((len(places), 3, 0), dtype=np.float32)
+            return super().shared_motion(places)
         slopes, cloud = (each[:, :2] / each[:, 2:] for each in (places, self.points))
         low, high = cloud.min(axis=0) - self.shared_over, cloud.max(axis=0) + self.shared_over
         number, length = np.arange(WAVES), (high - low)[:, None]

@@ -101,21 +101,21 @@ class NormalEquations:
         return float(np.linalg.slogdet(z - cross.T @ np.linalg.solve(pose, cross))[1])
 
 
-def eliminate(rows: Rows, nuisance: Float[np.ndarray, "r w"]) -> Rows:
-    """The same residuals beside a ``nuisance``: what w amplitudes, each N(0, 1), add to them.
+def eliminate(
+    columns: Float[np.ndarray, "r c"], weight: Float[np.ndarray, " r"], nuisance: Float[np.ndarray, "r w"]
+) -> Float[np.ndarray, "r c"]:
+    """Residuals, or their derivatives, without a ``nuisance``: what w amplitudes, each N(0, 1), add to them.
 
-    Their squares are those under the best amplitudes, with the squares of these: the normal equations are those of all
-    parameters with the amplitudes eliminated (Schur complement). All weights are 1.
+    All weights are 1 then. Squares are those under the best amplitudes, with the squares of these: the normal equations
+    are those of all parameters with the amplitudes eliminated (Schur complement).
     """
-    jacobian, residual, weight = rows
     root = np.sqrt(weight)[:, None]
     values, vectors = np.linalg.eigh((nuisance * weight[:, None]).T @ nuisance)
     length = np.sqrt(np.maximum(values, 1e-9))
     axes = root * nuisance @ (vectors / length)
-    lost = axes * (1.0 - 1.0 / np.hypot(1.0, length))
-    jacobian, residual = jacobian * root, residual * root[:, 0]
-    kept = (jacobian - lost @ (axes.T @ jacobian)).astype(rows[0].dtype)
-    return kept, residual - lost @ (axes.T @ residual), np.ones_like(residual)
+    kept = root * columns
+    kept -= axes * (1.0 - 1.0 / np.hypot(1.0, length)) @ (axes.T @ kept)
+    return kept
 
 
 def along(

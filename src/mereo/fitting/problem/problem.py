@@ -99,7 +99,7 @@ class Problem:
         config: constants, as a clean frame has them.
         noise: standard deviation of the observed points from the surface (``with_noise``).
         given: pose that is known; None where the frame alone says it.
-        unknown: variance of a point beside what neighbours are known to share (``worth``); None before it is asked for.
+        unknown: variance of a point beside what neighbours are known to share (``worth``, before which it is None).
     """
 
     model: StatisticalModel
@@ -205,15 +205,14 @@ class Problem:
     def innovations(self, surface: Surface) -> Float[np.ndarray, " n"]:
         """What a fit leaves over of all points beside what neighbours are known to share."""
         points, evidence = self.evidence.points, self.evidence
-        distance, face, position = surface.compared(points, None, evidence.all_alike(self.normal_length))
-        normal = surface.normals[face]
-        offset = np.copysign(distance, np.einsum("pi,pi->p", points - position, normal))
+        met = surface.compared(points, None, evidence.all_alike(self.normal_length))
+        offset, normal = surface.signed(points, met), surface.normals[met[1]]
         alone = max(noise_of(offset, evidence.around), CLEAN)
         # a point may be off by all that is shared, and is no outlier for that
         most = ROBUST * SIGMAS * float(np.hypot(alone, evidence.expected_noise))
         root = np.sqrt(geman_mcclure(offset, most)) / alone
         nuisance = np.einsum("pi,piw->pw", normal.astype(np.float32), evidence.shared_motion(points))
-        return eliminate((np.empty((len(points), 0)), offset, root**2), nuisance)[1] / root
+        return eliminate(offset[:, None], root**2, nuisance)[:, 0] / root
 
     def quieted(self, noise: float) -> "Problem":
         """The problem with no more than a noise, and by every point where that is still a camera's."""

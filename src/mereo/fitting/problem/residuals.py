@@ -211,7 +211,11 @@ class Surface:
         self, points: Float[np.ndarray, "p 3"], far: float | None = None, directions: Directions | None = None
     ) -> Float[np.ndarray, " p"]:
         """Signed distance of each point from what it is ``compared`` with, negative behind it."""
-        distance, face, position = self.compared(points, far, directions)
+        return self.signed(points, self.compared(points, far, directions))
+
+    def signed(self, points: Float[np.ndarray, "p 3"], met: Met) -> Float[np.ndarray, " p"]:
+        """Distance of each point from what it has ``met``, negative behind it."""
+        distance, face, position = met
         return np.copysign(distance, np.einsum("pi,pi->p", points - position, self.normals[face]))
 
     def planes(self, points: Float[np.ndarray, "p 3"], far: float, directions: Directions | None = None) -> Planes:
