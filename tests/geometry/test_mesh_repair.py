@@ -13,7 +13,7 @@ from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from overlapping import check_overlap
 from scene_files import write_bar, write_mesh
-from shapes import ball, box, knobbly_torus, one, segment
+from shapes import ball, box, knobbly_torus, one, segment, write_model
 
 from mereo.geometry import mesh_check, mesh_repair
 from mereo.geometry.mesh import Segment, SegmentedMesh, connected
@@ -301,15 +301,12 @@ def test_check_counts_faults_and_repair_leaves_the_users_files(
 
 
 def test_parts_of_a_model_get_files_of_their_own(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    scene = trimesh.Scene()
     parts = {
         "a": box((0, 0, 0), (2, 2, 2)),
         "core": box((2.5, 0.8, 0.8), (2.9, 1.2, 1.2)),
         "b b": box((1.5, 0, 0), (3.5, 2, 2)),
     }
-    for name, part in parts.items():
-        scene.add_geometry(trimesh.Trimesh(part.vertices, part.faces), node_name=name, geom_name=name)
-    scene.export(tmp_path / "model.glb")
+    write_model(tmp_path / "model.glb", parts)
     path = tmp_path / "two.yaml"
     path.write_text(
         "name: two\nunits: m\nmodel: model.glb  # from CAD\n\nparts:\n"

@@ -12,12 +12,13 @@ from mereo.io.intrinsics import CameraWarning, read_camera, read_intrinsics
 K = [[525.0, 0.0, 319.5], [0.0, 520.0, 239.5], [0.0, 0.0, 1.0]]
 FLAT = [v for row in K for v in row]
 SIZE = {"width": 640, "height": 480}
+PLAIN = {"fx": 525, "fy": 520, "cx": 319.5, "cy": 239.5, **SIZE}
 ROS2 = "header:\n  frame_id: depth\nheight: 480\nwidth: 640\ndistortion_model: plumb_bob\nd:\n- 0.0\n- 0.0\nk:\n"
 ROS2 += "".join(f"- {v}\n" for v in FLAT) + "r:\n- 1.0\n- 0.0\n---\n"
 ROS1 = f"image_width: 640\nimage_height: 480\ncamera_name: depth\nK: {FLAT}\nD: [0, 0]\n"
 CALIBRATOR = f"image_width: 640\nimage_height: 480\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: {FLAT}\n"
 CAMERAS = {
-    "plain.json": json.dumps({"fx": 525, "fy": 520, "cx": 319.5, "cy": 239.5, **SIZE}),
+    "plain.json": json.dumps(PLAIN),
     "realsense.json": json.dumps({"fx": 525, "fy": 520, "ppx": 319.5, "ppy": 239.5, **SIZE}),
     "open3d.json": json.dumps({"intrinsic_matrix": np.array(K).T.ravel().tolist(), **SIZE}),
     "matrix.json": json.dumps({"K": K, **SIZE}),
@@ -143,7 +144,7 @@ def test_the_frame_is_chosen_by_the_images_name_or_by_its_index(tmp_path: Path, 
     ],
 )
 def test_the_stated_depth_scale_is_turned_into_ours(tmp_path: Path, stated: dict, expected: float | None) -> None:
-    (tmp_path / "c.json").write_text(json.dumps({"fx": 525, "fy": 520, "cx": 319.5, "cy": 239.5, **SIZE, **stated}))
+    (tmp_path / "c.json").write_text(json.dumps(PLAIN | stated))
     found = read_intrinsics(tmp_path / "c.json").depth_scale
     assert found == (None if expected is None else pytest.approx(expected))
 
@@ -160,6 +161,6 @@ def test_the_stated_depth_scale_is_turned_into_ours(tmp_path: Path, stated: dict
     ],
 )
 def test_distortion_in_all_its_forms(tmp_path: Path, stated: dict, amount: str) -> None:
-    (tmp_path / "c.json").write_text(json.dumps({"fx": 525, "fy": 520, "cx": 319.5, "cy": 239.5, **SIZE, **stated}))
+    (tmp_path / "c.json").write_text(json.dumps(PLAIN | stated))
     with pytest.warns(CameraWarning, match=amount):
         read_camera(tmp_path / "c.json")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
-from toy_data import SMALL, make_small_datasets
+from toy_data import SMALL, contents, make_small_datasets
 from toy_scene import toy_scene
 
 from mereo.__main__ import main
@@ -154,10 +154,6 @@ def s3(endpoint: str, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRe
     systems().makedirs("bucket", exist_ok=True)
     yield ObjectPath(f"s3://bucket/sets/{abs(hash(request.node.name))}")
     systems.clear_instance_cache()
-
-
-def contents(folder: Path | ObjectPath) -> dict[str, bytes]:
-    return {name: (folder / name).read_bytes() for name in names_in(folder)}
 
 
 def test_a_dataset_is_shared_and_made_again(s3: ObjectPath, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -20,15 +20,24 @@ from recorded_bags import DEPTH_MM, Messages, depth_topics, write_bag
 CAMERA = Camera(8, 6, 10.0, 11.0, 4.0, 3.0)
 
 
-@pytest.mark.parametrize("name, ros", [("a.bag", 1), ("a.db3", 2), ("a.mcap", 2)])
-def test_the_depth_topic_is_found_and_read(tmp_path: Path, name: str, ros: int) -> None:
-    path = write_bag(tmp_path / name, ros, depth_topics)
-    frames = list(recorded_frames(path))
-    assert [frame.time_s for frame in frames] == [1.0, 2.0, 3.0]
-    for frame, depth in zip(frames, DEPTH_MM, strict=True):
+def check_depths(path: Path) -> None:
+    for frame, depth in zip(recorded_frames(path), DEPTH_MM, strict=True):
         content = frame.read()
         assert isinstance(content, DepthImage) and content.camera == CAMERA
         assert_array_equal(content.depth, depth / 1000)
+
+
+def depth_in(path: Path, **options: Any) -> DepthImage:
+    content = recorded_frame(path, **options).read()
+    assert isinstance(content, DepthImage)
+    return content
+
+
+@pytest.mark.parametrize("name, ros", [("a.bag", 1), ("a.db3", 2), ("a.mcap", 2)])
+def test_the_depth_topic_is_found_and_read(tmp_path: Path, name: str, ros: int) -> None:
+    path = write_bag(tmp_path / name, ros, depth_topics)
+    assert [frame.time_s for frame in recorded_frames(path)] == [1.0, 2.0, 3.0]
+    check_depths(path)
     seen = read_frame(path, InputConfig(frame_index=2))
     assert len(seen.cloud) == 47 and seen.unit_m == 1.0
     assert seen.source == f"{path.name}, /camera/depth/image_raw at 3.000 s"
@@ -55,8 +64,7 @@ def test_the_unit_is_that_which_the_sdk_of_a_realsense_records(tmp_path: Path) -
         depth, unit = make.image(DEPTH_MM[0], "16UC1"), make.types["std_msgs/msg/String"](data="0.000100")
         return {"/a/Depth_0": [depth], "/b": [make.info()], "/a/option/Depth_Units/value": [unit]}
 
-    read: Any = recorded_frame(write_bag(tmp_path / "a.mcap", 2, topics)).read()
-    assert_allclose(read.depth, DEPTH_MM[0] / 10_000)
+    assert_allclose(depth_in(write_bag(tmp_path / "a.mcap", 2, topics)).depth, DEPTH_MM[0] / 10_000)
 
 
 def test_floats_are_metres_in_either_byte_order(tmp_path: Path) -> None:
@@ -65,9 +73,7 @@ def test_floats_are_metres_in_either_byte_order(tmp_path: Path) -> None:
     path = write_bag(
         tmp_path / "a.bag", 1, lambda m: {"/d/image": [m.image(metres[0], "32FC1", big=True)], "/d/info": [m.info()]}
     )
-    content = recorded_frame(path).read()
-    assert isinstance(content, DepthImage)
-    assert_allclose(content.depth, DEPTH_MM[0] / 1000, rtol=1e-6)
+    assert_allclose(depth_in(path).depth, DEPTH_MM[0] / 1000, rtol=1e-6)
 
 
 def test_compressed_depth_is_found_beside_compressed_colour(tmp_path: Path) -> None:
@@ -80,11 +86,7 @@ def test_compressed_depth_is_found_beside_compressed_colour(tmp_path: Path) -> N
             "/camera/depth/camera_info": [make.info()],
         }
 
-    frames = list(recorded_frames(write_bag(tmp_path / "a.mcap", 2, topics)))
-    for frame, depth in zip(frames, DEPTH_MM, strict=True):
-        content = frame.read()
-        assert isinstance(content, DepthImage) and content.camera == CAMERA
-        assert_array_equal(content.depth, depth / 1000)
+    check_depths(write_bag(tmp_path / "a.mcap", 2, topics))
 
 
 def test_compressed_floats_are_inverse_depth(tmp_path: Path) -> None:
@@ -96,9 +98,7 @@ def test_compressed_floats_are_inverse_depth(tmp_path: Path) -> None:
     path = write_bag(
         tmp_path / "a.bag", 1, lambda m: {"/d/c": [m.compressed(stored, format_, (a, b))], "/d/info": [m.info()]}
     )
-    content = recorded_frame(path).read()
-    assert isinstance(content, DepthImage)
-    assert_allclose(content.depth, DEPTH_MM[0] / 1000, rtol=2e-4)
+    assert_allclose(depth_in(path).depth, DEPTH_MM[0] / 1000, rtol=2e-4)
 
 
 @pytest.mark.parametrize(
@@ -130,10 +130,8 @@ def test_distortion_counts_unless_the_topic_is_rectified(tmp_path: Path) -> None
 
     path = write_bag(tmp_path / "a.bag", 1, topics)
     with pytest.warns(CameraWarning, match="states lens distortion"):
-        content = recorded_frame(path, topic="/d/image_raw").read()
-    assert isinstance(content, DepthImage) and content.camera.focal_x_px == 20.0
-    content = recorded_frame(path, topic="/d/image_rect").read()
-    assert isinstance(content, DepthImage) and content.camera == CAMERA, "matrix P, not K"
+        assert depth_in(path, topic="/d/image_raw").camera.focal_x_px == 20.0
+    assert depth_in(path, topic="/d/image_rect").camera == CAMERA, "matrix P, not K"
 
 
 def test_one_broken_frame_stops_nothing(tmp_path: Path) -> None:
@@ -165,8 +163,7 @@ def test_what_is_no_recording_of_depth_is_said(tmp_path: Path) -> None:
     blind = write_bag(tmp_path / "blind.bag", 1, lambda m: {"/d/image": [m.image(DEPTH_MM[0], "16UC1")]})
     with pytest.raises(ValueError, match="has no CameraInfo.*--intrinsics"):
         recorded_frame(blind)
-    content = recorded_frame(blind, camera=CAMERA).read()
-    assert isinstance(content, DepthImage) and content.camera == CAMERA
+    assert depth_in(blind, camera=CAMERA).camera == CAMERA
     color = write_bag(tmp_path / "color.bag", 1, lambda m: {"/c": [m.image(np.zeros((6, 8), np.uint8), "mono8")]})
     with pytest.raises(ValueError, match=r"has neither depth images .* only /c \(sensor_msgs/msg/Image\)"):
         recorded_frame(color)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from folder_contents import read_json
-from toy_data import SMALL, make_small_datasets, read_all, small_shards
+from toy_data import SMALL, contents, make_small_datasets, read_all, small_shards
 from toy_scene import toy_scene
 
 from mereo.__main__ import main, parse
@@ -29,10 +29,6 @@ NUMBERS = count()
 def make(output: Place, seed: int = 3, **options: object) -> Place:
     generate(TOY, output, SMALL, examples=4, seed=seed, **options)  # type: ignore[arg-type]
     return output
-
-
-def contents(folder: Place) -> dict[str, bytes]:
-    return {name: (folder / name).read_bytes() for name in names_in(folder)}
 
 
 @pytest.fixture(scope="module")

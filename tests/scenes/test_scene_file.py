@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from overlapping import check_overlap
 from scene_code import CODE, EVERYTHING
 from scene_files import HEAD, write_bar, write_mesh
-from shapes import ball, box
+from shapes import ball, box, write_model
 
 import mereo.__main__ as command_line
 from mereo.deformation.maps import jacobian_determinant
@@ -119,11 +119,8 @@ def test_segments_with_the_same_deformations_stay_in_contact(tmp_path: Path) -> 
 
 
 def test_parts_of_a_model_are_renamed_joined_and_left_out(tmp_path: Path) -> None:
-    scene, path = trimesh.Scene(), tmp_path / "box.yaml"
-    parts = {"Lid": box((0, 0, 2), (2, 2, 3)), "Body": box((0, 0, 0), (2, 2, 2)), "Bolt": ball((9, 9, 9), 1)}
-    for name, part in parts.items():
-        scene.add_geometry(trimesh.Trimesh(part.vertices, part.faces), node_name=name, geom_name=name)
-    scene.export(tmp_path / "box.glb")
+    path, parts = tmp_path / "box.yaml", {"Lid": box((0, 0, 2), (2, 2, 3)), "Body": box((0, 0, 0), (2, 2, 2))}
+    write_model(tmp_path / "box.glb", {**parts, "Bolt": ball((9, 9, 9), 1)})
     head = "name: box\nunits: m\nmodel: box.glb\nparts:\n"
     path.write_text(f"{head}  - {{name: Body, nested_in: all}}\n  - {{name: all, parts: [Lid, Body]}}\n")
     rest = load_scene(path).rest
@@ -319,12 +316,8 @@ def test_every_name_of_a_file_is_a_segment_and_of_an_object_valid_and_new(tmp_pa
 
 def test_every_name_of_a_part_is_a_segment(tmp_path: Path) -> None:
     def write(*names: str) -> Path:
-        model = trimesh.Scene()
-        for low, name in enumerate(names):
-            part = box((low, 0, 0), (low + 0.9, 1, 1))
-            model.add_geometry(trimesh.Trimesh(part.vertices, part.faces), node_name=name, geom_name=name)
-        model.export(tmp_path / "model.glb")
-        return tmp_path / "model.glb"
+        parts = {name: box((low, 0, 0), (low + 0.9, 1, 1)) for low, name in enumerate(names)}
+        return write_model(tmp_path / "model.glb", parts)
 
     path = write_scene_file([write("Body/Lid\n2", "null", "Lid #2")], tmp_path / "a.yaml")
     assert load_scene(path).rest.names == ("Body_Lid_2", "null", "Lid #2")

@@ -1,5 +1,8 @@
 """Small closed meshes with known answers, for the tests of the forward path."""
 
+from collections.abc import Mapping
+from pathlib import Path
+
 import numpy as np
 import trimesh
 
@@ -30,6 +33,15 @@ def knobbly_torus(seed: int, name: str = "torus", color: int = 0) -> Segment:
     )
     turn = trimesh.transformations.random_rotation_matrix(rng.random(3))[:3, :3]
     return Segment(name, PALETTE[color], points @ turn.T, np.array(mesh.faces, dtype=np.int64))
+
+
+def write_model(path: Path, parts: Mapping[str, Segment]) -> Path:
+    """Write a model file whose nodes are these parts."""
+    scene = trimesh.Scene()
+    for name, part in parts.items():
+        scene.add_geometry(trimesh.Trimesh(part.vertices, part.faces), node_name=name, geom_name=name)
+    scene.export(path)
+    return path
 
 
 def one(part: Segment) -> SegmentedMesh:

@@ -17,6 +17,7 @@ from safetensors.numpy import save_file
 from toy_scene import toy_scene
 
 from mereo.api.generate import generate
+from mereo.io.object_storage import Place, names_in
 from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH
 from mereo.synthesis.config import TEMPLATE, GenerateConfig, SamplingConfig
 from mereo_learning import shards
@@ -41,6 +42,11 @@ def write_small_dataset(output: Path) -> Path:
         make_small_datasets(patch)
         generate(toy_scene(), output, SMALL, examples=4, seed=3)
     return output
+
+
+def contents(folder: Place) -> dict[str, bytes]:
+    """Files of a stored dataset."""
+    return {name: (folder / name).read_bytes() for name in names_in(folder)}
 
 
 def read_all(data: Dataset) -> SimpleNamespace:

@@ -176,10 +176,14 @@ def test_the_segmentation_is_wrong_anywhere_it_differs() -> None:
     assert set(np.unique(segmentation_error(labelled(truth, truth)))) == {0, 1}
 
 
+def two_boxes() -> np.ndarray:
+    labels = np.zeros((20, 20, 20), np.uint8)
+    labels[5:15, 5:10, 5:15], labels[5:15, 10:15, 5:15] = 1, 2
+    return labels
+
+
 def test_a_comparison_has_the_reference_and_a_column_for_each_answer(tmp_path: Path) -> None:
-    truth = np.zeros((20, 20, 20), np.uint8)
-    truth[5:15, 5:10, 5:15], truth[5:15, 10:15, 5:15] = 1, 2
-    other = truth.copy()
+    truth, other = two_boxes(), two_boxes()
     other[7:13, 7:13, 1:5] = 1  # toward the camera
     views, captions = [[labelled(truth, truth), labelled(truth, other)]], [["one", "two"]]
     colored = {}
@@ -216,9 +220,7 @@ def strips(picture: np.ndarray) -> int:
 
 
 def test_the_error_picture_shows_each_error_in_its_column_only(tmp_path: Path) -> None:
-    truth = np.zeros((20, 20, 20), np.uint8)
-    truth[5:15, 5:10, 5:15], truth[5:15, 10:15, 5:15] = 1, 2
-    found = truth.copy()
+    truth, found = two_boxes(), two_boxes()
     found[15:18, 5:15, 5:15], found[5:8, 5:15, 5:15], found[10:12, 5:15, 5:15] = 1, 0, 1
     error_picture(tmp_path / "e.png", [labelled(truth, found)], size=60)
     picture = np.asarray(Image.open(tmp_path / "e.png"))
