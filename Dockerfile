@@ -6,10 +6,11 @@ FROM python:3.13-slim AS build
 WORKDIR /source
 COPY pyproject.toml constraints.txt README.md LICENSE ./
 COPY src src
+COPY weights weights
 # torch without 3 GB of CUDA libraries; nothing is compiled, and no build tools are in the image
 RUN python -m venv /opt/mereo && \
     /opt/mereo/bin/pip install --no-cache-dir --extra-index-url https://download.pytorch.org/whl/cpu \
-        -c constraints.txt ".[network,cad,medical,sensors,serve]"
+        -c constraints.txt ./weights ".[network,cad,medical,sensors,serve]"
 
 FROM python:3.13-slim
 LABEL org.opencontainers.image.title="mereo" org.opencontainers.image.licenses="MIT"

@@ -23,8 +23,8 @@ def name_of(requirement: str) -> str:
 
 
 def lowest(requirement: str) -> str:
-    """The constraint to the lower bound: ``torch>=2.13,<3`` becomes ``torch==2.13``."""
-    bound = re.search(r">=\s*([A-Za-z0-9.]+)", requirement)
+    """The constraint to the lower bound: ``torch>=2.13,<3`` becomes ``torch==2.13``; one to a version stays."""
+    bound = re.search(r"[>=]=\s*([A-Za-z0-9.]+)", requirement)
     if bound is None:
         raise ValueError(f"{requirement!r} has no lower bound; write the oldest version that works as >=")
     return f"{name_of(requirement)}=={bound.group(1)}"

@@ -100,7 +100,7 @@ def _from_root(text: str) -> str:
 
 
 def _cards() -> list[Path]:
-    return sorted(SOURCE.rglob("weights/*.md"))
+    return sorted(ROOT.glob("weights/src/mereo_weights/*.md"))
 
 
 def _packages(folder: Path) -> Iterator[Path]:

@@ -35,7 +35,7 @@ from mereo.io.progress import Progress, progress
 from mereo.io.writers.meshes import write_positions_ply
 from mereo.models.device import keep_freed_memory, pick_device
 from mereo.models.weights import load_model, with_calibration
-from mereo.models.weights_place import WEIGHTS, find_weights, shipped_names
+from mereo.models.weights_place import NOT_SHIPPED, WEIGHTS, find_weights, shipped_names
 from mereo.scenes.files.check import check_scene
 from mereo.scenes.files.object_files import SCENE, SEARCH, names_scene, scene_of_folder, shapes_in
 from mereo.scenes.files.template import write_scene_file
@@ -244,6 +244,8 @@ def learn(
     clock, units, train = Clock(60 * config.minutes), config.units, config.train
     if config.init:
         find_weights(config.init)  # a name that is none is better said before the work
+    elif train != "never" and not shipped_names():
+        raise FileNotFoundError(f"there are no weights to start from: name some with --init, or {NOT_SHIPPED}")
     if not (output / PLAN).is_file() and not (output / SEARCH).is_file():
         clock.stage(1, "check the object")
         check_object(files, units)

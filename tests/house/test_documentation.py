@@ -20,7 +20,7 @@ from page_blocks import FENCE, ROOT, blocks
 from mereo.__main__ import parse
 
 EXPERIMENTS = ROOT / "docs" / "experiments.md"
-PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("src/mereo/**/weights/*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("weights/**/*.md")])
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 RELEASED = [page for page in PAGES if EXPERIMENTS not in (page, page.parent.with_suffix(".md"))]
 """Pages about the code as it is; an experiment is about the code of its commit."""
@@ -164,11 +164,12 @@ def test_readme_is_one_screen_and_pages_of_use_and_decisions_are_short() -> None
         assert len(page.read_text().splitlines()) <= 40, page
 
 
-def test_citation_is_of_this_version() -> None:
+def test_citation_and_weights_are_of_this_version() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    project, weights = (tomllib.loads((ROOT / f"{at}pyproject.toml").read_text())["project"] for at in ("", "weights/"))
     assert citation["title"] == project["name"]
-    assert all(citation[key] == project[key] for key in ("version", "license", "authors"))
+    assert all(citation[key] == project[key] == weights[key] for key in ("version", "license", "authors"))
+    assert f"mereo-weights=={project['version']}" in project["optional-dependencies"]["network"]
 
 
 def test_every_library_has_a_lowest_version() -> None:

@@ -1,6 +1,7 @@
 """Files of weights: what `mereo weights` says of them, and of a damaged one the sentence that names what is wrong."""
 
 import json
+import sys
 from collections.abc import Callable
 from hashlib import sha256
 from pathlib import Path
@@ -13,11 +14,14 @@ from analytic import untrained
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
+import mereo
 from mereo import __main__ as command_line
+from mereo.io.checked_tensors import pack_tensors, unpack_tensors
 from mereo.models.weights import load_model, save_model, trained_steps, weights_bytes
-from mereo.models.weights_place import SHIPPED, shipped_names
+from mereo.models.weights_place import NOT_SHIPPED, find_weights, shipped_names
+from mereo_learning.learn import learn
 
-WITH_STATES, BIAS = SHIPPED / "rope.safetensors", "decoder.head.bias"
+WITH_STATES, BIAS = find_weights("rope"), "decoder.head.bias"
 
 
 def changed(folder: Path, change: Callable[[Any, dict[str, torch.Tensor]], Any], with_states: bool = False) -> Path:
@@ -88,18 +92,38 @@ def test_every_shipped_file_is_listed_with_the_scores_of_its_card(capsys: pytest
     rows = {line.split()[1]: line for line in said(capsys, "list").splitlines() if line.startswith("│")}
     assert tuple(rows) == shipped_names()
     for name, row in rows.items():
-        assert f"{(SHIPPED / f'{name}.safetensors').stat().st_size / 2**20:.1f} MB" in row
+        assert f"{find_weights(name).stat().st_size / 2**20:.1f} MB" in row
     assert "0.973 0.904" in rows["bunny"]
 
 
 def test_show_prints_the_unit_and_the_card_or_all_as_json(capsys: pytest.CaptureFixture) -> None:
-    text = said(capsys, "show", "tumor")
-    assert "8.134 mm to a scene unit" in text and (SHIPPED / "tumor.md").read_text("utf-8") in text
-    assert sha256((SHIPPED / "tumor.safetensors").read_bytes()).hexdigest() in text.split("# tumor")[0]
+    text, tumor = said(capsys, "show", "tumor"), find_weights("tumor")
+    assert "8.134 mm to a scene unit" in text and tumor.with_suffix(".md").read_text("utf-8") in text
+    assert sha256(tumor.read_bytes()).hexdigest() in text.split("# tumor")[0]
     facts = json.loads(said(capsys, "show", "bunny", "--json"))
     assert facts["names"] == list(load_model("bunny").names) and facts["unit_m"] == pytest.approx(0.00604, rel=1e-3)
     assert facts["provenance"]["recipe"]["batch"] == 40 and facts["network"]["points"] == 1024
-    assert facts["card"] == (SHIPPED / "bunny.md").read_text("utf-8")
+    assert facts["card"] == find_weights("bunny").with_suffix(".md").read_text("utf-8")
+
+
+def test_where_none_are_shipped_their_package_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    monkeypatch.setitem(sys.modules, "mereo_weights", None)  # as if it were not installed
+    cure = r"mereo-weights: pip install 'mereo\[network\]', in a checkout pip install ./weights$"
+    with pytest.raises(FileNotFoundError, match=rf"^there are no weights 'rope'; give .*{cure}"):
+        load_model("rope")
+    with pytest.raises(FileNotFoundError, match=rf"^there are no weights to start from: .*{cure}"):
+        learn([Path("rope")], tmp_path)
+    assert said(capsys, "list") == f"no weights are shipped here: {NOT_SHIPPED}\n"
+
+
+def test_what_mereo_has_of_the_bunny_is_what_its_weights_have(tmp_path: Path) -> None:
+    tensors, header = unpack_tensors(find_weights("bunny").read_bytes())
+    states = {name: value for name, value in tensors.items() if name.startswith("states.")}
+    wanted, kept = tmp_path / "bunny.safetensors", Path(mereo.__file__).parent / "states/bunny.safetensors"
+    wanted.write_bytes(pack_tensors(states, {"states": header["states"]}))
+    assert pack_tensors(*unpack_tensors(kept.read_bytes())) == wanted.read_bytes(), f"copy {wanted} to {kept}"
 
 
 def test_weights_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -23,14 +23,14 @@ from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.bounds import check_value
 from mereo.io.config import MeshesConfig, RobotMeshes
 from mereo.io.errors import checked_path
-from mereo.io.extras import has_network, network_needed
+from mereo.io.extras import network_needed
 from mereo.io.mesh_formats import MESH_SUFFIXES
 from mereo.io.point_arrays import mesh_of
 from mereo.io.progress import stage
 from mereo.io.writers.meshes import write_segments_obj
 from mereo.models.config import InferenceConfig
 from mereo.models.trained import Trained
-from mereo.models.weights_place import is_weights, shipped_names, statistical_model_in
+from mereo.models.weights_place import has_network, is_weights, statistical_model_in
 from mereo.scenes.files.object_files import SCENE, names_scene, scene_of_folder, scene_of_meshes, shapes_in
 from mereo.scenes.parameters import parameters, random_state, with_joints
 from mereo.scenes.random_states import OBJECT_STATES, STATES_SEED, kept_model, scene_model
@@ -160,7 +160,7 @@ class Object:
 
 
 class WithoutWeightsWarning(UserWarning):
-    """Warning that a built-in object is searched by its model, as its weights need PyTorch."""
+    """Warning that a built-in object is searched by its model, as its weights or PyTorch are not installed."""
 
 
 @python_words()
@@ -182,8 +182,8 @@ def load_object(
             Open3D, PyVista or (vertices, faces), as a dict by the segments' names or a list; a scene file, a built-in
             scene's name or a scene; the folder that ``mereo learn`` has written; or weights: a shipped name, a file,
             or some that are loaded already. A name that both weights and a scene have means the weights, which know
-            that scene; without PyTorch the object is searched by the model that they carry, with a
-            ``WithoutWeightsWarning``.
+            that scene; without the extra `network` the object is searched by the model that they carry, with a
+            ``WithoutWeightsWarning``, or by that of its scene where they are not installed.
         scene: of weights: the object's scene, its name or its file, where it is not the built-in one of the weights.
         weights: to start the fit with, where ``source`` is meshes or a scene, or none of them.
         units: of meshes: "mm", "cm", "m" or "in"; guessed where not given.
@@ -243,8 +243,8 @@ def load_weights(given: Trained | str | Path, inference: InferenceConfig) -> Tra
 def _built_in_by_model(name: str) -> Object:
     """Built-in object without its weights' network, by the statistical model that they carry."""
     warnings.warn(
-        f"PyTorch is not installed, so {name} is searched by its model: pip install 'mereo[network]' lets its weights "
-        "start the fit at once",
+        f"the extra `network` is not installed, so {name} is searched by its model: pip install 'mereo[network]' lets "
+        "its weights start the fit at once",
         WithoutWeightsWarning,
         stacklevel=4,
     )
@@ -324,6 +324,6 @@ def _scene(source: Source, meshes: MeshesConfig) -> Scene:
     if len(files) == 1 and files[0].suffix == "" and not files[0].exists():
         raise FileNotFoundError(
             f"there is no object {str(files[0])!r}: name its meshes, its scene file, a folder of mereo learn, a "
-            f"built-in scene ({', '.join(SCENES)}), or weights ({', '.join(shipped_names())}, or a .safetensors file)"
+            f"built-in scene ({', '.join(SCENES)}), or weights (a name of mereo weights list, or a .safetensors file)"
         )
     return scene_of_meshes(files, **vars(meshes))

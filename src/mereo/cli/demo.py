@@ -1,4 +1,4 @@
-"""The command ``mereo demo``: a real scan by its object's meshes alone, and with torch frames by shipped weights."""
+"""The command ``mereo demo``: a real scan by its object's meshes alone, and frames by shipped weights."""
 
 import time
 from collections.abc import Iterator
@@ -50,8 +50,8 @@ class Demo:
         """Reconstruct every input, and print its scores, seconds and where to look."""
         from mereo.api.reconstruct import reconstruct
         from mereo.io.atomic_files import check_new_directory, check_place
-        from mereo.io.extras import has_network
         from mereo.io.progress import shown_stages
+        from mereo.models.weights_place import has_network
 
         check_place(self.output, may_be_link=True)
         scores, began = dict[str, Any](), time.perf_counter()
@@ -66,8 +66,10 @@ class Demo:
             page = f", or in the browser: mereo view {folder}" if result.taken else ""
             print(f"{len(frame.cloud)} points, {seconds:.1f} s; look at {folder / 'report.html'}{page}\n")
         if not has_network():
-            print("PyTorch is not installed, so nothing is shown of networks, which start the fit at once:")
-            print("run pip install 'mereo[network]' and this again.\n")
+            print(
+                "The extra `network` is not installed, so nothing is shown of networks, which start the fit at once:\n"
+                "run pip install 'mereo[network]' and this again.\n"
+            )
         print(f"All in {time.perf_counter() - began:.0f} s.")
         print(NEXT.format(frame=self.output / FRAME, meshes=self.output / MESHES))
         return Outcome(scores)
@@ -84,9 +86,8 @@ def _inputs(output: Path) -> "Iterator[tuple[str, str, Object, SensorFrame, Trut
     from mereo.geometry.metrics import truth_grid
     from mereo.geometry.transforms import transform_points
     from mereo.io.atomic_files import new_directory
-    from mereo.io.extras import has_network
     from mereo.io.writers.meshes import write_positions_ply, write_surface_stl
-    from mereo.models.weights_place import statistical_model_in
+    from mereo.models.weights_place import has_network, statistical_model_in
     from mereo.synthesis.sample_views import SHIPPED_SCAN, load_view
     from mereo_learning.scans import BUNNY_SCAN_POSES
 

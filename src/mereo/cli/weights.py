@@ -27,12 +27,16 @@ class WeightsList:
         from rich.console import Console
         from rich.table import Table
 
-        from mereo.models.weights_place import SHIPPED, read_facts, shipped_names
+        from mereo.models.weights_place import NOT_SHIPPED, read_facts, shipped_names
 
-        table = Table(title=None if self.weights else f"weights in {SHIPPED}", title_justify="left")
+        names = [file for place in self.weights for file in _weights_in(place)] or shipped_names()
+        if not names:
+            print(f"no weights are shipped here: {NOT_SHIPPED}")
+            return
+        table = Table()
         for column in ("name", "object", "segments", "size", "IoU mIoU"):
             table.add_column(column, overflow="fold")
-        for name in [file for place in self.weights for file in _weights_in(place)] or shipped_names():
+        for name in names:
             path, header = read_facts(name)
             card = path.with_suffix(".md")
             scores = SCORES.search(card.read_text("utf-8")) if card.is_file() else None

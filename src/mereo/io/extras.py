@@ -21,11 +21,6 @@ def network_needed() -> Iterator[None]:
         raise (ImportError(NEEDED) if is_torch(error) else error) from None
 
 
-def has_network() -> bool:
-    """Whether torch is installed."""
-    return find_spec("torch") is not None
-
-
 def is_torch(error: BaseException) -> bool:
     """Whether an error says that torch is not installed."""
     return isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] == "torch"

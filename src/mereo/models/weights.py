@@ -24,7 +24,7 @@ from mereo.models.encoders import CODES
 from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.models.trained import Trained
-from mereo.models.weights_place import STATES, find_weights
+from mereo.models.weights_place import STATES, find_weights, read_facts
 from mereo.scenes.statistical_model import StatisticalModel, pack_model, unpack_model
 from mereo.workers.spread import Cluster
 
@@ -234,9 +234,8 @@ def _unpack(packed: Int8[Tensor, "*s"]) -> Float[Tensor, "*s"]:
 def trained_steps(path: Path) -> int | None:
     """Steps of training that a file of weights says it has had, from its header alone; None where it is none."""
     try:
-        with safe_open(path, framework="pt") as file:
-            steps = json.loads((file.metadata() or {})["mereo"])["provenance"]["steps"]
-    except (SafetensorError, OSError, KeyError, ValueError, TypeError):
+        steps = read_facts(path)[1]["provenance"].get("steps")
+    except (OSError, ValueError):
         return None
     return steps if isinstance(steps, int) else None
 
