@@ -135,7 +135,8 @@ def stage(text: str) -> Iterator[None]:
 
 
 def _print(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
+    sys.stderr.write(f"{line}\n")  # at once: lines of several threads do not mix
+    sys.stderr.flush()
 
 
 def duration(seconds: float) -> str:
