@@ -132,7 +132,7 @@ BUDGET = {
 }
 """Syntax nodes and files that a folder may have at most. Lines are free: fewer of them are not less to know."""
 
-CHOICES = {"src/mereo/fitting": (321, 177), "src/mereo/locating": (34, 34)}
+CHOICES = {"src/mereo/fitting": (320, 176), "src/mereo/locating": (34, 34)}
 """Decisions (``if`` statements and expressions) and numbers in module constants that a folder may have at most.
 
 They choose among fits, and they only fall."""

@@ -135,8 +135,7 @@ def stage(text: str) -> Iterator[None]:
 
 
 def _print(line: str) -> None:
-    sys.stderr.write(f"{line}\n")  # at once: lines of several threads do not mix
-    sys.stderr.flush()
+    print(f"{line}\n", end="", file=sys.stderr, flush=True)  # at once: lines of several threads do not mix
 
 
 def duration(seconds: float) -> str:

@@ -12,6 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
@@ -142,19 +143,36 @@ def without_sign(normals: np.ndarray) -> np.ndarray:
     return (normals[..., :, None] * normals[..., None, :]).reshape(*normals.shape[:-1], 9)
 
 
+Kind = TypeVar("Kind", bound="ObservedPoints")
+
+
 @dataclass(frozen=True, eq=False)
 class ObservedPoints(ABC):
     """Observed points, prepared for comparison with surfaces; lengths in scene units.
 
     Attributes:
         points: observed, camera frame.
-        observed_samples: some of them, evenly spread.
+        chosen: rows of some of them, evenly spread: the observed samples.
         around: indices of each point's neighbours, up to 8.
     """
 
     points: Float[np.ndarray, "n 3"]
-    observed_samples: Float[np.ndarray, "p 3"]
+    chosen: Int[np.ndarray, " p"]
     around: Int[np.ndarray, "n k"]
+
+    @cached_property
+    def observed_samples(self) -> Float[np.ndarray, "p 3"]:
+        """Points that are compared with the model's surface."""
+        return self.points[self.chosen]
+
+    @property
+    def with_more_samples(self: Kind) -> Kind:
+        """The same with as many observed samples as a noisy frame needs."""
+        return replace(self, chosen=spread(self.points, MORE_SAMPLES))
+
+    def few(self: Kind, count: int) -> Kind:
+        """The same with so many observed samples at most."""
+        return replace(self, chosen=self.chosen[:count])
 
     def patch_share(self, tolerance: float) -> float:
         """Share of the points within a tolerance of one smooth patch: a quadratic function over their best plane."""
@@ -201,7 +219,7 @@ class ObservedPoints(ABC):
     @property
     def noise(self) -> float:
         """Noise of the frame at most, as it shows before any fit."""
-        roughness = self.roughness if np.isfinite(self.roughness) else 0.0  # of a few points
+        roughness = np.nan_to_num(self.roughness, posinf=0.0)  # of a few points
         return float(np.hypot(ROUGHER * roughness, self.expected_noise))
 
     @cached_property
@@ -266,18 +284,15 @@ class Evidence(ObservedPoints):
         """
         points = means_along_sight(points, most)
         ranges = np.linalg.norm(points, axis=1)
-        sight = cKDTree(points / ranges[:, None])
+        sight = cKDTree(unit_rows(points))
         angle, near = sight.query(sight.data, k=range(1, min(AROUND, len(points)) + 1))
         # the fourth neighbour of a pixel is one pitch away, as the first is; irregular clouds are not so lucky
         pitch = float(np.median(angle[:, min(4, len(points)) - 1]))
         front = np.where(angle <= AROUND_PITCHES * pitch, ranges[near], np.inf).min(axis=1)
-        unknown = [part for part in (outliers, lines.unknown) if part is not None]
-        if sum(map(len, unknown)):
-            toward = np.concatenate(unknown)
-            toward = toward / np.linalg.norm(toward, axis=1, keepdims=True)
-            sight = cKDTree(np.concatenate([sight.data, toward]))
-            front = np.concatenate([front, np.zeros(len(toward))])
-        chosen, around = points[spread(points, observed_samples)], near[:, 1:]
+        unknown = lines.unknown if outliers is None else np.concatenate([outliers, lines.unknown])
+        sight = cKDTree(np.concatenate([sight.data, unit_rows(unknown)]))
+        front = np.concatenate([front, np.zeros(len(unknown))])
+        chosen, around = spread(points, observed_samples), near[:, 1:]
         past, other_lines = PastLines.of(lines.past, pitch), lines.other_lines or "past"
         shared = lines.shared_noise, lines.shared_over
         return cls(points, chosen, around, sight, ranges, front, pitch, past, other_lines, *shared)
@@ -321,15 +336,6 @@ class Evidence(ObservedPoints):
         first = unit_rows(np.cross(sight, [0.0, 1.0, 0.0]))
         axes = (sight * shared, first * aside[:, None], np.cross(sight, first) * aside[:, None])
         return np.concatenate([axis[:, :, None] * field[:, None] for axis in axes], axis=2, dtype=np.float32)
-
-    @property
-    def with_more_samples(self) -> "Evidence":
-        """The same with as many observed samples as a noisy frame needs."""
-        return replace(self, observed_samples=self.points[spread(self.points, MORE_SAMPLES)])
-
-    def few(self, count: int) -> "Evidence":
-        """The same with so many observed samples at most."""
-        return replace(self, observed_samples=self.observed_samples[:count])
 
     def directions(self, length: float, wanted: bool) -> Directions | None:
         """Normals of the observed samples where they are ``wanted``, for the weight of each."""
@@ -375,12 +381,11 @@ class Evidence(ObservedPoints):
         """Share of the silhouette next to which nothing is known: where an occluder or the picture's edge cuts it."""
         if not self.is_open:
             return 0.0
-        toward = self.points / self.ranges[:, None]
+        toward = unit_rows(self.points)
         across = rotation_along(toward.mean(axis=0))[:, :2].T
         turns = np.arange(EDGE_DIRECTIONS) * (2 * np.pi / EDGE_DIRECTIONS)
         steps = EDGE_PITCHES * self.pitch * np.stack([np.cos(turns), np.sin(turns)], axis=1) @ across
-        around = (toward[:, None] + steps).reshape(-1, 3)
-        around = around / np.linalg.norm(around, axis=1, keepdims=True)
+        around = unit_rows((toward[:, None] + steps).reshape(-1, 3))
         is_around = cKDTree(toward).query(around)[0] > RIM_PITCHES * self.pitch
         _, front, free = self.along(around[is_around])
         nearest = (1 - self.pitch) * np.repeat(self.ranges, EDGE_DIRECTIONS)[is_around]
@@ -398,7 +403,7 @@ class Evidence(ObservedPoints):
         distance = np.linalg.norm(center, axis=1)
         across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         shown = np.maximum(-np.einsum("fi,fi->f", across, center), 0.0) / distance**3
-        toward = center / distance[:, None]
+        toward = unit_rows(center)
         angle, near = self.sight.query(toward)
         is_open = self._free(toward, np.full(len(toward), np.inf)) == 0.0
         is_unseen = is_open & (near < len(self.points)) & (angle > UNSEEN_PITCHES * self.pitch)
@@ -412,15 +417,21 @@ class Evidence(ObservedPoints):
         ``slack`` is how far in front of observed points a vertex may be.
         """
         distance = np.linalg.norm(vertices, axis=1)
-        toward = vertices / distance[:, None]
+        toward = unit_rows(vertices)
         angle, near = self.sight.query(toward)
         is_past = angle > SILHOUETTE_PITCHES * self.pitch
-        sideways = self.sight.data[near] * distance[:, None] - vertices
-        length = np.sqrt(np.einsum("ni,ni->n", sideways, sideways))
-        out = sideways / np.maximum(length, 1e-12)[:, None]
         ahead = self.front[near] - slack - distance
-        direction = np.where(is_past[:, None], out, toward)
-        amount = np.maximum(np.where(is_past, length - self.pitch * distance, ahead), 0.0)
+        # edges of masks and of stereo cameras are off by some pixels, and let in what is far behind: a line of sight
+        # that allows the vertex, among 9 x 9 pixels, is nearer then
+        rows = np.flatnonzero(~is_past & (ahead > AROUND * self.pitch * distance))
+        lines = self.sight.query(toward[rows], range(1, min(AROUND**2, len(self.sight.data)) + 1))[1]
+        allows = distance[rows, None] >= self.front[lines] - slack
+        line, aside = near.copy(), is_past.copy()
+        line[rows], aside[rows] = lines[np.arange(len(rows)), allows.argmax(axis=1)], allows.any(axis=1)
+        sideways = self.sight.data[line] * distance[:, None] - vertices
+        length = np.linalg.norm(sideways, axis=1) - self.pitch * distance
+        direction = np.where(aside[:, None], unit_rows(sideways), toward)
+        amount = np.maximum(np.where(aside, length, ahead), 0.0)
         if self.past is not None or self.other_lines == "unknown":
             rows = np.flatnonzero(is_past)
             nearest = np.where(near[rows] < len(self.points), np.inf, angle[rows])
@@ -460,13 +471,11 @@ class SurfaceEvidence(ObservedPoints):
 
     Attributes:
         normals: of all points, out of the surface, or of either sign.
-        sample_normals: of the observed samples.
         lift: of ``Directions``: whether the sign counts.
         other_lines: kind of all lines of sight.
     """
 
     normals: Float[np.ndarray, "n 3"]
-    sample_normals: Float[np.ndarray, "p 3"]
     lift: Callable[[np.ndarray], np.ndarray]
     other_lines: SightKind = "none"
 
@@ -488,18 +497,12 @@ class SurfaceEvidence(ObservedPoints):
         (normals, lift), rows = known, thin_to_grid(points, most)
         points, normals = points[rows], normals[rows]
         around = cKDTree(points).query(points, k=range(1, min(AROUND, len(points)) + 1))[1][:, 1:]
-        chosen = spread(points, observed_samples)
-        return cls(points, points[chosen], around, normals, normals[chosen], lift)
+        return cls(points, spread(points, observed_samples), around, normals, lift)
 
     @property
-    def with_more_samples(self) -> "SurfaceEvidence":
-        """As of ``Evidence``."""
-        chosen = spread(self.points, MORE_SAMPLES)
-        return replace(self, observed_samples=self.points[chosen], sample_normals=self.normals[chosen])
-
-    def few(self, count: int) -> "SurfaceEvidence":
-        """As of ``Evidence``."""
-        return replace(self, observed_samples=self.observed_samples[:count], sample_normals=self.sample_normals[:count])
+    def sample_normals(self) -> Float[np.ndarray, "p 3"]:
+        """Normals of the observed samples."""
+        return self.normals[self.chosen]
 
     def alike(self, length: float) -> Directions:
         """Normals by which the place is chosen that a sample is compared with."""

@@ -116,8 +116,6 @@ Shows = Callable[[Float[np.ndarray, "f 3"], Float[np.ndarray, "f 3"]], Bool[np.n
 ROBUST = 2.5
 """Residuals beyond this many sigma count for little."""
 
-MOST_VIOLATIONS = 400
-
 
 def robust_square(residual: Float[np.ndarray, " r"], sigma: float, robust: float = ROBUST) -> Float[np.ndarray, " r"]:
     """Geman and McClure's loss, in squared sigmas; ``geman_mcclure`` are its weights."""
@@ -314,7 +312,6 @@ def add_silhouette(
     rows = np.flatnonzero(amount > 0)
     if len(rows) == 0:
         return normal
-    rows = rows[:: max(1, -(-len(rows) // MOST_VIOLATIONS))]
     jacobian = along(posed, points[rows], modes_at(rows), direction[rows])
     weight = each / sigma**2 * geman_mcclure(amount[rows], 4 * ROBUST * sigma)
     return normal.add(jacobian, -amount[rows], weight)
