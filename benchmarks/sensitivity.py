@@ -149,8 +149,8 @@ def scores_with(numbers: Sequence[Number], frames: Path) -> Iterator[tuple[float
     """Scores and seconds of the frames, one after the other, with some numbers changed."""
     with TemporaryDirectory() as folder:
         package = Path(folder) / "mereo"
-        copytree(SOURCE, package, ignore=ignore_patterns("__pycache__", "weights", "frames"))
-        for name in ("weights", "frames"):
+        copytree(SOURCE, package, ignore=ignore_patterns("__pycache__", "states", "frames"))
+        for name in ("states", "frames"):
             (package / name).symlink_to(SOURCE / name)
         for number in reversed(numbers):  # the last in a line first, so that the others stay where they are
             path = package / number.path
