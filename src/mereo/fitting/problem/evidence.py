@@ -294,8 +294,19 @@ class Evidence(ObservedPoints):
         front = np.concatenate([front, np.zeros(len(unknown))])
         chosen, around = spread(points, observed_samples), near[:, 1:]
         past, other_lines = PastLines.of(lines.past, pitch), lines.other_lines or "past"
-        shared = lines.shared_noise, lines.shared_over
-        return cls(points, chosen, around, sight, ranges, front, pitch, past, other_lines, *shared)
+        return cls(
+            points,
+            chosen,
+            around,
+            sight,
+            ranges,
+            front,
+            pitch,
+            past,
+            other_lines,
+            lines.shared_noise,
+            lines.shared_over,
+        )
 
     @property
     def distance(self) -> float:
@@ -417,7 +428,7 @@ class Evidence(ObservedPoints):
         ``slack`` is how far in front of observed points a vertex may be.
         """
         distance = np.linalg.norm(vertices, axis=1)
-        toward = unit_rows(vertices)
+        toward = vertices / distance[:, None]
         angle, near = self.sight.query(toward)
         is_past = angle > SILHOUETTE_PITCHES * self.pitch
         ahead = self.front[near] - slack - distance
@@ -426,12 +437,12 @@ class Evidence(ObservedPoints):
         rows = np.flatnonzero(~is_past & (ahead > AROUND * self.pitch * distance))
         lines = self.sight.query(toward[rows], range(1, min(AROUND**2, len(self.sight.data)) + 1))[1]
         allows = distance[rows, None] >= self.front[lines] - slack
-        line, aside = near.copy(), is_past.copy()
-        line[rows], aside[rows] = lines[np.arange(len(rows)), allows.argmax(axis=1)], allows.any(axis=1)
-        sideways = self.sight.data[line] * distance[:, None] - vertices
-        length = np.linalg.norm(sideways, axis=1) - self.pitch * distance
-        direction = np.where(aside[:, None], unit_rows(sideways), toward)
-        amount = np.maximum(np.where(aside, length, ahead), 0.0)
+        aside = is_past.copy()
+        near[rows], aside[rows] = lines[np.arange(len(rows)), allows.argmax(axis=1)], allows.any(axis=1)
+        sideways = self.sight.data[near] * distance[:, None] - vertices
+        length = np.sqrt(np.einsum("ni,ni->n", sideways, sideways))
+        direction = np.where(aside[:, None], sideways / np.maximum(length, 1e-12)[:, None], toward)
+        amount = np.maximum(np.where(aside, length - self.pitch * distance, ahead), 0.0)
         if self.past is not None or self.other_lines == "unknown":
             rows = np.flatnonzero(is_past)
             nearest = np.where(near[rows] < len(self.points), np.inf, angle[rows])
