@@ -203,7 +203,7 @@ def information(problem: Problem, posed: Posed) -> tuple[float, Float[np.ndarray
 
     Logarithm of the determinant of the pose's part, without the scale's, and eigenvalues of the modes' that is left.
     """
-    jacobian, _, weight = problem.cloud_rows(posed)
+    jacobian, _, weight, _ = problem.cloud_rows(posed)
     weight = weight / max(float(weight.sum()), 1e-12)
     matrix = NormalEquations.nothing(jacobian.shape[1]).add(jacobian, np.zeros(len(jacobian)), weight).matrix
     pose = matrix[:6, :6] + 1e-9 * np.trace(matrix[:6, :6]) * np.eye(6)

@@ -188,7 +188,7 @@ def test_a_smooth_patch_is_not_believed(model: StatisticalModel) -> None:
     seen = observe(patch(0.0))
     part, whole = (answer_frame(each, None, Registrar(None, model)) for each in (replace(seen, extent="partial"), seen))
     assert part.recognition.known == "unsure" and part.recognition.reason == FEATURELESS
-    assert whole.recognition.known is False and "was not seen" in str(whole.recognition.reason)
+    assert whole.recognition.known is not True and whole.recognition.signs.unseen > 0.5
     merged = replace(seen, extent="partial")
     vars(merged)["self_hidden"] = 0.3  # as if another view's points lay behind: nothing believes it, tracked or not
     again = answer_frame(merged, None, Registrar(None, model)).recognition

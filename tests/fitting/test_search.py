@@ -29,7 +29,7 @@ from mereo.fitting.problem.residuals import NetworkTerm, Surface
 from mereo.fitting.registration.answer_frame import check_size, search_modes
 from mereo.fitting.registration.register import CloudToFit
 from mereo.fitting.search import ALIKE, ROUNDS, WHOLE, SearchRound, SightTable, Trail, likelier, medoids, rotations
-from mereo.geometry.camera import PointCloud, SightLines
+from mereo.geometry.camera import PointCloud, SharedNoise, SightLines
 from mereo.geometry.mesh import SegmentedMesh, area_vectors, surface_points
 from mereo.geometry.symmetry import Symmetry
 from mereo.models.weights import load_model
@@ -188,7 +188,7 @@ def test_a_noisy_frame_is_explained_where_neighbours_share_as_much_as_they_do_ar
     waves = 0.5 * np.sqrt(2) * np.sin(4 / model.half * points @ [0.6, 0.8, 0.0])
     seen = points * (1 + (waves + rng.normal(scale=0.05, size=len(points)))[:, None] / 150.0)
     for share, is_explained in ((np.inf, False), (0.1, False), (0.5, True)):
-        evidence = replace(Evidence.of(seen), shared_noise=share)
+        evidence = replace(Evidence.of(seen), shared_noise=SharedNoise(share))
         problem = Problem(model, NetworkTerm.none(model), evidence, OPEN_SCALE_STD, FitConfig(), noise=0.5)
         assert ScoredFit.of(problem, posed).explains(problem) is is_explained
 

@@ -206,7 +206,7 @@ def test_an_influence_is_how_far_a_moved_point_moves_the_place(found: Registrati
     row = 40
     one = found.explain(found.material[row])
     best = int(one.weights.argmax())
-    jacobian, residual, weight = optimum.terms.cloud
+    jacobian, residual, weight, _ = optimum.terms.cloud
     change = np.zeros(len(residual))
     change[best] = -1e-3  # the observed point moves outward, so that the model is farther inside
     total = optimum.terms.total

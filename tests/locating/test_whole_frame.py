@@ -18,7 +18,7 @@ import mereo
 from mereo.__main__ import main
 from mereo.fitting.tracking import SynchronousExecutor
 from mereo.fitting.uncertainty import radius95
-from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.camera import Camera, DepthImage, SharedNoise
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import rigid, transform_points
 from mereo.locating.outline import Jumps, Outline, compare_outline
@@ -382,11 +382,12 @@ def test_noise_that_neighbours_share_is_measured_on_the_plane_around_the_object(
     noisy = add_depth_noise(DepthImage(shared, clean.camera), std, rng)
     distance, shown = float(np.median(depth[depth > 0])), depth > 0
     # of single pixels' noise half may pass for shared, as things on the plane widen what is left over
-    noise, over = shared_noise(noisy, shown)
-    assert noise == pytest.approx(level * distance, rel=0.3, abs=2e-3 * distance + 0.6 * std)
+    noise = shared_noise(noisy, shown)
+    assert noise.pixel == 1 / CAMERA.focal_x_px
+    assert noise.std == pytest.approx(level * distance, rel=0.3, abs=2e-3 * distance + 0.6 * std)
     if level > std:  # else what is left over is none of the field
-        assert over * CAMERA.focal_x_px == pytest.approx(np.sqrt(np.pi) * 16, rel=0.3)
-    assert shared_noise(noisy, np.ones_like(shown)) == (np.inf, 0.0), "nothing is around it"
+        assert noise.side * CAMERA.focal_x_px == pytest.approx(np.sqrt(np.pi) * 16, rel=0.3)
+    assert shared_noise(noisy, np.ones_like(shown)) == SharedNoise(), "nothing is around it"
     assert shared_side(np.ones((40, 60))) > 30 and shared_side(rng.normal(size=(200, 300))) < 20
 
 

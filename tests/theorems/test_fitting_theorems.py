@@ -9,8 +9,9 @@ from fit_cases import IN_FRONT, said, shown
 from numpy.testing import assert_allclose, assert_array_equal
 
 from mereo.fitting.problem.evidence import UNSEEN_PITCHES, Evidence
-from mereo.fitting.problem.gauss_newton import eliminate
+from mereo.fitting.problem.gauss_newton import amplitudes, pull
 from mereo.fitting.problem.residuals import Surface
+from mereo.geometry.camera import SharedNoise
 from mereo.geometry.transforms import transform_points
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -79,12 +80,11 @@ def test_residuals_beside_a_nuisance_are_those_of_a_fit_that_has_it() -> None:
     weight = rng.random(40)
     rows = np.block([[jacobian, nuisance], [np.zeros((5, 3)), np.eye(5)]]) * np.sqrt(np.r_[weight, np.ones(5)])[:, None]
     whole = np.linalg.lstsq(rows, np.r_[residual * np.sqrt(weight), np.zeros(5)])
-    columns = np.column_stack([jacobian, residual])
-    left = eliminate(columns, weight, nuisance)
-    step, square, *_ = np.linalg.lstsq(left[:, :3], left[:, 3])
-    assert_allclose(step, whole[0][:3])
-    assert_allclose(square, whole[1])
-    assert_allclose(eliminate(columns, weight, nuisance[:, :0]).T, columns.T * np.sqrt(weight))
+    pulls = pull(jacobian, weight, nuisance)
+    step = np.linalg.solve(jacobian.T @ pulls, pulls.T @ residual)
+    found = amplitudes(residual - jacobian @ step, weight, nuisance)
+    assert_allclose(np.r_[step, found], whole[0])
+    assert_allclose(pull(jacobian, weight, nuisance[:, :0]).T, jacobian.T * weight)
 
 
 def test_noise_that_neighbours_share_is_alike_as_far_as_they_share_it() -> None:
@@ -92,11 +92,11 @@ def test_noise_that_neighbours_share_is_alike_as_far_as_they_share_it() -> None:
     across = np.linspace(-1.0, 1.0, 41)
     points = np.stack([*(each.ravel() for each in np.meshgrid(across, across)), np.full(41**2, 100.0)], axis=1)
     evidence = Evidence.of(points)
-    assert evidence.shared_motion(points).shape == (41**2, 3, 0)
-    evidence = replace(evidence, shared_noise=0.5, shared_over=0.03)
+    assert evidence.with_errors.shared_errors.amplitudes.shape == (0,)
+    evidence = replace(evidence, shared_noise=SharedNoise(0.5, 0.03, 0.001))
     vars(evidence)["roughness"] = 0.0
-    motion = evidence.shared_motion(points[20 * 41 : 21 * 41]).astype(np.float64)
-    along, aside = (np.einsum("iw,jw->ij", motion[:, axis], motion[:, axis]) for axis in (2, 0))
+    errors = evidence.with_errors.shared_errors.rows(np.arange(20 * 41, 21 * 41))
+    along, aside = (errors.along(np.tile(np.eye(3)[axis], (41, 1))).astype(np.float64) for axis in (2, 0))
     distance = np.abs(across[:, None] - across) / 100.0
-    assert_allclose(along, 0.25 * np.exp(-np.pi * (distance / 0.03) ** 2), atol=0.03)
-    assert_allclose(np.diag(aside), (UNSEEN_PITCHES * evidence.pitch * 100.0) ** 2, rtol=0.1)
+    assert_allclose(along @ along.T, 0.25 * np.exp(-np.pi * (distance / 0.03) ** 2), atol=0.03)
+    assert_allclose((aside**2).sum(axis=1), (UNSEEN_PITCHES * 0.001 * 100.0) ** 2, rtol=0.1)

@@ -123,17 +123,19 @@ def differing(problem: Problem, states: list[Posed], apart: float) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class ScoredFit:
-    """A state, its misfit and its surface."""
+    """A state, its misfit and its surface, and the problem ``Problem.cleared`` by that."""
 
     posed: Posed
     misfit: Misfit
     surface: Surface
+    problem: Problem
 
     @classmethod
     def of(cls, problem: Problem, posed: Posed) -> "ScoredFit":
         """Score a state."""
         surface = problem.surface(posed)
-        return cls(posed, problem.misfit(posed, surface), surface)
+        problem = problem.cleared(surface)
+        return cls(posed, problem.misfit(posed, surface), surface, problem)
 
     def explains(self, problem: Problem) -> bool:
         """Whether the state explains the cloud, noise aside."""
@@ -278,8 +280,7 @@ def fit_rest(problem: Problem, correspondences: Correspondences, modes: Posed) -
     model, rest = problem.model, of_rest(problem, correspondences)
     T = fit_rigid(model.rest_points, modes.place(model.material(modes.z)))
     start = Posed(T[:3, :3], T[:3, 3], np.empty(0), modes.log_scale)
-    prior = Prior(np.empty(0), np.empty((0, 0)))
-    return ScoredFit.of(rest, fit_cloud(rest, start, prior, REFINE_SIGMA, 10, 0.0))
+    return lowered(rest, fit_cloud(rest, start, Prior.whole(rest.model), REFINE_SIGMA, 10, 0.0))
 
 
 def of_rest(problem: Problem, correspondences: Correspondences) -> Problem:
@@ -338,9 +339,28 @@ def fit_seen(
     return problem, correspondences, best
 
 
-def settled(problem: Problem, posed: Posed) -> tuple[Problem, ScoredFit]:
+def settled(problem: Problem, posed: Posed) -> ScoredFit:
     """Fit a noisy frame again, twice, with as many independent points as the fit shows that its cloud is worth."""
     for _ in range(2):
         problem = problem.worth(problem.surface(posed))
-        posed = fit_cloud(problem, posed, Prior.whole(problem.model), REFINE_SIGMA, 10, 0.0)
-    return problem, ScoredFit.of(problem, posed)
+        fit = lowered(problem, posed)
+        posed = fit.posed
+    return fit
+
+
+GAIN = 1.0
+"""What a step must lower the misfit by for another one like it."""
+
+
+def lowered(problem: Problem, posed: Posed) -> ScoredFit:
+    """Descend by steps that lower the misfit (Levenberg and Marquardt)."""
+    best, prior, config = ScoredFit.of(problem, posed), Prior.whole(problem.model), problem.config
+    for damping in (DAMPING, 30.0 * DAMPING):
+        gain = np.inf
+        while gain > GAIN:
+            known = problem.known(best.posed, prior, 0.0)
+            normal = best.problem.seen(known, best.posed, problem.cloud_sigma, config.network_weight[1], True)
+            other = ScoredFit.of(problem, best.posed.moved(normal.step(damping)))
+            gain = best.misfit.total - other.misfit.total
+            best = min(best, other, key=lambda fit: fit.misfit.total)
+    return best

@@ -487,9 +487,9 @@ KEPT = 4
 SHAKEN_FITS = 3
 """Fits that differ, around each of which states are tried in each round."""
 
-HEAVY, HEAVIER_STEPS, HELPS = 3000.0, (0.04, 12), 0.65
-"""Weight of a cloud that an elastic solid explains only under it, the first sigma and the steps of the fit with it, and
-the share of the misfit that may be left: bends of a bunny's ears leave .45 to .54, states of livers .77 up."""
+HEAVIER_STEPS, HELPS = (0.04, 12), 0.65
+"""First sigma and steps of the fit of an elastic solid whose cloud weighs as others', and the share of the misfit that
+may be left: bends of a bunny's ears leave .45 to .54, states of livers .77 up."""
 
 WHOLE = 150.0
 """Misfit by which an object that is seen whole may be explained worse than one that something hides in part: it is on
@@ -554,7 +554,7 @@ class Trail:
         problem, best = self.problem, self.best
         if not problem.model.is_normal or self.is_explained:
             return None
-        problem = problem.changed(config=replace(problem.config, cloud_weight=HEAVY))
+        problem = problem.changed(config=replace(problem.config, cloud_weight=FitConfig.cloud_weight))
         heavier = ScoredFit.of(problem, fit_cloud(problem, best.posed, Prior.whole(problem.model), *HEAVIER_STEPS, 0.0))
         return Trail(problem, 0.0, [heavier]) if heavier.misfit.cloud < HELPS * best.misfit.cloud else None
 

@@ -171,7 +171,7 @@ def explore(track: Track, fitted: ModesFit, time_s: float) -> tuple[ModesFit, Tr
     problem = fitted.problem
     if time_s - track.explored_s < PAUSE_S or not has_many_optima(problem):
         return fitted, track
-    best = ScoredFit(fitted.posed, problem.misfit(fitted.posed, fitted.surface), fitted.surface)
+    best = ScoredFit.of(problem, fitted.posed)
     if best.misfit.cloud < WORSE * track.left or best.explains(problem):
         return fitted, track
     other = explored(problem, best.better(problem, refine(problem, best.posed)))

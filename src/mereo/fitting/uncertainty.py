@@ -10,20 +10,19 @@ Notation: m material points, n queried ones, k coefficients, p = 7 + k parameter
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 from scipy.linalg import eigh
-from scipy.special import chdtri
-from scipy.stats import norm
+from scipy.stats import chi2, norm
 
 from mereo.deformation.moving_least_squares import PointWeights
 from mereo.fitting.draws.fit import DrawsFit, DrawsProblem
 from mereo.fitting.draws.fit import terms as terms_of_draws
-from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, rigid_motion
+from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, pull, rigid_motion
 from mereo.fitting.problem.problem import Problem
 from mereo.fitting.problem.residuals import Prior, Surface, Terms
 from mereo.fitting.problem.segments import left_open
@@ -40,7 +39,7 @@ from mereo.scenes.statistical_model import StatisticalModel
 LEVEL = 0.95
 """Probability with which a true position lies within a radius, and a true number in an interval."""
 
-WITHIN = float(norm.ppf(0.5 + LEVEL / 2))
+WITHIN = float(norm.interval(LEVEL)[1])
 """Standard deviations of one Gaussian number on either side that hold it with this probability: 1.96."""
 
 UNCALIBRATED = 1.25
@@ -52,7 +51,7 @@ LEAST_RADIUS = 0.1
 camera's noise."""
 
 _FREEDOM = np.linspace(1.0, 3.0, 201)
-_QUANTILE = chdtri(_FREEDOM, 1.0 - LEVEL)
+_QUANTILE = chi2.ppf(LEVEL, _FREEDOM)
 """Quantile of chi square by its degrees of freedom, between which it is nearly straight."""
 
 
@@ -216,24 +215,6 @@ def covariance_factor(precision: Float[np.ndarray, "p p"]) -> Float[np.ndarray, 
     return factor
 
 
-def scattered(posterior: Posterior, terms: Terms, problem: Problem) -> Posterior:
-    """The posterior with the covariance that the noise gives the optimum; the same where all noise is of points alone.
-
-    The weights of a fit take points for independent. By what neighbours are known to share, and what is unknown beside
-    it, the gradient at the optimum scatters otherwise (sandwich estimator; White, Econometrica 1982).
-    """
-    if problem.unknown is None:
-        return posterior
-    jacobian, _, weight = terms.cloud
-    pull = jacobian.astype(np.float64) * weight[:, None]
-    normals = jacobian[:, 3:6]  # as a shift moves a residual
-    shared = pull.T @ np.einsum("pi,piw->pw", normals, problem.evidence.shared_motion(terms.observed_samples))
-    each = problem.unknown * len(weight) / len(problem.evidence.points)  # a sample stands for as many points
-    spread = terms.total.matrix - pull.T @ jacobian + each * pull.T @ pull + shared @ shared.T
-    values, vectors = np.linalg.eigh(posterior.factor.T @ spread @ posterior.factor)
-    return replace(posterior, factor=posterior.factor @ (vectors * np.sqrt(np.maximum(values, 0.0))))
-
-
 # --- the optimum and its posterior ------------------------------------------------------------------------------------
 
 # ModesOptimum, DrawsOptimum -> Terms of the normal equations -> Posterior
@@ -292,10 +273,7 @@ class ModesOptimum:
         with limit_blas_threads():
             open = [turns_left_open(self.problem, material)]
             open += [] if self.bent is None else [(self.bent - material)[:, :, None]]
-            posterior = Posterior.of(
-                self.terms.total, self.posed, material, model.modes, model.residue, open, self.others
-            )
-            return scattered(posterior, self.terms, self.problem)
+            return Posterior.of(self.terms.total, self.posed, material, model.modes, model.residue, open, self.others)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -341,8 +319,7 @@ class DrawsOptimum:
         material: Float[np.ndarray, "m 3"] = self.fit.surface.material
         with limit_blas_threads():
             turns = turns_left_open(self.problem.base, material)
-            posterior = Posterior.of(self.terms.total, self.fit.posed, material, modes, 0.0, [turns], self.others)
-            return scattered(posterior, self.terms, self.problem.base)
+            return Posterior.of(self.terms.total, self.fit.posed, material, modes, 0.0, [turns], self.others)
 
 
 def turns_left_open(problem: Problem, material: Float[np.ndarray, "m 3"]) -> Float32[np.ndarray, "m 3 e"]:
@@ -363,7 +340,8 @@ Optimum = ModesOptimum | DrawsOptimum
 #
 #     A S A^T = sum_t A S H_t S A^T
 #
-# Notation: n observed samples, p parameters, J_i and w_i derivatives and weight of an observed sample's residual.
+# Notation: n observed samples, p parameters, J_i and w_i derivatives and weight of an observed sample's residual. Where
+# neighbours share errors, its ``pull`` stands for w_i J_i.
 
 Evidence = Literal["points", "network", "silhouette", "states"]
 """What leaves a position unsure by its errors: the observed points, the network's correspondences, what the frame
@@ -455,7 +433,7 @@ class Uncertainty:
     @property
     def factor(self) -> float:
         """Factor of the posterior's radii."""
-        return self.scale or (UNCALIBRATED if self.optimum.frame.is_noisy else 1.0)
+        return self.scale or (UNCALIBRATED if self.optimum.frame.shares_noise else 1.0)
 
     def _of(self, parts: RadiusParts) -> Float[np.ndarray, " n"]:
         return self.optimum.unit * parts.radii(self.factor, self.extra_radius)
@@ -523,20 +501,22 @@ class Uncertainty:
     @cached_property
     def _whitened(
         self,
-    ) -> tuple[Float[np.ndarray, "n p"], Float[np.ndarray, " n"], dict[Evidence, Float[np.ndarray, "p p"]]]:
+    ) -> tuple[Float[np.ndarray, "n p"], Float[np.ndarray, "n p"], dict[Evidence, Float[np.ndarray, "p p"]]]:
         """Terms of the fit in parameters that are independent and standard normal after it (u = F v, ``F F^T = S``).
 
-        Derivatives and weights of the observed samples' residuals, and the parts of all other kinds of evidence in the
-        unit matrix that is the sum of all.
+        Derivatives of the observed samples' residuals, how much these ``pull``, and the parts of all other kinds of
+        evidence in the unit matrix that is the sum of all.
         """
         terms, factor = self.optimum.terms, self.posterior.factor
+        jacobian, _, weight, nuisance = terms.cloud
         others: dict[Evidence, Float[np.ndarray, "p p"]] = {
             "network": terms.network.matrix,
             "silhouette": terms.ruled_out.matrix,
             "states": terms.known.matrix,
         }
         parts = {name: factor.T @ matrix @ factor for name, matrix in others.items()}
-        return terms.cloud[0].astype(np.float64) @ factor, terms.cloud[2], parts
+        pulls = pull(jacobian, weight, nuisance)
+        return *(each.astype(np.float64) @ factor for each in (jacobian, pulls)), parts
 
     def explain(
         self,
@@ -545,11 +525,10 @@ class Uncertainty:
         T_registration_fit: Float[np.ndarray, "4 4"],
     ) -> Explanation:
         """What decides a position that moves so; ``T_registration_fit`` leads from the fit's frame, in input units."""
-        (rows, weight, parts), motion, unit = self._whitened, motion.astype(np.float64), self.optimum.unit
-        whole, leverage = float((motion**2).sum()), rows @ motion.T
-        shares: dict[Evidence, float] = {"points": float((weight[:, None] * leverage**2).sum()) / whole}
+        (rows, pulls, parts), motion, unit = self._whitened, motion.astype(np.float64), self.optimum.unit
+        whole, influence = float((motion**2).sum()), pulls @ motion.T
+        shares: dict[Evidence, float] = {"points": float((influence * (rows @ motion.T)).sum()) / whole}
         shares |= {name: float(((motion @ part) * motion).sum()) / whole for name, part in parts.items()}
-        influence = weight[:, None] * leverage
         length = np.linalg.norm(influence, axis=1)
         return Explanation(
             place=place,

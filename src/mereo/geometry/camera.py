@@ -5,7 +5,7 @@ pixel (column u, row v) is at (u + 0.5, v + 0.5). ``unproject`` and ``project`` 
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -211,6 +211,24 @@ SightKind = Literal["past", "unknown", "none"]
 """Kind of a line of sight that did not meet the object: *none* of a surface that no single camera saw."""
 
 
+class SharedNoise(NamedTuple):
+    """What neighbours share of a camera's noise, by what was measured around the object.
+
+    Attributes:
+        std: standard deviation, at the object; infinite where the frame does not say.
+        side: of the square over which they share it, as an angle.
+        pixel: angle between neighbouring pixels of the camera.
+    """
+
+    std: float = np.inf
+    side: float = 0.0
+    pixel: float = 0.0
+
+
+NOT_KNOWN = SharedNoise()
+"""That of a frame that does not say."""
+
+
 @dataclass(frozen=True, eq=False)
 class SightLines:
     """Lines of sight around the object, in the frame, axes and unit of its points.
@@ -220,16 +238,13 @@ class SightLines:
         unknown: points anywhere on lines of sight along which nothing is known.
         other_lines: kind of all lines of sight that none of these points, and none of the object's, is near; None where
             the frame does not say, as a bare cloud does not, and then a fit has to decide.
-        shared_noise: standard deviation, at the object, of what neighbours share of the camera's noise, by what was
-            measured around it; infinite where the frame does not say.
-        shared_over: side, as an angle, of the square over which they share it; 0 where the frame does not say.
+        shared_noise: of the camera.
     """
 
     past: Float[np.ndarray, "p 3"]
     unknown: Float[np.ndarray, "u 3"]
     other_lines: SightKind | None = None
-    shared_noise: float = np.inf
-    shared_over: float = 0.0
+    shared_noise: SharedNoise = NOT_KNOWN
 
     @classmethod
     def of_cloud(cls, other_lines: SightKind | None = None) -> "SightLines":
@@ -243,8 +258,8 @@ class SightLines:
 
     def scaled(self, factor: float) -> "SightLines":
         """Lines of sight in another unit."""
-        past, unknown, shared_noise = self.past * factor, self.unknown * factor, self.shared_noise * factor
-        return replace(self, past=past, unknown=unknown, shared_noise=shared_noise)
+        shared = self.shared_noise._replace(std=factor * self.shared_noise.std)
+        return replace(self, past=self.past * factor, unknown=self.unknown * factor, shared_noise=shared)
 
 
 # --- scanners' axes ---------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from mereo.geometry.brief import counted
-from mereo.geometry.camera import DepthImage, PointCloud, SightKind, SightLines, into_camera
+from mereo.geometry.camera import NOT_KNOWN, DepthImage, PointCloud, SharedNoise, SightKind, SightLines, into_camera
 from mereo.geometry.conventions import MIN_POINTS, CloudAxes
 from mereo.geometry.downsampling import MAX_POINTS, STEEPEST, random_subset
 from mereo.geometry.surface_patches import noise_of_differences, second_differences
@@ -481,24 +481,20 @@ def lines_of_image(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SightLi
     u, v = u[kept], v[kept]
     met = past[v, u]
     places = whole.camera.unproject(np.stack([u + left + 0.5, v + top + 0.5], axis=1), np.where(met, depth[v, u], 1.0))
-    return SightLines(places[met], places[~met], None if silent else "unknown", *shared_noise(whole, shown))
+    return SightLines(places[met], places[~met], None if silent else "unknown", shared_noise(whole, shown))
 
 
-NOT_SHOWN = np.inf, 0.0
-"""``shared_noise`` of a frame that does not show it."""
-
-
-def shared_noise(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> tuple[float, float]:
-    """Standard deviation of a camera's noise that neighbours share, at the distance of ``shown`` pixels, and how far.
+def shared_noise(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SharedNoise:
+    """Measure the noise of a camera that neighbours share, at the distance of ``shown`` pixels.
 
     What the largest plane around them leaves over beyond the noise of single pixels, where it is about as far away;
-    infinite without such a plane. Noise is taken to grow as the square of the distance, and to fall as the distance: up
+    Unknown without such a plane. Noise is taken to grow as the square of the distance, and to fall as the distance: up
     close something else than disparity limits a camera. It is shared over a square, whose side is an angle.
     """
     (height, width), depth = shown.shape, whole.depth
     others = np.flatnonzero(np.where(shown, 0.0, depth))
     if len(others) < FEWEST or not (shown & whole.valid).any():
-        return NOT_SHOWN
+        return NOT_KNOWN
     distance = float(np.median(depth[shown & whole.valid]))
 
     def terms(pixels: Int[np.ndarray, " n"]) -> Points:
@@ -512,7 +508,7 @@ def shared_noise(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> tuple[flo
     pixel = points[:, 2] / focal_px
     plane = largest_plane(points, pixel, np.random.default_rng(0))
     if plane is None:
-        return NOT_SHOWN
+        return NOT_KNOWN
     is_on = plane.distance(points) <= pixel
     for _ in range(FITS):
         linear = np.linalg.lstsq(places[is_on], inverse[is_on])[0]
@@ -523,7 +519,7 @@ def shared_noise(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> tuple[flo
     off = 1.0 / depth.ravel()[others] - expected
     rows = np.flatnonzero(np.abs(off) <= ON_PLANE * noise)
     if len(rows) < FEWEST:
-        return NOT_SHOWN
+        return NOT_KNOWN
     field = np.full(depth.size, np.nan)
     field[others[rows]] = off[rows]
     near = np.argpartition(np.abs(np.log(expected[rows] * distance)), FEWEST - 1)[:FEWEST]
@@ -535,8 +531,8 @@ def shared_noise(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> tuple[flo
     places, inverse = terms(rows), 1.0 / flat[rows]
     off = inverse - places @ np.linalg.lstsq(places, inverse)[0]
     shared = float(np.sqrt(max(np.mean(off**2) - alone**2, 0.0)))
-    over = shared_side(field.reshape(height, width)) / focal_px
-    return shared * distance * max(distance, float(np.median(flat[rows]))), over
+    side = shared_side(field.reshape(height, width)) / focal_px
+    return SharedNoise(shared * distance * max(distance, float(np.median(flat[rows]))), side, 1.0 / focal_px)
 
 
 def shared_side(noise: Float[np.ndarray, "h w"]) -> float:

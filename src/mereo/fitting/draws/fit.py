@@ -102,6 +102,7 @@ class DrawsFit:
     Attributes:
         posed: rigid pose; its ``z`` is empty.
         material: material points, unposed.
+        base: frame, ``Problem.cleared`` by the surface.
         distance, face, position: of what each observed sample is compared with.
         misfit: with the prior of the draws, the cloud by its last sigma.
         motion: of the played points for a standard deviation of each draw, where it is known.
@@ -112,6 +113,7 @@ class DrawsFit:
     posed: Posed
     material: Float[np.ndarray, "m 3"]
     surface: Surface
+    base: Problem
     distance: Float[np.ndarray, " p"]
     face: Int[np.ndarray, " p"]
     position: Float[np.ndarray, "p 3"]
@@ -135,18 +137,20 @@ def score_material(
     surface = Surface.through(problem.model, rigid.place(material), problem.base.evidence.shows)
     if len(surface.facing) == 0:
         return None
-    met = problem.base.met(surface) if problem.by_sight else problem.base.nearest(surface)
-    fit = DrawsFit(drawn, z, rigid, material, surface, *met, np.inf)
+    base = problem.base.cleared(surface)
+    met = base.met(surface) if problem.by_sight else base.nearest(surface)
+    fit = DrawsFit(drawn, z, rigid, material, surface, base, *met, np.inf)
     return replace(fit, misfit=misfit(problem, fit, problem.base.cloud_sigma))
 
 
 def misfit(problem: DrawsProblem, fit: DrawsFit, sigma: float) -> float:
     """Misfit as ``Problem.misfit`` counts it, by any sigma of the cloud, without looking for observed samples again."""
-    base = problem.base
+    base = fit.base
     cloud = base.config.cloud_weight * float(robust_square(fit.distance, sigma).mean())
     network = base.config.network_weight[1] * problem.network(fit).energy(fit.posed, base.network_sigma)
     losses = silhouette_losses(fit.surface.material[base.model.silhouette_vertices], base.evidence, sigma)
-    return cloud + network + base.config.silhouette_weight * float(losses.sum()) + float(fit.z @ fit.z)
+    outside = base.config.silhouette_weight * float(losses.sum())
+    return cloud + network + outside + float(fit.z @ fit.z) + base.evidence.shared_errors.square
 
 
 def by_misfit(state: "DrawsFit | StateOnShape") -> float:
@@ -163,7 +167,7 @@ def narrowing(problem: DrawsProblem, fit: DrawsFit) -> float:
 
 def terms(problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3 d"], sigma: float) -> Terms:
     """Terms of the fit of the modes, for changes of pose and draws: the played points' ``motion`` is that of modes."""
-    base, posed, config, surface = problem.base, fit.posed, problem.base.config, fit.surface
+    base, posed, config, surface = fit.base, fit.posed, fit.base.config, fit.surface
     samples, spread, count = base.evidence.observed_samples, problem.states.played.spread, len(fit.z)
     flat, vertices = motion.reshape(len(motion), -1), base.model.silhouette_vertices
 
@@ -178,7 +182,7 @@ def terms(problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3
     return Terms(
         known=prior_of_draws(fit.z, motion, posed.log_scale, base.scale_std),
         network=network.add_to(nothing, state, base.network_sigma, config.network_weight[1], robust=True),
-        cloud=cloud_rows(posed, samples, planes, sigma, config.cloud_weight, base.alike),
+        cloud=cloud_rows(posed, samples, planes, sigma, config.cloud_weight, base.evidence.sample_errors, base.alike),
         observed_samples=samples,
         ruled_out=add_silhouette(
             nothing,
@@ -409,8 +413,11 @@ def settled(problem: DrawsProblem, fit: DrawsFit) -> tuple[DrawsProblem, DrawsFi
     """Fit a noisy frame again with as many independent points as its cloud is worth."""
     if not problem.base.shares_noise:
         return problem, fit
-    worth = replace(problem, base=problem.base.worth(fit.surface))
-    return worth, refine_by_sight(worth, fit)
+    worth = replace(problem, base=problem.base.worth(fit.surface), by_sight=True)
+    start = simulate(worth, fit.drawn, fit.z, fit.posed)
+    assert start is not None  # it was played before
+    fit = descend(worth, start, problem.config.last_rounds)
+    return replace(worth, base=fit.base), fit
 
 
 def fit_near_modes(

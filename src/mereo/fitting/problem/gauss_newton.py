@@ -21,8 +21,9 @@ POSE = 7
 DAMPING = 1e-3
 """Damping of a step of the modes, relative to the diagonal."""
 
-Rows = tuple[Float[np.ndarray, "p q"], Float[np.ndarray, " p"], Float[np.ndarray, " p"]]
-"""Derivatives of residuals by the q parameters, the residuals, and their weights, as ``NormalEquations.add`` takes."""
+Rows = tuple[Float[np.ndarray, "p q"], Float[np.ndarray, " p"], Float[np.ndarray, " p"], Float[np.ndarray, "p a"]]
+"""Derivatives of residuals by the q parameters, the residuals, their weights, and those by a nuisance, as
+``NormalEquations.add`` takes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,10 +71,14 @@ class NormalEquations:
         return cls(matrix, gradient)
 
     def add(
-        self, jacobian: Float[np.ndarray, "r p"], residual: Float[np.ndarray, " r"], weight: Float[np.ndarray, " r"]
+        self,
+        jacobian: Float[np.ndarray, "r p"],
+        residual: Float[np.ndarray, " r"],
+        weight: Float[np.ndarray, " r"],
+        nuisance: Float[np.ndarray, "r a"] | None = None,
     ) -> "NormalEquations":
-        """Sum with further residuals."""
-        weighted = jacobian * weight[:, None].astype(jacobian.dtype)
+        """Sum with further residuals, beside a ``nuisance`` (``pull``)."""
+        weighted = pull(jacobian, weight, nuisance)
         matrix = (weighted.T @ jacobian).astype(np.float64)
         return NormalEquations(self.matrix + matrix, self.gradient + weighted.T.astype(np.float64) @ residual)
 
@@ -101,21 +106,29 @@ class NormalEquations:
         return float(np.linalg.slogdet(z - cross.T @ np.linalg.solve(pose, cross))[1])
 
 
-def eliminate(
-    columns: Float[np.ndarray, "r c"], weight: Float[np.ndarray, " r"], nuisance: Float[np.ndarray, "r w"]
-) -> Float[np.ndarray, "r c"]:
-    """Residuals, or their derivatives, without a ``nuisance``: what w amplitudes, each N(0, 1), add to them.
+def pull(
+    jacobian: Float[np.ndarray, "r p"], weight: Float[np.ndarray, " r"], nuisance: Float[np.ndarray, "r a"] | None
+) -> Float[np.ndarray, "r p"]:
+    """How much each residual adds to the gradient of the parameters: its weighted derivatives.
 
-    All weights are 1 then. Squares are those under the best amplitudes, with the squares of these: the normal equations
-    are those of all parameters with the amplitudes eliminated (Schur complement).
+    With a ``nuisance``, the derivatives by amplitudes, each N(0, 1), under the amplitudes that are best for any
+    parameters: the normal equations are those of all of them with the amplitudes eliminated (Schur complement).
     """
-    root = np.sqrt(weight)[:, None]
-    values, vectors = np.linalg.eigh((nuisance * weight[:, None]).T @ nuisance)
-    length = np.sqrt(np.maximum(values, 1e-9))
-    axes = root * nuisance @ (vectors / length)
-    kept = root * columns
-    kept -= axes * (1.0 - 1.0 / np.hypot(1.0, length)) @ (axes.T @ kept)
-    return kept
+    weighted = jacobian * weight[:, None].astype(jacobian.dtype)
+    if nuisance is None or nuisance.shape[1] == 0:
+        return weighted
+    apart: np.ndarray = weighted - nuisance * weight[:, None] @ amplitudes(jacobian, weight, nuisance)
+    return apart
+
+
+def amplitudes(
+    columns: Float[np.ndarray, "r *c"], weight: Float[np.ndarray, " r"], nuisance: Float[np.ndarray, "r a"]
+) -> Float[np.ndarray, "a *c"]:
+    """Likeliest amplitudes of a ``nuisance``, each N(0, 1), which with weighted noise makes up the columns."""
+    weighted = (nuisance * weight[:, None].astype(nuisance.dtype)).T
+    precision = (weighted @ nuisance).astype(np.float64) + np.eye(len(weighted))
+    solved: np.ndarray = cho_solve(cho_factor(precision), weighted.astype(np.float64) @ columns)
+    return solved
 
 
 def along(

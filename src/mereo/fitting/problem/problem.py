@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import isotonic_regression
+from scipy.stats import norm
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.correspondences import Correspondences
@@ -22,7 +23,7 @@ from mereo.fitting.problem.gauss_newton import (
     NormalEquations,
     Posed,
     Rows,
-    eliminate,
+    amplitudes,
     geman_mcclure,
     rigid_motion,
 )
@@ -99,7 +100,6 @@ class Problem:
         config: constants, as a clean frame has them.
         noise: standard deviation of the observed points from the surface (``with_noise``).
         given: pose that is known; None where the frame alone says it.
-        unknown: variance of a point beside what neighbours are known to share (``worth``, before which it is None).
     """
 
     model: StatisticalModel
@@ -109,7 +109,6 @@ class Problem:
     config: FitConfig
     noise: float = 0.0
     given: GivenPose | None = None
-    unknown: float | None = None
 
     @classmethod
     def of(
@@ -180,7 +179,7 @@ class Problem:
     @property
     def accepted(self) -> float:
         """Share of the observed points that must lie there for a fit to be believed."""
-        return min(self.config.accepted, ACCEPTED) if self.is_noisy else self.config.accepted
+        return min(self.config.accepted, ACCEPTED) if self.shares_noise else self.config.accepted
 
     def left_noise(self, surface: Surface) -> float:
         """Noise of the frame as a fit leaves it over: of that neighbours may share as much as around the object."""
@@ -193,26 +192,43 @@ class Problem:
         return float((self.nearest(surface)[0] <= self.tolerance).mean())
 
     def worth(self, surface: Surface) -> "Problem":
-        """The problem with as many independent points as what a fit leaves over shows that the cloud is worth."""
-        config, offset, freedom = self.config, self.offsets(surface), POSE + self.model.count
-        alone = (self.cloud_sigma / SIGMAS) ** 2  # variance of a point of which neighbours share nothing
-        share = min(alone / shared_variance(offset, self.evidence, freedom), 1.0)
-        weight, outside = SIGMAS**2 * share * len(offset), FitConfig.silhouette_weight * share
-        config = replace(config, cloud_weight=weight, silhouette_weight=outside)
-        unknown = shared_variance(self.innovations(surface), self.evidence, freedom)
-        return self.changed(config=config, unknown=unknown)
+        """The problem with as many independent points as what a fit leaves over shows that the cloud is worth.
 
-    def innovations(self, surface: Surface) -> Float[np.ndarray, " n"]:
-        """What a fit leaves over of all points beside what neighbours are known to share."""
-        points, evidence = self.evidence.points, self.evidence
-        met = surface.compared(points, None, evidence.all_alike(self.normal_length))
-        offset, normal = surface.signed(points, met), surface.normals[met[1]]
-        alone = max(noise_of(offset, evidence.around), CLEAN)
-        # a point may be off by all that is shared, and is no outlier for that
-        most = ROBUST * SIGMAS * float(np.hypot(alone, evidence.expected_noise))
-        root = np.sqrt(geman_mcclure(offset, most)) / alone
-        nuisance = np.einsum("pi,piw->pw", normal.astype(np.float32), evidence.shared_motion(points))
-        return eliminate(offset[:, None], root**2, nuisance)[:, 0] / root
+        What neighbours are known to share is an unknown from then on, and the noise is what is left beside it.
+        """
+        problem = self.changed(evidence=self.evidence.with_errors).cleared(surface)
+        problem = problem.with_noise(problem.left_noise(surface)).cleared(surface)
+        offset = problem.offsets(surface)
+        alone = (problem.cloud_sigma / SIGMAS) ** 2  # variance of a point of which neighbours share nothing
+        share = min(alone / shared_variance(offset, problem.evidence, POSE + problem.model.count), 1.0)
+        share /= max(problem.cloud_misfit(surface) / USUAL, 1.0)  # of slanted surfaces and edges is more left over
+        weight = SIGMAS**2 * share * len(offset)
+        outside = FitConfig.silhouette_weight * min(weight / FitConfig.cloud_weight, 1.0)
+        config = replace(problem.config, cloud_weight=weight, silhouette_weight=outside)
+        return problem.changed(config=config, evidence=problem.evidence.seen_again)
+
+    def cleared(self, surface: Surface) -> "Problem":
+        """The problem without the errors that neighbours most likely share, were this the surface.
+
+        They are estimated from the points as measured, so that a state has one misfit whatever was tried before it:
+        with wide robust weights first.
+        """
+        errors, sigma = self.evidence.sample_errors, self.cloud_sigma
+        if len(errors.amplitudes) == 0:
+            return self
+        problem = self.changed(evidence=self.evidence.without(np.zeros(len(errors.amplitudes))))
+        wide, each = np.hypot(sigma, SIGMAS * self.evidence.expected_noise), len(errors.measured) * sigma**2
+        for narrower in np.geomspace(wide, sigma, CLEARINGS):
+            _, face, place = problem.met(surface)
+            normal = surface.normals[face]
+            left, measured = (
+                np.einsum("pi,pi->p", normal, points - place)
+                for points in (problem.evidence.observed_samples, errors.measured)
+            )
+            weight = geman_mcclure(left, ROBUST * narrower) * self.config.cloud_weight / each
+            found = amplitudes(measured, weight, errors.along(normal))
+            problem = problem.changed(evidence=problem.evidence.without(found))
+        return problem
 
     def quieted(self, noise: float) -> "Problem":
         """The problem with no more than a noise, and by every point where that is still a camera's."""
@@ -324,7 +340,8 @@ class Problem:
         else:
             planes = samples.planes(observed, directions)
         normal = self.network.add_to(normal, posed, self.network_sigma, network_weight, robust=True)
-        normal = normal.add(*cloud_rows(posed, observed, planes, sigma, self.config.cloud_weight, directions))
+        weight, errors = self.config.cloud_weight, self.evidence.sample_errors
+        normal = normal.add(*cloud_rows(posed, observed, planes, sigma, weight, errors, directions))
         return self.add_silhouette(normal, posed, samples, sigma)
 
     def add_silhouette(
@@ -339,9 +356,9 @@ class Problem:
 
     def cloud_rows(self, posed: Posed) -> Rows:
         """Residuals of the observed samples from the faces, as the last steps of a fit have them."""
-        observed, config = self.evidence.observed_samples, self.config
-        planes = self.surface(posed).planes(observed, self.far, self.alike)
-        return cloud_rows(posed, observed, planes, self.cloud_sigma, config.cloud_weight, self.directions)
+        observed, weight = self.evidence.observed_samples, self.config.cloud_weight
+        planes, errors = self.surface(posed).planes(observed, self.far, self.alike), self.evidence.sample_errors
+        return cloud_rows(posed, observed, planes, self.cloud_sigma, weight, errors, self.directions)
 
     @property
     def directions(self) -> Directions | None:
@@ -373,7 +390,9 @@ class Problem:
         network = network * self.config.network_weight[1]
         silhouette = silhouette * self.config.silhouette_weight * SILHOUETTE_VERTICES
         prior, pairs = float(z @ z), PAIR_WEIGHT * self.pairs.energy(z)
-        total = self.config.cloud_weight * cloud + network + silhouette + prior + pairs
+        total = (
+            self.config.cloud_weight * cloud + network + silhouette + prior + pairs + self.evidence.shared_errors.square
+        )
         return Misfit(cloud, total, total - network)
 
 
@@ -399,6 +418,12 @@ SIGMAS = 1.5
 NOISES = 3.0
 """Distance, in noises, up to which a point of a noisy frame lies on the surface where a fit is to be believed."""
 
+USUAL = float(norm.expect(lambda offset: robust_square(np.atleast_1d(offset), SIGMAS)[0]))
+"""Misfit of a cloud of which normal numbers are left over."""
+
+CLEARINGS = 6
+"""Steps in which the errors that neighbours share are taken out."""
+
 SHARED = 1.05
 """Misfit of a noisy cloud, in misfits of what neighbours do not share, up to which nothing more is to be explained."""
 
@@ -415,12 +440,12 @@ def shared_variance(offset: Float[np.ndarray, " n"], observed: ObservedPoints, f
     ``freedom``, its number of parameters, bends to what as many patches share: theirs is no less than that of smaller
     ones, to which it cannot, and as many times what it leaves of it as the whole noise is that of points alone.
     """
-    most = 2 * ROBUST * TO_STD * float(np.median(np.abs(offset)))
+    most = 2 * ROBUST * noise_of(offset)
     offset = np.where(np.abs(offset) > ROBUST * SIGMAS * observed.largest_noise, 0.0, np.clip(offset, -most, most))
     means, variance = offset[observed.nested], list[float]()
     while len(means) > 1:
         first, second = means[::2], means[1::2]
-        variance.append((TO_STD * float(np.median(np.abs(first - second)))) ** 2 / 2)
+        variance.append(noise_of(first - second) ** 2 / 2)
         means = (first + second) / np.sqrt(2)
     patches = 0.5 ** np.arange(len(variance)) * len(observed.nested) / 2
     rising = np.maximum(isotonic_regression(variance, weights=patches).x, CLEAN**2)

@@ -15,7 +15,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from mereo.fitting.problem.correspondences import Correspondences
-from mereo.fitting.problem.evidence import Directions, Evidence, Observed
+from mereo.fitting.problem.evidence import Directions, Evidence, Observed, SharedErrors
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, Rows, along, cross, geman_mcclure, in_space
 from mereo.geometry.mesh import barycentric
 from mereo.geometry.solids import search_tree
@@ -277,11 +277,13 @@ def cloud_rows(
     planes: Planes,
     sigma: float,
     total_weight: float,
+    errors: SharedErrors,
     directions: Directions | None = None,
 ) -> Rows:
     """Each point's distance to its plane of the facing surface, its derivatives, and its weight.
 
-    With the points' ``directions``, a point far from its place on the plane or of another direction counts for less.
+    Distances are those of the points as measured, from which ``errors`` were taken out. With the points'
+    ``directions``, a point far from its place on the plane or of another direction counts for less.
     """
     position, across, modes = planes
     offset = position - points
@@ -292,7 +294,8 @@ def cloud_rows(
     else:
         weight *= geman_mcclure(np.linalg.norm(offset, axis=1), ROBUST * sigma)
         weight *= directions.agreement(across)
-    return along(posed, position, modes, across), residual, weight
+    nuisance = errors.along(across)
+    return along(posed, position, modes, across), residual - nuisance @ errors.amplitudes, weight, nuisance
 
 
 def add_silhouette(
@@ -386,19 +389,16 @@ class PairTerm:
         self, normal: NormalEquations, z: Float[np.ndarray, " k"], weight: float, slack: float
     ) -> NormalEquations:
         """Sum with squared errors of all lengths, together worth ``weight`` points; ``slack`` is added to their std."""
-        if len(self.std) == 0:
-            return normal
         vector, length = self._vectors(z)
         direction = (vector / np.maximum(length, 1e-12)[:, None]).astype(np.float32)
         jacobian = np.zeros((len(length), POSE + len(z)), dtype=np.float32)
         jacobian[:, POSE:] = np.matmul(direction[:, None], self.modes)[:, 0]
-        return normal.add(jacobian, length - self.distance, weight / len(length) / (self.std**2 + slack**2))
+        return normal.add(jacobian, length - self.distance, weight / max(1, len(length)) / (self.std**2 + slack**2))
 
     def energy(self, z: Float[np.ndarray, " k"]) -> float:
         """Mean squared error of the lengths, in standard deviations; 0 without pairs."""
-        if len(self.std) == 0:
-            return 0.0
-        return float((((self._vectors(z)[1] - self.distance) / self.std) ** 2).mean())
+        square = ((self._vectors(z)[1] - self.distance) / self.std) ** 2
+        return float(square.sum() / max(1, len(square)))
 
 
 @dataclass(frozen=True, eq=False)

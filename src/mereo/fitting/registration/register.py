@@ -180,8 +180,10 @@ class ModesFit:
         if not self.problem.shares_noise:
             return self
         with limit_blas_threads():
-            problem, modes = settled(self.problem, self.posed)
-            rest = resting(problem, self.correspondences, modes)
+            modes = settled(self.problem, self.posed)
+            rest = resting(modes.problem, self.correspondences, modes)
+        # the errors that neighbours share are those by the answer
+        problem = modes.problem.changed(evidence=(rest or modes).problem.evidence)
         return replace(self, problem=problem, posed=modes.posed, rest=rest)
 
     def with_draws(self, states: DrawnStates) -> Registration:

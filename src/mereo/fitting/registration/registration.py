@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from mereo.deformation.maps import newton
 from mereo.deformation.moving_least_squares import Anchors
 from mereo.fitting.draws.playback import Drawn
-from mereo.fitting.uncertainty import Explanation, Optimum, Uncertainty
+from mereo.fitting.uncertainty import AT_ONCE, Explanation, Optimum, Uncertainty
 from mereo.geometry.brief import counted
 from mereo.geometry.conventions import LARGEST, check_real
 from mereo.geometry.mesh import SegmentedMesh
@@ -25,8 +25,6 @@ Method = Literal["rest", "modes", "draws"]
 
 Place = Literal["camera", "rest"]
 """Frame of a point: the camera's, in the input's unit, or the rest model's, in scene units."""
-
-AT_ONCE = 20_000
 
 BELIEVED = 0.95
 """Share of a clean frame's points that a fit must explain to be believed."""
