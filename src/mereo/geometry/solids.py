@@ -17,7 +17,7 @@ import numpy as np
 from embreex import rtcore
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy.sparse import csr_array
 
 from mereo.geometry.mesh import Faces, Segment, SegmentedMesh, Vertices, area_vectors
@@ -57,12 +57,6 @@ def ray_scene(vertices: Vertices, faces: Faces) -> EmbreeScene:
     scene = EmbreeScene(_DEVICE)
     TriangleMesh(scene, vertices.astype(np.float32), faces.astype(np.int32))
     return scene
-
-
-def _rays(center: Vector, directions: Points) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
-    """Origins and directions in the single precision that Embree wants."""
-    single = np.ascontiguousarray(directions, dtype=np.float32)
-    return np.broadcast_to(-center.astype(np.float32), single.shape).copy(), single
 
 
 def toward(directions: Points, low: Vector, high: Vector) -> Int[np.ndarray, " m"]:
@@ -140,7 +134,8 @@ class _Solid:
     def first_hit(self, directions: Points) -> tuple[Int[np.ndarray, " m"], Hits]:
         """Which rays from the origin hit the segment, and where each of them does first."""
         rows = toward(directions, self.low, self.high)
-        hits = self.rays.run(*_rays(self.center, directions[rows]), output=True)
+        single = np.ascontiguousarray(directions[rows], dtype=np.float32)  # the precision that Embree wants
+        hits = self.rays.run(np.broadcast_to(-self.center.astype(np.float32), single.shape).copy(), single, output=True)
         hit = np.flatnonzero(hits["primID"] >= 0)
         return rows[hit], Hits(hits["tfar"][hit].astype(np.float64), hits["Ng"][hit].astype(np.float64))
 

@@ -424,8 +424,7 @@ EVIDENCE = {
 
 def explain_centroids(registered: Registration) -> dict[str, Explanation]:
     """What decides the centroid of each segment; nothing of a registration that was read from a file."""
-    explanations = ((name, registered.explain(name)) for name in registered.model.rest.names)
-    return {name: explanation for name, explanation in explanations if explanation is not None}
+    return {name: each for name in registered.model.rest.names if (each := registered.explain(name)) is not None}
 
 
 def point_marks(explanation: Explanation, points: Points) -> UInt8[np.ndarray, " n"]:
