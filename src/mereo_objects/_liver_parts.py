@@ -14,11 +14,11 @@ from scipy.spatial import cKDTree
 from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, Localized, Rigid
 from mereo.deformation.warps import Bend, FreeFormLattice, Squash, Twist
-from mereo.geometry.mesh import PALETTE, Segment, vertex_normals
-from mereo.geometry.mesh_check import Faces, Vertices, solid_of
+from mereo.geometry.mesh import PALETTE, AnyFaces, Segment, vertex_normals
+from mereo.geometry.mesh_check import solid_of
 from mereo.geometry.mesh_repair import close_holes, largest_piece
 from mereo.geometry.read_only import read_only
-from mereo.geometry.transforms import Normalizer
+from mereo.geometry.transforms import AnyPoints, Normalizer
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.scenes.scene import Workspace
 from mereo_objects import assets
@@ -49,7 +49,7 @@ WORKSPACE = Workspace(axis=(-0.05, -0.6, -0.8), fov_rad=float(np.deg2rad(22.0)))
 """Above the visceral surface, on which the gallbladder lies: what a laparoscope sees once the liver is lifted."""
 
 
-def repaired_liver() -> tuple[Vertices, Faces]:
+def repaired_liver() -> tuple[AnyPoints, AnyFaces]:
     """Largest piece of the liver with its open loop closed, millimetres: 28,560 faces, 1,762 cubic centimetres."""
     raw = read_segmented_mesh(assets.get("liver/lapgym_liver_visual.stl")).segments[0]
     return close_holes(*largest_piece(raw.vertices, raw.faces))
@@ -90,7 +90,7 @@ class Instrument(NamedTuple):
     tip_mm: float
     reach_mm: float
 
-    def sample(self, rng: np.random.Generator, tip: Vertices, normal: Vertices) -> Localized:
+    def sample(self, rng: np.random.Generator, tip: AnyPoints, normal: AnyPoints) -> Localized:
         """Random pull at one of the given places, within 30 degrees of its normal or so."""
         index = named(rng, "place").integers(len(tip))
         direction = normal[index] + 0.35 * named(rng, "slant").normal(size=3)
@@ -114,7 +114,7 @@ EDGE_SHARE = 0.12
 
 
 @cache
-def _places() -> dict[str, tuple[Vertices, Vertices]]:
+def _places() -> dict[str, tuple[AnyPoints, AnyPoints]]:
     """Places where each kind of instrument may be, with outward normals."""
     liver, gallbladder = organs()
     normals = [read_only(vertex_normals(part)) for part in (liver, gallbladder)]

@@ -29,7 +29,7 @@ from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.transforms import checked_pose, inverse_rigid, rigid, transform_points
+from mereo.geometry.transforms import Vector, checked_pose, inverse_rigid, rigid, transform_points
 from mereo.io.atomic_files import atomic_file, new_directory, to_json
 from mereo.io.attachments import Attachment, Content, PoseTable, Positions, Surfaces, read_attachments, write_attachment
 from mereo.io.bounds import Port, check_value
@@ -93,7 +93,7 @@ class SegmentResult:
     name: str
     label: int
     mesh: Segment
-    centroid: Float[np.ndarray, "3"]
+    centroid: Vector
     volume: float
     confidence: float
     error_radius: float | None

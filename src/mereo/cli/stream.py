@@ -100,6 +100,10 @@ Arrived = tuple[StreamFrame, float, int]
 """Frame, when it came by ``time.perf_counter``, and how many gave way to newer ones before it."""
 
 
+Frames = Iterator[StreamFrame | None]
+"""A sequence, with a None where nothing new has come."""
+
+
 def stream(
     frames: Iterable[StreamFrame | None],
     answer: Callable[[StreamFrame], Any],
@@ -133,7 +137,7 @@ def stream(
             yield Outcome(frame.name, frame.time_s, result, error, now - arrived_s, now - start, dropped)
 
 
-def _paced(frames: Iterable[StreamFrame | None]) -> Iterator[StreamFrame | None]:
+def _paced(frames: Iterable[StreamFrame | None]) -> Frames:
     start, zero = time.perf_counter(), None
     for frame in frames:
         if frame is not None:
@@ -142,7 +146,7 @@ def _paced(frames: Iterable[StreamFrame | None]) -> Iterator[StreamFrame | None]
         yield frame
 
 
-def _latest(frames: Iterator[StreamFrame | None]) -> Generator[Arrived, None, None]:
+def _latest(frames: Frames) -> Generator[Arrived, None, None]:
     """Frames that a thread brings, of those that came since the last one only the newest."""
     waiting: queue.Queue[Arrived | Exception | None] = queue.Queue(maxsize=1)
     is_left, reported = threading.Event(), 0
@@ -270,7 +274,7 @@ def frames_of(
     isolation: IsolationConfig,
     rate_hz: float = 30.0,
     align_color: bool = False,
-) -> Iterator[StreamFrame | None]:
+) -> Frames:
     """Frames of a source, in order; each is decoded when it is answered.
 
     A source is a folder of depth images or point clouds (in the order of their names, recorded at ``rate_hz``), a ROS
@@ -307,7 +311,7 @@ def frames_in(folder: Path, reading: InputConfig) -> list[Path]:
     return files
 
 
-def watched_frames(source: str, reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamFrame | None]:
+def watched_frames(source: str, reading: InputConfig, isolation: IsolationConfig) -> Frames:
     """Frames of a folder as their files arrive, without end; None where nothing new has come.
 
     Files that are there already come first. One that is written again is a new frame; see ``WatchedFolder`` on when a
@@ -322,7 +326,7 @@ def watched_frames(source: str, reading: InputConfig, isolation: IsolationConfig
         raise ValueError(f"{source} is no folder of frames; only such a folder can be watched: leave out --watch")
     folder, start = WatchedFolder(path, lambda file: _is_frame(file, reading)), time.perf_counter()
 
-    def arriving() -> Iterator[StreamFrame | None]:
+    def arriving() -> Frames:
         while True:
             begun = time.perf_counter()
             for file in folder.look(begun):

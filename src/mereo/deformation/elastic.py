@@ -21,7 +21,7 @@ from itertools import permutations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.sparse import coo_array, csc_array, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
@@ -33,7 +33,14 @@ from mereo.deformation.tetrahedral import Tetrahedra, TetrahedralMap
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.read_only import read_only, read_only_view
 from mereo.geometry.solids import label_grid
+from mereo.geometry.transforms import Flags, Values
 from mereo.io.progress import stage
+
+Modes = Float[np.ndarray, "n 3 k"]
+"""Motion of each node in each mode."""
+
+PerMode = Float[np.ndarray, " k"]
+"""A number for each mode."""
 
 _CORNERS = read_only(np.argwhere(np.ones((2, 2, 2))))
 _SPLIT = read_only(np.array([[0, *np.cumsum([4 >> axis for axis in path])] for path in permutations(range(3))]))
@@ -96,7 +103,7 @@ class ElasticSolid:
         return np.abs(self.mesh.volumes) * self.filled
 
     @property
-    def mass(self) -> Float[np.ndarray, " n"]:
+    def mass(self) -> Values:
         """Filled volume that belongs to each node, above 0."""
         corners, shares = self.mesh.elements.ravel(), np.repeat(self.volumes / 4, 4)
         return np.bincount(corners, weights=shares, minlength=len(self.mesh.nodes))
@@ -115,7 +122,7 @@ class ElasticSolid:
         incidence = coo_array((np.ones(len(rows)), (rows, number)), (count, int(number.max()) + 1)).tocsr()
         return int(connected_components(incidence @ incidence.T, directed=False)[0])
 
-    def most_modes(self, held: Bool[np.ndarray, " n"] | None = None) -> int:
+    def most_modes(self, held: Flags | None = None) -> int:
         """Number of modes that can be found, given which nodes are held."""
         free = len(self.mesh.nodes) if held is None else int((~held).sum())
         return 3 * free - 7
@@ -173,9 +180,7 @@ def assemble_stiffness(solid: ElasticSolid, material: Material) -> csc_array:
     return coo_array((blocks.ravel(), place), (3 * len(solid.mesh.nodes),) * 2).tocsc()
 
 
-def find_modes(
-    solid: ElasticSolid, count: int, material: Material, held: Bool[np.ndarray, " n"] | None = None
-) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "n 3 k"]]:
+def find_modes(solid: ElasticSolid, count: int, material: Material, held: Flags | None = None) -> tuple[PerMode, Modes]:
     """Eigenvalues, ascending, and modes of the free solid without its rigid motion, or of one that is held.
 
     Each mode moves material points by 1 unit of length, root mean square, and any two are orthogonal in the mass.
@@ -215,9 +220,7 @@ def find_modes(
     return values[order], modes.reshape(-1, 3, count) * np.sqrt(mass.sum())
 
 
-def scale_modes(
-    values: Float[np.ndarray, " k"], modes: Float[np.ndarray, "n 3 k"], motion: float, power: float = 2.0
-) -> Float[np.ndarray, "n 3 k"]:
+def scale_modes(values: PerMode, modes: Modes, motion: float, power: float = 2.0) -> Modes:
     """Modes for coefficients of variance 1, mode v's standard deviation being ~ lambda^(-power / 2).
 
     Args:
@@ -245,7 +248,7 @@ class StateMap:
     ``Tetrahedra.volume_ratios`` shows where a state inverts a tetrahedron; ``ElasticSampler`` takes none of these.
     """
 
-    def __init__(self, solid: ElasticSolid, modes: Float[np.ndarray, "n 3 k"]) -> None:
+    def __init__(self, solid: ElasticSolid, modes: Modes) -> None:
         mesh = solid.mesh
         self.mesh, self.modes = mesh, read_only_view(modes)
         weighted = mesh.shape_gradients * solid.volumes[:, None, None]
@@ -259,7 +262,7 @@ class StateMap:
         self._factors = _factorize((laplacian + 1e-9 * diags_array(laplacian.diagonal())).tocsc())
         self._share = solid.mass / solid.mass.sum()
 
-    def __call__(self, coefficients: Float[np.ndarray, " k"]) -> TetrahedralMap:
+    def __call__(self, coefficients: PerMode) -> TetrahedralMap:
         """Map of one state, normal coefficients of variance 1 giving the prior's; the centre of mass stays."""
         linear = self.mesh.gradients(self.mesh.nodes + self.modes @ coefficients)
         mirrored = np.swapaxes(linear, 1, 2)
@@ -284,7 +287,7 @@ MOST_SWELLING = 0.02
 """Largest change of a drawn state's volume, as a share."""
 
 
-_KEPT_MODES = dict[str, tuple[Float[np.ndarray, " k"], Float[np.ndarray, "n 3 k"]]]()
+_KEPT_MODES = dict[str, tuple[PerMode, Modes]]()
 """Modes of the last few solids by ``ElasticSampler.digest``: one command loads a scene several times."""
 
 
@@ -306,7 +309,7 @@ class ElasticSampler:
     material: Material
     count: int
     motion: float
-    held: Bool[np.ndarray, " n"] | None = None
+    held: Flags | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """State without the factors of the Poisson system, which cannot be pickled; a first state makes them again."""
@@ -321,7 +324,7 @@ class ElasticSampler:
         return digest.hexdigest()
 
     @cached_property
-    def modes(self) -> Float[np.ndarray, "n 3 k"]:
+    def modes(self) -> Modes:
         """Displacements of the nodes for coefficients of variance 1."""
         kept = _KEPT_MODES.get(self.digest)
         if kept is None:

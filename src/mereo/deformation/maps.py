@@ -13,10 +13,10 @@ from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float, Integer
+from jaxtyping import Float, Integer
 from scipy.spatial.transform import Rotation
 
-from mereo.geometry.transforms import Points, Vector
+from mereo.geometry.transforms import Flags, Matrices, Matrix, PointArray, Points, Values, Vector
 
 STEP, TOLERANCE = 1e-6, 1e-7
 """Step of finite differences, which err by 1e-6 in truncation, 1e-10 in rounding, and tolerance at which Newton's
@@ -37,7 +37,7 @@ class Deformation(Protocol):
 class Invertible(Protocol):
     """Deformation that can undo itself better than Newton's method: exactly, or where finite differences mislead."""
 
-    def rest_points(self, points: Points, guess: Points) -> tuple[Points, Bool[np.ndarray, " n"]]:
+    def rest_points(self, points: Points, guess: Points) -> tuple[Points, Flags]:
         """Rest points whose image is ``points``, and which of them were found; arguments as for ``invert``."""
 
 
@@ -63,7 +63,7 @@ class Rigid:
         return (points - self.center) @ self._matrix.T + (self.center + self.translation)
 
     @cached_property
-    def _matrix(self) -> Float[np.ndarray, "3 3"]:
+    def _matrix(self) -> Matrix:
         """Turn as a matrix, made once: a chain of joints asks each for all links behind it."""
         return np.asarray(Rotation.from_rotvec(self.rotation_vector).as_matrix())
 
@@ -161,7 +161,7 @@ def turn(
     return points + (np.cos(angle_rad) - 1.0)[:, None] * across + np.sin(angle_rad)[:, None] * quarter
 
 
-def crossing(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
+def crossing(vectors: PointArray) -> Float[np.ndarray, "*n 3 3"]:
     """Matrices whose rows are v x e_k, so that ``points @ matrix`` is v x p; many times faster than numpy's cross."""
     x, y, z = np.moveaxis(vectors, -1, 0)
     result = np.zeros((*vectors.shape, 3))
@@ -171,7 +171,7 @@ def crossing(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
     return result
 
 
-def jacobian(deformation: Deformation, points: Points) -> tuple[Points, Float[np.ndarray, "n 3 3"]]:
+def jacobian(deformation: Deformation, points: Points) -> tuple[Points, Matrices]:
     """Images ``f(x)`` and Jacobians ``J[:, i, j] = df_i / dx_j`` of a map, by forward differences.
 
     One call of the map with four times the points.
@@ -182,12 +182,12 @@ def jacobian(deformation: Deformation, points: Points) -> tuple[Points, Float[np
     return value[0], np.moveaxis((value[1:] - value[0]) / step, 0, -1)
 
 
-def jacobian_determinant(deformation: Deformation, points: Points) -> Float[np.ndarray, " n"]:
+def jacobian_determinant(deformation: Deformation, points: Points) -> Values:
     """Growth of volume at each point: 1 is rigid or volume preserving, 0 or less folds space over."""
     return np.linalg.det(jacobian(deformation, points)[1])
 
 
-def invert(deformation: Deformation, points: Points, guess: Points) -> tuple[Points, Bool[np.ndarray, " n"]]:
+def invert(deformation: Deformation, points: Points, guess: Points) -> tuple[Points, Flags]:
     """Rest points whose image is ``points``: by the deformation itself where it is ``Invertible``, else by ``newton``.
 
     It starts at ``guess``, for example the rest positions of the nearest deformed vertices. Returns also for each
@@ -198,7 +198,7 @@ def invert(deformation: Deformation, points: Points, guess: Points) -> tuple[Poi
     return newton(deformation, points, guess)
 
 
-def newton(deformation: Deformation, points: Points, guess: Points) -> tuple[Points, Bool[np.ndarray, " n"]]:
+def newton(deformation: Deformation, points: Points, guess: Points) -> tuple[Points, Flags]:
     """Rest points found by damped Newton's method with finite differences, all points at once; see ``invert``.
 
     A step is kept where the distance to the target falls by at least half of what the linear model promises; else
@@ -225,7 +225,7 @@ def newton(deformation: Deformation, points: Points, guess: Points) -> tuple[Poi
     return rest, error <= tolerance
 
 
-def _solve(matrix: Float[np.ndarray, "n 3 3"], right: Points) -> Points:
+def _solve(matrix: Matrices, right: Points) -> Points:
     """Cramer's rule, with a zero step where the matrix is singular (LAPACK would refuse the whole batch)."""
     a, b, c = (np.ascontiguousarray(matrix[:, :, k]) for k in range(3))
     bc = np.cross(b, c)

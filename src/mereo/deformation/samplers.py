@@ -14,17 +14,16 @@ from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
 
 from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, Localized, Rigid, unit
 from mereo.deformation.warps import Bend, FreeFormLattice, SmoothField, Squash, Taper, Twist
 from mereo.geometry.mesh import SegmentedMesh, vertex_normals
-from mereo.geometry.transforms import Corners, Points, Vector
+from mereo.geometry.transforms import AnyPoints, Corners, Points, Vector
 
 Range = tuple[float, float]
 
-Surface = Callable[[], tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 3"]]]
+Surface = Callable[[], tuple[AnyPoints, AnyPoints]]
 """Vertices of what is to be moved, as the maps before have left them, and outward unit normals."""
 
 FOLD_SHARE = 0.9
@@ -275,7 +274,7 @@ def _factor(rng: np.random.Generator, bounds: Range) -> float:
 
 def _surface(
     rest: SegmentedMesh, chains: Sequence[tuple[Deformation, ...]], members: Sequence[int]
-) -> tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 3"]]:
+) -> tuple[AnyPoints, AnyPoints]:
     """Vertices of segments after their maps so far, and their normals."""
     parts = [(rest.segments[index], Compose(chains[index])) for index in members]
     moved = [replace(segment, vertices=chain(segment.vertices)) for segment, chain in parts]

@@ -20,10 +20,16 @@ from scipy.spatial.distance import cdist
 
 from mereo.deformation.maps import newton, smooth_step
 from mereo.geometry.downsampling import farthest_point_order
-from mereo.geometry.mesh import barycentric
+from mereo.geometry.mesh import Elements, Faces, Vertices, barycentric
 from mereo.geometry.read_only import read_only, read_only_view
 from mereo.geometry.solids import search_tree
-from mereo.geometry.transforms import Points, longest_side
+from mereo.geometry.transforms import Matrices, Points, longest_side
+
+Places = Float[np.ndarray, "p 3"]
+"""Positions or vectors in rows: as many as whatever else has the axis ``p``."""
+
+Gradients = Float[np.ndarray, "m 3 3"]
+"""A matrix for each tetrahedron."""
 
 
 class Tetrahedra:
@@ -32,7 +38,7 @@ class Tetrahedra:
     Raises ``ValueError`` for NaN, indices that do not exist, and tetrahedra without volume.
     """
 
-    def __init__(self, nodes: Points, elements: Int[np.ndarray, "m 4"]) -> None:
+    def __init__(self, nodes: Points, elements: Elements) -> None:
         if len(elements) == 0:
             raise ValueError("there are no tetrahedra; at least one is needed: export the volume mesh")
         if not np.isfinite(nodes).all():
@@ -63,7 +69,7 @@ class Tetrahedra:
         return search_tree(self.nodes, self.elements)
 
     @cached_property
-    def surface(self) -> Int[np.ndarray, "f 3"]:
+    def surface(self) -> Faces:
         """Faces that one tetrahedron has alone, counter-clockwise from outside."""
         outward = np.where((self.volumes < 0)[:, None], self.elements[:, [1, 0, 2, 3]], self.elements)
         return read_only(np.ascontiguousarray(igl.boundary_facets(outward)[0].astype(np.int64)))
@@ -89,19 +95,19 @@ class Tetrahedra:
         """Volume of each tetrahedron at other node positions, of that at rest; 0 or less where it is inverted."""
         return np.linalg.det(_edges(nodes, self.elements)) / (6 * self.volumes)
 
-    def gradients(self, nodes: Points) -> Float[np.ndarray, "m 3 3"]:
+    def gradients(self, nodes: Points) -> Gradients:
         """Deformation gradients A of all tetrahedra at other node positions."""
         return _edges(nodes, self.elements) @ self._rest_inverse
 
-    def node_gradients(self, gradients: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "n 3 3"]:
+    def node_gradients(self, gradients: Gradients) -> Matrices:
         """Gradients averaged at nodes, which makes them continuous over the surface."""
         return np.reshape(self._node_mean @ gradients.reshape(-1, 9), (-1, 3, 3))
 
-    def locate(self, points: Float[np.ndarray, "p 3"]) -> Int[np.ndarray, " p"]:
+    def locate(self, points: Places) -> Int[np.ndarray, " p"]:
         """Tetrahedron around each point at rest, -1 outside."""
         return _locate(self._tree, self.nodes, self.elements, points)
 
-    def embed(self, points: Float[np.ndarray, "p 3"]) -> csr_array:
+    def embed(self, points: Places) -> csr_array:
         """Weights [p, n] by which points follow the nodes; outside they follow the closest point of the surface."""
         element = self.locate(points)
         rows, beyond = np.flatnonzero(element >= 0), np.flatnonzero(element < 0)
@@ -115,9 +121,7 @@ class Tetrahedra:
         entries = np.concatenate([weights.ravel(), outer.ravel()])
         return coo_array((entries, (place, nodes)), (len(points), len(self.nodes))).tocsr()
 
-    def closest(
-        self, points: Float[np.ndarray, "p 3"]
-    ) -> tuple[Int[np.ndarray, "p 3"], Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]]:
+    def closest(self, points: Places) -> tuple[Int[np.ndarray, "p 3"], Places, Places]:
         """Corners, barycentric weights and place of the closest point of the surface at rest."""
         _, face, place = self._surface_tree.squared_distance(self.nodes, self.surface, np.ascontiguousarray(points))
         corners = self.surface[face]
@@ -137,14 +141,14 @@ class TetrahedralMap:
     nodes: Points
 
     @cached_property
-    def _gradients(self) -> Float[np.ndarray, "m 3 3"]:
+    def _gradients(self) -> Gradients:
         return self.rest.gradients(self.nodes)
 
     @cached_property
-    def _node_gradients(self) -> Float[np.ndarray, "n 3 3"]:
+    def _node_gradients(self) -> Matrices:
         return self.rest.node_gradients(self._gradients)
 
-    def __call__(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
+    def __call__(self, points: Places) -> Places:
         """Images of points: affine in each tetrahedron, and continued outside of them."""
         element = self.rest.locate(points)
         moved = np.empty_like(points, dtype=np.float64)
@@ -156,15 +160,13 @@ class TetrahedralMap:
             moved[~inside] = self._beyond(points[~inside])
         return moved
 
-    def _beyond(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
+    def _beyond(self, points: Places) -> Places:
         corners, weights, place = self.rest.closest(points)
         base = np.einsum("pk,pki->pi", weights, self.nodes[corners])
         gradient = np.einsum("pk,pkij->pij", weights, self._node_gradients[corners])
         return base + _apply(gradient, points - place)
 
-    def rest_points(
-        self, points: Float[np.ndarray, "p 3"], guess: Float[np.ndarray, "p 3"]
-    ) -> tuple[Float[np.ndarray, "p 3"], Bool[np.ndarray, " p"]]:
+    def rest_points(self, points: Places, guess: Places) -> tuple[Places, Bool[np.ndarray, " p"]]:
         """Rest points of deformed ones: exact in a tetrahedron, by Newton's method outside.
 
         Where the deformed mesh overlaps itself one of the answers is given.
@@ -181,7 +183,7 @@ class TetrahedralMap:
         return rest, converged
 
 
-def _edges(nodes: Points, elements: Int[np.ndarray, "m 4"]) -> Float[np.ndarray, "m 3 3"]:
+def _edges(nodes: Points, elements: Elements) -> Gradients:
     """Edges from the first node as columns."""
     corners = nodes[elements]
     return np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
@@ -190,8 +192,8 @@ def _edges(nodes: Points, elements: Int[np.ndarray, "m 4"]) -> Float[np.ndarray,
 def _locate(
     tree: igl.AABB,
     nodes: Points,
-    elements: Int[np.ndarray, "m 4"],
-    points: Float[np.ndarray, "p 3"],
+    elements: Elements,
+    points: Places,
 ) -> Int[np.ndarray, " p"]:
     if len(points) == 0:  # libigl's loop expects some
         return np.empty(0, dtype=np.int64)
@@ -199,7 +201,7 @@ def _locate(
     return element.astype(np.int64)  # C's long long, which numpy tells apart
 
 
-def _apply(matrix: Float[np.ndarray, "p 3 3"], vector: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
+def _apply(matrix: Float[np.ndarray, "p 3 3"], vector: Places) -> Places:
     return np.einsum("pij,pj->pi", matrix, vector)
 
 
@@ -223,7 +225,7 @@ REACH = 3.0
 class Surface:
     """Closed surface at rest with its search tree and the spline's system, which all of its states share."""
 
-    def __init__(self, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> None:
+    def __init__(self, vertices: Vertices, faces: Faces) -> None:
         self.vertices = read_only_view(np.ascontiguousarray(vertices, dtype=np.float64))
         self.faces = read_only_view(np.ascontiguousarray(faces, dtype=np.int64))
         self.center = vertices.mean(axis=0)
@@ -254,13 +256,13 @@ class Surface:
         """Basis of the spline at all vertices at rest."""
         return read_only(self.basis(self.vertices))
 
-    def basis(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p k"]:
+    def basis(self, points: Places) -> Float[np.ndarray, "p k"]:
         """Values of the spline's functions at points at rest."""
         local = points - self.center
         radial = cdist(points, self.vertices[self.controls])
         return np.concatenate([radial, np.ones((len(points), 1)), local], axis=1)
 
-    def carry(self, values: Float[np.ndarray, "v 3"], points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
+    def carry(self, values: Vertices, points: Places) -> Places:
         """Values at vertices taken from the closest surface point, fading with its distance."""
         squared, face, place = self._tree.squared_distance(
             self.vertices, self.faces, np.ascontiguousarray(points, dtype=np.float64)
@@ -276,16 +278,16 @@ class SurfaceMap:
     """Map of space that one state of a surface gives, whose deformed ``vertices`` it meets exactly."""
 
     rest: Surface
-    vertices: Float[np.ndarray, "v 3"]
+    vertices: Vertices
 
     @cached_property
     def _coefficients(self) -> Float[np.ndarray, "k 3"]:
         return self.rest.solver @ self.vertices[self.rest.controls]
 
     @cached_property
-    def _error(self) -> Float[np.ndarray, "v 3"]:
+    def _error(self) -> Vertices:
         return self.vertices - self.rest.vertex_basis @ self._coefficients
 
-    def __call__(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
+    def __call__(self, points: Places) -> Places:
         """Images of points: exact on the surface, estimated inside."""
         return self.rest.basis(points) @ self._coefficients + self.rest.carry(self._error, points)

@@ -4,7 +4,8 @@ from collections.abc import Iterable
 from math import floor, isfinite, log10
 
 import numpy as np
-from jaxtyping import Float
+
+from mereo.geometry.transforms import Points
 
 FEW = 6
 """Names that are listed before the others are only counted."""
@@ -21,7 +22,7 @@ def counted(count: int, what: str) -> str:
     return f"{count:,} {what}{'' if count == 1 else 's'}"
 
 
-def sides(points: Float[np.ndarray, "n 3"]) -> str:
+def sides(points: Points) -> str:
     """Sides of the box around points, such as "31.5 x 17.6 x 19.1"; "empty" around none."""
     return " x ".join(f"{side:.3g}" for side in np.ptp(points, axis=0)) if len(points) else "empty"
 

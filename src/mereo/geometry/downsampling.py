@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float, Int, Real, Shaped
 from scipy.spatial import cKDTree
 
-from mereo.geometry.transforms import Points, longest_side
+from mereo.geometry.transforms import Indices, Points, Values, longest_side
 
 MAX_POINTS = 50_000
 """Many times what any network is trained on; comparing neighbours takes a fraction of a second."""
@@ -70,9 +70,7 @@ def means_along_sight(points: Points, limit: int) -> Float[np.ndarray, "m 3"]:
     return total / np.bincount(group)[:, None]
 
 
-def _surfaces_in_cells(
-    flat: Float[np.ndarray, "n 2"], distance: Float[np.ndarray, " n"], cell: float
-) -> Int[np.ndarray, " n"]:
+def _surfaces_in_cells(flat: Float[np.ndarray, "n 2"], distance: Values, cell: float) -> Indices:
     """Number of the group of each point: those of one cell without a gap in distance."""
     index = np.floor(flat / cell).astype(np.int64)
     key = index[:, 0] * (index[:, 1].max() + 1) + index[:, 1]

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.mesh import Color
-from mereo.geometry.transforms import Points, Vector
+from mereo.geometry.transforms import Labels, PointArray, Points, Values, Vector
 
 
 def part_of_grid(low: Int[np.ndarray, "3"], end: Int[np.ndarray, "3"]) -> tuple[slice, ...]:
@@ -40,7 +40,7 @@ class LabelGrid:
         x, y, z = (self.origin[i] + np.arange(self.labels.shape[i]) * self.spacing[i] for i in range(3))
         return x, y, z
 
-    def positions(self, index: Int[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    def positions(self, index: Int[np.ndarray, "*n 3"]) -> PointArray:
         """Centres of voxels given by their index."""
         return self.origin + index * self.spacing
 
@@ -66,9 +66,9 @@ class SegmentedCloud:
     """
 
     points: Points
-    labels: UInt8[np.ndarray, " n"]
-    confidence: Float[np.ndarray, " n"]
-    occupancy: Float[np.ndarray, " n"]
+    labels: Labels
+    confidence: Values
+    occupancy: Values
     names: tuple[str, ...]
     colors: tuple[Color, ...]
 
@@ -84,7 +84,7 @@ class SegmentedCloud:
         return f"SegmentedCloud({counted(len(self.points), 'point')}; {listed(self.names)})"
 
     @property
-    def chances(self) -> dict[str, Float[np.ndarray, " n"]]:
+    def chances(self) -> dict[str, Values]:
         """``confidence`` and ``occupancy`` by their names; none without a network's answer."""
         if len(self.points) and np.isnan(self.confidence).all():
             return {}

@@ -14,7 +14,27 @@ from scipy.sparse.csgraph import connected_components
 
 from mereo.geometry.brief import counted, listed, sides
 from mereo.geometry.read_only import read_only_view
-from mereo.geometry.transforms import Corners, Points, Transform, transform_points, unit_rows
+from mereo.geometry.transforms import (
+    AnyPoints,
+    Corners,
+    Indices,
+    Points,
+    Transform,
+    transform_points,
+    unit_rows,
+)
+
+Vertices = Float[np.ndarray, "v 3"]
+"""Positions or vectors in rows: one for each vertex of a mesh."""
+
+Faces = Int[np.ndarray, "f 3"]
+"""Three indices of vertices in each row, counter-clockwise seen from outside."""
+
+AnyFaces = Int[np.ndarray, "_ 3"]
+"""The same, as many as there are: of a mesh that is changed, with ``AnyPoints``."""
+
+Elements = Int[np.ndarray, "m 4"]
+"""Four indices of nodes in each row, a tetrahedron."""
 
 Color = tuple[int, int, int]
 """Red, green, blue in 0..255."""
@@ -51,8 +71,8 @@ class Segment:
 
     name: str
     color: Color
-    vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
+    vertices: Vertices
+    faces: Faces
     solid: bool = True
 
     def __post_init__(self) -> None:
@@ -159,7 +179,7 @@ class SegmentedMesh:
             volumes[outer] -= sum(volumes[inner] for inner, other in self.nesting if other == outer)
         return volumes
 
-    def with_vertices(self, vertices: Sequence[Float[np.ndarray, "_ 3"]]) -> "SegmentedMesh":
+    def with_vertices(self, vertices: Sequence[AnyPoints]) -> "SegmentedMesh":
         """Mesh of the same segments at other positions; ``vertices[i]`` belongs to ``segments[i]``."""
         moved = tuple(replace(s, vertices=v) for s, v in zip(self.segments, vertices, strict=True))
         return replace(self, segments=moved)
@@ -168,7 +188,7 @@ class SegmentedMesh:
         """Mesh with all vertices mapped by a homogeneous transform."""
         return self.with_vertices([transform_points(transform, segment.vertices) for segment in self.segments])
 
-    def merged(self) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Int[np.ndarray, " f"]]:
+    def merged(self) -> tuple[Vertices, Faces, Int[np.ndarray, " f"]]:
         """All segments in one array: vertices, faces, and for each face the index of its segment."""
         offsets = np.cumsum([0] + [len(s.vertices) for s in self.segments])
         vertices = np.concatenate([s.vertices for s in self.segments])
@@ -209,11 +229,16 @@ def check_segment(segment: Segment) -> None:
         raise ValueError(f"segment {segment.name!r} has {fault}")
 
 
+def directed_edges(faces: AnyFaces) -> Int[np.ndarray, "_ 2"]:
+    """The three edges of each face in turn, from corner to corner."""
+    return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+
+
 def edge_uses(
-    faces: Int[np.ndarray, "f 3"],
+    faces: Faces,
 ) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, " e"], Bool[np.ndarray, " e"]]:
     """Edges with their lower end first, how many faces each has, and whether these do not go there and back alike."""
-    directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+    directed = directed_edges(faces)
     size = int(directed.max(initial=0)) + 1
     keys, edge, uses = np.unique(np.sort(directed, axis=1) @ [size, 1], return_inverse=True, return_counts=True)
     forth = np.where(directed[:, 0] < directed[:, 1], 1, -1)
@@ -221,19 +246,19 @@ def edge_uses(
     return np.stack(np.divmod(keys, size), axis=1), uses, unbalanced
 
 
-def edge_imbalance(faces: Int[np.ndarray, "f 3"]) -> tuple[int, int]:
+def edge_imbalance(faces: Faces) -> tuple[int, int]:
     """Numbers of open and of misoriented edges: both zero exactly when a mesh is closed and oriented alike."""
     _, uses, unbalanced = edge_uses(faces)
     return int((uses % 2 == 1).sum()), int((unbalanced & (uses % 2 == 0)).sum())
 
 
-def three_cornered(faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
+def three_cornered(faces: Faces) -> Bool[np.ndarray, " f"]:
     """Which faces have three different vertices."""
     return np.asarray((faces != np.roll(faces, 1, axis=1)).all(axis=1))
 
 
 def with_used_vertices(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f k"]
+    vertices: Vertices, faces: Int[np.ndarray, "f k"]
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "f k"]]:
     """Mesh without the vertices that no face has; the others stay in their order."""
     used, kept = np.unique(faces, return_inverse=True)  # flat before numpy 2
@@ -245,21 +270,19 @@ def palette_color(index: int) -> Color:
     return PALETTE[index % len(PALETTE)]
 
 
-def area_vectors(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
+def area_vectors(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "f 3"]:
     """Normals of faces, each as long as twice the face's area."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return np.cross(b - a, c - a)
 
 
-def connected(pairs: Int[np.ndarray, "p 2"], count: int) -> Int[np.ndarray, " n"]:
+def connected(pairs: Int[np.ndarray, "p 2"], count: int) -> Indices:
     """Number of the group of each of ``count`` things, of which pairs hang together."""
     graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count))
     return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
-def surface_points(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], count: int
-) -> tuple[Points, Int[np.ndarray, " n"]]:
+def surface_points(vertices: Vertices, faces: Faces, count: int) -> tuple[Points, Indices]:
     """Points evenly spread over a surface, the same in every call, and the face of each.
 
     Vertices are not: a CAD program's are where a surface is round, none where it is flat.
@@ -276,12 +299,12 @@ FEW_VERTICES = 2500
 """Vertices below which places on the faces stand for a surface: corners of few large triangles do not show it."""
 
 
-def with_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "v 6"]:
+def with_normals(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "v 6"]:
     """Vertices and their normals, outward as the faces are wound; those of vertices that no face has are 0."""
     return np.hstack([vertices, vertex_normals(Segment("", PALETTE[0], vertices, faces))])
 
 
-def oriented_points(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "n 6"]:
+def oriented_points(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "n 6"]:
     """Points that stand for a surface: all vertices, or where these are few, points on the faces; with normals."""
     if len(vertices) >= FEW_VERTICES:
         return with_normals(vertices, faces)
@@ -289,7 +312,7 @@ def oriented_points(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "
     return np.hstack([points, area_vectors(vertices, faces)[face]])
 
 
-def barycentric(triangles: Float[np.ndarray, "n 3 3"], points: Points) -> Points:
+def barycentric(triangles: Float[np.ndarray, "n 3 3"], points: Points) -> Float[np.ndarray, "n 3"]:
     """Barycentric coordinates of points in the planes of their triangles."""
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
     normal = np.cross(b - a, c - a)
@@ -299,7 +322,7 @@ def barycentric(triangles: Float[np.ndarray, "n 3 3"], points: Points) -> Points
     return np.stack([1 - v - w, v, w], axis=1)
 
 
-def vertex_normals(segment: Segment) -> Float[np.ndarray, "v 3"]:
+def vertex_normals(segment: Segment) -> Vertices:
     """Unit normals of a segment's vertices, outward, weighted by the area of the faces around."""
     normals = np.zeros_like(segment.vertices)
     for k in range(3):

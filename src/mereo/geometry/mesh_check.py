@@ -12,19 +12,18 @@ from jaxtyping import Bool, Float, Int
 
 from mereo.geometry.brief import counted
 from mereo.geometry.mesh import (
+    AnyFaces,
     Segment,
     SegmentedMesh,
     area_vectors,
     connected,
+    directed_edges,
     edge_imbalance,
     edge_uses,
     three_cornered,
 )
 from mereo.geometry.solids import label_grid
-from mereo.geometry.transforms import Corners, Vector, longest_side
-
-Vertices = Float[np.ndarray, "_ 3"]
-Faces = Int[np.ndarray, "_ 3"]
+from mereo.geometry.transforms import AnyPoints, Corners, Vector, longest_side
 
 MOST_BURIED, MOST_BACKWARDS, MOST_UNDECIDED = 5e-3, 0.05, 0.5
 """Shares of a surface that may lie within the segment, as lips and eyelids do (two rays are compared anyway), face
@@ -115,7 +114,7 @@ def examine(segment: Segment, unit: str = "") -> Health:
     return Health(tuple(dirty), tuple(hopeless), notes=notes)
 
 
-def _broken_data(vertices: Vertices, faces: Faces) -> tuple[list[str], Bool[np.ndarray, " f"]]:
+def _broken_data(vertices: AnyPoints, faces: AnyFaces) -> tuple[list[str], Bool[np.ndarray, " f"]]:
     """Faults of the arrays, and which faces can be used all the same."""
     faults = []
     finite = np.isfinite(vertices).all(axis=1)
@@ -131,7 +130,7 @@ def _broken_data(vertices: Vertices, faces: Faces) -> tuple[list[str], Bool[np.n
     return faults, usable
 
 
-def _encloses_nothing(vertices: Vertices, faces: Faces) -> bool:
+def _encloses_nothing(vertices: AnyPoints, faces: AnyFaces) -> bool:
     """Whether a closed mesh has hardly any volume: far less than the thinnest sheet or wire of its size."""
     middle = vertices[faces].mean(axis=(0, 1))
     volume = abs(Segment("", (0, 0, 0), vertices - middle, faces).volume)
@@ -139,7 +138,7 @@ def _encloses_nothing(vertices: Vertices, faces: Faces) -> bool:
     return not volume > 1e-9 * area * float(np.linalg.norm(np.ptp(vertices[np.unique(faces)], axis=0)))
 
 
-def _wrong_edges(vertices: Vertices, faces: Faces, unit: str) -> tuple[int, list[str]]:
+def _wrong_edges(vertices: AnyPoints, faces: AnyFaces, unit: str) -> tuple[int, list[str]]:
     """Number of open edges, and phrases on them and on edges of too many faces or of faces that disagree."""
     ends, uses, unbalanced = edge_uses(faces)
     faults, rim = [], ends[uses == 1]
@@ -159,7 +158,7 @@ def _wrong_edges(vertices: Vertices, faces: Faces, unit: str) -> tuple[int, list
     return len(rim), faults
 
 
-def _notes(vertices: Vertices, faces: Faces, surface: "_FrontWinding", unit: str) -> tuple[str, ...]:
+def _notes(vertices: AnyPoints, faces: AnyFaces, surface: "_FrontWinding", unit: str) -> tuple[str, ...]:
     notes = []
     stray, what = fragments(vertices, faces, unit)
     if stray.any():
@@ -177,7 +176,7 @@ def near(point: Vector, unit: str) -> str:
     return f"near [{', '.join(f'{round(float(value), digits) + 0.0:.4g}' for value in point)}]{unit and f' {unit}'}"
 
 
-def faces_astray(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> bool:
+def faces_astray(vertices: AnyPoints, faces: AnyFaces) -> bool:
     """Whether neighbouring faces disagree in orientation, or some face inwards."""
     surface = _front_winding(vertices, faces)
     disagree = edge_imbalance(faces)[1] > 0
@@ -200,7 +199,7 @@ class _FrontWinding(NamedTuple):
         return near(self.middle[np.where(chosen, self.share, -1.0).argmax()], unit)
 
 
-def _front_winding(vertices: Vertices, faces: Faces) -> _FrontWinding:
+def _front_winding(vertices: AnyPoints, faces: AnyFaces) -> _FrontWinding:
     corners = vertices[np.unique(faces)]
     low, high = corners.min(axis=0), corners.max(axis=0)
     vertices = (np.where(np.isfinite(vertices), vertices, low) - (low + high) / 2) / float(np.linalg.norm(high - low))
@@ -216,9 +215,9 @@ def _front_winding(vertices: Vertices, faces: Faces) -> _FrontWinding:
     return _FrontWinding(winding, area[proper] / max(area.sum(), 1e-300), middle, proper)
 
 
-def pieces(faces: Faces, vertices: int) -> Int[np.ndarray, " f"]:
+def pieces(faces: AnyFaces, vertices: int) -> Int[np.ndarray, " f"]:
     """Number of the piece of each face; a piece is connected over edges which exactly two of its faces share."""
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1) @ [vertices, 1]
+    edges = np.sort(directed_edges(faces), axis=1) @ [vertices, 1]
     order = np.argsort(edges, kind="stable")
     _, first, uses = np.unique(edges[order], return_index=True, return_counts=True)
     return connected(np.stack([order[first[uses == 2]], order[first[uses == 2] + 1]], axis=1) // 3, len(faces))
@@ -228,7 +227,7 @@ FRAGMENT = 0.02
 """Diagonal of a fragment's box at most, in those of the whole."""
 
 
-def fragments(vertices: Vertices, faces: Faces, unit: str = "") -> tuple[Bool[np.ndarray, " f"], str]:
+def fragments(vertices: AnyPoints, faces: AnyFaces, unit: str = "") -> tuple[Bool[np.ndarray, " f"], str]:
     """Faces of pieces that are tiny compared with the whole, and a phrase with their number, share, size and place."""
     piece = pieces(faces, len(vertices))
     corners = vertices[faces]
@@ -260,7 +259,7 @@ PLAUSIBLE_M = (0.005, 5.0)
 """Longest side of what a depth camera looks at: from 5 mm to 5 m."""
 
 
-def solid_of(vertices: Vertices, faces: Faces) -> manifold3d.Manifold:
+def solid_of(vertices: AnyPoints, faces: AnyFaces) -> manifold3d.Manifold:
     """Solid of a closed mesh; raises ``ValueError`` where manifold3d does not accept it."""
     # copies, because manifold3d takes no array that is read-only
     mesh = manifold3d.Mesh64(np.array(vertices, np.float64, order="C"), np.array(faces, np.uint64, order="C"))
@@ -270,13 +269,13 @@ def solid_of(vertices: Vertices, faces: Faces) -> manifold3d.Manifold:
     return solid
 
 
-def mesh_of(solid: manifold3d.Manifold) -> tuple[Vertices, Faces]:
+def mesh_of(solid: manifold3d.Manifold) -> tuple[AnyPoints, AnyFaces]:
     """Vertices and faces of a solid."""
     mesh = solid.to_mesh64()
     return np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts, dtype=np.int64)
 
 
-def united(pieces: Sequence[Segment]) -> tuple[Vertices, Faces]:
+def united(pieces: Sequence[Segment]) -> tuple[AnyPoints, AnyFaces]:
     """Union of pieces, as vertices and faces, where each is a solid that faces outwards; else all of their faces."""
     if len(pieces) == 1:
         return pieces[0].vertices, pieces[0].faces

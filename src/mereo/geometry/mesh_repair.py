@@ -11,24 +11,24 @@ from typing import NamedTuple
 import igl
 import manifold3d
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
 from mereo.geometry.brief import counted
 from mereo.geometry.mesh import (
+    AnyFaces,
     Segment,
     SegmentedMesh,
     area_vectors,
     connected,
+    directed_edges,
     edge_imbalance,
     surface_points,
     three_cornered,
     with_used_vertices,
 )
 from mereo.geometry.mesh_check import (
-    Faces,
-    Vertices,
     examine,
     faces_astray,
     fragments,
@@ -39,7 +39,7 @@ from mereo.geometry.mesh_check import (
     solid_of,
 )
 from mereo.geometry.solids import search_tree
-from mereo.geometry.transforms import Vector, longest_side, unit_rows
+from mereo.geometry.transforms import AnyPoints, Flags, Indices, Values, Vector, longest_side, unit_rows
 
 MERGED_WITHIN = (1e-6, 1e-4)
 """Vertices of open edges this near to each other, in diagonals of the box, count as one; the less, where it helps."""
@@ -81,10 +81,10 @@ def repaired(segment: Segment, unit: str = "") -> Repair:
     return Repair(replace(segment, vertices=vertices, faces=faces, solid=True), tuple(changes), whole)
 
 
-Step = tuple[Vertices, Faces, str]
+Step = tuple[AnyPoints, AnyFaces, str]
 
 
-def _drop_unusable(vertices: Vertices, faces: Faces, unit: str) -> Step:
+def _drop_unusable(vertices: AnyPoints, faces: AnyFaces, unit: str) -> Step:
     """Faces without place or area, and repeated ones."""
     usable = np.all((faces >= 0) & (faces < len(vertices)), axis=1)
     usable[usable] = np.isfinite(vertices[faces[usable]]).all(axis=(1, 2))
@@ -97,7 +97,7 @@ def _drop_unusable(vertices: Vertices, faces: Faces, unit: str) -> Step:
     return *with_used_vertices(vertices, kept), change
 
 
-def _merge_near(vertices: Vertices, faces: Faces, unit: str) -> Step:
+def _merge_near(vertices: AnyPoints, faces: AnyFaces, unit: str) -> Step:
     """Vertices of open edges that are nearly the same, where that closes edges."""
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     best, fewest, change = (vertices, faces), len(open_edges(vertices, faces)), ""
@@ -111,7 +111,7 @@ def _merge_near(vertices: Vertices, faces: Faces, unit: str) -> Step:
     return *best, change
 
 
-def _merged(vertices: Vertices, faces: Faces, distance: float) -> tuple[Vertices, Faces]:
+def _merged(vertices: AnyPoints, faces: AnyFaces, distance: float) -> tuple[AnyPoints, AnyFaces]:
     rim = np.unique(open_edges(vertices, faces))
     pairs = rim[cKDTree(vertices[rim]).query_pairs(distance, output_type="ndarray")].reshape(-1, 2)
     group = connected(pairs, len(vertices))
@@ -120,14 +120,14 @@ def _merged(vertices: Vertices, faces: Faces, distance: float) -> tuple[Vertices
     return vertices[first], merged[three_cornered(merged)]
 
 
-def _drop_fragments(vertices: Vertices, faces: Faces, unit: str) -> Step:
+def _drop_fragments(vertices: AnyPoints, faces: AnyFaces, unit: str) -> Step:
     stray, what = fragments(vertices, faces, unit)
     if not stray.any():
         return vertices, faces, ""
     return *with_used_vertices(vertices, faces[~stray]), f"removed {what}"
 
 
-def _orient(vertices: Vertices, faces: Faces, unit: str) -> Step:
+def _orient(vertices: AnyPoints, faces: AnyFaces, unit: str) -> Step:
     """Neighbours agree, and each patch faces outwards; nothing where that is so, for a cavity's wall faces inwards."""
     if not faces_astray(vertices, faces):
         return vertices, faces, ""
@@ -143,14 +143,14 @@ def _orient(vertices: Vertices, faces: Faces, unit: str) -> Step:
     return vertices, turned, f"turned {changed} faces around" if changed else ""
 
 
-def _fill_holes(vertices: Vertices, faces: Faces, unit: str) -> Step:
+def _fill_holes(vertices: AnyPoints, faces: AnyFaces, unit: str) -> Step:
     closed = close_holes(vertices, faces)
     holes = len(closed[0]) - len(vertices)
     added = len(closed[1]) - len(faces)
     return *closed, f"filled {holes} {'hole' if holes == 1 else 'holes'} with {added} faces" if holes else ""
 
 
-def _unite(vertices: Vertices, faces: Faces, unit: str) -> Step:
+def _unite(vertices: AnyPoints, faces: AnyFaces, unit: str) -> Step:
     """Closed shells that reach into each other become one; shells that face inwards in others are cut out as cavities.
 
     Those that face inwards and lie outside are turned around.
@@ -192,7 +192,7 @@ FAR = 1.0
 MOST_SAMPLES = 100_000
 
 
-def _remesh(vertices: Vertices, faces: Faces, unit: str) -> Step:
+def _remesh(vertices: AnyPoints, faces: AnyFaces, unit: str) -> Step:
     """A new surface where the winding number is one half, smooth because it is found by distances near the old one."""
     low = vertices.min(axis=0)
     step = longest_side(vertices) / CELLS
@@ -216,16 +216,16 @@ def _remesh(vertices: Vertices, faces: Faces, unit: str) -> Step:
 class _Body:
     """A mesh in cells: which places it encloses, and how far they are from it."""
 
-    def __init__(self, vertices: Vertices, faces: Faces) -> None:
+    def __init__(self, vertices: AnyPoints, faces: AnyFaces) -> None:
         self.vertices, self.faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces, dtype=np.int64)
         self._closed = edge_imbalance(faces) == (0, 0)
         self._tree = search_tree(self.vertices, self.faces)
 
-    def inside(self, places: Vertices) -> Bool[np.ndarray, " n"]:
+    def inside(self, places: AnyPoints) -> Flags:
         """Whether the mesh winds around each place."""
         return igl.fast_winding_number(self.vertices, self.faces, places) > 0.5
 
-    def distance(self, places: Vertices) -> Float[np.ndarray, " n"]:
+    def distance(self, places: AnyPoints) -> Values:
         """Distance from the surface."""
         return np.sqrt(self._tree.squared_distance(self.vertices, self.faces, places)[0])
 
@@ -240,7 +240,7 @@ class _Body:
         inside[close] = (self._inside_parts(places, cell) if self._closed else self.inside(places)).reshape(-1, 64)
         return inside
 
-    def _inside_parts(self, nodes: Vertices, cell: float) -> Bool[np.ndarray, " n"]:
+    def _inside_parts(self, nodes: AnyPoints, cell: float) -> Flags:
         """The same for nodes of whole blocks: one winding number, which is slow, for all nodes that none parts.
 
         No surface lies between neighbours if the sum of their distances from it is more than their distance.
@@ -254,8 +254,8 @@ class _Body:
         return self.inside(nodes[order[first]])[part]
 
     def samples(
-        self, faces: Int[np.ndarray, " m"], spacing: float, around: Vertices | None = None
-    ) -> tuple[Vertices, Vertices, Int[np.ndarray, " n"]]:
+        self, faces: Int[np.ndarray, " m"], spacing: float, around: AnyPoints | None = None
+    ) -> tuple[AnyPoints, AnyPoints, Indices]:
         """Corners of some faces and places about ``spacing`` apart, the normal there, and the face of each.
 
         Where ``around`` is given, only those within four cells of it.
@@ -342,7 +342,7 @@ def _with_thin_parts(
     return whole.simplify(0.01 * cell) if cell < 1 else solid, cell, lost
 
 
-def _within(places: Vertices, of: Vertices, distance: float) -> Bool[np.ndarray, " n"]:
+def _within(places: AnyPoints, of: AnyPoints, distance: float) -> Flags:
     """Whether a place lies as near to any of the others."""
     return cKDTree(of).query(places, distance_upper_bound=distance)[0] < distance
 
@@ -354,7 +354,7 @@ def _without_specks(solid: manifold3d.Manifold, side: float) -> manifold3d.Manif
     return solid if len(kept) == len(shells) else manifold3d.Manifold.compose(kept)
 
 
-def _blocks(places: Vertices, way: Float[np.ndarray, " n"], side: float, margin: float) -> Int[np.ndarray, "b 3"]:
+def _blocks(places: AnyPoints, way: Values, side: float, margin: float) -> Int[np.ndarray, "b 3"]:
     """Blocks of a lattice with a margin around places, those around the largest ``way`` first."""
     shifts = margin * (np.indices((3, 3, 3)).reshape(3, -1).T - 1)
     order = np.argsort(-way, kind="stable")
@@ -388,9 +388,7 @@ def _fine_surface(body: _Body, blocks: Int[np.ndarray, "b 3"], cell: float) -> m
     return solid_of(vertices, faces.astype(np.int64)).simplify(0.2 * cell)
 
 
-def _cut_off(
-    body: _Body, solid: manifold3d.Manifold, places: Vertices, normals: Vertices
-) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+def _cut_off(body: _Body, solid: manifold3d.Manifold, places: AnyPoints, normals: AnyPoints) -> tuple[Values, Flags]:
     """Distances from a new solid, and whether a place lies far out of it; a narrow gap that it closes is no loss."""
     if solid.is_empty():
         return np.full(len(places), np.inf), np.ones(len(places), bool)
@@ -481,7 +479,7 @@ def without_overlaps(mesh: SegmentedMesh) -> tuple[SegmentedMesh, dict[str, list
     return replace(mesh, segments=tuple(segments.values())), changes
 
 
-def _without_flecks(vertices: Vertices, faces: Faces) -> Step:
+def _without_flecks(vertices: AnyPoints, faces: AnyFaces) -> Step:
     """Mesh without pieces of hardly any volume: Booleans of meshes that nearly touch leave them."""
     piece = pieces(faces, len(vertices))
     a, b, c = (vertices[faces[:, k]] - vertices.mean(axis=0) for k in range(3))
@@ -495,20 +493,20 @@ def _without_flecks(vertices: Vertices, faces: Faces) -> Step:
 # --- the largest piece, and holes -------------------------------------------------------------------------------------
 
 
-def largest_piece(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
+def largest_piece(vertices: AnyPoints, faces: AnyFaces) -> tuple[AnyPoints, AnyFaces]:
     """Piece of the most faces; unused vertices are left out."""
     piece = pieces(faces, len(vertices))
     return with_used_vertices(vertices, faces[piece == np.bincount(piece).argmax()])
 
 
-def open_edges(vertices: Vertices, faces: Faces) -> Int[np.ndarray, "_ 2"]:
+def open_edges(vertices: AnyPoints, faces: AnyFaces) -> Int[np.ndarray, "_ 2"]:
     """Directed edges that no face takes the other way, in the order of faces."""
-    directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    directed = directed_edges(faces)
     forth, back = directed @ [len(vertices), 1], directed @ [1, len(vertices)]
     return directed[~np.isin(forth, back)]
 
 
-def close_holes(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
+def close_holes(vertices: AnyPoints, faces: AnyFaces) -> tuple[AnyPoints, AnyFaces]:
     """Mesh whose open loops are closed by fans around the mean of their vertices; a closed mesh stays as it is."""
     rim = open_edges(vertices, faces)
     if len(rim) == 0:

@@ -11,6 +11,9 @@ from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import label_grid
 
+Confusion = Int[np.ndarray, "c c"]
+"""Numbers of places, by their true label and the predicted one."""
+
 
 @dataclass(frozen=True, eq=False)
 class Scores:
@@ -29,13 +32,13 @@ class Scores:
 
 def confusion_matrix(
     truth: Integer[np.ndarray, "*n"], prediction: Integer[np.ndarray, "*n"], classes: int
-) -> Int[np.ndarray, "c c"]:
+) -> Confusion:
     """Counts of points by true class (row) and predicted class (column)."""
     index = truth.astype(np.int64).ravel() * classes + prediction.astype(np.int64).ravel()
     return np.bincount(index, minlength=classes * classes).reshape(classes, classes)
 
 
-def intersection_over_union(confusion: Int[np.ndarray, "c c"], segmented: bool = True) -> Scores:
+def intersection_over_union(confusion: Confusion, segmented: bool = True) -> Scores:
     """Intersections over union, ``TP / (TP + FP + FN)``, from a confusion matrix.
 
     Args:
@@ -54,9 +57,7 @@ def intersection_over_union(confusion: Int[np.ndarray, "c c"], segmented: bool =
     return Scores(float(iou), miou, per_segment)
 
 
-def with_segments_exchanged(
-    confusion: Int[np.ndarray, "c c"], swaps: Sequence[Sequence[int]]
-) -> Int[np.ndarray, "c c"]:
+def with_segments_exchanged(confusion: Confusion, swaps: Sequence[Sequence[int]]) -> Confusion:
     """Confusion matrix up to symmetry: of the true segments as they are, or exchanged, what gives the greatest mIoU.
 
     Args:
@@ -109,7 +110,7 @@ def truth_grid(mesh: SegmentedMesh, cells: int = 100) -> TruthGrid:
     return TruthGrid(LabelGrid(label_grid(mesh, x, y, z), origin, spacing, mesh.names), kept)
 
 
-def grid_confusion(truth: TruthGrid, predicted: UInt8[np.ndarray, "x y z"], segments: int) -> Int[np.ndarray, "c c"]:
+def grid_confusion(truth: TruthGrid, predicted: UInt8[np.ndarray, "x y z"], segments: int) -> Confusion:
     """Confusion matrix of the points that count; where the model knows one segment, all true ones are taken as one."""
     labels = np.minimum(truth.grid.labels[truth.kept], segments)
     return confusion_matrix(labels, np.minimum(predicted[truth.kept], segments), segments + 1)

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import Color
-from mereo.geometry.transforms import Points
+from mereo.geometry.transforms import Points, Values
 
 STOPS: tuple[Color, ...] = ((214, 224, 234), (250, 205, 120), (226, 98, 62), (122, 24, 70))
 """Colours from a radius of none to ``Radii.high``: pale is sure, dark red is not."""
@@ -45,7 +45,7 @@ class Radii:
         """Radius at which colours end: the greatest but for a twentieth of the vertices."""
         return float(np.quantile(self.values[: sum(self.counts)], 0.95))
 
-    def colors(self, values: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
+    def colors(self, values: Values) -> UInt8[np.ndarray, "n 3"]:
         """Colours (red, green, blue) of radii."""
         return between_stops(values / max(self.high, 1e-30), STOPS).round().astype(np.uint8)
 
@@ -54,11 +54,11 @@ class Radii:
         return replace(self, points=self.points * factor, values=self.values * factor)
 
     @cached_property
-    def _trees(self) -> dict[int, tuple[cKDTree, Float[np.ndarray, " n"]]]:
+    def _trees(self) -> dict[int, tuple[cKDTree, Values]]:
         each = {int(label): np.flatnonzero(self.labels == label) for label in np.unique(self.labels)}
         return {label: (cKDTree(self.points[rows]), self.values[rows]) for label, rows in each.items()}
 
-    def at(self, places: Points, label: int) -> Float[np.ndarray, " n"]:
+    def at(self, places: Points, label: int) -> Values:
         """Radii at places in or near a segment, between its nearest points by the inverse of the squared distance."""
         tree, values = self._trees[label]
         distance, near = tree.query(places, k=range(1, min(4, len(values)) + 1))  # a radius is smooth
@@ -82,14 +82,14 @@ def describe_level(calibrated: bool) -> str:
     return "95 %" if calibrated else "95 %, not calibrated"
 
 
-def rounded_to(values: Float[np.ndarray, " n"], digits: int) -> Float[np.ndarray, " n"]:
+def rounded_to(values: Values, digits: int) -> Values:
     """Positive numbers to this many decimal digits."""
     unit = 10.0 ** (np.floor(np.log10(np.maximum(values, np.finfo(np.float64).tiny))) - digits + 1)
     result: np.ndarray = np.round(values / unit) * unit
     return result
 
 
-def between_stops(shares: Float[np.ndarray, " n"], stops: Sequence[Color]) -> Float[np.ndarray, "n 3"]:
+def between_stops(shares: Values, stops: Sequence[Color]) -> Float[np.ndarray, "n 3"]:
     """Colours (red, green, blue, 0 to 255) of shares, linear between stops at equal distances.
 
     What lies below 0 or above 1 has the colour of that end; NaN stays NaN.

@@ -17,12 +17,12 @@ import numpy as np
 from embreex import rtcore
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy.sparse import csr_array
 
-from mereo.geometry.mesh import Segment, SegmentedMesh, area_vectors
+from mereo.geometry.mesh import Faces, Segment, SegmentedMesh, Vertices, area_vectors
 from mereo.geometry.read_only import read_only
-from mereo.geometry.transforms import Points, Vector, unit_rows
+from mereo.geometry.transforms import Flags, Indices, Labels, Points, Values, Vector, unit_rows
 
 _DIRECTIONS = read_only(np.array([[0.4637, 0.5718, 0.6767], [-0.7301, 0.3469, -0.5887]], dtype=np.float32))
 """Two generic directions: not along any axis, face diagonal or each other."""
@@ -41,7 +41,7 @@ class Hits(NamedTuple):
         normal: of the surface there, of any length, on either side; zero where nothing is hit.
     """
 
-    distance: Float[np.ndarray, " n"]
+    distance: Values
     normal: Points
 
     def nearer(self, rows: Int[np.ndarray, " m"], others: "Hits") -> Int[np.ndarray, " k"]:
@@ -52,17 +52,11 @@ class Hits(NamedTuple):
         return kept
 
 
-def ray_scene(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> EmbreeScene:
+def ray_scene(vertices: Vertices, faces: Faces) -> EmbreeScene:
     """Embree scene of one triangle mesh. It works in single precision: keep coordinates near the origin."""
     scene = EmbreeScene(_DEVICE)
     TriangleMesh(scene, vertices.astype(np.float32), faces.astype(np.int32))
     return scene
-
-
-def _rays(center: Vector, directions: Points) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
-    """Origins and directions in the single precision that Embree wants."""
-    single = np.ascontiguousarray(directions, dtype=np.float32)
-    return np.broadcast_to(-center.astype(np.float32), single.shape).copy(), single
 
 
 def toward(directions: Points, low: Vector, high: Vector) -> Int[np.ndarray, " m"]:
@@ -80,7 +74,7 @@ def toward(directions: Points, low: Vector, high: Vector) -> Int[np.ndarray, " m
     return np.flatnonzero((x >= x0) & (x <= x1) & (y >= y0) & (y <= y1))
 
 
-def search_tree(vertices: Float[np.ndarray, "v 3"], elements: Int[np.ndarray, "m k"]) -> igl.AABB:
+def search_tree(vertices: Vertices, elements: Int[np.ndarray, "m k"]) -> igl.AABB:
     """Tree in which libigl finds the nearest of triangles, or the tetrahedron around a point."""
     tree = igl.AABB()
     tree.init(vertices, elements)
@@ -109,14 +103,14 @@ class _Solid:
     def tree(self) -> igl.AABB:
         return search_tree(self.vertices, self.faces)
 
-    def in_box(self, points: Points) -> Bool[np.ndarray, " n"]:
+    def in_box(self, points: Points) -> Flags:
         """Whether points lie strictly in the segment's box, outside of which nothing is inside."""
         result = np.ones(len(points), dtype=bool)
         for axis in range(3):  # several times faster than all three at once
             result &= (points[:, axis] > self.low[axis]) & (points[:, axis] < self.high[axis])
         return result
 
-    def holds(self, points: Points) -> Bool[np.ndarray, " n"]:
+    def holds(self, points: Points) -> Flags:
         """Whether points, already known to lie in the box, are inside."""
         if len(points) == 0:
             return np.zeros(0, dtype=bool)
@@ -140,11 +134,12 @@ class _Solid:
     def first_hit(self, directions: Points) -> tuple[Int[np.ndarray, " m"], Hits]:
         """Which rays from the origin hit the segment, and where each of them does first."""
         rows = toward(directions, self.low, self.high)
-        hits = self.rays.run(*_rays(self.center, directions[rows]), output=True)
+        single = np.ascontiguousarray(directions[rows], dtype=np.float32)  # the precision that Embree wants
+        hits = self.rays.run(np.broadcast_to(-self.center.astype(np.float32), single.shape).copy(), single, output=True)
         hit = np.flatnonzero(hits["primID"] >= 0)
         return rows[hit], Hits(hits["tfar"][hit].astype(np.float64), hits["Ng"][hit].astype(np.float64))
 
-    def closest(self, points: Points) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"], Points]:
+    def closest(self, points: Points) -> tuple[Values, Indices, Points]:
         """Squared distance to the surface, face and place of the closest surface point."""
         squared, face, place = self.tree.squared_distance(self.vertices, self.faces, np.ascontiguousarray(points))
         return squared, face.astype(np.int64), place  # libigl's faces are C's long long, which numpy tells apart
@@ -163,10 +158,10 @@ class Nearest(NamedTuple):
         owner: that face's segment.
     """
 
-    distance: Float[np.ndarray, " n"]
+    distance: Values
     point: Points
-    face: Int[np.ndarray, " n"]
-    owner: Int[np.ndarray, " n"]
+    face: Indices
+    owner: Indices
 
 
 class Solids:
@@ -182,21 +177,21 @@ class Solids:
         self._solids = [_Solid(segment) for segment in mesh.segments]
 
     @cached_property
-    def _merged(self) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Int[np.ndarray, " f"]]:
+    def _merged(self) -> tuple[Vertices, Faces, Int[np.ndarray, " f"]]:
         return self.mesh.merged()
 
     def boxes(self) -> Float[np.ndarray, "s 2 3"]:
         """Axis-aligned boxes of the segments."""
         return np.stack([[solid.low, solid.high] for solid in self._solids])
 
-    def inside(self, index: int, points: Points) -> Bool[np.ndarray, " n"]:
+    def inside(self, index: int, points: Points) -> Flags:
         """Whether each point lies in segment ``index``."""
         solid = self._solids[index]
         result = solid.in_box(points)
         result[result] = solid.holds(points[result])
         return result
 
-    def label(self, points: Points) -> UInt8[np.ndarray, " n"]:
+    def label(self, points: Points) -> Labels:
         """Labels of points: 0 in empty space, else index + 1; of overlapping segments the first (so a nested one).
 
         Rays are cast in single precision, so nearer to a surface than two millionths of its segment's longest side the
@@ -211,7 +206,7 @@ class Solids:
             labels[candidates[solid.holds(points[candidates])]] = index + 1
         return labels
 
-    def segment_distance(self, index: int, points: Points) -> Float[np.ndarray, " n"]:
+    def segment_distance(self, index: int, points: Points) -> Values:
         """Distance of points, without sign, to the surface of segment ``index``."""
         return np.sqrt(self._solids[index].closest(points)[0])
 
@@ -242,7 +237,7 @@ class Solids:
             hits.nearer(*solid.first_hit(directions))
         return hits
 
-    def face_normals(self, face: Int[np.ndarray, " n"]) -> Points:
+    def face_normals(self, face: Indices) -> Points:
         """Unit normals of faces of ``mesh.merged()``."""
         vertices, faces, _ = self._merged
         return unit_rows(area_vectors(vertices, faces[face]))
@@ -251,9 +246,9 @@ class Solids:
 def signed_distance_and_direction(
     solids: Solids,
     points: Points,
-    labels: UInt8[np.ndarray, " n"],
+    labels: Labels,
     nearest: Nearest | None = None,
-) -> tuple[Float[np.ndarray, " n"], Points]:
+) -> tuple[Values, Points]:
     """Distance (negative where ``labels`` is not 0) and unit direction to the closest surface point.
 
     ``nearest`` is ``solids.nearest(points)`` where the caller has it already. A point on the surface has no direction

@@ -6,16 +6,15 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mereo.geometry.mesh import Segment, connected
-
-Faces = Int[np.ndarray, "_ 3"]
+from mereo.geometry.mesh import AnyFaces, Faces, Segment, Vertices, connected, directed_edges
+from mereo.geometry.transforms import Indices
 
 TooLong = Callable[[Float[np.ndarray, "e 2 3"]], Bool[np.ndarray, " e"]]
 """Which edges are to be halved, by the places of their ends; the order of the two must not matter."""
 
 
 def split_long_edges(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], longest: float, most: int
+    vertices: Vertices, faces: Faces, longest: float, most: int
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
     """The same surface without edges over ``longest``; the given vertices come first and keep their places.
 
@@ -38,7 +37,7 @@ class TooManyFaces(ValueError):
 
 
 def split_edges(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], too_long: TooLong, most: int
+    vertices: Vertices, faces: Faces, too_long: TooLong, most: int
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
     """The same surface with all edges halved, and their halves again, that are ``too_long``; each is tested once.
 
@@ -62,14 +61,14 @@ def split_edges(
             raise TooManyFaces(f"a mesh would take {most:,} triangles or more")
 
 
-def _edges(faces: Faces) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "_ 3"]]:
+def _edges(faces: AnyFaces) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "_ 3"]]:
     """All edges, and for each face which they are: edge k leads from corner k to the next."""
     ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
     edges, inverse = np.unique(ends, axis=0, return_inverse=True)
     return edges, inverse.reshape(-1, 3)
 
 
-def _split(faces: Faces, middle: Int[np.ndarray, "_ 3"], long: Bool[np.ndarray, "_ 3"]) -> Faces:
+def _split(faces: AnyFaces, middle: Int[np.ndarray, "_ 3"], long: Bool[np.ndarray, "_ 3"]) -> AnyFaces:
     """Faces after halving their long edges, whose new vertices are ``middle``."""
     result = [faces[~long.any(axis=1)]]
     for count in (1, 2, 3):
@@ -97,7 +96,7 @@ CREASE_DEG = 30.0
 """Angle between the normals of two neighbouring faces above which the edge between them is a crease."""
 
 
-def split_at_creases(segment: Segment, angle_deg: float = CREASE_DEG) -> tuple[Segment, Int[np.ndarray, " n"]]:
+def split_at_creases(segment: Segment, angle_deg: float = CREASE_DEG) -> tuple[Segment, Indices]:
     """The same surface, its vertices split where faces meet at a crease: normals are farther apart than ``angle_deg``.
 
     A vertex is split into as many as there are groups of faces around it between which only creases lie; where a crease
@@ -145,10 +144,10 @@ def _face_normals(segment: Segment) -> Float[np.ndarray, "f 3"]:
 
 
 def _neighbours(
-    faces: Int[np.ndarray, "f 3"],
-) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Int[np.ndarray, "n 2"]]:
+    faces: Faces,
+) -> tuple[Indices, Indices, Int[np.ndarray, "n 2"]]:
     """Pairs of faces with a common edge, and its two vertices; of more than two at an edge each with the next."""
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
+    edges = np.sort(directed_edges(faces), axis=1)
     key = edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1]
     order = np.argsort(key, kind="stable")
     together = np.flatnonzero(key[order][1:] == key[order][:-1])
@@ -157,8 +156,8 @@ def _neighbours(
 
 
 def _groups(
-    faces: Int[np.ndarray, "f 3"],
-    smooth: tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Int[np.ndarray, "n 2"]],
+    faces: Faces,
+    smooth: tuple[Indices, Indices, Int[np.ndarray, "n 2"]],
     on_crease: Bool[np.ndarray, " v"],
 ) -> Int[np.ndarray, " c"]:
     """Number of the group of each corner of each face: corners at one vertex between which no crease lies share it.

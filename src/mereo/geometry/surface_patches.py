@@ -14,7 +14,7 @@ from scipy.stats import median_abs_deviation
 
 from mereo.geometry.downsampling import MAX_POINTS, thin_to_grid
 from mereo.geometry.mesh import connected
-from mereo.geometry.transforms import Points, longest_side
+from mereo.geometry.transforms import Flags, Indices, Points, Values, longest_side
 
 NEIGHBORS = 24
 """Neighbours that are looked at: in an image, the 5 x 5 pixels around one."""
@@ -40,12 +40,12 @@ STRETCH = 1.03
 """Times by which points off all surfaces must lengthen the cloud's box, by which a network is normalized, to matter."""
 
 
-def surface_points(points: Points) -> Bool[np.ndarray, " n"]:
+def surface_points(points: Points) -> Flags:
     """Whether each point belongs to a patch of surface, as in ``surface_patches``."""
     return surface_patches(points)[1]
 
 
-def surface_patches(points: Points) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+def surface_patches(points: Points) -> tuple[Indices, Flags]:
     """Number of each point's patch, and whether it belongs to one that is a surface; all do where too few can tell.
 
     Points are seen from the origin (camera frame), in any unit and density. Of more than ``MAX_POINTS``, points evenly
@@ -67,7 +67,7 @@ def surface_patches(points: Points) -> tuple[Int[np.ndarray, " n"], Bool[np.ndar
 
 def _patches(
     points: Points,
-) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+) -> tuple[Indices, Flags, Values]:
     """Number of the patch of each of many different points, whether it is an inner one, and its largest step."""
     distance = np.linalg.norm(points, axis=1)
     sight = points / np.maximum(distance, np.finfo(float).tiny)[:, None]
@@ -86,12 +86,12 @@ def _patches(
     return patch, same.sum(axis=1) >= INNER, tall
 
 
-def stretch(points: Points, keep: Bool[np.ndarray, " n"]) -> float:
+def stretch(points: Points, keep: Flags) -> float:
     """Times that the longest side of the points' box is as long as that of those that are kept, from 1 up."""
     return longest_side(points) / max(longest_side(points[keep]), np.finfo(float).tiny)
 
 
-def without_strays(points: Points) -> Bool[np.ndarray, " n"]:
+def without_strays(points: Points) -> Flags:
     """Whether each point is left where strays are removed: all are, unless strays make the box ``STRETCH`` longer."""
     keep = surface_points(points)
     if keep.all() or stretch(points, keep) <= STRETCH:
@@ -164,7 +164,7 @@ def roughness(points: Points, normals: Points | None = None) -> float:
 
 
 def _on_same_surface(
-    distance: Float[np.ndarray, " n"], angle: Float[np.ndarray, "n k"], neighbor: Int[np.ndarray, "n k"]
+    distance: Values, angle: Float[np.ndarray, "n k"], neighbor: Int[np.ndarray, "n k"]
 ) -> Bool[np.ndarray, "n k"]:
     """Whether the step in range to each neighbour is no larger than slant or noise make it."""
     step = np.abs(distance[neighbor] - distance[:, None])

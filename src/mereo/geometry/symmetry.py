@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from mereo.geometry.mesh import SegmentedMesh, area_vectors
 from mereo.geometry.solids import Solids, search_tree
-from mereo.geometry.transforms import Points, Transform, Vector, longest_side, transform_points
+from mereo.geometry.transforms import Matrix, Points, Transform, Vector, longest_side, transform_points
 
 TOLERANCE = 0.45
 """Scene units up to which a turned surface looks the same: a fit explains a point by a surface up to there."""
@@ -169,7 +169,7 @@ class _Surface:
         squared, _, place = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
         return np.sqrt(squared), place
 
-    def moments(self) -> tuple[Vector, Vector, Float[np.ndarray, "3 3"]]:
+    def moments(self) -> tuple[Vector, Vector, Matrix]:
         """Centroid of the visible surface, its second moments, ascending, and their axes as rows."""
         seen = self.points[self.visible]
         center = seen.mean(axis=0)
@@ -250,7 +250,7 @@ def _fixed_point(turns: list[Transform]) -> Vector:
     return point
 
 
-def _angle(rotation: Float[np.ndarray, "3 3"]) -> float:
+def _angle(rotation: Matrix) -> float:
     return float(Rotation.from_matrix(rotation).magnitude())
 
 

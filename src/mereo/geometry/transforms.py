@@ -4,15 +4,36 @@ from dataclasses import dataclass
 from numbers import Real
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy.typing import ArrayLike
 
 from mereo.geometry.conventions import LARGEST
 
+PointArray = Float[np.ndarray, "*n 3"]
+"""Points in an array of any shape."""
+
 Points = Float[np.ndarray, "n 3"]
 """Positions or vectors in rows: as many as whatever else has the axis ``n`` in a signature."""
 
+AnyPoints = Float[np.ndarray, "_ 3"]
+"""The same, as many as there are: no other array of the signature has to have as many rows."""
+
+Rows = Float[np.ndarray, "n c"]
+"""Numbers in rows, one for each point: its position and what else is known of it, or what a network says of it."""
+
+Values = Float[np.ndarray, " n"]
+"""A number for each row of the axis ``n``; ``Indices``, ``Labels`` (of segments) and ``Flags`` likewise."""
+
+Indices = Int[np.ndarray, " n"]
+Labels = UInt8[np.ndarray, " n"]
+Flags = Bool[np.ndarray, " n"]
+
 Vector = Float[np.ndarray, "3"]
+
+Matrix = Float[np.ndarray, "3 3"]
+"""Linear map of space, such as a rotation; ``Matrices`` are one for each row of the axis ``n``."""
+
+Matrices = Float[np.ndarray, "n 3 3"]
 
 Transform = Float[np.ndarray, "4 4"]
 """Homogeneous matrix of a map between two frames."""
@@ -21,7 +42,7 @@ Corners = Float[np.ndarray, "2 3"]
 """Lower and upper corner of a box along the axes."""
 
 
-def rigid(rotation: Float[np.ndarray, "3 3"], translation: Vector) -> Transform:
+def rigid(rotation: Matrix, translation: Vector) -> Transform:
     """Homogeneous transform from a rotation and a translation."""
     transform = np.eye(4)
     transform[:3, :3], transform[:3, 3] = rotation, translation
@@ -60,12 +81,12 @@ def checked_pose(pose: ArrayLike) -> Transform:
     )
 
 
-def transform_points(transform: Transform, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+def transform_points(transform: Transform, points: PointArray) -> PointArray:
     """Points mapped by a homogeneous transform."""
     return points @ transform[:3, :3].T + transform[:3, 3]
 
 
-def rotation_along(axis: Vector) -> Float[np.ndarray, "3 3"]:
+def rotation_along(axis: Vector) -> Matrix:
     """Rotation whose third column is along ``axis``."""
     z = axis / np.linalg.norm(axis)
     helper = np.eye(3)[np.argmin(np.abs(z))]
@@ -87,7 +108,7 @@ def look_at(eye: Vector, target: Vector, up: Vector, roll_rad: float = 0.0) -> T
     return rigid(np.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=1), eye)
 
 
-def longest_side(points: Float[np.ndarray, "_ 3"]) -> float:
+def longest_side(points: AnyPoints) -> float:
     """Longest side of the points' box, parallel to the axes."""
     return float(np.ptp(points, axis=0).max())
 
@@ -110,7 +131,7 @@ def finite_svd(
     return u, s, v
 
 
-def fit_rigid(source: Points, target: Points, weights: Float[np.ndarray, " n"] | None = None) -> Transform:
+def fit_rigid(source: Points, target: Points, weights: Values | None = None) -> Transform:
     """``T_target_source`` that brings ``source`` nearest to ``target`` in least squares (Kabsch, 1976), never mirrored.
 
     Of points on a line any turn about it is as good, and one is taken. ``weights`` are of the squared distances, not
@@ -152,11 +173,11 @@ class Normalizer:
             raise ValueError("all points coincide; the cloud needs an extent: check the file's columns and units")
         return cls((low + high) / 2, 1.0 / half)
 
-    def apply(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    def apply(self, points: PointArray) -> PointArray:
         """Points in normalized coordinates."""
         return (points - self.center) * self.scale
 
-    def invert(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    def invert(self, points: PointArray) -> PointArray:
         """Points in the cloud's frame and unit, from normalized coordinates."""
         return points / self.scale + self.center
 
@@ -187,7 +208,7 @@ def best_rotations(covariance: Float[np.ndarray, "*s 3 3"]) -> Float[np.ndarray,
 def robust_rigid(
     source: Points,
     target: Points,
-    weight: Float[np.ndarray, " n"],
+    weight: Values,
     sigma: float,
 ) -> Transform:
     """``fit_rigid`` under a Cauchy loss whose scale falls from the residuals' own median to ``sigma``."""

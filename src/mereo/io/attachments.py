@@ -12,12 +12,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.transforms import Points, longest_side
+from mereo.geometry.transforms import Matrices, Matrix, Points, longest_side
 from mereo.io.atomic_files import atomic_file, write_file
 from mereo.io.config import CarryFrame, Space
 from mereo.io.errors import check_suffix, readable
@@ -47,7 +46,7 @@ class Surfaces:
         """All vertices."""
         return np.concatenate([part.vertices for part in self.mesh.segments])
 
-    def at(self, points: Points, rotations: Float[np.ndarray, "n 3 3"] | None) -> "Surfaces":
+    def at(self, points: Points, rotations: Matrices | None) -> "Surfaces":
         """The surfaces with other vertices."""
         ends = np.cumsum([len(part.vertices) for part in self.mesh.segments])[:-1]
         return Surfaces(self.mesh.with_vertices(np.split(points, ends)))
@@ -60,7 +59,7 @@ class Positions:
     points: Points
     rotations = None
 
-    def at(self, points: Points, rotations: Float[np.ndarray, "n 3 3"] | None) -> "Positions":
+    def at(self, points: Points, rotations: Matrices | None) -> "Positions":
         """Other points."""
         return replace(self, points=points)
 
@@ -81,9 +80,9 @@ class PoseTable:
     rows: tuple[tuple[str, ...], ...]
     delimiter: str
     points: Points
-    rotations: Float[np.ndarray, "n 3 3"] | None
+    rotations: Matrices | None
 
-    def at(self, points: Points, rotations: Float[np.ndarray, "n 3 3"] | None) -> "PoseTable":
+    def at(self, points: Points, rotations: Matrices | None) -> "PoseTable":
         """The table with other positions and orientations."""
         return replace(self, points=points, rotations=rotations)
 
@@ -217,9 +216,7 @@ def _read(path: Path) -> Content:
     return content
 
 
-def write_attachment(
-    path: Path, content: Content, factor: float, frame_rotation: Float[np.ndarray, "3 3"], unit_m: float
-) -> None:
+def write_attachment(path: Path, content: Content, factor: float, frame_rotation: Matrix, unit_m: float) -> None:
     """Write an attachment, which is in the input's frame and unit, in the format of its name.
 
     Args:

@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 import yaml
-from jaxtyping import Float
 
 from mereo.geometry.camera import Camera
+from mereo.geometry.transforms import Values
 from mereo.io.errors import readable
 
 NAMED = (
@@ -313,7 +313,7 @@ def _distortion(camera: Camera, fields: Fields) -> str:
     return "a fisheye lens" if fisheye else f"up to {_shift_px(camera, coefficients):.2g} pixels in the corners"
 
 
-def _coefficients(fields: Fields) -> tuple[Float[np.ndarray, " n"], str]:
+def _coefficients(fields: Fields) -> tuple[Values, str]:
     """Distortion coefficients k1, k2, p1, p2, k3 ... as OpenCV orders them, and the model's name."""
     model = next((str(fields[name]) for name in MODELS if name in fields), "")
     for key in DISTORTION:
@@ -325,7 +325,7 @@ def _coefficients(fields: Fields) -> tuple[Float[np.ndarray, " n"], str]:
     return np.array([float(fields.get(name, 0.0)) for name in names]), model
 
 
-def _shift_px(camera: Camera, coefficients: Float[np.ndarray, " n"]) -> float:
+def _shift_px(camera: Camera, coefficients: Values) -> float:
     """Pixels by which the lens moves the farthest corner (OpenCV's Brown-Conrady or rational model)."""
     k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(coefficients[:8], (0, 8 - len(coefficients[:8])))
     u, v = np.array([0, camera.width] * 2), np.array([0, 0, camera.height, camera.height])

@@ -25,9 +25,12 @@ from jaxtyping import Float, Int, UInt8
 from mereo.geometry.conventions import LARGEST
 from mereo.geometry.mesh import (
     PALETTE,
+    AnyFaces,
     Color,
+    Faces,
     Segment,
     SegmentedMesh,
+    Vertices,
     edge_imbalance,
     palette_color,
     three_cornered,
@@ -35,7 +38,7 @@ from mereo.geometry.mesh import (
 )
 from mereo.geometry.mesh_repair import simplified
 from mereo.geometry.radii import Radii
-from mereo.geometry.transforms import Points, transform_points
+from mereo.geometry.transforms import AnyPoints, Matrix, Points, transform_points
 from mereo.io.errors import check_count, check_size, check_suffix, readable
 from mereo.io.extras import library
 from mereo.io.progress import stage
@@ -123,7 +126,7 @@ def _kept_mesh(known: _Known) -> SegmentedMesh:
     return replace(mesh, segments=tuple(segments))
 
 
-Part = tuple[str, Color | None, Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
+Part = tuple[str, Color | None, AnyPoints, AnyFaces]
 """Part of a mesh file: name, colour if known, vertices, faces."""
 
 
@@ -148,7 +151,7 @@ def _parts(path: Path) -> list[Part]:
     return parts
 
 
-def _check_places(name: str, vertices: Float[np.ndarray, "v 3"]) -> None:
+def _check_places(name: str, vertices: Vertices) -> None:
     if not (np.abs(vertices) <= LARGEST).all():
         raise ValueError(f"its part {name!r} has vertices that are NaN, infinite or beyond {LARGEST:g}")
 
@@ -165,11 +168,15 @@ def _check_off(path: Path) -> None:
     check_count(faces, rows - vertices, "faces")
 
 
+Owners = list[tuple[str, str, str]]
+"""Of each face of an OBJ file its object, group and material."""
+
+
 def _obj_parts(path: Path) -> list[Part]:
     """Parts of an OBJ file, parsed here because trimesh gives them in no stable order. Polygons become fans."""
     positions: list[list[float]] = []
     faces: list[list[int]] = []
-    owners: list[tuple[str, str, str]] = []
+    owners: Owners = []
     name = {"o": "", "g": "", "usemtl": "", "mtllib": ""}
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
         kind, *cells = line.split() or [""]
@@ -190,9 +197,7 @@ def _obj_parts(path: Path) -> list[Part]:
     return _split_parts(vertices, triangles, owners, colors, path.stem)
 
 
-def _material_parts(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], owners: list[tuple[str, str, str]], path: Path
-) -> list[tuple[str, str, str]]:
+def _material_parts(vertices: Vertices, faces: Faces, owners: Owners, path: Path) -> Owners:
     """Owners of which materials are the objects, in a file without others; none where these are not closed parts."""
     names = list(dict.fromkeys(material for _, _, material in owners))
     if len(names) < 2 or any(name or group for name, group, _ in owners):
@@ -216,9 +221,9 @@ def _obj_index(cell: str, count: int) -> int:
 
 
 def _split_parts(
-    vertices: Float[np.ndarray, "v 3"],
-    faces: Int[np.ndarray, "f 3"],
-    owners: list[tuple[str, str, str]],
+    vertices: Vertices,
+    faces: Faces,
+    owners: Owners,
     colors: dict[str, Color],
     stem: str,
 ) -> list[Part]:
@@ -336,7 +341,7 @@ def _nodes_with_faces(scene: Any) -> list[str]:
     return sorted(nodes, key=lambda node: (order[keys[node]], node))
 
 
-def _in_frame(scene: Any, node: str, base: str) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Any]:
+def _in_frame(scene: Any, node: str, base: str) -> tuple[Vertices, Faces, Any]:
     """Vertices of a node in the frame of another one, its faces, and trimesh's geometry."""
     transform, key = scene.graph.get(node, frame_from=base)
     geometry = scene.geometry[key]
@@ -358,9 +363,7 @@ def _color(geometry: Any) -> Color | None:
     return red, green, blue
 
 
-def merge_positions(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
-) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
+def merge_positions(vertices: Vertices, faces: Faces) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
     """Merge vertices at exactly the same position, in order of first use, and drop the faces this collapses."""
     first, index = _distinct(vertices)
     if len(first) == len(vertices):
@@ -390,8 +393,11 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 Buffers = dict[str, bytes]
 
+JsonObject = dict[str, Any]
+"""Content of a glTF file, or an entry of it."""
 
-def _plain_gltf(path: Path) -> tuple[dict[str, Any], Buffers]:
+
+def _plain_gltf(path: Path) -> tuple[JsonObject, Buffers]:
     """JSON of a GLB or glTF file and its buffers, without what trimesh leaves out or takes for something else.
 
     Instances and the materials of a mesh become nodes of their own, and normalized or sparse positions become floats.
@@ -435,7 +441,7 @@ def _buffer(path: Path, uri: str | None, chunk: bytes) -> bytes:
     return b64decode(uri.partition(",")[2]) if uri.startswith("data:") else _neighbour(path, unquote(uri)).read_bytes()
 
 
-def _values(tree: dict[str, Any], buffers: Buffers, accessor: dict[str, Any]) -> Float[np.ndarray, "n k"]:
+def _values(tree: JsonObject, buffers: Buffers, accessor: JsonObject) -> Float[np.ndarray, "n k"]:
     """Values of an accessor (glTF 2.0, sections 3.6.2 and 5.1)."""
     kind, width = np.dtype(KINDS[accessor["componentType"]]), WIDTHS[accessor["type"]]
     shape = accessor["count"], width
@@ -453,7 +459,7 @@ def _values(tree: dict[str, Any], buffers: Buffers, accessor: dict[str, Any]) ->
     return np.maximum(values / np.iinfo(kind).max, -1.0) if accessor.get("normalized") else values
 
 
-def _stored(tree: dict[str, Any], buffers: Buffers, values: Points) -> dict[str, Any]:
+def _stored(tree: JsonObject, buffers: Buffers, values: Points) -> JsonObject:
     """Accessor of values in a new buffer."""
     content = values.astype("<f4").tobytes()
     tree["bufferViews"].append({"buffer": len(buffers), "byteLength": len(content)})
@@ -462,7 +468,7 @@ def _stored(tree: dict[str, Any], buffers: Buffers, values: Points) -> dict[str,
     return {"bufferView": len(tree["bufferViews"]) - 1, "byteOffset": 0, "componentType": 5126}
 
 
-def _spread(tree: dict[str, Any], buffers: Buffers, node: dict[str, Any]) -> None:
+def _spread(tree: JsonObject, buffers: Buffers, node: JsonObject) -> None:
     """Give a node's mesh to children, one for each instance and each of its materials, where it has several."""
     mesh = tree["meshes"][node["mesh"]]
     stated, materials = node.get("extensions", {}).pop(INSTANCES, None), mesh["primitives"]
@@ -510,7 +516,7 @@ class GlbScene:
     mesh: SegmentedMesh
     colors: tuple[UInt8[np.ndarray, "_ 3"] | None, ...]
     radii: Radii | None
-    rotation: Float[np.ndarray, "3 3"]
+    rotation: Matrix
     unit_m: float
     is_ours: bool
 

@@ -16,14 +16,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, Num
+from jaxtyping import Float, Num
 from PIL import Image
 
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import DepthImage, PointCloud
 from mereo.geometry.conventions import LARGEST, check_real
-from mereo.geometry.mesh import Segment, SegmentedMesh, check_segment, palette_color
-from mereo.geometry.transforms import Points
+from mereo.geometry.mesh import Faces, Segment, SegmentedMesh, Vertices, check_segment, palette_color
+from mereo.geometry.transforms import Points, Rows
 from mereo.io.errors import reason
 from mereo.io.readers import InputWarning, valid_points
 from mereo.io.ros_recordings import cloud_points, depth_pixels
@@ -66,7 +66,7 @@ def points_of(source: object, drop_invalid: bool = False) -> tuple[PointCloud | 
     return PointCloud.of(kept), len(points) - len(kept)
 
 
-def _with_normals(points: Points, source: Any) -> Float[np.ndarray, "n c"]:
+def _with_normals(points: Points, source: Any) -> Rows:
     """Points, with the normals that an object of Open3D or trimesh has for each of them, if it has."""
     for name in ("normals", "vertex_normals"):
         with suppress(Exception):  # of what else has such a name
@@ -299,7 +299,7 @@ def parts_of_scene(source: Any) -> Any:
     return {mesh.metadata["node"]: mesh for mesh in source.dump()}
 
 
-def _triangles(source: Any) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]] | None:
+def _triangles(source: Any) -> tuple[Vertices, Faces] | None:
     """Vertices and faces of a mesh of whatever library, or of a tuple of both; None of what is none."""
     faces: Any = None
     if isinstance(source, tuple) and len(source) == 2 and np.ndim(source[0]) == 2:

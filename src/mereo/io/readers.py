@@ -23,9 +23,12 @@ from mereo.geometry.brief import listed
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import LARGEST
 from mereo.geometry.mesh import with_normals
-from mereo.geometry.transforms import Points, Transform, checked_pose, rigid
+from mereo.geometry.transforms import Points, Rows, Transform, checked_pose, rigid
 from mereo.io.errors import check_count, check_suffix, limited_memory, quiet, readable, without_output
 from mereo.io.extras import library
+
+Mask = Bool[np.ndarray, "h w"]
+"""Pixels that show the object."""
 
 PLAUSIBLE_DEPTH_M = (0.05, 20.0)
 """Range of an image's median depth; beyond it the unit is wrong, which is otherwise invisible."""
@@ -76,7 +79,7 @@ MESHES = (".stl", ".obj", ".glb", ".gltf", ".off", ".3mf")
 """Suffixes of files that hold surfaces and no points."""
 
 
-def read_points(path: str | Path) -> Float[np.ndarray, "n c"]:
+def read_points(path: str | Path) -> Rows:
     """Rows of ``PointCloud.of``: points as ``read_point_cloud`` has them, those without a measurement included."""
     path = Path(path)
     if path.suffix.lower() in MESHES and path.exists():
@@ -90,7 +93,7 @@ def read_points(path: str | Path) -> Float[np.ndarray, "n c"]:
 
 
 def valid_points(
-    rows: Float[np.ndarray, "n c"],
+    rows: Rows,
     path: str | Path,
     drop_invalid: bool,
     cure: str = "leave them out with --drop-invalid",
@@ -187,7 +190,7 @@ def depth_of(path: Path, raw: Raw, depth_scale: float | None, camera: Camera) ->
         raise ValueError(f"{path} cannot be used: {error}") from None
 
 
-def masked_depth(image: DepthImage, path: str | Path, mask: Bool[np.ndarray, "h w"]) -> DepthImage:
+def masked_depth(image: DepthImage, path: str | Path, mask: Mask) -> DepthImage:
     """Depth image without what a mask leaves out; raises ``ValueError`` where nothing is left."""
     depth = np.where(mask, image.depth, 0.0)
     if not (depth > 0).any():
@@ -226,9 +229,7 @@ LOSSY = ("JPEG", "MPO", "JPEG2000", "WEBP")
 """Formats (as Pillow calls them) that may store other values than they were given."""
 
 
-def read_mask(
-    path: str | Path, size: tuple[int, int] | None = None, values: tuple[int, ...] = ()
-) -> Bool[np.ndarray, "h w"]:
+def read_mask(path: str | Path, size: tuple[int, int] | None = None, values: tuple[int, ...] = ()) -> Mask:
     """Pixels of an image that show the object.
 
     These are the opaque ones of an image with transparent parts; else those that are not 0, in any channel, or that
@@ -244,9 +245,7 @@ def read_mask(
     return _chosen_pixels(layers, f"the mask {path}", size, values)
 
 
-def mask_of_image(
-    image: Image.Image, size: tuple[int, int] | None = None, values: tuple[int, ...] = ()
-) -> Bool[np.ndarray, "h w"]:
+def mask_of_image(image: Image.Image, size: tuple[int, int] | None = None, values: tuple[int, ...] = ()) -> Mask:
     """Pixels of an image in memory that show the object; takes the arguments of ``read_mask`` and raises as it does."""
     return _chosen_pixels(_mask_layers(image), "the mask", size, values)
 
@@ -262,9 +261,7 @@ def _mask_layers(image: Image.Image) -> MaskLayers:
     return image.format in LOSSY, opacity, shown, np.asarray(image) if image.mode == "P" else shown
 
 
-def _chosen_pixels(
-    layers: MaskLayers, name: str, size: tuple[int, int] | None, values: tuple[int, ...]
-) -> Bool[np.ndarray, "h w"]:
+def _chosen_pixels(layers: MaskLayers, name: str, size: tuple[int, int] | None, values: tuple[int, ...]) -> Mask:
     is_lossy, opacity, shown, stored = layers
     channels = stored.reshape(*stored.shape[:2], -1)
     ids, has_ids = channels.max(axis=-1), bool((channels == channels[..., :1]).all())
@@ -368,7 +365,7 @@ DEPTH_READERS: dict[str, Callable[[Path], Raw]] = {
 # --- parsers of point clouds: positions, NaN rows included ------------------------------------------------------------
 
 
-def _ply_points(path: Path) -> Float[np.ndarray, "n c"]:
+def _ply_points(path: Path) -> Rows:
     """Vertices of a PLY file, with the normals that it states, or that its faces have.
 
     trimesh returns those it finds, so a file cut short is only noticed by counting them.
@@ -590,7 +587,7 @@ def _zdf_points(path: Path) -> Points:
     return _check_array(np.ma.filled(np.ma.asarray(cloud, dtype=np.float64), np.nan))
 
 
-CLOUD_READERS: dict[str, Callable[[Path], Float[np.ndarray, "n c"]]] = {
+CLOUD_READERS: dict[str, Callable[[Path], Rows]] = {
     ".ply": _ply_points,
     ".pcd": _pcd_points,
     **dict.fromkeys((".xyz", ".txt", ".pts", ".asc", ".csv"), _text_points),

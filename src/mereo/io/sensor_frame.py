@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Num
+from jaxtyping import Num
 
 from mereo.geometry.brief import counted
 from mereo.geometry.camera import Camera, DepthImage, PointCloud, camera_axes
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import FEW_VERTICES, oriented_points
-from mereo.geometry.transforms import Points, Transform, inverse_rigid, longest_side, rigid, transform_points
+from mereo.geometry.transforms import Points, Rows, Transform, inverse_rigid, longest_side, rigid, transform_points
 from mereo.io.bounds import PositiveOrUnknown, check_bounds
 from mereo.io.config import InputConfig
 from mereo.io.intrinsics import intrinsics_of, read_intrinsics
@@ -166,7 +166,7 @@ def _as_stored(path: Path, reading: InputConfig, camera: Any) -> SensorFrame:
     return SensorFrame(path, PointCloud.of(usable), unit_m, reading.frame, invalid=len(rows) - len(usable))
 
 
-def _cloud_rows(path: Path) -> Float[np.ndarray, "n c"]:
+def _cloud_rows(path: Path) -> Rows:
     """Rows of ``PointCloud.of`` of a cloud, or of a mesh, where points on few large faces stand for it."""
     if path.suffix.lower() not in MESHES:
         rows = read_points(path)

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from mereo.geometry.transforms import Points, longest_side
+from mereo.geometry.mesh import Elements
+from mereo.geometry.transforms import AnyPoints, Indices, Points, longest_side
 from mereo.io.errors import readable
 from mereo.io.readers import read_arrays
 from mereo.io.vtk_frames import (
@@ -53,7 +54,7 @@ class TetrahedralRecord:
     """
 
     rest_nodes: Points
-    tetrahedra: Int[np.ndarray, "m 4"]
+    tetrahedra: Elements
     displacements: Float[np.ndarray, "f n 3"]
     frames: tuple[str, ...]
 
@@ -69,7 +70,7 @@ class SurfaceRecord:
     """
 
     vertices: dict[str, Float[np.ndarray, "f _ 3"]]
-    rest: dict[str, Float[np.ndarray, "_ 3"]]
+    rest: dict[str, AnyPoints]
     frames: tuple[str, ...]
 
 
@@ -97,7 +98,7 @@ def read_states(path: Path, names: tuple[str, ...], mesh: Path | None = None) ->
     return _sequence(path, names, mesh)
 
 
-def read_tetrahedra(path: Path) -> tuple[Points, Int[np.ndarray, "m 4"], Int[np.ndarray, " n"]]:
+def read_tetrahedra(path: Path) -> tuple[Points, Elements, Indices]:
     """Nodes, tetrahedra, four node indices each, and the nodes' numbers in a VTK, VTU, MSH or INP file, or an NPZ.
 
     An NPZ has them as `rest_nodes` and `tetrahedra`.
@@ -289,7 +290,7 @@ def _tetrahedral(path: Path, arrays: dict[str, np.ndarray]) -> TetrahedralRecord
     return TetrahedralRecord(rest, elements, moved - rest if key == "nodes" else moved, frames)
 
 
-def _volume(path: Path, arrays: dict[str, np.ndarray]) -> tuple[Points, Int[np.ndarray, "m 4"]]:
+def _volume(path: Path, arrays: dict[str, np.ndarray]) -> tuple[Points, Elements]:
     """Nodes and tetrahedra of an archive."""
     rest = _floats(path, "rest_nodes", arrays["rest_nodes"], 2).astype(np.float64)
     elements = arrays["tetrahedra"]
@@ -380,7 +381,7 @@ def _check_topology(path: Path, states: dict[str, np.ndarray]) -> None:
             )
 
 
-def mesh_vertices(path: Path) -> Float[np.ndarray, "_ 3"]:
+def mesh_vertices(path: Path) -> AnyPoints:
     """Vertices of a mesh file in its own order; an STL file has three for each face."""
     with readable(path, "mesh"):
         if path.suffix.lower() == ".obj":  # trimesh orders an OBJ file's vertices by faces and texture seams

@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
@@ -22,7 +23,7 @@ from skimage.measure import marching_cubes
 from mereo.geometry.brief import listed
 from mereo.geometry.labels import part_of_grid
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh, palette_color
-from mereo.geometry.transforms import Corners, Points, Transform, Vector, transform_points
+from mereo.geometry.transforms import Corners, Flags, Points, Transform, Vector, transform_points
 from mereo.io.config import Space
 from mereo.io.errors import check_size, limited_memory, quiet, readable
 from mereo.io.extras import library
@@ -62,15 +63,15 @@ class Volume:
     @property
     def bounds(self) -> Corners:
         """Axis-aligned box of the voxels, their own extent included."""
-        ends = np.stack(np.meshgrid(*([-0.5, n - 0.5] for n in self.values.shape), indexing="ij"), axis=-1)
-        corners = transform_points(self.T_world_index, ends.reshape(-1, 3))
+        ends = product(*([-0.5, n - 0.5] for n in self.values.shape))
+        corners = transform_points(self.T_world_index, np.array(list(ends)))
         return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
     def index_of(self, points: Points) -> Points:
         """Voxel indices, with fractions, of positions."""
         return transform_points(np.linalg.inv(self.T_world_index), points)
 
-    def holds(self, index: Points) -> Bool[np.ndarray, " n"]:
+    def holds(self, index: Points) -> Flags:
         """Whether indices with fractions lie in a voxel."""
         return np.all((index >= -0.5) & (index <= np.array(self.values.shape) - 0.5), axis=1)
 

@@ -17,8 +17,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
+from mereo.geometry.mesh import Elements
 from mereo.io.errors import limited_memory, printable_line, readable, reason
 
 VTK_SUFFIXES = (".vtk", ".vtu", ".vtp")
@@ -52,7 +53,7 @@ class MeshFrames:
 
     points: Float[np.ndarray, "f n 3"]
     displacements: Float[np.ndarray, "f n 3"] | None
-    tetrahedra: Int[np.ndarray, "m 4"]
+    tetrahedra: Elements
     frames: tuple[str, ...]
 
 

@@ -18,9 +18,12 @@ from torch import Tensor, nn
 from mereo.models.config import HEADS, NetworkConfig
 from mereo.models.device import exact, linear
 from mereo.models.encoders import Encoding, Level
-from mereo.models.neighbors import gather, nearest
+from mereo.models.neighbors import CloudBatch, QueryBatch, VectorBatch, gather, nearest
 from mereo.models.rigid_alignment import Alignment
 from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH
+
+Hidden = Float[Tensor, "b q h"]
+"""Hidden features at each query."""
 
 # --- template ---------------------------------------------------------------------------------------------------------
 
@@ -52,9 +55,7 @@ class RestLookup(nn.Module):
             nn.init.zeros_(layer.weight)
         nn.init.zeros_(self.where.bias)
 
-    def forward(
-        self, hidden: Float[Tensor, "b q h"], placed: Float[Tensor, "b q 3"]
-    ) -> tuple[Float[Tensor, "b q 3"], Float[Tensor, "b q r"]]:
+    def forward(self, hidden: Hidden, placed: QueryBatch) -> tuple[QueryBatch, Float[Tensor, "b q r"]]:
         """Rest coordinates, and the distances there as ``read`` takes them.
 
         ``placed`` are the queries in the aligned frame; gradients reach the coordinates through the distances.
@@ -65,7 +66,7 @@ class RestLookup(nn.Module):
             distance = self.distances(rest)
         return rest, torch.cat([(scale * distance).clamp(-1.0, 1.0) for scale in SCALES], dim=-1)
 
-    def distances(self, rest: Float[Tensor, "b q 3"]) -> Float[Tensor, "b q s"]:
+    def distances(self, rest: QueryBatch) -> Float[Tensor, "b q s"]:
         """Signed distance to each segment at rest coordinates, trilinear; beyond the grid that of its border."""
         # grid_sample takes coordinates from the last axis to the first, in [-1, 1]
         places = (rest / TEMPLATE_REACH).flip(-1)[None, :, :, None]
@@ -91,8 +92,8 @@ class Code:
     latent1: Float[Tensor, "b h"]
     latent2: Float[Tensor, "b h"]
     levels: tuple[Level, ...]
-    cloud: Float[Tensor, "b n 3"]
-    viewpoint: Float[Tensor, "b 3"]
+    cloud: CloudBatch
+    viewpoint: VectorBatch
     alignment: Alignment | None = None
 
 
@@ -108,8 +109,8 @@ class Prediction(NamedTuple):
 
     logits: Float[Tensor, "b q c"]
     distance: Float[Tensor, "b q"]
-    direction: Float[Tensor, "b q 3"]
-    rest: Float[Tensor, "b q 3"] | None = None
+    direction: QueryBatch
+    rest: QueryBatch | None = None
 
 
 class FrequencyEncoding(nn.Module):
@@ -123,7 +124,7 @@ class FrequencyEncoding(nn.Module):
         self.register_buffer("frequency", frequency, persistent=False)
         self.channels = 6 * len(frequency)
 
-    def forward(self, points: Float[Tensor, "b q 3"]) -> Float[Tensor, "b q e"]:
+    def forward(self, points: QueryBatch) -> Float[Tensor, "b q e"]:
         """Sines, then cosines, of each coordinate at each frequency."""
         phase = (points[..., None] * self.frequency).flatten(-2)
         return torch.cat([phase.sin(), phase.cos()], dim=-1)
@@ -143,7 +144,7 @@ class LocalAttention(nn.Module):
         self.offset = nn.Linear(4, width, bias=False)
         self.score = nn.Linear(width, HEADS)
 
-    def forward(self, level: Level, queries: Float[Tensor, "b q 3"]) -> Float[Tensor, "b q w"]:
+    def forward(self, level: Level, queries: QueryBatch) -> Float[Tensor, "b q w"]:
         """Attended features at each query; ``level.features`` are already projected."""
         index = nearest(queries, level.centers, self.neighbors)
         offset = queries[:, :, None] - gather(level.centers, index)
@@ -154,9 +155,7 @@ class LocalAttention(nn.Module):
         return (weight[..., None] * heads).sum(dim=2).flatten(-2)
 
 
-def line_of_sight(
-    queries: Float[Tensor, "b q 3"], cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"], count: int
-) -> Float[Tensor, "b q f"]:
+def line_of_sight(queries: QueryBatch, cloud: CloudBatch, viewpoint: VectorBatch, count: int) -> Float[Tensor, "b q f"]:
     """Evidence of free space: lateral offset and depth difference to the observed points nearest in the image.
 
     A query in front of them is in seen empty space; one behind is hidden; one with none nearby is outside the
@@ -214,8 +213,8 @@ class ConditionedMLP(nn.Module):
     def prepare(
         self,
         encoding: Encoding,
-        cloud: Float[Tensor, "b n 3"],
-        viewpoint: Float[Tensor, "b 3"],
+        cloud: CloudBatch,
+        viewpoint: VectorBatch,
         alignment: Alignment | None = None,
     ) -> Code:
         """Code of each cloud: the part of the work that does not depend on the queries."""
@@ -227,9 +226,7 @@ class ConditionedMLP(nn.Module):
             latent = encoding.latent.float()
             return Code(self.latent1(latent), self.latent2(latent), levels, cloud, viewpoint, alignment)
 
-    def features(
-        self, code: Code, queries: Float[Tensor, "b q 3"]
-    ) -> tuple[Float[Tensor, "b q f"], Float[Tensor, "b q 3"] | None]:
+    def features(self, code: Code, queries: QueryBatch) -> tuple[Float[Tensor, "b q f"], QueryBatch | None]:
         """Outputs of the last layer, and the rest coordinates of the lookup on the way, if there is one."""
         layers, added = self.config.decoder, self.config.additions
         placed = queries if code.alignment is None else code.alignment.apply(queries)
@@ -253,7 +250,7 @@ class ConditionedMLP(nn.Module):
             hidden = self._activate(number, joint_linear(read, rows, latent))
         return self.head(hidden).float(), rest
 
-    def _activate(self, number: int, hidden: Float[Tensor, "b q h"]) -> Float[Tensor, "b q h"]:
+    def _activate(self, number: int, hidden: Hidden) -> Hidden:
         """Normalization, ReLU and dropout of layer ``number``, counted from 0."""
         hidden = self.norms[number](hidden.flatten(0, 1)).relu_().unflatten(0, hidden.shape[:2])
         return nn.functional.dropout(hidden, self.config.decoder.dropout, self.training)
@@ -261,7 +258,7 @@ class ConditionedMLP(nn.Module):
 
 def joint_linear(
     layers: Sequence[nn.Linear], rows: Sequence[Float[Tensor, "b q _"]], latent: Float[Tensor, "b h"] | None
-) -> Float[Tensor, "b q h"]:
+) -> Hidden:
     """Sum ``sum_i W_i x_i`` (+ the cloud's ``latent``) as one product of joined rows: it is written once.
 
     ``rows`` may be fewer, and wider, than ``layers``, as long as the channels match in order.
@@ -285,7 +282,7 @@ class Decoder(ConditionedMLP):
         super().__init__(config, classes + 4, lookup)
         self.classes = classes
 
-    def forward(self, code: Code, queries: Float[Tensor, "b q 3"]) -> Prediction:
+    def forward(self, code: Code, queries: QueryBatch) -> Prediction:
         """Prediction at each query, the direction in the camera frame."""
         features, rest = self.features(code, queries)
         logits, distance, direction = features.split([self.classes, 1, 3], dim=-1)

@@ -14,7 +14,13 @@ from torch import Tensor, nn
 
 from mereo.models.config import AutodecoderConfig, PointNet2Config, PointTransformerConfig
 from mereo.models.device import exact
-from mereo.models.neighbors import ball_query, distinct_distances, gather
+from mereo.models.neighbors import CloudBatch, NeighborIndices, ball_query, distinct_distances, gather
+
+Latents = Float[Tensor, "b z"]
+"""Latent code of each example of a batch."""
+
+Features = Float[Tensor, "b n c"]
+"""Features of each point."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +35,7 @@ class Level:
 class Encoding:
     """Knowledge of an encoder about a cloud: the paper's latent vector, and levels on the way for local features."""
 
-    latent: Float[Tensor, "b z"]
+    latent: Latents
     levels: tuple[Level, ...]
 
 
@@ -73,7 +79,7 @@ class SetAbstraction(nn.Module):
         self.radius, self.neighbors = radius, neighbors
         self.mlp = SharedMLP((channels + 3, *widths))
 
-    def forward(self, points: Float[Tensor, "b n 3"], features: Float[Tensor, "b n c"] | None, count: int) -> Level:
+    def forward(self, points: CloudBatch, features: Features | None, count: int) -> Level:
         """Level of the first ``count`` points, with features of the balls around them."""
         centers = points[:, :count]
         index = ball_query(centers, points, self.radius, self.neighbors)
@@ -93,7 +99,7 @@ class PointNet2(nn.Module):
         self.level2 = SetAbstraction(config.mlp1[-1], config.radius2, config.neighbors, config.mlp2)
         self.pool = SharedMLP((config.mlp2[-1] + 3, *config.mlp_global))
 
-    def forward(self, cloud: Float[Tensor, "b n 3"]) -> Encoding:
+    def forward(self, cloud: CloudBatch) -> Encoding:
         """Encoding of each cloud."""
         count1 = share(cloud.shape[1], self.ratio1)
         count2 = share(count1, self.ratio2)
@@ -133,9 +139,7 @@ class VectorAttention(nn.Module):
         # the softmax removes what is added to all neighbours
         self.gamma = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, width, bias=False))
 
-    def forward(
-        self, points: Float[Tensor, "b n 3"], features: Float[Tensor, "b n c"], index: Int[Tensor, "b n k"]
-    ) -> Float[Tensor, "b n c"]:
+    def forward(self, points: CloudBatch, features: Features, index: Int[Tensor, "b n k"]) -> Features:
         """Attended features at each point; ``index`` are each point's neighbours."""
         place = self.theta(points[:, :, None] - gather(points, index))
         relation = self.phi(features)[:, :, None] - gather(self.psi(features), index) + place
@@ -154,9 +158,7 @@ class TransformerBlock(nn.Module):
         self.leave = nn.Linear(width, width, bias=False)
         self.left = nn.BatchNorm1d(width)
 
-    def forward(
-        self, points: Float[Tensor, "b n 3"], features: Float[Tensor, "b n c"], index: Int[Tensor, "b n k"]
-    ) -> Float[Tensor, "b n c"]:
+    def forward(self, points: CloudBatch, features: Features, index: Int[Tensor, "b n k"]) -> Features:
         """Features after the block; ``index`` are each point's neighbours."""
         hidden = self.attention(points, self.enter(features), index).flatten(0, 1)
         change = self.left(self.leave(torch.relu(self.attended(hidden))))
@@ -170,7 +172,7 @@ class TransitionDown(nn.Module):
         super().__init__()
         self.mlp = SharedMLP((before, after))
 
-    def forward(self, features: Float[Tensor, "b n i"], index: Int[Tensor, "b m k"]) -> Float[Tensor, "b m o"]:
+    def forward(self, features: Float[Tensor, "b n i"], index: NeighborIndices) -> Float[Tensor, "b m o"]:
         """Features at the kept points; ``index`` are their neighbours among all."""
         return gather(self.mlp(features), index).amax(dim=2)
 
@@ -190,7 +192,7 @@ class PointTransformer(nn.Module):
         self.blocks = nn.ModuleList(TransformerBlock(width) for width in widths)
         self.pool = SharedMLP((widths[-1], latent))
 
-    def forward(self, cloud: Float[Tensor, "b n 3"]) -> Encoding:
+    def forward(self, cloud: CloudBatch) -> Encoding:
         """Encoding of each cloud."""
         distances = distinct_distances(cloud)
         count = cloud.shape[1]
@@ -205,7 +207,7 @@ class PointTransformer(nn.Module):
         return Encoding(latent, tuple(levels[:2]))
 
 
-def _smallest(distances: Float[Tensor, "b m n"], count: int) -> Int[Tensor, "b m k"]:
+def _smallest(distances: Float[Tensor, "b m n"], count: int) -> NeighborIndices:
     return distances.topk(torch.sym_min(count, distances.shape[2]), dim=2, largest=False).indices
 
 
@@ -258,18 +260,16 @@ class Autodecoder(nn.Module):
             variance, axes = torch.linalg.eigh(centered.T @ centered / len(centered))
             self.axes.copy_((variance.clamp(min=0).sqrt() * axes).T)
 
-    def code(self, index: Int[Tensor, " b"]) -> Float[Tensor, "b z"]:
+    def code(self, index: Int[Tensor, " b"]) -> Latents:
         """Trained codes of training examples."""
         assert self.codes is not None, "weights hold no codes of training examples"
         return nn.functional.embedding(index, self.codes)
 
-    def length_penalty(self, code: Float[Tensor, "b z"]) -> Float[Tensor, " b"]:
+    def length_penalty(self, code: Latents) -> Float[Tensor, " b"]:
         """Gaussian prior on codes, relative to a mean distance (DeepSDF, equations 9 and 10)."""
         return self.penalty * code.square().sum(dim=1)
 
-    def search(
-        self, distance: Callable[[Float[Tensor, "b z"]], Float[Tensor, "b n"]], clouds: int
-    ) -> Float[Tensor, "b z"]:
+    def search(self, distance: Callable[[Latents], Float[Tensor, "b n"]], clouds: int) -> Latents:
         """Codes under which the observed points are nearest to a surface.
 
         ``distance`` answers with the signed distance at each cloud's observed points. Deterministic, and the clouds of
@@ -287,5 +287,5 @@ class Autodecoder(nn.Module):
             optimizer.step()
         return self._code_at(place).detach()
 
-    def _code_at(self, place: Float[Tensor, "b z"]) -> Float[Tensor, "b z"]:
+    def _code_at(self, place: Latents) -> Latents:
         return place if self.axes is None else self.mean + place @ self.axes

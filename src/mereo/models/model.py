@@ -22,12 +22,13 @@ from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.downsampling import farthest_point_order, random_subset
 from mereo.geometry.mesh import Color
-from mereo.geometry.transforms import Normalizer, Points
+from mereo.geometry.transforms import Normalizer, Points, Rows
 from mereo.models.calibration import Calibration, Scaling
 from mereo.models.config import Precision, Supervision
 from mereo.models.decoder import ConditionedMLP, Prediction
 from mereo.models.device import MOST, in_threads, pick_precision
 from mereo.models.encoders import SharedMLP
+from mereo.models.neighbors import QueryBatch
 from mereo.models.network import Network
 from mereo.models.trained import Answer, EncodedCloud, checked_points
 from mereo.scenes.statistical_model import StatisticalModel
@@ -162,7 +163,7 @@ class Model:
         label, probability, distance, direction = self._chunked(code, points, answer)
         return Answer(label, probability, distance / np.float32(code.normalizer.scale), direction)
 
-    def logits(self, code: EncodedCloud, points: Points) -> Float[np.ndarray, "n c"]:
+    def logits(self, code: EncodedCloud, points: Points) -> Rows:
         """Class logits at each point, without the rest of the answer: what surface extraction needs."""
         return self._chunked(code, points, lambda *answer: (self.class_logits(*answer),))[0]
 
@@ -171,7 +172,7 @@ class Model:
         """Whether probabilities are calibrated: by the temperature, and biases, of the weights' calibration."""
         return self.calibration is not None and self.calibration.temperature is not None
 
-    def correspond(self, code: EncodedCloud, points: Points) -> tuple[Float[np.ndarray, "n c"], Points] | None:
+    def correspond(self, code: EncodedCloud, points: Points) -> tuple[Rows, Points] | None:
         """Class probabilities, not calibrated, and rest coordinates of points; None from a model without template."""
         if self.network.decoder.lookup is None:
             return None
@@ -184,8 +185,8 @@ class Model:
         return probability, rest.astype(np.float64)
 
     def respond(
-        self, prediction: Prediction, queries: Float[Tensor, "b q 3"]
-    ) -> tuple[Float[Tensor, "b q c"], Float[Tensor, "b q"], Float[Tensor, "b q 3"]]:
+        self, prediction: Prediction, queries: QueryBatch
+    ) -> tuple[Float[Tensor, "b q c"], Float[Tensor, "b q"], QueryBatch]:
         """Class logits, signed distance and unit direction at normalized queries, in normalized units.
 
         A head that no term of the loss has trained says nothing: it is NaN.
@@ -197,7 +198,7 @@ class Model:
             direction = torch.full_like(direction, torch.nan)
         return self.class_logits(prediction, queries), distance, direction
 
-    def class_logits(self, prediction: Prediction, queries: Float[Tensor, "b q 3"]) -> Float[Tensor, "b q c"]:
+    def class_logits(self, prediction: Prediction, queries: QueryBatch) -> Float[Tensor, "b q c"]:
         """Logits of empty space and each segment; ``queries`` are normalized."""
         logits = prediction.logits
         if not self.segmented:
@@ -254,7 +255,7 @@ def scaled_logits(scaling: Scaling, logits: Float[Tensor, "*n c"]) -> Float[Tens
     return divided if scaling.biases is None else divided + _on_device(scaling.biases, logits.device)
 
 
-def scaled_array(scaling: Scaling, logits: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
+def scaled_array(scaling: Scaling, logits: Rows) -> Rows:
     """``scaled_logits`` of logits that have left their device."""
     return scaled_logits(scaling, torch.from_numpy(logits)).numpy()
 

@@ -15,6 +15,18 @@ from torch import Tensor
 
 from mereo.geometry.transforms import Points
 
+CloudBatch = Float[Tensor, "b n 3"]
+"""Points, or vectors at them, of each example of a batch."""
+
+QueryBatch = Float[Tensor, "b q 3"]
+"""Places that a network is asked about, or vectors there, of each example of a batch."""
+
+VectorBatch = Float[Tensor, "b 3"]
+"""A vector for each example of a batch."""
+
+NeighborIndices = Int[Tensor, "b m k"]
+"""Indices of the points near each center."""
+
 # PyTorch 2.6 cannot tell exporting from compiling, and compiles what is exported
 is_exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)
 
@@ -23,9 +35,7 @@ THREADED_QUERIES = 1024
 
 
 @torch.no_grad()
-def ball_query(
-    centers: Float[Tensor, "b m 3"], points: Float[Tensor, "b n 3"], radius: float, limit: int
-) -> Int[Tensor, "b m k"]:
+def ball_query(centers: Float[Tensor, "b m 3"], points: CloudBatch, radius: float, limit: int) -> NeighborIndices:
     """Indices of the first ``limit`` points, in order, within ``radius`` of each centre.
 
     Balls with fewer points repeat their first one, which a max pool does not notice. Every centre must itself be one
@@ -37,9 +47,7 @@ def ball_query(
     return _by_rank(centers, points, radius, limit)
 
 
-def _by_rank(
-    centers: Float[Tensor, "b m 3"], points: Float[Tensor, "b n 3"], radius: float, limit: int
-) -> Int[Tensor, "b m k"]:
+def _by_rank(centers: Float[Tensor, "b m 3"], points: CloudBatch, radius: float, limit: int) -> NeighborIndices:
     """Ball query without sizes that depend on the values: for GPUs and for graphs."""
     count = points.shape[1]
     near = squared_distances(centers, points) <= radius * radius
@@ -129,7 +137,7 @@ def squared_distances(a: Float[Tensor, "b m d"], b: Float[Tensor, "b n d"]) -> F
     return total
 
 
-def gather(values: Float[Tensor, "b n c"], index: Int[Tensor, "b m k"]) -> Float[Tensor, "b m k c"]:
+def gather(values: Float[Tensor, "b n c"], index: NeighborIndices) -> Float[Tensor, "b m k c"]:
     """Rows of each cloud's values by index, ``values[b, index[b, m, k]]``."""
     batch, count, channels = values.shape
     offset = torch.arange(batch, device=values.device).view(-1, 1, 1) * count
@@ -138,7 +146,7 @@ def gather(values: Float[Tensor, "b n c"], index: Int[Tensor, "b m k"]) -> Float
 
 
 @torch.no_grad()
-def distinct_distances(points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n n"]:
+def distinct_distances(points: CloudBatch) -> Float[Tensor, "b n n"]:
     """Squared distances among points; infinite in the columns of points that repeat an earlier one.
 
     A cloud with too few points repeats them. Repetitions must not take the places of real neighbours.

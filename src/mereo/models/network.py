@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from mereo.models.config import NetworkConfig
 from mereo.models.decoder import Code, ConditionedMLP, Decoder, Prediction
 from mereo.models.encoders import Autodecoder, Encoding, PointNet2, PointTransformer
+from mereo.models.neighbors import CloudBatch, QueryBatch, VectorBatch
 from mereo.models.rigid_alignment import Alignment, fit_rigid
 
 ALIGNED_QUERIES = 128
@@ -39,7 +40,7 @@ class Network(nn.Module):
         self.decoder = Decoder(config, segments + 1)
         self.aligner = AlignmentNet(config) if config.additions.align_points else None
 
-    def encode(self, cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"]) -> Code:
+    def encode(self, cloud: CloudBatch, viewpoint: VectorBatch) -> Code:
         """Code of each cloud, given in farthest-point order; an autodecoder searches for it, in evaluation mode."""
         if isinstance(self.encoder, Autodecoder):
             # the search needs gradients, which tensors of inference mode cannot give
@@ -47,13 +48,13 @@ class Network(nn.Module):
                 return self._search(self.encoder, cloud.clone(), viewpoint.clone())
         return self._encode(cloud, viewpoint, self._align(cloud))
 
-    def _align(self, cloud: Float[Tensor, "b n 3"]) -> Alignment | None:
+    def _align(self, cloud: CloudBatch) -> Alignment | None:
         return None if self.aligner is None else self.aligner(cloud).alignment
 
     def _encode(
         self,
-        cloud: Float[Tensor, "b n 3"],
-        viewpoint: Float[Tensor, "b 3"],
+        cloud: CloudBatch,
+        viewpoint: VectorBatch,
         alignment: Alignment | None,
         index: Int[Tensor, " b"] | None = None,
     ) -> Code:
@@ -64,7 +65,7 @@ class Network(nn.Module):
             encoding = self.encoder(cloud if alignment is None else alignment.apply(cloud))
         return self.decoder.prepare(encoding, cloud, viewpoint, alignment)
 
-    def _search(self, encoder: Autodecoder, cloud: Float[Tensor, "b n 3"], viewpoint: Float[Tensor, "b 3"]) -> Code:
+    def _search(self, encoder: Autodecoder, cloud: CloudBatch, viewpoint: VectorBatch) -> Code:
         alignment = self._align(cloud)
 
         def prepare(latent: Float[Tensor, "b z"]) -> Code:
@@ -72,16 +73,16 @@ class Network(nn.Module):
 
         return prepare(encoder.search(lambda latent: self.query(prepare(latent), cloud).distance, len(cloud)))
 
-    def query(self, code: Code, points: Float[Tensor, "b q 3"]) -> Prediction:
+    def query(self, code: Code, points: QueryBatch) -> Prediction:
         """Prediction at each point."""
         prediction: Prediction = self.decoder(code, points)
         return prediction
 
     def forward(
         self,
-        cloud: Float[Tensor, "b n 3"],
-        viewpoint: Float[Tensor, "b 3"],
-        points: Float[Tensor, "b q 3"],
+        cloud: CloudBatch,
+        viewpoint: VectorBatch,
+        points: QueryBatch,
         index: Int[Tensor, " b"] | None = None,
     ) -> TrainingOutput:
         """Predictions at ``points`` for training, with what else a loss looks at.
@@ -127,7 +128,7 @@ class Aligned(NamedTuple):
     """Rigid motion of each cloud, and the rest coordinates predicted at the queries, for the loss."""
 
     alignment: Alignment
-    rest: Float[Tensor, "b q 3"]
+    rest: QueryBatch
 
 
 class AlignmentNet(nn.Module):
@@ -149,7 +150,7 @@ class AlignmentNet(nn.Module):
         self.encoder = PointNet2(small.pointnet2)
         self.decoder = ConditionedMLP(small, outputs=3)
 
-    def forward(self, cloud: Float[Tensor, "b n 3"], queries: Float[Tensor, "b q 3"] | None = None) -> Aligned:
+    def forward(self, cloud: CloudBatch, queries: QueryBatch | None = None) -> Aligned:
         """Alignment of each cloud, and rest coordinates at ``queries`` (none where there are none)."""
         seen = cloud[:, : self.FITTED]
         unused = torch.zeros_like(cloud[:, 0])  # the viewpoint: rest coordinates need no lines of sight

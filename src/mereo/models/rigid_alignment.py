@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mereo.models.device import exact
+from mereo.models.neighbors import CloudBatch, VectorBatch
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,21 +21,21 @@ class Alignment:
     """
 
     rotation: Float[Tensor, "b 3 3"]
-    shift: Float[Tensor, "b 3"]
+    shift: VectorBatch
 
-    def apply(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 3"]:
+    def apply(self, points: CloudBatch) -> CloudBatch:
         """Points from the camera frame to the aligned frame."""
         with exact(points):
             return points @ self.rotation.transpose(1, 2) + self.shift[:, None]
 
-    def turn_back(self, directions: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 3"]:
+    def turn_back(self, directions: CloudBatch) -> CloudBatch:
         """Directions from the aligned frame to the camera's."""
         with exact(directions):
             return directions @ self.rotation
 
 
 @torch.no_grad()
-def fit_rigid(source: Float[Tensor, "b n 3"], target: Float[Tensor, "b n 3"]) -> Alignment:
+def fit_rigid(source: CloudBatch, target: CloudBatch) -> Alignment:
     """Rotation and shift with the least squared distance of moved ``source`` to ``target`` (Kabsch, 1976)."""
     middle, aim = source.mean(dim=1, keepdim=True), target.mean(dim=1, keepdim=True)
     with exact(source):

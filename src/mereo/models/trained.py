@@ -10,13 +10,12 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, UInt8
 
 from mereo.geometry.brief import counted
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import Color
-from mereo.geometry.transforms import Normalizer, Points
+from mereo.geometry.transforms import Labels, Normalizer, Points, Rows, Values
 from mereo.models.calibration import Calibration
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -51,9 +50,9 @@ class Answer:
         direction: unit vector towards it; NaN from a model that was not trained on directions.
     """
 
-    label: UInt8[np.ndarray, " n"]
-    probability: Float[np.ndarray, "n c"]
-    distance: Float[np.ndarray, " n"]
+    label: Labels
+    probability: Rows
+    distance: Values
     direction: Points
 
     def __repr__(self) -> str:
@@ -114,10 +113,10 @@ class Trained(Protocol):
     def query(self, code: EncodedCloud, points: Points) -> Answer:
         """Segment, probabilities, signed distance and direction at each point."""
 
-    def logits(self, code: EncodedCloud, points: Points) -> Float[np.ndarray, "n c"]:
+    def logits(self, code: EncodedCloud, points: Points) -> Rows:
         """Class logits at each point."""
 
-    def correspond(self, code: EncodedCloud, points: Points) -> tuple[Float[np.ndarray, "n c"], Points] | None:
+    def correspond(self, code: EncodedCloud, points: Points) -> tuple[Rows, Points] | None:
         """Class probabilities and rest coordinates of points; None from a network without them."""
 
 

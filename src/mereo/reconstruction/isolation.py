@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -22,7 +22,7 @@ from mereo.geometry.camera import PointCloud, into_camera
 from mereo.geometry.conventions import MIN_POINTS, CloudAxes
 from mereo.geometry.downsampling import MAX_POINTS, spacing, thin_to_grid
 from mereo.geometry.surface_patches import STRETCH, stretch, surface_patches
-from mereo.geometry.transforms import Points, Vector, transform_points
+from mereo.geometry.transforms import AnyPoints, Flags, Indices, Points, Values, Vector, transform_points
 from mereo.reconstruction.config import IsolationConfig
 
 PLANE_SPACINGS = 3.0
@@ -64,10 +64,10 @@ class IsolationStep:
         return f"{self.name}: {self.kept} of {self.before} points kept{note}"
 
 
-Keep = tuple[Bool[np.ndarray, " n"], str]
+Keep = tuple[Flags, str]
 """Points that a step keeps, and why in words."""
 
-Step = Callable[[Float[np.ndarray, "_ 3"]], Keep]
+Step = Callable[[AnyPoints], Keep]
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,12 +82,12 @@ class Selection:
         steps: what each step left out.
     """
 
-    keep: Bool[np.ndarray, " n"]
-    compared: Bool[np.ndarray, " n"]
-    thinned: Bool[np.ndarray, " n"]
+    keep: Flags
+    compared: Flags
+    thinned: Flags
     steps: tuple[IsolationStep, ...]
 
-    def of_object(self, points: Points) -> Bool[np.ndarray, " n"]:
+    def of_object(self, points: Points) -> Flags:
         """Points of the object, also those that were thinned out: their nearest compared point is the object's."""
         whole = self.keep.copy()
         if self.thinned.any():
@@ -194,7 +194,7 @@ def _inliers(points: Points) -> Keep:
     return distance <= distance.mean() + OUTLIER_STD * distance.std(), ""
 
 
-def clusters(points: Points) -> Int[np.ndarray, " n"]:
+def clusters(points: Points) -> Indices:
     """Number of each point's cluster, the largest being 0; see ``CLUSTER_NEIGHBORS``."""
     count = min(CLUSTER_NEIGHBORS, len(points) - 1) + 1
     gap = CLUSTER_GAP * spacing(points)
@@ -255,12 +255,12 @@ class Plane:
     normal: Vector
     offset: float
 
-    def distance(self, points: Points) -> Float[np.ndarray, " n"]:
+    def distance(self, points: Points) -> Values:
         """Distance of points from the plane, without sign."""
         return np.abs(points @ self.normal - self.offset)
 
 
-def largest_plane(points: Points, tolerance: Float[np.ndarray, " n"], rng: np.random.Generator) -> Plane | None:
+def largest_plane(points: Points, tolerance: Values, rng: np.random.Generator) -> Plane | None:
     """Plane with the most points within ``tolerance``; None where no three points span one.
 
     Args:
@@ -324,7 +324,7 @@ class Reading:
     """
 
     whole: PointCloud
-    keep: Bool[np.ndarray, " n"]
+    keep: Flags
 
     def __repr__(self) -> str:
         return f"Reading({len(self.cloud):,} of {counted(len(self.whole), 'point')})"
@@ -395,7 +395,7 @@ def readings(cloud: PointCloud | Points, axes: CloudAxes = "camera", keep_all: b
     return (surfaces, everything, *nearer) if scattered else (everything, surfaces, *nearer)
 
 
-def nearer_layer(points: Points, patch: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+def nearer_layer(points: Points, patch: Indices) -> Flags:
     """Mark the points before the largest gap in range between patches of surface; all where there is no gap.
 
     A mask that is too wide lets in what is behind the object, which may be as many points as the object's own where it

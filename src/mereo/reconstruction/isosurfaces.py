@@ -15,8 +15,20 @@ from jaxtyping import Bool, Float, Int, UInt8
 from skimage.measure import marching_cubes
 
 from mereo.geometry.labels import LabelGrid, part_of_grid
-from mereo.geometry.mesh import Color, Segment, SegmentedMesh
-from mereo.geometry.transforms import Corners, Points, Vector, longest_side
+from mereo.geometry.mesh import AnyFaces, Color, Segment, SegmentedMesh
+from mereo.geometry.transforms import AnyPoints, Corners, Points, Rows, Vector, longest_side
+
+GridLabels = UInt8[np.ndarray, "x y z"]
+"""Label of each node of a grid."""
+
+GridRows = Int[np.ndarray, "x y z"]
+"""Row of the logits of each node."""
+
+Logits = Float[np.ndarray, "m c"]
+"""Logits in rows."""
+
+CellFlags = Bool[np.ndarray, "i j k"]
+"""Whether each cell between nodes is meant."""
 
 # --- coarse to fine ---------------------------------------------------------------------------------------------------
 
@@ -34,7 +46,7 @@ from mereo.geometry.transforms import Corners, Points, Vector, longest_side
 #
 # Notation: nodes are points of the grid, cells are the boxes between eight nodes; c classes; class 0 is empty space.
 
-Field = Callable[[Points], Float[np.ndarray, "n c"]]
+Field = Callable[[Points], Rows]
 """Function from points to their class logits."""
 
 COARSE = 4
@@ -54,9 +66,9 @@ class Sampled:
         logits: of the evaluated nodes.
     """
 
-    labels: UInt8[np.ndarray, "x y z"]
-    rows: Int[np.ndarray, "x y z"]
-    logits: Float[np.ndarray, "m c"]
+    labels: GridLabels
+    rows: GridRows
+    logits: Logits
 
 
 class _Evaluator:
@@ -64,7 +76,7 @@ class _Evaluator:
 
     def __init__(self, field: Field, origin: Vector, spacing: Vector) -> None:
         self.field, self.origin, self.spacing = field, origin, spacing
-        self.chunks: list[Float[np.ndarray, "m c"]] = []
+        self.chunks: list[Logits] = []
         self.count = 0
 
     def __call__(self, index: Int[np.ndarray, "m 3"]) -> tuple[UInt8[np.ndarray, " m"], Int[np.ndarray, " m"]]:
@@ -75,7 +87,7 @@ class _Evaluator:
         self.count += len(index)
         return logits.argmax(axis=1).astype(np.uint8), rows
 
-    def logits(self) -> Float[np.ndarray, "m c"]:
+    def logits(self) -> Logits:
         """All answers so far, in the order of their rows."""
         return np.concatenate(self.chunks)
 
@@ -112,12 +124,12 @@ def _all_nodes(shape: tuple[int, int, int]) -> Int[np.ndarray, "n 3"]:
     return np.indices(shape).reshape(3, -1).T
 
 
-def changing_cells(labels: UInt8[np.ndarray, "x y z"]) -> Bool[np.ndarray, "i j k"]:
+def changing_cells(labels: GridLabels) -> CellFlags:
     """Cells whose eight corners do not all have one label."""
     return over_corners(labels, np.maximum) != over_corners(labels, np.minimum)
 
 
-def _sloping_cells(rows: Int[np.ndarray, "x y z"], logits: Float[np.ndarray, "m c"]) -> Bool[np.ndarray, "i j k"]:
+def _sloping_cells(rows: GridRows, logits: Logits) -> CellFlags:
     """Cells in which the lead of the winning class, falling on as between evaluated nodes, could vanish half way.
 
     For a field of signed distances this finds every cell that a surface passes, also of a ball between the nodes.
@@ -145,9 +157,9 @@ def over_corners(values: np.ndarray, combine: np.ufunc) -> np.ndarray:
 
 
 def _halve(
-    labels: UInt8[np.ndarray, "x y z"],
-    rows: Int[np.ndarray, "x y z"],
-    active: Bool[np.ndarray, "i j k"],
+    labels: GridLabels,
+    rows: GridRows,
+    active: CellFlags,
     step: int,
     evaluate: _Evaluator,
 ) -> tuple[UInt8[np.ndarray, "u v w"], Int[np.ndarray, "u v w"]]:
@@ -172,7 +184,7 @@ def _halve(
     return fine_labels, fine_rows
 
 
-def _nodes_of(cells: Bool[np.ndarray, "i j k"]) -> Bool[np.ndarray, "u v w"]:
+def _nodes_of(cells: CellFlags) -> Bool[np.ndarray, "u v w"]:
     """Nodes of the lattice half as wide that lie in or on these cells."""
     for axis in range(3):
         cells = _on_both_sides(np.repeat(cells, 2, axis=axis), axis, np.logical_or)
@@ -187,7 +199,7 @@ def _on_both_sides(values: np.ndarray, axis: int, combine: np.ufunc) -> np.ndarr
 
 
 def _contradicted(
-    labels: UInt8[np.ndarray, "x y z"], skipped: Bool[np.ndarray, "x y z"], news: Int[np.ndarray, "m 3"]
+    labels: GridLabels, skipped: Bool[np.ndarray, "x y z"], news: Int[np.ndarray, "m 3"]
 ) -> Bool[np.ndarray, "x y z"]:
     """Skipped nodes that touch one of the nodes ``news`` with another label.
 
@@ -355,9 +367,7 @@ def _grown(box: Corners, sides: Bool[np.ndarray, "2 3"], fraction: float) -> Cor
     return box + step * sides * np.array([[-1.0], [1.0]])
 
 
-def _surface(
-    sampled: Sampled, grid: LabelGrid, held: list[int]
-) -> tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]:
+def _surface(sampled: Sampled, grid: LabelGrid, held: list[int]) -> tuple[AnyPoints, AnyFaces]:
     """Vertices and faces around ``held``, a label and those nested in it; none where the first does not occur."""
     if not (sampled.labels == held[0]).any():
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
@@ -375,9 +385,9 @@ def _surface(
 
 
 def _margin(
-    labels: UInt8[np.ndarray, "x y z"],
-    rows: Int[np.ndarray, "x y z"],
-    logits: Float[np.ndarray, "m c"],
+    labels: GridLabels,
+    rows: GridRows,
+    logits: Logits,
     held: list[int],
 ) -> Float[np.ndarray, "x y z"]:
     """Margin at each node: the largest logit of ``held`` less that of the others, its sign by the label.

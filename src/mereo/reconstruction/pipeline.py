@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool
 from scipy import ndimage
 from scipy.special import expit, logsumexp, softmax
 
@@ -25,7 +25,7 @@ from mereo.geometry.downsampling import random_subset
 from mereo.geometry.labels import LabelGrid, SegmentedCloud, part_of_grid
 from mereo.geometry.mesh import PALETTE, Color, SegmentedMesh
 from mereo.geometry.solids import label_grid
-from mereo.geometry.transforms import Corners, Points, Transform, Vector, inverse_rigid, transform_points
+from mereo.geometry.transforms import Corners, Labels, Points, Rows, Transform, Vector, inverse_rigid, transform_points
 from mereo.models.calibration import Calibration
 from mereo.models.trained import EncodedCloud, Trained, checked_points
 from mereo.reconstruction.isolation import Reading
@@ -266,12 +266,12 @@ def turned_back(result: Reconstruction) -> Reconstruction:
 
 
 def segment_points(
-    logits: Float[np.ndarray, "n c"],
+    logits: Rows,
     points: Points,
     names: tuple[str, ...],
     colors: tuple[Color, ...],
     calibration: Calibration | None = None,
-    labels: UInt8[np.ndarray, " n"] | None = None,
+    labels: Labels | None = None,
 ) -> SegmentedCloud:
     """Segment of each point from the model's logits there, and the model's probability of it.
 

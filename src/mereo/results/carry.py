@@ -5,6 +5,7 @@ Attachment -place-> Placed (rest model, scene units) -carry-> Carried (frame and
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -16,12 +17,26 @@ from mereo.fitting.registration.registration import Registration
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids, label_grid
 from mereo.geometry.subdivision import split_long_edges
-from mereo.geometry.transforms import best_rotations, transform_points
+from mereo.geometry.transforms import (
+    Flags,
+    Indices,
+    Matrices,
+    PointArray,
+    Points,
+    Transform,
+    Values,
+    Vector,
+    best_rotations,
+    transform_points,
+)
 from mereo.io.attachments import Attachment, Content, Surfaces, turned_attachment
 from mereo.io.bounds import check_value
 from mereo.io.config import CarryFrame
 from mereo.io.volume_files import Volume, is_labels
 from mereo.scenes.statistical_model import StatisticalModel
+
+SegmentShares = Float[np.ndarray, "n s"]
+"""Share of each segment in the motion of each point."""
 
 Interpolation = Literal["linear", "nearest"]
 """Linear for intensities, nearest for labels (``is_labels``)."""
@@ -41,8 +56,8 @@ class Placed:
 
     name: str
     content: Content
-    shares: Float[np.ndarray, "n s"]
-    distance: Float[np.ndarray, " n"]
+    shares: SegmentShares
+    distance: Values
     note: str = ""
 
 
@@ -147,9 +162,7 @@ def place(attachments: Sequence[Attachment], registrar: Registrar, frame: CarryF
     return tuple(_placed(attachment, T_scene_file, registrar.model, solids) for attachment in attachments)
 
 
-def _placed(
-    attachment: Attachment, T_scene_file: Float[np.ndarray, "4 4"], model: StatisticalModel, solids: Solids
-) -> Placed:
+def _placed(attachment: Attachment, T_scene_file: Transform, model: StatisticalModel, solids: Solids) -> Placed:
     name, content, size = attachment.name, attachment.content, 2 * model.half
     if isinstance(content, Volume):
         volume = replace(content, T_world_index=T_scene_file @ content.T_world_index)
@@ -176,9 +189,7 @@ def _placed(
     return Placed(name, content, shares, distance, attachment.note)
 
 
-def check_overlap(
-    name: str, volume: Volume, T_scene_file: Float[np.ndarray, "4 4"], model: StatisticalModel, solids: Solids
-) -> None:
+def check_overlap(name: str, volume: Volume, T_scene_file: Transform, model: StatisticalModel, solids: Solids) -> None:
     """Raise ``ValueError`` for a volume, in scene units, without any voxel in the object."""
     if volume.holds(volume.index_of(model.rest_points)).any():
         return
@@ -188,8 +199,7 @@ def check_overlap(
         return
     boxes = []
     for bounds in (volume.bounds, model.rest.bounds):
-        corners = np.stack(np.meshgrid(*bounds.T, indexing="ij"), axis=-1).reshape(-1, 3)
-        corners = transform_points(np.linalg.inv(T_scene_file), corners)
+        corners = transform_points(np.linalg.inv(T_scene_file), np.array(list(product(*bounds.T))))
         boxes.append(
             " to ".join(str(corner.round(2).tolist()) for corner in (corners.min(axis=0), corners.max(axis=0)))
         )
@@ -200,9 +210,7 @@ def check_overlap(
     )
 
 
-def _shares(
-    solids: Solids, points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "n s"], Float[np.ndarray, " n"]]:
+def _shares(solids: Solids, points: Points) -> tuple[SegmentShares, Values]:
     """Share of each segment in the motion of points, and their distance from the nearest segment, 0 inside.
 
     Outside the share falls with the fourth power of the distance, so that a surface does not tear where another
@@ -236,9 +244,7 @@ def carry(placed: Placed, registration: Registration) -> Carried:
     return Carried(placed.name, content.at(points, rotations), inside, farthest, placed.note)
 
 
-def moved(
-    registration: Registration, points: Float[np.ndarray, "n 3"], shares: Float[np.ndarray, "n s"]
-) -> Float[np.ndarray, "n 3"]:
+def moved(registration: Registration, points: Points, shares: SegmentShares) -> Points:
     """Move points at rest, which go along with segments by ``shares``, to where the registered object is."""
     result = np.zeros_like(points)
     for index, share in enumerate(shares.T):
@@ -249,9 +255,7 @@ def moved(
     return result
 
 
-def local_rotations(
-    registration: Registration, points: Float[np.ndarray, "n 3"], shares: Float[np.ndarray, "n s"]
-) -> Float[np.ndarray, "n 3 3"]:
+def local_rotations(registration: Registration, points: Points, shares: SegmentShares) -> Matrices:
     """Return the rotation of the surroundings of points at rest: the polar factor of the map's Jacobian."""
     step = 1e-3 * registration.model.half
     columns = [
@@ -283,7 +287,7 @@ QUERIES_AT_ONCE = 2000
 
 CELLS_AT_ONCE, POINTS_AT_ONCE = 1024, 500_000
 
-CUBE = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
+CUBE = np.indices((2, 2, 2)).reshape(3, 8).T
 
 
 def resampled(source: Volume, registration: Registration, name: str = "", most: int = 16_000_000) -> CarriedVolume:
@@ -325,7 +329,7 @@ class _Fill:
     registration: Registration
     interpolation: Interpolation
     margin: float
-    origin: Float[np.ndarray, "3"]
+    origin: Vector
     spacing: float
     background: float | int
     values: Shaped[np.ndarray, "x y z"]
@@ -346,11 +350,11 @@ class _Fill:
         values = np.full(cell * cells, background, dtype=source.values.dtype)
         return cls(source, registration, interpolation, margin, origin, spacing, background, values)
 
-    def at(self, index: Shaped[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    def at(self, index: Shaped[np.ndarray, "*n 3"]) -> PointArray:
         """Positions of voxel indices, which may have fractions."""
         return self.origin + self.spacing * index
 
-    def at_rows(self, rows: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+    def at_rows(self, rows: Indices) -> Points:
         """Positions of voxels by their rows in the flattened grid."""
         return self.at(np.stack(np.unravel_index(rows, self.values.shape), axis=1))
 
@@ -391,7 +395,7 @@ class _Fill:
             held += int(inside_[self._put(left[part], index)].sum())
         return held
 
-    def _put(self, rows: Int[np.ndarray, " n"], index: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " m"]:
+    def _put(self, rows: Indices, index: Points) -> Int[np.ndarray, " m"]:
         """Fill voxels with the source's values at indices with fractions; returns those that it holds."""
         source, held = self.source.values, self.source.holds(index)
         if self.interpolation == "nearest":
@@ -406,7 +410,7 @@ class _Fill:
 
     def _corners(
         self, cells: Int[np.ndarray, "n 3"], side: int, label: int
-    ) -> tuple[Float[np.ndarray, "n 8 3"], Bool[np.ndarray, " n"]]:
+    ) -> tuple[Float[np.ndarray, "n 8 3"], Flags]:
         """Indices in the source of cells' corners, and whether they may be interpolated, by the cells' centres."""
         shape = [n // side + 1 for n in self.values.shape]
         nodes, row = np.unique(_flat(cells[:, None] + CUBE, shape), return_inverse=True)
@@ -415,7 +419,7 @@ class _Fill:
         centers = self._source_index(self.at(side * (cells + 0.5)), label)
         return corners, np.linalg.norm(corners.mean(axis=1) - centers, axis=1) <= TOLERANCE
 
-    def _source_index(self, points: Float[np.ndarray, "n 3"], label: int) -> Float[np.ndarray, "n 3"]:
+    def _source_index(self, points: Points, label: int) -> Points:
         """Voxel indices, with fractions, of where points that move along with a segment were at rest."""
         rest, labels = np.empty_like(points), np.full(len(points), label, dtype=np.uint8)
         for part in _parts(len(points), QUERIES_AT_ONCE):

@@ -12,7 +12,7 @@ from typing import Any, Literal
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.special import chdtri, ndtr
 
@@ -22,7 +22,7 @@ from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.uncertainty import LEVEL, WITHIN
 from mereo.geometry.brief import as_exact_as
-from mereo.geometry.transforms import fit_rigid, transform_points
+from mereo.geometry.transforms import Indices, fit_rigid, transform_points
 from mereo.scenes.scene import AssetUnavailable, Scene
 
 SHOWN = {"rad": (180 / np.pi, "°"), "m": (1000.0, " mm"), "": (1.0, " units")}
@@ -109,7 +109,7 @@ def _measured(registration: Registration, scene: Scene | None) -> dict[str, Join
 
 
 def _fit_shares(
-    registration: Registration, motion: RandomMotion, leaders: Sequence[str], rows: Int[np.ndarray, " n"]
+    registration: Registration, motion: RandomMotion, leaders: Sequence[str], rows: Indices
 ) -> OptimizeResult:
     """Numbers of the joints that bring the object's points at rest nearest to the registered ones.
 
@@ -136,9 +136,7 @@ def _fit_shares(
     return min(fits, key=lambda fit: float(fit.cost))
 
 
-def _reach(
-    registration: Registration, fit: OptimizeResult, rows: Int[np.ndarray, " n"]
-) -> Float[np.ndarray, " j"] | None:
+def _reach(registration: Registration, fit: OptimizeResult, rows: Indices) -> Float[np.ndarray, " j"] | None:
     """How far off shares may be with probability 0.95; None where the uncertainty of the points is not known.
 
     The parts are those of a radius (``RadiusParts``), without what each point has in addition: it averages out.

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from mereo.fitting.draws.playback import Drawn, material_moved, shares_of
@@ -22,7 +22,7 @@ from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import CURE, other_mesh
 from mereo.fitting.registration.registration import BELIEVED, Method, Registration
 from mereo.geometry.conventions import CloudAxes
-from mereo.geometry.transforms import fit_rigid, is_rigid, transform_points
+from mereo.geometry.transforms import Rows, Transform, fit_rigid, is_rigid, transform_points
 from mereo.io.atomic_files import write_json
 from mereo.io.errors import first_problem
 from mereo.scenes.draw_recorder import SMOOTH
@@ -158,7 +158,7 @@ def state_of(
     weights: str = "",
     frame: CloudAxes = "camera",
     unit_m: float | None = None,
-    T_camera_input: Float[np.ndarray, "4 4"] | None = None,
+    T_camera_input: Transform | None = None,
 ) -> RegistrationState:
     """Make the state of a registration.
 
@@ -295,5 +295,5 @@ def _witnesses(model: StatisticalModel) -> Int[np.ndarray, " w"]:
     return np.linspace(0, len(model.mean) - 1, WITNESSES).astype(np.int64)
 
 
-def _rows(values: Float[np.ndarray, "n c"]) -> tuple[tuple[float, ...], ...]:
+def _rows(values: Rows) -> tuple[tuple[float, ...], ...]:
     return tuple(map(tuple, values.tolist()))

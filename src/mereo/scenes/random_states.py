@@ -32,6 +32,15 @@ from mereo.scenes.statistical_model import (
     statistical_model_bytes,
 )
 
+Nodes = Float[np.ndarray, "j 3"]
+"""Positions of the interior nodes, in rows."""
+
+NodeLabels = UInt8[np.ndarray, " j"]
+"""Label of the segment of each."""
+
+StatePoints = Float32[np.ndarray, "n m 3"]
+"""Material points in each random state."""
+
 STATES = 1500
 STATES_SEED = 500_000
 """A training seed: no test view shares its states."""
@@ -45,7 +54,7 @@ NODES = 600
 CANDIDATES = 40_000
 
 
-def interior_nodes(rest: SegmentedMesh) -> tuple[Float[np.ndarray, "j 3"], UInt8[np.ndarray, " j"]]:
+def interior_nodes(rest: SegmentedMesh) -> tuple[Nodes, NodeLabels]:
     """Points inside the segments, evenly spread, as many for each segment, and their labels."""
     rng = np.random.default_rng(0)
     low, high = rest.bounds
@@ -61,21 +70,19 @@ def interior_nodes(rest: SegmentedMesh) -> tuple[Float[np.ndarray, "j 3"], UInt8
     return points[chosen], labels[chosen]
 
 
-def state_points(
-    state: State, nodes: Float[np.ndarray, "j 3"], labels: UInt8[np.ndarray, " j"]
-) -> Float[np.ndarray, "m 3"]:
+def state_points(state: State, nodes: Nodes, labels: NodeLabels) -> Float[np.ndarray, "m 3"]:
     """Positions to which a state has moved all material points, in the scene's frame."""
     return material_points(state.mesh, moved_by(nodes, labels - 1, state.deformations))
 
 
 def sample_states(
     scene: Scene,
-    nodes: Float[np.ndarray, "j 3"],
-    labels: UInt8[np.ndarray, " j"],
+    nodes: Nodes,
+    labels: NodeLabels,
     count: int,
     seed: int,
     quiet: bool = True,
-) -> Float32[np.ndarray, "n m 3"]:
+) -> StatePoints:
     """Material points of random states; state i comes from (seed, i). Progress is shown unless ``quiet``."""
     return np.stack(
         [
@@ -117,10 +124,10 @@ WIDER = 2.0
 
 def elastic_model(
     rest: SegmentedMesh,
-    nodes: Float[np.ndarray, "j 3"],
-    node_labels: UInt8[np.ndarray, " j"],
+    nodes: Nodes,
+    node_labels: NodeLabels,
     solid: ElasticSampler,
-    states: Float32[np.ndarray, "n m 3"],
+    states: StatePoints,
     count: int,
 ) -> StatisticalModel:
     """Statistical model of an elastic solid: the rest pose, its modes, and ``count`` normal draws as the library.
@@ -166,9 +173,9 @@ MOST_MODES = 160
 
 def build_model(
     rest: SegmentedMesh,
-    nodes: Float[np.ndarray, "j 3"],
-    node_labels: UInt8[np.ndarray, " j"],
-    states: Float32[np.ndarray, "n m 3"],
+    nodes: Nodes,
+    node_labels: NodeLabels,
+    states: StatePoints,
     most: int = MOST_MODES,
 ) -> StatisticalModel:
     """Statistical model of random or recorded states.
@@ -199,7 +206,7 @@ def build_model(
 
 
 def _aligned(
-    rest: Float[np.ndarray, "m 3"], states: Float32[np.ndarray, "n m 3"]
+    rest: Float[np.ndarray, "m 3"], states: StatePoints
 ) -> tuple[Float[np.ndarray, "m 3"], Float32[np.ndarray, "n c"]]:
     """The mean, turned as the rest pose, and the aligned states' differences from it."""
     few = spread(rest, PROCRUSTES_POINTS)

@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Deformation
 from mereo.deformation.tetrahedral import Surface, SurfaceMap, Tetrahedra, TetrahedralMap
-from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.transforms import Points, Vector, longest_side
+from mereo.geometry.mesh import Elements, Segment, SegmentedMesh, Vertices
+from mereo.geometry.transforms import AnyPoints, Points, Vector, longest_side
 from mereo.io.simulation_states import SurfaceRecord, TetrahedralRecord, read_states
 from mereo.scenes.scene import Scene, Workspace
 
@@ -132,7 +132,7 @@ class TetrahedralFrames:
         return (TetrahedralMap(self.mesh, self.nodes(frame)),) * self.segments
 
 
-def tetrahedra_around(path: Path, nodes: Points, elements: Int[np.ndarray, "m 4"], rest: SegmentedMesh) -> Tetrahedra:
+def tetrahedra_around(path: Path, nodes: Points, elements: Elements, rest: SegmentedMesh) -> Tetrahedra:
     """Tetrahedra of a file around an object, both in scene units.
 
     Raises ``ValueError`` naming the file for tetrahedra that are none, and for a mesh far from ``rest``.
@@ -187,7 +187,7 @@ class SurfaceFrames:
         """Number of frames."""
         return len(self.vertices[0])
 
-    def positions(self, segment: int, frame: int) -> Float[np.ndarray, "_ 3"]:
+    def positions(self, segment: int, frame: int) -> AnyPoints:
         """Vertices of one segment in scene units."""
         return self.vertices[segment][frame].astype(np.float64) * self.scale + self.shift
 
@@ -248,7 +248,7 @@ def _order(
     return np.asarray(nearest, dtype=np.int64)
 
 
-def _check_order(path: Path, segment: Segment, vertices: Float[np.ndarray, "v 3"]) -> None:
+def _check_order(path: Path, segment: Segment, vertices: Vertices) -> None:
     """Refuse vertices whose neighbours are far apart: the order is another mesh's, or the unit another one."""
     edges = segment.faces[:, [0, 1]]
     before, after = (np.linalg.norm(v[edges[:, 0]] - v[edges[:, 1]], axis=1) for v in (segment.vertices, vertices))

@@ -6,13 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from mereo.deformation.maps import Deformation
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.conventions import WorkspaceName
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.transforms import Transform, Vector, look_at, rotation_along
+from mereo.geometry.transforms import AnyPoints, Transform, Vector, look_at, rotation_along
 from mereo.io.config import Space
 from mereo.scenes.seeds import TEST_SEED_START
 
@@ -186,7 +185,7 @@ class Scene:
 
     def deform(self, deformations: tuple[Deformation, ...]) -> State:
         """State made by one deformation per segment; vertices shared by a common map are moved in one call."""
-        moved: list[Float[np.ndarray, "_ 3"]] = [np.empty((0, 3))] * len(deformations)
+        moved: list[AnyPoints] = [np.empty((0, 3))] * len(deformations)
         for shared in {id(each): each for each in deformations}.values():
             members = [index for index, each in enumerate(deformations) if each is shared]
             parts = [self.rest.segments[index].vertices for index in members]

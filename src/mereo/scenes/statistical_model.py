@@ -19,14 +19,20 @@ from scipy.special import ndtri
 
 from mereo.deformation.moving_least_squares import ANCHORS, Anchors, PointWeights, spread
 from mereo.geometry.brief import counted, listed
-from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.mesh import Faces, Segment, SegmentedMesh
 from mereo.geometry.symmetry import TOLERANCE, Symmetry, find_symmetries
-from mereo.geometry.transforms import Points, Transform, Vector, fit_rigid, transform_points
+from mereo.geometry.transforms import Labels, Points, Transform, Values, Vector, fit_rigid, transform_points
 from mereo.io.checked_tensors import Tensors, pack_tensors, read_content, unpack_tensors
 from mereo.io.errors import reason
 from mereo.io.object_storage import Place, write_whole
 from mereo.scenes.rest_pose import rest_frame
 from mereo.scenes.scene import SourceFrame
+
+MaterialPoints = Float[np.ndarray, "m 3"]
+"""Positions of the material points, in rows."""
+
+PerMode = Float[np.ndarray, " k"]
+"""A number for each mode."""
 
 # --- distances that all states keep -----------------------------------------------------------------------------------
 
@@ -65,7 +71,7 @@ class PairDistances:
 
 def kept_distances(
     tried: Int[np.ndarray, " v"],
-    mean: Float[np.ndarray, "m 3"],
+    mean: MaterialPoints,
     modes: Float32[np.ndarray, "m 3 k"],
     library: Float32[np.ndarray, "n k"],
     half: float,
@@ -139,7 +145,7 @@ class StatisticalModel:
     rest: SegmentedMesh
     nodes: Float[np.ndarray, "j 3"]
     node_labels: UInt8[np.ndarray, " j"]
-    mean: Float[np.ndarray, "m 3"]
+    mean: MaterialPoints
     modes: Float32[np.ndarray, "m 3 k"]
     library: Float32[np.ndarray, "n k"]
     residue: float
@@ -154,7 +160,7 @@ class StatisticalModel:
         return f"StatisticalModel({states}, residue {self.residue:.2g} units; {listed(self.rest.names)})"
 
     @cached_property
-    def rest_z(self) -> Float[np.ndarray, " k"]:
+    def rest_z(self) -> PerMode:
         """Coefficients nearest to the rest pose; those of the mean where that is none of the states."""
         return self.project(self.rest_points)[1] if self.rests else np.zeros(self.count)
 
@@ -175,7 +181,7 @@ class StatisticalModel:
         return self.modes.shape[2]
 
     @cached_property
-    def faces(self) -> Int[np.ndarray, "f 3"]:
+    def faces(self) -> Faces:
         """Faces of all segments, as indices of material points."""
         return self.rest.merged()[1].astype(np.int64)
 
@@ -191,11 +197,11 @@ class StatisticalModel:
         return np.concatenate([owner + 1, self.node_labels]).astype(np.uint8)
 
     @cached_property
-    def rest_points(self) -> Float[np.ndarray, "m 3"]:
+    def rest_points(self) -> MaterialPoints:
         """All material points at rest."""
         return material_points(self.rest, self.nodes)
 
-    def source_points(self, scene_unit: float) -> Float[np.ndarray, "m 3"]:
+    def source_points(self, scene_unit: float) -> MaterialPoints:
         """Material points at rest in the frame of the object's own files, in a unit of which a scene unit has some."""
         if self.source_frame is None:
             return scene_unit * self.rest_points
@@ -242,31 +248,31 @@ class StatisticalModel:
         motion = self.library @ self.modes[self.sparse].reshape(3 * len(self.sparse), self.count).T
         return self.mean[self.sparse].astype(np.float32) + motion.reshape(len(self.library), -1, 3)
 
-    def around(self, mean: Float[np.ndarray, "m 3"], modes: Float32[np.ndarray, "m 3 d"]) -> "StatisticalModel":
+    def around(self, mean: MaterialPoints, modes: Float32[np.ndarray, "m 3 d"]) -> "StatisticalModel":
         """Another linear model of the same object, without kept distances; what depends on rest alone is shared."""
         library = np.zeros((0, modes.shape[2]), dtype=np.float32)
         other = replace(self, mean=mean, modes=modes, library=library, pairs=PairDistances.none())
         vars(other).update({name: getattr(self, name) for name in OF_REST})
         return other
 
-    def material(self, z: Float[np.ndarray, " k"]) -> Float[np.ndarray, "m 3"]:
+    def material(self, z: PerMode) -> MaterialPoints:
         """Positions of all material points, unposed."""
         return self.mean + (self.modes.reshape(3 * len(self.modes), self.count) @ z.astype(np.float32)).reshape(-1, 3)
 
     @cached_property
-    def motion(self) -> Float[np.ndarray, " k"]:
+    def motion(self) -> PerMode:
         """Root mean square motion of the material points for one standard deviation of each mode."""
         squared: np.ndarray = np.einsum("mck,mck->k", self.modes, self.modes, dtype=np.float64)
         return np.sqrt(squared / len(self.modes))
 
     @cached_property
-    def explained(self) -> Float[np.ndarray, " k"]:
+    def explained(self) -> PerMode:
         """Share of the states' variance that the first 1 ... k modes explain together."""
         variance = np.cumsum(self.motion**2)
         return variance / (variance[-1] + self.residue**2) if self.count else variance
 
     @cached_property
-    def residues(self) -> Float[np.ndarray, " n"]:
+    def residues(self) -> Values:
         """Root mean square distance of a state that the model has not seen, by its first 0 ... k modes."""
         left = np.concatenate([np.cumsum(self.motion[::-1] ** 2)[::-1], [0.0]])
         return np.sqrt(left + self.residue**2)
@@ -275,7 +281,7 @@ class StatisticalModel:
         """Fewest modes that leave no more than this root mean square distance; None where all leave more."""
         return next(iter(np.flatnonzero(self.residues <= residue).tolist()), None)
 
-    def beyond(self, z: Float[np.ndarray, " k"]) -> float:
+    def beyond(self, z: PerMode) -> float:
         """How far a state lies outside the range of the library's states: root mean square of the material points.
 
         A coefficient that any state of the library reaches is within; lengths are scene units.
@@ -285,12 +291,12 @@ class StatisticalModel:
         return float(np.sqrt((excess**2).sum()))
 
     @cached_property
-    def _squares(self) -> Float[np.ndarray, " n"]:
+    def _squares(self) -> Values:
         """Logarithms of the library's mean squared coefficients, in order."""
         squares = (self.library.astype(np.float64) ** 2).mean(axis=1)
         return np.log(np.sort(np.maximum(squares, np.finfo(float).tiny)))
 
-    def unusual(self, z: Float[np.ndarray, " k"]) -> float:
+    def unusual(self, z: PerMode) -> float:
         """How improbable a state is that is bent so far, in standard deviations: by the library's states bent farther.
 
         A normal number is as rarely as large. Beyond all of the library, it goes on as from its median to its largest.
@@ -301,16 +307,16 @@ class StatisticalModel:
         far = (level - middle) / max(levels[-1] - middle, np.finfo(float).eps)
         return float(within * max(far, 1.0))
 
-    def mesh(self, material: Float[np.ndarray, "m 3"]) -> SegmentedMesh:
+    def mesh(self, material: MaterialPoints) -> SegmentedMesh:
         """The segments, with the rest mesh's faces, at these positions."""
         ends = np.cumsum(self.vertex_counts)
         return self.rest.with_vertices(np.split(material[: ends[-1]].astype(np.float64), ends[:-1]))
 
-    def weights(self, points: Points, labels: UInt8[np.ndarray, " n"]) -> PointWeights:
+    def weights(self, points: Points, labels: Labels) -> PointWeights:
         """Weights by which points at rest, of the segments ``labels`` (1 or more), follow the material points."""
         return following(self.rest_anchors, points, labels)
 
-    def project(self, material: Float[np.ndarray, "m 3"]) -> tuple[Transform, Float[np.ndarray, " k"]]:
+    def project(self, material: MaterialPoints) -> tuple[Transform, PerMode]:
         """Pose and coefficients of a state: ``T_state_model`` and z of (nearly) least squared distance."""
         flat = self.modes.reshape(3 * len(self.modes), self.count).astype(np.float64)
         normal = flat.T @ flat + 1e-9 * np.trace(flat.T @ flat) * np.eye(self.count)
@@ -322,12 +328,12 @@ class StatisticalModel:
         return fit_rigid(self.mean + (flat @ z).reshape(-1, 3), material), z
 
 
-def material_points(mesh: SegmentedMesh, nodes: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "m 3"]:
+def material_points(mesh: SegmentedMesh, nodes: Float[np.ndarray, "j 3"]) -> MaterialPoints:
     """Vertices of all segments, then the nodes."""
     return np.concatenate([*(segment.vertices for segment in mesh.segments), nodes])
 
 
-def following(anchors: tuple[Anchors, ...], points: Points, labels: UInt8[np.ndarray, " n"]) -> PointWeights:
+def following(anchors: tuple[Anchors, ...], points: Points, labels: Labels) -> PointWeights:
     """Weights of points by the anchors of their own segments."""
     width = max((min(len(a.index), 32) for a in anchors), default=1)
     index = np.zeros((len(points), width), dtype=np.int64)

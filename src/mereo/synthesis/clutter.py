@@ -7,10 +7,10 @@ Occluders are solid bodies with a depth of their own (sources in docs/design/000
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Int
 
 from mereo.geometry.solids import Hits, Solids, toward
-from mereo.geometry.transforms import Points, Vector
+from mereo.geometry.transforms import Labels, Matrix, Points, Values, Vector
 from mereo.synthesis.config import Occluder, SensorConfig
 
 NOTHING, OBJECT, OCCLUDER, BACKGROUND = range(4)
@@ -37,12 +37,12 @@ class Capsule:
         share = np.clip((place - self.start) @ axis / max(float(axis @ axis), 1e-300), 0.0, 1.0)
         return rows[hit], Hits(distance[hit], place - (self.start + share[:, None] * axis))  # from the axis outwards
 
-    def _end_hit(self, center: Vector, rays: Points) -> Float[np.ndarray, " n"]:
+    def _end_hit(self, center: Vector, rays: Points) -> Values:
         """Entry into the ball around one end: the smaller root of |t ray - center| = radius."""
         a, b, c = np.einsum("ij,ij->i", rays, rays), rays @ center, center @ center - self.radius**2
         return _entry(a, b, np.full(len(rays), c))
 
-    def _side_hit(self, rays: Points) -> Float[np.ndarray, " n"]:
+    def _side_hit(self, rays: Points) -> Values:
         """Entry through the cylinder's side: the same equation for the parts perpendicular to the axis."""
         axis = self.end - self.start
         length = float(np.linalg.norm(axis))
@@ -58,9 +58,7 @@ class Capsule:
         return np.where((place >= 0) & (place <= length), distance, np.inf)
 
 
-def _entry(
-    a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"], c: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, " n"]:
+def _entry(a: Values, b: Values, c: Values) -> Values:
     """The smaller root of a t^2 - 2 b t + c = 0 where it is positive, else infinity."""
     discriminant = b * b - a * c
     root = (b - np.sqrt(np.maximum(discriminant, 0.0))) / np.maximum(a, 1e-300)
@@ -88,7 +86,7 @@ class Surroundings:
     occluders: tuple[Capsule, ...] = ()
     background: Backdrop | None = None
 
-    def join(self, hits: Hits, directions: Points) -> tuple[Hits, UInt8[np.ndarray, " n"]]:
+    def join(self, hits: Hits, directions: Points) -> tuple[Hits, Labels]:
         """First hits of rays among object and surroundings, and what is hit; ``hits`` are those of the object alone."""
         first = Hits(hits.distance.copy(), hits.normal.copy())
         source = np.where(np.isfinite(hits.distance), OBJECT, NOTHING).astype(np.uint8)
@@ -102,7 +100,7 @@ class Surroundings:
 def sample_surroundings(
     sensor: SensorConfig,
     solids: Solids,
-    seen: Float[np.ndarray, "m 3"],
+    seen: Points,
     reach: float,
     streams: dict[str, np.random.Generator],
 ) -> Surroundings:
@@ -121,7 +119,7 @@ def sample_surroundings(
 
 
 def sample_occluder(
-    kind: Occluder, seen: Float[np.ndarray, "m 3"], reach: float, unit: float, rng: np.random.Generator
+    kind: Occluder, seen: Points, reach: float, unit: float, rng: np.random.Generator
 ) -> tuple[Capsule, ...]:
     """Random occluder of a kind in front of an object; "none" is nothing.
 
@@ -150,9 +148,7 @@ def _polar(radius: float, angle_rad: float) -> Vector:
     return np.array([radius * np.cos(angle_rad), radius * np.sin(angle_rad), 1.0])
 
 
-def _approach(
-    seen: Float[np.ndarray, "m 3"], reach: float, unit: float, rng: np.random.Generator
-) -> tuple[Vector, Vector]:
+def _approach(seen: Points, reach: float, unit: float, rng: np.random.Generator) -> tuple[Vector, Vector]:
     """A tip up to 3 cm before a visible point, and the way out: a point nearer to the camera, outside the image."""
     target = seen[rng.integers(len(seen))]
     tip = target * max(1 - rng.uniform(0.002, 0.03) * unit / target[2], 0.5)
@@ -160,7 +156,7 @@ def _approach(
     return tip, out
 
 
-def _sample_tool(seen: Float[np.ndarray, "m 3"], reach: float, unit: float, rng: np.random.Generator) -> list[Capsule]:
+def _sample_tool(seen: Points, reach: float, unit: float, rng: np.random.Generator) -> list[Capsule]:
     """Random straight shaft that ends in two jaws, as laparoscopic instruments have: 5 to 12 mm thick."""
     tip, out = _approach(seen, reach, unit, rng)
     radius, jaw, opening = rng.uniform(0.0025, 0.006) * unit, 0.018 * unit, rng.uniform(0.05, 0.4)
@@ -176,7 +172,7 @@ _FINGERS = ((-0.030, 0.90), (-0.010, 1.0), (0.010, 0.93), (0.030, 0.75))
 """Index to little finger: place of the knuckle across the palm in metres, length relative to the middle finger."""
 
 
-def _sample_hand(seen: Float[np.ndarray, "m 3"], reach: float, unit: float, rng: np.random.Generator) -> list[Capsule]:
+def _sample_hand(seen: Points, reach: float, unit: float, rng: np.random.Generator) -> list[Capsule]:
     """Random left or right hand with forearm, as capsules, that reaches up to 7 cm past the point it is sent to.
 
     An adult's: about 18 cm long, 8 cm wide, with 10 % of variation. Fingers bend away from the camera by random angles.
@@ -205,7 +201,7 @@ def _sample_hand(seen: Float[np.ndarray, "m 3"], reach: float, unit: float, rng:
     return [*parts, part(np.array([-0.015, 0.0, 0]), base, 0.014), part(base, thumb, 0.01)]
 
 
-def _hand_frame(tip: Vector, out: Vector, rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
+def _hand_frame(tip: Vector, out: Vector, rng: np.random.Generator) -> Matrix:
     """Rows: across the palm, along the fingers, away from the camera; rolled by up to 45 degrees."""
     along = (tip - out) / np.linalg.norm(tip - out)
     away = tip - (tip @ along) * along

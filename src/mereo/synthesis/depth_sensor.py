@@ -17,9 +17,18 @@ from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Hits, Solids
-from mereo.geometry.transforms import Points, unit_rows
+from mereo.geometry.transforms import Labels, Points, Values, unit_rows
 from mereo.synthesis.clutter import NOTHING, OBJECT, Surroundings, sample_surroundings
 from mereo.synthesis.config import SENSOR_TERMS, SensorConfig, SensorModel
+
+Numbers = Float[np.ndarray, "*n"]
+"""Numbers in any shape, which the whole signature has."""
+
+PixelValues = Float[np.ndarray, "h w"]
+"""A number for each pixel."""
+
+PixelMask = Bool[np.ndarray, "h w"]
+"""Whether each pixel is meant."""
 
 STEEPEST_RAD = float(np.deg2rad(80.0))
 """Largest angle of the noise formulas, which have a pole at 90 degrees: steeper surfaces count as seen at this one."""
@@ -42,7 +51,7 @@ class SimulatedView:
     """
 
     whole: DepthImage
-    mask: Bool[np.ndarray, "h w"]
+    mask: PixelMask
     source: UInt8[np.ndarray, "h w"]
 
     @property
@@ -101,7 +110,7 @@ def _look(
     sensor: SensorConfig,
     streams: dict[str, np.random.Generator],
     around: Surroundings | None,
-) -> tuple[Hits, UInt8[np.ndarray, " n"]]:
+) -> tuple[Hits, Labels]:
     """What each pixel's ray meets, with the surroundings and lateral noise."""
     directions = camera.directions().reshape(-1, 3)
     hits = solids.first_hit(directions)
@@ -121,7 +130,7 @@ def _look(
     return around.join(solids.first_hit(moved), moved)
 
 
-def _incidence(hits: Hits, directions: Points) -> Float[np.ndarray, " n"]:
+def _incidence(hits: Hits, directions: Points) -> Values:
     """Angle between ray and surface normal in radians, from 0 to pi / 2; 0 where nothing is hit."""
     along = np.abs(np.einsum("ij,ij->i", hits.normal, directions))
     squared = np.einsum("ij,ij->i", hits.normal, hits.normal) * np.einsum("ij,ij->i", directions, directions)
@@ -129,9 +138,7 @@ def _incidence(hits: Hits, directions: Points) -> Float[np.ndarray, " n"]:
     return np.arccos(np.where(squared > 0, np.minimum(cosine, 1.0), 1.0))
 
 
-def lateral_std(
-    z_m: Float[np.ndarray, "*n"], angle_rad: Float[np.ndarray, "*n"], model: SensorModel = "structured-light"
-) -> Float[np.ndarray, "*n"]:
+def lateral_std(z_m: Numbers, angle_rad: Numbers, model: SensorModel = "structured-light") -> Numbers:
     """Standard deviation of where a pixel looks, as a slope x/z.
 
     Structured light: 0.8 + 0.035 a / (pi/2 - a) pixels of the Kinect. Time of flight: 1.6 mm at any depth.
@@ -145,9 +152,7 @@ def lateral_std(
 # --- depth ------------------------------------------------------------------------------------------------------------
 
 
-def axial_std_m(
-    z_m: Float[np.ndarray, "*n"], angle_rad: Float[np.ndarray, "*n"], model: SensorModel = "structured-light"
-) -> Float[np.ndarray, "*n"]:
+def axial_std_m(z_m: Numbers, angle_rad: Numbers, model: SensorModel = "structured-light") -> Numbers:
     """Standard deviation of the depth in metres, at distance z and angle a.
 
     Structured light: 0.0012 + 0.0019 (z - 0.4)^2 + 0.0001 z^-1/2 a^2 / (pi/2 - a)^2; its source adds the last term
@@ -162,8 +167,8 @@ def axial_std_m(
 
 
 def add_axial_noise(
-    depth: Float[np.ndarray, "h w"], angle_rad: Float[np.ndarray, "h w"], sensor: SensorConfig, rng: np.random.Generator
-) -> Float[np.ndarray, "h w"]:
+    depth: PixelValues, angle_rad: PixelValues, sensor: SensorConfig, rng: np.random.Generator
+) -> PixelValues:
     """Depth with Gaussian noise of ``axial_std_m`` on every measured pixel; misses (0) stay misses."""
     if sensor.axial == 0:
         return depth
@@ -175,7 +180,7 @@ def add_axial_noise(
     return noisy
 
 
-def quantize(z_m: Float[np.ndarray, "*n"], strength: float) -> Float[np.ndarray, "*n"]:
+def quantize(z_m: Numbers, strength: float) -> Numbers:
     """Depth of the nearest whole disparity: z -> D / round(D / z), D = 351.3 m / ``strength``; 0 stays 0.
 
     A triangulating camera measures disparity in steps (an eighth of a pixel in the Kinect), so depth has steps of about
@@ -186,9 +191,7 @@ def quantize(z_m: Float[np.ndarray, "*n"], strength: float) -> Float[np.ndarray,
     return np.where(z_m > 0, disparity / steps, 0.0)
 
 
-def mix_edges(
-    depth: Float[np.ndarray, "h w"], focal_px: float, probability: float, rng: np.random.Generator
-) -> Float[np.ndarray, "h w"]:
+def mix_edges(depth: PixelValues, focal_px: float, probability: float, rng: np.random.Generator) -> PixelValues:
     """Depth with flying pixels: at edges, with this probability, a depth between the pixel's own and its neighbour's.
 
     A pixel whose footprint covers both sides of an edge returns a mixture. How much of each depends on both surfaces'
@@ -209,7 +212,7 @@ def mix_edges(
 # --- missing pixels, mask ---------------------------------------------------------------------------------------------
 
 
-def dropout_probability(angle_rad: Float[np.ndarray, "*n"], strength: float) -> Float[np.ndarray, "*n"]:
+def dropout_probability(angle_rad: Numbers, strength: float) -> Numbers:
     """Probability that a pixel is missing: 0 up to 60 degrees of slant, then rising to ``strength`` at 90.
 
     Light from a matt surface falls with the cosine of the angle, and cameras give up on weak returns. The probability
@@ -219,12 +222,12 @@ def dropout_probability(angle_rad: Float[np.ndarray, "*n"], strength: float) -> 
 
 
 def sample_holes(
-    depth: Float[np.ndarray, "h w"],
-    seen: Bool[np.ndarray, "h w"],
+    depth: PixelValues,
+    seen: PixelMask,
     focal_px: float,
     sensor: SensorConfig,
     rng: np.random.Generator,
-) -> Bool[np.ndarray, "h w"]:
+) -> PixelMask:
     """Pixels in missing blobs, as mirroring and absorbing spots leave them.
 
     A Poisson number of ellipses at object pixels with gamma-distributed radii (shape 5).
@@ -244,9 +247,7 @@ def sample_holes(
     return holes
 
 
-def sample_mask(
-    seen: Bool[np.ndarray, "h w"], sensor: SensorConfig, streams: dict[str, np.random.Generator]
-) -> Bool[np.ndarray, "h w"]:
+def sample_mask(seen: PixelMask, sensor: SensorConfig, streams: dict[str, np.random.Generator]) -> PixelMask:
     """Mask of the object as a segmentation gives it: shifted, its edge too far out here and too far in there.
 
     The signed distance to the true edge is compared with a smooth random offset, so that neighbouring parts of the edge

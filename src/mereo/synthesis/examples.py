@@ -11,7 +11,7 @@ evaluation and reconstruction look into, which know the camera's axes only.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 
 from mereo.deformation.maps import Deformation, invert
 from mereo.geometry.camera import Camera, DepthImage
@@ -20,13 +20,26 @@ from mereo.geometry.downsampling import farthest_point_order
 from mereo.geometry.mesh import SegmentedMesh, barycentric
 from mereo.geometry.solids import Nearest, Solids, signed_distance_and_direction
 from mereo.geometry.surface_patches import without_strays
-from mereo.geometry.transforms import Normalizer, Points, Transform, inverse_rigid, transform_points, unit_rows
+from mereo.geometry.transforms import (
+    AnyPoints,
+    Indices,
+    Matrices,
+    Normalizer,
+    Points,
+    Transform,
+    inverse_rigid,
+    transform_points,
+    unit_rows,
+)
 from mereo.scenes.rest_pose import rest_frame
 from mereo.scenes.scene import Scene
 from mereo.synthesis.clutter import OBJECT
 from mereo.synthesis.config import OBSERVATIONS, GenerateConfig, SensorConfig
 from mereo.synthesis.depth_sensor import observe
 from mereo.synthesis.query_sampling import Samples, sample_queries
+
+QueryPoints = Float[np.ndarray, "q 3"]
+"""Positions or vectors at the query points, in rows."""
 
 ATTEMPTS = 100
 """Number of views drawn before giving up on a scene."""
@@ -61,11 +74,11 @@ class LabelledPoints:
             not be inverted.
     """
 
-    positions: Float[np.ndarray, "q 3"]
+    positions: QueryPoints
     labels: UInt8[np.ndarray, " q"]
     distances: Float[np.ndarray, " q"]
-    directions: Float[np.ndarray, "q 3"]
-    rest: Float[np.ndarray, "q 3"]
+    directions: QueryPoints
+    rest: QueryPoints
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +95,7 @@ class Example:
     cloud: Float[np.ndarray, "p 3"]
     normalizer: Normalizer
     queries: LabelledPoints
-    observations: tuple[Float[np.ndarray, "_ 3"], ...] = ()
+    observations: tuple[AnyPoints, ...] = ()
 
 
 def synthesize(scene: Scene, settings: GenerateConfig, rng: np.random.Generator) -> Example:
@@ -146,7 +159,7 @@ def _labelled(scene: Scene, view: View, solids: Solids, samples: Samples, normal
     )
 
 
-def rest_coordinates(scene: Scene, view: View, samples: Samples, nearest: Nearest) -> Float[np.ndarray, "q 3"]:
+def rest_coordinates(scene: Scene, view: View, samples: Samples, nearest: Nearest) -> QueryPoints:
     """Rest coordinates of points inside segments, normalized by the joint rest box; NaN for the others."""
     inside = np.flatnonzero(samples.labels)
     world = transform_points(view.T_world_camera, samples.points[inside])
@@ -168,7 +181,7 @@ def _rest_guess(
     deformed: SegmentedMesh,
     points: Points,
     closest: Points,
-    face: Int[np.ndarray, " n"],
+    face: Indices,
 ) -> Points:
     """First guess of rest positions: the closest surface point's, and the offset from it turned as its triangle was.
 
@@ -182,7 +195,7 @@ def _rest_guess(
     return np.einsum("nk,nkj->nj", weights, old) + np.einsum("nij,nj->ni", _triangle_frames(old), local)
 
 
-def _triangle_frames(triangles: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
+def _triangle_frames(triangles: Float[np.ndarray, "n 3 3"]) -> Matrices:
     """Rotations whose columns are each triangle's first edge, its normal, and the direction across."""
     along = triangles[:, 1] - triangles[:, 0]
     normal = np.cross(along, triangles[:, 2] - triangles[:, 0])
@@ -200,7 +213,7 @@ def _triangle_frames(triangles: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray,
 UNCLEANED, BY_RULE = 0.1, 0.4
 """Probabilities that an observation keeps its strays and that it loses those that the rule finds; else it loses all."""
 
-Clouds = tuple[Float[np.ndarray, "_ 3"], ...]
+Clouds = tuple[AnyPoints, ...]
 
 
 def _further_observations(

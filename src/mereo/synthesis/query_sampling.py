@@ -12,10 +12,14 @@ from collections.abc import Callable
 from typing import NamedTuple, NoReturn, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
+from mereo.geometry.transforms import Flags, Labels, Values
 from mereo.synthesis.config import SamplingConfig
+
+Places = Float[np.ndarray, "n d"]
+"""Positions in rows, in space of any dimension."""
 
 # --- labels -----------------------------------------------------------------------------------------------------------
 
@@ -39,17 +43,17 @@ class Shape(Protocol):
     def boxes(self) -> Float[np.ndarray, "s 2 d"]:
         """Lower and upper corner of each segment's axis-aligned box."""
 
-    def label(self, points: Float[np.ndarray, "n d"]) -> UInt8[np.ndarray, " n"]:
+    def label(self, points: Places) -> Labels:
         """Label of each point: 0 in empty space, else index + 1 of the first segment that holds it."""
 
-    def inside(self, index: int, points: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
+    def inside(self, index: int, points: Places) -> Flags:
         """Whether each point lies in segment ``index``."""
 
-    def segment_distance(self, index: int, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+    def segment_distance(self, index: int, points: Places) -> Values:
         """Unsigned distance of each point to the surface of segment ``index``."""
 
 
-def owner_labels(shape: Shape, points: Float[np.ndarray, "n d"]) -> UInt8[np.ndarray, " n"]:
+def owner_labels(shape: Shape, points: Places) -> Labels:
     """Label of each point where solids may overlap, an organ inside an organ: the nearest surface's segment owns it.
 
     Only segments that hold the point compete. The nearest surface of all may belong to one that does not: just outside
@@ -80,12 +84,12 @@ _FIRST_BATCH, _LARGEST_BATCH = 8, 1 << 17
 class Samples(NamedTuple):
     """Query points with labels: segment by segment, inside before outside, then the uniform ones."""
 
-    points: Float[np.ndarray, "n d"]
-    labels: UInt8[np.ndarray, " n"]
+    points: Places
+    labels: Labels
 
 
 Boxes = Float[np.ndarray, "s 2 d"]
-Label = Callable[[Float[np.ndarray, "n d"]], UInt8[np.ndarray, " n"]]
+Label = Callable[[Places], Labels]
 
 
 def extended_boxes(shape: Shape, margin: float = 0.5) -> Boxes:
@@ -239,7 +243,7 @@ def _sort(
     return _join([(d, rows[_nearest_rows(shape, d.index, d.points[rows], keep)]) for d, rows in draws])
 
 
-def _nearest_rows(shape: Shape, index: int, points: Float[np.ndarray, "n d"], keep: int) -> np.ndarray:
+def _nearest_rows(shape: Shape, index: int, points: Places, keep: int) -> np.ndarray:
     """Rows of the ``keep`` points nearest to segment ``index``'s surface, in the order given; exact.
 
     Distances dominate data generation, so most are avoided: a point is no nearer to the surface than to its box, and a
@@ -268,7 +272,7 @@ def _nearest_rows(shape: Shape, index: int, points: Float[np.ndarray, "n d"], ke
     return np.sort(np.argpartition(distance, keep - 1)[:keep])
 
 
-def _keep_th(distance: Float[np.ndarray, " n"], keep: int) -> float:
+def _keep_th(distance: Values, keep: int) -> float:
     return float(np.partition(distance, keep - 1)[keep - 1])
 
 
@@ -277,6 +281,6 @@ def _join(sides: list[tuple[_Draws, np.ndarray]]) -> Samples:
     return Samples(np.concatenate(points), np.concatenate(labels))
 
 
-def _uniform(box: Float[np.ndarray, "2 d"], count: int, rng: np.random.Generator) -> Float[np.ndarray, "n d"]:
+def _uniform(box: Float[np.ndarray, "2 d"], count: int, rng: np.random.Generator) -> Places:
     low, high = box
     return low + rng.random((count, len(low))) * (high - low)

@@ -30,7 +30,7 @@ from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import Transform, Vector, inverse_rigid, unit_rows
+from mereo.geometry.transforms import Transform, Values, Vector, inverse_rigid, unit_rows
 from mereo.io.atomic_files import write_json
 from mereo.io.intrinsics import written_intrinsics
 from mereo.scenes.draw_recorder import SMOOTH, Key, OutOfDraws, Recorder
@@ -61,7 +61,7 @@ EXTREMES = (0.02, 0.98)
 """Shares at which a draw shows whether it is a switch."""
 
 
-def walk(scene: Scene, seed: int, times_s: Float[np.ndarray, " n"], change_s: float) -> list[Played]:
+def walk(scene: Scene, seed: int, times_s: Values, change_s: float) -> list[Played]:
     """States of a scene along the smooth walk of a seed, at times that rise from 0.
 
     In ``change_s`` a state becomes about an independent one. ``scene`` is as ``Scene.for_seed`` gives it. Raises
@@ -91,7 +91,7 @@ def walk(scene: Scene, seed: int, times_s: Float[np.ndarray, " n"], change_s: fl
     return states
 
 
-def process_weights(times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:
+def process_weights(times: Values) -> Float[np.ndarray, "n k"]:
     """Weights of independent normal nodes at times, in distances between nodes; their squares sum to 1.
 
     Cubic B-splines: twice continuously differentiable, and a node is forgotten two distances away.
@@ -146,7 +146,7 @@ class _Path:
     reach: float = 1.0
 
     @classmethod
-    def of(cls, scene: Scene, start: Played, seed: int, times: Float[np.ndarray, " n"]) -> "_Path":
+    def of(cls, scene: Scene, start: Played, seed: int, times: Values) -> "_Path":
         fixed = switches(scene, start)
         moving = [call.kind in SMOOTH and call.key not in fixed for call in start.calls]
         parts = [call.shares for call, moves in zip(start.calls, moving, strict=True) if moves]
@@ -242,7 +242,7 @@ def sequence(scene: Scene, settings: SequenceConfig, sensor: SensorConfig, seed:
 
 
 def _camera_aims(
-    workspace: Workspace, times: Float[np.ndarray, " n"], rng: np.random.Generator
+    workspace: Workspace, times: Values, rng: np.random.Generator
 ) -> list[Callable[[np.ndarray], np.ndarray]]:
     """Poses by what they aim at, on a smooth way near a random one; ``times`` are in units of the change."""
     weights = process_weights(times)

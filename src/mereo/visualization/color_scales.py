@@ -10,9 +10,10 @@ from scipy.spatial import cKDTree
 from mereo.geometry.brief import as_exact_as
 from mereo.geometry.mesh import Color, Segment, SegmentedMesh, vertex_normals
 from mereo.geometry.radii import STOPS, Radii, between_stops, describe_level
+from mereo.geometry.transforms import Points, Values
 from mereo.models.trained import Answer
 
-Ask = Callable[[Float[np.ndarray, "n 3"]], Answer]
+Ask = Callable[[Points], Answer]
 """Function that answers as a model does at points in the frame of the surfaces."""
 
 CONFIDENCE_STEP = 0.02
@@ -69,7 +70,7 @@ class ColorScale:
     stops: tuple[Color, ...]
     words: tuple[str, ...]
 
-    def colors(self, values: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
+    def colors(self, values: Values) -> UInt8[np.ndarray, "n 3"]:
         """Colours (red, green, blue) of numbers, linear between the stops; NaN is grey."""
         mixed = between_stops((values - self.low) / (self.high - self.low), self.stops)
         return np.where(np.isnan(values)[:, None], 128.0, mixed).round().astype(np.uint8)
@@ -129,7 +130,7 @@ def _confidence(segment: Segment, labels: list[int], ask: Ask, step: float) -> F
     return result
 
 
-def observed_distance(surfaces: SegmentedMesh, observed: Float[np.ndarray, "n 3"]) -> list[Float[np.ndarray, " _"]]:
+def observed_distance(surfaces: SegmentedMesh, observed: Points) -> list[Float[np.ndarray, " _"]]:
     """Distance from every vertex to the nearest observed point: what is far from all of them is a guess."""
     tree = cKDTree(observed)
     return [tree.query(s.vertices)[0] if len(s.vertices) else np.zeros(0) for s in surfaces.segments]

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from mereo.geometry.brief import rounded
 from mereo.geometry.camera import DepthImage
 from mereo.geometry.mesh import Color
+from mereo.geometry.transforms import Points
 from mereo.io.atomic_files import atomic_file
 from mereo.visualization.color_scales import viridis
 from mereo.visualization.renderer import Canvas, Viewpoint
@@ -128,7 +129,7 @@ def data_url(picture: Picture) -> str:
     return PNG_URL + base64.b64encode(content.getvalue()).decode("ascii")
 
 
-def cloud_picture(points: Float[np.ndarray, "n 3"], view: Viewpoint, size: tuple[int, int]) -> Picture:
+def cloud_picture(points: Points, view: Viewpoint, size: tuple[int, int]) -> Picture:
     """Picture of a point cloud coloured by depth, near is bright, on white."""
     canvas = Canvas.empty(view, size)
     if len(points):

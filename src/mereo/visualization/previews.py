@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.transforms import Corners, Points
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
@@ -62,7 +63,7 @@ def render_cloud_and_segments(
 
 
 def points_on_segments(
-    points: Float[np.ndarray, "n 3"], surfaces: SegmentedMesh, sides: Sequence[tuple[Vector, Vector]], size: int
+    points: Points, surfaces: SegmentedMesh, sides: Sequence[tuple[Vector, Vector]], size: int
 ) -> list[Picture]:
     """Pictures of the segments with the observed points on them as dark dots, one from each side.
 
@@ -83,7 +84,7 @@ def points_on_segments(
     return pictures
 
 
-def _joint_bounds(points: Float[np.ndarray, "n 3"], solid: SegmentedMesh) -> Float[np.ndarray, "2 3"]:
+def _joint_bounds(points: Points, solid: SegmentedMesh) -> Corners:
     joint = np.concatenate([points, *(segment.vertices for segment in solid.segments if len(segment.faces))])
     return np.stack([joint.min(axis=0), joint.max(axis=0)])
 

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8, UInt16
+from jaxtyping import Int, UInt8, UInt16
 from PIL import Image
 from scipy.spatial import cKDTree
 
@@ -30,9 +30,10 @@ from mereo.fitting.uncertainty import Explanation
 from mereo.geometry.brief import rounded
 from mereo.geometry.camera import DepthImage, PointCloud
 from mereo.geometry.downsampling import random_subset
-from mereo.geometry.mesh import Color, Segment, SegmentedMesh
+from mereo.geometry.mesh import Color, Faces, Segment, SegmentedMesh
 from mereo.geometry.radii import Radii, describe_level
 from mereo.geometry.subdivision import split_at_creases
+from mereo.geometry.transforms import Indices, Matrix, Points, Vector
 from mereo.io.atomic_files import atomic_file
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
 from mereo.visualization.color_scales import radius_scale
@@ -51,6 +52,9 @@ CLOUD_POINTS = 60_000
 """Most points of the cloud that the page shows."""
 
 STEPS = 65535
+
+Facts = Mapping[str, Any]
+"""Summary of a result, or a block of it; every key may be missing."""
 
 
 # --- written ----------------------------------------------------------------------------------------------------------
@@ -76,7 +80,7 @@ class Report:
     cloud: PointCloud
     surfaces: SegmentedMesh
     summary: dict[str, Any]
-    rotation: Float[np.ndarray, "3 3"] = field(default_factory=lambda: GLTF_CAMERA_ROTATION)
+    rotation: Matrix = field(default_factory=lambda: GLTF_CAMERA_ROTATION)
     unit: Unit = UNKNOWN
     registered: Registration | None = None
     depth: DepthImage | None = None
@@ -152,17 +156,13 @@ class Report:
         }
 
 
-def _joint_bounds(
-    points: Float[np.ndarray, "n 3"], surfaces: SegmentedMesh
-) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+def _joint_bounds(points: Points, surfaces: SegmentedMesh) -> tuple[Vector, Vector]:
     everything = np.concatenate([points, *(segment.vertices for segment in surfaces.segments)])
     low, high = everything.min(axis=0), everything.max(axis=0)
     return low, np.maximum(high, low + 1e-9 * max(1.0, float(np.abs(low).max())))
 
 
-def _quantize(
-    points: Float[np.ndarray, "n 3"], low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]
-) -> UInt16[np.ndarray, "n 3"]:
+def _quantize(points: Points, low: Vector, high: Vector) -> UInt16[np.ndarray, "n 3"]:
     return np.rint((points - low) / (high - low) * STEPS).astype("<u2")
 
 
@@ -189,13 +189,13 @@ def cluster(segment: Segment, cell: float) -> Segment:
     inverse = _same(np.floor((segment.vertices - segment.vertices.min(axis=0)) / cell).astype(np.int64))[1]
     count = np.bincount(inverse)
     sums = [np.bincount(inverse, weights=segment.vertices[:, axis], minlength=len(count)) for axis in range(3)]
-    faces: Int[np.ndarray, "f 3"] = inverse[segment.faces]
+    faces: Faces = inverse[segment.faces]
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     first = _same(np.sort(faces, axis=1))[0]
     return Segment(segment.name, segment.color, np.stack(sums, axis=1) / count[:, None], faces[np.sort(first)])
 
 
-def _same(rows: Int[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " n"]]:
+def _same(rows: Int[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Indices]:
     """First index of each different row, and for each row which one it is; packed, because sorting rows is slow."""
     base = int(rows.max(initial=0)) + 1
     packed = (rows[:, 0] * base + rows[:, 1]) * base + rows[:, 2]
@@ -219,15 +219,6 @@ VERDICTS: Mapping[Level, str] = {
 NOT_RECOGNIZED, NOT_SURE = 3, 4
 """Exit statuses of a command with an answer that is not the object, and with one that may not be."""
 
-STATUSES: Mapping[Level, int] = {
-    "yes": 0,
-    "doubt": NOT_SURE,
-    "no": NOT_RECOGNIZED,
-    "unchecked": NOT_SURE,
-    "alone": NOT_SURE,
-}
-"""Exit status of a command with such an answer: 0 is what can be relied on without looking."""
-
 
 @dataclass(frozen=True)
 class Trust:
@@ -246,11 +237,11 @@ class Trust:
 
     @property
     def status(self) -> int:
-        """Exit status of a command that ends with this answer."""
-        return STATUSES[self.level]
+        """Exit status of a command that ends with this answer: 0 is what can be relied on without looking."""
+        return {"yes": 0, "no": NOT_RECOGNIZED}.get(self.level, NOT_SURE)
 
 
-def trust(summary: Mapping[str, Any]) -> Trust:
+def trust(summary: Facts) -> Trust:
     """Verdict on the answer that a summary is of, which report, summary and exit status state; any key may be missing.
 
     Args:
@@ -276,7 +267,7 @@ def trust(summary: Mapping[str, Any]) -> Trust:
     return Trust("yes", f"the frame shows the object{model_explains}")
 
 
-def _block(summary: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+def _block(summary: Facts, key: str) -> Facts:
     value = summary.get(key)
     return value if isinstance(value, Mapping) else {}
 
@@ -312,7 +303,7 @@ def confidence_title(calibrated: bool) -> str:
     return "confidence" if calibrated else "confidence, not calibrated"
 
 
-def page_words(summary: Mapping[str, Any], unit: Unit) -> dict[str, Any]:
+def page_words(summary: Facts, unit: Unit) -> dict[str, Any]:
     """Texts of the page.
 
     Args:
@@ -338,7 +329,7 @@ def page_words(summary: Mapping[str, Any], unit: Unit) -> dict[str, Any]:
     }
 
 
-def _heads(summary: Mapping[str, Any], unit: Unit) -> list[str]:
+def _heads(summary: Facts, unit: Unit) -> list[str]:
     """Heads of the table; with radii of 95 % its centres and volumes say how sure they are."""
     sure = isinstance(summary.get("radius95"), Mapping)
     centre, volume = (", ± 95 %", ", 95 % range") if sure else ("", "")
@@ -349,7 +340,7 @@ def _heads(summary: Mapping[str, Any], unit: Unit) -> list[str]:
     return ["segment", *heads]
 
 
-def _facts(summary: Mapping[str, Any], unit: Unit, verdict: Trust) -> list[str]:
+def _facts(summary: Facts, unit: Unit, verdict: Trust) -> list[str]:
     """Where the answer comes from, how sure it is, and what it was made with."""
     registration, radius95 = summary.get("registration"), summary.get("radius95")
     facts = [_answer(registration, verdict)] if isinstance(registration, Mapping) else []
@@ -365,14 +356,14 @@ def _facts(summary: Mapping[str, Any], unit: Unit, verdict: Trust) -> list[str]:
     return facts
 
 
-def radius_words(radius95: Mapping[str, Any], unit: Unit) -> str:
+def radius_words(radius95: Facts, unit: Unit) -> str:
     """How far off the surface of a registered model may be, in the words of its ``radius95`` in a summary."""
     middle, most = (f"{rounded(radius95[key] * unit.length_factor)} {unit.length_name}" for key in ("median", "max"))
     level = describe_level(bool(radius95.get("calibrated")))
     return f"its points are within {middle} of their true places in the median, {most} where it is least sure ({level})"
 
 
-def _answer(registration: Mapping[str, Any], verdict: Trust) -> str:
+def _answer(registration: Facts, verdict: Trust) -> str:
     explained = _number(registration.get("explained"))
     if registration.get("answer") != "registration":
         return "the network's own answer"
@@ -383,7 +374,7 @@ def _answer(registration: Mapping[str, Any], verdict: Trust) -> str:
     return f"your model, {how}" + (share and f": it explains {share} of the points")
 
 
-def _warnings(summary: Mapping[str, Any], verdict: Trust) -> list[str]:
+def _warnings(summary: Facts, verdict: Trust) -> list[str]:
     """Sentences on what to do about a result that may not be what it seems; the verdict itself has said why."""
     warnings = [] if verdict.cure is None else [verdict.cure]
     warnings += [str(sentence) for sentence in _block(summary, "registration").get("symmetries") or ()]
@@ -392,7 +383,7 @@ def _warnings(summary: Mapping[str, Any], verdict: Trust) -> list[str]:
     return [text[0].upper() + text[1:] + ("" if text.endswith(".") else ".") for text in warnings]
 
 
-def _row(segment: Mapping[str, Any], unit: Unit) -> list[Any]:
+def _row(segment: Facts, unit: Unit) -> list[Any]:
     centre, volume = segment.get("centroid"), _number(segment.get("volume"))
     radius = _number(segment.get("centroid_radius95"))
     words = (
@@ -433,11 +424,10 @@ EVIDENCE = {
 
 def explain_centroids(registered: Registration) -> dict[str, Explanation]:
     """What decides the centroid of each segment; nothing of a registration that was read from a file."""
-    explanations = ((name, registered.explain(name)) for name in registered.model.rest.names)
-    return {name: explanation for name, explanation in explanations if explanation is not None}
+    return {name: each for name in registered.model.rest.names if (each := registered.explain(name)) is not None}
 
 
-def point_marks(explanation: Explanation, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
+def point_marks(explanation: Explanation, points: Points) -> UInt8[np.ndarray, " n"]:
     """A byte for each observed point: how much it decides a place, 0 to ``MOST``, or that it is ``UNEXPLAINED``.
 
     The weights are those of the fit's observed samples, which stand for the points around them.
@@ -543,9 +533,9 @@ PICTURE_PX = 300
 
 
 def result_html(
-    summary: Mapping[str, Any],
+    summary: Facts,
     lines: Sequence[str],
-    points: Float[np.ndarray, "n 3"],
+    points: Points,
     surfaces: SegmentedMesh,
     unit: Unit,
 ) -> str:
@@ -575,7 +565,7 @@ def result_html(
     )
 
 
-def _table(summary: Mapping[str, Any], surfaces: SegmentedMesh, unit: Unit) -> str:
+def _table(summary: Facts, surfaces: SegmentedMesh, unit: Unit) -> str:
     heads, rows = _heads(summary, unit), []
     for segment, (red, green, blue) in zip(summary["segments"], surfaces.colors, strict=True):
         swatch = f'<span style="color:rgb({red},{green},{blue})">&#9632;</span>'

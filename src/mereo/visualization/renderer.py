@@ -8,15 +8,24 @@ from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
-from embreex import rtcore
-from embreex import rtcore_scene as rtcs
-from embreex.mesh_construction import TriangleMesh
 from jaxtyping import Float, Int, UInt8
 from scipy.sparse import csr_array
 
 from mereo.geometry.camera import Camera
-from mereo.geometry.mesh import Color, SegmentedMesh
-from mereo.geometry.transforms import inverse_rigid, look_at, rigid, unit_rows
+from mereo.geometry.mesh import Color, Faces, SegmentedMesh, Vertices
+from mereo.geometry.solids import ray_scene
+from mereo.geometry.transforms import (
+    Corners,
+    Indices,
+    Points,
+    Transform,
+    Values,
+    inverse_rigid,
+    look_at,
+    rigid,
+    transform_points,
+    unit_rows,
+)
 from mereo.io.writers.meshes import OUTER_OPACITY
 
 Vector = tuple[float, float, float]
@@ -37,14 +46,14 @@ class Viewpoint:
         camera: intrinsics, scaled to the picture's width.
     """
 
-    T_view_world: Float[np.ndarray, "4 4"]
+    T_view_world: Transform
     half_size: float = 1.0
     camera: Camera | None = None
 
     @classmethod
     def along(
         cls,
-        bounds: Float[np.ndarray, "2 3"],
+        bounds: Corners,
         direction: Vector,
         up: Vector,
         margin: float = 1.08,
@@ -56,15 +65,15 @@ class Viewpoint:
         return cls(rigid(rotation, -rotation @ bounds.mean(axis=0)), margin * max(float(half.max()), 1e-12))
 
     @classmethod
-    def through(cls, camera: Camera, T_world_camera: Float[np.ndarray, "4 4"] | None = None) -> "Viewpoint":
+    def through(cls, camera: Camera, T_world_camera: Transform | None = None) -> "Viewpoint":
         """View of what a camera sees; by default things are in the camera's own frame."""
         return cls(np.eye(4) if T_world_camera is None else inverse_rigid(T_world_camera), camera=camera)
 
-    def apply(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def apply(self, points: Points) -> Points:
         """Points in the view frame."""
-        return points @ self.T_view_world[:3, :3].T + self.T_view_world[:3, 3]
+        return transform_points(self.T_view_world, points)
 
-    def pixels(self, points_view: Float[np.ndarray, "n 3"], width: int, height: int) -> Float[np.ndarray, "n 2"]:
+    def pixels(self, points_view: Points, width: int, height: int) -> Float[np.ndarray, "n 2"]:
         """Column and row (pixel centres at +0.5) of points in the view frame."""
         if self.camera is not None:
             return self.camera.project(points_view) * [width / self.camera.width, height / self.camera.height]
@@ -96,8 +105,8 @@ class Triangles:
         owner: number of the part that each face belongs to; an outline is drawn where it changes.
     """
 
-    vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
+    vertices: Vertices
+    faces: Faces
     colors: Float[np.ndarray, "f 3"]
     normals: Float[np.ndarray, "f 3 3"]
     owner: Int[np.ndarray, " f"]
@@ -110,7 +119,7 @@ class Triangles:
         return cls(vertices, faces, palette[owner], corner_normals(vertices, faces), owner)
 
 
-def corner_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3 3"]:
+def corner_normals(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "f 3 3"]:
     """Normal at each corner of each face: the mean, weighted by angle, of those faces there that no crease parts."""
     edges = [unit_rows(vertices[np.roll(faces, -k, axis=1)] - vertices[faces]) for k in (1, 2)]
     angle = np.arccos(np.clip((edges[0] * edges[1]).sum(axis=-1), -1, 1)).ravel()
@@ -165,9 +174,7 @@ class Canvas:
                 edge |= part != np.roll(part, step, axis=axis)
         self.rgb[edge & (part >= 0)] *= 0.45
 
-    def draw_points(
-        self, points: Float[np.ndarray, "n 3"], colors: Float[np.ndarray, "n 3"], radius_px: float = 1.2
-    ) -> None:
+    def draw_points(self, points: Points, colors: Float[np.ndarray, "n 3"], radius_px: float = 1.2) -> None:
         """Draw points as small discs, hidden by whatever is nearer."""
         height, width = self.depth.shape
         in_view = self.view.apply(points)
@@ -182,7 +189,7 @@ class Canvas:
         for dx, dy in ((x, y) for x in steps for y in steps if x * x + y * y <= radius * radius):
             self._put(corner + np.array([dx, dy]), z, colors[order])
 
-    def _put(self, at: Int[np.ndarray, "n 2"], z: Float[np.ndarray, " n"], colors: Float[np.ndarray, "n 3"]) -> None:
+    def _put(self, at: Int[np.ndarray, "n 2"], z: Values, colors: Float[np.ndarray, "n 3"]) -> None:
         """Single pixels, ordered far to near."""
         height, width = self.depth.shape
         inside = (at >= 0).all(axis=1) & (at[:, 0] < width) & (at[:, 1] < height)
@@ -205,18 +212,15 @@ class Canvas:
 
 
 def _cast(
-    vertices: Float[np.ndarray, "v 3"],
-    faces: Int[np.ndarray, "f 3"],
-    origins: Float[np.ndarray, "n 3"],
-    directions: Float[np.ndarray, "n 3"],
-) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    vertices: Vertices,
+    faces: Faces,
+    origins: Points,
+    directions: Points,
+) -> tuple[Indices, Values, Points]:
     """For each ray the first face (-1: none), the distance in lengths of its direction, barycentric weights."""
     if len(faces) == 0:
         return np.full(len(origins), -1), np.full(len(origins), np.inf), np.zeros((len(origins), 3))
-    device = rtcore.EmbreeDevice()
-    scene = rtcs.EmbreeScene(device)
-    TriangleMesh(scene, vertices.astype(np.float32), faces.astype(np.int32))
-    hits = scene.run(origins.astype(np.float32), directions.astype(np.float32), output=True)
+    hits = ray_scene(vertices, faces).run(origins.astype(np.float32), directions.astype(np.float32), output=True)
     face = hits["primID"].astype(np.int64)
     face = np.where((face < 0) | (face >= len(faces)), -1, face)
     u, v = hits["u"].astype(float), hits["v"].astype(float)
@@ -248,7 +252,7 @@ def opacities(mesh: SegmentedMesh) -> list[float]:
     return [OUTER_OPACITY if index in outer else 1.0 for index in range(len(mesh.segments))]
 
 
-def _light(normal: Float[np.ndarray, "n 3"], ray: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+def _light(normal: Points, ray: Points) -> Float[np.ndarray, "n 2"]:
     """Diffuse factor and added highlight: a key light from above left, a fill from the viewer, some ambient."""
     facing = np.where((normal * ray).sum(axis=1, keepdims=True) > 0, -normal, normal)
     key = unit_rows(np.array([-0.5, -0.8, -0.9]))

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import describe
@@ -16,7 +15,7 @@ from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.radii import Radii
-from mereo.geometry.transforms import transform_points
+from mereo.geometry.transforms import Matrix, transform_points
 from mereo.io.attachments import Surfaces, write_attachment
 from mereo.io.config import DEFAULT_FILES, FilesConfig
 from mereo.io.sensor_frame import SensorFrame
@@ -166,7 +165,7 @@ def _results(answer: Answer, files: FilesConfig) -> Results:
     return Results(*parts, to_viewer, frame.metres, files.millimetres, radii=radii)
 
 
-def to_viewer_of(frame: SensorFrame) -> Float[np.ndarray, "3 3"]:
+def to_viewer_of(frame: SensorFrame) -> Matrix:
     """Rotation from a frame's axes to glTF's, in which it is seen as its camera saw it."""
     return GLTF_CAMERA_ROTATION @ frame.T_camera_result[:3, :3]
 

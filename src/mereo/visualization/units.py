@@ -3,10 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from jaxtyping import Float
-
 from mereo.geometry.brief import as_exact_as, rounded
+from mereo.geometry.transforms import Vector
 
 
 @dataclass(frozen=True)
@@ -39,7 +37,7 @@ class Unit:
         """Factor from a volume of the frame to the written one."""
         return 1.0 if self.metres is None else (100 * self.metres) ** 3
 
-    def place(self, point: Float[np.ndarray, "3"], radius: float | None = None) -> str:
+    def place(self, point: Vector, radius: float | None = None) -> str:
         """Coordinates of a point of the frame, without the unit's name; with a radius all as exact as that, and it."""
         values = [float(value) for value in point * self.length_factor]
         if radius is None:

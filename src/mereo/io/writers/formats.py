@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float32
 
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.radii import Radii
+from mereo.geometry.transforms import Matrix
 from mereo.io.atomic_files import write_json
 from mereo.io.config import Format
 from mereo.io.writers.glb import write_segments_glb
@@ -45,7 +46,7 @@ class Results:
     surfaces: SegmentedMesh
     labels: LabelGrid
     observed: SegmentedCloud | None
-    frame_rotation: Float[np.ndarray, "3 3"]
+    frame_rotation: Matrix
     unit_m: float = 1.0
     millimetres: bool = False
     summary: Mapping[str, Any] = field(default_factory=dict)

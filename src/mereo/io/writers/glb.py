@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Shaped, UInt8
+from jaxtyping import Shaped, UInt8
 
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
 from mereo.geometry.radii import STOPS, Radii
 from mereo.geometry.subdivision import split_at_creases
+from mereo.geometry.transforms import Matrix, PointArray
 from mereo.io.atomic_files import atomic_file
 from mereo.io.mesh_formats import VIEWER_ROOT
 from mereo.io.writers.meshes import OUTER_OPACITY, with_faces
@@ -20,7 +21,7 @@ GLTF_CAMERA_ROTATION = np.diag([1.0, -1.0, -1.0])
 """Rotation by half a turn about x: from the camera frame (y down, z forward) to glTF (y up, z toward the viewer)."""
 
 
-def viewer_rotation(frame: CloudAxes) -> Float[np.ndarray, "3 3"]:
+def viewer_rotation(frame: CloudAxes) -> Matrix:
     """Rotation from the input's axes to glTF's, which a scanner's already are."""
     return GLTF_CAMERA_ROTATION if frame == "camera" else np.eye(3)
 
@@ -28,7 +29,7 @@ def viewer_rotation(frame: CloudAxes) -> Float[np.ndarray, "3 3"]:
 def write_segments_glb(
     path: str | Path,
     surfaces: SegmentedMesh,
-    frame_rotation: Float[np.ndarray, "3 3"] = GLTF_CAMERA_ROTATION,
+    frame_rotation: Matrix = GLTF_CAMERA_ROTATION,
     unit_m: float = 1.0,
     radii: Radii | None = None,
     colored: bool = False,
@@ -127,7 +128,7 @@ def _material(segment: Segment, opaque: bool) -> dict[str, Any]:
     return material if opaque else {**material, "alphaMode": "BLEND"}
 
 
-def _linear(srgb: UInt8[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+def _linear(srgb: UInt8[np.ndarray, "*n 3"]) -> PointArray:
     """Linear light of screen colours (glTF 2.0, section 3.9.2)."""
     share = srgb / 255.0
     linear: np.ndarray = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from jaxtyping import Int, UInt8
+from jaxtyping import UInt8
 
 from mereo.geometry.labels import SegmentedCloud
-from mereo.geometry.mesh import Color, Segment, SegmentedMesh, connected, edge_uses, three_cornered
+from mereo.geometry.mesh import Color, Faces, Segment, SegmentedMesh, connected, edge_uses, three_cornered
 from mereo.geometry.radii import Radii
 from mereo.geometry.transforms import Points
 from mereo.io.atomic_files import atomic_file, new_directory, write_file
@@ -65,7 +65,7 @@ def settled(segment: Segment) -> Segment:
     return Segment(segment.name, segment.color, segment.vertices[first], faces)
 
 
-def _is_closed(faces: Int[np.ndarray, "f 3"]) -> bool:
+def _is_closed(faces: Faces) -> bool:
     """Whether each edge has two faces, which run along it in opposite directions."""
     _, uses, unbalanced = edge_uses(faces)
     return bool(((uses == 2) & ~unbalanced).all())

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -32,7 +32,7 @@ from mereo.deformation.samplers import DeformationSampler
 from mereo.geometry.conventions import UNITS_M
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import Corners, Normalizer, Points, Vector, longest_side
+from mereo.geometry.transforms import Corners, Indices, Normalizer, Points, Values, Vector, longest_side
 from mereo.io.config import RobotMeshes
 from mereo.io.point_arrays import model_points
 from mereo.io.readers import read_points
@@ -373,7 +373,7 @@ class HeldPlace(Block):
             return "the list of nodes" if self.points is None else f"the file {self.points}"
         return f"the place at {list(self.center)}"
 
-    def depth(self, nodes: Points, numbers: Int[np.ndarray, " n"] | None, target: Target) -> Float[np.ndarray, " n"]:
+    def depth(self, nodes: Points, numbers: Indices | None, target: Target) -> Values:
         """How far nodes of a solid, in the scene's frame, are inside, scene units; below 0 outside.
 
         ``numbers`` are those in their file. ``Misfit`` for points that cannot be read, and for numbers of no node.
@@ -386,7 +386,7 @@ class HeldPlace(Block):
             return np.asarray(offset @ unit(np.array(self.direction)))
         return np.asarray((self.radius or 0.0) * target.unit - np.linalg.norm(offset, axis=1))
 
-    def _rows(self, nodes: Points, numbers: Int[np.ndarray, " n"] | None, target: Target) -> Int[np.ndarray, " r"]:
+    def _rows(self, nodes: Points, numbers: Indices | None, target: Target) -> Int[np.ndarray, " r"]:
         """Rows of the nodes that are held one by one."""
         if self.nodes is None:
             try:
@@ -464,7 +464,7 @@ class ElasticBlock(DeformationBlock):
                 break
         return solid
 
-    def _volume(self, target: Target, stiffness: list[float] | None) -> tuple[ElasticSolid, Int[np.ndarray, " n"]]:
+    def _volume(self, target: Target, stiffness: list[float] | None) -> tuple[ElasticSolid, Indices]:
         """Tetrahedra of the file, each as stiff as the segment around its middle, and their nodes' numbers in it."""
         path = target.folder / (self.tetrahedra or "")
         try:

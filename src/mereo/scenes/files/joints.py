@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 from itertools import combinations, product
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from mereo.deformation.maps import Compose, Rigid
 from mereo.geometry.mesh import Segment, SegmentedMesh, area_vectors, connected, surface_points
 from mereo.geometry.mesh_check import overlaps
 from mereo.geometry.solids import search_tree
-from mereo.geometry.transforms import Points, Vector, longest_side, unit_rows
+from mereo.geometry.transforms import Flags, Indices, Points, Values, Vector, longest_side, unit_rows
 
 # --- contacts ---------------------------------------------------------------------------------------------------------
 
@@ -77,12 +77,12 @@ def contacts(mesh: SegmentedMesh) -> tuple[Contact, ...]:
     return tuple(touching)
 
 
-def _normals(segment: Segment, face: Int[np.ndarray, " n"]) -> Points:
+def _normals(segment: Segment, face: Indices) -> Points:
     """Unit normals of faces."""
     return unit_rows(area_vectors(segment.vertices, segment.faces[face]))
 
 
-def _distance(points: Points, segment: Segment) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+def _distance(points: Points, segment: Segment) -> tuple[Values, Indices]:
     """Distance of points to a surface, and the nearest face."""
     vertices, faces = np.array(segment.vertices), np.array(segment.faces, dtype=np.int64)
     squared, face, _ = search_tree(vertices, faces).squared_distance(vertices, faces, np.ascontiguousarray(points))
@@ -122,7 +122,7 @@ def _shapes(first: int, second: int, points: Points, normals: Points, reach: flo
     return touching
 
 
-def _largest_plane(points: Points, normals: Points, reach: float) -> Bool[np.ndarray, " n"]:
+def _largest_plane(points: Points, normals: Points, reach: float) -> Flags:
     """The largest set of points of one normal and offset."""
     offsets = normals @ points.T  # of all points along each one's normal
     alike = (normals @ normals.T > SAME_NORMAL) & (np.abs(offsets - np.diag(offsets)[:, None]) < reach)

@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 import yaml
-from jaxtyping import Int
 from scipy.spatial import ConvexHull, QhullError
 
 from mereo.deformation.maps import Deformation, moved_by, unit
@@ -29,6 +28,7 @@ from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, palette_color, 
 from mereo.geometry.mesh_check import examine, likely_unit, overlaps
 from mereo.geometry.transforms import (
     Corners,
+    Indices,
     Normalizer,
     Points,
     Vector,
@@ -86,7 +86,7 @@ def measure_motion(rest: SegmentedMesh, draw: Draw) -> Motion:
     return Motion(float(np.median(np.sqrt(np.mean(shares**2, axis=1)))), float(np.median(shares.max(axis=1))))
 
 
-def material_points(mesh: SegmentedMesh, count: int) -> tuple[Points, Int[np.ndarray, " n"]]:
+def material_points(mesh: SegmentedMesh, count: int) -> tuple[Points, Indices]:
     """Points evenly spread over the surface of all segments, and the index of the segment of each."""
     vertices, faces, owner = mesh.merged()
     points, face = surface_points(vertices, faces, count)
@@ -135,10 +135,8 @@ def rubber(mesh: SegmentedMesh) -> Blocks:
 
 def _blocks(mesh: SegmentedMesh, strength: float) -> Blocks:
     """A bend along the longest side and ``LATTICES`` lattices, numbers rounded as they are written."""
-    low, high = mesh.bounds
-    longest = int((high - low).argmax())
-    origin, axis, length = (low + high) / 2, np.eye(3)[longest], float((high - low)[longest])
-    origin[longest] = low[longest]
+    origin, longest, length = _longest_side(mesh)
+    axis = np.eye(3)[longest]
     radius = distance_from_line(mesh.merged()[0], origin, axis)
     most = min(BEND_SHARE * np.rad2deg(length / radius), MOST_BEND_DEG)
     (x, y, z), (u, v, w) = (rounded(value) for value in origin), axis.tolist()
@@ -146,6 +144,15 @@ def _blocks(mesh: SegmentedMesh, strength: float) -> Blocks:
     share = rounded(MOST_STRENGTH * strength, 2)
     bend = BendBlock(type="bend", origin=(x, y, z), axis=(u, v, w), length=size, angle=(-angle, angle))
     return (bend, *(LATTICES * [LatticeBlock(type="lattice", spacing=rounded(length / 2), strength=share)]))
+
+
+def _longest_side(mesh: SegmentedMesh) -> tuple[Vector, int, float]:
+    """Middle of the box's face at which its longest side begins, number of the axis along it, and its length."""
+    low, high = mesh.bounds
+    longest = int((high - low).argmax())
+    start = (low + high) / 2
+    start[longest] = low[longest]
+    return start, longest, float((high - low)[longest])
 
 
 def rounded(value: float, digits: int = 4) -> float:
@@ -530,7 +537,10 @@ def _draft(name: str, source: _Source, meshes: MeshesConfig, aperture: float) ->
         unit=unit,
         reason=reason,
         up_reason=up_reason,
-        **{key: f"{value:g}" for key, value in (("size", size), ("aperture", aperture), ("near", near), ("far", far))},
+        size=size,
+        cone=aperture,
+        near=near,
+        far=far,
         sides=" x ".join(f"{side:.4g}" for side in sides),
         up=_numbers(np.array((x, y, z))),
         roll="true" if workspace.any_roll else "false",
@@ -622,13 +632,9 @@ def _narrowed(joint: Joint) -> str:
 
 def _deformations(mesh: SegmentedMesh, moves: _Moves) -> str:
     """The key ``deformations`` with its lines: joints, what bends the whole, and others in comments."""
-    sides, joints = np.ptp(mesh.bounds, axis=0), _joints(mesh, moves.joints)
-    longest = int(sides.argmax())
-    start = (mesh.bounds[0] + mesh.bounds[1]) / 2
-    start[longest] = mesh.bounds[0, longest]
-    end, axis, length = _numbers(start), np.eye(3, dtype=int)[longest].tolist(), f"{rounded(sides[longest]):g}"
-    push, reach = f"{0.1 * sides.min():.3g}", f"{0.5 * sides.min():.3g}"
-    further = FURTHER.format(end=end, axis=axis, length=length, push=push, reach=reach)
+    (start, longest, length), joints = _longest_side(mesh), _joints(mesh, moves.joints)
+    end, axis, shortest = _numbers(start), np.eye(3, dtype=int)[longest].tolist(), np.ptp(mesh.bounds, axis=0).min()
+    further = FURTHER.format(end=end, axis=axis, length=rounded(length), push=0.1 * shortest, reach=0.5 * shortest)
     if moves.way == "rigid":
         return f"deformations: rigid\n{joints}{further}"
     if moves.way == "articulated" and moves.robot:
@@ -748,17 +754,17 @@ FURTHER = """\
 #  - type: twist
 #    origin: {end}
 #    axis: {axis}
-#    length: {length}
+#    length: {length:g}
 #    angle: [-30, 30]
 #  - type: squash  # along a random axis, with the volume kept
 #    factor: [0.9, 1.1]
 #  - type: waves
-#    wavelength: [{length}, {length}]
+#    wavelength: [{length:g}, {length:g}]
 #    strength: 0.3
 #  - type: push  # an instrument pulls (above 0) or presses (below 0) at a random place
-#    distance: [-{push}, {push}]
-#    tip: {push}
-#    reach: {reach}
+#    distance: [-{push:.3g}, {push:.3g}]
+#    tip: {push:.3g}
+#    reach: {reach:.3g}
 """
 
 TEMPLATE = """\
@@ -774,12 +780,12 @@ source: my own  # where the meshes come from, and their licence; kept with datas
 {block}
 
 # Scene units, in which networks see the object: its shortest side is this long. The camera's noise is 0.1 of them.
-size: {size}
+size: {size:g}
 
 camera:
-  aperture: {aperture}  # of the cone of directions from which the camera looks: 360 is all around, 180 never from below
+  aperture: {cone:g}  # of the cone of directions from which the camera looks: 360 is all around, 180 never from below
   axis: {up}  # the middle of that cone, as seen from the object: above it, where {up_reason}
-  distance: [{near}, {far}]  # from the object's centre, in scene units
+  distance: [{near:g}, {far:g}]  # from the object's centre, in scene units
   roll: {roll}  # whether the camera may be rolled about its line of sight
   field_of_view: {view}  # as narrow as still shows all of the object at the nearest distance
 
