@@ -122,7 +122,7 @@ MAY_IMPORT = {"torch": ("models/", "cli/tools.py"), "matplotlib": ("io/extras.py
 """The same of libraries that most installations lack: asked for where they are used, with the extra's name."""
 
 BUDGET = {
-    "src/mereo": (315_650, 161),
+    "src/mereo": (312_400, 161),
     "src/mereo_learning": (47_500, 22),
     "src/mereo_objects": (40_000, 28),
     "src/mereo_serving": (10_700, 13),
@@ -132,7 +132,7 @@ BUDGET = {
 }
 """Syntax nodes and files that a folder may have at most. Lines are free: fewer of them are not less to know."""
 
-CHOICES = {"src/mereo/fitting": (320, 176), "src/mereo/locating": (34, 34)}
+CHOICES = {"src/mereo/fitting": (319, 176), "src/mereo/locating": (34, 34)}
 """Decisions (``if`` statements and expressions) and numbers in module constants that a folder may have at most.
 
 They choose among fits, and they only fall."""

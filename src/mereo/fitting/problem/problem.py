@@ -226,8 +226,8 @@ class Problem:
                 for points in (problem.evidence.observed_samples, errors.measured)
             )
             weight = geman_mcclure(left, ROBUST * narrower) * self.config.cloud_weight / each
-            found = amplitudes(measured, weight, errors.along(normal))
-            problem = problem.changed(evidence=problem.evidence.without(found))
+            likeliest = amplitudes(measured, weight, errors.along(normal))
+            problem = problem.changed(evidence=problem.evidence.without(likeliest))
         return problem
 
     def quieted(self, noise: float) -> "Problem":
