@@ -132,11 +132,14 @@ def today(frame: Frame) -> int | None:
     chosen, heavier = least(frame, given, handicap), frame.of_stages(["heavier"])
     if not rows[chosen]["explains"] and heavier and rows[heavier[-1]]["cloud"] < HELPS * rows[chosen]["cloud"]:
         chosen = heavier[-1]
-    settled, rest = frame.of_stages(["settled"]), frame.of_stages(["rest"])
-    chosen = settled[-1] if settled else chosen
-    is_rigid = problems[0]["modes"] == 0
-    if rest and (is_rigid or rows[rest[-1]]["total"] - rows[chosen]["total"] < rows[chosen]["narrowing"]):
-        chosen = rest[-1]
+    # of the last problem, in which each step that was tried is a candidate
+    settled, rest = (
+        [least(frame, same(frame, numbers, numbers[-1]))] if numbers else []
+        for numbers in (frame.of_stages([stage]) for stage in ("settled", "rest"))
+    )
+    chosen, is_rigid = [chosen, *settled][-1], problems[0]["modes"] == 0
+    if rest and (is_rigid or rows[rest[0]]["total"] - rows[chosen]["total"] < rows[chosen]["narrowing"]):
+        chosen = rest[0]
     drawn, draws = frame.facts["drawn"], frame.of_stages(["draws"])
     if drawn is not None and draws:
         number = min(draws, key=lambda n: abs(rows[n]["total"] - drawn["misfit"]))
