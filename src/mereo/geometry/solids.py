@@ -69,6 +69,21 @@ def search_tree(vertices: Vertices, elements: Int[np.ndarray, "m k"]) -> igl.AAB
     return tree
 
 
+def cast_rays(
+    tree: igl.AABB, vertices: Vertices, faces: Faces, origins: Points, directions: Points
+) -> tuple[Indices, Values, Float[np.ndarray, "n 2"]]:
+    """Find what each ray ``origin + t * direction`` meets first of the triangles of a tree.
+
+    Returns the face, -1 where there is none, t, and the weights of the face's second and third corner; the latter two
+    mean nothing where there is none.
+    """
+    # libigl takes a triangle for parallel to a ray by a product that has a unit; long directions keep small triangles
+    longest = float(np.ptp(vertices, axis=0).max(initial=1e-100))
+    stretch = 2.0 ** (40 - 2 * round(np.log2(longest)))
+    face, share, weights = tree.intersect_ray_first(vertices, faces, origins, stretch * directions)
+    return face.astype(np.int64), stretch * share, weights  # libigl's faces are C's long long, which numpy tells apart
+
+
 # --- segments and objects ---------------------------------------------------------------------------------------------
 
 
@@ -112,26 +127,21 @@ class _Solid:
     def _behind_first_hit(self, points: Points) -> Bool[np.ndarray, "2 n"]:
         """For each of two rays whether the first face it hits is seen from behind."""
         directions = np.repeat(_DIRECTIONS, len(points), axis=0)
-        face = self.met(np.tile(points, (2, 1)), directions)[0]
+        face = cast_rays(self.tree, self.vertices, self.faces, np.tile(points, (2, 1)), directions)[0]
         behind = np.einsum("ni,ni->n", self.normals[face], directions) > 0
         return (behind & (face >= 0)).reshape(2, -1)
-
-    def met(self, origins: Points, directions: Points) -> tuple[Indices, Values]:
-        """First face that each ray ``origin + t * direction`` meets, -1 where it meets none, and its t."""
-        face, share, _ = self.tree.intersect_ray_first(self.vertices, self.faces, origins, directions)
-        return face.astype(np.int64), share
 
     def first_hit(self, directions: Points) -> tuple[Int[np.ndarray, " m"], Hits]:
         """Which rays from the origin hit the segment, and where each of them does first."""
         rows = toward(directions, self.low, self.high)
-        face, share = self.met(np.zeros((len(rows), 3)), directions[rows])
+        face, share, _ = cast_rays(self.tree, self.vertices, self.faces, np.zeros((len(rows), 3)), directions[rows])
         hit = np.flatnonzero(face >= 0)
         return rows[hit], Hits(share[hit], self.normals[face[hit]])
 
     def closest(self, points: Points) -> tuple[Values, Indices, Points]:
         """Squared distance to the surface, face and place of the closest surface point."""
         squared, face, place = self.tree.squared_distance(self.vertices, self.faces, np.ascontiguousarray(points))
-        return squared, face.astype(np.int64), place  # libigl's faces are C's long long, which numpy tells apart
+        return squared, face.astype(np.int64), place
 
 
 class Nearest(NamedTuple):

@@ -13,7 +13,7 @@ from scipy.sparse import csr_array
 
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import Color, Faces, SegmentedMesh, Vertices
-from mereo.geometry.solids import search_tree
+from mereo.geometry.solids import cast_rays, search_tree
 from mereo.geometry.transforms import (
     Corners,
     Indices,
@@ -221,10 +221,10 @@ def _cast(
     if len(faces) == 0:
         return np.full(len(origins), -1), np.full(len(origins), np.inf), np.zeros((len(origins), 3))
     vertices, faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces, dtype=np.int64)
-    face, share, place = search_tree(vertices, faces).intersect_ray_first(vertices, faces, origins, directions)
+    face, share, place = cast_rays(search_tree(vertices, faces), vertices, faces, origins, directions)
     place[face < 0] = 0.0  # else it is whatever was in memory
     weights = np.concatenate([1 - place.sum(axis=1, keepdims=True), place], axis=1)
-    return face.astype(np.int64), np.where(face >= 0, share, np.inf), weights
+    return face, np.where(face >= 0, share, np.inf), weights
 
 
 def enclosed(mesh: SegmentedMesh) -> set[tuple[int, int]]:
