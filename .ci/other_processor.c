@@ -1,5 +1,5 @@
 // Preloaded (LD_PRELOAD), this library lets the processor describe itself as an older one, so that every library takes
-// the code path that it would take there: numpy, OpenBLAS, PyTorch, oneDNN, Embree. OTHER_PROCESSOR=avx2 hides AVX-512
+// the code path that it would take there: numpy, OpenBLAS, PyTorch, oneDNN. OTHER_PROCESSOR=avx2 hides AVX-512
 // and AMX; sse hides AVX and fused multiply-add too. Linux on x86-64, and a processor that can trap the instruction
 // CPUID ("cpuid_fault" in /proc/cpuinfo). The instructions still work: what does not ask CPUID is not covered.
 #define _GNU_SOURCE

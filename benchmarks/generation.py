@@ -4,7 +4,8 @@
 
 Both make the same thing at the paper's settings: a random state seen by a random camera, a noisy depth image,
 SortSample queries with labels, signed distances and directions. The rival uses trimesh's own functions, as its
-documentation suggests: the Embree intersector for the image, ``contains`` for labels, ``closest_point`` for distances.
+documentation suggests: the Embree intersector for the image (`pip install embreex`), ``contains`` for labels,
+``closest_point`` for distances.
 It may skip what trimesh has nothing for, the rest coordinates and the farthest-point order; ours makes them too.
 
 Both run in this process, one example of each in turn, so that a busy machine slows both. Times are medians, of seconds
@@ -126,7 +127,7 @@ def compare(scene: Scene, examples: int) -> None:
 STAGES: tuple[tuple[Any, str, str], ...] = (
     (examples, "_sample_view", "view"),
     (Scene, "sample_state", "view: state"),
-    (examples, "render_depth", "view: depth image"),
+    (examples, "observe", "view: depth image"),
     (examples, "sample_queries", "sampling"),
     (Solids, "label", "sampling: labels"),
     (query_sampling, "_nearest_rows", "sampling: k nearest"),
@@ -137,15 +138,15 @@ STAGES: tuple[tuple[Any, str, str], ...] = (
 )
 
 
-def profile(scene: Scene, examples: int) -> None:
+def profile(scene: Scene, count: int) -> None:
     """CPU time of each stage, by wrapping its function; "a: b" is a part of a."""
     spent: dict[str, float] = defaultdict(float)
 
     def timed(function: Callable[..., Any], name: str) -> Callable[..., Any]:
-        def wrapped(*values: Any) -> Any:
+        def wrapped(*values: Any, **named: Any) -> Any:
             start = time.process_time()
             try:
-                return function(*values)
+                return function(*values, **named)
             finally:
                 spent[name] += time.process_time() - start
 
@@ -155,13 +156,13 @@ def profile(scene: Scene, examples: int) -> None:
     try:
         for owner, attribute, name in STAGES:
             setattr(owner, attribute, timed(getattr(owner, attribute), name))
-        for index in range(examples):
+        for index in range(count):
             examples.synthesize(scene, SETTINGS, example_rng(1, index))
     finally:
         for owner, attribute, original in originals:
             setattr(owner, attribute, original)
     for *_, name in STAGES:
-        print(f"  {name:26}{1e3 * spent[name] / examples:7.1f} ms")
+        print(f"  {name:26}{1e3 * spent[name] / count:7.1f} ms")
 
 
 def main() -> None:

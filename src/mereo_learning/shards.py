@@ -57,7 +57,7 @@ from mereo.workers.spread import Cluster, spread
 SHARD_SIZE = 64
 MANIFEST = "manifest.json"
 
-LIBRARIES = ("numpy", "scipy", "embreex", "libigl", "manifold3d", "trimesh")
+LIBRARIES = ("numpy", "scipy", "libigl", "manifold3d", "trimesh")
 """Libraries whose versions are in the manifest: others may move last bits, but make no other dataset."""
 
 NOT_COMPARED = ("libraries", "bytes")

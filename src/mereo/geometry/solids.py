@@ -2,11 +2,11 @@
 
 Inside tests ask of two rays in unrelated directions whether the first face hit is seen from behind; where they disagree
 (a ray through an edge, an imperfect mesh), and of what is marked as no solid, the generalized winding number decides
-(Jacobson et al., SIGGRAPH 2013; Barill et al., SIGGRAPH 2018). Each segment has a ray scene of its own: in a joint one
-the coincident faces of two neighbours would make the first face hit ambiguous.
+(Jacobson et al., SIGGRAPH 2013; Barill et al., SIGGRAPH 2018). Each segment has a search tree of its own: in a joint
+one the coincident faces of two neighbours would make the first face hit ambiguous.
 
-Rays from the camera are ``t * direction``, t > 0, from the origin of the camera frame; Embree finds where they first
-meet a surface. Directions have z = 1, so that t is the depth and a direction's x and y are its slopes.
+Rays from the camera are ``t * direction``, t > 0, from the origin of the camera frame. Directions have z = 1, so that t
+is the depth and a direction's x and y are its slopes.
 """
 
 from functools import cached_property
@@ -14,9 +14,6 @@ from typing import NamedTuple
 
 import igl
 import numpy as np
-from embreex import rtcore
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.sparse import csr_array
 
@@ -24,13 +21,11 @@ from mereo.geometry.mesh import Faces, Segment, SegmentedMesh, Vertices, area_ve
 from mereo.geometry.read_only import read_only
 from mereo.geometry.transforms import Flags, Indices, Labels, Points, Values, Vector, unit_rows
 
-_DIRECTIONS = read_only(np.array([[0.4637, 0.5718, 0.6767], [-0.7301, 0.3469, -0.5887]], dtype=np.float32))
+_DIRECTIONS = read_only(np.array([[0.4637, 0.5718, 0.6767], [-0.7301, 0.3469, -0.5887]]))
 """Two generic directions: not along any axis, face diagonal or each other."""
 
 
 # --- rays from the camera ---------------------------------------------------------------------------------------------
-
-_DEVICE = rtcore.EmbreeDevice()
 
 
 class Hits(NamedTuple):
@@ -50,13 +45,6 @@ class Hits(NamedTuple):
         kept = rows[better]
         self.distance[kept], self.normal[kept] = others.distance[better], others.normal[better]
         return kept
-
-
-def ray_scene(vertices: Vertices, faces: Faces) -> EmbreeScene:
-    """Embree scene of one triangle mesh. It works in single precision: keep coordinates near the origin."""
-    scene = EmbreeScene(_DEVICE)
-    TriangleMesh(scene, vertices.astype(np.float32), faces.astype(np.int32))
-    return scene
 
 
 def toward(directions: Points, low: Vector, high: Vector) -> Int[np.ndarray, " m"]:
@@ -81,6 +69,21 @@ def search_tree(vertices: Vertices, elements: Int[np.ndarray, "m k"]) -> igl.AAB
     return tree
 
 
+def cast_rays(
+    tree: igl.AABB, vertices: Vertices, faces: Faces, origins: Points, directions: Points
+) -> tuple[Indices, Values, Float[np.ndarray, "n 2"]]:
+    """Find what each ray ``origin + t * direction`` meets first of the triangles of a tree.
+
+    Returns the face, -1 where there is none, t, and the weights of the face's second and third corner; the latter two
+    mean nothing where there is none.
+    """
+    # libigl takes a triangle for parallel to a ray by a product that has a unit; long directions keep small triangles
+    longest = float(np.ptp(vertices, axis=0).max(initial=1e-100))
+    stretch = 2.0 ** (40 - 2 * round(np.log2(longest)))
+    face, share, weights = tree.intersect_ray_first(vertices, faces, origins, stretch * directions)
+    return face.astype(np.int64), stretch * share, weights  # libigl's faces are C's long long, which numpy tells apart
+
+
 # --- segments and objects ---------------------------------------------------------------------------------------------
 
 
@@ -92,12 +95,11 @@ class _Solid:
         self.faces = np.ascontiguousarray(segment.faces, dtype=np.int64)
         self.is_solid = segment.solid
         self.low, self.high = segment.bounds
-        self.center = (self.low + self.high) / 2
 
     @cached_property
-    def rays(self) -> EmbreeScene:
-        # about its own centre: a camera frame is hundreds of units away, where single precision is coarse
-        return ray_scene(self.vertices - self.center, self.faces)
+    def normals(self) -> Points:
+        """Of each face, of any length."""
+        return area_vectors(self.vertices, self.faces)
 
     @cached_property
     def tree(self) -> igl.AABB:
@@ -124,25 +126,22 @@ class _Solid:
 
     def _behind_first_hit(self, points: Points) -> Bool[np.ndarray, "2 n"]:
         """For each of two rays whether the first face it hits is seen from behind."""
-        origins = np.tile((points - self.center).astype(np.float32), (2, 1))
         directions = np.repeat(_DIRECTIONS, len(points), axis=0)
-        hits = self.rays.run(origins, directions, output=True)
-        normals = hits["Ng"].reshape(2, -1, 3)
-        behind = np.stack([normal @ direction for normal, direction in zip(normals, _DIRECTIONS, strict=True)]) > 0
-        return behind & (hits["primID"].reshape(2, -1) >= 0)
+        face = cast_rays(self.tree, self.vertices, self.faces, np.tile(points, (2, 1)), directions)[0]
+        behind = np.einsum("ni,ni->n", self.normals[face], directions) > 0
+        return (behind & (face >= 0)).reshape(2, -1)
 
     def first_hit(self, directions: Points) -> tuple[Int[np.ndarray, " m"], Hits]:
         """Which rays from the origin hit the segment, and where each of them does first."""
         rows = toward(directions, self.low, self.high)
-        single = np.ascontiguousarray(directions[rows], dtype=np.float32)  # the precision that Embree wants
-        hits = self.rays.run(np.broadcast_to(-self.center.astype(np.float32), single.shape).copy(), single, output=True)
-        hit = np.flatnonzero(hits["primID"] >= 0)
-        return rows[hit], Hits(hits["tfar"][hit].astype(np.float64), hits["Ng"][hit].astype(np.float64))
+        face, share, _ = cast_rays(self.tree, self.vertices, self.faces, np.zeros((len(rows), 3)), directions[rows])
+        hit = np.flatnonzero(face >= 0)
+        return rows[hit], Hits(share[hit], self.normals[face[hit]])
 
     def closest(self, points: Points) -> tuple[Values, Indices, Points]:
         """Squared distance to the surface, face and place of the closest surface point."""
         squared, face, place = self.tree.squared_distance(self.vertices, self.faces, np.ascontiguousarray(points))
-        return squared, face.astype(np.int64), place  # libigl's faces are C's long long, which numpy tells apart
+        return squared, face.astype(np.int64), place
 
 
 class Nearest(NamedTuple):
@@ -194,11 +193,10 @@ class Solids:
     def label(self, points: Points) -> Labels:
         """Labels of points: 0 in empty space, else index + 1; of overlapping segments the first (so a nested one).
 
-        Rays are cast in single precision, so nearer to a surface than two millionths of its segment's longest side the
-        label may be that of the other side, on some processors and not on others (0.4 millionths were the most with
-        AVX-512 and AVX2, 1.6 with SSE). Beyond that it is right where no surface folds over itself. Next to such a fold
-        both rays may meet the wall of a pocket of winding number -1 from behind, and a point outside then counts as
-        inside: of the built-in scenes six in 10,000 within 0.1 units of the skull's cranium.
+        Nearer to a surface than a billionth of its segment's longest side, the label may be that of the other side.
+        Beyond that it is right where no surface folds over itself. Next to such a fold both rays may meet the wall of a
+        pocket of winding number -1 from behind, and a point outside then counts as inside: of the built-in scenes six
+        in 10,000 within 0.1 units of the skull's cranium.
         """
         labels = np.zeros(len(points), dtype=np.uint8)
         for index, solid in enumerate(self._solids):

@@ -1,4 +1,4 @@
-"""Renderer of shaded pictures: rays by Embree, two-sided Lambert light, smooth normals, dark outlines.
+"""Renderer of shaded pictures: rays by libigl, two-sided Lambert light, smooth normals, dark outlines.
 
 It needs neither a display nor OpenGL. Notation: the view frame is x right, y down, z away from the viewer, as a
 camera's.
@@ -13,7 +13,7 @@ from scipy.sparse import csr_array
 
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import Color, Faces, SegmentedMesh, Vertices
-from mereo.geometry.solids import ray_scene
+from mereo.geometry.solids import cast_rays, search_tree
 from mereo.geometry.transforms import (
     Corners,
     Indices,
@@ -220,12 +220,11 @@ def _cast(
     """For each ray the first face (-1: none), the distance in lengths of its direction, barycentric weights."""
     if len(faces) == 0:
         return np.full(len(origins), -1), np.full(len(origins), np.inf), np.zeros((len(origins), 3))
-    hits = ray_scene(vertices, faces).run(origins.astype(np.float32), directions.astype(np.float32), output=True)
-    face = hits["primID"].astype(np.int64)
-    face = np.where((face < 0) | (face >= len(faces)), -1, face)
-    u, v = hits["u"].astype(float), hits["v"].astype(float)
-    distance = np.where(face >= 0, hits["tfar"].astype(float), np.inf)
-    return face, distance, np.stack([1 - u - v, u, v], axis=1)
+    vertices, faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces, dtype=np.int64)
+    face, share, place = cast_rays(search_tree(vertices, faces), vertices, faces, origins, directions)
+    place[face < 0] = 0.0  # else it is whatever was in memory
+    weights = np.concatenate([1 - place.sum(axis=1, keepdims=True), place], axis=1)
+    return face, np.where(face >= 0, share, np.inf), weights
 
 
 def enclosed(mesh: SegmentedMesh) -> set[tuple[int, int]]:

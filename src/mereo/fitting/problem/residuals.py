@@ -18,7 +18,7 @@ from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.evidence import Directions, Evidence, Observed, SharedErrors
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, Rows, along, cross, geman_mcclure, in_space
 from mereo.geometry.mesh import barycentric
-from mereo.geometry.solids import search_tree
+from mereo.geometry.solids import cast_rays, search_tree
 from mereo.geometry.transforms import unit_rows
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -167,11 +167,9 @@ class Surface:
         A depth camera is off along the line of sight; noise across an edge would pull the nearest position along. Where
         nothing is met, or only a plane farther than ``far`` from the point, it is the nearest position all the same.
         """
-        tree, vertices, faces = self._tree
-        sight = np.ascontiguousarray(points)
-        met, share, _ = tree.intersect_ray_first(vertices, faces, np.zeros_like(sight), sight)
+        met, share, _ = cast_rays(*self._tree, np.zeros_like(points), points)
         rows = np.flatnonzero(met >= 0)
-        met, toward = met[rows].astype(np.int64), points[rows]
+        met, toward = met[rows], points[rows]
         met_position = toward * share[rows, None]
         off = np.abs(np.einsum("pi,pi->p", self.normals[met], toward - met_position))
         near = off <= far
