@@ -182,8 +182,8 @@ class ModesFit:
         with limit_blas_threads():
             modes = settled(self.problem, self.posed)
             rest = resting(modes.problem, self.correspondences, modes)
-        # the errors that neighbours share are those by the answer
-        problem = modes.problem.changed(evidence=(rest or modes).problem.evidence)
+        # the errors that neighbours share are those by the answer; few samples are edges more often than points are
+        problem = modes.problem.changed(evidence=(rest or modes).problem.evidence.with_more_samples)
         return replace(self, problem=problem, posed=modes.posed, rest=rest)
 
     def with_draws(self, states: DrawnStates) -> Registration:
