@@ -80,7 +80,9 @@ def cast_rays(
     # libigl takes a triangle for parallel to a ray by a product that has a unit; long directions keep small triangles
     longest = float(np.ptp(vertices, axis=0).max(initial=1e-100))
     stretch = 2.0 ** (40 - 2 * round(np.log2(longest)))
-    face, share, weights = tree.intersect_ray_first(vertices, faces, origins, stretch * directions)
+    # a ray along an edge may pass between its triangles
+    askew = directions + 1e-10 * np.abs(directions).max(initial=0.0) * _DIRECTIONS[0]
+    face, share, weights = tree.intersect_ray_first(vertices, faces, origins, stretch * askew)
     return face.astype(np.int64), stretch * share, weights  # libigl's faces are C's long long, which numpy tells apart
 
 
