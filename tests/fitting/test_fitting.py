@@ -273,7 +273,7 @@ def test_what_is_explained_hopeless_or_a_cameras_noise_is_left(robot: Statistica
     assert shaken(hasty, wrong) is wrong, "a tracker has no time"
     assert shaken(replace(problem, scale_std=OPEN_SCALE_STD), wrong) is wrong
     noisy, fitted = stuck(robot, 4, 4, noise=0.5)
-    assert not fitted.explains(noisy) and shaken(noisy, fitted) is fitted
+    assert not fitted.explains(noisy) and shaken(noisy, fitted).misfit.total > 0.9 * fitted.misfit.total
 
 
 def test_states_near_one_tell_of_it_where_they_lie_on_a_curved_set_and_not_where_each_is_by_itself(
