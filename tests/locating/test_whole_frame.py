@@ -387,7 +387,7 @@ def test_noise_that_neighbours_share_is_measured_on_the_plane_around_the_object(
     assert noise.std == pytest.approx(level * distance, rel=0.3, abs=2e-3 * distance + 0.6 * std)
     if level > std:  # else what is left over is none of the field
         assert noise.side * CAMERA.focal_x_px == pytest.approx(np.sqrt(np.pi) * 16, rel=0.3)
-    assert shared_noise(noisy, np.ones_like(shown)) == SharedNoise(), "nothing is around it"
+    assert shared_noise(noisy, np.ones_like(shown)) == SharedNoise()  # nothing is around it
     assert shared_side(np.ones((40, 60))) > 30 and shared_side(rng.normal(size=(200, 300))) < 20
 
 
