@@ -354,12 +354,13 @@ GAIN = 1.0
 
 def lowered(problem: Problem, posed: Posed) -> ScoredFit:
     """Descend by steps that lower the misfit (Levenberg and Marquardt)."""
-    best, prior, config = ScoredFit.of(problem, posed), Prior.whole(problem.model), problem.config
+    best, prior = ScoredFit.of(problem, posed), Prior.whole(problem.model)
+    sigma, weight = problem.cloud_sigma, problem.config.network_weight[1]
     for damping in (DAMPING, 30.0 * DAMPING):
         gain = np.inf
         while gain > GAIN:
             known = problem.known(best.posed, prior, 0.0)
-            normal = best.problem.seen(known, best.posed, problem.cloud_sigma, config.network_weight[1], True)
+            normal = best.problem.seen(known, best.posed, sigma, weight, True, best.surface)
             other = ScoredFit.of(problem, best.posed.moved(normal.step(damping)))
             gain = best.misfit.total - other.misfit.total
             best = min(best, other, key=lambda fit: fit.misfit.total)

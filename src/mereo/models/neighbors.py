@@ -19,7 +19,7 @@ CloudBatch = Float[Tensor, "b n 3"]
 """Points, or vectors at them, of each example of a batch."""
 
 QueryBatch = Float[Tensor, "b q 3"]
-"""Places that a network is asked about, or vectors there, of each example of a batch."""
+"""Places at which a network is evaluated, or vectors there, of each example of a batch."""
 
 VectorBatch = Float[Tensor, "b 3"]
 """A vector for each example of a batch."""

@@ -77,7 +77,7 @@ class NormalEquations:
         weight: Float[np.ndarray, " r"],
         nuisance: Float[np.ndarray, "r a"] | None = None,
     ) -> "NormalEquations":
-        """Sum with further residuals, beside a ``nuisance`` (``pull``)."""
+        """Sum with further residuals, which may have a ``nuisance`` (``pull``)."""
         weighted = pull(jacobian, weight, nuisance)
         matrix = (weighted.T @ jacobian).astype(np.float64)
         return NormalEquations(self.matrix + matrix, self.gradient + weighted.T.astype(np.float64) @ residual)

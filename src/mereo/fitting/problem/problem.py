@@ -194,7 +194,7 @@ class Problem:
     def worth(self, surface: Surface) -> "Problem":
         """The problem with as many independent points as what a fit leaves over shows that the cloud is worth.
 
-        What neighbours are known to share is an unknown from then on, and the noise is what is left beside it.
+        What neighbours are known to share is an unknown from then on, and the noise is what is left without it.
         """
         problem = self.changed(evidence=self.evidence.with_errors).cleared(surface)
         problem = problem.with_noise(problem.left_noise(surface)).cleared(surface)
@@ -330,13 +330,22 @@ class Problem:
         )
 
     def seen(
-        self, normal: NormalEquations, posed: Posed, sigma: float, network_weight: float, exact: bool
+        self,
+        normal: NormalEquations,
+        posed: Posed,
+        sigma: float,
+        network_weight: float,
+        exact: bool,
+        surface: Surface | None = None,
     ) -> NormalEquations:
-        """Sum with cloud, silhouette and correspondences; ``exact`` uses the faces and not the samples."""
+        """Sum with cloud, silhouette and correspondences; ``exact`` uses the faces and not the samples.
+
+        The state's ``surface`` may be there already.
+        """
         samples, observed = self.samples.posed(posed), self.evidence.observed_samples
         directions = self.directions
         if exact:
-            planes = self.surface(posed).planes(observed, self.far, self.alike)
+            planes = (surface or self.surface(posed)).planes(observed, self.far, self.alike)
         else:
             planes = samples.planes(observed, directions)
         normal = self.network.add_to(normal, posed, self.network_sigma, network_weight, robust=True)
