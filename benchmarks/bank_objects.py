@@ -19,9 +19,9 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 from manifold3d import CrossSection, Manifold, OpType
-from skimage.measure import marching_cubes
 
 from mereo.geometry.conventions import Way
+from mereo.geometry.marching_cubes import zero_surface
 from mereo.geometry.mesh_check import mesh_of
 from mereo.scenes.files.object_files import scene_of_meshes
 from mereo.scenes.random_states import kept_model
@@ -180,8 +180,8 @@ def teddy() -> trimesh.Trimesh:
     for distance, blend in parts[1:]:
         overlap = np.maximum(blend - np.abs(field - distance), 0.0) / blend
         field = np.minimum(field, distance) - overlap**2 * blend / 4
-    vertices, faces, _, _ = marching_cubes(field, 0.0, spacing=(step,) * 3)
-    mesh = trimesh.Trimesh(vertices.astype(np.float64), faces)
+    vertices, faces = zero_surface(-field)
+    mesh = trimesh.Trimesh(step * vertices, faces)
     trimesh.smoothing.filter_taubin(mesh, lamb=0.5, nu=0.52, iterations=12)
     return mesh
 

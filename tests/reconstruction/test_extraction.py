@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from analytic import Distance, ball, half, logits_of, plate, union
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.ndimage import map_coordinates
 
+from mereo.geometry.marching_cubes import zero_surface
 from mereo.geometry.mesh import PALETTE, Segment
 from mereo.reconstruction.isosurfaces import Extraction, Field, _grid, extract, extract_whole, locate
 
@@ -88,6 +90,20 @@ def test_neighbours_share_their_interface_and_volumes_add_up() -> None:
     assert len(walls[0]) > 200
     assert_allclose(walls[0], walls[1], atol=2e-5 * voxel + 1e-9)
     assert left.volume + right.volume == pytest.approx(together.volume, rel=3e-3)  # gaps below a voxel along the rim
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_field_and_its_negative_have_one_surface_with_its_faces_turned(seed: int) -> None:
+    """Also where opposite corners of a cell's side are alike, as on most sides of noise."""
+    field = np.pad(np.random.default_rng(seed).normal(size=(12, 13, 14)), 1, constant_values=-1.0)
+    vertices, faces = zero_surface(field)
+    again, turned = zero_surface(-field)
+    assert_array_equal(vertices, again)
+    first, second = ({tuple(np.roll(face, -face.argmin())) for face in each} for each in (faces, turned[:, ::-1]))
+    assert first == second
+    surface = Segment("noise", PALETTE[0], vertices, faces)
+    assert surface.edge_imbalance() == (0, 0) and surface.volume > 0, "closed, outward"
+    assert_allclose(map_coordinates(field, vertices.T, order=1), 0.0, atol=1e-12)
 
 
 def test_a_segment_that_fills_the_box_is_closed_half_a_voxel_outside() -> None:

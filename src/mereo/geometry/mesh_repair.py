@@ -13,9 +13,9 @@ import manifold3d
 import numpy as np
 from jaxtyping import Bool, Int
 from scipy.spatial import cKDTree
-from skimage.measure import marching_cubes
 
 from mereo.geometry.brief import counted
+from mereo.geometry.marching_cubes import CORNERS, changing_cells, nodes_of, zero_surface
 from mereo.geometry.mesh import (
     AnyFaces,
     Segment,
@@ -285,9 +285,6 @@ NODES = np.indices((4, 4, 4)).reshape(3, -1).T
 NEIGHBOURS = np.argwhere(np.triu(np.abs(NODES[:, None] - NODES).sum(axis=2) == 1))
 """Pairs of nodes of a block."""
 
-CORNERS = np.array([[0, 0, 0], [0, 1, 0], [1, 1, 0], [1, 0, 0], [0, 0, 1], [0, 1, 1], [1, 1, 1], [1, 0, 1]])
-"""Of a cell, in the order in which libigl's marching cubes give faces that face outwards."""
-
 
 def _even_surface(body: _Body) -> manifold3d.Manifold:
     """Surface from cells of one size."""
@@ -296,18 +293,12 @@ def _even_surface(body: _Body) -> manifold3d.Manifold:
     first = 4 * np.indices(blocks).reshape(3, -1).T
     inside = body.inside_blocks(first, 1.0).reshape(*blocks, 4, 4, 4).transpose(0, 3, 1, 4, 2, 5)
     inside = inside.reshape(4 * blocks)[: shape[0], : shape[1], : shape[2]]
-    near_change = np.zeros_like(inside)
-    for axis in range(3):
-        change = np.diff(inside, axis=axis)
-        for side in (slice(None, -1), slice(1, None)):
-            near_change[tuple(side if k == axis else slice(None) for k in range(3))] |= change
     if not inside.any():
         return manifold3d.Manifold()
-    field = np.ones(inside.shape)
-    field[near_change] = np.clip(body.distance(np.argwhere(near_change).astype(float)), 1e-3, 1)
-    field[~inside] *= -1
-    corners, triangles, _, _ = marching_cubes(field, 0.0, gradient_direction="ascent")
-    return solid_of(corners.astype(np.float64), triangles.astype(np.int64)).simplify(0.2)
+    nodes = np.argwhere(nodes_of(changing_cells(inside)))
+    field = np.where(inside, 1.0, -1.0)
+    field[tuple(nodes.T)] *= np.clip(body.distance(nodes.astype(float)), 1e-3, 1)
+    return solid_of(*zero_surface(field)).simplify(0.2)
 
 
 def _with_thin_parts(

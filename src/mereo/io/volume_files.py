@@ -18,10 +18,10 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Integer, Shaped
 from scipy.ndimage import gaussian_filter
-from skimage.measure import marching_cubes
 
 from mereo.geometry.brief import listed
 from mereo.geometry.labels import part_of_grid
+from mereo.geometry.marching_cubes import zero_surface
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh, palette_color
 from mereo.geometry.transforms import Corners, Flags, Points, Transform, Vector, transform_points
 from mereo.io.config import Space
@@ -553,9 +553,9 @@ class _Grid:
         """Surface where ``margin`` is 0, outward oriented, in world coordinates; None where it is nowhere positive."""
         if margin.max() <= 0:
             return None
-        vertices, faces, _, _ = marching_cubes(margin, 0.0, gradient_direction="ascent")
+        vertices, faces = zero_surface(margin)
         index = (vertices - MARGIN + 0.5) * self.block - 0.5 + self.first
         world = transform_points(self.T_world_index, index)
         # voxel axes may be left-handed
         turned = -1 if np.linalg.det(self.T_world_index[:3, :3]) < 0 else 1
-        return Segment(name, color, world, faces[:, ::turned].astype(np.int64))
+        return Segment(name, color, world, faces[:, ::turned])

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
-from skimage.measure import marching_cubes
 
 from mereo.geometry.labels import LabelGrid, part_of_grid
+from mereo.geometry.marching_cubes import CellFlags, changing_cells, nodes_of, on_both_sides, over_corners, zero_surface
 from mereo.geometry.mesh import AnyFaces, Color, Segment, SegmentedMesh
 from mereo.geometry.transforms import AnyPoints, Corners, Points, Rows, Vector, longest_side
 
@@ -26,9 +26,6 @@ GridRows = Int[np.ndarray, "x y z"]
 
 Logits = Float[np.ndarray, "m c"]
 """Logits in rows."""
-
-CellFlags = Bool[np.ndarray, "i j k"]
-"""Whether each cell between nodes is meant."""
 
 # --- coarse to fine ---------------------------------------------------------------------------------------------------
 
@@ -124,11 +121,6 @@ def _all_nodes(shape: tuple[int, int, int]) -> Int[np.ndarray, "n 3"]:
     return np.indices(shape).reshape(3, -1).T
 
 
-def changing_cells(labels: GridLabels) -> CellFlags:
-    """Cells whose eight corners do not all have one label."""
-    return over_corners(labels, np.maximum) != over_corners(labels, np.minimum)
-
-
 def _sloping_cells(rows: GridRows, logits: Logits) -> CellFlags:
     """Cells in which the lead of the winning class, falling on as between evaluated nodes, could vanish half way.
 
@@ -141,19 +133,9 @@ def _sloping_cells(rows: GridRows, logits: Logits) -> CellFlags:
     change = np.zeros_like(lead)
     for axis in range(3):
         steps = np.nan_to_num(np.abs(np.diff(lead, axis=axis)))
-        change += _on_both_sides(steps, axis, np.maximum)
+        change += on_both_sides(steps, axis, np.maximum)
     # NaN compares as False: a cell all of whose corners were skipped stays as it is
     return over_corners(lead <= REACH * 0.5 * change, np.logical_or)
-
-
-def over_corners(values: np.ndarray, combine: np.ufunc) -> np.ndarray:
-    """Values of each cell's eight corners, joined by ``combine``."""
-    for axis in range(3):
-        count = values.shape[axis]
-        values = combine(
-            np.take(values, np.arange(count - 1), axis=axis), np.take(values, np.arange(1, count), axis=axis)
-        )
-    return values
 
 
 def _halve(
@@ -174,7 +156,8 @@ def _halve(
     fine_labels = labels[np.ix_(*(np.arange(n) // 2 for n in shape))]
     fine_rows = np.full(shape, -1, dtype=np.int32)
     fine_rows[::2, ::2, ::2] = rows
-    wanted = np.argwhere(_nodes_of(active) & (fine_rows < 0))
+    halves = np.kron(active, np.ones((2, 2, 2), dtype=bool))
+    wanted = np.argwhere(nodes_of(halves) & (fine_rows < 0))
     while len(wanted):
         place = tuple(wanted.T)
         fine_labels[place], fine_rows[place] = evaluate(step * wanted)
@@ -182,20 +165,6 @@ def _halve(
         part = part_of_grid(low, high)
         wanted = low + np.argwhere(_contradicted(fine_labels[part], fine_rows[part] < 0, wanted - low))
     return fine_labels, fine_rows
-
-
-def _nodes_of(cells: CellFlags) -> Bool[np.ndarray, "u v w"]:
-    """Nodes of the lattice half as wide that lie in or on these cells."""
-    for axis in range(3):
-        cells = _on_both_sides(np.repeat(cells, 2, axis=axis), axis, np.logical_or)
-    return cells
-
-
-def _on_both_sides(values: np.ndarray, axis: int, combine: np.ufunc) -> np.ndarray:
-    """Values that lie between nodes along an axis, at the nodes: those of both sides joined by ``combine``."""
-    before, after = [(0, 0)] * 3, [(0, 0)] * 3
-    before[axis], after[axis] = (1, 0), (0, 1)
-    return combine(np.pad(values, before), np.pad(values, after))
 
 
 def _contradicted(
@@ -379,9 +348,8 @@ def _surface(sampled: Sampled, grid: LabelGrid, held: list[int]) -> tuple[AnyPoi
     core = (slice(1, -1),) * 3
     closed = -np.abs(margin)
     closed[core] = margin[core]
-    vertices, faces, _, _ = marching_cubes(closed, 0.0, gradient_direction="ascent")
-    positions = grid.origin + (vertices.astype(np.float64) - 1 + low) * grid.spacing
-    return positions, faces.astype(np.int64)
+    vertices, faces = zero_surface(closed)
+    return grid.origin + (vertices - 1 + low) * grid.spacing, faces
 
 
 def _margin(

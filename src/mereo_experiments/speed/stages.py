@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
+from mereo.geometry.marching_cubes import changing_cells, over_corners
 from mereo.geometry.transforms import Normalizer
 from mereo.models.decoder import Code, Decoder, Prediction, line_of_sight
 from mereo.models.device import linear
@@ -28,11 +29,9 @@ from mereo.models.model import Model
 from mereo.models.network import Network
 from mereo.models.trained import EncodedCloud
 from mereo.reconstruction.isosurfaces import (
-    changing_cells,
     extract,
     extract_whole,
     locate,
-    over_corners,
     sample_coarse_to_fine,
     sample_dense,
 )
