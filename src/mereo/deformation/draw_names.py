@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-import numpy as np
+from numpy.random import Generator
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class DrawName:
     unit: str = ""
 
 
-class NamedGenerator(np.random.Generator):
+class NamedGenerator(Generator):
     """Generator that knows the name of its next draw, and its parts, the outermost first.
 
     ``checked`` is whether states that the scene would refuse are to be refused, see ``unchecked``.
@@ -45,7 +45,7 @@ class NamedGenerator(np.random.Generator):
         return DrawName(self.parts, name, unit)
 
 
-def named(rng: np.random.Generator, name: str | tuple[str, ...], unit: str = "") -> np.random.Generator:
+def named(rng: Generator, name: str | tuple[str, ...], unit: str = "") -> Generator:
     """Generator ``rng`` itself, with a name for the numbers of its next draw.
 
     ``name`` is that of all numbers, or of each of them in C order; ``unit`` as they are drawn is "rad", "°", "mm",
@@ -56,7 +56,7 @@ def named(rng: np.random.Generator, name: str | tuple[str, ...], unit: str = "")
     return rng
 
 
-def unchecked(rng: np.random.Generator) -> bool:
+def unchecked(rng: Generator) -> bool:
     """Whether a scene may leave out its test of a state, as the state itself is not wanted.
 
     A fit simulates states a small step from a tested one for what each draw moves. A test such as for parts that meet
@@ -66,7 +66,7 @@ def unchecked(rng: np.random.Generator) -> bool:
 
 
 @contextmanager
-def part(rng: np.random.Generator, name: str) -> Iterator[None]:
+def part(rng: Generator, name: str) -> Iterator[None]:
     """Block of code whose draws all belong to a part of the object, or to a part of the part around it."""
     if not isinstance(rng, NamedGenerator):
         yield

@@ -14,6 +14,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Integer
+from numpy.linalg import det, norm
 from scipy.spatial.transform import Rotation
 
 from mereo.geometry.transforms import Flags, Matrices, Matrix, PointArray, Points, Values, Vector
@@ -117,7 +118,7 @@ class Localized:
 
     def __call__(self, points: Points) -> Points:
         """Points after the part of ``inner`` that reaches them."""
-        distance = np.linalg.norm(points - self.center, axis=1, keepdims=True)
+        distance = norm(points - self.center, axis=1, keepdims=True)
         weight = 1.0 - smooth_step((distance - self.inner_radius) / (self.outer_radius - self.inner_radius))
         return points + weight * (self.inner(points) - points)
 
@@ -139,7 +140,7 @@ def moved_by(points: Points, owner: Integer[np.ndarray, " n"], deformations: tup
 
 def unit(vector: Vector) -> Vector:
     """Unit vector along ``vector``. Raises ``ValueError`` when it has no direction."""
-    length = float(np.linalg.norm(vector))
+    length = float(norm(vector))
     if not (np.isfinite(length) and length > 0):
         raise ValueError(f"the direction {vector.tolist()} has no finite length above 0: give a vector that points")
     return vector / length
@@ -184,7 +185,7 @@ def jacobian(deformation: Deformation, points: Points) -> tuple[Points, Matrices
 
 def jacobian_determinant(deformation: Deformation, points: Points) -> Values:
     """Growth of volume at each point: 1 is rigid or volume preserving, 0 or less folds space over."""
-    return np.linalg.det(jacobian(deformation, points)[1])
+    return det(jacobian(deformation, points)[1])
 
 
 def invert(deformation: Deformation, points: Points, guess: Points) -> tuple[Points, Flags]:
@@ -213,7 +214,7 @@ def newton(deformation: Deformation, points: Points, guess: Points) -> tuple[Poi
         trial = rest[active] + scale[active, None] * full[active]
         value, matrix = jacobian(deformation, trial)
         residual = points[active] - value
-        distance = np.linalg.norm(residual, axis=1)
+        distance = norm(residual, axis=1)
         closer = distance <= (1.0 - 0.5 * scale[active]) * error[active]
         kept = active[closer]
         rest[kept], error[kept], scale[kept] = trial[closer], distance[closer], 1.0

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.linalg import norm
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -270,7 +271,7 @@ def read_pose_table(path: Path) -> PoseTable:
                 raise ValueError(f"line {line} has {len(row)} cells and the header {len(header)}")
         values = np.array([[_number(line, row[columns[name]], name) for name in names] for line, row in body])
         points, quaternions = values[:, :3], values[:, 3:]
-        off = np.abs(np.linalg.norm(quaternions, axis=1) - 1) >= 1e-3
+        off = np.abs(norm(quaternions, axis=1) - 1) >= 1e-3
         if len(names) > 3 and off.any():
             raise ValueError(f"line {body[int(np.argmax(off))][0]} has an orientation that is no rotation")
         rotations = Rotation.from_quat(quaternions).as_matrix() if len(names) > 3 else None

@@ -21,6 +21,7 @@ from zipfile import ZipFile
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int, UInt8
+from numpy.linalg import det
 
 from mereo.geometry.conventions import LARGEST
 from mereo.geometry.mesh import (
@@ -347,7 +348,7 @@ def _in_frame(scene: Any, node: str, base: str) -> tuple[Vertices, Faces, Any]:
     geometry = scene.geometry[key]
     vertices = transform_points(transform, np.asarray(geometry.vertices, dtype=np.float64))
     faces = np.asarray(geometry.faces, dtype=np.int64)
-    if np.linalg.det(transform[:3, :3]) < 0:
+    if det(transform[:3, :3]) < 0:
         faces = faces[:, ::-1]
     return vertices, faces, geometry
 
@@ -539,7 +540,7 @@ def read_glb(path: str | Path) -> GlbScene:
             raise ValueError("it has no faces")
         parts = (_glb_part(scene, node, base, number, path.stem) for number, node in enumerate(nodes))
         segments, colors, radii, calibrated = zip(*parts, strict=True)
-        unit_m = float(abs(np.linalg.det(root)) ** (1 / 3))
+        unit_m = float(abs(det(root)) ** (1 / 3))
         if not unit_m > 0:
             raise ValueError("its root node has a scale of 0")
         names = _numbered([segment.name for segment in segments])

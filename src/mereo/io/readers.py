@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, Real
+from numpy.linalg import norm
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -518,7 +519,7 @@ def read_viewpoint(path: Path) -> Transform | None:
     with readable(path, "point cloud"), path.open("rb") as file:
         words = _pcd_parts(file.read(65536))[0].get("VIEWPOINT", ["0", "0", "0", "1", "0", "0", "0"])
         numbers = np.array(words, dtype=np.float64)
-        if numbers.shape != (7,) or not np.isfinite(numbers).all() or abs(np.linalg.norm(numbers[3:]) - 1.0) > 1e-2:
+        if numbers.shape != (7,) or not np.isfinite(numbers).all() or abs(norm(numbers[3:]) - 1.0) > 1e-2:
             raise ValueError(f"its VIEWPOINT is {' '.join(words)}, not x y z and a unit quaternion qw qx qy qz")
         pose = rigid(Rotation.from_quat(numbers[3:], scalar_first=True).as_matrix(), numbers[:3])
         return None if np.allclose(pose, np.eye(4)) else pose

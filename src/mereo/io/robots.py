@@ -15,6 +15,7 @@ from zlib import crc32
 
 import numpy as np
 import trimesh
+from numpy.linalg import norm
 from scipy.spatial.transform import Rotation
 
 from mereo.geometry.conventions import LARGEST
@@ -427,7 +428,7 @@ def _assembled(content: _Described) -> Robot:
         if joint.name in kept:
             leader, *ends = limits[joint.name]
             ends = ends if leader in kept else sorted(ends)
-            axis = poses[joint.child][:3, :3] @ (joint.axis / np.linalg.norm(joint.axis))
+            axis = poses[joint.child][:3, :3] @ (joint.axis / norm(joint.axis))
             place = joint.type != "prismatic", poses[joint.child][:3, 3], axis, (ends[0], ends[1])
             _check_numbers(path, joint.name, np.array([*poses[joint.child][:3, 3], *axis, *np.rad2deg(ends)]))
             joined.append(RobotJoint(joint.name, *place, kept[joint.name], leader if leader in kept else ""))
@@ -495,7 +496,7 @@ def _limits(path: Path, joints: Sequence[Any]) -> dict[str, tuple[str, float, fl
             )
         least, most = _range(path, leader)
         if joint.type != "fixed" and most > least:
-            if not 0 < np.linalg.norm(joint.axis) < LARGEST:
+            if not 0 < norm(joint.axis) < LARGEST:
                 raise ValueError(
                     f"{path}: joint {joint.name!r} has the axis {joint.axis}; it must be a direction: correct it"
                 )

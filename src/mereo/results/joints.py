@@ -13,6 +13,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Float
+from numpy.linalg import inv, norm
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.special import chdtri, ndtr
 
@@ -147,7 +148,7 @@ def _reach(registration: Registration, fit: OptimizeResult, rows: Indices) -> Fl
         return None
     gaussian, ways = moves
     away: np.ndarray = np.abs(ways).max(axis=1, initial=0.0)
-    return away + WITHIN * np.linalg.norm(gaussian, axis=1)
+    return away + WITHIN * norm(gaussian, axis=1)
 
 
 def pose_covariance(registration: Registration) -> Float[np.ndarray, "6 6"] | None:
@@ -163,7 +164,7 @@ def pose_covariance(registration: Registration) -> Float[np.ndarray, "6 6"] | No
     source = transform_points(placed, registration.model.source_points(registration.scene_unit))
     arm, aim = source - source.mean(axis=0), target - target.mean(axis=0)
     # The turn w of the best rotation solves sum arm x (aim + shift) = 0 to first order: M w = sum arm x shift
-    turning = np.linalg.inv((arm * aim).sum() * np.eye(3) - arm.T @ aim)
+    turning = inv((arm * aim).sum() * np.eye(3) - arm.T @ aim)
     turn = np.moveaxis(rigid_motion(arm)[:, :, :3] @ turning, 2, 0)
     lever = target.mean(axis=0) - placed[:3, 3]
     shift = np.eye(3)[:, None] / len(arm) - np.cross(turn, lever, axisa=0, axisc=0)

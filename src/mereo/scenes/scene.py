@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.linalg import det
+from numpy.random import Generator
 
 from mereo.deformation.maps import Deformation
 from mereo.geometry.brief import counted, listed
@@ -30,7 +32,7 @@ class SourceFrame:
     @property
     def scale(self) -> float:
         """Scene units per unit of the files."""
-        return float(np.cbrt(np.linalg.det(self.T_scene_source[:3, :3])))
+        return float(np.cbrt(det(self.T_scene_source[:3, :3])))
 
     def facts(self) -> dict[str, Any]:
         """Plain values for a file's header."""
@@ -84,7 +86,7 @@ class Workspace:
         """Whether it is the whole sphere, which has no middle."""
         return self.aperture_rad >= WHOLE_SPHERE_RAD
 
-    def sample(self, rng: np.random.Generator, target: Vector) -> Transform:
+    def sample(self, rng: Generator, target: Vector) -> Transform:
         """Pose ``T_world_camera`` of a camera aimed at ``target``, uniform in direction and in distance."""
         cosine = rng.uniform(np.cos(min(self.aperture_rad / 2, np.pi)), 1.0)
         azimuth = rng.uniform(0.0, 2 * np.pi)
@@ -134,7 +136,7 @@ class Scene:
 
     name: str
     rest: SegmentedMesh
-    sample_deformations: Callable[[np.random.Generator], tuple[Deformation, ...]]
+    sample_deformations: Callable[[Generator], tuple[Deformation, ...]]
     workspace: Workspace = field(default_factory=Workspace)
     source: str = "modelled in mereo's own code, MIT licence"
     held_out: "Scene | None" = None
@@ -179,7 +181,7 @@ class Scene:
         """Scene that a seed draws from: its held-out states for testing (``TEST_SEED_START`` up), or itself."""
         return self.held_out if self.held_out is not None and seed >= TEST_SEED_START else self
 
-    def sample_state(self, rng: np.random.Generator) -> State:
+    def sample_state(self, rng: Generator) -> State:
         """Random deformed state within the scene's hand-made bounds."""
         return self.deform(self.sample_deformations(rng))
 

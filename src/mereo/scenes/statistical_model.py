@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
+from numpy.linalg import inv
 from scipy.special import ndtri
 
 from mereo.deformation.moving_least_squares import ANCHORS, Anchors, PointWeights, spread
@@ -205,7 +206,7 @@ class StatisticalModel:
         """Material points at rest in the frame of the object's own files, in a unit of which a scene unit has some."""
         if self.source_frame is None:
             return scene_unit * self.rest_points
-        T_source_scene = np.linalg.inv(self.source_frame.T_scene_source)
+        T_source_scene = inv(self.source_frame.T_scene_source)
         return scene_unit * self.source_frame.scale * transform_points(T_source_scene, self.rest_points)
 
     @cached_property

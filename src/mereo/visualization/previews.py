@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from jaxtyping import Float
+from numpy.linalg import norm
 
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
@@ -135,14 +136,14 @@ def preview_states(
 def _from_side(view: View, size: int, up: Vector) -> Picture:
     world = view.mesh.transformed(view.T_world_camera)
     center = world.bounds.mean(axis=0)
-    radius = float(np.linalg.norm(world.bounds[1] - world.bounds[0])) / 2
+    radius = float(norm(world.bounds[1] - world.bounds[0])) / 2
     toward = view.T_world_camera[:3, 3] - center
-    arrow = _arrow(center, toward / np.linalg.norm(toward), radius)
+    arrow = _arrow(center, toward / norm(toward), radius)
     # an arrow that points away from the viewer is hidden by the object, as it should be
     shown = replace(world, segments=(*world.segments, arrow))
-    z = np.asarray(up) / np.linalg.norm(up)
+    z = np.asarray(up) / norm(up)
     x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
-    direction = -(x / np.linalg.norm(x) + 0.35 * np.cross(z, x) + 0.4 * z)
+    direction = -(x / norm(x) + 0.35 * np.cross(z, x) + 0.4 * z)
     side = Viewpoint.along(world.bounds, (direction[0], direction[1], direction[2]), up)
     return shade(shown, replace(side, half_size=1.4 * radius), (size, size))
 

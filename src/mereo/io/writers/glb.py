@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Shaped, UInt8
+from numpy.linalg import norm
 
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
@@ -59,7 +60,7 @@ def write_segments_glb(
     for index, (label, segment) in enumerate(solid):
         creased, source = split_at_creases(segment)
         normals = vertex_normals(creased)
-        normals[np.linalg.norm(normals, axis=1) < 0.5] = (0.0, 0.0, 1.0)  # of no face's area; glTF wants unit length
+        normals[norm(normals, axis=1) < 0.5] = (0.0, 0.0, 1.0)  # of no face's area; glTF wants unit length
         attributes = {"POSITION": arrays.add(creased.vertices, "VEC3"), "NORMAL": arrays.add(normals, "VEC3")}
         primitive = {
             "attributes": attributes,

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import trimesh
 from jaxtyping import UInt8
+from numpy.linalg import norm
 
 from mereo.geometry.labels import SegmentedCloud
 from mereo.geometry.mesh import Color, Faces, Segment, SegmentedMesh, connected, edge_uses, three_cornered
@@ -52,7 +53,7 @@ def settled(segment: Segment) -> Segment:
     """
     extent = float(np.abs(segment.vertices).max(initial=0.0))
     edges = np.concatenate([segment.faces[:, pair] for pair in ((0, 1), (1, 2), (2, 0))])
-    away = np.linalg.norm(segment.vertices[edges[:, 0]] - segment.vertices[edges[:, 1]], axis=1)
+    away = norm(segment.vertices[edges[:, 0]] - segment.vertices[edges[:, 1]], axis=1)
     short = edges[away < max(MERGED_WITHIN, 4 * float(np.finfo(np.float32).eps) * extent)]
     if not len(short):
         return segment

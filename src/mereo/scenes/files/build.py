@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
+from numpy.linalg import norm
+from numpy.random import Generator
 
 from mereo.deformation.elastic import ElasticSampler
 from mereo.deformation.maps import Deformation
@@ -118,7 +120,7 @@ def build(document: Document, file: SceneFile, mesh: SegmentedMesh) -> Scene:
             f"least, as the camera's noise is 0.1: raise it to {file.size * SMALLEST / longest:.3g} or more",
         )
     rest = mesh.with_vertices([placement.apply(segment.vertices) for segment in mesh.segments])
-    nearest, radius = file.camera.distance[0], float(np.linalg.norm(np.ptp(rest.bounds, axis=0))) / 2
+    nearest, radius = file.camera.distance[0], float(norm(np.ptp(rest.bounds, axis=0))) / 2
     if not nearest > radius:
         raise document.error(
             ("camera", "distance"),
@@ -343,7 +345,7 @@ PLACES = ((0.5, 0.5), (0.25, 0.75), (0.75, 0.25))
 """Shares of an edge's two ends at which it is compared, symmetric, so that neighbours split a shared edge alike."""
 
 
-def refined(rest: SegmentedMesh, draw: Callable[[np.random.Generator], tuple[Deformation, ...]]) -> SegmentedMesh:
+def refined(rest: SegmentedMesh, draw: Callable[[Generator], tuple[Deformation, ...]]) -> SegmentedMesh:
     """Mesh with all edges halved that ``draw``'s maps bend away from a straight line; itself where none is.
 
     An edge is halved where in one of ``STATES`` random states the map of a place on it is farther than ``TOLERANCE``
@@ -355,7 +357,7 @@ def refined(rest: SegmentedMesh, draw: Callable[[np.random.Generator], tuple[Def
     cells = [sampler.solid.cell for sampler, _ in steps if isinstance(sampler, ElasticSampler)]
     shortest = max([SHORTEST, *cells])
     corners = [segment.vertices[segment.faces] for segment in rest.segments]
-    if not any((np.linalg.norm(c - np.roll(c, 1, axis=1), axis=2) > shortest).any() for c in corners):
+    if not any((norm(c - np.roll(c, 1, axis=1), axis=2) > shortest).any() for c in corners):
         return rest
     states = [draw(example_rng(0, index)) for index in range(STATES)]
     tolerance = TOLERANCE
@@ -385,7 +387,7 @@ def _bent(
 ) -> Bool[np.ndarray, " e"]:
     """Which edges a map makes a curve of, farther from its chord than the first limit, if longer than the second."""
     result, (tolerance, shortest) = np.zeros(len(ends), dtype=bool), limits
-    long = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > shortest
+    long = norm(ends[:, 0] - ends[:, 1], axis=1) > shortest
     for deform in maps:
         rows = np.flatnonzero(long & ~result)
         if len(rows) == 0:
@@ -393,6 +395,6 @@ def _bent(
         a, b = ends[rows, 0], ends[rows, 1]
         moved = deform(np.concatenate([a, b, *(s * a + t * b for s, t in PLACES)])).reshape(2 + len(PLACES), -1, 3)
         for (s, t), place in zip(PLACES, moved[2:], strict=True):
-            away = np.linalg.norm(place - (s * moved[0] + t * moved[1]), axis=1)
+            away = norm(place - (s * moved[0] + t * moved[1]), axis=1)
             result[rows] |= away > tolerance
     return result
