@@ -34,6 +34,10 @@ class Deformation(Protocol):
         """Images of points, in the points' unit."""
 
 
+Deformations = tuple[Deformation, ...]
+"""One for each segment of a scene, or one after the other."""
+
+
 @runtime_checkable
 class Invertible(Protocol):
     """Deformation that can undo itself better than Newton's method: exactly, or where finite differences mislead."""
@@ -73,7 +77,7 @@ class Rigid:
 class Compose:
     """Chain of deformations, the first of ``parts`` applied first; the Jacobians multiply."""
 
-    parts: tuple[Deformation, ...]
+    parts: Deformations
 
     def __call__(self, points: Points) -> Points:
         """Points after all parts."""
@@ -129,7 +133,7 @@ def smooth_step(t: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     return t * t * t * (t * (6.0 * t - 15.0) + 10.0)
 
 
-def moved_by(points: Points, owner: Integer[np.ndarray, " n"], deformations: tuple[Deformation, ...]) -> Points:
+def moved_by(points: Points, owner: Integer[np.ndarray, " n"], deformations: Deformations) -> Points:
     """Images of points, each by the deformation of its ``owner``'s number."""
     result = np.empty_like(points)
     for index in np.unique(owner):

@@ -18,7 +18,7 @@ from numpy.linalg import norm
 from numpy.random import Generator
 
 from mereo.deformation.draw_names import named, part
-from mereo.deformation.maps import Compose, Deformation, Localized, Rigid, unit
+from mereo.deformation.maps import Compose, Deformation, Deformations, Localized, Rigid, unit
 from mereo.deformation.warps import Bend, FreeFormLattice, SmoothField, Squash, Taper, Twist
 from mereo.geometry.mesh import SegmentedMesh, vertex_normals
 from mereo.geometry.transforms import AnyPoints, Corners, Points, Vector
@@ -209,9 +209,9 @@ class RandomMotion:
     rest: SegmentedMesh
     steps: tuple[tuple[DeformationSampler, tuple[int, ...]], ...]
 
-    def __call__(self, rng: Generator) -> tuple[Deformation, ...]:
+    def __call__(self, rng: Generator) -> Deformations:
         """One deformation for each segment, as ``Scene.sample_deformations`` draws them."""
-        chains: list[tuple[Deformation, ...]] = [()] * len(self.rest.segments)
+        chains: list[Deformations] = [()] * len(self.rest.segments)
         shares = dict[str, float]()
         for number, (sampler, members) in enumerate(self.steps, start=1):
 
@@ -242,12 +242,12 @@ class RandomMotion:
         joints = {name: replace(self.joints[name][0], shares=each) for name, each in shares.items()}
         return replace(self, steps=tuple((joints.get(getattr(s, "name", ""), s), members) for s, members in self.steps))
 
-    def at(self, shares: Mapping[str, float]) -> tuple[Deformation, ...]:
+    def at(self, shares: Mapping[str, float]) -> Deformations:
         """One deformation for each segment by the joints with a name alone, at these shares of their ranges.
 
         ``shares`` has those of the joints that follow no other one.
         """
-        chains: list[tuple[Deformation, ...]] = [()] * len(self.rest.segments)
+        chains: list[Deformations] = [()] * len(self.rest.segments)
         for joint, members in self.joints.values():
             motion = joint.at(shares[joint.follows or joint.name])
             for index in members:
@@ -263,7 +263,7 @@ class RandomMotion:
         return f"{number} {kind}" + ("" if whole else f" of {', '.join(self.rest.names[i] for i in members)}")
 
 
-def _shared(chains: Sequence[tuple[Deformation, ...]]) -> tuple[Compose, ...]:
+def _shared(chains: Sequence[Deformations]) -> tuple[Compose, ...]:
     """Chains as maps, one for all segments of the same chain."""
     maps: dict[tuple[int, ...], Compose] = {}
     return tuple(maps.setdefault(tuple(id(part) for part in chain), Compose(chain)) for chain in chains)
@@ -275,7 +275,7 @@ def _factor(rng: Generator, bounds: Range) -> float:
 
 
 def _surface(
-    rest: SegmentedMesh, chains: Sequence[tuple[Deformation, ...]], members: Sequence[int]
+    rest: SegmentedMesh, chains: Sequence[Deformations], members: Sequence[int]
 ) -> tuple[AnyPoints, AnyPoints]:
     """Vertices of segments after their maps so far, and their normals."""
     parts = [(rest.segments[index], Compose(chains[index])) for index in members]

@@ -317,6 +317,10 @@ def _stamps(folder: Path) -> dict[str, list[int] | None]:
 # --- JSON -------------------------------------------------------------------------------------------------------------
 
 
+JsonObject = dict[str, Any]
+"""Object of JSON: values by their names, as ``json`` reads them and ``to_json`` can write them."""
+
+
 def write_json(path: str | Path, value: Any, *, force: bool = True) -> None:
     """Write ``to_json`` of a value, indented, whole or not at all; ``force`` as in ``atomic_file``."""
     write_file(path, json_text(value), force=force)

@@ -40,6 +40,7 @@ from mereo.geometry.mesh import (
 from mereo.geometry.mesh_repair import simplified
 from mereo.geometry.radii import Radii
 from mereo.geometry.transforms import AnyPoints, Matrix, Points, transform_points
+from mereo.io.atomic_files import JsonObject
 from mereo.io.errors import check_count, check_size, check_suffix, readable
 from mereo.io.extras import library
 from mereo.io.progress import stage
@@ -393,9 +394,7 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 """Components of glTF's accessors."""
 
 Buffers = dict[str, bytes]
-
-JsonObject = dict[str, Any]
-"""Content of a glTF file, or an entry of it."""
+"""Content of the buffers of a glTF file, by their names."""
 
 
 def _plain_gltf(path: Path) -> tuple[JsonObject, Buffers]:

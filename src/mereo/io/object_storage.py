@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mereo.io.atomic_files import atomic_file, check_place, json_text, remove_abandoned, write_json
+from mereo.io.atomic_files import JsonObject, atomic_file, check_place, json_text, remove_abandoned, write_json
 from mereo.io.errors import checked_path
 from mereo.io.extras import library
 
@@ -160,7 +160,7 @@ def write_whole(place: Place, content: bytes) -> None:
         os.fsync(file.fileno())  # NFS tells of a full disk here, and a name comes after its content
 
 
-def claim(folder: Place, name: str, settings: dict[str, Any], kind: str) -> dict[str, Any] | None:
+def claim(folder: Place, name: str, settings: JsonObject, kind: str) -> JsonObject | None:
     """Settings that a place of earlier work holds, or None where it was made with ``settings`` just now.
 
     Of several processes or machines that come at a time one puts its file and the others read that. Hidden files do not
@@ -197,7 +197,7 @@ def claim(folder: Place, name: str, settings: dict[str, Any], kind: str) -> dict
     return None if json_text(stored) == content else stored
 
 
-def _settings(path: Place) -> dict[str, Any]:
+def _settings(path: Place) -> JsonObject:
     try:
         settings = json.loads(path.read_text("utf-8"))
     except ValueError:

@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from mereo.io.atomic_files import write_file
+from mereo.io.atomic_files import JsonObject, write_file
 from mereo.io.errors import reason
 from mereo.models.calibration import Calibration
 from mereo.models.config import InferenceConfig, Loss, NetworkConfig, Supervision
@@ -50,8 +50,8 @@ class Provenance(BaseModel):
     steps: int | None = None
     examples_before: Annotated[int, Field(ge=0)] | None = None
     visible_m: tuple[FiniteFloat, FiniteFloat] | None = None
-    data: dict[str, Any] | None = None
-    recipe: dict[str, Any] | None = None
+    data: JsonObject | None = None
+    recipe: JsonObject | None = None
 
 
 class Header(BaseModel):
@@ -62,14 +62,14 @@ class Header(BaseModel):
         states: facts about the statistical model, which ``scenes.statistical_model`` reads; None without one.
     """
 
-    network: dict[str, Any]
+    network: JsonObject
     names: Annotated[tuple[Name, ...], Field(min_length=1, max_length=255)]
     colors: tuple[tuple[Byte, Byte, Byte], ...]
     loss: Loss
-    provenance: dict[str, Any]
+    provenance: JsonObject
     domain: tuple[Corner, Corner] | None
     nested: tuple[tuple[Name, Name], ...] = ()
-    states: dict[str, Any] | None = None
+    states: JsonObject | None = None
     calibration: Calibration | None = None
 
 

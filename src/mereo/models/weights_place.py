@@ -3,10 +3,10 @@
 import json
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
+from mereo.io.atomic_files import JsonObject
 from mereo.io.checked_tensors import unpack_tensors
 from mereo.io.errors import reason
 from mereo.scenes.statistical_model import StatisticalModel, unpack_model
@@ -55,7 +55,7 @@ def find_weights(name: str | Path) -> Path:
     return path
 
 
-def read_facts(name: str | Path) -> tuple[Path, dict[str, Any]]:
+def read_facts(name: str | Path) -> tuple[Path, JsonObject]:
     """Path of weights, and what their header says, read without torch and without their network.
 
     Raises ``FileNotFoundError`` as ``find_weights`` does, and ``ValueError`` for a file that is not weights.

@@ -8,7 +8,7 @@ uncertainty is known.
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Literal
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -24,6 +24,7 @@ from mereo.fitting.registration.registration import Registration
 from mereo.fitting.uncertainty import LEVEL, WITHIN
 from mereo.geometry.brief import as_exact_as
 from mereo.geometry.transforms import Indices, fit_rigid, transform_points
+from mereo.io.atomic_files import JsonObject
 from mereo.scenes.scene import AssetUnavailable, Scene
 
 SHOWN = {"rad": (180 / np.pi, "°"), "m": (1000.0, " mm"), "": (1.0, " units")}
@@ -61,7 +62,7 @@ class JointValue:
         value, least, most = as_exact_as(ends[1] - ends[0], factor * self.value, *ends)
         return f"{value}{unit} ({least} to {most})"
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> JsonObject:
         """Content for ``summary.json``."""
         return asdict(self)
 

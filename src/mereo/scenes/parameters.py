@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import ndtr, ndtri
 
-from mereo.deformation.maps import Deformation
+from mereo.deformation.maps import Deformations
 from mereo.deformation.samplers import JointSampler, RandomMotion, Range
 from mereo.io.bounds import NotNegative, Number, check_value
 from mereo.io.yaml_document import Document
@@ -57,7 +57,7 @@ class Played:
 
     seed: int
     calls: tuple[Call, ...]
-    deformations: tuple[Deformation, ...]
+    deformations: Deformations
     remembered: Mapping[Key, Shares]
     turns: Mapping[Key, tuple[float, Shares]]
 
@@ -94,7 +94,7 @@ def random_state(scene: Scene, seed: int) -> Played:
     return _played(scene, seed, {}, {}, None)
 
 
-def play(scene: Scene, recorder: Recorder) -> tuple[Deformation, ...]:
+def play(scene: Scene, recorder: Recorder) -> Deformations:
     """Deformations of one run of a scene; ``scenes.draw_recorder`` counts the calls from here on."""
     return scene.sample_deformations(recorder)
 
@@ -143,9 +143,7 @@ def _renumbered(calls: Sequence[Call]) -> tuple[Call, ...]:
     return tuple(result)
 
 
-def _without_refused(
-    scene: Scene, seed: int, calls: tuple[Call, ...], deformations: tuple[Deformation, ...]
-) -> tuple[Call, ...]:
+def _without_refused(scene: Scene, seed: int, calls: tuple[Call, ...], deformations: Deformations) -> tuple[Call, ...]:
     """The draws that matter: those of attempts that the scene threw away are left out.
 
     A run of draws that starts where a later one starts again is left out, if without it the scene draws exactly the
@@ -165,7 +163,7 @@ def _without_refused(
     return calls
 
 
-def _witness(scene: Scene, deformations: tuple[Deformation, ...]) -> Float[np.ndarray, "w 3"]:
+def _witness(scene: Scene, deformations: Deformations) -> Float[np.ndarray, "w 3"]:
     """Where a few vertices of each segment go."""
     return np.concatenate(
         [

@@ -14,7 +14,7 @@ from numpy.random import Generator
 from scipy.spatial import cKDTree
 
 from mereo.deformation.draw_names import named
-from mereo.deformation.maps import Deformation
+from mereo.deformation.maps import Deformations
 from mereo.deformation.tetrahedral import Surface, SurfaceMap, Tetrahedra, TetrahedralMap
 from mereo.geometry.mesh import Elements, Segment, SegmentedMesh, Vertices
 from mereo.geometry.transforms import AnyPoints, Points, Vector, longest_side
@@ -33,7 +33,7 @@ class States:
     first: int
     end: int
 
-    def sample(self, rng: Generator) -> tuple[Deformation, ...]:
+    def sample(self, rng: Generator) -> Deformations:
         """Deformations of one random frame, each as likely as the other."""
         return self.frames.deformations(int(named(rng, "frame").integers(self.first, self.end)))
 
@@ -129,7 +129,7 @@ class TetrahedralFrames:
         """Node positions in scene units."""
         return self.mesh.nodes + self.scale * self.displacements[frame].astype(np.float64)
 
-    def deformations(self, frame: int) -> tuple[Deformation, ...]:
+    def deformations(self, frame: int) -> Deformations:
         """Deformations of the segments in one frame: one map for all of them."""
         return (TetrahedralMap(self.mesh, self.nodes(frame)),) * self.segments
 
@@ -193,7 +193,7 @@ class SurfaceFrames:
         """Vertices of one segment in scene units."""
         return self.vertices[segment][frame].astype(np.float64) * self.scale + self.shift
 
-    def deformations(self, frame: int) -> tuple[Deformation, ...]:
+    def deformations(self, frame: int) -> Deformations:
         """Deformations of the segments in one frame, a map of its own for each."""
         return tuple(SurfaceMap(s, self.positions(index, frame)) for index, s in enumerate(self.surfaces))
 

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.linalg import det
 from numpy.random import Generator
 
-from mereo.deformation.maps import Deformation
+from mereo.deformation.maps import Deformations
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.conventions import WorkspaceName
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import AnyPoints, Transform, Vector, look_at, rotation_along
+from mereo.io.atomic_files import JsonObject
 from mereo.io.config import Space
 from mereo.scenes.seeds import TEST_SEED_START
 
@@ -34,7 +35,7 @@ class SourceFrame:
         """Scene units per unit of the files."""
         return float(np.cbrt(det(self.T_scene_source[:3, :3])))
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> JsonObject:
         """Plain values for a file's header."""
         return {"T_scene_source": self.T_scene_source.tolist(), "unit_m": self.unit_m, "space": self.space}
 
@@ -109,7 +110,11 @@ class State:
     """Random state of a scene in its own (world) frame, and for each segment the map of space from its rest pose."""
 
     mesh: SegmentedMesh
-    deformations: tuple[Deformation, ...]
+    deformations: Deformations
+
+
+Draw = Callable[[Generator], Deformations]
+"""How one deformation is drawn for each segment."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +141,7 @@ class Scene:
 
     name: str
     rest: SegmentedMesh
-    sample_deformations: Callable[[Generator], tuple[Deformation, ...]]
+    sample_deformations: Draw
     workspace: Workspace = field(default_factory=Workspace)
     source: str = "modelled in mereo's own code, MIT licence"
     held_out: "Scene | None" = None
@@ -185,7 +190,7 @@ class Scene:
         """Random deformed state within the scene's hand-made bounds."""
         return self.deform(self.sample_deformations(rng))
 
-    def deform(self, deformations: tuple[Deformation, ...]) -> State:
+    def deform(self, deformations: Deformations) -> State:
         """State made by one deformation per segment; vertices shared by a common map are moved in one call."""
         moved: list[AnyPoints] = [np.empty((0, 3))] * len(deformations)
         for shared in {id(each): each for each in deformations}.values():

@@ -23,6 +23,7 @@ from mereo.geometry.brief import counted, listed
 from mereo.geometry.mesh import Faces, Segment, SegmentedMesh
 from mereo.geometry.symmetry import TOLERANCE, Symmetry, find_symmetries
 from mereo.geometry.transforms import Labels, Points, Transform, Values, Vector, fit_rigid, transform_points
+from mereo.io.atomic_files import JsonObject
 from mereo.io.checked_tensors import Tensors, pack_tensors, read_content, unpack_tensors
 from mereo.io.errors import reason
 from mereo.io.object_storage import Place, write_whole
@@ -360,7 +361,7 @@ LIBRARY_STEP, WIDE_MODES = 1 / 32, 12
 """Step of a coefficient, whose bytes reach to 4 standard deviations, and how many first modes have two bytes."""
 
 
-def pack_model(model: StatisticalModel) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def pack_model(model: StatisticalModel) -> tuple[dict[str, np.ndarray], JsonObject]:
     """Tensors of a statistical model, and the facts about it that are none: names, colours, sizes, residue."""
     wide, wide_scale = _integers(model.modes[..., :WIDE_MODES], np.int16)
     narrow, narrow_scale = _integers(model.modes[..., WIDE_MODES:], np.int8)

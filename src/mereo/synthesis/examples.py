@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy.random import Generator
 
-from mereo.deformation.maps import Deformation, invert
+from mereo.deformation.maps import Deformations, invert
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.downsampling import farthest_point_order
@@ -60,7 +60,7 @@ class View:
     mesh: SegmentedMesh
     depth: DepthImage
     T_world_camera: Transform
-    deformations: tuple[Deformation, ...]
+    deformations: Deformations
 
 
 @dataclass(frozen=True, eq=False)

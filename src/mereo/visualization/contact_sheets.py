@@ -5,7 +5,6 @@ import io
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -15,7 +14,7 @@ from mereo.geometry.brief import rounded
 from mereo.geometry.camera import DepthImage
 from mereo.geometry.mesh import Color
 from mereo.geometry.transforms import Points
-from mereo.io.atomic_files import atomic_file
+from mereo.io.atomic_files import JsonObject, atomic_file
 from mereo.visualization.color_scales import viridis
 from mereo.visualization.renderer import Canvas, Viewpoint
 from mereo.visualization.units import Unit
@@ -115,7 +114,7 @@ def depth_ends(depth: DepthImage, unit: Unit) -> list[str]:
     return [f"{rounded(end * unit.length_factor)} {unit.length_name}" for end in ends]
 
 
-def depth_data(depth: DepthImage, unit: Unit) -> dict[str, Any]:
+def depth_data(depth: DepthImage, unit: Unit) -> JsonObject:
     """What a page needs to show a depth image: ``url``, ``width`` and ``height`` of its picture, ``ends`` in words."""
     picture = depth_picture(depth)
     height, width = picture.shape[:2]

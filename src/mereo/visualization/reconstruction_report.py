@@ -34,7 +34,7 @@ from mereo.geometry.mesh import Color, Faces, Segment, SegmentedMesh
 from mereo.geometry.radii import Radii, describe_level
 from mereo.geometry.subdivision import split_at_creases
 from mereo.geometry.transforms import Indices, Matrix, Points, Vector
-from mereo.io.atomic_files import atomic_file
+from mereo.io.atomic_files import JsonObject, atomic_file
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
 from mereo.visualization.color_scales import radius_scale
 from mereo.visualization.contact_sheets import MOST_DEPTH_PX, PNG_URL, Picture, data_url, depth_data
@@ -79,7 +79,7 @@ class Report:
 
     cloud: PointCloud
     surfaces: SegmentedMesh
-    summary: dict[str, Any]
+    summary: JsonObject
     rotation: Matrix = field(default_factory=lambda: GLTF_CAMERA_ROTATION)
     unit: Unit = UNKNOWN
     registered: Registration | None = None
@@ -98,7 +98,7 @@ class Report:
         with atomic_file(path) as partial:
             partial.write_bytes(encoded)
 
-    def _data(self) -> dict[str, Any]:
+    def _data(self) -> JsonObject:
         words = page_words(self.summary, self.unit)
         depth = None if self.depth is None else depth_data(self.depth, self.unit)
         points = self.cloud.points
@@ -303,7 +303,7 @@ def confidence_title(calibrated: bool) -> str:
     return "confidence" if calibrated else "confidence, not calibrated"
 
 
-def page_words(summary: Facts, unit: Unit) -> dict[str, Any]:
+def page_words(summary: Facts, unit: Unit) -> JsonObject:
     """Texts of the page.
 
     Args:

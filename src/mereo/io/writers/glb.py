@@ -3,7 +3,6 @@
 import json
 import struct
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Shaped, UInt8
@@ -14,7 +13,7 @@ from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
 from mereo.geometry.radii import STOPS, Radii
 from mereo.geometry.subdivision import split_at_creases
 from mereo.geometry.transforms import Matrix, PointArray
-from mereo.io.atomic_files import atomic_file
+from mereo.io.atomic_files import JsonObject, atomic_file
 from mereo.io.mesh_formats import VIEWER_ROOT
 from mereo.io.writers.meshes import OUTER_OPACITY, with_faces
 
@@ -55,7 +54,7 @@ def write_segments_glb(
     matrix = np.eye(4)
     matrix[:3, :3] = np.asarray(frame_rotation) * unit_m
     root = {"name": VIEWER_ROOT, "matrix": matrix.T.ravel().tolist(), "children": list(range(1, len(solid) + 1))}
-    nodes: list[dict[str, Any]] = [root]  # glTF matrices are column-major
+    nodes: list[JsonObject] = [root]  # glTF matrices are column-major
     meshes, materials = [], []
     for index, (label, segment) in enumerate(solid):
         creased, source = split_at_creases(segment)
@@ -68,7 +67,7 @@ def write_segments_glb(
             "material": index,
         }
         # the exact colour, which a material's factors approximate
-        extras: dict[str, Any] = {"label": label, "color": list(segment.color)}
+        extras: JsonObject = {"label": label, "color": list(segment.color)}
         material = _material(segment, surfaces.opaque[label - 1])
         if radii is not None:
             values = radii.at(segment.vertices, label)[source]
@@ -106,7 +105,7 @@ class _Arrays:
     """Arrays of the file's one buffer; all components are four bytes wide, so every view starts aligned."""
 
     def __init__(self) -> None:
-        self.chunks, self.views, self.accessors = list[bytes](), list[dict[str, Any]](), list[dict[str, Any]]()
+        self.chunks, self.views, self.accessors = list[bytes](), list[JsonObject](), list[JsonObject]()
 
     def add(self, values: Shaped[np.ndarray, "n k"], kind: str) -> int:
         """Number of the accessor of vertices' attributes, as single floats, or of faces' corners."""
@@ -122,7 +121,7 @@ class _Arrays:
         return number
 
 
-def _material(segment: Segment, opaque: bool) -> dict[str, Any]:
+def _material(segment: Segment, opaque: bool) -> JsonObject:
     color = [*_linear(np.array(segment.color, dtype=np.uint8)).round(6).tolist(), 1.0 if opaque else OUTER_OPACITY]
     surface = {"baseColorFactor": color, "metallicFactor": 0.0, "roughnessFactor": 0.7}
     material = {"name": segment.name, "doubleSided": True, "pbrMetallicRoughness": surface}

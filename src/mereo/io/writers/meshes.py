@@ -9,7 +9,6 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -20,7 +19,7 @@ from mereo.geometry.labels import SegmentedCloud
 from mereo.geometry.mesh import Color, Faces, Segment, SegmentedMesh, connected, edge_uses, three_cornered
 from mereo.geometry.radii import Radii
 from mereo.geometry.transforms import Points
-from mereo.io.atomic_files import atomic_file, new_directory, write_file
+from mereo.io.atomic_files import JsonObject, atomic_file, new_directory, write_file
 from mereo.io.mesh_formats import STL_NAME
 
 OUTER_OPACITY = 0.4
@@ -72,7 +71,7 @@ def _is_closed(faces: Faces) -> bool:
     return bool(((uses == 2) & ~unbalanced).all())
 
 
-def segment_table(names: Sequence[str], colors: Sequence[Color]) -> list[dict[str, Any]]:
+def segment_table(names: Sequence[str], colors: Sequence[Color]) -> list[JsonObject]:
     """Label, name and colour of each segment, in label order."""
     rows = enumerate(zip(names, colors, strict=True), start=1)
     return [{"label": label, "name": name, "color": list(color)} for label, (name, color) in rows]

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.linalg import norm
-from numpy.random import Generator
 
 from mereo.deformation.elastic import ElasticSampler
-from mereo.deformation.maps import Deformation
+from mereo.deformation.maps import Deformation, Deformations
 from mereo.deformation.samplers import RandomMotion
 from mereo.geometry.mesh import Segment, SegmentedMesh, palette_color
 from mereo.geometry.mesh_check import examine, united
@@ -41,7 +40,7 @@ from mereo.scenes.files.deformation_blocks import (
 )
 from mereo.scenes.files.template import default_deformations, placed
 from mereo.scenes.recorded_states import load_states
-from mereo.scenes.scene import SCENES, Scene, Workspace
+from mereo.scenes.scene import SCENES, Draw, Scene, Workspace
 from mereo.scenes.seeds import example_rng
 
 SMALLEST = 1.0
@@ -345,7 +344,7 @@ PLACES = ((0.5, 0.5), (0.25, 0.75), (0.75, 0.25))
 """Shares of an edge's two ends at which it is compared, symmetric, so that neighbours split a shared edge alike."""
 
 
-def refined(rest: SegmentedMesh, draw: Callable[[Generator], tuple[Deformation, ...]]) -> SegmentedMesh:
+def refined(rest: SegmentedMesh, draw: Draw) -> SegmentedMesh:
     """Mesh with all edges halved that ``draw``'s maps bend away from a straight line; itself where none is.
 
     An edge is halved where in one of ``STATES`` random states the map of a place on it is farther than ``TOLERANCE``
@@ -370,7 +369,7 @@ def refined(rest: SegmentedMesh, draw: Callable[[Generator], tuple[Deformation, 
 
 
 def _refined_surface(
-    rest: SegmentedMesh, states: list[tuple[Deformation, ...]], limits: tuple[float, float], most: int
+    rest: SegmentedMesh, states: list[Deformations], limits: tuple[float, float], most: int
 ) -> SegmentedMesh:
     segments = []
     for index, segment in enumerate(rest.segments):

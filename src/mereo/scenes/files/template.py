@@ -19,10 +19,9 @@ import numpy as np
 import trimesh
 import yaml
 from numpy.linalg import norm
-from numpy.random import Generator
 from scipy.spatial import ConvexHull, QhullError
 
-from mereo.deformation.maps import Deformation, moved_by, unit
+from mereo.deformation.maps import moved_by, unit
 from mereo.deformation.samplers import RandomMotion, distance_from_line
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.conventions import UNITS_M, Way
@@ -61,15 +60,13 @@ from mereo.scenes.files.deformation_blocks import (
     Target,
 )
 from mereo.scenes.files.joints import SLIDES_ALONG, TURNS_ON, Joint, proposed_joints
-from mereo.scenes.scene import SCENES, Workspace
+from mereo.scenes.scene import SCENES, Draw, Workspace
 from mereo.scenes.seeds import example_rng
 
 # --- how far states move ----------------------------------------------------------------------------------------------
 
 STATES, POINTS = 24, 800
 """Random states in which motion is measured, and places of the surface at which it is."""
-
-Draw = Callable[[Generator], tuple[Deformation, ...]]
 
 
 class Motion(NamedTuple):
