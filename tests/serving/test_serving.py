@@ -728,8 +728,7 @@ async def test_others_than_this_machine_need_the_token(root: Path) -> None:
 
 def get(port: int, path: str) -> bytes:
     with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=20) as answer:
-        content: bytes = answer.read()
-        return content
+        return answer.read()
 
 
 def workers_of(server: Any) -> list[int]:

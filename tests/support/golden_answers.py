@@ -218,8 +218,7 @@ def is_same(kept: dict[str, Any], now: dict[str, Any]) -> bool:
 
 
 def kept_of(name: str) -> dict[str, dict[str, Any]]:
-    kept: dict[str, dict[str, Any]] = read_json(FOLDER / f"{name}.json")
-    return kept
+    return read_json(FOLDER / f"{name}.json")
 
 
 def write(name: str, answers: dict[str, dict[str, Any]]) -> None:

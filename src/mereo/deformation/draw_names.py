@@ -13,6 +13,8 @@ from dataclasses import dataclass
 
 from numpy.random import Generator
 
+from mereo.geometry.conventions import Names
+
 
 @dataclass(frozen=True)
 class DrawName:
@@ -24,8 +26,8 @@ class DrawName:
         unit: of the numbers as they are drawn; "rad" is shown in degrees, "log" is a factor's logarithm.
     """
 
-    parts: tuple[str, ...] = ()
-    name: str | tuple[str, ...] = ""
+    parts: Names = ()
+    name: str | Names = ""
     unit: str = ""
 
 
@@ -35,8 +37,8 @@ class NamedGenerator(Generator):
     ``checked`` is whether states that the scene would refuse are to be refused, see ``unchecked``.
     """
 
-    parts: tuple[str, ...] = ()
-    next_name: tuple[str | tuple[str, ...], str] = ("", "")
+    parts: Names = ()
+    next_name: tuple[str | Names, str] = ("", "")
     checked: bool = True
 
     def take_name(self) -> DrawName:
@@ -45,7 +47,7 @@ class NamedGenerator(Generator):
         return DrawName(self.parts, name, unit)
 
 
-def named(rng: Generator, name: str | tuple[str, ...], unit: str = "") -> Generator:
+def named(rng: Generator, name: str | Names, unit: str = "") -> Generator:
     """Generator ``rng`` itself, with a name for the numbers of its next draw.
 
     ``name`` is that of all numbers, or of each of them in C order; ``unit`` as they are drawn is "rad", "°", "mm",

@@ -272,7 +272,7 @@ class StateMap:
         spin = (linear - mirrored) / 2
         turn = Rotation.from_rotvec(np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)).as_matrix()
         gradients = np.swapaxes(turn @ strain, 1, 2).reshape(-1, 3)
-        nodes: np.ndarray = self._factors.solve(self._divergence @ gradients)
+        nodes = self._factors.solve(self._divergence @ gradients)
         return TetrahedralMap(self.mesh, nodes + self._share @ (self.mesh.nodes - nodes))
 
 

@@ -20,10 +20,9 @@ from numpy.random import Generator
 from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, Deformations, Localized, Rigid, unit
 from mereo.deformation.warps import Bend, FreeFormLattice, SmoothField, Squash, Taper, Twist
+from mereo.geometry.conventions import Range
 from mereo.geometry.mesh import SegmentedMesh, vertex_normals
 from mereo.geometry.transforms import AnyPoints, Corners, Points, Vector
-
-Range = tuple[float, float]
 
 Surface = Callable[[], tuple[AnyPoints, AnyPoints]]
 """Vertices of what is to be moved, as the maps before have left them, and outward unit normals."""

@@ -198,7 +198,7 @@ def _locate(
 ) -> Int[np.ndarray, " p"]:
     if len(points) == 0:  # libigl's loop expects some
         return np.empty(0, dtype=np.int64)
-    element: np.ndarray = igl.in_element(nodes, elements, np.ascontiguousarray(points, dtype=np.float64), tree)
+    element = igl.in_element(nodes, elements, np.ascontiguousarray(points, dtype=np.float64), tree)
     return element.astype(np.int64)  # C's long long, which numpy tells apart
 
 

@@ -16,6 +16,7 @@ from scipy.ndimage import map_coordinates
 
 from mereo.deformation.draw_names import named
 from mereo.deformation.maps import crossing, smooth_step, turn, unit
+from mereo.geometry.conventions import Range
 from mereo.geometry.transforms import Corners, Points, Vector, unit_rows
 
 LATTICE_LIMIT = 1 / 2.48
@@ -151,7 +152,7 @@ class SmoothField:
         return float(lengths[0] @ lengths[1])
 
     @classmethod
-    def sample(cls, rng: Generator, strength: float, wavelength: tuple[float, float], modes: int = 4) -> "SmoothField":
+    def sample(cls, rng: Generator, strength: float, wavelength: Range, modes: int = 4) -> "SmoothField":
         """Field of ``modes`` random waves, wavelengths uniform in a range, with gradient bound ``strength``."""
         directions, amplitudes = named(rng, "pattern").normal(size=(2, modes, 3))
         frequencies = unit_rows(directions) * 2 * np.pi / named(rng, "wavelength").uniform(*wavelength, size=(modes, 1))
@@ -216,7 +217,7 @@ class CurveSweep:
     """
 
     curve: CubicSpline
-    ends: tuple[float, float]
+    ends: Range
 
     @classmethod
     def through(

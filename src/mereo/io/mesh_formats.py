@@ -41,7 +41,7 @@ from mereo.geometry.mesh_repair import simplified
 from mereo.geometry.radii import Radii
 from mereo.geometry.transforms import AnyPoints, Matrix, Points, transform_points
 from mereo.io.atomic_files import JsonObject
-from mereo.io.errors import check_count, check_size, check_suffix, readable
+from mereo.io.errors import AnyPath, check_count, check_size, check_suffix, readable
 from mereo.io.extras import library
 from mereo.io.progress import stage
 from mereo.io.readers import check_ply, lies_below
@@ -63,7 +63,7 @@ class MeshWarning(UserWarning):
     """Warning that a mesh is used, but not as its file may mean it."""
 
 
-def read_segmented_mesh(*paths: str | Path) -> SegmentedMesh:
+def read_segmented_mesh(*paths: AnyPath) -> SegmentedMesh:
     """Segments of one or more GLB, OBJ, 3MF, DAE, PLY, STL or OFF files, in label order; they are not checked.
 
     A file with several named parts (GLB nodes and their instances, OBJ objects or groups, 3MF objects) gives one
@@ -92,7 +92,7 @@ def read_segmented_mesh(*paths: str | Path) -> SegmentedMesh:
     return SegmentedMesh(tuple(segments))
 
 
-def read_object_mesh(path: str | Path) -> SegmentedMesh:
+def read_object_mesh(path: AnyPath) -> SegmentedMesh:
     """Segments of a file, or of a folder's files, for an object that is to be found; raises as ``read_segmented_mesh``.
 
     Solids of more than ``mesh_repair.MOST_FACES`` faces are simplified, and a ``MeshWarning`` says how far. What was
@@ -526,7 +526,7 @@ def is_glb(path: Path) -> bool:
     return path.suffix.lower() == ".glb"
 
 
-def read_glb(path: str | Path) -> GlbScene:
+def read_glb(path: AnyPath) -> GlbScene:
     """Meshes of any GLB file; raises ``FileNotFoundError``, and ``ValueError`` where it is damaged or has no faces."""
     path = Path(path)
     with readable(path, "GLB file"):
@@ -589,7 +589,7 @@ def _colors(geometry: Any, plain: Color) -> tuple[Color, UInt8[np.ndarray, "v 3"
     return (int(color[0]), int(color[1]), int(color[2])), each if varied else None
 
 
-def _screen(linear: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
+def _screen(linear: Points) -> UInt8[np.ndarray, "n 3"]:
     """Colours of a screen from linear light (glTF 2.0, section 3.9.2)."""
     light = np.clip(linear, 0.0, 1.0)
     share = np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)

@@ -20,6 +20,7 @@ from mereo.geometry.mesh import FEW_VERTICES, oriented_points
 from mereo.geometry.transforms import Points, Rows, Transform, inverse_rigid, longest_side, rigid, transform_points
 from mereo.io.bounds import PositiveOrUnknown, check_bounds
 from mereo.io.config import InputConfig
+from mereo.io.errors import AnyPath
 from mereo.io.intrinsics import intrinsics_of, read_intrinsics
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.readers import (
@@ -132,7 +133,7 @@ class SensorFrame:
 
 
 def read_frame(
-    path: str | Path,
+    path: AnyPath,
     reading: InputConfig = InputConfig(),  # noqa: B008 (frozen)
     T_input_camera: Transform | None = None,
     camera: Any = None,

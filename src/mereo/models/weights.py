@@ -16,7 +16,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from mereo.io.atomic_files import JsonObject, write_file
-from mereo.io.errors import reason
+from mereo.io.errors import AnyPath, reason
 from mereo.models.calibration import Calibration
 from mereo.models.config import InferenceConfig, Loss, NetworkConfig, Supervision
 from mereo.models.device import find_device, pick_precision
@@ -183,7 +183,7 @@ def weights_bytes(model: Model, dtype: torch.dtype = torch.float32) -> bytes:
     return save(tensors, metadata={"mereo": json.dumps(header)})
 
 
-def with_calibration(name: str | Path, calibration: Calibration) -> bytes:
+def with_calibration(name: AnyPath, calibration: Calibration) -> bytes:
     """Content of a file of weights with another calibration; all else in it stays, bit for bit.
 
     Raises as ``load_model`` does for a file that is none.
@@ -240,12 +240,12 @@ def trained_steps(path: Path) -> int | None:
     return steps if isinstance(steps, int) else None
 
 
-def load_for(name: str | Path, inference: InferenceConfig) -> Model:
+def load_for(name: AnyPath, inference: InferenceConfig) -> Model:
     """Trained model (``load_model``) on the device and in the precision that are asked for."""
     return replace(load_model(name, find_device(inference.device)), precision=inference.precision)
 
 
-def load_model(name: str | Path, device: torch.device | str = "cpu") -> Model:
+def load_model(name: AnyPath, device: torch.device | str = "cpu") -> Model:
     """Trained model, a shipped one by its name or one from a file.
 
     Raises ``FileNotFoundError`` for unknown names, ``ValueError`` when it is not weights of this version.

@@ -23,6 +23,7 @@ from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.uncertainty import LEVEL, WITHIN
 from mereo.geometry.brief import as_exact_as
+from mereo.geometry.conventions import Range
 from mereo.geometry.transforms import Indices, fit_rigid, transform_points
 from mereo.io.atomic_files import JsonObject
 from mereo.scenes.scene import AssetUnavailable, Scene
@@ -49,9 +50,9 @@ class JointValue:
     """
 
     value: float
-    interval: tuple[float, float] | None
+    interval: Range | None
     unit: Literal["rad", "m", ""]
-    limits: tuple[float, float]
+    limits: Range
 
     def __str__(self) -> str:
         """Value and interval for people, in degrees or millimetres."""
@@ -148,8 +149,7 @@ def _reach(registration: Registration, fit: OptimizeResult, rows: Indices) -> Fl
     if (moves := _moves(registration, gradient)) is None:
         return None
     gaussian, ways = moves
-    away: np.ndarray = np.abs(ways).max(axis=1, initial=0.0)
-    return away + WITHIN * norm(gaussian, axis=1)
+    return np.abs(ways).max(axis=1, initial=0.0) + WITHIN * norm(gaussian, axis=1)
 
 
 def pose_covariance(registration: Registration) -> Float[np.ndarray, "6 6"] | None:
@@ -173,7 +173,7 @@ def pose_covariance(registration: Registration) -> Float[np.ndarray, "6 6"] | No
     if moves is None or sure is None:
         return None
     factor = np.hstack(moves)
-    covariance: np.ndarray = factor @ factor.T
+    covariance = factor @ factor.T
     covariance[range(3, 6), range(3, 6)] += (sure.optimum.unit * sure.extra_radius) ** 2 / chdtri(3, 1 - LEVEL)
     return covariance
 

@@ -11,7 +11,7 @@ from numpy.random import Generator
 
 from mereo.deformation.maps import Deformations
 from mereo.geometry.brief import counted, listed
-from mereo.geometry.conventions import WorkspaceName
+from mereo.geometry.conventions import Range, WorkspaceName
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import AnyPoints, Transform, Vector, look_at, rotation_along
 from mereo.io.atomic_files import JsonObject
@@ -77,7 +77,7 @@ class Workspace:
     """
 
     aperture_rad: float = PAPER_APERTURE_RAD
-    distance: tuple[float, float] = (100.0, 200.0)
+    distance: Range = (100.0, 200.0)
     axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
     any_roll: bool = False
     fov_rad: float = float(np.deg2rad(35.0))

@@ -264,7 +264,7 @@ class StatisticalModel:
     @cached_property
     def motion(self) -> PerMode:
         """Root mean square motion of the material points for one standard deviation of each mode."""
-        squared: np.ndarray = np.einsum("mck,mck->k", self.modes, self.modes, dtype=np.float64)
+        squared = np.einsum("mck,mck->k", self.modes, self.modes, dtype=np.float64)
         return np.sqrt(squared / len(self.modes))
 
     @cached_property

@@ -8,7 +8,7 @@ from typing import Literal
 
 from tyro.conf import OmitArgPrefixes
 
-from mereo.geometry.conventions import WorkspaceName
+from mereo.geometry.conventions import Range, WorkspaceName
 from mereo.io.atomic_files import JsonObject
 from mereo.io.bounds import (
     ImageSize,
@@ -240,7 +240,7 @@ class SequenceConfig:
         return round(self.seconds * self.rate)
 
     @property
-    def hidden_s(self) -> tuple[float, float]:
+    def hidden_s(self) -> Range:
         """First and last time at which the occluder may be in view; the same without one."""
         span = 0.0 if self.occluder == "none" else min(self.occluded, self.seconds)
         return (self.seconds - span) / 2, (self.seconds + span) / 2

@@ -196,7 +196,7 @@ def _rest_guess(
     return np.einsum("nk,nkj->nj", weights, old) + np.einsum("nij,nj->ni", _triangle_frames(old), local)
 
 
-def _triangle_frames(triangles: Float[np.ndarray, "n 3 3"]) -> Matrices:
+def _triangle_frames(triangles: Matrices) -> Matrices:
     """Rotations whose columns are each triangle's first edge, its normal, and the direction across."""
     along = triangles[:, 1] - triangles[:, 0]
     normal = np.cross(along, triangles[:, 2] - triangles[:, 0])

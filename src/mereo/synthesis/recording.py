@@ -29,7 +29,7 @@ from PIL import Image
 from scipy.special import ndtr, ndtri
 
 from mereo.geometry.camera import Camera
-from mereo.geometry.conventions import MIN_POINTS
+from mereo.geometry.conventions import MIN_POINTS, Range
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import Transform, Values, Vector, inverse_rigid, unit_rows
@@ -269,7 +269,7 @@ class _Around(NamedTuple):
 
     occluder: tuple[Capsule, ...]
     away: Vector
-    span_s: tuple[float, float]
+    span_s: Range
     normal: Vector | None = None
     gap: float = 0.0
 

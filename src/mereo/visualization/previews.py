@@ -5,7 +5,6 @@ Everything is drawn by ``mereo.visualization.renderer``, without a display.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import trimesh
@@ -15,6 +14,7 @@ from numpy.linalg import norm
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import Corners, Points
+from mereo.io.errors import AnyPath
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
@@ -39,7 +39,7 @@ CAMERA_VIEWS = {
 
 
 def render_cloud_and_segments(
-    path: str | Path,
+    path: AnyPath,
     cloud: PointCloud,
     surfaces: SegmentedMesh,
     title: str = "",
@@ -93,7 +93,7 @@ def _joint_bounds(points: Points, solid: SegmentedMesh) -> Corners:
 # --- states of one scene ---------------------------------------------------------------------------------------------
 
 
-def preview_scene(scene: Scene, path: str | Path, seed: int = 0, states: int = 9) -> None:
+def preview_scene(scene: Scene, path: AnyPath, seed: int = 0, states: int = 9) -> None:
     """Write ``preview_states`` of random states of a scene; state i comes from (seed, i) alone."""
     settings = GenerateConfig()
     views = [sample_view(scene, settings, example_rng(seed, index)) for index in range(states)]
@@ -103,7 +103,7 @@ def preview_scene(scene: Scene, path: str | Path, seed: int = 0, states: int = 9
 
 
 def preview_states(
-    path: str | Path,
+    path: AnyPath,
     views: Sequence[View],
     title: str = "",
     size: int = 220,

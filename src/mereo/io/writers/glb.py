@@ -2,7 +2,6 @@
 
 import json
 import struct
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Shaped, UInt8
@@ -14,6 +13,7 @@ from mereo.geometry.radii import STOPS, Radii
 from mereo.geometry.subdivision import split_at_creases
 from mereo.geometry.transforms import Matrix, PointArray
 from mereo.io.atomic_files import JsonObject, atomic_file
+from mereo.io.errors import AnyPath
 from mereo.io.mesh_formats import VIEWER_ROOT
 from mereo.io.writers.meshes import OUTER_OPACITY, with_faces
 
@@ -27,7 +27,7 @@ def viewer_rotation(frame: CloudAxes) -> Matrix:
 
 
 def write_segments_glb(
-    path: str | Path,
+    path: AnyPath,
     surfaces: SegmentedMesh,
     frame_rotation: Matrix = GLTF_CAMERA_ROTATION,
     unit_m: float = 1.0,
@@ -131,5 +131,4 @@ def _material(segment: Segment, opaque: bool) -> JsonObject:
 def _linear(srgb: UInt8[np.ndarray, "*n 3"]) -> PointArray:
     """Linear light of screen colours (glTF 2.0, section 3.9.2)."""
     share = srgb / 255.0
-    linear: np.ndarray = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
-    return linear
+    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)

@@ -18,6 +18,7 @@ from numpy.linalg import norm
 from mereo.deformation.elastic import ElasticSampler
 from mereo.deformation.maps import Deformation, Deformations
 from mereo.deformation.samplers import RandomMotion
+from mereo.geometry.conventions import Range
 from mereo.geometry.mesh import Segment, SegmentedMesh, palette_color
 from mereo.geometry.mesh_check import examine, united
 from mereo.geometry.subdivision import TooManyFaces, split_edges
@@ -368,9 +369,7 @@ def refined(rest: SegmentedMesh, draw: Draw) -> SegmentedMesh:
             tolerance *= 2
 
 
-def _refined_surface(
-    rest: SegmentedMesh, states: list[Deformations], limits: tuple[float, float], most: int
-) -> SegmentedMesh:
+def _refined_surface(rest: SegmentedMesh, states: list[Deformations], limits: Range, most: int) -> SegmentedMesh:
     segments = []
     for index, segment in enumerate(rest.segments):
         bent = partial(_bent, maps=[state[index] for state in states], limits=limits)
@@ -381,9 +380,7 @@ def _refined_surface(
     return replace(rest, segments=tuple(segments))
 
 
-def _bent(
-    ends: Float[np.ndarray, "e 2 3"], maps: list[Deformation], limits: tuple[float, float]
-) -> Bool[np.ndarray, " e"]:
+def _bent(ends: Float[np.ndarray, "e 2 3"], maps: list[Deformation], limits: Range) -> Bool[np.ndarray, " e"]:
     """Which edges a map makes a curve of, farther from its chord than the first limit, if longer than the second."""
     result, (tolerance, shortest) = np.zeros(len(ends), dtype=bool), limits
     long = norm(ends[:, 0] - ends[:, 1], axis=1) > shortest

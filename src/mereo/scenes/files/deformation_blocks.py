@@ -119,8 +119,7 @@ class Target:
 
     def point(self, place: Point) -> Vector:
         """Place of the file in the scene's frame."""
-        moved: Vector = self.placement.apply(np.array(place))
-        return moved
+        return self.placement.apply(np.array(place))
 
 
 class DeformationBlock(Block, ABC):

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from numpy.linalg import norm
 
 from mereo.deformation.maps import Compose, Rigid
+from mereo.geometry.conventions import Range
 from mereo.geometry.mesh import Segment, SegmentedMesh, area_vectors, connected, surface_points
 from mereo.geometry.mesh_check import overlaps
 from mereo.geometry.solids import search_tree
@@ -204,8 +205,8 @@ class Joint:
     hinge: bool
     moved: tuple[int, ...]
     axis: Vector
-    most: tuple[float, float]
-    alone: tuple[float, float]
+    most: Range
+    alone: Range
 
     @property
     def narrowed(self) -> bool:

@@ -24,7 +24,7 @@ from scipy.spatial import ConvexHull, QhullError
 from mereo.deformation.maps import moved_by, unit
 from mereo.deformation.samplers import RandomMotion, distance_from_line
 from mereo.geometry.brief import counted, listed
-from mereo.geometry.conventions import UNITS_M, Way
+from mereo.geometry.conventions import UNITS_M, Names, Range, Way
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, palette_color, surface_points
 from mereo.geometry.mesh_check import examine, likely_unit, overlaps
 from mereo.geometry.transforms import (
@@ -412,7 +412,7 @@ def _source(files: Sequence[Path], folder: Path, robot_meshes: RobotMeshes) -> _
     return _Source("\n".join(lines), mesh, *_likely_frame(files[0], mesh.bounds))
 
 
-def _segment_names(names: Sequence[str], kind: str) -> tuple[str, ...]:
+def _segment_names(names: Sequence[str], kind: str) -> Names:
     """Names of segments after those of files or parts; raises ``ValueError`` where two of them are the same."""
     valid = tuple(_segment_name(name) for name in names)
     if repeated := sorted({name for name in valid if valid.count(name) > 1}):
@@ -682,7 +682,7 @@ def _joints(mesh: SegmentedMesh, joints: Sequence[Joint]) -> str:
     return "".join(line + "\n" for line in (JOINTS, *lines))
 
 
-def _range(values: tuple[float, float]) -> str:
+def _range(values: Range) -> str:
     return f"[{values[0]:.4g}, {values[1]:.4g}]"
 
 
