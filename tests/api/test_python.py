@@ -16,10 +16,12 @@ from analytic import untrained
 from angle import write_angle
 from answers import answer_to
 from folder_contents import read_json
+from numpy.linalg import det, inv, norm
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
-from toy_frames import CENTERS, MODEL, NAMES, RADII, seen
+from toy_frames import MODEL, NAMES, seen
 from toy_scene import toy_scene
+from two_balls import BIG, SMALL
 
 import mereo
 from mereo.__main__ import main
@@ -45,6 +47,7 @@ from mereo.scenes.random_states import CACHE_VARIABLE
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SourceFrame
 from mereo.scenes.seeds import example_rng
+from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.sample_views import load_view
 from mereo.visualization.units import Unit
@@ -267,7 +270,7 @@ UNIT_M, SCALE = 0.01, 4.0
 
 def test_segments_are_had_by_their_names(result: Result) -> None:
     assert result.names == NAMES and len(result) == 3
-    for name, center, radius in zip(NAMES, CENTERS, RADII, strict=False):
+    for name, (center, radius) in zip(NAMES, (BIG, SMALL), strict=False):
         found = result[name]
         assert_allclose(found.centroid, center, atol=0.003)
         assert found.volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.05)
@@ -294,6 +297,13 @@ def registrar(rope: Model) -> Registrar:
     return Registrar(rope, own, "modes")
 
 
+def rest_in_files(model: StatisticalModel) -> np.ndarray:
+    """Points at rest in the frame and unit of the object's files."""
+    source = model.source_frame
+    assert source is not None
+    return transform_points(inv(source.T_scene_source), model.rest_points)
+
+
 @pytest.mark.parametrize("unit, axes", [(UNIT_M, "camera"), (0.001, "scanner")])
 def test_the_pose_brings_the_objects_files_to_the_frame(
     unit: float, axes: CloudAxes, rope: Model, registrar: Registrar
@@ -306,12 +316,10 @@ def test_the_pose_brings_the_objects_files_to_the_frame(
     assert registered is not None and result.pose is not None and result.unit_m == unit
     assert result.model_scale == pytest.approx(SCALE * UNIT_M / unit, rel=0.1)
     assert_allclose(result.pose[:3, :3] @ result.pose[:3, :3].T, np.eye(3), atol=1e-9)
-    assert np.linalg.det(result.pose[:3, :3]) == pytest.approx(1.0)
-    source = registered.model.source_frame
-    assert source is not None
-    rest = transform_points(np.linalg.inv(source.T_scene_source), registered.model.rest_points)
+    assert det(result.pose[:3, :3]) == pytest.approx(1.0)
+    rest = rest_in_files(registered.model)
     placed = transform_points(result.pose, result.model_scale * rest)
-    away = np.linalg.norm(placed - registered.material, axis=1)
+    away = norm(placed - registered.material, axis=1)
     length = float(np.ptp(registered.material, axis=0).max())
     assert np.median(away) < 0.5 * length, "rigidly placed, a bent rope lies about where it is"
     assert_allclose(placed.mean(axis=0), registered.material.mean(axis=0), atol=1e-6 * length)
@@ -321,14 +329,12 @@ def test_each_segment_has_its_own_pose_and_radius(rope: Model, registrar: Regist
     result = Result.of(answer_to(load_view("rope").depth.to_points(), rope, registrar, 16, unit_m=UNIT_M))
     registered, whole = result.registered, result.pose
     assert registered is not None and whole is not None and result.model_scale is not None
-    source = registered.model.source_frame
-    assert source is not None
-    rest = transform_points(np.linalg.inv(source.T_scene_source), registered.model.rest_points)
+    rest = rest_in_files(registered.model)
     for one in result:
         rows = registered.model.labels == one.label
         assert one.pose is not None and one.error_radius is not None and one.error_radius > 0
         own, common = (
-            np.linalg.norm(transform_points(T, result.model_scale * rest[rows]) - registered.material[rows], axis=1)
+            norm(transform_points(T, result.model_scale * rest[rows]) - registered.material[rows], axis=1)
             for T in (one.pose, whole)
         )
         assert np.sqrt((own**2).mean()) < np.sqrt((common**2).mean()), one.name

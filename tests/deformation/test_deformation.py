@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.linalg import det, norm
 from numpy.random import Generator, default_rng
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
@@ -41,7 +42,7 @@ BOX = np.array([[-HALF] * 3, [HALF] * 3])
 
 def direction(rng: Generator) -> np.ndarray:
     vector = rng.normal(size=3)
-    return vector / np.linalg.norm(vector)
+    return vector / norm(vector)
 
 
 def make_bend(rng: Generator) -> Deformation:
@@ -153,7 +154,7 @@ def test_composition_applies_the_first_part_first() -> None:
 def test_bend_preserves_arc_length_and_has_the_closed_form_jacobian() -> None:
     bend = Bend(np.zeros(3), np.array([0.0, 0, 2]), np.array([1.0, 0, 5]), length=12.0, angle_rad=1.5, radius=7.0)
     axis = np.linspace(-5, 20, 4001)[:, None] * np.array([0, 0, 1.0])
-    steps = np.linalg.norm(np.diff(bend(axis), axis=0), axis=1)
+    steps = norm(np.diff(bend(axis), axis=0), axis=1)
     assert np.isclose(steps.sum(), 25.0, rtol=1e-6)
     points = default_rng(5).uniform([-7, -7, 0.1], [7, 7, 11.9], size=(500, 3))
     assert np.allclose(jacobian_determinant(bend, points), 1 - 1.5 / 12 * points[:, 0], atol=1e-4)
@@ -162,7 +163,7 @@ def test_bend_preserves_arc_length_and_has_the_closed_form_jacobian() -> None:
 def test_bend_is_a_circle_between_rigid_ends() -> None:
     bend, straight = (Bend(np.zeros(3), *np.eye(3)[[2, 0]], length=12.0, angle_rad=a, radius=7.0) for a in (1.5, 0.0))
     arc = bend(np.linspace(0, 12, 50)[:, None] * np.array([0, 0, 1.0]))
-    assert np.allclose(np.linalg.norm(arc - np.array([8.0, 0, 0]), axis=1), 8.0)
+    assert np.allclose(norm(arc - np.array([8.0, 0, 0]), axis=1), 8.0)
     before = np.array([[1.0, 2, -3], [-4, 1, -8]])
     assert np.allclose(bend(before), before)
     # turned by the angle about y, from z towards x
@@ -190,7 +191,7 @@ def test_smooth_field_changes_distances_within_its_bound(seed: int, strength: fl
     field = SmoothField.sample(rng, strength, (5.0, 30.0))
     assert np.isclose(field.gradient_bound, strength)
     x, y = cube(rng), cube(rng) * rng.choice([1e-2, 1.0])
-    ratio = np.linalg.norm(field(x) - field(y), axis=1) / np.linalg.norm(x - y, axis=1)
+    ratio = norm(field(x) - field(y), axis=1) / norm(x - y, axis=1)
     assert ratio.min() >= 1 - strength - 1e-9 and ratio.max() <= 1 + strength + 1e-9
 
 
@@ -225,7 +226,7 @@ def test_window_is_its_inner_map_inside_and_nothing_outside() -> None:
     rng = default_rng(9)
     inner = Rigid(np.array([0.0, 0, 0.3]), np.array([0.5, 0, 0]), np.zeros(3))
     window, points = Localized(inner, np.ones(3), 3.0, 9.0), cube(rng, 4000)
-    distance = np.linalg.norm(points - 1.0, axis=1)
+    distance = norm(points - 1.0, axis=1)
     assert np.allclose(window(points)[distance < 3], inner(points)[distance < 3])
     assert np.array_equal(window(points)[distance > 9], points[distance > 9])
 
@@ -250,7 +251,7 @@ def test_transported_frames_are_rotations_that_do_not_twist() -> None:
     t = np.linspace(0, 4 * np.pi, 2000)
     tangents = np.stack([-np.sin(t), np.cos(t), np.full_like(t, 0.5)], axis=1) / np.hypot(1, 0.5)
     frames = transport_frames(tangents, np.array([1.0, 1.0, 0.3]))
-    assert np.allclose(frames @ frames.transpose(0, 2, 1), np.eye(3)) and np.allclose(np.linalg.det(frames), 1)
+    assert np.allclose(frames @ frames.transpose(0, 2, 1), np.eye(3)) and np.allclose(det(frames), 1)
     assert np.allclose(frames[:, 0], tangents)
     twist = np.einsum("ni,ni->n", np.gradient(frames[:, 1], t, axis=0), frames[:, 2])
     assert np.abs(twist[2:-2]).max() < 1e-4

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from answers import fit_correspondences
-from fit_cases import IN_FRONT, SCENE, said, seen, shown
+from fit_cases import IN_FRONT, SCENE, said, seen, shown, true_material
+from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
@@ -25,22 +26,15 @@ from mereo.fitting.registration.register import CloudToFit, ModesFit, is_drawn
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.search import rotations
 from mereo.fitting.tracking import PAUSE_S, Track, explore
-from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.geometry.transforms import transform_points
 from mereo.models.weights import load_model
 from mereo.scenes.random_states import build_model, interior_nodes, sample_states, state_points
-from mereo.scenes.scene import State
 from mereo.scenes.seeds import example_rng
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import View, sample_view
 
 CLEAN = replace(GenerateConfig(), noise_std=0.0)
-
-
-def true_material(model: StatisticalModel, view: View) -> np.ndarray:
-    state = State(view.mesh.transformed(view.T_world_camera), view.deformations)
-    points = state_points(state, model.nodes, model.node_labels)
-    return transform_points(inverse_rigid(view.T_world_camera), points)
 
 
 def told(model: StatisticalModel, view: View, error: float = 0.0) -> Correspondences:
@@ -63,7 +57,7 @@ def test_a_known_state_is_found(model: StatisticalModel, index: int, method: str
     error, states = (0.0, None) if method == "modes" else (0.5, DrawnStates.of(SCENE, model, 100, 1000))
     found = fit_correspondences(view.depth.to_points().points, told(model, view, error), model, 1.0, states)
     assert found.method == method
-    assert np.median(np.linalg.norm(found.material - true_material(model, view), axis=1)) < 0.05
+    assert np.median(norm(found.material - true_material(model, view), axis=1)) < 0.05
     assert found.accepted and found.explained > 0.99 and found.beyond_states < 0.05
 
 
@@ -117,9 +111,9 @@ def test_an_object_at_rest_is_found_to_be_at_rest(model: StatisticalModel, noise
     found = fit_correspondences(unit * points, said(model, material).scaled(unit), model, unit)
     assert found.method == "rest" and found.accepted
     # a rigid motion of the rest model, and the right one
-    apart = [np.linalg.norm(np.diff(places[::50], axis=0), axis=1) for places in (found.material / unit, material)]
+    apart = [norm(np.diff(places[::50], axis=0), axis=1) for places in (found.material / unit, material)]
     assert_allclose(*apart, atol=1e-6)
-    assert np.linalg.norm(found.material / unit - material, axis=1).max() < 0.05 + noise / 2
+    assert norm(found.material / unit - material, axis=1).max() < 0.05 + noise / 2
     assert_allclose(found.z, model.rest_z)
 
 
@@ -174,7 +168,7 @@ def test_the_approach_reaches_a_state_of_the_scene(model: StatisticalModel, stat
     drawn = Drawn.of(SCENE, states.seeds[3])
     start = lay_on_shape(states, shape, drawn, drawn.z)
     found = approach(states, shape, start, 3)
-    apart = [np.linalg.norm(n.points @ n.rotation.T + n.translation - points, axis=1) for n in (start, found)]
+    apart = [norm(n.points @ n.rotation.T + n.translation - points, axis=1) for n in (start, found)]
     assert found.misfit < start.misfit
     assert np.median(apart[1]) < 0.3 * np.median(apart[0])
 
@@ -208,7 +202,7 @@ def test_modes_reproduce_states_they_were_not_built_from(model: StatisticalModel
         state = state_points(SCENE.sample_state(example_rng(7, index)), model.nodes, model.node_labels)
         T, z = model.project(state)
         found = model.material(z) @ T[:3, :3].T + T[:3, 3]
-        assert np.linalg.norm(found - state, axis=1).max() < 0.15
+        assert norm(found - state, axis=1).max() < 0.15
         assert np.abs(z).max() < 5
     assert 0 < model.residue < 0.01 * model.half  # that of held-out states
 

@@ -7,6 +7,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from answers import answer_to
+from numpy.linalg import norm
 from numpy.random import default_rng
 from scipy.spatial import cKDTree
 
@@ -175,10 +176,8 @@ def with_rim(points: np.ndarray) -> np.ndarray:
     slopes = points[:, :2] / points[:, 2:]
     pitch = np.sqrt(np.ptp(slopes, axis=0).prod() / len(slopes))
     middle = slopes.mean(axis=0)
-    far = slopes[np.argsort(-np.linalg.norm(slopes - middle, axis=1))[:: len(slopes) // 6][:6]]
-    pieces = [
-        far + (far - middle) / np.linalg.norm(far - middle, axis=1)[:, None] * pitch * step for step in (1.5, 2.5)
-    ]
+    far = slopes[np.argsort(-norm(slopes - middle, axis=1))[:: len(slopes) // 6][:6]]
+    pieces = [far + (far - middle) / norm(far - middle, axis=1)[:, None] * pitch * step for step in (1.5, 2.5)]
     rim = np.concatenate(pieces)
     return np.concatenate([points, np.column_stack([rim, np.ones(len(rim))]) * (1.4 * points[:, 2].max())])
 
@@ -192,7 +191,7 @@ def test_strays_are_left_out_and_all_else_is_kept(registrar: Registrar, points: 
     found = fitted(registrar, with_rim(points))
     assert clean.hypothesis.dropped == 0 and clean.encoded is likelier
     assert not found.hypothesis.keep[len(points) :].any() and found.hypothesis.keep[: len(points)].mean() > 0.99
-    moved = np.linalg.norm(found.modes.registration.material - clean.modes.registration.material, axis=1)
+    moved = norm(found.modes.registration.material - clean.modes.registration.material, axis=1)
     assert np.median(moved) < 0.2
     assert fitted(registrar, with_rim(points), keep_all=True).hypothesis.dropped == 0
 
@@ -222,7 +221,7 @@ def test_an_answer_says_which_points_it_is_of(registrar: Registrar, points: np.n
 
 def noisy(points: np.ndarray, std: float) -> np.ndarray:
     noise = default_rng(0).normal(scale=std, size=(len(points), 1))
-    return points + noise * points / np.linalg.norm(points, axis=1)[:, None]
+    return points + noise * points / norm(points, axis=1)[:, None]
 
 
 @pytest.mark.slow
@@ -320,7 +319,7 @@ def test_what_neighbours_share_is_told_from_what_points_have_alone(registrar: Re
     assert (known.evidence.shared_errors.offsets - off)[:, 2].std() < 0.4 * off[:, 2].std()
     assert known.noise < 0.5 * noise_of(problem.offsets(modes.surface))
     forward = ModesOptimum(known, modes.posed, 1.0).posterior.factor[5]  # a shift along the line of sight
-    assert 0.1 < np.linalg.norm(forward) < 0.6
+    assert 0.1 < norm(forward) < 0.6
 
 
 def test_a_noisy_cloud_is_explained_where_only_noise_is_left(registrar: Registrar, points: np.ndarray) -> None:
@@ -343,7 +342,7 @@ def test_constants_follow_the_noise_and_end(registrar: Registrar, points: np.nda
     clean = (config.cloud_sigma, config.tolerance, config.accepted)
     assert constants(0.0) == constants(CLEAN) == clean and not problem.with_noise(CLEAN).is_noisy
     assert constants(0.2) == pytest.approx((0.3, 0.6, ACCEPTED)) and problem.with_noise(0.2).is_noisy
-    largest = 0.01 * np.median(np.linalg.norm(points, axis=1))  # of a camera, whatever the object's size
+    largest = 0.01 * np.median(norm(points, axis=1))  # of a camera, whatever the object's size
     assert constants(99.0)[0] == pytest.approx(SIGMAS * largest, rel=0.02)
 
 

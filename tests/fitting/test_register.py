@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from analytic import untrained
 from answers import answer_to, reconstruct
+from fit_cases import true_material
 from folder_contents import read_json
 from numpy.testing import assert_allclose, assert_array_equal
 from trimesh.remesh import subdivide
@@ -34,15 +35,13 @@ from mereo.geometry.camera import SCANNER_TO_CAMERA, PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.metrics import Scores, confusion_matrix, intersection_over_union
 from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import inverse_rigid, transform_points
 from mereo.io.atomic_files import write_json
 from mereo.models.model import Model
 from mereo.models.weights import load_model
 from mereo.reconstruction.observation import observe
 from mereo.reconstruction.pipeline import Reconstruction
-from mereo.scenes.random_states import state_points
 from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import AssetUnavailable, State
+from mereo.scenes.scene import AssetUnavailable
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import View, sample_view
@@ -240,9 +239,7 @@ def engine_view() -> View:
 
 def test_a_registration_is_as_far_off_as_its_points_are(engine: Model, engine_view: View) -> None:
     statistical = engine.statistical_model
-    state = State(engine_view.mesh.transformed(engine_view.T_world_camera), engine_view.deformations)
-    truth = state_points(state, statistical.nodes, statistical.node_labels)
-    truth = transform_points(inverse_rigid(engine_view.T_world_camera), truth)
+    truth = true_material(statistical, engine_view)
     cloud = engine_view.depth.to_points()
     found = Registrar.of(engine, "modes").fit_modes(CloudToFit(cloud.points, scene_unit=1.0)).registration
     shown = seen_points(truth, cloud, 1.0)

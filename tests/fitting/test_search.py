@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fit_cases import seen
+from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
@@ -32,6 +33,7 @@ from mereo.fitting.search import ALIKE, ROUNDS, WHOLE, SearchRound, SightTable, 
 from mereo.geometry.camera import PointCloud, SharedNoise, SightLines
 from mereo.geometry.mesh import SegmentedMesh, area_vectors, surface_points
 from mereo.geometry.symmetry import Symmetry
+from mereo.geometry.transforms import unit_rows
 from mereo.models.weights import load_model
 from mereo.reconstruction.isolation import Reading
 from mereo.reconstruction.pipeline import encode_frame
@@ -155,7 +157,7 @@ def test_noise_is_told_from_a_wrong_state(
         cells = (points[:, :2] / points[:, 2:] // 0.012).astype(int)
         rows = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
     off_by = default_rng(0).normal(scale=0.5, size=len(points))[rows]
-    noisy = points * (1 + off_by / np.linalg.norm(points, axis=1))[:, None]
+    noisy = points * (1 + off_by / norm(points, axis=1))[:, None]
     fitted = search_modes(CloudToFit(noisy, 1.0, lines=SightLines.of_cloud("past")), model)
     assert fitted.problem.is_noisy and fitted.registration.accepted
     assert off(model, fitted.registration.material, posed) < 0.1
@@ -221,9 +223,7 @@ def all_around(model: StatisticalModel, posed: Posed, std: float = 0.05) -> tupl
     mesh = model.mesh(posed.place(model.material(posed.z)))
     vertices, faces, _ = SegmentedMesh(mesh.segments[1:]).merged()  # without the core inside
     points, face = surface_points(vertices, faces, 1500)
-    normals = area_vectors(vertices, faces)[face]
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return points + default_rng(0).normal(scale=std, size=points.shape), normals
+    return points + default_rng(0).normal(scale=std, size=points.shape), unit_rows(area_vectors(vertices, faces)[face])
 
 
 @pytest.mark.parametrize("kind", ["whole", "half", "unknown unit", "without normals"])
@@ -263,9 +263,7 @@ def test_surfaces_without_a_camera_rule_nothing_out_and_show_all_faces(model: St
     surface = Surface.of(model, posed, evidence.shows)
     assert len(surface.facing) == len(model.faces) > len(Surface.of(model, posed).facing)
     corners = surface.material[model.faces]
-    assert evidence.area == pytest.approx(
-        np.linalg.norm(area_vectors(surface.material, model.faces), axis=1).sum() / 2, rel=0.5
-    )
+    assert evidence.area == pytest.approx(norm(area_vectors(surface.material, model.faces), axis=1).sum() / 2, rel=0.5)
     assert corners.shape[0] and len(evidence.few(7).alike(1.0).lifted) == 7 == len(evidence.few(7).observed_samples)
     dense = SurfaceEvidence.of(np.tile(points, (5, 1)) + np.repeat(np.arange(5), len(points))[:, None] * 1e-3)
     assert len(dense.points) <= MOST_POINTS and len(dense.with_more_samples.sample_normals) > OBSERVED_SAMPLES

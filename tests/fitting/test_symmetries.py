@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from fit_cases import IN_FRONT, said, seen
+from numpy.linalg import norm
 from numpy.random import Generator, default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
@@ -68,7 +69,7 @@ def rest_mesh(sides: int, peg: float) -> SegmentedMesh:
     wheel = trimesh.creation.cylinder(radius=6.0, height=5.0, sections=sides).subdivide().subdivide()
     vertices = np.asarray(wheel.vertices)
     corner = np.array([6.0, 0.0])
-    near = np.exp(-((np.linalg.norm(vertices[:, :2] - corner, axis=1) / 1.5) ** 2))
+    near = np.exp(-((norm(vertices[:, :2] - corner, axis=1) / 1.5) ** 2))
     vertices = vertices + peg * near[:, None] * np.array([1.0, 0.0, 0.0]) + np.array([0.0, 0.0, 8.0])
     segment = Segment("wheel", (200, 60, 60), vertices, np.asarray(wheel.faces, dtype=np.int32))
     block = box((-9, -7, -5), (8, 6, 5), "block", 0)
@@ -145,7 +146,7 @@ def test_radii_hold_what_is_left_open() -> None:
     assert not alone.open.any()
     wheel = model.labels == 2
     assert_allclose(radii[~wheel], alone.radii()[~wheel])
-    rim = wheel & (np.linalg.norm(model.rest_points[:, :2], axis=1) > 5.5)
+    rim = wheel & (norm(model.rest_points[:, :2], axis=1) > 5.5)
     assert radii[rim].min() > 8.0 and radii[rim].max() < 20.0
     follow = model.weights(model.rest_points[:5], model.labels[:5])
     assert_allclose(replace(without, open=turns).radii(follow).radii(), radii[:5], rtol=0.2)

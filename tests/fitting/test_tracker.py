@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.linalg import det, norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -297,7 +298,7 @@ def test_a_stream_says_that_an_object_is_lost(
         lines.append(line(folder.written(outcome, "camera")))
     answering.close()
     assert [one["tracking"] for one in lines] == ["found", "lost"] and lines[1]["segments"] == {}
-    assert np.linalg.det(lines[0]["pose"]) == pytest.approx(1) and lines[1]["pose"] is None  # no earlier pose
+    assert det(lines[0]["pose"]) == pytest.approx(1) and lines[1]["pose"] is None  # no earlier pose
     assert lines[1]["reason"].startswith("the object is lost: only")
     # surfaces of the frame that was there by this name before it was lost are gone
     assert not list((tmp_path / "out").iterdir())
@@ -373,7 +374,7 @@ def second(scene: Scene) -> SegmentedMesh:
 
 
 def apart(found: Answer, mesh: SegmentedMesh) -> float:
-    return float(np.linalg.norm(vertices(found.surfaces) - vertices(mesh), axis=1).mean())
+    return float(norm(vertices(found.surfaces) - vertices(mesh), axis=1).mean())
 
 
 @pytest.mark.parametrize("unit", [pytest.param(1.0, marks=pytest.mark.slow), None])
@@ -384,7 +385,7 @@ def test_a_slow_sequence_is_tracked_as_its_frames_are_fitted(
     tracker, frames = Tracker(engine), [observe(PointCloud(size * seen(scene, mesh).points)) for mesh in meshes]
     found = [tracker.follow(frame, i / RATE_HZ, scene_unit=unit) for i, frame in enumerate(frames)]
     assert all(one.tracked for one in found[1:])
-    assert np.linalg.norm(vertices(meshes[-1]) - vertices(meshes[0]), axis=1).max() > 0.5
+    assert norm(vertices(meshes[-1]) - vertices(meshes[0]), axis=1).max() > 0.5
     alone = Tracker(engine).follow(frames[-1], 0.0, scene_unit=unit)
     assert apart(found[-1], alone.surfaces) < 0.2 * size
     # the unit that was found is kept

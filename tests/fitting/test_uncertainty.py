@@ -13,6 +13,7 @@ import trimesh
 from answers import answer_to, fit_correspondences
 from fit_cases import SCENE, said, seen, shown
 from folder_contents import read_json
+from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial import cKDTree
@@ -72,7 +73,7 @@ def test_the_radius_holds_95_percent_of_a_gaussian() -> None:
         turn = Rotation.random(random_state=1).as_matrix()
         points = rng.normal(size=(200_000, 3)) * spread @ turn.T
         radius = radius95((turn @ np.diag(np.square(spread)) @ turn.T)[None])[0]
-        assert (np.linalg.norm(points, axis=1) <= radius).mean() == pytest.approx(0.95, abs=0.005)
+        assert (norm(points, axis=1) <= radius).mean() == pytest.approx(0.95, abs=0.005)
 
 
 def test_the_posterior_of_a_linear_problem_is_its_closed_form() -> None:
@@ -88,7 +89,7 @@ def test_the_posterior_of_a_linear_problem_is_its_closed_form() -> None:
     posed = Posed(turn, np.array([3.0, -2.0, 50.0]), np.zeros(1))
     posterior = Posterior.of(normal, posed, rng.normal(size=(7, 3)), modes)
     variance = 1.0 / (1.0 + float((modes.astype(float) ** 2).sum()) / sigma**2)
-    lengths = np.linalg.norm(modes[..., 0], axis=1)
+    lengths = norm(modes[..., 0], axis=1)
     assert_allclose(posterior.radii().radii(), lengths * np.sqrt(variance * chi2.ppf(0.95, 1)), rtol=1e-3)
 
 
@@ -169,7 +170,7 @@ def test_the_scale_is_that_which_holds_95_percent(found: Registration, sure: Unc
     assert_array_equal(one.seen, shown)
     calibrated = RegistrationErrors.of(replace(found, radius_scale=7.0, extra_radius=0.05), material, shown, 1.0)
     assert_allclose(calibrated.radii, np.hypot(7.0 * one.radii, 0.05))
-    off = np.linalg.norm(found.material - material, axis=1)
+    off = norm(found.material - material, axis=1)
     assert_array_equal(calibrated.ratios <= 1.0, off <= calibrated.radii)
     assert_array_equal(one.ratios <= 1.0, off <= sure.material)
     both = RegistrationErrors.together([one, one])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from label_cases import CENTER, ORIGIN, RADIUS, SPACING, halves, nibabel, write_nifti
+from numpy.linalg import norm
 from numpy.testing import assert_allclose, assert_array_equal
 from overlapping import check_overlap
 from shapes import ball, box
@@ -17,6 +18,7 @@ from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
 from mereo.geometry.mesh_check import overlaps
 from mereo.geometry.solids import Solids
 from mereo.geometry.subdivision import split_at_creases
+from mereo.geometry.transforms import unit_rows
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.volume_files import LabelVolume, LabelWarning, is_volume, read_label_volume, segment_surfaces
 from mereo.io.writers.glb import write_segments_glb
@@ -63,7 +65,7 @@ def test_surfaces_are_smooth_and_neighbours_touch(tmp_path: Path) -> None:
     volume = read_label_volume(write_nifti(tmp_path / "a.nii", halves()))
     mesh = segment_surfaces(volume, {1: "liver", 2: "spleen"}, 96)
     outer = mesh.merged()[0] - (ORIGIN + CENTER)
-    radius = np.linalg.norm(outer[np.abs(outer[:, 0]) > 5], axis=1)
+    radius = norm(outer[np.abs(outer[:, 0]) > 5], axis=1)
     assert np.abs(radius - RADIUS).max() < 1.25  # slices are 2.5 mm apart; unsmoothed steps would be as high
     assert radius.std() < 0.4
     wall = np.stack(np.meshgrid([-1.0, 1.0], np.linspace(-25, 25, 9), np.linspace(-25, 25, 9), indexing="ij"), axis=-1)
@@ -113,7 +115,7 @@ def test_a_scene_from_a_label_volume(tmp_path: Path) -> None:
 def sphere(center: tuple[float, ...], radius: float) -> np.ndarray:
     """Voxels of a ball on a grid of 60 x 60 x 40, which are 1 x 1 x 1.5 mm."""
     axes = [np.arange(n) * s for n, s in zip((60, 60, 40), GRID, strict=True)]
-    return np.linalg.norm(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1) - center, axis=-1) < radius
+    return norm(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1) - center, axis=-1) < radius
 
 
 GRID = np.array([1.0, 1.0, 1.5])
@@ -291,8 +293,7 @@ def test_a_box_has_three_normals_at_each_corner() -> None:
     normals = vertex_normals(split)
     assert_allclose(np.abs(normals).max(axis=1), 1.0)
     faces = split.vertices[split.faces]
-    own = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
-    own /= np.linalg.norm(own, axis=1, keepdims=True)
+    own = unit_rows(np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0]))
     assert_allclose(normals[split.faces], np.repeat(own[:, None], 3, axis=1), atol=1e-12)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 import yaml
+from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from overlapping import check_overlap
@@ -342,7 +343,7 @@ def crossing() -> Segment:
 
 def truth(points: np.ndarray, part: Segment) -> np.ndarray:
     centers = [(0, 0, 0), (1.5, 0, 0)][: 1 + (len(part.vertices) > len(WHOLE.vertices))]
-    return np.min([np.linalg.norm(points - center, axis=-1) for center in centers], axis=0) - 2.0
+    return np.min([norm(points - center, axis=-1) for center in centers], axis=0) - 2.0
 
 
 @pytest.mark.parametrize("part", [holed(), crossing()], ids=["hole", "self-intersection"])
@@ -350,7 +351,7 @@ def test_points_and_grids_are_labelled_as_of_the_solid(part: Segment) -> None:
     axis, points = np.linspace(-2.7, 3.7, 33), default_rng(0).uniform(-3, 4, size=(4000, 3))
     found = Solids(one(part)).label(points), label_grid(one(part), axis, axis, axis)
     for labels, places in zip(found, (points, nodes(axis, axis, axis)), strict=True):
-        clear = (np.abs(truth(places, part)) > 0.06) & (np.linalg.norm(places - [2, 0, 0], axis=-1) > 0.6)
+        clear = (np.abs(truth(places, part)) > 0.06) & (norm(places - [2, 0, 0], axis=-1) > 0.6)
         assert_array_equal(labels[clear] == 1, truth(places, part)[clear] < 0)
 
 
@@ -405,7 +406,7 @@ def test_outside_a_box_distance_and_direction_have_closed_forms() -> None:
     points = points[(outside > 0).any(axis=1)]
     foot = np.clip(points, [-1, -2, -3], [1, 2, 3])
     distance, direction = signed_distance_and_direction(solids, points, solids.label(points))
-    expected = np.linalg.norm(points - foot, axis=1)
+    expected = norm(points - foot, axis=1)
     assert np.allclose(distance, expected, atol=1e-9)
     assert np.allclose(direction, (foot - points) / expected[:, None], atol=1e-6)
 
@@ -424,7 +425,7 @@ def test_nearest_over_all_segments_is_the_least_of_each_segments_distance() -> N
     found = solids.nearest(points)
     assert np.allclose(found.distance, each.min(axis=0))
     assert np.array_equal(found.owner, each.argmin(axis=0))
-    assert np.allclose(np.linalg.norm(found.point - points, axis=1), found.distance)
+    assert np.allclose(norm(found.point - points, axis=1), found.distance)
 
 
 @pytest.mark.parametrize("unit, shift", [(1.0, 0.0), (1e-5, 0.0), (1.0, 3000.0)])

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from jaxtyping import Float
+from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
@@ -89,18 +90,18 @@ def test_planes_stay_and_their_noise_falls(tilt: float) -> None:
     flat = plane(tilt)
     assert_allclose(smoothed(flat), flat, rtol=2e-3)
     before, after = noisy(flat, 0.3) - flat, smoothed(noisy(flat, 0.3)) - flat
-    assert np.linalg.norm(after, axis=1).std() < 0.5 * np.linalg.norm(before, axis=1).std()
+    assert norm(after, axis=1).std() < 0.5 * norm(before, axis=1).std()
 
 
 def test_points_stay_on_their_lines_of_sight_in_any_frame_and_unit() -> None:
     points = noisy(plane(0.4), 0.3)
     moved = smoothed(points)
-    along = np.einsum("ij,ij->i", moved, points) / (np.linalg.norm(moved, axis=1) * np.linalg.norm(points, axis=1))
+    along = np.einsum("ij,ij->i", moved, points) / (norm(moved, axis=1) * norm(points, axis=1))
     assert_allclose(along, 1.0)
     assert_allclose(smoothed(points * 1024.0), moved * 1024.0)
     turn = Rotation.from_rotvec([0.2, -0.4, 1.0]).as_matrix()
     turned = smoothed(points @ turn.T) @ turn
-    assert np.median(np.linalg.norm(turned - moved, axis=1)) < 0.02
+    assert np.median(norm(turned - moved, axis=1)) < 0.02
 
 
 def test_an_edge_stays_sharp() -> None:
@@ -177,7 +178,7 @@ def test_on_a_lattice_the_choice_is_exact_and_ties_go_to_smaller_coordinates() -
     points = lattice(5)
     order = farthest_point_order(points, 60)
     # each point's distance to the nearest of the first 1, 2, ... chosen ones
-    gaps = np.minimum.accumulate(np.linalg.norm(points[:, None] - points[order[:-1]][None], axis=-1), axis=1)
+    gaps = np.minimum.accumulate(norm(points[:, None] - points[order[:-1]][None], axis=-1), axis=1)
     # rows of the lattice are sorted by x, y, z, and argmax takes the first: the rule in one line
     assert np.array_equal(order[1:], gaps.argmax(axis=0))
 

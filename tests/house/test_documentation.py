@@ -195,8 +195,7 @@ def tool() -> SimpleNamespace:
 
 @pytest.fixture(scope="module")
 def tour(tool: SimpleNamespace) -> dict[str, Any]:
-    notebook: dict[str, Any] = tool.read()
-    return notebook
+    return tool.read()
 
 
 def test_what_is_shown_is_of_the_code_as_it_is(tool: SimpleNamespace, tour: dict[str, Any]) -> None:

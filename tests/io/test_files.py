@@ -6,12 +6,15 @@ import os
 import struct
 import sys
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
+from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
@@ -120,18 +123,20 @@ BAD_CLOUDS: dict[str, tuple[bytes, str]] = {
 def test_a_bad_cloud_gets_one_sentence(tmp_path: Path, name: str) -> None:
     content, expected = BAD_CLOUDS[name]
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(ValueError, match=expected) as caught:
+    with refused(tmp_path / name, expected):
         read_point_cloud(tmp_path / name)
-    assert_sentence(caught.value, tmp_path / name)
 
 
-def assert_sentence(error: Exception, path: Path) -> None:
-    """One line that names the file and, after a colon, the cure."""
-    message = str(error)
+@contextmanager
+def refused(path: Path, expected: str) -> Iterator[None]:
+    """Expect an error of one line that names the file and, after a colon, the cure."""
+    with pytest.raises(ValueError, match=expected) as caught:
+        yield
+    message = str(caught.value)
     assert "\n" not in message
     assert str(path) in message
     assert ": " in message.replace(str(path), "")
-    assert not isinstance(error, UnicodeError)
+    assert not isinstance(caught.value, UnicodeError)
 
 
 def test_missing_files_and_directories(tmp_path: Path) -> None:
@@ -184,9 +189,8 @@ def test_bad_meshes_get_one_sentence(tmp_path: Path) -> None:
         ("drawing.step", b"ISO-10303-21;", "suffix '.step'"),
     ):
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(ValueError, match=expected) as caught:
+        with refused(tmp_path / name, expected):
             read_segmented_mesh(tmp_path / name)
-        assert_sentence(caught.value, tmp_path / name)
 
 
 def write_glb(path: Path, arrays: list[np.ndarray], **tree: Any) -> Path:
@@ -270,9 +274,8 @@ def test_positions_as_shares_of_integers_and_sparse_ones_are_read_as_such(tmp_pa
 def test_a_compressed_glb_file_is_refused_by_its_compression(extension: str, tmp_path: Path) -> None:
     tree = {"nodes": [{"mesh": 0}], "meshes": [{"primitives": [SOLID]}], "extensionsUsed": [extension]}
     path = write_glb(tmp_path / "a.glb", [CORNERS, SIDES], **tree)
-    with pytest.raises(ValueError, match=f"it is compressed by {extension}, which is not read: export") as caught:
+    with refused(path, f"it is compressed by {extension}, which is not read: export"):
         read_segmented_mesh(path)
-    assert_sentence(caught.value, path)
 
 
 def test_a_mesh_opens_no_files_but_buffers_in_its_folder(tmp_path: Path) -> None:
@@ -382,9 +385,8 @@ def test_a_bad_depth_image_gets_one_sentence(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
     noise = default_rng(0).integers(500, 1500, (60, 80)).astype(np.uint16)
     path.write_bytes(save_depth(path, noise).read_bytes()[:3000])
-    with pytest.raises(ValueError, match="cannot be read as a depth image") as caught:
+    with refused(path, "cannot be read as a depth image"):
         read_depth_image(path, CAMERA)
-    assert_sentence(caught.value, path)
     save_depth(path, good)
     with pytest.raises(ValueError, match="measures 0 pixels inside the mask"):
         read_depth_image(path, CAMERA, 1000.0, save_depth(tmp_path / "m.png", np.zeros((6, 8), np.uint8)))
@@ -506,9 +508,8 @@ def test_what_is_no_depth_image_is_said_so(tmp_path: Path) -> None:
         ("words.npy", "not a number"),
         ("photo.jpg", "suffix '.jpg'; a depth image is one of .png, .tif, .tiff, .exr, .npy"),
     ):
-        with pytest.raises(ValueError, match=expected) as caught:
+        with refused(tmp_path / name, expected):
             read_depth_image(tmp_path / name, CAMERA)
-        assert_sentence(caught.value, tmp_path / name)
 
 
 def test_arrays_are_told_apart_by_their_shape(tmp_path: Path) -> None:
@@ -528,7 +529,7 @@ def test_normals_of_a_ply_file_are_read_with_its_points(tmp_path: Path) -> None:
     for name in ("a.ply", "b.ply"):
         cloud = read_point_cloud(tmp_path / name)
         assert_array_equal(cloud.points, POINTS.astype(np.float64))
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        length = norm(normals, axis=1, keepdims=True)
         assert_allclose(cloud.normals, normals / length, atol=1e-6)
     rows[3], rows[5, 3] = 0.0, np.nan
     (tmp_path / "b.ply").write_bytes(head.format("binary_little_endian").encode() + rows.tobytes())

@@ -10,6 +10,7 @@ import pytest
 import torch
 import trimesh
 from memory_frames import FORMS, GRID, POINTS, Tensor, TensorMap, message, records, with_data
+from numpy.linalg import norm
 from numpy.testing import assert_allclose, assert_array_equal
 
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
@@ -197,6 +198,6 @@ def test_normals_of_other_libraries_come_with_the_points() -> None:
     assert_allclose(cloud.normals, ball.vertices, atol=0.05)
     longer, lost = points_of(SimpleNamespace(points=broken(POINTS), normals=3.0 * POINTS), drop_invalid=True)
     assert isinstance(longer, PointCloud) and lost == 3
-    assert_allclose(longer.normals, MEASURED / np.linalg.norm(MEASURED, axis=1, keepdims=True))
+    assert_allclose(longer.normals, MEASURED / norm(MEASURED, axis=1, keepdims=True))
     for normals in ([], POINTS[:3], np.full(POINTS.shape, np.nan), "none"):
         assert points_of(SimpleNamespace(points=POINTS, normals=normals))[0].normals is None  # type: ignore[union-attr]

@@ -13,6 +13,7 @@ import trimesh
 from angle import write_angle
 from fit_cases import seen
 from folder_contents import read_json
+from numpy.linalg import norm
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
@@ -414,7 +415,7 @@ def test_a_rigid_object_is_placed_exactly_by_every_way(moves: str, folder: Path,
         assert np.abs(answer.surfaces.merged()[0] - true.merged()[0]).max() < 1e-3 * longest, answer
     assert [answer.tracked for answer in answers[-2:]] == [False, True]
     corners = answers[0].carry([[1.0, 1.0, 1.0], [119.0, 1.0, 1.0]])
-    assert np.linalg.norm(corners[1] - corners[0]) == pytest.approx(0.118, rel=1e-3)
+    assert norm(corners[1] - corners[0]) == pytest.approx(0.118, rel=1e-3)
 
 
 def test_a_rigid_object_of_unknown_unit_is_found_with_its_size(folder: Path, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from folder_contents import read_json
+from numpy.linalg import norm
 from numpy.random import Generator, default_rng
 from page_blocks import ROOT, blocks
 
@@ -135,4 +136,4 @@ def test_a_tiny_network_finds_the_rope(tmp_path: Path) -> None:
     assert "base" in nodes
     base = next(s for s in view.mesh.segments if s.name == "base")
     found = next(s for s in read_json(result / "summary.json")["segments"] if s["name"] == "base")
-    assert np.linalg.norm(np.array(found["centroid"]) - base.vertices.mean(axis=0)) < 4.0
+    assert norm(np.array(found["centroid"]) - base.vertices.mean(axis=0)) < 4.0

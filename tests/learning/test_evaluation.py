@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from analytic import AnalyticModel, untrained
+from analytic import AnalyticModel, oracle, untrained
 from folder_contents import read_json
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
@@ -44,12 +44,6 @@ def two_cuboids() -> SegmentedMesh:
 
 def cloud() -> PointCloud:
     return PointCloud(default_rng(0).uniform([0, 0, 5], [2, 1, 5.001], size=(200, 3)))
-
-
-def oracle(mesh: SegmentedMesh, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> AnalyticModel:
-    """Knows the truth, moved by ``shift``."""
-    solids = Solids(mesh)
-    return AnalyticModel.of(lambda points: 5.0 * np.eye(3)[solids.label(points - shift)], mesh.names)
 
 
 def test_the_truth_scores_one_and_a_shifted_answer_its_closed_form() -> None:

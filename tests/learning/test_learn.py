@@ -14,6 +14,7 @@ import torch
 import trimesh
 from angle import write_angle
 from folder_contents import read_json
+from numpy.linalg import norm
 from safetensors.torch import load_file
 from scene_files import HEAD, write_bar
 from scipy.spatial.transform import Rotation
@@ -432,7 +433,7 @@ def test_radii_are_measured_against_the_nearest_of_the_truths_that_no_frame_tell
     turned = transform_points(T @ over_end.turn, model.rest_points)  # the answer has taken each half for the other
     for material in (truth, turned):
         nearest = nearest_truth(model, material, truth)
-        assert np.linalg.norm(nearest - material, axis=1).max() < 0.5, "as much as the turn that was settled is off"
+        assert norm(nearest - material, axis=1).max() < 0.5, "as much as the turn that was settled is off"
     part = truth[:10]
     assert nearest_truth(model, turned, part) is part
 
@@ -450,5 +451,5 @@ def test_radii_of_what_is_round_are_measured_by_the_nearest_angle(tmp_path: Path
     spin = rigid(Rotation.from_rotvec(2.345 * symmetry.axis).as_matrix(), np.zeros(3))
     center = truth.mean(axis=0)
     spun = transform_points(spin, truth - center) + center
-    assert np.linalg.norm(spun - truth, axis=1).max() > 0.5 * model.half
-    assert np.linalg.norm(nearest_truth(model, spun, truth) - spun, axis=1).max() < 0.5
+    assert norm(spun - truth, axis=1).max() > 0.5 * model.half
+    assert norm(nearest_truth(model, spun, truth) - spun, axis=1).max() < 0.5

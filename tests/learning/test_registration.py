@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from analytic import AnalyticModel
+from analytic import AnalyticModel, oracle
 from folder_contents import read_json
+from numpy.linalg import det, inv, norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from scene_files import write_bar
@@ -20,7 +21,7 @@ from mereo.__main__ import main
 from mereo.geometry.camera import VIEW_DISTANCE, Camera, into_camera
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import Normalizer, inverse_rigid, rigid, transform_points
+from mereo.geometry.transforms import Normalizer, inverse_rigid, rigid, transform_points, unit_rows
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.models.weights import load_model
 from mereo.scenes.registry import load_scene
@@ -68,15 +69,15 @@ def scan_of(mesh: SegmentedMesh, noise: float, seed: int = 0) -> np.ndarray:
 def perturbed(pose: np.ndarray, middle: np.ndarray, degrees: float, shift: float, seed: int) -> np.ndarray:
     """``pose``, then a turn about ``middle`` (model coordinates) and a shift, both in a random direction."""
     rng = default_rng(seed)
-    axis, way = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))
+    axis, way = (vector / norm(vector) for vector in rng.normal(size=(2, 3)))
     turn, place = Rotation.from_rotvec(np.deg2rad(degrees) * axis).as_matrix(), transform_points(pose, middle)
     return rigid(turn, place - turn @ place + shift * way) @ pose
 
 
 def pose_error(found: np.ndarray, true: np.ndarray, middle: np.ndarray) -> tuple[float, float]:
     """Distance of the segment's middle from where it belongs, and the turn in degrees."""
-    shift = np.linalg.norm(transform_points(found, middle) - transform_points(true, middle))
-    turn = Rotation.from_matrix((found @ np.linalg.inv(true))[:3, :3])
+    shift = norm(transform_points(found, middle) - transform_points(true, middle))
+    turn = Rotation.from_matrix((found @ inv(true))[:3, :3])
     return float(shift), float(np.rad2deg(turn.magnitude()))
 
 
@@ -174,8 +175,7 @@ def test_a_ball_is_shifted_but_not_turned() -> None:
     """Its three turns are free: half of a ball, moved by a known shift, gives the shift and no turn."""
     sphere = ball((0, 0, 50), 6.0, "ball", level=4)
     shift = np.array([0.4, -0.3, 0.2])
-    way = default_rng(0).normal(size=(3000, 3))
-    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    way = unit_rows(default_rng(0).normal(size=(3000, 3)))
     half = np.array([0.0, 0.0, 50.0]) + 6.0 * way * [1, 1, -1] + shift
     motion, held = icp(half[half[:, 2] < 50.2], SegmentedMesh((sphere,)), 1.0, 0.05, hold=True)
     assert held == 3
@@ -317,9 +317,9 @@ def test_the_command_places_the_segments_and_the_truth_is_in_one_frame(bar: Bar)
 def test_evaluate_takes_the_truth(bar: Bar, tmp_path: Path, shift_mm: float, low: float, high: float) -> None:
     """Of an answer that is the truth, or the truth moved along x by a tenth of the bar's length."""
     truth = read_truth(bar[0] / "truth").truth
-    solids, shift = Solids(truth), np.array([shift_mm, 0.0, 0.0])
-    model = AnalyticModel.of(lambda points: 5.0 * np.eye(3)[solids.label(points - shift)], truth.names)
-    evaluation = evaluate_weights(model, tmp_path / "test", EvaluationConfig(scans=[bar[0] / "truth"], cells=20))
+    evaluation = evaluate_weights(
+        oracle(truth, (shift_mm, 0.0, 0.0)), tmp_path / "test", EvaluationConfig(scans=[bar[0] / "truth"], cells=20)
+    )
     assert list(evaluation.examples) == ["truth"] and low <= evaluation.scores.iou <= high
     written = read_json(tmp_path / "test/metrics.json")
     assert written["iou"] == evaluation.scores.iou and written["scans"] == ["truth"]
@@ -406,7 +406,7 @@ def bunny_truth_pose(name: str) -> tuple[SegmentedMesh, np.ndarray, float]:
     """The bunny at rest, its published pose in a scan, and metres per scene unit."""
     middle, units_per_m = model_to_scene()
     T_model_scene = rigid(np.eye(3) / units_per_m, middle)
-    return load_scene("bunny").rest, np.linalg.inv(BUNNY_SCAN_POSES[name]) @ T_model_scene, 1 / units_per_m
+    return load_scene("bunny").rest, inv(BUNNY_SCAN_POSES[name]) @ T_model_scene, 1 / units_per_m
 
 
 @pytest.mark.slow
@@ -416,7 +416,7 @@ def test_scans_of_the_bunny_come_to_their_known_pose(name: str, seed: int, requi
     """From 15 to 20 degrees and a tenth of its size beside it."""
     require_asset("bunny/bunny.off"), require_asset(f"bunny/{name}.ply")
     rest, true, scale = bunny_truth_pose(name)
-    size = float(np.linalg.norm(rest.bounds[1] - rest.bounds[0])) * scale
+    size = float(norm(rest.bounds[1] - rest.bounds[0])) * scale
     rough = perturbed(true, rest.bounds.mean(axis=0), 15 + 5 * seed, 0.1 * size, seed)
     placement = place(rest, bunny_scan(name)[0].points, Start(np.stack([rough] * 5), np.zeros(5, bool), ""), "scanner")
     assert placement.explained > 0.99
@@ -457,7 +457,7 @@ def test_a_scan_is_put_before_the_camera() -> None:
     T_camera_scanner = into_camera(scan, "scanner")
     seen = transform_points(T_camera_scanner, scan)
     assert_allclose(T_camera_scanner[:3, :3] @ T_camera_scanner[:3, :3].T, np.eye(3))
-    assert np.linalg.det(T_camera_scanner[:3, :3]) == pytest.approx(1.0)
+    assert det(T_camera_scanner[:3, :3]) == pytest.approx(1.0)
     for axis, sign in ((0, 1), (1, -1), (2, -1)):
         assert_array_equal(np.argsort(seen[:, axis]), np.argsort(sign * scan[:, axis]))
     assert_allclose(Normalizer.fit(seen).viewpoint, [0.0, 0.0, -VIEW_DISTANCE], atol=1e-12)

@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from angle import write_angle
 from folder_contents import read_json
+from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from scipy.ndimage import gaussian_filter
@@ -65,6 +66,12 @@ def rest(folder: Path) -> SegmentedMesh:
     return SegmentedMesh(tuple(segment(name, mesh, (mesh.vertices - middle) / 1000) for name, mesh in meshes.items()))
 
 
+@pytest.fixture(scope="module")
+def long(folder: Path) -> np.ndarray:
+    """Places of one part of the angle in its files' frame, metres."""
+    return np.asarray(trimesh.load(folder / "long.stl").vertices) / 1000
+
+
 def segment(name: str, mesh: trimesh.Trimesh, vertices: np.ndarray) -> Segment:
     return Segment(name, (0, 0, 0), vertices, np.asarray(mesh.faces))
 
@@ -104,11 +111,10 @@ def found(image: DepthImage, angle: mereo.Object) -> mereo.Result:
 
 
 def test_an_object_among_others_is_known_at_its_place(
-    found: mereo.Result, image: DepthImage, rest: SegmentedMesh, folder: Path
+    found: mereo.Result, image: DepthImage, rest: SegmentedMesh, long: np.ndarray
 ) -> None:
     assert found.known is True and found.pose is not None
     assert found.seen.steps[-1].name == "whole frame" and found.seen.steps[-1].before == image.valid.sum()
-    long = np.asarray(trimesh.load(folder / "long.stl").vertices) / 1000
     true = transform_points(PLACED, rest.segments[0].vertices)
     assert_allclose(transform_points(found.pose, long), true, atol=2e-3)
     assert found.seen.cloud.points[:, 2].max() < 0.65, "neither the desk behind it nor the wall is taken for it"
@@ -136,12 +142,11 @@ SECOND = rigid(
 
 
 def test_each_instance_is_at_its_place_and_has_a_folder(
-    placed: SegmentedMesh, rest: SegmentedMesh, angle: mereo.Object, folder: Path, tmp_path: Path
+    placed: SegmentedMesh, rest: SegmentedMesh, angle: mereo.Object, long: np.ndarray, tmp_path: Path
 ) -> None:
     both = desk(*placed.segments, *(replace(each, name=f"{each.name} 2") for each in rest.transformed(SECOND).segments))
     found = mereo.reconstruct(both, angle, unit_m=1.0, instances="all")
     assert [each.known for each in found.instances] == [True, True] and found.instances[0] is found
-    long = np.asarray(trimesh.load(folder / "long.stl").vertices) / 1000
     places = [transform_points(each.pose, long) for each in found.instances if each.pose is not None]
     for T in (PLACED, SECOND):
         true = transform_points(T, rest.segments[0].vertices)
@@ -291,7 +296,7 @@ def test_without_a_known_size_a_point_keeps_the_connected_surface(image: DepthIm
     seen = find_object(frame, mereo.IsolationConfig(remove_plane=True, depth_range=(0.3, 1.2), point=CAN))
     kept = at_point(seen, None)
     assert [step.name for step in kept.steps] == ["depth range", "plane", "point"] and at_point(kept, None) is kept
-    assert np.linalg.norm(kept.cloud.points - on_desk(-0.16, 0.025, 0.08), axis=1).max() < 0.08 < seen.size_m[0]
+    assert norm(kept.cloud.points - on_desk(-0.16, 0.025, 0.08), axis=1).max() < 0.08 < seen.size_m[0]
 
 
 @pytest.mark.parametrize(
@@ -395,10 +400,9 @@ def test_noise_that_neighbours_share_is_measured_on_the_plane_around_the_object(
 
 
 def test_an_object_is_followed_through_whole_frames_lost_and_seen_again(
-    image: DepthImage, rest: SegmentedMesh, folder: Path, angle: mereo.Object, on_angle: tuple[int, int]
+    image: DepthImage, rest: SegmentedMesh, long: np.ndarray, angle: mereo.Object, on_angle: tuple[int, int]
 ) -> None:
     """Its point is where it is in the first frame."""
-    long = np.asarray(trimesh.load(folder / "long.stl").vertices) / 1000
     with mereo.Tracker(angle, executor=SynchronousExecutor()) as tracker:
         for number in range(4):
             turn = Rotation.from_euler("y", 2 * number, degrees=True).as_matrix()
@@ -407,7 +411,7 @@ def test_an_object_is_followed_through_whole_frames_lost_and_seen_again(
             found = tracker.follow(seen, number / 15, unit_m=1.0, point=on_angle)
             assert found.tracking == ("followed" if number else "found") and found.pose is not None
             off = transform_points(found.pose, long) - transform_points(moved, rest.segments[0].vertices)
-            assert np.linalg.norm(off, axis=1).max() < 0.006, "a pixel is 2.2 mm wide"
+            assert norm(off, axis=1).max() < 0.006, "a pixel is 2.2 mm wide"
         assert tracker.follow(desk(), 5 / 15, unit_m=1.0, point=(0, 9999)).tracking == "lost"
         assert tracker.follow(image, 20 / 15, unit_m=1.0, point=CAN).tracking == "found"
         tracker.forget()

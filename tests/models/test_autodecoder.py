@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from answers import reconstruct
+from numpy.linalg import norm
 from safetensors.torch import load_file
 from shapes import ball
 from toy_data import example_of, read_all, write_toy_dataset
@@ -15,6 +16,7 @@ from training_runs import assert_resumes_exactly
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.metrics import truth_grid
+from mereo.geometry.transforms import unit_rows
 from mereo.models.config import AutodecoderConfig, NetworkConfig
 from mereo.models.encoders import Autodecoder, Encoding
 from mereo.models.model import Model
@@ -48,14 +50,13 @@ def ball_pair(rng: np.random.Generator, points: int, queries: int) -> dict[str, 
     """Two touching balls seen from the front, the second of 0.3 to 1 times the radius of the first."""
     radii = np.array([1.0, rng.uniform(0.3, 1.0)])
     centers = np.array([[0.0, 0.0, 20.0], [radii.sum(), 0.0, 20.0]])
-    front = rng.normal(size=(points, 3))
-    front /= np.linalg.norm(front, axis=1, keepdims=True)
+    front = unit_rows(rng.normal(size=(points, 3)))
     front[:, 2] = -np.abs(front[:, 2])
     which = rng.integers(0, 2, size=points)
     cloud = centers[which] + radii[which, None] * front
     places = rng.uniform([-1.4, -1.4, 18.6], [1.4 + 2 * radii[1], 1.4, 21.4], size=(queries, 3))
     to_center = centers - places[:, None]
-    reach, rows = np.linalg.norm(to_center, axis=2), np.arange(queries)
+    reach, rows = norm(to_center, axis=2), np.arange(queries)
     nearest = (reach - radii).argmin(axis=1)
     distance = (reach - radii)[rows, nearest]
     outward = np.where(distance < 0, -1, 1)[:, None]
@@ -190,7 +191,7 @@ def test_reconstruct_and_evaluate(dataset: Path, model: Model) -> None:
     found = reconstruct(case.cloud, model, resolution=24)
     assert [segment.name for segment in found.segments] == ["left", "right"]
     for segment, true in zip(found.segments, truth(dataset, 2).segments, strict=True):
-        assert np.linalg.norm(segment.centroid - true.vertices.mean(axis=0)) < 0.25
+        assert norm(segment.centroid - true.vertices.mean(axis=0)) < 0.25
     assert 0 < found.segments[1].volume < 0.5 * found.segments[0].volume
 
 

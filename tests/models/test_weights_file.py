@@ -24,8 +24,12 @@ from mereo_learning.learn import learn
 WITH_STATES, BIAS = find_weights("rope"), "decoder.head.bias"
 
 
-def changed(folder: Path, change: Callable[[Any, dict[str, torch.Tensor]], Any], with_states: bool = False) -> Path:
-    """Weights after a change to header and tensors, which may return another header."""
+Change = Callable[[Any, dict[str, torch.Tensor]], Any]
+"""Change to a header and tensors, which may return another header."""
+
+
+def changed(folder: Path, change: Change, with_states: bool = False) -> Path:
+    """Weights after a change."""
     path = folder / "changed.safetensors"
     path.write_bytes(WITH_STATES.read_bytes() if with_states else weights_bytes(untrained(("a", "b"))))
     with safe_open(path, "pt") as file:
@@ -35,7 +39,7 @@ def changed(folder: Path, change: Callable[[Any, dict[str, torch.Tensor]], Any],
     return path
 
 
-WRONG: dict[str, Callable[[Any, dict[str, torch.Tensor]], Any]] = {
+WRONG: dict[str, Change] = {
     "has weights format None": lambda h, t: [],
     "a header with a wrong 'names'": lambda h, t: h.update(names="ab"),
     "and nested segments disagree": lambda h, t: h.update(nested=[["a", "c"]]),
@@ -54,7 +58,7 @@ WRONG: dict[str, Callable[[Any, dict[str, torch.Tensor]], Any]] = {
     "NaN or infinity in the tensor decoder.head.bias": lambda h, t: t.update({BIAS: torch.ones(7) / 0}),
 }
 
-WRONG_STATES: dict[str, Callable[[Any, dict[str, torch.Tensor]], Any]] = {
+WRONG_STATES: dict[str, Change] = {
     "nothing is called 'pair_index'": lambda h, t: t.pop("states.pair_index") is None or None,
     "nothing is called": lambda h, t: h.pop("states") and None,
     "there is NaN or infinity in states.mean": lambda h, t: t["states.mean"].fill_(float("nan")) is None or None,

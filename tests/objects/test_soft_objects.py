@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.linalg import norm
 from numpy.random import default_rng
 from scipy.spatial import cKDTree
 
@@ -43,7 +44,7 @@ def test_rope_does_not_pass_through_itself(states: list[SegmentedMesh]) -> None:
         place = np.repeat(np.arange(rope.SEGMENTS), rope.RINGS + 1) * rope.SEGMENT_LENGTH
         place = place + np.tile(np.linspace(0, rope.SEGMENT_LENGTH, rope.RINGS + 1), rope.SEGMENTS)
         far = np.abs(place[:, None] - place) > np.pi / rope.MAX_BEND
-        assert np.linalg.norm(centers[:, None] - centers, axis=-1)[far].min() > 2.3 * rope.RADIUS
+        assert norm(centers[:, None] - centers, axis=-1)[far].min() > 2.3 * rope.RADIUS
 
 
 def test_rope_leaves_its_base_at_a_right_angle_and_keeps_its_length_and_round_section(
@@ -55,14 +56,14 @@ def test_rope_leaves_its_base_at_a_right_angle_and_keeps_its_length_and_round_se
         assert np.array_equal(mesh.segments[0].vertices, rest.segments[0].vertices)
         assert np.abs(loops[0] - rings(rest)[0]).max() < 0.02
         centers = loops.mean(axis=1)
-        assert np.abs(np.linalg.norm(loops - centers[:, None], axis=-1) / rope.RADIUS - 1).max() < 0.01
-        assert np.isclose(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum(), rope.LENGTH, rtol=0.01)
+        assert np.abs(norm(loops - centers[:, None], axis=-1) / rope.RADIUS - 1).max() < 0.01
+        assert np.isclose(norm(np.diff(centers, axis=0), axis=1).sum(), rope.LENGTH, rtol=0.01)
 
 
 def test_states_vary_and_coil(states: list[SegmentedMesh]) -> None:
     ends = np.stack([rings(mesh)[-1].mean(axis=0) for mesh in states])
     assert ends.std(axis=0).min() > 5.0
-    reach = np.linalg.norm(ends, axis=1)
+    reach = norm(ends, axis=1)
     assert reach.min() < 25.0 and reach.max() > 55.0  # from coiled up to nearly straight
 
 
@@ -135,7 +136,7 @@ def underside_share(deformation: Deformation) -> float:
     """How much of the sheet shows its other side from above than the rest does."""
     _, matrix = jacobian(deformation, middle_points())
     normals = np.cross(matrix[:, :, 0], matrix[:, :, 1])
-    up = normals[:, 2] / np.linalg.norm(normals, axis=1)
+    up = normals[:, 2] / norm(normals, axis=1)
     return float(min((up < -0.2).mean(), (up > 0.2).mean()))
 
 

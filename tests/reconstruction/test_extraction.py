@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from analytic import Distance, ball, half, logits_of, plate, union
+from numpy.linalg import norm
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.ndimage import map_coordinates
 
@@ -70,7 +71,7 @@ def test_a_ball_is_a_closed_surface_of_euler_number_2_for_which_few_points_are_a
     assert segment.edge_imbalance() == (0, 0)
     assert euler_number(segment) == 2
     assert segment.volume == pytest.approx(4 / 3 * np.pi * 0.7**3, rel=2e-3)
-    radius = np.linalg.norm(segment.vertices - [0.03, -0.02, 0.05], axis=1)
+    radius = norm(segment.vertices - [0.03, -0.02, 0.05], axis=1)
     assert np.abs(radius - 0.7).max() < 0.05 * 2 / 64, "a twentieth of a voxel"
     assert run(logits_of(ball((0.0, 0.0, 0.0), 0.6)), resolution=128).evaluated < 0.08 * 129**3
 
@@ -85,7 +86,7 @@ def test_neighbours_share_their_interface_and_volumes_add_up() -> None:
     walls = []
     for segment in (left, right):
         assert segment.edge_imbalance() == (0, 0) and euler_number(segment) == 2
-        on_wall = (np.abs(segment.vertices[:, 0]) < 1e-5) & (np.linalg.norm(segment.vertices, axis=1) < 0.7 - 2 * voxel)
+        on_wall = (np.abs(segment.vertices[:, 0]) < 1e-5) & (norm(segment.vertices, axis=1) < 0.7 - 2 * voxel)
         walls.append(np.unique(segment.vertices[on_wall].round(5), axis=0))
     assert len(walls[0]) > 200
     assert_allclose(walls[0], walls[1], atol=2e-5 * voxel + 1e-9)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_array_equal
 from two_balls import front
@@ -85,7 +86,7 @@ def test_the_plane_is_the_one_of_least_squares() -> None:
 
 def test_outliers_go_and_the_object_stays() -> None:
     left = kept(np.concatenate([BALL, STRAYS]), IsolationConfig(remove_outliers=True))
-    off = np.linalg.norm(left - [0, 0, 0.8], axis=1) - 0.1
+    off = norm(left - [0, 0, 0.8], axis=1) - 0.1
     assert (np.abs(off) < 1e-9).sum() >= 0.999 * len(BALL) and (off > 0.03).mean() < 0.002
 
 

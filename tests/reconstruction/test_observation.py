@@ -12,6 +12,7 @@ import pytest
 import trimesh
 from camera_files import write_camera
 from folder_contents import read_json
+from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
@@ -20,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 import mereo
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
-from mereo.geometry.transforms import rigid, transform_points
+from mereo.geometry.transforms import rigid, transform_points, unit_rows
 from mereo.io.config import InputConfig
 from mereo.io.readers import InputWarning
 from mereo.io.sensor_frame import SensorFrame, read_frame
@@ -58,7 +59,7 @@ def test_a_depth_image_becomes_the_points_it_shows(folder: Path) -> None:
 
 def test_lengths_along_rays_become_depths(folder: Path) -> None:
     """Distances from the camera to a plane at half a metre are the plane again, from a file and in memory."""
-    lengths = 0.5 * np.linalg.norm(CAMERA.directions(), axis=-1)
+    lengths = 0.5 * norm(CAMERA.directions(), axis=-1)
     np.save(folder / "r.npy", lengths)
     reading = InputConfig(intrinsics=folder / "k.json", depth_along="ray")
     for frame in (
@@ -225,8 +226,7 @@ def test_points_behind_the_camera_get_the_cure_of_their_axes(turn: list[list[int
 def test_a_merged_cloud_is_known_by_what_it_hides() -> None:
     """Of a sphere's surface all but the cap that faces the camera is hidden; a single view hides nothing of itself."""
     rng, (x, y) = default_rng(0), np.meshgrid(*[(np.arange(80) - 39.5) / 200] * 2)
-    normals = rng.normal(size=(6000, 3))
-    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    normals = unit_rows(rng.normal(size=(6000, 3)))
     sphere = normals + np.array([0.0, 0.0, 5.0])
     front = sphere[(normals * sphere).sum(axis=1) < 0]
     opposite = front * [1.0, 1.0, -1.0] + [0.0, 0.0, 10.0]  # as a camera on the other side sees it
@@ -236,7 +236,7 @@ def test_a_merged_cloud_is_known_by_what_it_hides() -> None:
         "sphere": front,
         "few points": front[:200],
         "noisy": front * rng.normal(1.0, 0.004, (len(front), 1)),
-        "in steps": front * np.round(1 / np.linalg.norm(front, axis=1)[:, None], 2) * 5,
+        "in steps": front * np.round(1 / norm(front, axis=1)[:, None], 2) * 5,
         "strays": np.concatenate([front, rng.uniform((-1.2, -1.2, 4), (1.2, 1.2, 7), (80, 3))]),
         "bars": np.stack([x * wall, y * wall, wall], axis=-1).reshape(-1, 3),
         "one place": np.ones((500, 3)),
@@ -292,8 +292,7 @@ def test_missing_extras_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 def test_a_surface_that_no_camera_can_have_seen_is_known_by_its_normals() -> None:
     rng = default_rng(0)
-    normals = rng.normal(size=(3000, 3))
-    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    normals = unit_rows(rng.normal(size=(3000, 3)))
     sphere = normals + np.array([0.0, 0.0, 5.0])
     ahead = (normals * sphere).sum(axis=1) < 0
     whole = PointCloud(sphere, normals)

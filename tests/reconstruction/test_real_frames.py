@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.linalg import norm
 from PIL import Image
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
@@ -139,7 +140,7 @@ def test_a_bottle_before_a_stereo_camera_is_believed_without_a_dent(
     T = found.pose
     assert T is not None
     placed_by_fit = transform_points(T, rest)
-    assert np.linalg.norm(placed_by_fit.mean(axis=0) - placed.mean(axis=0)) < 0.003
+    assert norm(placed_by_fit.mean(axis=0) - placed.mean(axis=0)) < 0.003
     true = fit_rigid(rest, placed)[:3, :3]
     turns = (T[:3, :3] @ np.diag([x, x, 1.0]) @ true.T for x in (1.0, -1.0))  # its two sides look the same
     assert min(np.degrees(Rotation.from_matrix(turn).magnitude()) for turn in turns) < 3.0
@@ -155,4 +156,4 @@ def test_a_bottle_before_a_stereo_camera_is_followed_on_its_desk(tmp_path: Path)
             found = tracker.follow(depth, number / 30, intrinsics=tmp_path / "camera.json")
             assert (found.tracking, found.known) == ("followed" if number else "found", True) and found.pose is not None
             placed = masked_bottle(tmp_path, name)[1]
-            assert np.linalg.norm(transform_points(found.pose, rest).mean(axis=0) - placed.mean(axis=0)) < 0.004
+            assert norm(transform_points(found.pose, rest).mean(axis=0) - placed.mean(axis=0)) < 0.004

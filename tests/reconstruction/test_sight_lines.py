@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 import pytest
 from camera_files import write_camera
+from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
@@ -92,7 +93,7 @@ def occlude(view: View, kind: Cut, sensor: SensorConfig = SENSORS["paper"], wall
     backdrop = Backdrop(AWAY, farthest(solids, AWAY) + 60.0) if wall else None
     choices = [Surroundings((), backdrop)]
     if kind != "none":
-        points, reach = view.depth.to_points().points, float(np.linalg.norm(rays[:, :2], axis=1).max())
+        points, reach = view.depth.to_points().points, float(norm(rays[:, :2], axis=1).max())
         occluders = [sample_occluder(kind, points, reach, 1 / sensor.metres_per_unit, rng) for _ in range(8)]
         choices = [Surroundings(each, backdrop) for each in occluders]
     shown = [int((around.join(solids.first_hit(rays), rays)[1] == OBJECT).sum()) for around in choices]

@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from analytic import untrained
 from folder_contents import read_json
+from numpy.linalg import det, norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from scene_files import write_bar
@@ -99,7 +100,7 @@ def test_interior_points_follow_the_scenes_own_maps(registrar: Registrar, state:
     found = carry(placed_one(registrar, Positions(points)), bent)
     for label in range(1, 5):
         truth = transform_points(T, state.deformations[label - 1](points[labels == label]))
-        assert np.linalg.norm(found.content.points[labels == label] - truth, axis=1).max() < 0.1
+        assert norm(found.content.points[labels == label] - truth, axis=1).max() < 0.1
 
 
 def polar(motion: Deformation, points: np.ndarray) -> np.ndarray:
@@ -115,7 +116,7 @@ def test_poses_turn_as_their_surroundings_do(state: State, bent: Registration) -
     found = local_rotations(bent, points, shares)
     truth = T[:3, :3] @ polar(state.deformations[0], points)
     angle = Rotation.from_matrix(found @ truth.transpose(0, 2, 1)).magnitude()
-    assert np.rad2deg(angle).max() < 2.0 and np.linalg.det(found).min() > 0.999
+    assert np.rad2deg(angle).max() < 2.0 and det(found).min() > 0.999
     still = np.rad2deg(Rotation.from_matrix(truth @ T[:3, :3].T).magnitude())
     assert np.median(still) > 3.0  # it has turned by more than the tolerance
 
@@ -134,7 +135,7 @@ def test_a_surface_outside_does_not_tear(registrar: Registrar, bent: Registratio
     nearest = bent.to_camera(placed.content.points)
 
     def longest(points: np.ndarray) -> float:
-        return float(np.linalg.norm(points[faces] - points[np.roll(faces, 1, axis=1)], axis=2).max())
+        return float(norm(points[faces] - points[np.roll(faces, 1, axis=1)], axis=2).max())
 
     assert longest(placed.content.points) <= 0.9 + 1e-9
     assert longest(found) < 2.0 < longest(nearest)
@@ -329,9 +330,9 @@ def test_a_material_point_keeps_its_value(resized: Registration) -> None:
     centers = transform_points(found.content.T_world_index, index.astype(float))
     truth = resized.to_rest(centers) @ RAMP + 100
     error = at_points(found.content, centers) - truth
-    assert np.abs(error).max() < 0.1 * SPACING * np.linalg.norm(RAMP)  # a tenth of a voxel
+    assert np.abs(error).max() < 0.1 * SPACING * norm(RAMP)  # a tenth of a voxel
     # and the point's own value is less than a voxel away
-    assert np.abs(at_points(found.content, centers) - (points @ RAMP + 100)).max() < SPACING * np.linalg.norm(RAMP)
+    assert np.abs(at_points(found.content, centers) - (points @ RAMP + 100)).max() < SPACING * norm(RAMP)
 
 
 def test_far_from_the_object_there_is_background(model: StatisticalModel) -> None:
@@ -519,11 +520,11 @@ def test_the_command_carries_in_the_frame_and_unit_of_its_other_files(folder: Pa
     assert all(one["farthest"] < 0.01 for one in summary["carried"][:3]) and summary["registration"]["unit"] == "known"
     own = read_segmented_mesh(out / "segments.glb").segments[1].vertices
     carried = read_segmented_mesh(out / "carried/own.glb").segments[0].vertices
-    assert np.linalg.norm(carried[: len(own)] - own, axis=1).max() < 0.3
+    assert norm(carried[: len(own)] - own, axis=1).max() < 0.3
     in_mm = read_segmented_mesh(out / "carried/own.ply").segments[0].vertices
     assert_allclose(in_mm, 10 * carried, rtol=1e-4, atol=1e-3)
     grasp = read_pose_table(out / "carried/grasp.csv")
-    assert np.linalg.norm(grasp.points[0] / 10 - own.mean(axis=0)) < 1.0
+    assert norm(grasp.points[0] / 10 - own.mean(axis=0)) < 1.0
     assert grasp.rows[0][-1] == "0.02" and grasp.rotations is not None
     volume = read_volume(out / "carried/ct.nrrd")  # millimetres: ten of the input's unit
     low, high = (np.diag([-1.0, -1.0, 1.0]) @ bound for bound in read_segmented_mesh(out / "segments.glb").bounds)

@@ -10,6 +10,7 @@ import pytest
 import trimesh
 from cad_objects import tongs, write_parts, write_pliers
 from manifold3d import Manifold
+from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from scene_files import write_bar, write_mesh
@@ -58,7 +59,7 @@ def test_every_edge_follows_its_curve(pliers: Scene) -> None:
             a, b = segment.vertices[segment.faces[:, 0]], segment.vertices[segment.faces[:, 1]]
             share = rng.uniform(0, 1, (len(a), 1))
             chord = (1 - share) * deform(a) + share * deform(b)
-            away.append(np.linalg.norm(deform((1 - share) * a + share * b) - chord, axis=1).max())
+            away.append(norm(deform((1 - share) * a + share * b) - chord, axis=1).max())
     assert max(away) < 1.5 * TOLERANCE
 
 
@@ -134,7 +135,7 @@ def test_a_rigid_motion_is_none_and_a_stretch_is_its_own() -> None:
     turn = Rigid(np.array([0.3, 0.2, 0.1]), np.array([5.0, 0, 0]), np.zeros(3))
     assert measure_motion(mesh, lambda rng: (turn,)).largest < 1e-12
     squash, (points, _) = Squash(np.zeros(3), np.array([0, 0, 1.0]), 1.1), material_points(mesh, 800)
-    way, found = np.linalg.norm(squash(points) - points, axis=1) / 2, measure_motion(mesh, lambda rng: (squash,))
+    way, found = norm(squash(points) - points, axis=1) / 2, measure_motion(mesh, lambda rng: (squash,))
     assert found.mean == pytest.approx(np.sqrt(np.mean(way**2)), rel=0.02)
     assert found.largest == pytest.approx(way.max(), rel=0.1)
 
@@ -241,7 +242,7 @@ def test_a_word_says_how_the_object_moves(tmp_path: Path, capsys: pytest.Capture
     assert hinge in (tmp_path / "auto.yaml").read_text()
     middle = scene.T_scene_source[:3, 3]
     for deform in scene.sample_deformations(default_rng(0))[:2]:  # the pin's axis stays
-        assert np.linalg.norm((deform(middle[None]) - middle)[0, :2]) < 0.05 * scene.T_scene_source[0, 0]
+        assert norm((deform(middle[None]) - middle)[0, :2]) < 0.05 * scene.T_scene_source[0, 0]
     assert scene.definition != load_scene(write_scene_file(files, tmp_path / "s.yaml", deformations="stiff")).definition
     check_scene(str(tmp_path / "auto.yaml"))
     assert "fault" not in capsys.readouterr().out
@@ -298,7 +299,7 @@ def test_planes_cylinders_and_other_contacts() -> None:
     axis = turn(np.array([[0.0, 0, 1]]))[0]
     assert abs(round_one.axis @ axis) > 0.9999 and round_one.radius == pytest.approx(1, abs=0.02)
     away = round_one.point - turn(np.array([[2.0, 0, 0]]))[0]
-    assert np.linalg.norm(away - (away @ axis) * axis) < 0.02
+    assert norm(away - (away @ axis) * axis) < 0.02
     assert abs(found[frozenset(("body", "lid"))].axis @ axis) > 0.9999
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from fit_cases import IN_FRONT, said, seen
+from numpy.linalg import norm
 from numpy.random import Generator, default_rng
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
@@ -93,7 +94,7 @@ def test_a_choice_that_no_start_has_made_is_found() -> None:
     found = fitted.with_draws(states_with(model, 3, 16))
     assert found.method == "draws" and found.drawn is not None
     assert box_of(found.drawn) == 1
-    assert np.median(np.linalg.norm(found.material - material, axis=1)) < 0.05
+    assert np.median(norm(found.material - material, axis=1)) < 0.05
 
 
 REFUSES = {"human": 7, "robot": 3, "rope": 1, "sheet": 5}
@@ -151,10 +152,10 @@ def test_one_joint_of_segments_that_touch_moves_and_the_rest_stays(arm: Statisti
     moved = [np.split(other.place(arm.material(other.z)), 3) for other in Joints.of(arm).others(posed, 4)]
     assert len(moved) == 8
     axis = here[2].mean(axis=0) - here[1].mean(axis=0)
-    half = Rotation.from_rotvec(np.pi * axis / np.linalg.norm(axis))
+    half = Rotation.from_rotvec(np.pi * axis / norm(axis))
     opposite = half.apply(here[2] - here[2].mean(axis=0)) + here[2].mean(axis=0)
-    best = min(moved, key=lambda parts: float(np.linalg.norm(parts[2] - opposite, axis=1).max()))
-    assert np.linalg.norm(best[2] - opposite, axis=1).max() < 1.5
+    best = min(moved, key=lambda parts: float(norm(parts[2] - opposite, axis=1).max()))
+    assert norm(best[2] - opposite, axis=1).max() < 1.5
     assert_allclose(best[0], here[0], atol=0.3)
     assert_allclose(best[1], here[1], atol=0.3)
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from overlapping import check_overlap
@@ -119,7 +120,7 @@ def test_the_tumours_place_and_size_vary_within_their_bounds() -> None:
     for _ in range(60):
         placed = tumor.sample_placement(rng)
         moved = placed(inner)
-        shifts.append(np.linalg.norm(placed(placed.center[None])[0] - placed.center) / _liver_parts.MM)
+        shifts.append(norm(placed(placed.center[None])[0] - placed.center) / _liver_parts.MM)
         factors.append(float(np.ptp(moved[:, 0]) / np.ptp(inner[:, 0])))
         assert np.abs(placed(outer) - outer).max() < 1.0 * _liver_parts.MM, "nothing of it shows on the surface"
     assert max(shifts) <= 4.0 + 1e-9 and max(shifts) > 3.0

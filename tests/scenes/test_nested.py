@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from analytic import ball as distance_to_ball
 from analytic import logits_of
+from numpy.linalg import norm
 from numpy.random import Generator, default_rng
 from numpy.testing import assert_allclose
 from overlapping import check_overlap
@@ -15,7 +16,7 @@ from mereo.deformation.maps import Deformation
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.mesh_check import overlaps
 from mereo.geometry.solids import Solids, signed_distance_and_direction
-from mereo.geometry.transforms import transform_points
+from mereo.geometry.transforms import transform_points, unit_rows
 from mereo.reconstruction.isosurfaces import extract
 from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH, rest_distances, rest_frame
 from mereo.scenes.scene import Scene
@@ -38,7 +39,7 @@ def onion() -> SegmentedMesh:
 
 
 def radius(points: np.ndarray, part: tuple[tuple[float, float, float], float]) -> np.ndarray:
-    return np.linalg.norm(points - part[0], axis=1)
+    return norm(points - part[0], axis=1)
 
 
 def clear_of(points: np.ndarray, gap: float) -> np.ndarray:
@@ -98,7 +99,7 @@ def test_distance_and_direction_lead_to_the_surface_of_what_the_owner_owns() -> 
     assert_allclose(distance, expected, atol=0.02)  # facets lie up to 0.01 inside the ball
     wall = (labels == 1) | ((labels == 2) & (to_core < -to_organ))
     center = np.where(wall[:, None], CORE[0], ORGAN[0])
-    outward = (points - center) / np.linalg.norm(points - center, axis=1, keepdims=True)
+    outward = unit_rows(points - center)
     within = np.where(wall, to_core, to_organ) < 0
     cosine = np.einsum("ni,ni->n", direction, np.where(within[:, None], outward, -outward))
     tie = np.abs(np.abs(to_core) - np.abs(to_organ)) < 0.03

@@ -5,6 +5,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from numpy.linalg import det, norm
 from numpy.random import Generator, default_rng
 from overlapping import check_overlap
 from scipy.spatial import ConvexHull, cKDTree
@@ -157,7 +158,7 @@ def test_workspace_is_a_cone_of_the_stated_aperture_and_distance() -> None:
     workspace, target = Workspace(axis=(0.0, 1.0, 0.0)), np.array([3.0, -2.0, 1.0])
     poses = [workspace.sample(rng, target) for _ in range(1500)]
     offset = np.stack([pose[:3, 3] - target for pose in poses])
-    distance = np.linalg.norm(offset, axis=1)
+    distance = norm(offset, axis=1)
     cosine = offset[:, 1] / distance
     assert distance.min() >= 100 and distance.max() <= 200 and abs(distance.mean() - 150) < 3
     # uniform over the cap: the cosine is uniform between that of 70 degrees and 1
@@ -175,7 +176,7 @@ def test_whole_sphere_with_any_roll_prefers_no_direction() -> None:
     poses = np.stack([workspace.sample(rng, np.zeros(3)) for _ in range(3000)])
     for column in range(3):  # x, y and z axes of the camera are each uniform on the sphere
         assert np.abs(poses[:, :3, column].mean(axis=0)).max() < 0.06
-    assert np.allclose(np.linalg.det(poses[:, :3, :3]), 1.0)
+    assert np.allclose(det(poses[:, :3, :3]), 1.0)
     pose = look_at(np.array([0.0, 0.0, 10.0]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
     assert is_rigid(pose) and np.allclose(pose[:3, 2], [0, 0, -1]), "straight along up"
 

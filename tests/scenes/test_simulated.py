@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from analytic import untrained
 from lattice import SIZE, boxes, lattice, pvd_text, states
+from numpy.linalg import norm
 from numpy.random import Generator, default_rng
 from numpy.testing import assert_allclose
 from scene_files import write_bar
@@ -96,7 +97,7 @@ def test_the_interior_estimate_is_near_the_solid_that_made_the_surface() -> None
     for nodes in states()[[0, -1]]:
         truth = TetrahedralMap(lattice(), nodes)
         estimate = SurfaceMap(surface, truth(part.vertices))
-        error = np.linalg.norm(estimate(points) - truth(points), axis=1)
+        error = norm(estimate(points) - truth(points), axis=1)
         assert np.sqrt((error**2).mean()) < 0.1 * np.sqrt(((truth(points) - points) ** 2).sum(axis=1).mean())
         assert jacobian_determinant(estimate, points).min() > 0.3
         found, converged = invert(estimate, estimate(points), points + 0.05)

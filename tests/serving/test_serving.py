@@ -38,7 +38,7 @@ from analytic import AnalyticModel
 from camera_files import write_camera
 from fuzz import damaged, zipped
 from PIL import Image
-from two_balls import BIG, NAMES, SMALL, front, two_balls
+from two_balls import NAMES, fronts, two_balls
 
 import mereo
 from mereo.cli.answers import ReconstructCommand, ServeCommand
@@ -61,7 +61,7 @@ from mereo_serving.workers import WorkerDied, WorkerProcess
 pytestmark = pytest.mark.anyio
 
 NPY = {"Content-Type": "application/x-npy"}
-CLOUD = np.concatenate([front(*BIG, -1.0), front(*SMALL, -1.0)])
+CLOUD = fronts(-1.0)
 MIDDLE, HALF = (CLOUD.min(axis=0) + CLOUD.max(axis=0)) / 2, np.ptp(CLOUD, axis=0).max() / 2
 ADDRESS = "/v1/balls/reconstruct"
 
@@ -315,11 +315,17 @@ def held_up(server: Server) -> ThreadWorker:
     return worker
 
 
+async def begun(server: Server) -> tuple[ThreadWorker, asyncio.Task[httpx2.Response]]:
+    """Its held-up worker, and a frame that it has begun."""
+    worker = held_up(server)
+    first = asyncio.create_task(server.post(npy()))
+    await until(worker.begun.is_set)
+    return worker, first
+
+
 async def test_a_full_queue_refuses_and_goes_on(tmp_path: Path) -> None:
     async with running(tmp_path, ServeConfig(queue=2)) as server:
-        worker = held_up(server)
-        first = asyncio.create_task(server.post(npy()))
-        await until(worker.begun.is_set)
+        worker, first = await begun(server)
         waiting = [asyncio.create_task(server.post(npy(moved(n)))) for n in range(2)]
         await until(lambda: server.dispatcher.held == 2)
         refused = await server.post(npy())
@@ -352,9 +358,7 @@ async def test_impatience_leaves_no_work_behind(tmp_path: Path, monkeypatch: pyt
 
 async def test_a_frame_whose_client_has_left_is_not_begun(tmp_path: Path) -> None:
     async with running(tmp_path) as server:
-        worker = held_up(server)
-        first = asyncio.create_task(server.post(npy()))
-        await until(worker.begun.is_set)
+        worker, first = await begun(server)
         told, statuses = asyncio.Event(), list[int | None]()
         messages = iter([{"type": "http.request", "body": npy(), "more_body": False}])
 
@@ -385,10 +389,8 @@ async def test_a_frame_that_ends_its_process_costs_no_other(tmp_path: Path, capl
     deadly = npy(np.full((40, 3), 0.6))
 
     async with running(tmp_path) as server:
-        worker = held_up(server)
+        worker, first = await begun(server)
         worker.dies = lambda frame: frame.path.read_bytes() == deadly
-        first = asyncio.create_task(server.post(npy()))
-        await until(worker.begun.is_set)
         bodies = [npy(moved(1)), deadly, npy(moved(2)), npy(moved(3))]
         rest = [asyncio.create_task(server.post(body)) for body in bodies]
         await until(lambda: server.dispatcher.held == 4)
@@ -418,9 +420,7 @@ async def test_a_process_that_hangs_is_ended(tmp_path: Path, monkeypatch: pytest
 
 async def test_the_end_answers_what_is_begun_and_refuses_the_rest(tmp_path: Path) -> None:
     async with running(tmp_path) as server:
-        worker = held_up(server)
-        first = asyncio.create_task(server.post(npy()))
-        await until(worker.begun.is_set)
+        worker, first = await begun(server)
         waits = asyncio.create_task(server.post(npy()))
         await until(lambda: server.dispatcher.held == 1)
         server.dispatcher.stop()
@@ -728,8 +728,7 @@ async def test_others_than_this_machine_need_the_token(root: Path) -> None:
 
 def get(port: int, path: str) -> bytes:
     with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=20) as answer:
-        content: bytes = answer.read()
-        return content
+        return answer.read()
 
 
 def workers_of(server: Any) -> list[int]:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.linalg import norm
 from PIL import Image
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -101,6 +102,6 @@ def until(condition: Callable[[], Any], timeout_s: float = 120.0) -> Any:
 def pixels_of(picture: np.ndarray, color: tuple[int, int, int], cosine: float = 0.99) -> int:
     """How many pixels have this hue, whatever the light."""
     wanted, shown = np.asarray(color, dtype=float), picture.astype(float)
-    length = np.linalg.norm(shown, axis=-1)
-    same = shown @ wanted / (np.maximum(length, 1e-9) * np.linalg.norm(wanted)) > cosine
+    length = norm(shown, axis=-1)
+    same = shown @ wanted / (np.maximum(length, 1e-9) * norm(wanted)) > cosine
     return int((same & (length > 60)).sum())

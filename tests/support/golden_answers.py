@@ -35,6 +35,7 @@ from typing import Any
 import numpy as np
 from folder_contents import read_json
 from golden_objects import FOLDER, OWN, weights_of
+from numpy.linalg import norm
 
 import mereo
 from mereo.geometry.mesh import SegmentedMesh
@@ -167,7 +168,7 @@ def answers_of(name: str) -> dict[str, dict[str, Any]]:
 def change(fact: str, kept: dict[str, Any], now: dict[str, Any]) -> float:
     """How far a number is from the kept one: relative for lengths and radii, in object sizes for positions."""
     if fact == "positions":
-        return float(np.linalg.norm(np.asarray(now[fact]) - kept[fact], axis=1).max() / kept["size"])
+        return float(norm(np.asarray(now[fact]) - kept[fact], axis=1).max() / kept["size"])
     before, after = (np.asarray(facts.get(fact) or 0.0, dtype=float) for facts in (kept, now))
     return float((abs(after - before) / (abs(before) if fact in ("scene_unit", "radius95") else 1.0)).max())
 
@@ -218,8 +219,7 @@ def is_same(kept: dict[str, Any], now: dict[str, Any]) -> bool:
 
 
 def kept_of(name: str) -> dict[str, dict[str, Any]]:
-    kept: dict[str, dict[str, Any]] = read_json(FOLDER / f"{name}.json")
-    return kept
+    return read_json(FOLDER / f"{name}.json")
 
 
 def write(name: str, answers: dict[str, dict[str, Any]]) -> None:

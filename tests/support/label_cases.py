@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from jaxtyping import Int
+from numpy.linalg import norm
 
 nibabel = pytest.importorskip("nibabel")
 
@@ -25,7 +26,7 @@ def halves() -> Int[np.ndarray, "80 140 44"]:
     """A ball of radius 40 mm as 1 (lower x) and 2, with a stray voxel of 7; position is index times spacing."""
     axes = [np.arange(n) * s for n, s in zip((80, 140, 44), SPACING, strict=True)]
     position = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1) - CENTER
-    ball = np.linalg.norm(position, axis=-1) < RADIUS
+    ball = norm(position, axis=-1) < RADIUS
     labels = np.where(ball, np.where(position[..., 0] < 0, 1, 2), 0)
     labels[0, 0, 0] = 7
     return labels.astype(np.int64)

@@ -5,6 +5,7 @@ from itertools import combinations
 import igl
 import numpy as np
 from manifold3d import Manifold
+from numpy.linalg import norm
 
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.mesh_check import solid_of
@@ -42,7 +43,7 @@ def crowded(mesh: SegmentedMesh, depth: float, chosen: slice = slice(None)) -> s
     corners = vertices[faces]
     normals = np.zeros_like(vertices)
     np.add.at(normals, faces, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, None])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-30
+    normals /= norm(normals, axis=1, keepdims=True) + 1e-30
     owner = np.repeat(np.arange(len(mesh.segments)), [len(segment.vertices) for segment in mesh.segments])[chosen]
     allowed = 1 + np.array([sum(inner == index for inner, _ in mesh.nesting) for index in range(len(mesh.segments))])
     winding = igl.fast_winding_number(vertices, faces, (vertices - depth * normals)[chosen])

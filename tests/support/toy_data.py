@@ -12,11 +12,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from numpy.linalg import norm
 from numpy.random import Generator, default_rng
 from safetensors.numpy import save_file
 from toy_scene import toy_scene
 
 from mereo.api.generate import generate
+from mereo.geometry.transforms import unit_rows
 from mereo.io.object_storage import Place, names_in
 from mereo.scenes.rest_pose import TEMPLATE_NODES, TEMPLATE_REACH
 from mereo.synthesis.config import TEMPLATE, GenerateConfig, SamplingConfig
@@ -94,13 +96,12 @@ def _template() -> np.ndarray:
 
 def half_balls(rng: Generator, points: int, queries: int) -> dict[str, np.ndarray]:
     radius, center = rng.uniform(5.0, 10.0), np.array([rng.uniform(-5, 5), rng.uniform(-5, 5), rng.uniform(100, 200)])
-    front = rng.normal(size=(points, 3))
-    front /= np.linalg.norm(front, axis=1, keepdims=True)
+    front = unit_rows(rng.normal(size=(points, 3)))
     front[:, 2] = -np.abs(front[:, 2])
     cloud = center + radius * front
     places = center + radius * rng.uniform(-1.4, 1.4, size=(queries, 3))
     offset = (places - center) / radius
-    reach = np.linalg.norm(offset, axis=1)
+    reach = norm(offset, axis=1)
     # distance to the nearest of the sphere and, inside, the wall between the halves
     wall = np.where(reach < 1, np.abs(offset[:, 0]), np.inf)
     distance = np.minimum(np.abs(reach - 1), wall) * np.where(reach < 1, -1, 1) * radius

@@ -4,10 +4,11 @@ from collections.abc import Callable
 
 import numpy as np
 from analytic import AnalyticModel, ball, logits_of
+from numpy.random import default_rng
 
 from mereo.geometry.camera import into_camera
 from mereo.geometry.conventions import CloudAxes
-from mereo.geometry.transforms import inverse_rigid, transform_points
+from mereo.geometry.transforms import inverse_rigid, transform_points, unit_rows
 
 NAMES = ("big", "small", "absent")
 
@@ -17,10 +18,14 @@ BIG, SMALL = ((0.02, -0.03, 0.6), 0.06), ((0.02, 0.0605, 0.6), 0.03)
 
 def front(center: tuple[float, float, float], radius: float, toward: float, count: int = 600) -> np.ndarray:
     """Points on the half of a sphere on the side of z that ``toward`` names."""
-    points = np.random.default_rng(0).normal(size=(count, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    points = unit_rows(default_rng(0).normal(size=(count, 3)))
     points[:, 2] = toward * np.abs(points[:, 2])
     return np.asarray(center) + radius * points
+
+
+def fronts(toward: float) -> np.ndarray:
+    """Points on the halves of both balls on the side of z that ``toward`` names."""
+    return np.concatenate([front(*BIG, toward), front(*SMALL, toward)])
 
 
 def two_balls(points: np.ndarray) -> np.ndarray:
@@ -31,7 +36,7 @@ def two_balls(points: np.ndarray) -> np.ndarray:
 def scene(frame: CloudAxes) -> tuple[np.ndarray, AnalyticModel]:
     """The two balls as given in ``frame``, and a model that knows them in the camera frame that is made of it."""
     if frame == "camera":
-        return np.concatenate([front(*BIG, -1.0), front(*SMALL, -1.0)]), AnalyticModel.of(two_balls, NAMES)
-    cloud = np.concatenate([front(*BIG, 1.0), front(*SMALL, 1.0)])
+        return fronts(-1.0), AnalyticModel.of(two_balls, NAMES)
+    cloud = fronts(1.0)
     back = inverse_rigid(into_camera(cloud, "scanner"))
     return cloud, AnalyticModel.of(lambda points: two_balls(transform_points(back, points)), NAMES)

@@ -10,6 +10,7 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 from folder_contents import contents, read_json
+from numpy.linalg import norm
 from numpy.random import Generator
 from safetensors.numpy import load_file
 from scene_code import CODE
@@ -301,7 +302,7 @@ def test_the_cloud_is_the_depth_image_unprojected_and_normalized(case: Case) -> 
     example, view = case
     seen = view.depth.to_points().points
     kept = example.normalizer.invert(example.cloud)
-    gaps = np.linalg.norm(kept[:, None] - seen[None], axis=-1)
+    gaps = norm(kept[:, None] - seen[None], axis=-1)
     assert gaps.min(axis=1).max() < 1e-6
     assert len(np.unique(gaps.argmin(axis=1))) == len(kept) == min(len(seen), SETTINGS.points)
     box = example.normalizer.apply(seen)
@@ -322,7 +323,7 @@ def test_labels_distances_and_directions_are_those_of_the_deformed_segments(case
     assert len(queries.labels) == SETTINGS.sampling.total(4)
     foot = queries.positions + np.abs(queries.distances)[:, None] * queries.directions
     assert solids.nearest(example.normalizer.invert(foot)).distance.max() < 1e-6
-    assert np.allclose(np.linalg.norm(queries.directions, axis=1), 1)
+    assert np.allclose(norm(queries.directions, axis=1), 1)
 
 
 def test_rest_coordinates_lead_back_to_the_query_and_lie_in_the_same_segment_at_rest(case: Case) -> None:

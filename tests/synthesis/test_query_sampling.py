@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_array_equal
 from shapes import box
@@ -35,7 +36,7 @@ class Balls:
         return np.stack([self.centers - self.radii[:, None], self.centers + self.radii[:, None]], axis=1)
 
     def radius(self, index: int, points: np.ndarray) -> np.ndarray:
-        return np.linalg.norm(points - self.centers[index], axis=1)
+        return norm(points - self.centers[index], axis=1)
 
     def inside(self, index: int, points: np.ndarray) -> np.ndarray:
         return self.radius(index, points) < self.radii[index]
@@ -113,7 +114,7 @@ def test_batch_size_changes_no_bit_and_the_generator_advances_alike_whatever_is_
 def test_the_nearest_surface_owns_nested_and_overlapping_solids() -> None:
     nested = Balls(((0, 0, 0), 3.0), ((0, 0, 0), 2.0), ((0, 0, 0), 1.0))
     points = default_rng(0).uniform(-3.2, 3.2, size=(5000, 3))
-    radius = np.linalg.norm(points, axis=1)
+    radius = norm(points, axis=1)
     # the innermost ball that holds it, also just outside ball 3, whose surface is then the nearest of all
     assert_array_equal(owner_labels(nested, points), (radius < 3).astype(int) + (radius < 2) + (radius < 1))
     overlapping = Balls(((-0.6, 0, 0), 1.0), ((0.6, 0, 0), 1.0))

@@ -6,6 +6,7 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 import trimesh
+from numpy.linalg import norm
 from numpy.random import default_rng
 from shapes import ball, box, one, segment
 from toy_scene import toy_scene
@@ -13,6 +14,7 @@ from toy_scene import toy_scene
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.solids import Solids
+from mereo.geometry.transforms import unit_rows
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.clutter import BACKGROUND, NOTHING, OBJECT, OCCLUDER, Capsule
 from mereo.synthesis.config import SENSOR_TERMS, SENSORS, GenerateConfig, SamplingConfig, SensorConfig, SensorModel
@@ -47,7 +49,7 @@ def wall(z: float, tilt_deg: float = 0.0) -> Solids:
 def slant(tilt_deg: float) -> np.ndarray:
     """Angle between each ray and that wall's normal."""
     normal = np.array([np.sin(np.deg2rad(tilt_deg)), 0, np.cos(np.deg2rad(tilt_deg))])
-    return np.arccos(np.abs(RAYS @ normal) / np.linalg.norm(RAYS, axis=-1))
+    return np.arccos(np.abs(RAYS @ normal) / norm(RAYS, axis=-1))
 
 
 def look(solids: Solids, seed: int = 0, noise_std: float = 0.0, **terms: object) -> SimulatedView:
@@ -198,7 +200,7 @@ def test_depth_of_a_sphere_is_the_smaller_root_of_the_ray_equation() -> None:
     a, b, c = (rays**2).sum(-1), rays @ center, center @ center - radius**2
     discriminant = b**2 - a * c
     expected = np.where(discriminant > 0, (b - np.sqrt(np.maximum(discriminant, 0))) / a, 0.0)
-    miss = np.linalg.norm(center - (b / a)[..., None] * rays, axis=-1)  # how far the ray passes from the centre
+    miss = norm(center - (b / a)[..., None] * rays, axis=-1)  # how far the ray passes from the centre
     well_inside, well_outside = miss < 0.95 * radius, miss > radius
     assert well_inside.sum() > 500 and well_outside.sum() > 500
     assert (depth[well_outside] == 0).all()
@@ -233,7 +235,7 @@ def test_rays_hit_a_capsule_where_they_hit_its_triangles(seed: int) -> None:
     low, high = (-30, -30, 100), (30, 30, 160)
     start, end, radius = rng.uniform(low, high), rng.uniform(low, high), rng.uniform(3, 10)
     rows, hits = Capsule(start, end, radius).first_hit(SIGHT)
-    length = float(np.linalg.norm(end - start))
+    length = float(norm(end - start))
     mesh = trimesh.creation.capsule(length, radius, count=[128, 128], transform=np.eye(4))
     mesh.apply_translation([0, 0, -mesh.bounds.mean(axis=0)[2]])
     mesh.apply_transform(trimesh.geometry.align_vectors([0, 0, 1], (end - start) / length))
@@ -244,8 +246,8 @@ def test_rays_hit_a_capsule_where_they_hit_its_triangles(seed: int) -> None:
     both = np.isfinite(distance) & np.isfinite(expected.distance)
     assert both.sum() > 100 and (np.isfinite(distance) != np.isfinite(expected.distance)).sum() < 0.03 * both.sum()
     assert np.median(np.abs(distance[both] - expected.distance[both])) < 0.01
-    normal = hits.normal / np.linalg.norm(hits.normal, axis=1, keepdims=True)
-    assert np.allclose(np.linalg.norm(hits.normal, axis=1), radius)
+    normal = unit_rows(hits.normal)
+    assert np.allclose(norm(hits.normal, axis=1), radius)
     assert (np.einsum("ij,ij->i", normal, SIGHT[rows]) < 1e-9).all()
 
 
@@ -253,7 +255,7 @@ def test_a_capsule_without_length_is_a_ball_and_behind_the_camera_nothing() -> N
     center = np.array([3.0, -4.0, 120.0])
     rows, hits = Capsule(center, center, 10.0).first_hit(SIGHT)
     places = SIGHT[rows] * hits.distance[:, None]
-    assert len(rows) > 100 and np.allclose(np.linalg.norm(places - center, axis=1), 10.0)
+    assert len(rows) > 100 and np.allclose(norm(places - center, axis=1), 10.0)
     assert len(Capsule(-center, np.array([40.0, 0, -100]), 10.0).first_hit(SIGHT)[0]) == 0
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from folder_contents import read_json
+from numpy.linalg import norm
 from numpy.random import Generator
 from numpy.testing import assert_allclose, assert_array_equal
 from toy_scene import Shear, rest_mesh, toy_scene
@@ -43,9 +44,9 @@ def test_a_walk_starts_in_the_state_of_its_seed_and_moves_on_smoothly() -> None:
     start = scene.deform(random_state(scene, 3).deformations).mesh.merged()[0]
     assert_allclose(coarse[0], start, atol=1e-9)
     assert_allclose(coarse, fine[::2])
-    largest = [np.linalg.norm(np.diff(one, axis=0), axis=2).max() for one in (coarse, fine)]
+    largest = [norm(np.diff(one, axis=0), axis=2).max() for one in (coarse, fine)]
     assert 0.4 < largest[1] / largest[0] < 0.65  # half the time, half the way
-    assert np.linalg.norm(coarse[-1] - coarse[0], axis=1).max() > 1.0
+    assert norm(coarse[-1] - coarse[0], axis=1).max() > 1.0
     assert not np.allclose(places(scene, 4, np.array([0.0, 1.0])), coarse[[0, 10]])
     weights = process_weights(np.linspace(0.0, 5.3, 50))
     assert_allclose((weights**2).sum(axis=1), 1.0)

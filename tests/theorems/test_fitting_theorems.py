@@ -6,19 +6,20 @@ import numpy as np
 import pytest
 from answers import fit_correspondences
 from fit_cases import IN_FRONT, said, shown
+from numpy.linalg import norm
 from numpy.testing import assert_allclose, assert_array_equal
 
 from mereo.fitting.problem.evidence import UNSEEN_PITCHES, Evidence
 from mereo.fitting.problem.gauss_newton import amplitudes, pull
 from mereo.fitting.problem.residuals import Surface
 from mereo.geometry.camera import SharedNoise
-from mereo.geometry.transforms import transform_points
+from mereo.geometry.transforms import transform_points, unit_rows
 from mereo.scenes.statistical_model import StatisticalModel
 
 
 def test_more_noise_never_makes_the_residual_smaller(toy_model: StatisticalModel) -> None:
     points, material = shown(toy_model, 0.5)
-    noise = np.random.default_rng(0).normal(size=(len(points), 1)) * points / np.linalg.norm(points, axis=1)[:, None]
+    noise = np.random.default_rng(0).normal(size=(len(points), 1)) * points / norm(points, axis=1)[:, None]
     residuals = []
     for std in (0.0, 0.05, 0.1, 0.2, 0.4, 0.8):
         registration = fit_correspondences(points + std * noise, said(toy_model, material), toy_model, 1.0)
@@ -52,10 +53,10 @@ def test_noise_along_the_lines_of_sight_says_nothing_of_where_the_surface_is(
     faces = toy_model.faces[at_rest.facing]
     middle = at_rest.material[faces[toy_model.labels[faces[:, 0]] == toy_model.labels.max()]].mean(axis=1)
     _, face, place = at_rest.along_sight(middle, np.inf)
-    toward = place / np.linalg.norm(place, axis=1, keepdims=True)
+    toward = unit_rows(place)
     slant = -np.einsum("pi,pi->p", at_rest.normals[face], toward)
-    points = middle[(np.linalg.norm(middle - place, axis=1) < 1e-3) & (slant > 0.5)]  # seen, and not at the rim
-    noise = 0.8 * points / np.linalg.norm(points, axis=1, keepdims=True)
+    points = middle[(norm(middle - place, axis=1) < 1e-3) & (slant > 0.5)]  # seen, and not at the rim
+    noise = 0.8 * unit_rows(points)
     noisy = np.concatenate([points - noise, points + noise])
     _, face, place = at_rest.along_sight(noisy, np.inf)
     assert abs(np.einsum("pi,pi->p", noisy - place, at_rest.normals[face]).mean()) < 1e-5
@@ -69,7 +70,7 @@ def test_what_a_line_of_sight_misses_or_meets_far_off_is_compared_with_the_neare
     for found, nearest in zip(at_rest.along_sight(points, 0.5), at_rest.nearest(points), strict=True):
         assert_array_equal(found, nearest)
     distance, face, place = at_rest.along_sight(points, 100.0)
-    assert_allclose(np.cross(place[1], middle), 0.0, atol=1e-9 * np.linalg.norm(middle) ** 2)
+    assert_allclose(np.cross(place[1], middle), 0.0, atol=1e-9 * norm(middle) ** 2)
     offset = np.einsum("i,i->", at_rest.normals[face[1]], middle - place[1])
     assert distance[1] == pytest.approx(abs(offset)) and distance[1] > at_rest.nearest(points)[0][1]
 

@@ -19,6 +19,7 @@ import pytest
 import trimesh
 from answers import answer_to
 from browser import Page, needs_browser, pixels_of, until
+from numpy.linalg import norm
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from reported_scenes import ball, example, wall
@@ -175,8 +176,8 @@ def test_a_page_looks_at_the_middle_of_the_object_from_where_all_of_it_is_seen(s
     stage._turn(camera, aspect)
     np.testing.assert_allclose(camera.look_at, stage.place(bounds.mean(axis=0)), atol=1e-9)
     half_angle = np.arctan(np.tan(np.deg2rad(20)) * min(aspect, 1))
-    radius = np.linalg.norm(np.subtract(camera.position, camera.look_at)) * np.sin(half_angle)
-    assert radius == pytest.approx(np.linalg.norm(np.ptp(bounds, axis=0)) / 2 * stage.scale), "of the ball around it"
+    radius = norm(np.subtract(camera.position, camera.look_at)) * np.sin(half_angle)
+    assert radius == pytest.approx(norm(np.ptp(bounds, axis=0)) / 2 * stage.scale), "of the ball around it"
 
 
 def first_message(port: int, host: str, origin: str | None) -> bytes:
@@ -297,7 +298,7 @@ def test_the_camera_stands_where_its_place_says_and_sees_the_state() -> None:
     view = laboratory.look(played, place)
     world = view.mesh.transformed(view.T_world_camera)
     offset = view.T_world_camera[:3, 3] - world.bounds.mean(axis=0)
-    assert np.linalg.norm(offset) == pytest.approx(140.0)
+    assert norm(offset) == pytest.approx(140.0)
     assert np.arccos(offset[2] / 140.0) == pytest.approx(0.5)
     expected = laboratory.scene.deform(played.deformations).mesh
     for shown, wanted in zip(world.segments, expected.segments, strict=True):
@@ -540,7 +541,7 @@ def test_places_are_asked_of_a_results_surfaces(folder: Path) -> None:
     middle, rim = head.vertices.mean(axis=0), head.vertices[0]
     inside, outside, on_it = (content.ask(point[None]) for point in (middle, middle + 5.0, rim))
     assert inside.label == 1 and outside.label == 0 and on_it.label == 1
-    size = np.linalg.norm(rim - middle)
+    size = norm(rim - middle)
     assert inside.distance[0] == pytest.approx(-size, rel=0.1) and outside.distance[0] > 4
     assert outside.radius95 is None and on_it.radius95 is not None
     assert on_it.radius95[0] == pytest.approx(0.001, rel=0.01)

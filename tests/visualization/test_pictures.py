@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 from answers import answer_to
+from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
@@ -64,7 +65,7 @@ def hue_is(pixels: np.ndarray, color: Color) -> np.ndarray:
     """Pixels whose colour is ``color`` at some brightness."""
     wanted = np.asarray(color, dtype=float)
     values = pixels.astype(float)
-    cosine = (values @ wanted) / np.maximum(np.linalg.norm(values, axis=-1) * np.linalg.norm(wanted), 1e-9)
+    cosine = (values @ wanted) / np.maximum(norm(values, axis=-1) * norm(wanted), 1e-9)
     return (cosine > 0.985) & (values.sum(axis=-1) > 30)
 
 
@@ -94,7 +95,7 @@ def test_a_pinhole_picture_is_the_camera_depth_image_in_colour() -> None:
     row, column = np.nonzero(np.isfinite(canvas.depth))
     pixel = np.column_stack([column + 0.5, row + 0.5]) / SUPERSAMPLE
     points = camera.unproject(pixel, canvas.depth[row, column])
-    assert_allclose(np.linalg.norm(points - [0.1, -0.2, 3], axis=1), 0.7, atol=4e-3)
+    assert_allclose(norm(points - [0.1, -0.2, 3], axis=1), 0.7, atol=4e-3)
 
 
 def test_nearer_things_hide_farther_ones() -> None:
@@ -205,8 +206,8 @@ def test_offsets_are_pale_within_the_tolerance_and_for_rounding_and_full_at_the_
     ramp = offset_colors(np.linspace(TOLERANCE_CELLS, FULL_CELLS, 9))
     assert (np.diff(ramp[:, 0]) < 0).all()  # the red of blue falls
     grid = np.indices((40, 40, 40)).transpose(1, 2, 3, 0)
-    truth = (np.linalg.norm(grid - 19.5, axis=-1) < 14.0).astype(np.uint8)
-    moved = (np.linalg.norm(grid - [19.8, 19.3, 19.6], axis=-1) < 14.1).astype(np.uint8)
+    truth = (norm(grid - 19.5, axis=-1) < 14.0).astype(np.uint8)
+    moved = (norm(grid - [19.8, 19.3, 19.6], axis=-1) < 14.1).astype(np.uint8)
     assert (truth != moved).sum() > 400  # which the staircases would show as speckle
     pale = np.isclose(offset_triangles(labelled(truth, moved)).colors, np.asarray(PALE) / 255, atol=0.08).all(axis=1)
     assert pale.mean() > 0.99
@@ -219,6 +220,11 @@ def strips(picture: np.ndarray) -> int:
     return 44 + len(legend(SEGMENTATION_WORDS, (PALE, WRONG, EXTRA_OR_MISSING), picture.shape[1]))
 
 
+def columns_of(picture: np.ndarray) -> list[np.ndarray]:
+    """Columns of a picture of errors."""
+    return np.array_split(picture[: -strips(picture), 12:], 8, axis=1)
+
+
 def test_the_error_picture_shows_each_error_in_its_column_only(tmp_path: Path) -> None:
     truth, found = two_boxes(), two_boxes()
     found[15:18, 5:15, 5:15], found[5:8, 5:15, 5:15], found[10:12, 5:15, 5:15] = 1, 0, 1
@@ -226,7 +232,7 @@ def test_the_error_picture_shows_each_error_in_its_column_only(tmp_path: Path) -
     picture = np.asarray(Image.open(tmp_path / "e.png"))
     below = picture[-strips(picture) :]
     assert all(hue_is(below, color).any() for color in (OVER, UNDER, WRONG, EXTRA_OR_MISSING))
-    columns = np.array_split(picture[: -strips(picture), 12:], 8, axis=1)
+    columns = columns_of(picture)
     shows = [[bool(hue_is(column, c).sum() > 20) for c in (OVER, UNDER, WRONG)] for column in columns]
     assert shows[3] == shows[4] == [True, True, False]
     assert shows[6] == [False, False, True] and hue_is(columns[6], EXTRA_OR_MISSING).sum() > 20
@@ -242,7 +248,7 @@ def test_an_error_on_the_far_side_is_seen_from_behind_only_and_an_empty_predicti
     found[7:13, 7:13, 12:16] = 1
     error_picture(tmp_path / "e.png", [labelled(truth, found)], size=60)
     picture = np.asarray(Image.open(tmp_path / "e.png"))
-    columns = np.array_split(picture[: -strips(picture), 12:], 8, axis=1)
+    columns = columns_of(picture)
     assert [bool(hue_is(columns[k], OVER).sum() > 20) for k in (3, 4)] == [False, True]
     truth = np.zeros((6, 6, 6), np.uint8)
     truth[2:4, 2:4, 2:4] = 1
@@ -264,7 +270,7 @@ def test_a_preview_of_states_has_three_pictures_for_each_state(tmp_path: Path) -
     toward = np.array([0.0, 0.6, 0.8])
     arrow = previews._arrow(np.ones(3), toward, 2.0).vertices - 1  # from the camera's side to the object
     assert_allclose(sorted({round(far, 6) for far in arrow @ toward}), [1.7, 2.06, 2.7])
-    assert np.linalg.norm(arrow - np.outer(arrow @ toward, toward), axis=1).max() < 0.17
+    assert norm(arrow - np.outer(arrow @ toward, toward), axis=1).max() < 0.17
 
 
 SPACING = np.array([0.5, 0.3, 0.4])
@@ -275,12 +281,12 @@ CELLS = (32, 52, 40)
 def ball_cells(radius: float) -> np.ndarray:
     """Occupied cells of a ball on the anisotropic grid."""
     grid = np.indices(CELLS).transpose(1, 2, 3, 0) * SPACING
-    return np.asarray(np.linalg.norm(grid - CENTER, axis=-1) < radius)
+    return np.asarray(norm(grid - CENTER, axis=-1) < radius)
 
 
 def directions() -> np.ndarray:
     drawn = default_rng(5).normal(size=(400, 3))
-    return np.asarray(drawn / np.linalg.norm(drawn, axis=1, keepdims=True))
+    return np.asarray(drawn / norm(drawn, axis=1, keepdims=True))
 
 
 @pytest.mark.parametrize(("truth", "found"), [(5.0, 5.6), (5.0, 6.5), (5.6, 5.0), (6.5, 5.0), (5.0, 5.1)])
@@ -323,8 +329,8 @@ def test_confidence_is_the_drop_of_probability_across_the_surface() -> None:
     """A model that is certain of one ball's border, and says one half everywhere near the other's."""
 
     def ask(points: np.ndarray) -> Answer:
-        inside = (np.linalg.norm(points, axis=1) < 2.0).astype(float)
-        unsure = 0.5 * (np.linalg.norm(points - [6, 0, 0], axis=1) < 3.0)
+        inside = (norm(points, axis=1) < 2.0).astype(float)
+        unsure = 0.5 * (norm(points - [6, 0, 0], axis=1) < 3.0)
         probability = np.stack([1 - inside - unsure, inside, unsure], axis=1)
         nothing = np.zeros(len(points))
         return Answer(probability.argmax(axis=1).astype(np.uint8), probability, nothing, np.zeros_like(points))

@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from browser import Page, needs_browser, pixels_of, until
+from numpy.linalg import norm
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from reported_scenes import ball, example, page_data, positions, wall
@@ -109,7 +110,7 @@ def test_a_large_reconstruction_stays_under_the_budget_and_in_shape(tmp_path: Pa
     data = page_data(tmp_path / "r.html")
     assert data["coarsened"]
     for i, shown in enumerate(data["segments"]):
-        distance = np.linalg.norm(positions(data, shown["positions"]) - [0.2 * i, 0, 0.5], axis=1)
+        distance = norm(positions(data, shown["positions"]) - [0.2 * i, 0, 0.5], axis=1)
         assert_allclose(distance, 0.1, atol=0.002)
     with pytest.raises(ValueError, match="at most 5000000: shorten the summary"):
         Report(cloud, mesh, {"title": "x" * BUDGET_BYTES}).write(tmp_path / "r2.html")

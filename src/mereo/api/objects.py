@@ -15,10 +15,10 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from mereo.api.words import check_names, names_of, python_words
-from mereo.deformation.samplers import RandomMotion, Range
+from mereo.deformation.samplers import RandomMotion
 from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.register import Registrar, other_mesh, registrar_for, statistical_model_of
-from mereo.geometry.conventions import LengthUnit, Way
+from mereo.geometry.conventions import LengthUnit, Names, Range, Way
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.bounds import check_value
 from mereo.io.config import MeshesConfig, RobotMeshes
@@ -80,7 +80,7 @@ class Object:
         return self.known_as if self.scene is None else self.scene.name
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> Names:
         """Names of the segments, in the order of their labels."""
         return self.segments.names
 

@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike
 from mereo.api.words import python_words
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.registration import Registration
+from mereo.geometry.conventions import Names
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import Vector, checked_pose, inverse_rigid, rigid, transform_points
@@ -154,7 +155,7 @@ class SegmentedResult(ABC):
         """All segments by their names."""
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> Names:
         """Names of the segments, in the order of their labels; none where the object is lost without an answer."""
         return tuple(self._segments)
 
@@ -249,7 +250,7 @@ class Result(Answer, SegmentedResult):
         )
 
     @property
-    def names(self) -> tuple[str, ...]:  # noqa: D102 (SegmentedResult)
+    def names(self) -> Names:  # noqa: D102 (SegmentedResult)
         return () if self.is_missing else self.surfaces.names
 
     @property
@@ -320,8 +321,7 @@ class Result(Answer, SegmentedResult):
 
         Of a lost object without an answer they have no segments, and ``recognition`` says why.
         """
-        figures: dict[str, Any] = to_json(summary_of(self))
-        return figures
+        return to_json(summary_of(self))
 
     def __reduce__(self) -> Any:
         """Values of the result, without what computes further ones."""

@@ -9,6 +9,7 @@ from difflib import get_close_matches
 from typing import Any, TypeVar, get_args
 
 from mereo.fitting.config import AnswerMethod
+from mereo.geometry.conventions import Names
 from mereo.io.config import CarryFrame
 from mereo.reconstruction.config import Extent
 
@@ -80,7 +81,7 @@ def python_words() -> Iterator[None]:
 Settings = TypeVar("Settings")
 
 
-def names_of(settings: type) -> tuple[str, ...]:
+def names_of(settings: type) -> Names:
     """Names of a dataclass's fields."""
     return tuple(item.name for item in fields(settings))
 

@@ -4,9 +4,10 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mereo.cli.options import Outcome
+from mereo.io.atomic_files import JsonObject
 
 if TYPE_CHECKING:
     from mereo.api.objects import Object
@@ -54,7 +55,7 @@ class Demo:
         from mereo.models.weights_place import has_network
 
         check_place(self.output, may_be_link=True)
-        scores, began = dict[str, Any](), time.perf_counter()
+        scores, began = JsonObject(), time.perf_counter()
         for name, title, known, frame, truth in _inputs(self.output):
             folder, started = self.output / name, time.perf_counter()
             check_new_directory(folder, force=True)

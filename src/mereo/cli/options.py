@@ -23,6 +23,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from mereo.io.bounds import check_values
 from mereo.io.config import InputConfig, MeshesConfig
+from mereo.io.errors import AnyPath
 from mereo.io.object_storage import Place, place_of
 from mereo.models.config import InferenceConfig
 from mereo.reconstruction.config import IsolationConfig
@@ -112,7 +113,7 @@ class FrameOptions:
     inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
 
 
-def check_named(command: str, object: Sequence[str], weights: str | Path | None) -> None:
+def check_named(command: str, object: Sequence[str], weights: AnyPath | None) -> None:
     """Raise ``ValueError`` where neither an object nor weights are named."""
     if not object and weights is None:
         raise ValueError(
@@ -145,7 +146,7 @@ def loaded_object(command: FrameOptions, inference: InferenceConfig | None = Non
     )
 
 
-def files_read(object: Sequence[str], weights: str | Path | None) -> list[str | Path]:
+def files_read(object: Sequence[str], weights: AnyPath | None) -> list[AnyPath]:
     """Files that are read for these options, so that no output takes their place."""
     return [*(name for name in object if Path(name).exists()), *([] if weights is None else [weights])]
 

@@ -36,6 +36,7 @@ from mereo.geometry.symmetry import describe_symmetries
 from mereo.io.atomic_files import MARKER, check_new_directory, check_place, new_directory, write_json
 from mereo.io.attachments import Attachment, read_attachments
 from mereo.io.config import CONFIG, InputConfig
+from mereo.io.errors import AnyPath
 from mereo.io.progress import duration, shown_stages, stage
 from mereo.io.readers import read_pose
 from mereo.io.ros_recordings import is_recording
@@ -85,7 +86,7 @@ class FrameJob:
         _ = self.attachments, self.initial_pose  # raises for those that cannot be read
 
     @property
-    def read(self) -> tuple[str | Path, ...]:
+    def read(self) -> tuple[AnyPath, ...]:
         """Files that are read besides the frames."""
         command = self.command
         scene = () if command.scene is None else files_of(command.scene)
@@ -130,7 +131,7 @@ class FrameJob:
         return moved
 
 
-def reconstruct_file(input: str | Path, output: str | Path, job: FrameJob) -> Result:
+def reconstruct_file(input: AnyPath, output: AnyPath, job: FrameJob) -> Result:
     """Read one frame of a sensor, reconstruct it, write a new directory, print what was found.
 
     Warns with ``SizeWarning`` where what is seen cannot be the object. Raises as ``FrameJob.check``, ``read_frame``,
@@ -418,7 +419,7 @@ def _write_answer(path: Path, folder: Path, answered: _Answered | Exception, job
 # --- what is printed --------------------------------------------------------------------------------------------------
 
 
-def written(output: str | Path, seconds: float) -> str:
+def written(output: AnyPath, seconds: float) -> str:
     """Line about a folder of results that is there."""
     return f"wrote {output} in {seconds:.1f} s; open {Path(output) / 'report.html'} in a browser"
 

@@ -36,7 +36,7 @@ from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import owned_centroids
 from mereo.geometry.transforms import Transform, Vector
-from mereo.io.atomic_files import atomic_file, check_place, remove_abandoned, to_json
+from mereo.io.atomic_files import JsonObject, atomic_file, check_place, remove_abandoned, to_json
 from mereo.io.config import InputConfig
 from mereo.io.errors import is_foreseen, words_of
 from mereo.io.readers import CLOUD_READERS, DEPTH_READERS
@@ -434,7 +434,7 @@ def stream_reconstructions(command: StreamCommand) -> Summary:
     return summary
 
 
-def line(outcome: Outcome) -> dict[str, Any]:
+def line(outcome: Outcome) -> JsonObject:
     """JSON that is printed of one frame; lengths in the input's unit, times in milliseconds."""
     return {
         "frame": outcome.name,
@@ -465,13 +465,13 @@ class FrameAnswer:
     """
 
     surfaces: SegmentedMesh | None
-    facts: dict[str, Any]
+    facts: JsonObject
 
     @classmethod
     def of(cls, answer: Answer, uncertainty: bool = False, radius: bool = True) -> "FrameAnswer":
         """Facts of an answer, with the error ``radius`` of its surface; by ``uncertainty`` also those of segments."""
         registration, is_missing = answer.registration, answer.is_missing
-        facts: dict[str, Any] = {
+        facts: JsonObject = {
             "method": None if is_missing else "network",
             "tracked": answer.tracked,
             "tracking": answer.tracking,
@@ -481,7 +481,7 @@ class FrameAnswer:
             "pose": None,
             "joints": {},
         }
-        strays, segments = answer.hypothesis.dropped, dict[str, dict[str, Any]]()
+        strays, segments = answer.hypothesis.dropped, dict[str, JsonObject]()
         if is_missing:
             return cls(None, {**facts, "strays": strays, "segments": segments})
         mesh = answer.surfaces
@@ -510,7 +510,7 @@ def _rows(pose: Transform) -> list[list[float]]:
     return [[round(value, DIGITS) for value in row] for row in pose.tolist()]
 
 
-def _facts(centroid: Vector, volume: float) -> dict[str, Any]:
+def _facts(centroid: Vector, volume: float) -> JsonObject:
     return {"centroid": [round(float(value), DIGITS) for value in centroid], "volume": volume}
 
 

@@ -11,7 +11,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-import numpy as np
+from numpy.random import Generator
+
+from mereo.geometry.conventions import Names
 
 
 @dataclass(frozen=True)
@@ -24,19 +26,19 @@ class DrawName:
         unit: of the numbers as they are drawn; "rad" is shown in degrees, "log" is a factor's logarithm.
     """
 
-    parts: tuple[str, ...] = ()
-    name: str | tuple[str, ...] = ""
+    parts: Names = ()
+    name: str | Names = ""
     unit: str = ""
 
 
-class NamedGenerator(np.random.Generator):
+class NamedGenerator(Generator):
     """Generator that knows the name of its next draw, and its parts, the outermost first.
 
     ``checked`` is whether states that the scene would refuse are to be refused, see ``unchecked``.
     """
 
-    parts: tuple[str, ...] = ()
-    next_name: tuple[str | tuple[str, ...], str] = ("", "")
+    parts: Names = ()
+    next_name: tuple[str | Names, str] = ("", "")
     checked: bool = True
 
     def take_name(self) -> DrawName:
@@ -45,7 +47,7 @@ class NamedGenerator(np.random.Generator):
         return DrawName(self.parts, name, unit)
 
 
-def named(rng: np.random.Generator, name: str | tuple[str, ...], unit: str = "") -> np.random.Generator:
+def named(rng: Generator, name: str | Names, unit: str = "") -> Generator:
     """Generator ``rng`` itself, with a name for the numbers of its next draw.
 
     ``name`` is that of all numbers, or of each of them in C order; ``unit`` as they are drawn is "rad", "°", "mm",
@@ -56,7 +58,7 @@ def named(rng: np.random.Generator, name: str | tuple[str, ...], unit: str = "")
     return rng
 
 
-def unchecked(rng: np.random.Generator) -> bool:
+def unchecked(rng: Generator) -> bool:
     """Whether a scene may leave out its test of a state, as the state itself is not wanted.
 
     A fit simulates states a small step from a tested one for what each draw moves. A test such as for parts that meet
@@ -66,7 +68,7 @@ def unchecked(rng: np.random.Generator) -> bool:
 
 
 @contextmanager
-def part(rng: np.random.Generator, name: str) -> Iterator[None]:
+def part(rng: Generator, name: str) -> Iterator[None]:
     """Block of code whose draws all belong to a part of the object, or to a part of the part around it."""
     if not isinstance(rng, NamedGenerator):
         yield

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from numpy.random import Generator, default_rng
 from scipy.sparse import coo_array, csc_array, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
@@ -204,7 +205,7 @@ def find_modes(solid: ElasticSolid, count: int, material: Material, held: Flags 
     weight = diags_array(np.repeat(mass[free], 3), format="csc")
     shift = -SHIFT * float(stiffness.diagonal().mean() / weight.diagonal().mean())
     inverse = LinearOperator(stiffness.shape, _factorize(stiffness - shift * weight).solve)
-    start = np.random.default_rng(0).normal(size=len(rows))  # eigsh's own is another in each call
+    start = default_rng(0).normal(size=len(rows))  # eigsh's own is another in each call
     values, vectors = eigsh(stiffness, count + rigid, M=weight, sigma=shift, OPinv=inverse, tol=1e-5, v0=start)
     order = np.argsort(values)[rigid:]
     if values[order[0]] < 0.01 * abs(shift):
@@ -271,7 +272,7 @@ class StateMap:
         spin = (linear - mirrored) / 2
         turn = Rotation.from_rotvec(np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)).as_matrix()
         gradients = np.swapaxes(turn @ strain, 1, 2).reshape(-1, 3)
-        nodes: np.ndarray = self._factors.solve(self._divergence @ gradients)
+        nodes = self._factors.solve(self._divergence @ gradients)
         return TetrahedralMap(self.mesh, nodes + self._share @ (self.mesh.nodes - nodes))
 
 
@@ -338,7 +339,7 @@ class ElasticSampler:
     def _state(self) -> StateMap:
         return StateMap(self.solid, self.modes)
 
-    def __call__(self, rng: np.random.Generator, surface: Surface) -> TetrahedralMap:
+    def __call__(self, rng: Generator, surface: Surface) -> TetrahedralMap:
         """A random state; no tetrahedron of it is inverted, and its volume is that at rest within ``MOST_SWELLING``."""
         coefficients = named(rng, "coefficients").normal(size=self.count)
         share = self.solid.volumes / self.solid.volumes.sum()

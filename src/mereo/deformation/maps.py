@@ -14,6 +14,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Integer
+from numpy.linalg import det, norm
 from scipy.spatial.transform import Rotation
 
 from mereo.geometry.transforms import Flags, Matrices, Matrix, PointArray, Points, Values, Vector
@@ -31,6 +32,10 @@ class Deformation(Protocol):
 
     def __call__(self, points: Points) -> Points:
         """Images of points, in the points' unit."""
+
+
+Deformations = tuple[Deformation, ...]
+"""One for each segment of a scene, or one after the other."""
 
 
 @runtime_checkable
@@ -72,7 +77,7 @@ class Rigid:
 class Compose:
     """Chain of deformations, the first of ``parts`` applied first; the Jacobians multiply."""
 
-    parts: tuple[Deformation, ...]
+    parts: Deformations
 
     def __call__(self, points: Points) -> Points:
         """Points after all parts."""
@@ -117,7 +122,7 @@ class Localized:
 
     def __call__(self, points: Points) -> Points:
         """Points after the part of ``inner`` that reaches them."""
-        distance = np.linalg.norm(points - self.center, axis=1, keepdims=True)
+        distance = norm(points - self.center, axis=1, keepdims=True)
         weight = 1.0 - smooth_step((distance - self.inner_radius) / (self.outer_radius - self.inner_radius))
         return points + weight * (self.inner(points) - points)
 
@@ -128,7 +133,7 @@ def smooth_step(t: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     return t * t * t * (t * (6.0 * t - 15.0) + 10.0)
 
 
-def moved_by(points: Points, owner: Integer[np.ndarray, " n"], deformations: tuple[Deformation, ...]) -> Points:
+def moved_by(points: Points, owner: Integer[np.ndarray, " n"], deformations: Deformations) -> Points:
     """Images of points, each by the deformation of its ``owner``'s number."""
     result = np.empty_like(points)
     for index in np.unique(owner):
@@ -139,7 +144,7 @@ def moved_by(points: Points, owner: Integer[np.ndarray, " n"], deformations: tup
 
 def unit(vector: Vector) -> Vector:
     """Unit vector along ``vector``. Raises ``ValueError`` when it has no direction."""
-    length = float(np.linalg.norm(vector))
+    length = float(norm(vector))
     if not (np.isfinite(length) and length > 0):
         raise ValueError(f"the direction {vector.tolist()} has no finite length above 0: give a vector that points")
     return vector / length
@@ -184,7 +189,7 @@ def jacobian(deformation: Deformation, points: Points) -> tuple[Points, Matrices
 
 def jacobian_determinant(deformation: Deformation, points: Points) -> Values:
     """Growth of volume at each point: 1 is rigid or volume preserving, 0 or less folds space over."""
-    return np.linalg.det(jacobian(deformation, points)[1])
+    return det(jacobian(deformation, points)[1])
 
 
 def invert(deformation: Deformation, points: Points, guess: Points) -> tuple[Points, Flags]:
@@ -213,7 +218,7 @@ def newton(deformation: Deformation, points: Points, guess: Points) -> tuple[Poi
         trial = rest[active] + scale[active, None] * full[active]
         value, matrix = jacobian(deformation, trial)
         residual = points[active] - value
-        distance = np.linalg.norm(residual, axis=1)
+        distance = norm(residual, axis=1)
         closer = distance <= (1.0 - 0.5 * scale[active]) * error[active]
         kept = active[closer]
         rest[kept], error[kept], scale[kept] = trial[closer], distance[closer], 1.0

@@ -42,7 +42,7 @@ class PointWeights:
         flat = material.reshape(len(material), -1)
         rows = np.repeat(np.arange(len(self.index)), self.index.shape[1])
         entries = (self.weight.ravel().astype(flat.dtype), (rows, self.index.ravel()))
-        result: np.ndarray = csr_array(entries, shape=(len(self.index), len(flat))) @ flat
+        result = csr_array(entries, shape=(len(self.index), len(flat))) @ flat
         return result.reshape(len(self.index), *material.shape[1:])
 
     def rows(self, chosen: np.ndarray) -> "PointWeights":

@@ -14,14 +14,15 @@ from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+from numpy.linalg import norm
+from numpy.random import Generator
 
 from mereo.deformation.draw_names import named, part
-from mereo.deformation.maps import Compose, Deformation, Localized, Rigid, unit
+from mereo.deformation.maps import Compose, Deformation, Deformations, Localized, Rigid, unit
 from mereo.deformation.warps import Bend, FreeFormLattice, SmoothField, Squash, Taper, Twist
+from mereo.geometry.conventions import Range
 from mereo.geometry.mesh import SegmentedMesh, vertex_normals
 from mereo.geometry.transforms import AnyPoints, Corners, Points, Vector
-
-Range = tuple[float, float]
 
 Surface = Callable[[], tuple[AnyPoints, AnyPoints]]
 """Vertices of what is to be moved, as the maps before have left them, and outward unit normals."""
@@ -34,7 +35,7 @@ FOLD_SHARE = 0.9
 class DeformationSampler(Protocol):
     """Bounds of one deformation, from which a random one is drawn."""
 
-    def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+    def __call__(self, rng: Generator, surface: Surface) -> Deformation:
         """A random deformation; ``surface`` is what it is to move, as the maps before have left it."""
         ...
 
@@ -47,7 +48,7 @@ class LatticeSampler:
     cells: tuple[int, int, int]
     strength: float
 
-    def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+    def __call__(self, rng: Generator, surface: Surface) -> Deformation:
         """A random lattice."""
         return FreeFormLattice.sample(rng, self.bounds, self.cells, self.strength)
 
@@ -60,7 +61,7 @@ class WavesSampler:
     strength: float
     modes: int
 
-    def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+    def __call__(self, rng: Generator, surface: Surface) -> Deformation:
         """A random field of waves."""
         strength = named(rng, "strength").uniform(0.0, self.strength)
         return SmoothField.sample(rng, strength, self.wavelength, self.modes)
@@ -76,7 +77,7 @@ class BendSampler:
     angle_rad: Range
     toward: Vector | None
 
-    def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+    def __call__(self, rng: Generator, surface: Surface) -> Deformation:
         """A random bend that does not fold what the maps before have made of the object."""
         toward = named(rng, "toward").normal(size=3) if self.toward is None else self.toward
         radius = distance_from_line(surface()[0], self.origin, self.axis)
@@ -94,7 +95,7 @@ class TwistSampler:
     length: float
     angle_rad: Range
 
-    def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+    def __call__(self, rng: Generator, surface: Surface) -> Deformation:
         """A random twist."""
         return Twist(self.origin, self.axis, self.length, named(rng, "angle", "rad").uniform(*self.angle_rad))
 
@@ -108,7 +109,7 @@ class TaperSampler:
     length: float
     factor: Range
 
-    def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+    def __call__(self, rng: Generator, surface: Surface) -> Deformation:
         """A random taper."""
         return Taper(self.origin, self.axis, self.length, _factor(rng, self.factor))
 
@@ -121,7 +122,7 @@ class SquashSampler:
     axis: Vector | None
     factor: Range
 
-    def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+    def __call__(self, rng: Generator, surface: Surface) -> Deformation:
         """A random squash."""
         axis = named(rng, "axis").normal(size=3) if self.axis is None else self.axis
         return Squash(self.center, axis, _factor(rng, self.factor))
@@ -144,7 +145,7 @@ class JointSampler:
     follows: str = ""
     shares: Range = (0.0, 1.0)
 
-    def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+    def __call__(self, rng: Generator, surface: Surface) -> Deformation:
         """A random rigid motion."""
         axis = unit(self.axis)
         rotation = axis * named(rng, "angle", "rad").uniform(*self.angle_rad)
@@ -165,7 +166,7 @@ class JointSampler:
         """Share of the range of a joint with a name at a value: 0 at its least, 1 at its greatest."""
         return float((value - self.limits[0]) / (self.limits[1] - self.limits[0]))
 
-    def sample_share(self, rng: np.random.Generator) -> float:
+    def sample_share(self, rng: Generator) -> float:
         """Random share that a joint with a name may have."""
         drawn = named(rng, "angle", "rad") if self.turns else named(rng, "slide")
         least, most = ((1 - share) * self.limits[0] + share * self.limits[1] for share in self.shares)
@@ -188,7 +189,7 @@ class PushSampler:
     tip: float
     reach: float
 
-    def __call__(self, rng: np.random.Generator, surface: Surface) -> Deformation:
+    def __call__(self, rng: Generator, surface: Surface) -> Deformation:
         """A random push of the surface as the maps before have left it."""
         vertices, normals = surface()
         index = named(rng, "vertex").integers(len(vertices))
@@ -207,9 +208,9 @@ class RandomMotion:
     rest: SegmentedMesh
     steps: tuple[tuple[DeformationSampler, tuple[int, ...]], ...]
 
-    def __call__(self, rng: np.random.Generator) -> tuple[Deformation, ...]:
+    def __call__(self, rng: Generator) -> Deformations:
         """One deformation for each segment, as ``Scene.sample_deformations`` draws them."""
-        chains: list[tuple[Deformation, ...]] = [()] * len(self.rest.segments)
+        chains: list[Deformations] = [()] * len(self.rest.segments)
         shares = dict[str, float]()
         for number, (sampler, members) in enumerate(self.steps, start=1):
 
@@ -240,12 +241,12 @@ class RandomMotion:
         joints = {name: replace(self.joints[name][0], shares=each) for name, each in shares.items()}
         return replace(self, steps=tuple((joints.get(getattr(s, "name", ""), s), members) for s, members in self.steps))
 
-    def at(self, shares: Mapping[str, float]) -> tuple[Deformation, ...]:
+    def at(self, shares: Mapping[str, float]) -> Deformations:
         """One deformation for each segment by the joints with a name alone, at these shares of their ranges.
 
         ``shares`` has those of the joints that follow no other one.
         """
-        chains: list[tuple[Deformation, ...]] = [()] * len(self.rest.segments)
+        chains: list[Deformations] = [()] * len(self.rest.segments)
         for joint, members in self.joints.values():
             motion = joint.at(shares[joint.follows or joint.name])
             for index in members:
@@ -261,19 +262,19 @@ class RandomMotion:
         return f"{number} {kind}" + ("" if whole else f" of {', '.join(self.rest.names[i] for i in members)}")
 
 
-def _shared(chains: Sequence[tuple[Deformation, ...]]) -> tuple[Compose, ...]:
+def _shared(chains: Sequence[Deformations]) -> tuple[Compose, ...]:
     """Chains as maps, one for all segments of the same chain."""
     maps: dict[tuple[int, ...], Compose] = {}
     return tuple(maps.setdefault(tuple(id(part) for part in chain), Compose(chain)) for chain in chains)
 
 
-def _factor(rng: np.random.Generator, bounds: Range) -> float:
+def _factor(rng: Generator, bounds: Range) -> float:
     """A factor, uniform in its logarithm."""
     return float(np.exp(named(rng, "factor", "log").uniform(*np.log(bounds))))
 
 
 def _surface(
-    rest: SegmentedMesh, chains: Sequence[tuple[Deformation, ...]], members: Sequence[int]
+    rest: SegmentedMesh, chains: Sequence[Deformations], members: Sequence[int]
 ) -> tuple[AnyPoints, AnyPoints]:
     """Vertices of segments after their maps so far, and their normals."""
     parts = [(rest.segments[index], Compose(chains[index])) for index in members]
@@ -285,7 +286,7 @@ def distance_from_line(points: Points, origin: Vector, axis: Vector) -> float:
     """Largest distance of the points; that of all of a mesh is at a vertex, because the distance is convex."""
     local = points - origin
     across = local - np.outer(local @ unit(axis), unit(axis))
-    return float(np.linalg.norm(across, axis=1).max())
+    return float(norm(across, axis=1).max())
 
 
 def default_cells(bounds: Corners) -> tuple[int, int, int]:

@@ -15,6 +15,7 @@ from typing import Any
 import igl
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from numpy.linalg import det, inv
 from scipy.sparse import coo_array, csr_array
 from scipy.spatial.distance import cdist
 
@@ -52,13 +53,13 @@ class Tetrahedra:
         self.nodes = read_only_view(np.ascontiguousarray(nodes, dtype=np.float64))
         self.elements = read_only_view(np.ascontiguousarray(elements, dtype=np.int64))
         edges = _edges(self.nodes, self.elements)
-        self.volumes = np.linalg.det(edges) / 6
+        self.volumes = det(edges) / 6
         size = longest_side(self.nodes)
         if (flat := np.abs(self.volumes) <= 1e-12 * size**3).any():
             raise ValueError(
                 f"tetrahedron {np.argmax(flat)} has no volume at rest; it must have some: remove it from the mesh"
             )
-        self._rest_inverse = np.linalg.inv(edges)
+        self._rest_inverse = inv(edges)
 
     def __getstate__(self) -> dict[str, Any]:
         """State without the search trees, which cannot be pickled; they are built again on first use."""
@@ -93,7 +94,7 @@ class Tetrahedra:
 
     def volume_ratios(self, nodes: Points) -> Float[np.ndarray, " m"]:
         """Volume of each tetrahedron at other node positions, of that at rest; 0 or less where it is inverted."""
-        return np.linalg.det(_edges(nodes, self.elements)) / (6 * self.volumes)
+        return det(_edges(nodes, self.elements)) / (6 * self.volumes)
 
     def gradients(self, nodes: Points) -> Gradients:
         """Deformation gradients A of all tetrahedra at other node positions."""
@@ -176,7 +177,7 @@ class TetrahedralMap:
         inside = element >= 0
         rest, converged = np.empty_like(points, dtype=np.float64), inside.copy()
         first = elements[element[inside], 0]
-        back = np.linalg.inv(self._gradients[element[inside]])
+        back = inv(self._gradients[element[inside]])
         rest[inside] = self.rest.nodes[first] + _apply(back, points[inside] - self.nodes[first])
         if not inside.all():
             rest[~inside], converged[~inside] = newton(self, points[~inside], guess[~inside])
@@ -197,7 +198,7 @@ def _locate(
 ) -> Int[np.ndarray, " p"]:
     if len(points) == 0:  # libigl's loop expects some
         return np.empty(0, dtype=np.int64)
-    element: np.ndarray = igl.in_element(nodes, elements, np.ascontiguousarray(points, dtype=np.float64), tree)
+    element = igl.in_element(nodes, elements, np.ascontiguousarray(points, dtype=np.float64), tree)
     return element.astype(np.int64)  # C's long long, which numpy tells apart
 
 
@@ -249,7 +250,7 @@ class Surface:
         system = np.zeros((count + 4, count + 4))
         system[:count] = basis
         system[count:, :count] = basis[:, count:].T
-        return np.linalg.inv(system)[:, :count]
+        return inv(system)[:, :count]
 
     @cached_property
     def vertex_basis(self) -> Float[np.ndarray, "v k"]:

@@ -9,11 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from numpy.linalg import norm
+from numpy.random import Generator
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import map_coordinates
 
 from mereo.deformation.draw_names import named
 from mereo.deformation.maps import crossing, smooth_step, turn, unit
+from mereo.geometry.conventions import Range
 from mereo.geometry.transforms import Corners, Points, Vector, unit_rows
 
 LATTICE_LIMIT = 1 / 2.48
@@ -145,17 +148,15 @@ class SmoothField:
     @property
     def gradient_bound(self) -> float:
         """Bound g of the displacement's gradient, from 0 to below 1."""
-        lengths = [np.linalg.norm(vectors, axis=1) for vectors in (self.amplitudes, self.frequencies)]
+        lengths = [norm(vectors, axis=1) for vectors in (self.amplitudes, self.frequencies)]
         return float(lengths[0] @ lengths[1])
 
     @classmethod
-    def sample(
-        cls, rng: np.random.Generator, strength: float, wavelength: tuple[float, float], modes: int = 4
-    ) -> "SmoothField":
+    def sample(cls, rng: Generator, strength: float, wavelength: Range, modes: int = 4) -> "SmoothField":
         """Field of ``modes`` random waves, wavelengths uniform in a range, with gradient bound ``strength``."""
         directions, amplitudes = named(rng, "pattern").normal(size=(2, modes, 3))
         frequencies = unit_rows(directions) * 2 * np.pi / named(rng, "wavelength").uniform(*wavelength, size=(modes, 1))
-        shares = np.linalg.norm(amplitudes, axis=1) @ np.linalg.norm(frequencies, axis=1)
+        shares = norm(amplitudes, axis=1) @ norm(frequencies, axis=1)
         phases = named(rng, "phase", "rad").uniform(0, 2 * np.pi, size=modes)
         return cls(amplitudes * (strength / shares), frequencies, phases)
 
@@ -187,9 +188,7 @@ class FreeFormLattice:
             )
 
     @classmethod
-    def sample(
-        cls, rng: np.random.Generator, bounds: Corners, cells: tuple[int, int, int], strength: float
-    ) -> "FreeFormLattice":
+    def sample(cls, rng: Generator, bounds: Corners, cells: tuple[int, int, int], strength: float) -> "FreeFormLattice":
         """Random control points over a box of ``cells`` and one spacing around; ``strength`` in [0, 1) of the limit."""
         spacing = (bounds[1] - bounds[0]) / np.array(cells)
         shape = (cells[0] + 3, cells[1] + 3, cells[2] + 3, 3)
@@ -218,7 +217,7 @@ class CurveSweep:
     """
 
     curve: CubicSpline
-    ends: tuple[float, float]
+    ends: Range
 
     @classmethod
     def through(
@@ -235,8 +234,8 @@ class CurveSweep:
         """
         spline = CubicSpline(nodes, centers)
         velocity, acceleration = spline(nodes, 1), spline(nodes, 2)
-        speed = np.linalg.norm(velocity, axis=1)
-        curvature = np.linalg.norm(np.cross(velocity, acceleration), axis=1) / speed**3
+        speed = norm(velocity, axis=1)
+        curvature = norm(np.cross(velocity, acceleration), axis=1) / speed**3
         _check_curvature(float(curvature.max()), radius)
         frames = transport_frames(velocity / speed[:, None], normal)
         curve = CubicSpline(nodes, np.concatenate([centers, frames[:, 1], frames[:, 2]], axis=1))

@@ -16,6 +16,9 @@ from mereo.geometry.conventions import CloudAxes, check_real
 from mereo.geometry.read_only import read_only
 from mereo.geometry.transforms import Normalizer, Points, Transform, rigid, transform_points, unit_rows
 
+Size = tuple[int, int]
+"""Width and height of an image in pixels."""
+
 
 @dataclass(frozen=True)
 class Camera:

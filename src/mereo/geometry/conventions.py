@@ -12,6 +12,14 @@ LARGEST = 1e12
 """Coordinate in any unit that is beyond every scan; products of larger ones may be infinite."""
 
 
+Names = tuple[str, ...]
+"""Names in an order, mostly that of the labels."""
+
+
+Range = tuple[float, float]
+"""Least and greatest value."""
+
+
 CloudAxes = Literal["camera", "scanner"]
 """Axes of a point cloud: camera is x right, y down, z forward; scanner is y up, z toward the scanner."""
 

@@ -21,6 +21,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from mereo.io.errors import AnyPath
+
 try:
     import fcntl
 
@@ -166,7 +168,7 @@ def _clear(scratch: Path, path: Path) -> None:
 
 
 @contextmanager
-def atomic_file(path: str | Path, *, force: bool = True, inputs: Iterable[str | Path] = ()) -> Iterator[Path]:
+def atomic_file(path: AnyPath, *, force: bool = True, inputs: Iterable[AnyPath] = ()) -> Iterator[Path]:
     """Yield a path of the same name in a scratch folder; rename it to ``path`` when the block succeeds.
 
     Args:
@@ -193,13 +195,13 @@ def atomic_file(path: str | Path, *, force: bool = True, inputs: Iterable[str | 
             os.rename(partial, path)
 
 
-def write_file(path: str | Path, content: str | bytes, *, force: bool = True) -> None:
+def write_file(path: AnyPath, content: str | bytes, *, force: bool = True) -> None:
     """Write a file of this content, whole or not at all; text in UTF-8; raises as ``atomic_file``."""
     with atomic_file(path, force=force) as partial:
         partial.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
 
 
-def check_file_place(path: str | Path | None, *, force: bool = True, inputs: Iterable[str | Path] = ()) -> None:
+def check_file_place(path: AnyPath | None, *, force: bool = True, inputs: Iterable[AnyPath] = ()) -> None:
     """Raise as ``atomic_file`` does for a place where no file can be put: before the work, not after. None is none.
 
     What killed processes left for the file is removed, also where it is refused because it is whole.
@@ -225,7 +227,7 @@ def check_file_place(path: str | Path | None, *, force: bool = True, inputs: Ite
 
 
 @contextmanager
-def new_directory(path: str | Path, force: bool = False, inputs: Sequence[str | Path] = ()) -> Iterator[Path]:
+def new_directory(path: AnyPath, force: bool = False, inputs: Sequence[AnyPath] = ()) -> Iterator[Path]:
     """Yield an empty temporary directory; rename it to ``path`` when the block succeeds.
 
     Args:
@@ -260,7 +262,7 @@ def new_directory(path: str | Path, force: bool = False, inputs: Sequence[str | 
             ) from None
 
 
-def check_new_directory(path: Path, force: bool, inputs: Sequence[str | Path] = ()) -> None:
+def check_new_directory(path: Path, force: bool, inputs: Sequence[AnyPath] = ()) -> None:
     """Check what ``new_directory`` may do, before the work; raises as it does.
 
     An output that a killed process was just replacing is put back.
@@ -317,7 +319,11 @@ def _stamps(folder: Path) -> dict[str, list[int] | None]:
 # --- JSON -------------------------------------------------------------------------------------------------------------
 
 
-def write_json(path: str | Path, value: Any, *, force: bool = True) -> None:
+JsonObject = dict[str, Any]
+"""Object of JSON: values by their names, as ``json`` reads them and ``to_json`` can write them."""
+
+
+def write_json(path: AnyPath, value: Any, *, force: bool = True) -> None:
     """Write ``to_json`` of a value, indented, whole or not at all; ``force`` as in ``atomic_file``."""
     write_file(path, json_text(value), force=force)
 

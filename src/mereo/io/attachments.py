@@ -12,14 +12,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.linalg import norm
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from mereo.geometry.conventions import Names
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import Matrices, Matrix, Points, longest_side
 from mereo.io.atomic_files import atomic_file, write_file
 from mereo.io.config import CarryFrame, Space
-from mereo.io.errors import check_suffix, readable
+from mereo.io.errors import AnyPath, check_suffix, readable
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.readers import check_ply, read_points
 from mereo.io.volume_files import VOLUME_SUFFIXES, Volume, file_space, is_volume, read_scalar_volume
@@ -76,7 +78,7 @@ class PoseTable:
         rotations: orientation of each row, the pose's axes as columns; None where the table has none.
     """
 
-    header: tuple[str, ...]
+    header: Names
     rows: tuple[tuple[str, ...], ...]
     delimiter: str
     points: Points
@@ -188,7 +190,7 @@ def _fits_better(turned: Content, content: Content, inside: Points) -> bool:
     return away > NEAR * size and away > FARTHER * other
 
 
-def read_attachments(paths: Sequence[str | Path]) -> tuple[Attachment, ...]:
+def read_attachments(paths: Sequence[AnyPath]) -> tuple[Attachment, ...]:
     """Attachments of files, whose names must differ; raises as their readers."""
     files = [Path(path) for path in paths]
     names = [file.name.lower() for file in files]
@@ -270,7 +272,7 @@ def read_pose_table(path: Path) -> PoseTable:
                 raise ValueError(f"line {line} has {len(row)} cells and the header {len(header)}")
         values = np.array([[_number(line, row[columns[name]], name) for name in names] for line, row in body])
         points, quaternions = values[:, :3], values[:, 3:]
-        off = np.abs(np.linalg.norm(quaternions, axis=1) - 1) >= 1e-3
+        off = np.abs(norm(quaternions, axis=1) - 1) >= 1e-3
         if len(names) > 3 and off.any():
             raise ValueError(f"line {body[int(np.argmax(off))][0]} has an orientation that is no rotation")
         rotations = Rotation.from_quat(quaternions).as_matrix() if len(names) > 3 else None

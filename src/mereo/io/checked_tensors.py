@@ -13,6 +13,7 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from mereo.io.atomic_files import JsonObject
 from mereo.io.errors import reason
 from mereo.io.object_storage import Place, StorageError
 
@@ -39,7 +40,7 @@ def read_content(path: Place) -> bytes:
         raise ValueError(reason(error)) from None
 
 
-def unpack_tensors(content: bytes, dataset: str | None = None) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def unpack_tensors(content: bytes, dataset: str | None = None) -> tuple[dict[str, np.ndarray], JsonObject]:
     """Tensors that ``pack_tensors`` has packed, and their facts, none where there is no header entry.
 
     Raises ``ValueError`` (its reason only) where the content is damaged, or of another dataset than the one of this
@@ -49,7 +50,7 @@ def unpack_tensors(content: bytes, dataset: str | None = None) -> tuple[dict[str
         tensors = load(content)
         # 8 bytes with the length of a JSON object, which follows
         header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
-        facts: dict[str, Any] = json.loads(header.get("__metadata__", {}).get(HEADER, "{}"))
+        facts: JsonObject = json.loads(header.get("__metadata__", {}).get(HEADER, "{}"))
         expected = facts.pop(CHECKSUM, None)
     except (SafetensorError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(reason(error)) from None

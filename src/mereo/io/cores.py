@@ -69,8 +69,7 @@ class SharedLimit:
 def _blas_limit() -> AbstractContextManager[object]:
     from threadpoolctl import threadpool_limits
 
-    limit: AbstractContextManager[object] = threadpool_limits(1, "blas")
-    return limit
+    return threadpool_limits(1, "blas")
 
 
 _BLAS_LIMIT = SharedLimit(_blas_limit)

@@ -37,6 +37,9 @@ LIBRARIES = tuple(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", 
 MOST_CHARACTERS = 300
 """Length of what is quoted of a library's text, which may quote all that it has read."""
 
+AnyPath = str | Path
+"""Path of a file or folder, as people write it or as Python has it."""
+
 C_LIBRARY = "ucrtbase" if sys.platform == "win32" else None
 """Library of C that Python and what it loads print by; None is what this process has loaded already."""
 
@@ -133,13 +136,13 @@ def max_bytes() -> int:
     return int(limit * 1e9)
 
 
-def check_size(path: str | Path, size: int) -> None:
+def check_size(path: AnyPath, size: int) -> None:
     """Raise ``SizeError`` for a file whose ``size`` in bytes, stored or by its header in memory, is over the limit."""
     if size > max_bytes():
         raise _too_large(path)
 
 
-def _too_large(path: str | Path) -> SizeError:
+def _too_large(path: AnyPath) -> SizeError:
     limit = max_bytes() / 1e9
     return SizeError(
         f"{path} takes more than {limit:g} GB of memory to read: check that it is what it should be, export less, or "
@@ -163,7 +166,7 @@ _MEMORY_LIMIT = SharedLimit(_memory_limit)
 
 
 @contextmanager
-def limited_memory(path: str | Path) -> Iterator[None]:
+def limited_memory(path: AnyPath) -> Iterator[None]:
     """Let a block that reads ``path`` take only so much more memory; raises ``SizeError`` where it needs more."""
     try:
         with _MEMORY_LIMIT if PAGES.exists() else nullcontext():
@@ -177,7 +180,7 @@ def limited_memory(path: str | Path) -> Iterator[None]:
 
 def checked_path(value: object, name: str) -> Path:
     """Path that an argument of this name is; ``ValueError`` for what is neither a text nor a path."""
-    if not isinstance(value, str | Path):
+    if not isinstance(value, AnyPath):
         raise ValueError(f"{name} is {value!r}; it must be a path: give a text or a pathlib.Path")
     return Path(value)
 

@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from mereo.geometry.camera import Camera
+from mereo.geometry.camera import Camera, Size
 from mereo.geometry.transforms import Values
-from mereo.io.errors import readable
+from mereo.io.errors import AnyPath, readable
 
 NAMED = (
     ("fx", "fy", "cx", "cy"),
@@ -68,7 +68,7 @@ class Intrinsics:
     depth_scale: float | None = None
 
 
-def read_camera(path: str | Path, size: tuple[int, int] | None = None) -> Camera:
+def read_camera(path: AnyPath, size: Size | None = None) -> Camera:
     """Pinhole camera from a JSON or ROS YAML file, see ``read_intrinsics``."""
     return read_intrinsics(path, size).camera
 
@@ -109,7 +109,7 @@ def stated_fields(source: Any) -> Fields:
         ) from None
 
 
-def intrinsics_of(source: Any, size: tuple[int, int] | None = None) -> Intrinsics:
+def intrinsics_of(source: Any, size: Size | None = None) -> Intrinsics:
     """Intrinsics of a camera, or of what ``stated_fields`` makes of one in memory; ``size`` as of ``read_intrinsics``.
 
     Raises ``ValueError`` for other fields, and for lens distortion: of a file it may be that of the colour image, of a
@@ -131,7 +131,7 @@ def intrinsics_of(source: Any, size: tuple[int, int] | None = None) -> Intrinsic
 
 
 def read_intrinsics(
-    path: str | Path, size: tuple[int, int] | None = None, image: str | Path | None = None, index: int | None = None
+    path: AnyPath, size: Size | None = None, image: AnyPath | None = None, index: int | None = None
 ) -> Intrinsics:
     """Pinhole intrinsics, and the depth scale where it is stated, from JSON, ROS YAML or a text of numbers.
 
@@ -184,7 +184,7 @@ def _names_of_sides(fields: Fields) -> tuple[str, str] | None:
     return next((names for names in SIDES if all(fields.get(name) is not None for name in names)), None)
 
 
-def camera_from_fields(fields: Fields, size: tuple[int, int] | None = None) -> Camera:
+def camera_from_fields(fields: Fields, size: Size | None = None) -> Camera:
     """Pinhole camera that these fields of a file state; ``size`` is (width, height) in pixels where they do not say.
 
     Raises ``ValueError`` that says which fields are missing.

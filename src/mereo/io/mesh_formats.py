@@ -21,6 +21,7 @@ from zipfile import ZipFile
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int, UInt8
+from numpy.linalg import det
 
 from mereo.geometry.conventions import LARGEST
 from mereo.geometry.mesh import (
@@ -39,7 +40,8 @@ from mereo.geometry.mesh import (
 from mereo.geometry.mesh_repair import simplified
 from mereo.geometry.radii import Radii
 from mereo.geometry.transforms import AnyPoints, Matrix, Points, transform_points
-from mereo.io.errors import check_count, check_size, check_suffix, readable
+from mereo.io.atomic_files import JsonObject
+from mereo.io.errors import AnyPath, check_count, check_size, check_suffix, readable
 from mereo.io.extras import library
 from mereo.io.progress import stage
 from mereo.io.readers import check_ply, lies_below
@@ -61,7 +63,7 @@ class MeshWarning(UserWarning):
     """Warning that a mesh is used, but not as its file may mean it."""
 
 
-def read_segmented_mesh(*paths: str | Path) -> SegmentedMesh:
+def read_segmented_mesh(*paths: AnyPath) -> SegmentedMesh:
     """Segments of one or more GLB, OBJ, 3MF, DAE, PLY, STL or OFF files, in label order; they are not checked.
 
     A file with several named parts (GLB nodes and their instances, OBJ objects or groups, 3MF objects) gives one
@@ -90,7 +92,7 @@ def read_segmented_mesh(*paths: str | Path) -> SegmentedMesh:
     return SegmentedMesh(tuple(segments))
 
 
-def read_object_mesh(path: str | Path) -> SegmentedMesh:
+def read_object_mesh(path: AnyPath) -> SegmentedMesh:
     """Segments of a file, or of a folder's files, for an object that is to be found; raises as ``read_segmented_mesh``.
 
     Solids of more than ``mesh_repair.MOST_FACES`` faces are simplified, and a ``MeshWarning`` says how far. What was
@@ -347,7 +349,7 @@ def _in_frame(scene: Any, node: str, base: str) -> tuple[Vertices, Faces, Any]:
     geometry = scene.geometry[key]
     vertices = transform_points(transform, np.asarray(geometry.vertices, dtype=np.float64))
     faces = np.asarray(geometry.faces, dtype=np.int64)
-    if np.linalg.det(transform[:3, :3]) < 0:
+    if det(transform[:3, :3]) < 0:
         faces = faces[:, ::-1]
     return vertices, faces, geometry
 
@@ -392,9 +394,7 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 """Components of glTF's accessors."""
 
 Buffers = dict[str, bytes]
-
-JsonObject = dict[str, Any]
-"""Content of a glTF file, or an entry of it."""
+"""Content of the buffers of a glTF file, by their names."""
 
 
 def _plain_gltf(path: Path) -> tuple[JsonObject, Buffers]:
@@ -526,7 +526,7 @@ def is_glb(path: Path) -> bool:
     return path.suffix.lower() == ".glb"
 
 
-def read_glb(path: str | Path) -> GlbScene:
+def read_glb(path: AnyPath) -> GlbScene:
     """Meshes of any GLB file; raises ``FileNotFoundError``, and ``ValueError`` where it is damaged or has no faces."""
     path = Path(path)
     with readable(path, "GLB file"):
@@ -539,7 +539,7 @@ def read_glb(path: str | Path) -> GlbScene:
             raise ValueError("it has no faces")
         parts = (_glb_part(scene, node, base, number, path.stem) for number, node in enumerate(nodes))
         segments, colors, radii, calibrated = zip(*parts, strict=True)
-        unit_m = float(abs(np.linalg.det(root)) ** (1 / 3))
+        unit_m = float(abs(det(root)) ** (1 / 3))
         if not unit_m > 0:
             raise ValueError("its root node has a scale of 0")
         names = _numbered([segment.name for segment in segments])
@@ -589,7 +589,7 @@ def _colors(geometry: Any, plain: Color) -> tuple[Color, UInt8[np.ndarray, "v 3"
     return (int(color[0]), int(color[1]), int(color[2])), each if varied else None
 
 
-def _screen(linear: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
+def _screen(linear: Points) -> UInt8[np.ndarray, "n 3"]:
     """Colours of a screen from linear light (glTF 2.0, section 3.9.2)."""
     light = np.clip(linear, 0.0, 1.0)
     share = np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mereo.io.atomic_files import atomic_file, check_place, json_text, remove_abandoned, write_json
-from mereo.io.errors import checked_path
+from mereo.io.atomic_files import JsonObject, atomic_file, check_place, json_text, remove_abandoned, write_json
+from mereo.io.errors import AnyPath, checked_path
 from mereo.io.extras import library
 
 LIBRARIES = {"s3": ("s3fs", "storage"), "gs": ("gcsfs", "gcs"), "memory": ("fsspec", "storage")}
@@ -95,8 +95,7 @@ class ObjectPath:
     def read_bytes(self) -> bytes:
         """Content of the object; ``FileNotFoundError`` where there is none."""
         with self._system() as system:
-            content: bytes = system.cat_file(self.url)
-            return content
+            return system.cat_file(self.url)
 
     def read_text(self, encoding: str) -> str:
         """Content of the object as text; raises as ``read_bytes`` does, and ``UnicodeDecodeError``."""
@@ -134,7 +133,7 @@ class ObjectPath:
 Place = Path | ObjectPath
 
 
-def place_of(given: str | Path | ObjectPath) -> Place:
+def place_of(given: AnyPath | ObjectPath) -> Place:
     """Place that a text means: with a protocol a folder of a storage (raises as ``ObjectPath``), else a local one."""
     if not isinstance(given, str):
         return given if isinstance(given, ObjectPath) else checked_path(given, "the folder")
@@ -160,7 +159,7 @@ def write_whole(place: Place, content: bytes) -> None:
         os.fsync(file.fileno())  # NFS tells of a full disk here, and a name comes after its content
 
 
-def claim(folder: Place, name: str, settings: dict[str, Any], kind: str) -> dict[str, Any] | None:
+def claim(folder: Place, name: str, settings: JsonObject, kind: str) -> JsonObject | None:
     """Settings that a place of earlier work holds, or None where it was made with ``settings`` just now.
 
     Of several processes or machines that come at a time one puts its file and the others read that. Hidden files do not
@@ -197,7 +196,7 @@ def claim(folder: Place, name: str, settings: dict[str, Any], kind: str) -> dict
     return None if json_text(stored) == content else stored
 
 
-def _settings(path: Place) -> dict[str, Any]:
+def _settings(path: Place) -> JsonObject:
     try:
         settings = json.loads(path.read_text("utf-8"))
     except ValueError:

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Num
+from numpy.linalg import norm
 from PIL import Image
 
 from mereo.geometry.brief import counted, listed
@@ -157,7 +158,7 @@ def _normals(columns: Points, name: str) -> Points | None:
     """Normals that three more columns of points are; None of colours. Rows that are not finite or 0 say nothing."""
     known = columns[np.isfinite(columns).all(axis=1) & columns.any(axis=1)]
     if (known < 0).any():
-        if (np.abs(np.linalg.norm(known, axis=1) - 1) < 0.01).all():
+        if (np.abs(norm(known, axis=1) - 1) < 0.01).all():
             return columns
     elif known.max(initial=0) <= 1 or (known.max() <= 255 and (known == np.rint(known)).all()):
         warnings.warn(f"the last three columns of {name} are colours, which are left out", InputWarning, stacklevel=7)

@@ -16,15 +16,16 @@ from typing import Any
 import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, Real
+from numpy.linalg import norm
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from mereo.geometry.brief import listed
-from mereo.geometry.camera import Camera, DepthImage, PointCloud
+from mereo.geometry.camera import Camera, DepthImage, PointCloud, Size
 from mereo.geometry.conventions import LARGEST
 from mereo.geometry.mesh import with_normals
 from mereo.geometry.transforms import Points, Rows, Transform, checked_pose, rigid
-from mereo.io.errors import check_count, check_suffix, limited_memory, quiet, readable, without_output
+from mereo.io.errors import AnyPath, check_count, check_suffix, limited_memory, quiet, readable, without_output
 from mereo.io.extras import library
 
 Mask = Bool[np.ndarray, "h w"]
@@ -59,7 +60,7 @@ Raw = Real[np.ndarray, "h w"]
 # --- point clouds -----------------------------------------------------------------------------------------------------
 
 
-def read_point_cloud(path: str | Path, drop_invalid: bool = False) -> PointCloud:
+def read_point_cloud(path: AnyPath, drop_invalid: bool = False) -> PointCloud:
     """Points of a PLY, PCD, XYZ/TXT/PTS/ASC/CSV, NPY, NPZ or ZDF file, in the file's units and frame.
 
     Args:
@@ -79,7 +80,7 @@ MESHES = (".stl", ".obj", ".glb", ".gltf", ".off", ".3mf")
 """Suffixes of files that hold surfaces and no points."""
 
 
-def read_points(path: str | Path) -> Rows:
+def read_points(path: AnyPath) -> Rows:
     """Rows of ``PointCloud.of``: points as ``read_point_cloud`` has them, those without a measurement included."""
     path = Path(path)
     if path.suffix.lower() in MESHES and path.exists():
@@ -94,7 +95,7 @@ def read_points(path: str | Path) -> Rows:
 
 def valid_points(
     rows: Rows,
-    path: str | Path,
+    path: AnyPath,
     drop_invalid: bool,
     cure: str = "leave them out with --drop-invalid",
 ) -> Float[np.ndarray, "m c"]:
@@ -127,7 +128,7 @@ def valid_points(
 
 
 def read_depth_image(
-    path: str | Path, camera: Camera, depth_scale: float | None = None, mask_path: str | Path | None = None
+    path: AnyPath, camera: Camera, depth_scale: float | None = None, mask_path: AnyPath | None = None
 ) -> DepthImage:
     """Depth in metres of a PNG, TIFF, EXR or NPY image; 0 where nothing was measured or the mask is 0.
 
@@ -190,7 +191,7 @@ def depth_of(path: Path, raw: Raw, depth_scale: float | None, camera: Camera) ->
         raise ValueError(f"{path} cannot be used: {error}") from None
 
 
-def masked_depth(image: DepthImage, path: str | Path, mask: Mask) -> DepthImage:
+def masked_depth(image: DepthImage, path: AnyPath, mask: Mask) -> DepthImage:
     """Depth image without what a mask leaves out; raises ``ValueError`` where nothing is left."""
     depth = np.where(mask, image.depth, 0.0)
     if not (depth > 0).any():
@@ -200,7 +201,7 @@ def masked_depth(image: DepthImage, path: str | Path, mask: Mask) -> DepthImage:
 
 
 def usable_depth(
-    image: DepthImage, path: str | Path, mask_path: str | Path | None = None, mask_values: tuple[int, ...] = ()
+    image: DepthImage, path: AnyPath, mask_path: AnyPath | None = None, mask_values: tuple[int, ...] = ()
 ) -> DepthImage:
     """Depth image in metres without what its mask leaves out; raises ``ValueError`` as ``read_depth_image`` does.
 
@@ -229,7 +230,7 @@ LOSSY = ("JPEG", "MPO", "JPEG2000", "WEBP")
 """Formats (as Pillow calls them) that may store other values than they were given."""
 
 
-def read_mask(path: str | Path, size: tuple[int, int] | None = None, values: tuple[int, ...] = ()) -> Mask:
+def read_mask(path: AnyPath, size: Size | None = None, values: tuple[int, ...] = ()) -> Mask:
     """Pixels of an image that show the object.
 
     These are the opaque ones of an image with transparent parts; else those that are not 0, in any channel, or that
@@ -245,7 +246,7 @@ def read_mask(path: str | Path, size: tuple[int, int] | None = None, values: tup
     return _chosen_pixels(layers, f"the mask {path}", size, values)
 
 
-def mask_of_image(image: Image.Image, size: tuple[int, int] | None = None, values: tuple[int, ...] = ()) -> Mask:
+def mask_of_image(image: Image.Image, size: Size | None = None, values: tuple[int, ...] = ()) -> Mask:
     """Pixels of an image in memory that show the object; takes the arguments of ``read_mask`` and raises as it does."""
     return _chosen_pixels(_mask_layers(image), "the mask", size, values)
 
@@ -261,7 +262,7 @@ def _mask_layers(image: Image.Image) -> MaskLayers:
     return image.format in LOSSY, opacity, shown, np.asarray(image) if image.mode == "P" else shown
 
 
-def _chosen_pixels(layers: MaskLayers, name: str, size: tuple[int, int] | None, values: tuple[int, ...]) -> Mask:
+def _chosen_pixels(layers: MaskLayers, name: str, size: Size | None, values: tuple[int, ...]) -> Mask:
     is_lossy, opacity, shown, stored = layers
     channels = stored.reshape(*stored.shape[:2], -1)
     ids, has_ids = channels.max(axis=-1), bool((channels == channels[..., :1]).all())
@@ -518,7 +519,7 @@ def read_viewpoint(path: Path) -> Transform | None:
     with readable(path, "point cloud"), path.open("rb") as file:
         words = _pcd_parts(file.read(65536))[0].get("VIEWPOINT", ["0", "0", "0", "1", "0", "0", "0"])
         numbers = np.array(words, dtype=np.float64)
-        if numbers.shape != (7,) or not np.isfinite(numbers).all() or abs(np.linalg.norm(numbers[3:]) - 1.0) > 1e-2:
+        if numbers.shape != (7,) or not np.isfinite(numbers).all() or abs(norm(numbers[3:]) - 1.0) > 1e-2:
             raise ValueError(f"its VIEWPOINT is {' '.join(words)}, not x y z and a unit quaternion qw qx qy qz")
         pose = rigid(Rotation.from_quat(numbers[3:], scalar_first=True).as_matrix(), numbers[:3])
         return None if np.allclose(pose, np.eye(4)) else pose

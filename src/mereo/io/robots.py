@@ -15,14 +15,15 @@ from zlib import crc32
 
 import numpy as np
 import trimesh
+from numpy.linalg import norm
 from scipy.spatial.transform import Rotation
 
-from mereo.geometry.conventions import LARGEST
+from mereo.geometry.conventions import LARGEST, Names, Range
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, palette_color
 from mereo.geometry.mesh_check import united
 from mereo.geometry.transforms import Transform, Vector, inverse_rigid, rigid, transform_points
 from mereo.io.config import RobotMeshes
-from mereo.io.errors import readable
+from mereo.io.errors import AnyPath, readable
 from mereo.io.extras import library
 from mereo.io.mesh_formats import read_object_mesh
 
@@ -54,8 +55,8 @@ class RobotJoint:
     turns: bool
     pivot: Vector
     axis: Vector
-    limits: tuple[float, float]
-    moved: tuple[str, ...]
+    limits: Range
+    moved: Names
     follows: str
 
 
@@ -97,7 +98,7 @@ def read_object_file(path: Path, robot_meshes: RobotMeshes = "visual") -> Segmen
     return read_object_mesh(path)
 
 
-def read_robot(path: str | Path, robot_meshes: RobotMeshes = "visual") -> Robot:
+def read_robot(path: AnyPath, robot_meshes: RobotMeshes = "visual") -> Robot:
     """Read a robot from a URDF, SDF or MJCF file, with the meshes that it names.
 
     Shapes are those of the visual or of the collision elements, and of links that have none of these, the others.
@@ -401,11 +402,11 @@ def _assembled(content: _Described) -> Robot:
     path, joints = content.path, _from_base(content.path, content.robot)
     limits = _limits(path, joints)
     poses = {link.name: np.eye(4) for link in content.robot.links}
-    carriers: dict[str, tuple[str, ...]] = dict.fromkeys(poses, ())
+    carriers: dict[str, Names] = dict.fromkeys(poses, ())
     for joint in joints:
         poses[joint.child] = poses[joint.parent] @ _origin(joint)
         carriers[joint.child] = carriers[joint.parent] + ((joint.name,) if joint.name in limits else ())
-    names, parts = dict[tuple[str, ...], str](), dict[str, list[Segment]]()
+    names, parts = dict[Names, str](), dict[str, list[Segment]]()
     order = [*(link for link in poses if not carriers[link]), *(joint.child for joint in joints)]
     for shape in sorted(content.shapes, key=lambda shape: order.index(shape.link)):
         pieces = parts.setdefault(names.setdefault(carriers[shape.link], shape.link), [])
@@ -427,7 +428,7 @@ def _assembled(content: _Described) -> Robot:
         if joint.name in kept:
             leader, *ends = limits[joint.name]
             ends = ends if leader in kept else sorted(ends)
-            axis = poses[joint.child][:3, :3] @ (joint.axis / np.linalg.norm(joint.axis))
+            axis = poses[joint.child][:3, :3] @ (joint.axis / norm(joint.axis))
             place = joint.type != "prismatic", poses[joint.child][:3, 3], axis, (ends[0], ends[1])
             _check_numbers(path, joint.name, np.array([*poses[joint.child][:3, 3], *axis, *np.rad2deg(ends)]))
             joined.append(RobotJoint(joint.name, *place, kept[joint.name], leader if leader in kept else ""))
@@ -495,7 +496,7 @@ def _limits(path: Path, joints: Sequence[Any]) -> dict[str, tuple[str, float, fl
             )
         least, most = _range(path, leader)
         if joint.type != "fixed" and most > least:
-            if not 0 < np.linalg.norm(joint.axis) < LARGEST:
+            if not 0 < norm(joint.axis) < LARGEST:
                 raise ValueError(
                     f"{path}: joint {joint.name!r} has the axis {joint.axis}; it must be a direction: correct it"
                 )
@@ -503,7 +504,7 @@ def _limits(path: Path, joints: Sequence[Any]) -> dict[str, tuple[str, float, fl
     return ranges
 
 
-def _range(path: Path, joint: Any) -> tuple[float, float]:
+def _range(path: Path, joint: Any) -> Range:
     """Least and greatest value of a joint that follows none: of one that turns, at most a turn."""
     limits = (None, None) if joint.limit is None else (joint.limit.lower, joint.limit.upper)
     least, most = (np.nan, np.nan) if limits == (None, None) else (limits[0] or 0.0, limits[1] or 0.0)

@@ -19,7 +19,7 @@ from jaxtyping import Num, UInt8
 
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.transforms import Points
-from mereo.io.errors import check_count, is_foreseen, limited_memory, reason
+from mereo.io.errors import AnyPath, check_count, is_foreseen, limited_memory, reason
 from mereo.io.extras import library
 from mereo.io.intrinsics import camera_from_fields, warn_of_distortion
 from mereo.io.readers import metres, open_image
@@ -68,7 +68,7 @@ def is_recording(path: Path) -> bool:
 
 
 def recorded_frames(
-    path: str | Path,
+    path: AnyPath,
     topic: str | None = None,
     camera: Camera | None = None,
     depth_scale: float | None = None,
@@ -111,7 +111,7 @@ def recorded_frames(
 
 
 def recorded_frame(
-    path: str | Path,
+    path: AnyPath,
     index: int = 0,
     topic: str | None = None,
     camera: Camera | None = None,
@@ -145,7 +145,7 @@ def _opened(path: Path) -> Iterator[Any]:
         raise ValueError(f"{path} cannot be read as a ROS bag ({reason(error)}): record or copy it again") from error
 
 
-def _messages(reader: Any, connections: list[Any], source: str | Path) -> Iterator[Any]:
+def _messages(reader: Any, connections: list[Any], source: AnyPath) -> Iterator[Any]:
     messages = reader.messages(connections)
     while True:
         with limited_memory(source):

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Num
+from numpy.linalg import inv, norm
 
 from mereo.geometry.brief import counted
 from mereo.geometry.camera import Camera, DepthImage, PointCloud, camera_axes
@@ -19,6 +20,7 @@ from mereo.geometry.mesh import FEW_VERTICES, oriented_points
 from mereo.geometry.transforms import Points, Rows, Transform, inverse_rigid, longest_side, rigid, transform_points
 from mereo.io.bounds import PositiveOrUnknown, check_bounds
 from mereo.io.config import InputConfig
+from mereo.io.errors import AnyPath
 from mereo.io.intrinsics import intrinsics_of, read_intrinsics
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.readers import (
@@ -91,7 +93,7 @@ class SensorFrame:
                 f"a camera pose is given, but {self.path} is a depth image, or a scan that --frame turns; it is for "
                 "clouds in another frame, such as a robot's base: leave out --camera-pose"
             )
-        cloud = self.cloud.transformed(np.linalg.inv(T_input_camera))  # its digits may be few
+        cloud = self.cloud.transformed(inv(T_input_camera))  # its digits may be few
         return replace(self, cloud=cloud, T_input_result=T_input_camera)
 
     def transformed(self, T_new_result: Transform) -> "SensorFrame":
@@ -131,7 +133,7 @@ class SensorFrame:
 
 
 def read_frame(
-    path: str | Path,
+    path: AnyPath,
     reading: InputConfig = InputConfig(),  # noqa: B008 (frozen)
     T_input_camera: Transform | None = None,
     camera: Any = None,
@@ -191,7 +193,7 @@ def _near_origin(frame: SensorFrame) -> SensorFrame:
     """
     points, size = frame.cloud.points, longest_side(frame.cloud.points)
     middle = np.median(points, axis=0)
-    times = float(np.linalg.norm(middle)) / size if size > 0 else 0.0
+    times = float(norm(middle)) / size if size > 0 else 0.0
     if frame.depth is not None or times <= FAR:
         return frame
     where = f"the points of {frame.path} lie around ({', '.join(f'{value:.10g}' for value in np.round(middle, 3))})"
@@ -239,7 +241,7 @@ def _stated_pose(frame: SensorFrame, reading: InputConfig) -> Transform | None:
 
 def _is_in_view(points: Points) -> bool:
     """Whether a camera at the origin that looks along z may see these points."""
-    return bool((points[:, 2] > IN_VIEW * np.linalg.norm(points, axis=1)).mean() >= MOST_IN_VIEW)
+    return bool((points[:, 2] > IN_VIEW * norm(points, axis=1)).mean() >= MOST_IN_VIEW)
 
 
 def read_messages(path: Path, reading: InputConfig) -> Iterator[RecordedFrame]:

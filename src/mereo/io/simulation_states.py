@@ -13,6 +13,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
+from mereo.geometry.conventions import Names
 from mereo.geometry.mesh import Elements
 from mereo.geometry.transforms import AnyPoints, Indices, Points, longest_side
 from mereo.io.errors import readable
@@ -56,7 +57,7 @@ class TetrahedralRecord:
     rest_nodes: Points
     tetrahedra: Elements
     displacements: Float[np.ndarray, "f n 3"]
-    frames: tuple[str, ...]
+    frames: Names
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,10 +72,10 @@ class SurfaceRecord:
 
     vertices: dict[str, Float[np.ndarray, "f _ 3"]]
     rest: dict[str, AnyPoints]
-    frames: tuple[str, ...]
+    frames: Names
 
 
-def read_states(path: Path, names: tuple[str, ...], mesh: Path | None = None) -> TetrahedralRecord | SurfaceRecord:
+def read_states(path: Path, names: Names, mesh: Path | None = None) -> TetrahedralRecord | SurfaceRecord:
     """States in a file, a directory or the files of a pattern.
 
     Args:
@@ -159,7 +160,7 @@ def files_of_states(path: Path, mesh: Path | None = None) -> list[Path]:
 # --- sequences --------------------------------------------------------------------------------------------------------
 
 
-def _sequence(path: Path, names: tuple[str, ...], mesh: Path | None) -> TetrahedralRecord | SurfaceRecord:
+def _sequence(path: Path, names: Names, mesh: Path | None) -> TetrahedralRecord | SurfaceRecord:
     """States of one mesh that moves all segments, or of the surface of the only one."""
     frames = _mesh_frames(path)
     if 0 in frames.points.shape:
@@ -254,7 +255,7 @@ def _rest_file(path: Path) -> Path | None:
 # --- NPZ --------------------------------------------------------------------------------------------------------------
 
 
-def _archive(path: Path, names: tuple[str, ...]) -> TetrahedralRecord | SurfaceRecord:
+def _archive(path: Path, names: Names) -> TetrahedralRecord | SurfaceRecord:
     with readable(path, "NPZ file"):
         arrays = read_arrays(path)
     if "tetrahedra" in arrays:
@@ -320,7 +321,7 @@ def _floats(path: Path, key: str, array: np.ndarray, axes: int) -> np.ndarray:
     return array
 
 
-def _check_names(path: Path, stated: set[str], names: tuple[str, ...]) -> None:
+def _check_names(path: Path, stated: set[str], names: Names) -> None:
     if missing := [name for name in names if name not in stated]:
         raise ValueError(
             f"{path} has states of {', '.join(map(repr, sorted(stated))) or 'nothing'} but not of segment "
@@ -333,14 +334,14 @@ def _check_names(path: Path, stated: set[str], names: tuple[str, ...]) -> None:
         )
 
 
-def _numbered(count: int) -> tuple[str, ...]:
+def _numbered(count: int) -> Names:
     return tuple(f"frame {index}" for index in range(count))
 
 
 # --- directories ------------------------------------------------------------------------------------------------------
 
 
-def _folders(path: Path, names: tuple[str, ...]) -> SurfaceRecord:
+def _folders(path: Path, names: Names) -> SurfaceRecord:
     """States in a directory with a folder of meshes for each segment."""
     folders = {item.name: item for item in path.iterdir() if item.is_dir() and not item.name.startswith(".")}
     if not folders:

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from mereo.geometry.conventions import Names
 from mereo.geometry.mesh import Elements
 from mereo.io.errors import limited_memory, printable_line, readable, reason
 
@@ -54,7 +55,7 @@ class MeshFrames:
     points: Float[np.ndarray, "f n 3"]
     displacements: Float[np.ndarray, "f n 3"] | None
     tetrahedra: Elements
-    frames: tuple[str, ...]
+    frames: Names
 
 
 def read_vtk_frames(files: Sequence[Path]) -> MeshFrames:

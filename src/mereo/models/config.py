@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
 
+from mereo.io.atomic_files import JsonObject
 from mereo.io.bounds import (
     Count,
     CountOrNone,
@@ -263,9 +264,9 @@ class NetworkConfig:
             return self.transformer.transformer_widths[1:3]
         return self.pointnet2.mlp1[-1], self.pointnet2.mlp2[-1]
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """All settings by name, those of all parts side by side, as files hold them, which leave out an unused one."""
-        settings: dict[str, Any] = {}
+        settings: JsonObject = {}
         for name, value in asdict(self).items():
             settings |= value if isinstance(value, dict) else {name: value}
         return {name: value for name, value in settings.items() if value or name != "spread_penalty"}

@@ -164,8 +164,7 @@ def _suits_onednn(rows: Tensor, weight: Tensor) -> bool:
 
 
 def _by_onednn(rows: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
-    product: Tensor = torch.ops.mkldnn._linear_pointwise(rows, weight, bias, "none", [], "")
-    return product
+    return torch.ops.mkldnn._linear_pointwise(rows, weight, bias, "none", [], "")
 
 
 # --- threads ----------------------------------------------------------------------------------------------------------

@@ -41,8 +41,7 @@ class Encoding:
 
 def share(count: int, ratio: float) -> int:
     """Share of a count, ``max(1, int(count * ratio))``, also of the sizes that an exported graph leaves open."""
-    kept: int = torch.sym_max(1, torch.sym_int(count * ratio))
-    return kept
+    return torch.sym_max(1, torch.sym_int(count * ratio))
 
 
 class SharedMLP(nn.Module):

@@ -20,6 +20,7 @@ from torch.nn.utils.fusion import fuse_linear_bn_eval
 
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud
+from mereo.geometry.conventions import Names
 from mereo.geometry.downsampling import farthest_point_order, random_subset
 from mereo.geometry.mesh import Color
 from mereo.geometry.transforms import Normalizer, Points, Rows
@@ -67,7 +68,7 @@ class Model:
     """
 
     network: Network
-    names: tuple[str, ...]
+    names: Names
     colors: tuple[Color, ...]
     loss: str = "ce+l1"
     provenance: dict[str, object] = field(default_factory=dict)

@@ -119,8 +119,7 @@ def _by_tree(queries: Float[np.ndarray, "q d"], points: Float[np.ndarray, "n d"]
     workers = torch.get_num_threads() if len(queries) >= THREADED_QUERIES else 1
     ranks = np.arange(1, count + 1)  # a list keeps the last axis where one number would drop it
     tree = _tree(points.tobytes(), points.dtype.str, points.shape[1])
-    rows: np.ndarray = tree.query(queries, ranks, workers=workers)[1]
-    return rows.astype(np.int64, copy=False)
+    return tree.query(queries, ranks, workers=workers)[1].astype(np.int64, copy=False)
 
 
 @lru_cache(maxsize=16)

@@ -75,8 +75,7 @@ class Network(nn.Module):
 
     def query(self, code: Code, points: QueryBatch) -> Prediction:
         """Prediction at each point."""
-        prediction: Prediction = self.decoder(code, points)
-        return prediction
+        return self.decoder(code, points)
 
     def forward(
         self,

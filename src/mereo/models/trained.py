@@ -13,7 +13,7 @@ import numpy as np
 
 from mereo.geometry.brief import counted
 from mereo.geometry.camera import PointCloud
-from mereo.geometry.conventions import MIN_POINTS
+from mereo.geometry.conventions import MIN_POINTS, Names
 from mereo.geometry.mesh import Color
 from mereo.geometry.transforms import Labels, Normalizer, Points, Rows, Values
 from mereo.models.calibration import Calibration
@@ -68,7 +68,7 @@ class Trained(Protocol):
         """How the weights were named when they were loaded."""
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> Names:
         """Names of the segments."""
 
     @property

@@ -15,8 +15,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from mereo.io.atomic_files import write_file
-from mereo.io.errors import reason
+from mereo.io.atomic_files import JsonObject, write_file
+from mereo.io.errors import AnyPath, reason
 from mereo.models.calibration import Calibration
 from mereo.models.config import InferenceConfig, Loss, NetworkConfig, Supervision
 from mereo.models.device import find_device, pick_precision
@@ -50,8 +50,8 @@ class Provenance(BaseModel):
     steps: int | None = None
     examples_before: Annotated[int, Field(ge=0)] | None = None
     visible_m: tuple[FiniteFloat, FiniteFloat] | None = None
-    data: dict[str, Any] | None = None
-    recipe: dict[str, Any] | None = None
+    data: JsonObject | None = None
+    recipe: JsonObject | None = None
 
 
 class Header(BaseModel):
@@ -62,14 +62,14 @@ class Header(BaseModel):
         states: facts about the statistical model, which ``scenes.statistical_model`` reads; None without one.
     """
 
-    network: dict[str, Any]
+    network: JsonObject
     names: Annotated[tuple[Name, ...], Field(min_length=1, max_length=255)]
     colors: tuple[tuple[Byte, Byte, Byte], ...]
     loss: Loss
-    provenance: dict[str, Any]
+    provenance: JsonObject
     domain: tuple[Corner, Corner] | None
     nested: tuple[tuple[Name, Name], ...] = ()
-    states: dict[str, Any] | None = None
+    states: JsonObject | None = None
     calibration: Calibration | None = None
 
 
@@ -183,7 +183,7 @@ def weights_bytes(model: Model, dtype: torch.dtype = torch.float32) -> bytes:
     return save(tensors, metadata={"mereo": json.dumps(header)})
 
 
-def with_calibration(name: str | Path, calibration: Calibration) -> bytes:
+def with_calibration(name: AnyPath, calibration: Calibration) -> bytes:
     """Content of a file of weights with another calibration; all else in it stays, bit for bit.
 
     Raises as ``load_model`` does for a file that is none.
@@ -240,12 +240,12 @@ def trained_steps(path: Path) -> int | None:
     return steps if isinstance(steps, int) else None
 
 
-def load_for(name: str | Path, inference: InferenceConfig) -> Model:
+def load_for(name: AnyPath, inference: InferenceConfig) -> Model:
     """Trained model (``load_model``) on the device and in the precision that are asked for."""
     return replace(load_model(name, find_device(inference.device)), precision=inference.precision)
 
 
-def load_model(name: str | Path, device: torch.device | str = "cpu") -> Model:
+def load_model(name: AnyPath, device: torch.device | str = "cpu") -> Model:
     """Trained model, a shipped one by its name or one from a file.
 
     Raises ``FileNotFoundError`` for unknown names, ``ValueError`` when it is not weights of this version.

@@ -3,12 +3,13 @@
 import json
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
+from mereo.geometry.conventions import Names
+from mereo.io.atomic_files import JsonObject
 from mereo.io.checked_tensors import unpack_tensors
-from mereo.io.errors import reason
+from mereo.io.errors import AnyPath, reason
 from mereo.scenes.statistical_model import StatisticalModel, unpack_model
 
 NOT_SHIPPED = (
@@ -30,7 +31,7 @@ def shipped_weights() -> dict[str, Path]:
     return {path.stem: path for place in places for path in sorted(Path(place).glob("*.safetensors"))}
 
 
-def shipped_names() -> tuple[str, ...]:
+def shipped_names() -> Names:
     """Names that ``load_model`` knows without a path."""
     return tuple(shipped_weights())
 
@@ -40,7 +41,7 @@ def has_network() -> bool:
     return find_spec("torch") is not None and bool(shipped_weights())
 
 
-def find_weights(name: str | Path) -> Path:
+def find_weights(name: AnyPath) -> Path:
     """Path of weights that are given by a shipped name, as an existing file, or as the folder that holds them."""
     path, shipped = Path(name), shipped_weights()
     if str(name) in shipped and not path.is_file():
@@ -55,7 +56,7 @@ def find_weights(name: str | Path) -> Path:
     return path
 
 
-def read_facts(name: str | Path) -> tuple[Path, dict[str, Any]]:
+def read_facts(name: AnyPath) -> tuple[Path, JsonObject]:
     """Path of weights, and what their header says, read without torch and without their network.
 
     Raises ``FileNotFoundError`` as ``find_weights`` does, and ``ValueError`` for a file that is not weights.
@@ -74,7 +75,7 @@ def read_facts(name: str | Path) -> tuple[Path, dict[str, Any]]:
     return path, header
 
 
-def is_weights(name: str | Path) -> bool:
+def is_weights(name: AnyPath) -> bool:
     """Whether a name is that of weights: a shipped one, a .safetensors file, or a folder that holds one.
 
     That of the bunny is one also where the shipped weights are not installed, as their statistical model is there.
@@ -95,7 +96,7 @@ def statistical_model_in(name: str) -> StatisticalModel:
     return unpack_model(states, header["states"])
 
 
-def _find_states(name: str | Path) -> Path:
+def _find_states(name: AnyPath) -> Path:
     """Path of weights, or of what ``mereo/states`` has of some that are not installed, which is all but the network."""
     try:
         return find_weights(name)

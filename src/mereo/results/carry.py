@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
+from numpy.linalg import det, inv, norm
 from scipy.ndimage import map_coordinates
 
 from mereo.fitting.registration.register import Registrar
@@ -156,7 +157,7 @@ def place(attachments: Sequence[Attachment], registrar: Registrar, frame: CarryF
                 "--carry-frame scene"
             )
         T_scene_file = source.T_scene_source
-        inside = transform_points(np.linalg.inv(T_scene_file), registrar.model.nodes)
+        inside = transform_points(inv(T_scene_file), registrar.model.nodes)
         attachments = [turned_attachment(each, frame, source.space, inside) for each in attachments]
     solids = Solids(registrar.model.rest)
     return tuple(_placed(attachment, T_scene_file, registrar.model, solids) for attachment in attachments)
@@ -168,7 +169,7 @@ def _placed(attachment: Attachment, T_scene_file: Transform, model: StatisticalM
         volume = replace(content, T_world_index=T_scene_file @ content.T_world_index)
         check_overlap(name, volume, T_scene_file, model, solids)
         return Placed(name, volume, np.zeros((0, solids.count)), np.zeros(0), attachment.note)
-    turn = T_scene_file[:3, :3] / np.cbrt(np.linalg.det(T_scene_file[:3, :3]))  # orientations are not scaled
+    turn = T_scene_file[:3, :3] / np.cbrt(det(T_scene_file[:3, :3]))  # orientations are not scaled
     rotations = None if content.rotations is None else turn @ content.rotations
     content = content.at(transform_points(T_scene_file, content.points), rotations)
     shares, distance = _shares(solids, content.points)
@@ -199,7 +200,7 @@ def check_overlap(name: str, volume: Volume, T_scene_file: Transform, model: Sta
         return
     boxes = []
     for bounds in (volume.bounds, model.rest.bounds):
-        corners = transform_points(np.linalg.inv(T_scene_file), np.array(list(product(*bounds.T))))
+        corners = transform_points(inv(T_scene_file), np.array(list(product(*bounds.T))))
         boxes.append(
             " to ".join(str(corner.round(2).tolist()) for corner in (corners.min(axis=0), corners.max(axis=0)))
         )
@@ -417,7 +418,7 @@ class _Fill:
         at_nodes = side * np.stack(np.unravel_index(nodes, shape), axis=1)
         corners = self._source_index(self.at(at_nodes), label)[row.reshape(-1, 8)]
         centers = self._source_index(self.at(side * (cells + 0.5)), label)
-        return corners, np.linalg.norm(corners.mean(axis=1) - centers, axis=1) <= TOLERANCE
+        return corners, norm(corners.mean(axis=1) - centers, axis=1) <= TOLERANCE
 
     def _source_index(self, points: Points, label: int) -> Points:
         """Voxel indices, with fractions, of where points that move along with a segment were at rest."""

@@ -8,11 +8,12 @@ uncertainty is known.
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Literal
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Float
+from numpy.linalg import inv, norm
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.special import chdtri, ndtr
 
@@ -22,7 +23,9 @@ from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.uncertainty import LEVEL, WITHIN
 from mereo.geometry.brief import as_exact_as
+from mereo.geometry.conventions import Range
 from mereo.geometry.transforms import Indices, fit_rigid, transform_points
+from mereo.io.atomic_files import JsonObject
 from mereo.scenes.scene import AssetUnavailable, Scene
 
 SHOWN = {"rad": (180 / np.pi, "°"), "m": (1000.0, " mm"), "": (1.0, " units")}
@@ -47,9 +50,9 @@ class JointValue:
     """
 
     value: float
-    interval: tuple[float, float] | None
+    interval: Range | None
     unit: Literal["rad", "m", ""]
-    limits: tuple[float, float]
+    limits: Range
 
     def __str__(self) -> str:
         """Value and interval for people, in degrees or millimetres."""
@@ -60,7 +63,7 @@ class JointValue:
         value, least, most = as_exact_as(ends[1] - ends[0], factor * self.value, *ends)
         return f"{value}{unit} ({least} to {most})"
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> JsonObject:
         """Content for ``summary.json``."""
         return asdict(self)
 
@@ -146,8 +149,7 @@ def _reach(registration: Registration, fit: OptimizeResult, rows: Indices) -> Fl
     if (moves := _moves(registration, gradient)) is None:
         return None
     gaussian, ways = moves
-    away: np.ndarray = np.abs(ways).max(axis=1, initial=0.0)
-    return away + WITHIN * np.linalg.norm(gaussian, axis=1)
+    return np.abs(ways).max(axis=1, initial=0.0) + WITHIN * norm(gaussian, axis=1)
 
 
 def pose_covariance(registration: Registration) -> Float[np.ndarray, "6 6"] | None:
@@ -163,7 +165,7 @@ def pose_covariance(registration: Registration) -> Float[np.ndarray, "6 6"] | No
     source = transform_points(placed, registration.model.source_points(registration.scene_unit))
     arm, aim = source - source.mean(axis=0), target - target.mean(axis=0)
     # The turn w of the best rotation solves sum arm x (aim + shift) = 0 to first order: M w = sum arm x shift
-    turning = np.linalg.inv((arm * aim).sum() * np.eye(3) - arm.T @ aim)
+    turning = inv((arm * aim).sum() * np.eye(3) - arm.T @ aim)
     turn = np.moveaxis(rigid_motion(arm)[:, :, :3] @ turning, 2, 0)
     lever = target.mean(axis=0) - placed[:3, 3]
     shift = np.eye(3)[:, None] / len(arm) - np.cross(turn, lever, axisa=0, axisc=0)
@@ -171,7 +173,7 @@ def pose_covariance(registration: Registration) -> Float[np.ndarray, "6 6"] | No
     if moves is None or sure is None:
         return None
     factor = np.hstack(moves)
-    covariance: np.ndarray = factor @ factor.T
+    covariance = factor @ factor.T
     covariance[range(3, 6), range(3, 6)] += (sure.optimum.unit * sure.extra_radius) ** 2 / chdtri(3, 1 - LEVEL)
     return covariance
 

@@ -24,7 +24,7 @@ from mereo.fitting.registration.registration import BELIEVED, Method, Registrati
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.transforms import Rows, Transform, fit_rigid, is_rigid, transform_points
 from mereo.io.atomic_files import write_json
-from mereo.io.errors import first_problem
+from mereo.io.errors import AnyPath, first_problem
 from mereo.scenes.draw_recorder import SMOOTH
 from mereo.scenes.parameters import draw_names, played_back
 from mereo.scenes.registry import load_scene
@@ -108,12 +108,12 @@ class RegistrationState(Block):
         return self
 
 
-def save_state(path: str | Path, state: RegistrationState) -> None:
+def save_state(path: AnyPath, state: RegistrationState) -> None:
     """Write a state, whole or not at all."""
     write_json(path, state.model_dump())
 
 
-def read_state(path: str | Path) -> RegistrationState:
+def read_state(path: AnyPath) -> RegistrationState:
     """Read a state from its file, or from a folder of results that has one.
 
     Raises ``FileNotFoundError`` where there is none, and ``ValueError`` where it is no such state.
@@ -224,7 +224,7 @@ def write_state(directory: Path, answer: Answer) -> None:
     save_state(directory / STATE, state)
 
 
-def load_state(path: str | Path, model: StatisticalModel, scene: Scene | None = None) -> Registration:
+def load_state(path: AnyPath, model: StatisticalModel, scene: Scene | None = None) -> Registration:
     """Load a registration from its state, in the camera frame and the input's unit.
 
     Args:

@@ -19,9 +19,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import ndtr, ndtri
 
-from mereo.deformation.maps import Deformation
-from mereo.deformation.samplers import JointSampler, RandomMotion, Range
+from mereo.deformation.maps import Deformations
+from mereo.deformation.samplers import JointSampler, RandomMotion
+from mereo.geometry.conventions import Names, Range
 from mereo.io.bounds import NotNegative, Number, check_value
+from mereo.io.errors import AnyPath
 from mereo.io.yaml_document import Document
 from mereo.scenes.draw_recorder import Call, Key, OutOfDraws, Place, Recorder, Shares, Trail
 from mereo.scenes.scene import Scene
@@ -57,7 +59,7 @@ class Played:
 
     seed: int
     calls: tuple[Call, ...]
-    deformations: tuple[Deformation, ...]
+    deformations: Deformations
     remembered: Mapping[Key, Shares]
     turns: Mapping[Key, tuple[float, Shares]]
 
@@ -94,7 +96,7 @@ def random_state(scene: Scene, seed: int) -> Played:
     return _played(scene, seed, {}, {}, None)
 
 
-def play(scene: Scene, recorder: Recorder) -> tuple[Deformation, ...]:
+def play(scene: Scene, recorder: Recorder) -> Deformations:
     """Deformations of one run of a scene; ``scenes.draw_recorder`` counts the calls from here on."""
     return scene.sample_deformations(recorder)
 
@@ -143,9 +145,7 @@ def _renumbered(calls: Sequence[Call]) -> tuple[Call, ...]:
     return tuple(result)
 
 
-def _without_refused(
-    scene: Scene, seed: int, calls: tuple[Call, ...], deformations: tuple[Deformation, ...]
-) -> tuple[Call, ...]:
+def _without_refused(scene: Scene, seed: int, calls: tuple[Call, ...], deformations: Deformations) -> tuple[Call, ...]:
     """The draws that matter: those of attempts that the scene threw away are left out.
 
     A run of draws that starts where a later one starts again is left out, if without it the scene draws exactly the
@@ -165,7 +165,7 @@ def _without_refused(
     return calls
 
 
-def _witness(scene: Scene, deformations: tuple[Deformation, ...]) -> Float[np.ndarray, "w 3"]:
+def _witness(scene: Scene, deformations: Deformations) -> Float[np.ndarray, "w 3"]:
     """Where a few vertices of each segment go."""
     return np.concatenate(
         [
@@ -182,7 +182,7 @@ def parameters(played: Played) -> tuple[Parameter, ...]:
     """Degrees of freedom of this state, in the order in which they are drawn, with names that differ in a group."""
     sliders: list[Parameter] = []
     titles = [_title(call) for call in played.calls]
-    seen: Counter[tuple[str, tuple[str, ...]]] = Counter()
+    seen: Counter[tuple[str, Names]] = Counter()
     for call, (group, names) in zip(played.calls, titles, strict=True):
         seen[group, names] += 1
         if titles.count((group, names)) > 1:
@@ -195,7 +195,7 @@ def parameters(played: Played) -> tuple[Parameter, ...]:
     return tuple(parameter for parameter in sliders if parameter.high > parameter.low)
 
 
-def _title(call: Call) -> tuple[str, tuple[str, ...]]:
+def _title(call: Call) -> tuple[str, Names]:
     """Group of a draw, and its name or those of its numbers: as the scene calls them, else as the source does."""
     group, *inner = call.name.parts or ("whole",)
     names = (call.name.name,) if isinstance(call.name.name, str) else call.name.name
@@ -211,7 +211,7 @@ def _source_name(trail: Trail) -> str:
     return name.strip("_").replace("_", " ")
 
 
-def _numbered(call: Call, names: tuple[str, ...]) -> tuple[str, ...]:
+def _numbered(call: Call, names: Names) -> Names:
     """A name for each number of a draw: x, y and z of a vector, else a count, where they share one."""
     count = len(call.shares)
     if len(names) == count:
@@ -270,8 +270,7 @@ def turned(shares: Shares, turn: float, seed: int | tuple[int, int]) -> Shares:
     """
     other = np.random.default_rng(seed).normal(size=len(shares))
     angle = 2 * np.pi * turn
-    moved: Shares = ndtr(np.cos(angle) * ndtri(shares) + np.sin(angle) * other)
-    return moved
+    return ndtr(np.cos(angle) * ndtri(shares) + np.sin(angle) * other)
 
 
 def _share(call: Call, parameter: Parameter, value: float) -> float:
@@ -318,7 +317,7 @@ def played_back(
     return played
 
 
-def draw_names(played: Played) -> tuple[str, ...]:
+def draw_names(played: Played) -> Names:
     """Name of each number in the order of the draws, as its slider is called; "" for one that cannot vary."""
     sliders = {(slider.key, slider.index): f"{slider.group}: {slider.name}" for slider in parameters(played)}
     numbers = [(call.key, index) for call in played.calls for index in range(len(call.shares))]
@@ -352,7 +351,7 @@ def with_joints(scene: Scene | None, given: Any) -> Scene:
             "joints are given, but the object has none with a name: leave them out, or write a scene file in which its "
             "joints have names"
         )
-    if isinstance(given, str | Path):
+    if isinstance(given, AnyPath):
         content = Document(Path(given), "file of joints", "JOINT:").data
         try:
             return with_joints(scene, content)
@@ -372,7 +371,7 @@ def with_joints(scene: Scene | None, given: Any) -> Scene:
     return replace(scene, sample_deformations=motion.narrowed(shares))
 
 
-def _values(given: Any, names: list[str]) -> dict[str, tuple[float, float]]:
+def _values(given: Any, names: list[str]) -> dict[str, Range]:
     """Value of each joint that is given, and its largest error."""
     if hasattr(given, "position"):  # a message
         given = {"name": given.name, "position": given.position}
@@ -390,7 +389,7 @@ def _values(given: Any, names: list[str]) -> dict[str, tuple[float, float]]:
             f"the joints are {repr(given)[:80]}; they must be values by name, of {', '.join(names)}: give for example "
             f"{{{names[0]!r}: 0.1}}"
         )
-    values = dict[str, tuple[float, float]]()
+    values = dict[str, Range]()
     for name, value in given.items():
         if name not in names:
             raise ValueError(f"no joint is called {name!r}; it must be one of {', '.join(names)}: correct it")

@@ -9,10 +9,12 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.linalg import norm
+from numpy.random import Generator
 from scipy.spatial import cKDTree
 
 from mereo.deformation.draw_names import named
-from mereo.deformation.maps import Deformation
+from mereo.deformation.maps import Deformations
 from mereo.deformation.tetrahedral import Surface, SurfaceMap, Tetrahedra, TetrahedralMap
 from mereo.geometry.mesh import Elements, Segment, SegmentedMesh, Vertices
 from mereo.geometry.transforms import AnyPoints, Points, Vector, longest_side
@@ -31,7 +33,7 @@ class States:
     first: int
     end: int
 
-    def sample(self, rng: np.random.Generator) -> tuple[Deformation, ...]:
+    def sample(self, rng: Generator) -> Deformations:
         """Deformations of one random frame, each as likely as the other."""
         return self.frames.deformations(int(named(rng, "frame").integers(self.first, self.end)))
 
@@ -127,7 +129,7 @@ class TetrahedralFrames:
         """Node positions in scene units."""
         return self.mesh.nodes + self.scale * self.displacements[frame].astype(np.float64)
 
-    def deformations(self, frame: int) -> tuple[Deformation, ...]:
+    def deformations(self, frame: int) -> Deformations:
         """Deformations of the segments in one frame: one map for all of them."""
         return (TetrahedralMap(self.mesh, self.nodes(frame)),) * self.segments
 
@@ -144,7 +146,7 @@ def tetrahedra_around(path: Path, nodes: Points, elements: Elements, rest: Segme
     size = longest_side(mesh.nodes)
     for segment in rest.segments:
         away = segment.vertices[mesh.locate(segment.vertices) < 0]
-        distance = np.linalg.norm(away - mesh.closest(away)[2], axis=1) if len(away) else np.zeros(0)
+        distance = norm(away - mesh.closest(away)[2], axis=1) if len(away) else np.zeros(0)
         if (distance > FAR * size).sum() > len(segment.vertices) / 2:
             raise ValueError(
                 f"segment {segment.name!r} lies {np.median(distance):.3g} outside of the tetrahedra in {path}, whose "
@@ -191,7 +193,7 @@ class SurfaceFrames:
         """Vertices of one segment in scene units."""
         return self.vertices[segment][frame].astype(np.float64) * self.scale + self.shift
 
-    def deformations(self, frame: int) -> tuple[Deformation, ...]:
+    def deformations(self, frame: int) -> Deformations:
         """Deformations of the segments in one frame, a map of its own for each."""
         return tuple(SurfaceMap(s, self.positions(index, frame)) for index, s in enumerate(self.surfaces))
 
@@ -251,7 +253,7 @@ def _order(
 def _check_order(path: Path, segment: Segment, vertices: Vertices) -> None:
     """Refuse vertices whose neighbours are far apart: the order is another mesh's, or the unit another one."""
     edges = segment.faces[:, [0, 1]]
-    before, after = (np.linalg.norm(v[edges[:, 0]] - v[edges[:, 1]], axis=1) for v in (segment.vertices, vertices))
+    before, after = (norm(v[edges[:, 0]] - v[edges[:, 1]], axis=1) for v in (segment.vertices, vertices))
     stretch = float(np.exp(np.median(np.abs(np.log(np.maximum(after, 1e-300) / np.maximum(before, 1e-300))))))
     if stretch > DOUBTFUL_STRETCH:
         raise ValueError(

@@ -6,12 +6,13 @@ from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
+from mereo.io.errors import AnyPath
 from mereo.scenes.scene import SCENES, Scene
 
 
 def is_yaml(scene: "str | Path | Scene") -> bool:
     """Whether this names a YAML scene file."""
-    return isinstance(scene, str | Path) and Path(scene).suffix.lower() in (".yaml", ".yml")
+    return isinstance(scene, AnyPath) and Path(scene).suffix.lower() in (".yaml", ".yml")
 
 
 def scene_named_in(file: Path, name: str) -> Scene:
@@ -27,7 +28,7 @@ def scene_named_in(file: Path, name: str) -> Scene:
     return load_scene(name if name in SCENES else file.parent / name)
 
 
-def files_of(name: str | Path) -> list[Path]:
+def files_of(name: AnyPath) -> list[Path]:
     """Files and folders that a scene is read from, so that no output takes their place.
 
     Of a Python scene that is its file alone, because what it reads is not known; of a built-in one, all assets here.
@@ -42,7 +43,7 @@ def files_of(name: str | Path) -> list[Path]:
     return [path for path in map(location, ASSETS) if path is not None]
 
 
-def load_scene(name: str | Path) -> Scene:
+def load_scene(name: AnyPath) -> Scene:
     """Scene by its built-in name, or from a file, YAML or Python.
 
     YAML files are read by ``scenes.files.build``; Python files are run: trust them first.
@@ -50,7 +51,7 @@ def load_scene(name: str | Path) -> Scene:
     ``FileNotFoundError`` where it, or a mesh that it names, does not exist.
     """
     if is_yaml(name):
-        scene: Scene = replace(import_module("mereo.scenes.files.build").load(Path(name)), file=Path(name))
+        scene = replace(import_module("mereo.scenes.files.build").load(Path(name)), file=Path(name))
     elif Path(name).suffix == ".py":
         scene = replace(_load_python(Path(name)), file=Path(name))
     elif name in SCENES:

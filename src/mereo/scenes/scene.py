@@ -6,12 +6,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.linalg import det
+from numpy.random import Generator
 
-from mereo.deformation.maps import Deformation
+from mereo.deformation.maps import Deformations
 from mereo.geometry.brief import counted, listed
-from mereo.geometry.conventions import WorkspaceName
+from mereo.geometry.conventions import Range, WorkspaceName
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import AnyPoints, Transform, Vector, look_at, rotation_along
+from mereo.io.atomic_files import JsonObject
 from mereo.io.config import Space
 from mereo.scenes.seeds import TEST_SEED_START
 
@@ -30,9 +33,9 @@ class SourceFrame:
     @property
     def scale(self) -> float:
         """Scene units per unit of the files."""
-        return float(np.cbrt(np.linalg.det(self.T_scene_source[:3, :3])))
+        return float(np.cbrt(det(self.T_scene_source[:3, :3])))
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> JsonObject:
         """Plain values for a file's header."""
         return {"T_scene_source": self.T_scene_source.tolist(), "unit_m": self.unit_m, "space": self.space}
 
@@ -74,7 +77,7 @@ class Workspace:
     """
 
     aperture_rad: float = PAPER_APERTURE_RAD
-    distance: tuple[float, float] = (100.0, 200.0)
+    distance: Range = (100.0, 200.0)
     axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
     any_roll: bool = False
     fov_rad: float = float(np.deg2rad(35.0))
@@ -84,7 +87,7 @@ class Workspace:
         """Whether it is the whole sphere, which has no middle."""
         return self.aperture_rad >= WHOLE_SPHERE_RAD
 
-    def sample(self, rng: np.random.Generator, target: Vector) -> Transform:
+    def sample(self, rng: Generator, target: Vector) -> Transform:
         """Pose ``T_world_camera`` of a camera aimed at ``target``, uniform in direction and in distance."""
         cosine = rng.uniform(np.cos(min(self.aperture_rad / 2, np.pi)), 1.0)
         azimuth = rng.uniform(0.0, 2 * np.pi)
@@ -107,7 +110,11 @@ class State:
     """Random state of a scene in its own (world) frame, and for each segment the map of space from its rest pose."""
 
     mesh: SegmentedMesh
-    deformations: tuple[Deformation, ...]
+    deformations: Deformations
+
+
+Draw = Callable[[Generator], Deformations]
+"""How one deformation is drawn for each segment."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +141,7 @@ class Scene:
 
     name: str
     rest: SegmentedMesh
-    sample_deformations: Callable[[np.random.Generator], tuple[Deformation, ...]]
+    sample_deformations: Draw
     workspace: Workspace = field(default_factory=Workspace)
     source: str = "modelled in mereo's own code, MIT licence"
     held_out: "Scene | None" = None
@@ -179,11 +186,11 @@ class Scene:
         """Scene that a seed draws from: its held-out states for testing (``TEST_SEED_START`` up), or itself."""
         return self.held_out if self.held_out is not None and seed >= TEST_SEED_START else self
 
-    def sample_state(self, rng: np.random.Generator) -> State:
+    def sample_state(self, rng: Generator) -> State:
         """Random deformed state within the scene's hand-made bounds."""
         return self.deform(self.sample_deformations(rng))
 
-    def deform(self, deformations: tuple[Deformation, ...]) -> State:
+    def deform(self, deformations: Deformations) -> State:
         """State made by one deformation per segment; vertices shared by a common map are moved in one call."""
         moved: list[AnyPoints] = [np.empty((0, 3))] * len(deformations)
         for shared in {id(each): each for each in deformations}.values():

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
+from numpy.linalg import inv
 from scipy.special import ndtri
 
 from mereo.deformation.moving_least_squares import ANCHORS, Anchors, PointWeights, spread
@@ -22,6 +23,7 @@ from mereo.geometry.brief import counted, listed
 from mereo.geometry.mesh import Faces, Segment, SegmentedMesh
 from mereo.geometry.symmetry import TOLERANCE, Symmetry, find_symmetries
 from mereo.geometry.transforms import Labels, Points, Transform, Values, Vector, fit_rigid, transform_points
+from mereo.io.atomic_files import JsonObject
 from mereo.io.checked_tensors import Tensors, pack_tensors, read_content, unpack_tensors
 from mereo.io.errors import reason
 from mereo.io.object_storage import Place, write_whole
@@ -205,7 +207,7 @@ class StatisticalModel:
         """Material points at rest in the frame of the object's own files, in a unit of which a scene unit has some."""
         if self.source_frame is None:
             return scene_unit * self.rest_points
-        T_source_scene = np.linalg.inv(self.source_frame.T_scene_source)
+        T_source_scene = inv(self.source_frame.T_scene_source)
         return scene_unit * self.source_frame.scale * transform_points(T_source_scene, self.rest_points)
 
     @cached_property
@@ -262,7 +264,7 @@ class StatisticalModel:
     @cached_property
     def motion(self) -> PerMode:
         """Root mean square motion of the material points for one standard deviation of each mode."""
-        squared: np.ndarray = np.einsum("mck,mck->k", self.modes, self.modes, dtype=np.float64)
+        squared = np.einsum("mck,mck->k", self.modes, self.modes, dtype=np.float64)
         return np.sqrt(squared / len(self.modes))
 
     @cached_property
@@ -359,7 +361,7 @@ LIBRARY_STEP, WIDE_MODES = 1 / 32, 12
 """Step of a coefficient, whose bytes reach to 4 standard deviations, and how many first modes have two bytes."""
 
 
-def pack_model(model: StatisticalModel) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def pack_model(model: StatisticalModel) -> tuple[dict[str, np.ndarray], JsonObject]:
     """Tensors of a statistical model, and the facts about it that are none: names, colours, sizes, residue."""
     wide, wide_scale = _integers(model.modes[..., :WIDE_MODES], np.int16)
     narrow, narrow_scale = _integers(model.modes[..., WIDE_MODES:], np.int8)

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Int
+from numpy.linalg import norm
+from numpy.random import Generator
 
 from mereo.geometry.solids import Hits, Solids, toward
 from mereo.geometry.transforms import Labels, Matrix, Points, Values, Vector
@@ -45,7 +47,7 @@ class Capsule:
     def _side_hit(self, rays: Points) -> Values:
         """Entry through the cylinder's side: the same equation for the parts perpendicular to the axis."""
         axis = self.end - self.start
-        length = float(np.linalg.norm(axis))
+        length = float(norm(axis))
         if length == 0:
             return np.full(len(rays), np.inf)
         axis = axis / length
@@ -102,7 +104,7 @@ def sample_surroundings(
     solids: Solids,
     seen: Points,
     reach: float,
-    streams: dict[str, np.random.Generator],
+    streams: dict[str, Generator],
 ) -> Surroundings:
     """Random tool, hand and plane around an object, as probable as ``sensor`` says, each of a stream of its name.
 
@@ -118,9 +120,7 @@ def sample_surroundings(
     return Surroundings(tuple(occluders), plane)
 
 
-def sample_occluder(
-    kind: Occluder, seen: Points, reach: float, unit: float, rng: np.random.Generator
-) -> tuple[Capsule, ...]:
+def sample_occluder(kind: Occluder, seen: Points, reach: float, unit: float, rng: Generator) -> tuple[Capsule, ...]:
     """Random occluder of a kind in front of an object; "none" is nothing.
 
     It points at one of the visible points ``seen``, in the camera frame, and begins outside the image: ``reach`` is the
@@ -131,10 +131,10 @@ def sample_occluder(
     return tuple((_sample_tool if kind == "tool" else _sample_hand)(seen, reach, unit, rng))
 
 
-def sample_plane(solids: Solids, unit: float, rng: np.random.Generator) -> Backdrop:
+def sample_plane(solids: Solids, unit: float, rng: Generator) -> Backdrop:
     """Random table or wall behind the object: up to 45 degrees off the image plane, touching to 5 cm behind."""
     normal = _polar(np.tan(rng.uniform(0, np.pi / 4)), rng.uniform(0, 2 * np.pi))
-    normal = normal / np.linalg.norm(normal)
+    normal = normal / norm(normal)
     return Backdrop(normal, farthest(solids, normal) + rng.uniform(0, 0.05) * unit)
 
 
@@ -148,7 +148,7 @@ def _polar(radius: float, angle_rad: float) -> Vector:
     return np.array([radius * np.cos(angle_rad), radius * np.sin(angle_rad), 1.0])
 
 
-def _approach(seen: Points, reach: float, unit: float, rng: np.random.Generator) -> tuple[Vector, Vector]:
+def _approach(seen: Points, reach: float, unit: float, rng: Generator) -> tuple[Vector, Vector]:
     """A tip up to 3 cm before a visible point, and the way out: a point nearer to the camera, outside the image."""
     target = seen[rng.integers(len(seen))]
     tip = target * max(1 - rng.uniform(0.002, 0.03) * unit / target[2], 0.5)
@@ -156,13 +156,13 @@ def _approach(seen: Points, reach: float, unit: float, rng: np.random.Generator)
     return tip, out
 
 
-def _sample_tool(seen: Points, reach: float, unit: float, rng: np.random.Generator) -> list[Capsule]:
+def _sample_tool(seen: Points, reach: float, unit: float, rng: Generator) -> list[Capsule]:
     """Random straight shaft that ends in two jaws, as laparoscopic instruments have: 5 to 12 mm thick."""
     tip, out = _approach(seen, reach, unit, rng)
     radius, jaw, opening = rng.uniform(0.0025, 0.006) * unit, 0.018 * unit, rng.uniform(0.05, 0.4)
-    axis = (out - tip) / np.linalg.norm(out - tip)
+    axis = (out - tip) / norm(out - tip)
     across = np.cross(axis, rng.normal(size=3))
-    across /= np.linalg.norm(across)
+    across /= norm(across)
     joint = tip + jaw * axis
     ends = [joint - jaw * (np.cos(opening) * axis + side * np.sin(opening) * across) for side in (-1, 1)]
     return [Capsule(joint, out, radius), *(Capsule(joint, end, 0.45 * radius) for end in ends)]
@@ -172,7 +172,7 @@ _FINGERS = ((-0.030, 0.90), (-0.010, 1.0), (0.010, 0.93), (0.030, 0.75))
 """Index to little finger: place of the knuckle across the palm in metres, length relative to the middle finger."""
 
 
-def _sample_hand(seen: Points, reach: float, unit: float, rng: np.random.Generator) -> list[Capsule]:
+def _sample_hand(seen: Points, reach: float, unit: float, rng: Generator) -> list[Capsule]:
     """Random left or right hand with forearm, as capsules, that reaches up to 7 cm past the point it is sent to.
 
     An adult's: about 18 cm long, 8 cm wide, with 10 % of variation. Fingers bend away from the camera by random angles.
@@ -201,11 +201,11 @@ def _sample_hand(seen: Points, reach: float, unit: float, rng: np.random.Generat
     return [*parts, part(np.array([-0.015, 0.0, 0]), base, 0.014), part(base, thumb, 0.01)]
 
 
-def _hand_frame(tip: Vector, out: Vector, rng: np.random.Generator) -> Matrix:
+def _hand_frame(tip: Vector, out: Vector, rng: Generator) -> Matrix:
     """Rows: across the palm, along the fingers, away from the camera; rolled by up to 45 degrees."""
-    along = (tip - out) / np.linalg.norm(tip - out)
+    along = (tip - out) / norm(tip - out)
     away = tip - (tip @ along) * along
-    away /= np.linalg.norm(away)
+    away /= norm(away)
     across = np.cross(along, away)
     roll = rng.uniform(-np.pi / 4, np.pi / 4)
     cosine, sine = np.cos(roll), np.sin(roll)

@@ -4,11 +4,12 @@ Light, so that the command line may import them.
 """
 
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal
+from typing import Literal
 
 from tyro.conf import OmitArgPrefixes
 
-from mereo.geometry.conventions import WorkspaceName
+from mereo.geometry.conventions import Range, WorkspaceName
+from mereo.io.atomic_files import JsonObject
 from mereo.io.bounds import (
     ImageSize,
     Multiple,
@@ -189,7 +190,7 @@ class GenerateConfig:
             return {name: sensor for name, sensor in OBSERVATIONS.items() if sensor != self.sensor}
         return {name: OBSERVATIONS[name] for name in self.observations if name != "all"}
 
-    def stated(self) -> dict[str, Any]:
+    def stated(self) -> JsonObject:
         """Settings as a manifest has them: further observations with their sensors, and no word of these without any.
 
         Nor of the workspace where it is the scene's own.
@@ -239,7 +240,7 @@ class SequenceConfig:
         return round(self.seconds * self.rate)
 
     @property
-    def hidden_s(self) -> tuple[float, float]:
+    def hidden_s(self) -> Range:
         """First and last time at which the occluder may be in view; the same without one."""
         span = 0.0 if self.occluder == "none" else min(self.occluded, self.seconds)
         return (self.seconds - span) / 2, (self.seconds + span) / 2

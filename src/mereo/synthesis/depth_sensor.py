@@ -11,6 +11,8 @@ from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+from numpy.linalg import norm
+from numpy.random import Generator
 from scipy import ndimage
 
 from mereo.geometry.camera import Camera, DepthImage
@@ -70,7 +72,7 @@ def observe(
     camera: Camera,
     noise_std: float,
     sensor: SensorConfig,
-    rng: np.random.Generator,
+    rng: Generator,
     *,
     around: Surroundings | None = None,
 ) -> SimulatedView:
@@ -108,7 +110,7 @@ def _look(
     solids: Solids,
     camera: Camera,
     sensor: SensorConfig,
-    streams: dict[str, np.random.Generator],
+    streams: dict[str, Generator],
     around: Surroundings | None,
 ) -> tuple[Hits, Labels]:
     """What each pixel's ray meets, with the surroundings and lateral noise."""
@@ -118,7 +120,7 @@ def _look(
     if visible.sum() < MIN_POINTS:
         return hits, np.where(visible, OBJECT, NOTHING).astype(np.uint8)
     seen = directions[visible] * hits.distance[visible, None]
-    reach = float(np.linalg.norm(directions[:, :2], axis=1).max())
+    reach = float(norm(directions[:, :2], axis=1).max())
     around = sample_surroundings(sensor, solids, seen, reach, streams) if around is None else around
     hits, source = around.join(hits, directions)
     if sensor.lateral == 0:
@@ -166,9 +168,7 @@ def axial_std_m(z_m: Numbers, angle_rad: Numbers, model: SensorModel = "structur
     return 0.0012 + 0.0019 * (z_m - 0.4) ** 2 + 0.0001 * slant / np.sqrt(z_m)
 
 
-def add_axial_noise(
-    depth: PixelValues, angle_rad: PixelValues, sensor: SensorConfig, rng: np.random.Generator
-) -> PixelValues:
+def add_axial_noise(depth: PixelValues, angle_rad: PixelValues, sensor: SensorConfig, rng: Generator) -> PixelValues:
     """Depth with Gaussian noise of ``axial_std_m`` on every measured pixel; misses (0) stay misses."""
     if sensor.axial == 0:
         return depth
@@ -191,7 +191,7 @@ def quantize(z_m: Numbers, strength: float) -> Numbers:
     return np.where(z_m > 0, disparity / steps, 0.0)
 
 
-def mix_edges(depth: PixelValues, focal_px: float, probability: float, rng: np.random.Generator) -> PixelValues:
+def mix_edges(depth: PixelValues, focal_px: float, probability: float, rng: Generator) -> PixelValues:
     """Depth with flying pixels: at edges, with this probability, a depth between the pixel's own and its neighbour's.
 
     A pixel whose footprint covers both sides of an edge returns a mixture. How much of each depends on both surfaces'
@@ -226,7 +226,7 @@ def sample_holes(
     seen: PixelMask,
     focal_px: float,
     sensor: SensorConfig,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> PixelMask:
     """Pixels in missing blobs, as mirroring and absorbing spots leave them.
 
@@ -247,7 +247,7 @@ def sample_holes(
     return holes
 
 
-def sample_mask(seen: PixelMask, sensor: SensorConfig, streams: dict[str, np.random.Generator]) -> PixelMask:
+def sample_mask(seen: PixelMask, sensor: SensorConfig, streams: dict[str, Generator]) -> PixelMask:
     """Mask of the object as a segmentation gives it: shifted, its edge too far out here and too far in there.
 
     The signed distance to the true edge is compared with a smooth random offset, so that neighbouring parts of the edge
@@ -287,7 +287,7 @@ def render_depth(mesh: SegmentedMesh | Solids, camera: Camera) -> DepthImage:
     return DepthImage(np.where(np.isfinite(depth), depth, 0.0).reshape(camera.height, camera.width), camera)
 
 
-def add_depth_noise(image: DepthImage, std: float, rng: np.random.Generator) -> DepthImage:
+def add_depth_noise(image: DepthImage, std: float, rng: Generator) -> DepthImage:
     """Depth image with Gaussian noise of standard deviation ``std`` (the depth's unit) on every measured pixel.
 
     ``rng`` advances by one number per pixel, measured or not. Raises ``ValueError`` when ``std`` is not finite and at

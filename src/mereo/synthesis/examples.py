@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from numpy.random import Generator
 
-from mereo.deformation.maps import Deformation, invert
+from mereo.deformation.maps import Deformations, invert
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.downsampling import farthest_point_order
@@ -59,7 +60,7 @@ class View:
     mesh: SegmentedMesh
     depth: DepthImage
     T_world_camera: Transform
-    deformations: tuple[Deformation, ...]
+    deformations: Deformations
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +99,7 @@ class Example:
     observations: tuple[AnyPoints, ...] = ()
 
 
-def synthesize(scene: Scene, settings: GenerateConfig, rng: np.random.Generator) -> Example:
+def synthesize(scene: Scene, settings: GenerateConfig, rng: Generator) -> Example:
     """Training example: a random state, seen and noisy, and query points with their answers.
 
     Raises:
@@ -117,7 +118,7 @@ def synthesize(scene: Scene, settings: GenerateConfig, rng: np.random.Generator)
     )
 
 
-def sample_view(scene: Scene, settings: GenerateConfig, rng: np.random.Generator) -> View:
+def sample_view(scene: Scene, settings: GenerateConfig, rng: Generator) -> View:
     """Random state of a scene, seen by a random camera.
 
     Both are drawn again while fewer than ``MIN_POINTS`` points of the object are seen.
@@ -127,7 +128,7 @@ def sample_view(scene: Scene, settings: GenerateConfig, rng: np.random.Generator
     return _sample_view(scene, settings, rng)[0]
 
 
-def _sample_view(scene: Scene, settings: GenerateConfig, rng: np.random.Generator) -> tuple[View, Solids]:
+def _sample_view(scene: Scene, settings: GenerateConfig, rng: Generator) -> tuple[View, Solids]:
     """View of a random state, and the search structures on its mesh that rendering has built."""
     workspace = scene.workspace_named(settings.workspace)
     camera = Camera.from_fov(settings.image_size, settings.image_size, workspace.fov_rad)
@@ -195,7 +196,7 @@ def _rest_guess(
     return np.einsum("nk,nkj->nj", weights, old) + np.einsum("nij,nj->ni", _triangle_frames(old), local)
 
 
-def _triangle_frames(triangles: Float[np.ndarray, "n 3 3"]) -> Matrices:
+def _triangle_frames(triangles: Matrices) -> Matrices:
     """Rotations whose columns are each triangle's first edge, its normal, and the direction across."""
     along = triangles[:, 1] - triangles[:, 0]
     normal = np.cross(along, triangles[:, 2] - triangles[:, 0])
@@ -217,7 +218,7 @@ Clouds = tuple[AnyPoints, ...]
 
 
 def _further_observations(
-    solids: Solids, first: DepthImage, normalizer: Normalizer, settings: GenerateConfig, rng: np.random.Generator
+    solids: Solids, first: DepthImage, normalizer: Normalizer, settings: GenerateConfig, rng: Generator
 ) -> Clouds:
     """Clouds of the sensors ``settings.further``, normalized as the first one, each in farthest-point order.
 
@@ -236,7 +237,7 @@ def _further_observations(
 
 
 def _observed_points(
-    solids: Solids, first: DepthImage, noise_std: float, sensor: SensorConfig, rng: np.random.Generator
+    solids: Solids, first: DepthImage, noise_std: float, sensor: SensorConfig, rng: Generator
 ) -> Points | None:
     """Points that a sensor sees in place of ``first``, in the camera frame; None where too few show the object."""
     way = rng.random()

@@ -13,6 +13,8 @@ from typing import NamedTuple, NoReturn, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from numpy.linalg import norm
+from numpy.random import Generator, default_rng
 from scipy.spatial import cKDTree
 
 from mereo.geometry.transforms import Flags, Labels, Values
@@ -105,14 +107,14 @@ def joint_box(shape: Shape) -> Float[np.ndarray, "2 d"]:
     return np.stack([low.min(axis=0), high.max(axis=0)])
 
 
-def volume_uniform(shape: Shape, count: int, rng: np.random.Generator, boxes: Boxes | None = None) -> Samples:
+def volume_uniform(shape: Shape, count: int, rng: Generator, boxes: Boxes | None = None) -> Samples:
     """Volume Uniform samples: ``count`` points per segment, uniform in its draw box (extended), whatever they hit."""
     boxes = extended_boxes(shape) if boxes is None else boxes
     points = np.concatenate([_uniform(box, count, rng) for box in boxes])
     return Samples(points, shape.label(points))
 
 
-def label_uniform(shape: Shape, keep: int, rng: np.random.Generator, boxes: Boxes | None = None) -> Samples:
+def label_uniform(shape: Shape, keep: int, rng: Generator, boxes: Boxes | None = None) -> Samples:
     """Label Uniform samples: per segment, ``keep`` points uniform inside it and ``keep`` outside it in its draw box.
 
     Points outside may lie in other segments and carry their labels. Raises ``ValueError`` as ``sort_sample``.
@@ -121,7 +123,7 @@ def label_uniform(shape: Shape, keep: int, rng: np.random.Generator, boxes: Boxe
     return _join([(d, rows[:keep]) for d in draws for rows in d.sides()])
 
 
-def sort_sample(shape: Shape, keep: int, draw: int, rng: np.random.Generator, boxes: Boxes | None = None) -> Samples:
+def sort_sample(shape: Shape, keep: int, draw: int, rng: Generator, boxes: Boxes | None = None) -> Samples:
     """SortSample: per segment, the ``keep`` points nearest to its surface inside it, and as many in empty space.
 
     Points are drawn uniformly in the segment's draw box until ``draw`` of them lie inside the segment and ``draw`` in
@@ -135,9 +137,7 @@ def sort_sample(shape: Shape, keep: int, draw: int, rng: np.random.Generator, bo
     return _sort(shape, keep, draw, shape.label, others=False, rng=rng, boxes=boxes)
 
 
-def nested_sort_sample(
-    shape: Shape, keep: int, draw: int, rng: np.random.Generator, boxes: Boxes | None = None
-) -> Samples:
+def nested_sort_sample(shape: Shape, keep: int, draw: int, rng: Generator, boxes: Boxes | None = None) -> Samples:
     """NestedSortSample (the authors' later work): as ``sort_sample``, for organs inside organs.
 
     A draw in another segment counts as outside and keeps that segment's label; see ``owner_labels`` for overlaps.
@@ -145,7 +145,7 @@ def nested_sort_sample(
     return _sort(shape, keep, draw, lambda points: owner_labels(shape, points), others=True, rng=rng, boxes=boxes)
 
 
-def sample_queries(shape: Shape, settings: SamplingConfig, rng: np.random.Generator) -> Samples:
+def sample_queries(shape: Shape, settings: SamplingConfig, rng: Generator) -> Samples:
     """Queries of one example: ``settings.sampler``'s, then uniform points in ``joint_box`` (paper, section 3.2).
 
     They are ``settings.total(shape.count)`` points. Raises ``ValueError`` where a segment cannot be sampled.
@@ -169,7 +169,7 @@ class _Draws:
 
     def __init__(self, index: int, box: Float[np.ndarray, "2 d"], need: int, outside: np.ndarray, seed: np.ndarray):
         self.index, self.box, self.need, self.outside = index, box, need, outside
-        self.rng = np.random.default_rng(seed)
+        self.rng = default_rng(seed)
         self.points = np.empty((0, box.shape[1]))
         self.labels = np.empty(0, dtype=np.uint8)
         self.fewest = 0
@@ -210,9 +210,7 @@ class _Draws:
         )
 
 
-def _draw_all(
-    shape: Shape, boxes: Boxes | None, need: int, label: Label, others: bool, rng: np.random.Generator
-) -> list[_Draws]:
+def _draw_all(shape: Shape, boxes: Boxes | None, need: int, label: Label, others: bool, rng: Generator) -> list[_Draws]:
     """Draw for all segments at once: one large call of ``label`` per round, two to four rounds in all."""
     boxes = extended_boxes(shape) if boxes is None else boxes
     # a stream per segment: how many draws one segment's batches hold changes no other segment's points
@@ -234,7 +232,7 @@ def _draw_all(
 
 
 def _sort(
-    shape: Shape, keep: int, draw: int, label: Label, others: bool, rng: np.random.Generator, boxes: Boxes | None
+    shape: Shape, keep: int, draw: int, label: Label, others: bool, rng: Generator, boxes: Boxes | None
 ) -> Samples:
     """Samples with the ``keep`` points on each side of every segment that are nearest to its surface."""
     if not 1 <= keep <= draw:
@@ -254,7 +252,7 @@ def _nearest_rows(shape: Shape, index: int, points: Places, keep: int) -> np.nda
     if len(points) <= keep:
         return np.arange(len(points))
     low, high = shape.boxes()[index]
-    to_box = np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=1)
+    to_box = norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=1)
     known = np.argsort(to_box, kind="stable")[: 2 * keep]
     distance = np.full(len(points), np.inf)
     distance[known] = shape.segment_distance(index, points[known])
@@ -281,6 +279,6 @@ def _join(sides: list[tuple[_Draws, np.ndarray]]) -> Samples:
     return Samples(np.concatenate(points), np.concatenate(labels))
 
 
-def _uniform(box: Float[np.ndarray, "2 d"], count: int, rng: np.random.Generator) -> Places:
+def _uniform(box: Float[np.ndarray, "2 d"], count: int, rng: Generator) -> Places:
     low, high = box
     return low + rng.random((count, len(low))) * (high - low)

@@ -23,11 +23,13 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from numpy.linalg import norm
+from numpy.random import Generator
 from PIL import Image
 from scipy.special import ndtr, ndtri
 
 from mereo.geometry.camera import Camera
-from mereo.geometry.conventions import MIN_POINTS
+from mereo.geometry.conventions import MIN_POINTS, Range
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import Transform, Values, Vector, inverse_rigid, unit_rows
@@ -76,7 +78,7 @@ def walk(scene: Scene, seed: int, times_s: Values, change_s: float) -> list[Play
         i = len(states)
         if (state := replayed(scene, seed, path.shares(i))) is not None:
             place = scene.deform(state.deformations).mesh.merged()[0]
-            if i == 0 or np.linalg.norm(place - places[-1], axis=1).max() <= max(step[i], 1e-9):
+            if i == 0 or norm(place - places[-1], axis=1).max() <= max(step[i], 1e-9):
                 states.append(state)
                 places.append(place)
                 continue
@@ -142,7 +144,7 @@ class _Path:
     weights: Float[np.ndarray, "n k"]
     first: Float[np.ndarray, " d"]
     nodes: Float[np.ndarray, "k d"]
-    rng: np.random.Generator
+    rng: Generator
     reach: float = 1.0
 
     @classmethod
@@ -241,9 +243,7 @@ def sequence(scene: Scene, settings: SequenceConfig, sensor: SensorConfig, seed:
         yield Moment(float(time_s), played, mesh, T_world_camera, seen)
 
 
-def _camera_aims(
-    workspace: Workspace, times: Values, rng: np.random.Generator
-) -> list[Callable[[np.ndarray], np.ndarray]]:
+def _camera_aims(workspace: Workspace, times: Values, rng: Generator) -> list[Callable[[np.ndarray], np.ndarray]]:
     """Poses by what they aim at, on a smooth way near a random one; ``times`` are in units of the change."""
     weights = process_weights(times)
     first = rng.normal(size=3)
@@ -269,7 +269,7 @@ class _Around(NamedTuple):
 
     occluder: tuple[Capsule, ...]
     away: Vector
-    span_s: tuple[float, float]
+    span_s: Range
     normal: Vector | None = None
     gap: float = 0.0
 
@@ -281,7 +281,7 @@ class _Around(NamedTuple):
         T_world_camera: Transform,
         settings: SequenceConfig,
         sensor: SensorConfig,
-        rng: np.random.Generator,
+        rng: Generator,
     ) -> "_Around":
         """Surroundings as they are drawn for the first frame."""
         directions = camera.directions().reshape(-1, 3)
@@ -293,7 +293,7 @@ class _Around(NamedTuple):
                 "needed: take another --seed"
             )
         seen, unit = directions[hit] * distance[hit, None], 1 / sensor.metres_per_unit
-        reach = float(np.linalg.norm(directions[:, :2], axis=1).max())
+        reach = float(norm(directions[:, :2], axis=1).max())
         occluder = sample_occluder(settings.occluder, seen, reach, unit, rng)
         away = _way_out(occluder, reach)
         if rng.random() >= sensor.background:
@@ -324,8 +324,8 @@ def _way_out(occluder: tuple[Capsule, ...], reach: float) -> Vector:
         return np.zeros(3)
     ends = np.stack([end for part in occluder for end in (part.start, part.end)])
     slope = ends[:, :2] / ends[:, 2:]
-    outward = slope[np.linalg.norm(slope, axis=1).argmax()]
-    outward = outward / np.linalg.norm(outward)
+    outward = slope[norm(slope, axis=1).argmax()]
+    outward = outward / norm(outward)
     thickest = max(part.radius for part in occluder)
     # the end that lies farthest back must pass the image's corner
     back = float((reach - slope @ outward).max())

@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.conventions import Names
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.metrics import TruthGrid
-from mereo.io.errors import SizeError, quiet, reason
+from mereo.io.errors import AnyPath, SizeError, quiet, reason
 from mereo.io.readers import read_arrays, read_point_cloud
 from mereo.io.sensor_frame import SensorFrame
 from mereo.scenes.scene import GUESSED_UNIT_M
@@ -47,17 +48,17 @@ class SampleView:
         return self.unit_m or GUESSED_UNIT_M
 
 
-def shipped_views() -> tuple[str, ...]:
+def shipped_views() -> Names:
     """Names of the views that come with the package, which ``load_view`` knows without a path."""
     return tuple(sorted(path.stem for path in SHIPPED.glob("*.npz")))
 
 
-def shipped_frames() -> tuple[str, ...]:
+def shipped_frames() -> Names:
     """Names of the frames that come with the package, which ``shipped_frame`` knows."""
     return (SHIPPED_SCAN, *shipped_views())
 
 
-def load_view(name: str | Path) -> SampleView:
+def load_view(name: AnyPath) -> SampleView:
     """Sample view that is shipped under a name, or read from a file.
 
     Raises ``FileNotFoundError`` where there is none, ``ValueError`` for a file that is something else.

@@ -126,8 +126,7 @@ def _confidence(segment: Segment, labels: list[int], ask: Ask, step: float) -> F
         return np.zeros(0)
     offset = step * vertex_normals(segment)
     inside, outside = (ask(segment.vertices + sign * offset).probability[:, labels].sum(axis=1) for sign in (-1, 1))
-    result: Float[np.ndarray, " v"] = np.clip(inside - outside, 0.0, 1.0).astype(np.float64)
-    return result
+    return np.clip(inside - outside, 0.0, 1.0).astype(np.float64)
 
 
 def observed_distance(surfaces: SegmentedMesh, observed: Points) -> list[Float[np.ndarray, " _"]]:

@@ -5,17 +5,18 @@ import io
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from mereo.geometry.brief import rounded
-from mereo.geometry.camera import DepthImage
+from mereo.geometry.camera import DepthImage, Size
+from mereo.geometry.conventions import Range
 from mereo.geometry.mesh import Color
 from mereo.geometry.transforms import Points
-from mereo.io.atomic_files import atomic_file
+from mereo.io.atomic_files import JsonObject, atomic_file
+from mereo.io.errors import AnyPath
 from mereo.visualization.color_scales import viridis
 from mereo.visualization.renderer import Canvas, Viewpoint
 from mereo.visualization.units import Unit
@@ -32,7 +33,7 @@ MOST_DEPTH_PX = 480
 PNG_URL = "data:image/png;base64,"
 
 
-def save_png(path: str | Path, picture: Picture) -> None:
+def save_png(path: AnyPath, picture: Picture) -> None:
     """Write a picture whole or not at all."""
     with atomic_file(Path(path)) as partial:
         Image.fromarray(picture).save(partial, format="PNG")
@@ -80,7 +81,7 @@ def font(size: int) -> Font:
     return ImageFont.load_default(size)
 
 
-def depth_to_rgb(image: DepthImage, limits: tuple[float, float] | None = None) -> Picture:
+def depth_to_rgb(image: DepthImage, limits: Range | None = None) -> Picture:
     """Depth as colour (viridis, near is bright); pale grey where nothing was measured.
 
     ``limits`` is the nearest and farthest depth shown; by default the range of what was measured.
@@ -115,7 +116,7 @@ def depth_ends(depth: DepthImage, unit: Unit) -> list[str]:
     return [f"{rounded(end * unit.length_factor)} {unit.length_name}" for end in ends]
 
 
-def depth_data(depth: DepthImage, unit: Unit) -> dict[str, Any]:
+def depth_data(depth: DepthImage, unit: Unit) -> JsonObject:
     """What a page needs to show a depth image: ``url``, ``width`` and ``height`` of its picture, ``ends`` in words."""
     picture = depth_picture(depth)
     height, width = picture.shape[:2]
@@ -129,7 +130,7 @@ def data_url(picture: Picture) -> str:
     return PNG_URL + base64.b64encode(content.getvalue()).decode("ascii")
 
 
-def cloud_picture(points: Points, view: Viewpoint, size: tuple[int, int]) -> Picture:
+def cloud_picture(points: Points, view: Viewpoint, size: Size) -> Picture:
     """Picture of a point cloud coloured by depth, near is bright, on white."""
     canvas = Canvas.empty(view, size)
     if len(points):

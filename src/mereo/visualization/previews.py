@@ -5,15 +5,16 @@ Everything is drawn by ``mereo.visualization.renderer``, without a display.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import trimesh
 from jaxtyping import Float
+from numpy.linalg import norm
 
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import Corners, Points
+from mereo.io.errors import AnyPath
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.config import GenerateConfig
@@ -38,7 +39,7 @@ CAMERA_VIEWS = {
 
 
 def render_cloud_and_segments(
-    path: str | Path,
+    path: AnyPath,
     cloud: PointCloud,
     surfaces: SegmentedMesh,
     title: str = "",
@@ -92,7 +93,7 @@ def _joint_bounds(points: Points, solid: SegmentedMesh) -> Corners:
 # --- states of one scene ---------------------------------------------------------------------------------------------
 
 
-def preview_scene(scene: Scene, path: str | Path, seed: int = 0, states: int = 9) -> None:
+def preview_scene(scene: Scene, path: AnyPath, seed: int = 0, states: int = 9) -> None:
     """Write ``preview_states`` of random states of a scene; state i comes from (seed, i) alone."""
     settings = GenerateConfig()
     views = [sample_view(scene, settings, example_rng(seed, index)) for index in range(states)]
@@ -102,7 +103,7 @@ def preview_scene(scene: Scene, path: str | Path, seed: int = 0, states: int = 9
 
 
 def preview_states(
-    path: str | Path,
+    path: AnyPath,
     views: Sequence[View],
     title: str = "",
     size: int = 220,
@@ -135,14 +136,14 @@ def preview_states(
 def _from_side(view: View, size: int, up: Vector) -> Picture:
     world = view.mesh.transformed(view.T_world_camera)
     center = world.bounds.mean(axis=0)
-    radius = float(np.linalg.norm(world.bounds[1] - world.bounds[0])) / 2
+    radius = float(norm(world.bounds[1] - world.bounds[0])) / 2
     toward = view.T_world_camera[:3, 3] - center
-    arrow = _arrow(center, toward / np.linalg.norm(toward), radius)
+    arrow = _arrow(center, toward / norm(toward), radius)
     # an arrow that points away from the viewer is hidden by the object, as it should be
     shown = replace(world, segments=(*world.segments, arrow))
-    z = np.asarray(up) / np.linalg.norm(up)
+    z = np.asarray(up) / norm(up)
     x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
-    direction = -(x / np.linalg.norm(x) + 0.35 * np.cross(z, x) + 0.4 * z)
+    direction = -(x / norm(x) + 0.35 * np.cross(z, x) + 0.4 * z)
     side = Viewpoint.along(world.bounds, (direction[0], direction[1], direction[2]), up)
     return shade(shown, replace(side, half_size=1.4 * radius), (size, size))
 

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Int, UInt8, UInt16
+from jaxtyping import Int, UInt16
 from PIL import Image
 from scipy.spatial import cKDTree
 
@@ -29,12 +29,14 @@ from mereo.fitting.registration.registration import Registration
 from mereo.fitting.uncertainty import Explanation
 from mereo.geometry.brief import rounded
 from mereo.geometry.camera import DepthImage, PointCloud
+from mereo.geometry.conventions import Names
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.mesh import Color, Faces, Segment, SegmentedMesh
 from mereo.geometry.radii import Radii, describe_level
 from mereo.geometry.subdivision import split_at_creases
-from mereo.geometry.transforms import Indices, Matrix, Points, Vector
-from mereo.io.atomic_files import atomic_file
+from mereo.geometry.transforms import Indices, Labels, Matrix, Points, Vector
+from mereo.io.atomic_files import JsonObject, atomic_file
+from mereo.io.errors import AnyPath
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
 from mereo.visualization.color_scales import radius_scale
 from mereo.visualization.contact_sheets import MOST_DEPTH_PX, PNG_URL, Picture, data_url, depth_data
@@ -79,13 +81,13 @@ class Report:
 
     cloud: PointCloud
     surfaces: SegmentedMesh
-    summary: dict[str, Any]
+    summary: JsonObject
     rotation: Matrix = field(default_factory=lambda: GLTF_CAMERA_ROTATION)
     unit: Unit = UNKNOWN
     registered: Registration | None = None
     depth: DepthImage | None = None
 
-    def write(self, path: str | Path) -> None:
+    def write(self, path: AnyPath) -> None:
         """Write the page; raises ``ValueError`` when it cannot be brought under the budget."""
         data = self._data()
         # "</script>" inside a name must not end the script; \u003c is the same character to JSON
@@ -98,7 +100,7 @@ class Report:
         with atomic_file(path) as partial:
             partial.write_bytes(encoded)
 
-    def _data(self) -> dict[str, Any]:
+    def _data(self) -> JsonObject:
         words = page_words(self.summary, self.unit)
         depth = None if self.depth is None else depth_data(self.depth, self.unit)
         points = self.cloud.points
@@ -303,7 +305,7 @@ def confidence_title(calibrated: bool) -> str:
     return "confidence" if calibrated else "confidence, not calibrated"
 
 
-def page_words(summary: Facts, unit: Unit) -> dict[str, Any]:
+def page_words(summary: Facts, unit: Unit) -> JsonObject:
     """Texts of the page.
 
     Args:
@@ -427,14 +429,14 @@ def explain_centroids(registered: Registration) -> dict[str, Explanation]:
     return {name: each for name in registered.model.rest.names if (each := registered.explain(name)) is not None}
 
 
-def point_marks(explanation: Explanation, points: Points) -> UInt8[np.ndarray, " n"]:
+def point_marks(explanation: Explanation, points: Points) -> Labels:
     """A byte for each observed point: how much it decides a place, 0 to ``MOST``, or that it is ``UNEXPLAINED``.
 
     The weights are those of the fit's observed samples, which stand for the points around them.
     """
     away, nearest = cKDTree(explanation.points).query(points)
     share = explanation.weights[nearest] / max(float(explanation.weights.max()), np.finfo(np.float64).tiny)
-    marks: UInt8[np.ndarray, " n"] = np.rint(MOST * share).astype(np.uint8)
+    marks = np.rint(MOST * share).astype(np.uint8)
     if len(explanation.unexplained):
         samples, spacing = explanation.points, np.inf
         if len(samples) > 1:
@@ -450,7 +452,7 @@ def describe_shares(explanation: Explanation) -> str:
     return ", ".join(f"{EVIDENCE[name]} {share:.0%}" for name, share in order if share >= 0.005)
 
 
-def _radius_bytes(radii: Radii, names: tuple[str, ...], part: Segment) -> str | None:
+def _radius_bytes(radii: Radii, names: Names, part: Segment) -> str | None:
     """A byte for each vertex, 255 at ``Radii.high``, as base64; None for what is no segment of the model."""
     if part.name not in names or not len(part.vertices):
         return None

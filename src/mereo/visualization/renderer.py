@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from scipy.sparse import csr_array
 
-from mereo.geometry.camera import Camera
+from mereo.geometry.camera import Camera, Size
 from mereo.geometry.mesh import Color, Faces, SegmentedMesh, Vertices
 from mereo.geometry.solids import cast_rays, search_tree
 from mereo.geometry.transforms import (
@@ -142,7 +142,7 @@ class Canvas:
     depth: Float[np.ndarray, "h w"]
 
     @classmethod
-    def empty(cls, view: Viewpoint, size: tuple[int, int]) -> "Canvas":
+    def empty(cls, view: Viewpoint, size: Size) -> "Canvas":
         """Blank picture; ``size`` is (width, height) when it is finished."""
         shape = (size[1] * SUPERSAMPLE, size[0] * SUPERSAMPLE)
         return cls(view, np.full((*shape, 3), BACKGROUND), np.full(shape, np.inf))
@@ -174,7 +174,7 @@ class Canvas:
                 edge |= part != np.roll(part, step, axis=axis)
         self.rgb[edge & (part >= 0)] *= 0.45
 
-    def draw_points(self, points: Points, colors: Float[np.ndarray, "n 3"], radius_px: float = 1.2) -> None:
+    def draw_points(self, points: Points, colors: Points, radius_px: float = 1.2) -> None:
         """Draw points as small discs, hidden by whatever is nearer."""
         height, width = self.depth.shape
         in_view = self.view.apply(points)
@@ -189,7 +189,7 @@ class Canvas:
         for dx, dy in ((x, y) for x in steps for y in steps if x * x + y * y <= radius * radius):
             self._put(corner + np.array([dx, dy]), z, colors[order])
 
-    def _put(self, at: Int[np.ndarray, "n 2"], z: Values, colors: Float[np.ndarray, "n 3"]) -> None:
+    def _put(self, at: Int[np.ndarray, "n 2"], z: Values, colors: Points) -> None:
         """Single pixels, ordered far to near."""
         height, width = self.depth.shape
         inside = (at >= 0).all(axis=1) & (at[:, 0] < width) & (at[:, 1] < height)
@@ -261,7 +261,7 @@ def _light(normal: Points, ray: Points) -> Float[np.ndarray, "n 2"]:
 
 
 def shade(
-    mesh: SegmentedMesh, view: Viewpoint, size: tuple[int, int], colors: list[Color] | None = None
+    mesh: SegmentedMesh, view: Viewpoint, size: Size, colors: list[Color] | None = None
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Shaded picture of ``size`` (width, height) pixels on white, each segment in its colour (or ``colors``).
 
@@ -270,9 +270,7 @@ def shade(
     return shaded_canvas(mesh, view, size, colors).picture()
 
 
-def shaded_canvas(
-    mesh: SegmentedMesh, view: Viewpoint, size: tuple[int, int], colors: list[Color] | None = None
-) -> Canvas:
+def shaded_canvas(mesh: SegmentedMesh, view: Viewpoint, size: Size, colors: list[Color] | None = None) -> Canvas:
     """``shade`` before it is finished: more can be drawn on it."""
     canvas, colors = Canvas.empty(view, size), list(mesh.colors) if colors is None else colors
     canvas.draw_triangles(Triangles.of(mesh, colors))

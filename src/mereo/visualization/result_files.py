@@ -5,7 +5,6 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 from mereo.geometry.radii import Radii
 from mereo.geometry.transforms import Matrix, transform_points
+from mereo.io.atomic_files import JsonObject
 from mereo.io.attachments import Surfaces, write_attachment
 from mereo.io.config import DEFAULT_FILES, FilesConfig
 from mereo.io.sensor_frame import SensorFrame
@@ -35,14 +35,14 @@ INSTANCE = "instance{}"
 
 def summary_of(
     answer: Answer, carried: Sequence[Carried] = (), timings_s: Mapping[str, float] | None = None
-) -> dict[str, Any]:
+) -> JsonObject:
     """Content of ``summary.json``: what people read first, then facts of answer and frame, the coefficients last.
 
     Of a lost object without an answer there are no segments.
     """
     seen, frame = answer.seen, answer.seen.frame
     model, registrar = answer.model, answer.registrar
-    facts: dict[str, Any] = {
+    facts: JsonObject = {
         "title": seen.frame.source,
         "weights": None if model is None else model.name,
         "resolution": answer.resolution,
@@ -69,11 +69,11 @@ def summary_of(
     if answer.is_missing:
         return {**head, "pose": None, "segments": [], "tracking": answer.tracking, **facts}
     result, fit = answer.reconstruction, answer.registered
-    segments: list[dict[str, Any]] = [
+    segments: list[JsonObject] = [
         {**asdict(segment), **({} if fit is None else {"pose": fit.segment_pose(segment.label)}), "color": color}
         for segment, color in zip(result.segments, result.surfaces.colors, strict=True)
     ]
-    radii, sure = dict[str, Any](), None if fit is None else fit.uncertainty
+    radii, sure = JsonObject(), None if fit is None else fit.uncertainty
     if fit is not None and sure is not None:
         radii["radius95"] = {**sure.summary(), "unit_m": frame.unit_m}
         for row, segment in zip(segments, sure.segments, strict=True):
@@ -170,7 +170,7 @@ def to_viewer_of(frame: SensorFrame) -> Matrix:
     return GLTF_CAMERA_ROTATION @ frame.T_camera_result[:3, :3]
 
 
-def report_of(answer: Answer, surfaces: SegmentedMesh, summary: dict[str, Any]) -> Report:
+def report_of(answer: Answer, surfaces: SegmentedMesh, summary: JsonObject) -> Report:
     """Page of an answer with these surfaces, which may be coarser and more than its own."""
     frame, cloud = answer.seen.frame, answer.seen.cloud
     to_viewer, unit = to_viewer_of(frame), Unit(frame.unit_m)

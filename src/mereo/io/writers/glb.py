@@ -2,18 +2,18 @@
 
 import json
 import struct
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Shaped, UInt8
+from numpy.linalg import norm
 
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.mesh import Segment, SegmentedMesh, vertex_normals
 from mereo.geometry.radii import STOPS, Radii
 from mereo.geometry.subdivision import split_at_creases
 from mereo.geometry.transforms import Matrix, PointArray
-from mereo.io.atomic_files import atomic_file
+from mereo.io.atomic_files import JsonObject, atomic_file
+from mereo.io.errors import AnyPath
 from mereo.io.mesh_formats import VIEWER_ROOT
 from mereo.io.writers.meshes import OUTER_OPACITY, with_faces
 
@@ -27,7 +27,7 @@ def viewer_rotation(frame: CloudAxes) -> Matrix:
 
 
 def write_segments_glb(
-    path: str | Path,
+    path: AnyPath,
     surfaces: SegmentedMesh,
     frame_rotation: Matrix = GLTF_CAMERA_ROTATION,
     unit_m: float = 1.0,
@@ -54,12 +54,12 @@ def write_segments_glb(
     matrix = np.eye(4)
     matrix[:3, :3] = np.asarray(frame_rotation) * unit_m
     root = {"name": VIEWER_ROOT, "matrix": matrix.T.ravel().tolist(), "children": list(range(1, len(solid) + 1))}
-    nodes: list[dict[str, Any]] = [root]  # glTF matrices are column-major
+    nodes: list[JsonObject] = [root]  # glTF matrices are column-major
     meshes, materials = [], []
     for index, (label, segment) in enumerate(solid):
         creased, source = split_at_creases(segment)
         normals = vertex_normals(creased)
-        normals[np.linalg.norm(normals, axis=1) < 0.5] = (0.0, 0.0, 1.0)  # of no face's area; glTF wants unit length
+        normals[norm(normals, axis=1) < 0.5] = (0.0, 0.0, 1.0)  # of no face's area; glTF wants unit length
         attributes = {"POSITION": arrays.add(creased.vertices, "VEC3"), "NORMAL": arrays.add(normals, "VEC3")}
         primitive = {
             "attributes": attributes,
@@ -67,7 +67,7 @@ def write_segments_glb(
             "material": index,
         }
         # the exact colour, which a material's factors approximate
-        extras: dict[str, Any] = {"label": label, "color": list(segment.color)}
+        extras: JsonObject = {"label": label, "color": list(segment.color)}
         material = _material(segment, surfaces.opaque[label - 1])
         if radii is not None:
             values = radii.at(segment.vertices, label)[source]
@@ -105,7 +105,7 @@ class _Arrays:
     """Arrays of the file's one buffer; all components are four bytes wide, so every view starts aligned."""
 
     def __init__(self) -> None:
-        self.chunks, self.views, self.accessors = list[bytes](), list[dict[str, Any]](), list[dict[str, Any]]()
+        self.chunks, self.views, self.accessors = list[bytes](), list[JsonObject](), list[JsonObject]()
 
     def add(self, values: Shaped[np.ndarray, "n k"], kind: str) -> int:
         """Number of the accessor of vertices' attributes, as single floats, or of faces' corners."""
@@ -121,7 +121,7 @@ class _Arrays:
         return number
 
 
-def _material(segment: Segment, opaque: bool) -> dict[str, Any]:
+def _material(segment: Segment, opaque: bool) -> JsonObject:
     color = [*_linear(np.array(segment.color, dtype=np.uint8)).round(6).tolist(), 1.0 if opaque else OUTER_OPACITY]
     surface = {"baseColorFactor": color, "metallicFactor": 0.0, "roughnessFactor": 0.7}
     material = {"name": segment.name, "doubleSided": True, "pbrMetallicRoughness": surface}
@@ -131,5 +131,4 @@ def _material(segment: Segment, opaque: bool) -> dict[str, Any]:
 def _linear(srgb: UInt8[np.ndarray, "*n 3"]) -> PointArray:
     """Linear light of screen colours (glTF 2.0, section 3.9.2)."""
     share = srgb / 255.0
-    linear: np.ndarray = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
-    return linear
+    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)

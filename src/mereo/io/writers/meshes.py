@@ -9,17 +9,18 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
 from jaxtyping import UInt8
+from numpy.linalg import norm
 
 from mereo.geometry.labels import SegmentedCloud
 from mereo.geometry.mesh import Color, Faces, Segment, SegmentedMesh, connected, edge_uses, three_cornered
 from mereo.geometry.radii import Radii
 from mereo.geometry.transforms import Points
-from mereo.io.atomic_files import atomic_file, new_directory, write_file
+from mereo.io.atomic_files import JsonObject, atomic_file, new_directory, write_file
+from mereo.io.errors import AnyPath
 from mereo.io.mesh_formats import STL_NAME
 
 OUTER_OPACITY = 0.4
@@ -52,7 +53,7 @@ def settled(segment: Segment) -> Segment:
     """
     extent = float(np.abs(segment.vertices).max(initial=0.0))
     edges = np.concatenate([segment.faces[:, pair] for pair in ((0, 1), (1, 2), (2, 0))])
-    away = np.linalg.norm(segment.vertices[edges[:, 0]] - segment.vertices[edges[:, 1]], axis=1)
+    away = norm(segment.vertices[edges[:, 0]] - segment.vertices[edges[:, 1]], axis=1)
     short = edges[away < max(MERGED_WITHIN, 4 * float(np.finfo(np.float32).eps) * extent)]
     if not len(short):
         return segment
@@ -71,7 +72,7 @@ def _is_closed(faces: Faces) -> bool:
     return bool(((uses == 2) & ~unbalanced).all())
 
 
-def segment_table(names: Sequence[str], colors: Sequence[Color]) -> list[dict[str, Any]]:
+def segment_table(names: Sequence[str], colors: Sequence[Color]) -> list[JsonObject]:
     """Label, name and colour of each segment, in label order."""
     rows = enumerate(zip(names, colors, strict=True), start=1)
     return [{"label": label, "name": name, "color": list(color)} for label, (name, color) in rows]
@@ -80,7 +81,7 @@ def segment_table(names: Sequence[str], colors: Sequence[Color]) -> list[dict[st
 # --- PLY --------------------------------------------------------------------------------------------------------------
 
 
-def write_segments_ply(path: str | Path, surfaces: SegmentedMesh, radii: Radii | None = None) -> None:
+def write_segments_ply(path: AnyPath, surfaces: SegmentedMesh, radii: Radii | None = None) -> None:
     """Write all surfaces as one PLY mesh whose vertices and faces have ``label``, ``red``, ``green``, ``blue`` (uchar).
 
     Positions are float32, and ``radius95`` of ``radii`` of the same unit. Raises ``ValueError`` where no segment has
@@ -102,7 +103,7 @@ def write_segments_ply(path: str | Path, surfaces: SegmentedMesh, radii: Radii |
     _write(path, comments, {"vertex": vertices, "face": triangles})
 
 
-def write_points_ply(path: str | Path, cloud: SegmentedCloud) -> None:
+def write_points_ply(path: AnyPath, cloud: SegmentedCloud) -> None:
     """Write the observed points with ``label``, its colour, and a network's ``confidence`` and ``occupancy``."""
     colors = np.array(cloud.colors, dtype=np.uint8)[cloud.labels - 1]
     sure = {name: ("f4", values) for name, values in cloud.chances.items()}
@@ -110,7 +111,7 @@ def write_points_ply(path: str | Path, cloud: SegmentedCloud) -> None:
     _write(path, _comments(cloud.names, cloud.colors), {"vertex": vertices})
 
 
-def write_positions_ply(path: str | Path, points: Points, comment: str = "") -> None:
+def write_positions_ply(path: AnyPath, points: Points, comment: str = "") -> None:
     """Write a cloud's positions alone, as float32; ``comment`` is for people who open the file."""
     _write(path, [comment] if comment else [], {"vertex": _records(_positions(points))})
 
@@ -140,7 +141,7 @@ def _records(columns: Columns) -> np.ndarray:
     return records
 
 
-def _write(path: str | Path, comments: list[str], elements: dict[str, np.ndarray]) -> None:
+def _write(path: AnyPath, comments: list[str], elements: dict[str, np.ndarray]) -> None:
     types = {"u1": "uchar", "i4": "int", "f4": "float"}
     lines = ["ply", "format binary_little_endian 1.0", "comment written by mereo", *(f"comment {c}" for c in comments)]
     for element, records in elements.items():
@@ -158,7 +159,7 @@ def _write(path: str | Path, comments: list[str], elements: dict[str, np.ndarray
 # --- OBJ --------------------------------------------------------------------------------------------------------------
 
 
-def write_segments_obj(path: str | Path, surfaces: SegmentedMesh) -> None:
+def write_segments_obj(path: AnyPath, surfaces: SegmentedMesh) -> None:
     """Write one OBJ object (``o``) per segment with a material of its colour; the materials go next to it, as STEM.mtl.
 
     Materials have the segments' names, too, as many programs name what they read after its material (trimesh, VTK).
@@ -199,7 +200,7 @@ def _materials(solid: list[tuple[int, Segment]], names: list[str], opaque: tuple
 # --- STL --------------------------------------------------------------------------------------------------------------
 
 
-def write_segments_stl(directory: str | Path, surfaces: SegmentedMesh, force: bool = False) -> None:
+def write_segments_stl(directory: AnyPath, surfaces: SegmentedMesh, force: bool = False) -> None:
     """Write a new directory of ``1-head.stl``, ``2-left-ear.stl``, ...: label and name of each segment with faces.
 
     Positions are float32. Raises as ``new_directory``, and ``ValueError`` where no segment has faces.
@@ -210,7 +211,7 @@ def write_segments_stl(directory: str | Path, surfaces: SegmentedMesh, force: bo
             (partial / stl_name(label, segment.name)).write_bytes(_stl(segment))
 
 
-def write_surface_stl(path: str | Path, surfaces: SegmentedMesh) -> None:
+def write_surface_stl(path: AnyPath, surfaces: SegmentedMesh) -> None:
     """Write all segments as one nameless surface; positions are float32."""
     vertices, faces, _ = surfaces.merged()
     write_file(path, _stl(Segment("", surfaces.colors[0], vertices, faces)))

@@ -25,6 +25,7 @@ from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import Color
 from mereo.geometry.transforms import Transform, Vector
 from mereo.io.atomic_files import atomic_file, write_file
+from mereo.io.errors import AnyPath
 from mereo.io.extras import library
 from mereo.io.volume_files import Volume, segment_fields
 from mereo.io.writers.meshes import segment_table
@@ -48,7 +49,7 @@ compressor="vtkZLibDataCompressor">
 """
 
 
-def write_labels_npz(path: str | Path, grid: LabelGrid, radii: Float32[np.ndarray, "x y z"] | None = None) -> None:
+def write_labels_npz(path: AnyPath, grid: LabelGrid, radii: Float32[np.ndarray, "x y z"] | None = None) -> None:
     """Write a label grid for numpy: the arrays ``labels``, ``origin``, ``spacing`` and ``names``.
 
     Voxel [i, j, k] is centred at ``origin + [i, j, k] * spacing``, in the input's frame and units. ``names[k]`` is the
@@ -69,7 +70,7 @@ def write_labels_npz(path: str | Path, grid: LabelGrid, radii: Float32[np.ndarra
         )
 
 
-def write_points_npz(path: str | Path, cloud: SegmentedCloud) -> None:
+def write_points_npz(path: AnyPath, cloud: SegmentedCloud) -> None:
     """Write the arrays of a cloud: ``points``, ``labels``, ``confidence``, ``occupancy``, ``names`` and ``colors``.
 
     ``names[k]`` and ``colors[k]`` are of label k + 1. ``confidence`` and ``occupancy`` are a network's, and left out
@@ -88,7 +89,7 @@ def write_points_npz(path: str | Path, cloud: SegmentedCloud) -> None:
 
 
 def write_labels_vti(
-    path: str | Path,
+    path: AnyPath,
     grid: LabelGrid,
     colors: Sequence[Color],
     radii: Float32[np.ndarray, "x y z"] | None = None,
@@ -143,7 +144,7 @@ space origin: {origin}
 """
 
 
-def write_labels_nifti(path: str | Path, grid: LabelGrid, colors: Sequence[Color], unit_m: float = 1.0) -> None:
+def write_labels_nifti(path: AnyPath, grid: LabelGrid, colors: Sequence[Color], unit_m: float = 1.0) -> None:
     """Write NIfTI-1 (``.nii`` or ``.nii.gz``): ``RAS = diag(-1, -1, 1) * position * 1000 * unit_m``.
 
     NIfTI has no place for the names of labels. They stand as JSON in a comment of the header:
@@ -183,7 +184,7 @@ def _T_lps_index(grid: LabelGrid, unit_m: float) -> Transform:
     return transform
 
 
-def write_labels_seg_nrrd(path: str | Path, grid: LabelGrid, colors: Sequence[Color], unit_m: float = 1.0) -> None:
+def write_labels_seg_nrrd(path: AnyPath, grid: LabelGrid, colors: Sequence[Color], unit_m: float = 1.0) -> None:
     """Write a segmentation of 3D Slicer: ``LPS = position * 1000 * unit_m``, with names, colours and labels.
 
     One layer: a voxel has one label, and inside a nested segment it is the inner one's. Slicer knows the file by its

@@ -27,8 +27,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
-from mereo.geometry.conventions import MIN_POINTS
+from mereo.geometry.conventions import MIN_POINTS, Names
 from mereo.io.atomic_files import new_directory, write_json
+from mereo.io.errors import AnyPath
 from mereo.models.decoder import Code
 from mereo.models.encoders import Level
 from mereo.models.model import DENSE_FACTOR, Model
@@ -107,8 +108,8 @@ class Graphs:
 
     encoder: ExportedProgram
     query: ExportedProgram
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
+    inputs: Names
+    outputs: Names
     most: int | None
 
 
@@ -174,7 +175,7 @@ def _quiet() -> Iterator[None]:
 
 
 def export_weights(
-    weights: Model | str | Path, output: str | Path, format: Literal["onnx", "torch"] = "onnx", force: bool = False
+    weights: Model | str | Path, output: AnyPath, format: Literal["onnx", "torch"] = "onnx", force: bool = False
 ) -> None:
     """Write a new directory with both graphs, ``model.json`` and, for ONNX, the runner (``mereo export``).
 

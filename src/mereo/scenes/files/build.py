@@ -13,10 +13,12 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
+from numpy.linalg import norm
 
 from mereo.deformation.elastic import ElasticSampler
-from mereo.deformation.maps import Deformation
+from mereo.deformation.maps import Deformation, Deformations
 from mereo.deformation.samplers import RandomMotion
+from mereo.geometry.conventions import Range
 from mereo.geometry.mesh import Segment, SegmentedMesh, palette_color
 from mereo.geometry.mesh_check import examine, united
 from mereo.geometry.subdivision import TooManyFaces, split_edges
@@ -39,7 +41,7 @@ from mereo.scenes.files.deformation_blocks import (
 )
 from mereo.scenes.files.template import default_deformations, placed
 from mereo.scenes.recorded_states import load_states
-from mereo.scenes.scene import SCENES, Scene, Workspace
+from mereo.scenes.scene import SCENES, Draw, Scene, Workspace
 from mereo.scenes.seeds import example_rng
 
 SMALLEST = 1.0
@@ -118,7 +120,7 @@ def build(document: Document, file: SceneFile, mesh: SegmentedMesh) -> Scene:
             f"least, as the camera's noise is 0.1: raise it to {file.size * SMALLEST / longest:.3g} or more",
         )
     rest = mesh.with_vertices([placement.apply(segment.vertices) for segment in mesh.segments])
-    nearest, radius = file.camera.distance[0], float(np.linalg.norm(np.ptp(rest.bounds, axis=0))) / 2
+    nearest, radius = file.camera.distance[0], float(norm(np.ptp(rest.bounds, axis=0))) / 2
     if not nearest > radius:
         raise document.error(
             ("camera", "distance"),
@@ -343,7 +345,7 @@ PLACES = ((0.5, 0.5), (0.25, 0.75), (0.75, 0.25))
 """Shares of an edge's two ends at which it is compared, symmetric, so that neighbours split a shared edge alike."""
 
 
-def refined(rest: SegmentedMesh, draw: Callable[[np.random.Generator], tuple[Deformation, ...]]) -> SegmentedMesh:
+def refined(rest: SegmentedMesh, draw: Draw) -> SegmentedMesh:
     """Mesh with all edges halved that ``draw``'s maps bend away from a straight line; itself where none is.
 
     An edge is halved where in one of ``STATES`` random states the map of a place on it is farther than ``TOLERANCE``
@@ -355,7 +357,7 @@ def refined(rest: SegmentedMesh, draw: Callable[[np.random.Generator], tuple[Def
     cells = [sampler.solid.cell for sampler, _ in steps if isinstance(sampler, ElasticSampler)]
     shortest = max([SHORTEST, *cells])
     corners = [segment.vertices[segment.faces] for segment in rest.segments]
-    if not any((np.linalg.norm(c - np.roll(c, 1, axis=1), axis=2) > shortest).any() for c in corners):
+    if not any((norm(c - np.roll(c, 1, axis=1), axis=2) > shortest).any() for c in corners):
         return rest
     states = [draw(example_rng(0, index)) for index in range(STATES)]
     tolerance = TOLERANCE
@@ -367,9 +369,7 @@ def refined(rest: SegmentedMesh, draw: Callable[[np.random.Generator], tuple[Def
             tolerance *= 2
 
 
-def _refined_surface(
-    rest: SegmentedMesh, states: list[tuple[Deformation, ...]], limits: tuple[float, float], most: int
-) -> SegmentedMesh:
+def _refined_surface(rest: SegmentedMesh, states: list[Deformations], limits: Range, most: int) -> SegmentedMesh:
     segments = []
     for index, segment in enumerate(rest.segments):
         bent = partial(_bent, maps=[state[index] for state in states], limits=limits)
@@ -380,12 +380,10 @@ def _refined_surface(
     return replace(rest, segments=tuple(segments))
 
 
-def _bent(
-    ends: Float[np.ndarray, "e 2 3"], maps: list[Deformation], limits: tuple[float, float]
-) -> Bool[np.ndarray, " e"]:
+def _bent(ends: Float[np.ndarray, "e 2 3"], maps: list[Deformation], limits: Range) -> Bool[np.ndarray, " e"]:
     """Which edges a map makes a curve of, farther from its chord than the first limit, if longer than the second."""
     result, (tolerance, shortest) = np.zeros(len(ends), dtype=bool), limits
-    long = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > shortest
+    long = norm(ends[:, 0] - ends[:, 1], axis=1) > shortest
     for deform in maps:
         rows = np.flatnonzero(long & ~result)
         if len(rows) == 0:
@@ -393,6 +391,6 @@ def _bent(
         a, b = ends[rows, 0], ends[rows, 1]
         moved = deform(np.concatenate([a, b, *(s * a + t * b for s, t in PLACES)])).reshape(2 + len(PLACES), -1, 3)
         for (s, t), place in zip(PLACES, moved[2:], strict=True):
-            away = np.linalg.norm(place - (s * moved[0] + t * moved[1]), axis=1)
+            away = norm(place - (s * moved[0] + t * moved[1]), axis=1)
             result[rows] |= away > tolerance
     return result

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import trimesh
 import yaml
+from numpy.random import Generator
 
 from mereo.deformation.samplers import JointSampler, RandomMotion
 from mereo.geometry.brief import counted
@@ -284,7 +285,7 @@ def _direction(workspace: Workspace) -> str:
     return f"[{', '.join(f'{value:.3g}' for value in axis)}], the camera's `axis`"
 
 
-def _view(workspace: Workspace, mesh: SegmentedMesh, rng: np.random.Generator) -> tuple[float, int]:
+def _view(workspace: Workspace, mesh: SegmentedMesh, rng: Generator) -> tuple[float, int]:
     """Share of the vertices in a random picture, and the number of pixels that show the object."""
     local = mesh.transformed(inverse_rigid(workspace.sample(rng, mesh.bounds.mean(axis=0))))
     camera = Camera.from_fov(WIDTH, WIDTH, workspace.fov_rad)

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Int
+from numpy.linalg import norm
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -118,8 +119,7 @@ class Target:
 
     def point(self, place: Point) -> Vector:
         """Place of the file in the scene's frame."""
-        moved: Vector = self.placement.apply(np.array(place))
-        return moved
+        return self.placement.apply(np.array(place))
 
 
 class DeformationBlock(Block, ABC):
@@ -201,7 +201,7 @@ class BendBlock(DeformationBlock):
         """Sampler of bends; ``Misfit`` where ``toward`` is along the axis, or the largest one would fold space over."""
         origin, axis, length = target.point(self.origin), np.array(self.axis), self.length * target.unit
         toward = None if self.toward is None else np.array(self.toward)
-        if toward is not None and np.linalg.norm(np.cross(toward, axis)) < 1e-9 * np.linalg.norm(toward):
+        if toward is not None and norm(np.cross(toward, axis)) < 1e-9 * norm(toward):
             raise Misfit("toward", f"`toward` is {list(self.toward or ())}, along the axis; it must point away from it")
         radius = max(samplers.distance_from_line(part.vertices, origin, axis) for part in target.moved.segments)
         most = np.rad2deg(samplers.FOLD_SHARE * length / radius)
@@ -384,7 +384,7 @@ class HeldPlace(Block):
         offset = nodes - target.point(self.center)
         if self.direction is not None:
             return np.asarray(offset @ unit(np.array(self.direction)))
-        return np.asarray((self.radius or 0.0) * target.unit - np.linalg.norm(offset, axis=1))
+        return np.asarray((self.radius or 0.0) * target.unit - norm(offset, axis=1))
 
     def _rows(self, nodes: Points, numbers: Indices | None, target: Target) -> Int[np.ndarray, " r"]:
         """Rows of the nodes that are held one by one."""

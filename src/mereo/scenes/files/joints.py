@@ -10,8 +10,10 @@ from itertools import combinations, product
 
 import numpy as np
 from jaxtyping import Float
+from numpy.linalg import norm
 
 from mereo.deformation.maps import Compose, Rigid
+from mereo.geometry.conventions import Range
 from mereo.geometry.mesh import Segment, SegmentedMesh, area_vectors, connected, surface_points
 from mereo.geometry.mesh_check import overlaps
 from mereo.geometry.solids import search_tree
@@ -67,7 +69,7 @@ def contacts(mesh: SegmentedMesh) -> tuple[Contact, ...]:
     """All contacts between segments, which need not be solids. Lengths are in the mesh's unit."""
     reach = CLEARANCE * longest_side(mesh.bounds)
     vectors = [area_vectors(segment.vertices, segment.faces) for segment in mesh.segments]
-    areas = [float(np.linalg.norm(each, axis=1).sum()) for each in vectors]
+    areas = [float(norm(each, axis=1).sum()) for each in vectors]
     touching: list[Contact] = []
     for pair in combinations(range(len(mesh.segments)), 2):
         first, second = sorted(pair, key=lambda index: areas[index])
@@ -112,7 +114,7 @@ def _shapes(first: int, second: int, points: Points, normals: Points, reach: flo
         if flat.sum() < max(PLANE_SHARE * count, LEAST_POINTS):
             break
         axis, along, extent = normals[flat].mean(axis=0), *_longest(points[flat])
-        axis /= np.linalg.norm(axis)
+        axis /= norm(axis)
         touching.append(Contact(first, second, "plane", points[flat].mean(axis=0), axis, along, 0.0, extent))
         points, normals = points[~flat], normals[~flat]
     if len(points) >= LEAST_POINTS:
@@ -148,7 +150,7 @@ def _cylinder(first: int, second: int, points: Points, normals: Points) -> Conta
     system[:, 2] = outward.ravel()
     solution = np.linalg.lstsq(system, flat.ravel(), rcond=None)[0]
     center, radius = solution[:2], abs(float(solution[2]))
-    misfit = np.linalg.norm(flat - center, axis=1) - radius
+    misfit = norm(flat - center, axis=1) - radius
     if not np.sqrt(np.mean(misfit**2)) < MISFIT * radius:
         return None
     height = points @ axis
@@ -203,8 +205,8 @@ class Joint:
     hinge: bool
     moved: tuple[int, ...]
     axis: Vector
-    most: tuple[float, float]
-    alone: tuple[float, float]
+    most: Range
+    alone: Range
 
     @property
     def narrowed(self) -> bool:
@@ -274,7 +276,7 @@ def _allows(contact: Contact, joint: Contact, hinge: bool, axis: Vector, reach: 
     if contact.kind == "plane":
         return bool(aligned > PARALLEL if hinge else aligned < np.sqrt(1 - PARALLEL**2))
     away = contact.point - joint.point
-    coaxial = np.linalg.norm(away - (away @ axis) * axis) < reach
+    coaxial = norm(away - (away @ axis) * axis) < reach
     return bool(aligned > PARALLEL and (coaxial or not hinge))
 
 

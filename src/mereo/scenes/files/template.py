@@ -18,12 +18,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 import yaml
+from numpy.linalg import norm
 from scipy.spatial import ConvexHull, QhullError
 
-from mereo.deformation.maps import Deformation, moved_by, unit
+from mereo.deformation.maps import moved_by, unit
 from mereo.deformation.samplers import RandomMotion, distance_from_line
 from mereo.geometry.brief import counted, listed
-from mereo.geometry.conventions import UNITS_M, Way
+from mereo.geometry.conventions import UNITS_M, Names, Range, Way
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, palette_color, surface_points
 from mereo.geometry.mesh_check import examine, likely_unit, overlaps
 from mereo.geometry.transforms import (
@@ -59,15 +60,13 @@ from mereo.scenes.files.deformation_blocks import (
     Target,
 )
 from mereo.scenes.files.joints import SLIDES_ALONG, TURNS_ON, Joint, proposed_joints
-from mereo.scenes.scene import SCENES, Workspace
+from mereo.scenes.scene import SCENES, Draw, Workspace
 from mereo.scenes.seeds import example_rng
 
 # --- how far states move ----------------------------------------------------------------------------------------------
 
 STATES, POINTS = 24, 800
 """Random states in which motion is measured, and places of the surface at which it is."""
-
-Draw = Callable[[np.random.Generator], tuple[Deformation, ...]]
 
 
 class Motion(NamedTuple):
@@ -82,7 +81,7 @@ def measure_motion(rest: SegmentedMesh, draw: Draw) -> Motion:
     points, owner = material_points(rest, POINTS)
     states = [moved_by(points, owner, draw(example_rng(0, index))) for index in range(STATES)]
     ways = [moved - transform_points(fit_rigid(points, moved), points) for moved in states]
-    shares = np.linalg.norm(ways, axis=2) / longest_side(rest.bounds)
+    shares = norm(ways, axis=2) / longest_side(rest.bounds)
     return Motion(float(np.median(np.sqrt(np.mean(shares**2, axis=1)))), float(np.median(shares.max(axis=1))))
 
 
@@ -200,7 +199,7 @@ class FlatBase:
         """One sentence: where it is, and what a camera in a workspace sees of it."""
         normal = " ".join(f"{value:.2g}" for value in self.normal + 0.0)
         text = f"it can stand on a flat base (normal {normal}, {self.share:.0%} of its hull)"
-        axis = np.array(workspace.axis) / np.linalg.norm(workspace.axis)
+        axis = np.array(workspace.axis) / norm(workspace.axis)
         away = float(np.arccos(np.clip(axis @ self.normal, -1.0, 1.0)))
         if away - workspace.aperture_rad / 2 > np.pi / 2 - 0.01:
             return f"{text}, and the camera never looks from below"
@@ -227,7 +226,7 @@ def flat_base(mesh: SegmentedMesh, up: Sequence[float]) -> FlatBase | None:
         if not any(normal @ base.normal > SAME_NORMAL for base in bases):
             base = _base(solid, hull, normal)
             bases += [base] if base is not None else []
-    lowest = [base for base in bases if base.normal @ np.array(up) < -SAME_NORMAL * np.linalg.norm(up)]
+    lowest = [base for base in bases if base.normal @ np.array(up) < -SAME_NORMAL * norm(up)]
     return max(lowest or bases, key=lambda base: base.share, default=None)
 
 
@@ -235,7 +234,7 @@ def _base(solid: trimesh.Trimesh, hull: trimesh.Trimesh, normal: Vector) -> Flat
     heights = solid.vertices @ normal
     top = heights.max() - THICKNESS_SHARE * hull.volume / hull.area
     crossed = solid.triangles_cross * np.sign(solid.triangles_cross @ normal)[:, None]
-    areas = np.linalg.norm(crossed, axis=1)
+    areas = norm(crossed, axis=1)
     on = (heights[solid.faces].min(axis=1) > top) & (crossed @ normal > SAME_NORMAL * areas)
     if areas[on].sum() / 2 < LEAST_COVER * LEAST_BASE * hull.area:
         return None
@@ -274,7 +273,7 @@ def _default_view(rest: SegmentedMesh, draw: Draw, workspace: Workspace) -> tupl
     moved = [moved_by(points, owner, draw(example_rng(0, index))) for index in range(STATES_SEEN)]
     # the camera aims at the middle of their box
     states = [(places, (places.min(axis=0) + places.max(axis=0)) / 2) for places in moved]
-    reach = max(float(np.linalg.norm(points - center, axis=1).max()) for points, center in states)
+    reach = max(float(norm(points - center, axis=1).max()) for points, center in states)
     near = max(NEAR, float(np.ceil(reach / np.sin(MOST_VIEW_RAD / 2))))
     widest = 0.0
     for index in range(VIEWS):
@@ -413,7 +412,7 @@ def _source(files: Sequence[Path], folder: Path, robot_meshes: RobotMeshes) -> _
     return _Source("\n".join(lines), mesh, *_likely_frame(files[0], mesh.bounds))
 
 
-def _segment_names(names: Sequence[str], kind: str) -> tuple[str, ...]:
+def _segment_names(names: Sequence[str], kind: str) -> Names:
     """Names of segments after those of files or parts; raises ``ValueError`` where two of them are the same."""
     valid = tuple(_segment_name(name) for name in names)
     if repeated := sorted({name for name in valid if valid.count(name) > 1}):
@@ -683,7 +682,7 @@ def _joints(mesh: SegmentedMesh, joints: Sequence[Joint]) -> str:
     return "".join(line + "\n" for line in (JOINTS, *lines))
 
 
-def _range(values: tuple[float, float]) -> str:
+def _range(values: Range) -> str:
     return f"[{values[0]:.4g}, {values[1]:.4g}]"
 
 
