@@ -10,6 +10,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -346,6 +347,13 @@ def settled(problem: Problem, posed: Posed) -> ScoredFit:
         fit = lowered(problem, posed)
         posed = fit.posed
     return fit
+
+
+@lru_cache(maxsize=8)
+def explains_settled(problem: Problem, fit: ScoredFit) -> bool:
+    """Whether a state explains a noisy frame once it is fitted with what neighbours share as unknowns."""
+    settled = lowered(problem.worth(fit.surface), fit.posed)
+    return problem.shares_noise and settled.explains(settled.problem)
 
 
 GAIN = 1.0

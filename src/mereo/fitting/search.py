@@ -29,6 +29,7 @@ from mereo.fitting.modes import (
     ScoredFit,
     bend_by_few,
     differing,
+    explains_settled,
     explored,
     fit_cloud,
     fit_wide,
@@ -523,8 +524,8 @@ class Trail:
 
     @property
     def is_explained(self) -> bool:
-        """Whether that explains the frame."""
-        return self.best.explains(self.problem)
+        """Whether that explains the frame, noise that neighbours share aside."""
+        return self.best.explains(self.problem) or explains_settled(self.problem, self.best)
 
     def go_on(self, stage: SearchRound) -> None:
         """Fit the candidates of a round that may be the best, and explore from there."""
@@ -535,7 +536,7 @@ class Trail:
                 break
             fitted.append(refined(self.problem, fit_wide(self.problem, posed)))
         self.fitted += fitted
-        if not self.is_explained:
+        if not self.best.explains(self.problem):
             self.fitted.append(explored(self.problem, self.best))
 
     def shake(self) -> None:

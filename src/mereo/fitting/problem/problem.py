@@ -204,7 +204,7 @@ class Problem:
         share /= max(problem.cloud_misfit(surface) / USUAL, 1.0)  # of slanted surfaces and edges is more left over
         weight = SIGMAS**2 * share * len(offset)
         outside = FitConfig.silhouette_weight * min(weight / FitConfig.cloud_weight, 1.0)
-        config = replace(problem.config, cloud_weight=weight, silhouette_weight=outside)
+        config = replace(problem.config, cloud_weight=weight, silhouette_weight=outside, accepted=self.accepted)
         return problem.changed(config=config, evidence=problem.evidence.seen_again)
 
     def cleared(self, surface: Surface) -> "Problem":
@@ -249,7 +249,7 @@ class Problem:
         Of that neighbours may share as much as they do around the object, and as many points as of a clean frame must
         lie on the surface.
         """
-        if cloud < most or not self.is_noisy or self.share_on(surface) < self.config.accepted:
+        if cloud < most or not self.shares_noise or self.share_on(surface) < self.config.accepted:
             return cloud < most
         offset = self.offsets(surface, self.far)
         evidence = self.evidence
