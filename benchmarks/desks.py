@@ -21,8 +21,7 @@ from bank_views import OBJECTS, desk_view, scene_of
 
 from mereo.geometry.metrics import truth_grid
 from mereo.io.cores import use_threads
-from mereo.locating.outline import Outline
-from mereo.locating.whole_frame import LOOKS, PlacedAnswer, WholeFrame, answers_in, chance, instances_in
+from mereo.locating.whole_frame import LOOKS, PlacedAnswer, WholeFrame, answers_in, instances_in
 from mereo.synthesis.examples import View
 
 FOUND = 0.75
@@ -49,7 +48,7 @@ def facts_of(placed: PlacedAnswer, view: View | None) -> dict[str, Any]:
     facts = {
         "nats": placed.nats,
         "outline": placed.outline._asdict(),
-        "chance": chance(registration.model),
+        "believed": placed.is_believed,
         "place": placed.place.outline.nats,
         "known": said.known,
         "strangeness": said.strangeness,
@@ -89,7 +88,7 @@ def show(frames: list[dict[str, Any]]) -> None:
 
 def is_known(place: dict[str, Any]) -> bool:
     """Whether a place is believed to show the object."""
-    return place.get("known") is True and place["chance"] + Outline(**place["outline"]).nats > 0
+    return place.get("believed", False)
 
 
 def main() -> None:

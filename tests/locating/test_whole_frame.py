@@ -24,7 +24,7 @@ from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import rigid, transform_points
 from mereo.locating.outline import Jumps, Outline, compare_outline
 from mereo.locating.regions import connected_pixels, off_planes, regions, thinned
-from mereo.locating.whole_frame import BY_MASK, Place, WholeFrame, at_point, doubted, is_whole
+from mereo.locating.whole_frame import CHANCE, Place, WholeFrame, at_point, is_whole, judged
 from mereo.reconstruction.observation import find_object, shared_noise, shared_side
 from mereo.synthesis.depth_sensor import add_depth_noise, render_depth
 
@@ -208,12 +208,12 @@ def test_a_frame_of_one_plane_holds_nothing_and_that_is_a_sentence(angle: mereo.
 
 
 def test_an_outline_that_is_not_the_images_makes_an_answer_unsure_or_refuses_it(found: mereo.Result) -> None:
-    assert doubted(found, None, 0.0) is found, "nothing is around it"
-    assert doubted(found, Outline(hits=100), 0.0) is found
-    few, wrong = (doubted(found, each, 0.0).recognition for each in (Outline(hits=20), Outline(hits=20, misses=40)))
+    assert judged(found, None) is found, "nothing is around it"
+    assert judged(found, Outline(hits=100)) is found
+    few, wrong = (judged(found, each).recognition for each in (Outline(hits=20), Outline(hits=20, misses=40)))
     assert few.known == "unsure" and wrong.known is False
     assert wrong.reason is not None and "20 of 60 pixels of it have an edge" in wrong.reason
-    assert doubted(found, Outline(hits=20), BY_MASK) is found, "a mask says where it is"
+    assert judged(found, Outline(hits=20), -CHANCE) is found, "a mask says where it is"
 
 
 # --- where it is ------------------------------------------------------------------------------------------------------

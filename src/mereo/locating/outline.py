@@ -26,10 +26,10 @@ GAP = 30
 NOISE_STD = 5.0
 """Standard deviations of a camera's noise from which on a gap between neighbours is a jump."""
 
-HIT, CREASE, MISS, PAST, SEEN = 0.29, -0.7, -1.5, -3.2, 2.0
+HIT, CREASE, MISS, PAST, SEEN = 0.28, -0.26, -1.2, -3.3, 2.0
 """Nats of independent pixels: of the outline with a jump, with a crease alone, and without either. Of the root of the
 number of those inside that have seen past the object, which lie together; and of the logarithm of the share that
-nothing hides. By a logistic regression of training desks, but for the last (docs/experiments/082.md)."""
+nothing hides. By a logistic regression of training desks, but for the last (docs/experiments/091.md)."""
 
 CREASE_STD = 6.0
 """Standard deviations of their noise from which on second differences show a crease, as where a thing stands."""

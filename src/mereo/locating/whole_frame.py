@@ -42,23 +42,23 @@ from mereo.models.trained import Trained
 from mereo.reconstruction.isolation import IsolationStep, Reading, Selection
 from mereo.reconstruction.observation import HOLE_PX, Observation
 from mereo.reconstruction.pipeline import encode_frame
-from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.depth_sensor import render_depth
 
-QUICK = SearchRound(0, 200, 4, 3)
+QUICK = SearchRound(6, 40, 6, 4)
 """Round of the search by which a region is looked at."""
 
 LOOKS, ANSWERS = 12, 3
 """Regions that are looked at, and of these how many are answered, at most."""
 
-CHANCE, PER_MODE, MOST_MODES, BY_MASK = -3.0, -0.5, 6, 5.0
-"""Nats of an object at a place of a frame before its outline is compared; those of each mode, up to so many, by which
-it can follow another thing's outline; and how many a mask adds."""
+CHANCE, BENDS, RULED_OUT, STRANGE = -4.0, -0.8, -2.4, -0.036
+"""Nats of an object at a place of a frame where nobody says that it is there; of one that bends, and so can follow
+another thing's outline; of the logarithm of one and the percent of its surface that are ruled out; and of the square of
+its strangeness. By the regression of ``outline.HIT``."""
 
 WORTH = 1.0
 """Nats that a better state must win at a place to be searched for."""
 
-UNLIKELY = -5.0
+UNLIKELY = -3.0
 """Nats below which a frame does not show the object at a place; up to 0 it may."""
 
 NOWHERE = (
@@ -273,7 +273,7 @@ def locate_object(
     """
     frame = WholeFrame.of(seen, replace(registrar, method="modes"), scene_unit)
     best, *_ = instances_in(frame, list(answers_in(frame, registrar.network, keep_all)), keep_all)
-    return best.seen, best.candidate if best.is_outlined else replace(best.candidate, modes=None)
+    return best.seen, best.candidate if best.nats > 0 else replace(best.candidate, modes=None)
 
 
 def is_whole(seen: Observation, registrar: Registrar) -> bool:
@@ -302,9 +302,12 @@ def at_point(seen: Observation, registrar: Registrar | None) -> Observation:
     return replace(part_of(seen, label == label[row, column], "point", "the connected surface at it"), point=None)
 
 
-def chance(model: StatisticalModel) -> float:
-    """Nats of an object at a place of a frame before its outline is compared."""
-    return CHANCE + PER_MODE * min(model.count, MOST_MODES)
+def evidence_of(answer: Answer, outline: Outline, stated: float = 0.0) -> float:
+    """Nats by which an answer is likelier than something else that was taken for the object; some may be ``stated``."""
+    registration = answer.registration
+    assert registration is not None
+    state = BENDS * (registration.model.count > 0) + STRANGE * answer.recognition.strangeness**2
+    return float(CHANCE + stated + state + RULED_OUT * np.log1p(100 * (registration.ruled_out or 0.0)) + outline.nats)
 
 
 @dataclass(frozen=True, eq=False)
@@ -330,9 +333,7 @@ class PlacedAnswer:
     @property
     def nats(self) -> float:
         """By the outline, and by how strange the state and what is left over are."""
-        registration = self.answer.registration
-        assert registration is not None
-        return chance(registration.model) + self.outline.nats - self.lost
+        return evidence_of(self.answer, self.outline)
 
     @property
     def mesh(self) -> SegmentedMesh:
@@ -342,23 +343,18 @@ class PlacedAnswer:
 
     @property
     def lost(self) -> float:
-        """Nats that the state's strangeness costs, and that a better state may win."""
+        """Nats that a better state may win: those of the strangeness, were it spread as normal numbers."""
         return 0.5 * self.answer.recognition.strangeness**2
 
     @property
-    def is_outlined(self) -> bool:
-        """Whether the outline is none of another thing, as ``doubted`` has it."""
-        return self.nats + self.lost > 0
-
-    @property
     def is_believed(self) -> bool:
-        """Whether the object is known there, by its outline too."""
-        return self.is_outlined and self.answer.recognition.known is True
+        """Whether the object is known there."""
+        return judged(self.answer, self.outline).recognition.known is True
 
     @property
     def is_evident(self) -> bool:
         """Whether it is believed, and no state is much better."""
-        return self.is_believed and self.nats > 0 and self.lost < WORTH
+        return self.is_believed and self.lost < WORTH
 
 
 def answers_in(
@@ -419,13 +415,13 @@ def answer_observation(
         answer = answer_frame(
             seen, model, registrar, keep_all=keep_all, resolution=resolution, label_points=label_points
         )
-        return doubted(answer, outline_of(answer), BY_MASK)
+        return judged(answer, outline_of(answer), -CHANCE)
     check_value("resolution", resolution, Cells, 128)
     started = time.perf_counter()
     with stage("look through the whole frame"), limit_blas_threads():
         frame = WholeFrame.of(seen, registrar)
         best, *others = instances_in(frame, list(answers_in(frame, model, keep_all, most)), keep_all, most)
-    answer = absent(best) if best.nats < UNLIKELY else doubted(best.answer, best.outline, 0.0)
+    answer = absent(best) if best.nats < UNLIKELY else judged(best.answer, best.outline)
     stated: dict[str, Any] = {"resolution": resolution, "label_points": label_points}
     further = tuple(replace(each.answer, **stated) for each in others if best.nats >= UNLIKELY)
     return replace(answer, **stated, further=further, seconds=time.perf_counter() - started)
@@ -460,11 +456,11 @@ def outline_of(answer: Answer) -> Outline | None:
     return compare_outline(jumps, render_depth(registration.mesh, jumps.image.camera).depth)
 
 
-def doubted(answer: Answer, outline: Outline | None, stated: float) -> Answer:
-    """The same, unsure or not known where an outline speaks against it; ``stated`` are the nats of who says where."""
+def judged(answer: Answer, outline: Outline | None, stated: float = 0.0) -> Answer:
+    """The same, unsure or not known where its evidence speaks against it; ``stated`` are the nats of who says where."""
     if outline is None or answer.registration is None or answer.recognition.known is False:
         return answer
-    nats = chance(answer.registration.model) + stated + outline.nats
+    nats = evidence_of(answer, outline, stated)
     if nats > 0:
         return answer
     reason = (
