@@ -40,7 +40,7 @@ from mereo.fitting.problem.evidence import Evidence, Observed, SurfaceEvidence
 from mereo.fitting.problem.gauss_newton import DAMPING, Posed, cross
 from mereo.fitting.problem.problem import Problem, is_normal, noise_of
 from mereo.fitting.problem.residuals import ROBUST, Prior, SampledSurface
-from mereo.fitting.problem.segments import diverse_rows, rms_distance
+from mereo.fitting.problem.segments import corner_positions, diverse_rows, rms_distance
 from mereo.geometry.transforms import rotation_along, unit_rows
 from mereo.io.cores import cores
 from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
@@ -511,11 +511,17 @@ _total = attrgetter("misfit.total")
 
 @dataclass(eq=False)
 class Trail:
-    """Search under one hypothesis on the lines of sight around the cloud, by the constants of one noise."""
+    """Search under one hypothesis on the lines of sight around the cloud, by the constants of one noise.
+
+    Attributes:
+        handicap: misfit by which another hypothesis is likelier before the frame was seen.
+        is_repeated: whether several starts of a round ended in the best state, so that others would, too.
+    """
 
     problem: Problem
     handicap: float = 0.0
     fitted: list[ScoredFit] = field(default_factory=list)
+    is_repeated: bool = False
 
     @property
     def best(self) -> ScoredFit:
@@ -538,6 +544,9 @@ class Trail:
         self.fitted += fitted
         if not self.best.explains(self.problem):
             self.fitted.append(explored(self.problem, self.best))
+        places = corner_positions(self.problem.model, [fit.posed for fit in (self.best, *fitted)])
+        near = rms_distance(places[1:] - places[0]) < BENT_APART * self.problem.model.half
+        self.is_repeated = int(near.sum()) > 1
 
     def shake(self) -> None:
         """Fit again from states around the best fits that differ: an object that looks alike turned is one of them."""
@@ -564,7 +573,7 @@ class Trail:
         states = [scored.posed for scored in sorted(self.fitted, key=_total)]
         rows = differing(problem, states, BENT_APART)[:KEPT]
         fits = [refined(problem, fit_wide(problem, states[row])) for row in rows]
-        return Trail(problem, self.handicap, fits)
+        return Trail(problem, self.handicap, fits, self.is_repeated)
 
     def with_shared_noise(self) -> "Trail":
         """The same with all noise that the best fit leaves over, where nothing else explains the frame."""
@@ -625,9 +634,9 @@ def search(
         if chosen.is_explained:
             return chosen
         heavier = chosen.with_heavier_cloud()
-        if heavier is not None and (stage is rounds[-1] or heavier.is_explained):
-            return heavier
-    return chosen.with_shared_noise()
+        if chosen.is_repeated or (heavier is not None and heavier.is_explained):
+            break
+    return heavier or chosen.with_shared_noise()
 
 
 def likelier(trails: list[Trail]) -> Trail:
