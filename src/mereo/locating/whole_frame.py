@@ -258,7 +258,7 @@ class WholeFrame:
         if modes is None or placed.nats < UNLIKELY or placed.is_finished:
             return placed
         again = self.answered(self.place(placed.place.mask, [modes.posed]), model, keep_all, ())
-        best = placed if again is None else max(placed, again, key=lambda each: each.nats)
+        best = placed if again is None else max(placed, again, key=lambda each: each.score)
         answer = answer_candidate(best.seen, model, self.registrar, best.candidate, best.candidate.encoded)
         assert answer.registration is not None
         return replace(best, answer=answer, outline=self.outline(answer.registration.mesh), is_finished=True)
@@ -336,6 +336,11 @@ class PlacedAnswer:
         return evidence_of(self.answer, self.outline)
 
     @property
+    def score(self) -> float:
+        """Nats of the answer as it is, by which answers are compared."""
+        return self.nats - self.lost
+
+    @property
     def mesh(self) -> SegmentedMesh:
         """Registered mesh, in the image's unit."""
         assert self.answer.registration is not None
@@ -384,8 +389,8 @@ def answers_in(
             if most == 0:
                 return
             answers.append(placed)
-        least = min(0.0, max((placed.nats for placed in answers), default=0.0))
-        waiting = [each.place for each in answers if hopeful and each.lost >= WORTH and each.nats + each.lost > least]
+        least = min(0.0, max((placed.score for placed in answers), default=0.0))
+        waiting = [each.place for each in answers if hopeful and each.lost >= WORTH and each.nats > least]
 
 
 def answer_observation(
@@ -435,7 +440,7 @@ def instances_in(
     Raises ``NoFit`` where there are none.
     """
     instances, taken = list[PlacedAnswer](), np.zeros_like(frame.jumps.image.valid)
-    for placed in sorted(answers, key=lambda placed: -placed.nats):
+    for placed in sorted(answers, key=lambda placed: -placed.score):
         is_further = len(instances) < most and placed.is_believed and not frame.is_among(taken, placed.mesh)
         if is_further or not instances:
             instances.append(frame.finished(placed, keep_all))
