@@ -352,8 +352,9 @@ def settled(problem: Problem, posed: Posed) -> ScoredFit:
 @lru_cache(maxsize=8)
 def explains_settled(problem: Problem, fit: ScoredFit) -> bool:
     """Whether a state explains a noisy frame once it is fitted with what neighbours share as unknowns."""
-    settled = lowered(problem.worth(fit.surface), fit.posed)
-    return problem.shares_noise and settled.explains(settled.problem)
+    return problem.shares_noise and (settled := lowered(problem.worth(fit.surface), fit.posed)).explains(
+        settled.problem
+    )
 
 
 GAIN = 1.0

@@ -246,7 +246,7 @@ class Problem:
     def explained(self, cloud: float, surface: Surface, most: float) -> bool:
         """Whether a surface explains the cloud: by a misfit below ``most``, or of a noisy one all but the noise.
 
-        Of that neighbours may share as much as they do around the object, and as many points as of a clean frame must
+        Of that neighbours may share as much as they do around the object, and as many points as are to be accepted must
         lie on the surface.
         """
         if cloud < most or not self.shares_noise or self.share_on(surface) < self.config.accepted:
