@@ -88,7 +88,7 @@ def show(frames: list[dict[str, Any]]) -> None:
 
 def is_known(place: dict[str, Any]) -> bool:
     """Whether a place is believed to show the object."""
-    return place.get("believed", False)
+    return bool(place) and place["believed"]
 
 
 def main() -> None:

@@ -342,19 +342,14 @@ def fit_seen(
 
 def settled(problem: Problem, posed: Posed) -> ScoredFit:
     """Fit a noisy frame again, twice, with as many independent points as the fit shows that its cloud is worth."""
-    for _ in range(2):
-        problem = problem.worth(problem.surface(posed))
-        fit = lowered(problem, posed)
-        posed = fit.posed
-    return fit
+    first = settled_once(problem, posed)
+    return settled_once(first.problem, first.posed)
 
 
-@lru_cache(maxsize=8)
-def explains_settled(problem: Problem, fit: ScoredFit) -> bool:
-    """Whether a state explains a noisy frame once it is fitted with what neighbours share as unknowns."""
-    return problem.shares_noise and (settled := lowered(problem.worth(fit.surface), fit.posed)).explains(
-        settled.problem
-    )
+@lru_cache(maxsize=2)  # a search has settled the state that it ends with, to see whether that explains the frame
+def settled_once(problem: Problem, posed: Posed) -> ScoredFit:
+    """Fit a noisy frame again as ``settled``, once."""
+    return lowered(problem.worth(problem.surface(posed)), posed)
 
 
 GAIN = 1.0

@@ -29,11 +29,11 @@ from mereo.fitting.modes import (
     ScoredFit,
     bend_by_few,
     differing,
-    explains_settled,
     explored,
     fit_cloud,
     fit_wide,
     refined,
+    settled_once,
     shaken,
 )
 from mereo.fitting.problem.evidence import Evidence, Observed, SurfaceEvidence
@@ -531,7 +531,10 @@ class Trail:
     @property
     def is_explained(self) -> bool:
         """Whether that explains the frame, noise that neighbours share aside."""
-        return self.best.explains(self.problem) or explains_settled(self.problem, self.best)
+        problem, best = self.problem, self.best
+        return best.explains(problem) or (
+            problem.shares_noise and (settled := settled_once(problem, best.posed)).explains(settled.problem)
+        )
 
     def go_on(self, stage: SearchRound) -> None:
         """Fit the candidates of a round that may be the best, and explore from there."""

@@ -20,17 +20,14 @@ CORNERS = np.array([[0, 0, 0], [0, 1, 0], [1, 1, 0], [1, 0, 0], [0, 0, 1], [0, 1
 FAR_SIDES = ((2, 3, 7, 6), (1, 2, 6, 5), (4, 5, 6, 7))
 """Corners around the far side of a cell along each axis."""
 
-MOST_FACES = 5
-"""In a cell."""
-
 
 @cache
 def cases() -> Int[np.ndarray, "256 f 3 3"]:
-    """Corners of the faces in a cell, in half cells, or -1 where there are fewer, by libigl.
+    """Corners of the faces in a cell, in half cells, or -1 where there are fewer than five, by libigl.
 
     Bit k of a case says whether the field is positive at corner k.
     """
-    faces = np.full((256, MOST_FACES, 3, 3), -1)
+    faces = np.full((256, 5, 3, 3), -1)
     for case in range(1, 255):
         values = np.where(case >> np.arange(8) & 1, 1.0, -1.0)
         middles, rows, _ = igl.marching_cubes(values, CORNERS.astype(np.float64), np.arange(8)[None], 0.0)

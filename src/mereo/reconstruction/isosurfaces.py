@@ -156,7 +156,7 @@ def _halve(
     fine_labels = labels[np.ix_(*(np.arange(n) // 2 for n in shape))]
     fine_rows = np.full(shape, -1, dtype=np.int32)
     fine_rows[::2, ::2, ::2] = rows
-    halves = np.kron(active, np.ones((2, 2, 2), dtype=bool))
+    halves = active.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
     wanted = np.argwhere(nodes_of(halves) & (fine_rows < 0))
     while len(wanted):
         place = tuple(wanted.T)
