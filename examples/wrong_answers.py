@@ -28,7 +28,6 @@ from mereo.synthesis.examples import sample_view
 from mereo.visualization.contact_sheets import INK, Picture, fit_font, save_png
 from mereo.visualization.previews import points_on_segments
 from mereo.visualization.reconstruction_report import VERDICTS, trust
-from mereo.visualization.result_files import frame_facts
 
 SIDE, TEXT = 280, 130
 """In pixels: of each picture, and the height of the words below a column."""
@@ -68,7 +67,7 @@ class Case:
         given = self.name if self.finder == "weights" else load_scene(self.name)
         result = mereo.reconstruct(PointCloud(points), given, unit_m=scene.unit_m)
         score = "" if self.seen else scores(view.mesh, result.surfaces)
-        verdict = trust(frame_facts(result))
+        verdict = trust(result.to_dict())
         words = [self.title, score, f"{VERDICTS[verdict.level]}: {verdict.why}".replace("\N{NO-BREAK SPACE}", " ")]
         print(" | ".join(words), flush=True)
         pictures = [points_on_segments(points, mesh, [BESIDE], SIDE)[0] for mesh in (view.mesh, result.surfaces)]

@@ -18,7 +18,7 @@ from scipy.special import ndtr, ndtri
 
 from mereo.deformation.moving_least_squares import PointWeights, spread
 from mereo.fitting.config import FEW_DRAWS, MANY_DRAWS, DrawsConfig
-from mereo.fitting.draws.playback import Drawn, DrawnStates, as_sparse, material_moved, shares_of
+from mereo.fitting.draws.playback import NO_DIRECTIONS, Directions, Drawn, DrawnStates, as_sparse, material_moved, shares_of
 from mereo.fitting.modes import refine, robust_poses
 from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, geman_mcclure, in_space
@@ -123,6 +123,7 @@ class DrawsFit:
 
 def simulate(problem: DrawsProblem, drawn: Drawn, z: Float[np.ndarray, " d"], posed: Posed) -> DrawsFit | None:
     """Simulate the state of these draws and score it; None where the scene refuses it."""
+    z = drawn.normalized(z)
     deformations = drawn.deformations(problem.states.scene, z)
     if deformations is None:
         return None
@@ -319,6 +320,7 @@ class StateOnShape:
 
 def lay_on_shape(states: DrawnStates, shape: Shape, drawn: Drawn, z: Float[np.ndarray, " d"]) -> StateOnShape | None:
     """Lay the state of these draws robustly onto the shape; None where the scene refuses it."""
+    z = drawn.normalized(z)
     deformations = drawn.deformations(states.scene, z)
     if deformations is None:
         return None
@@ -492,7 +494,7 @@ def find_other_choices(problem: DrawsProblem, shape: Shape, best: StateOnShape |
     states = problem.states
     if best is None or best.misfit < 100.0:
         return []
-    others = redraw_choices(states.scene, replace(best.drawn, z=best.z), 100)
+    others = redraw_choices(states.scene, replace(best.drawn, z=best.z), 100, states.directions)
     states_near = [lay_on_shape(states, shape, other, other.z) for other in others]
     # a choice may come out the same again
     new = [near for near in states_near if near is not None and np.abs(near.points - best.points).max() > shape.std]
@@ -618,7 +620,7 @@ def lower(
 # --- other discrete choices -------------------------------------------------------------------------------------------
 
 
-def redraw_choices(scene: Scene, drawn: Drawn, count: int) -> list[Drawn]:
+def redraw_choices(scene: Scene, drawn: Drawn, count: int, directions: Directions = NO_DIRECTIONS) -> list[Drawn]:
     """Redraw some of the discrete draws of a state, and what depends on them; fewer than ``count`` where refused.
 
     Discrete draws are such as how many corners of a sheet are folded: derivatives do not reach across them, and random
@@ -641,7 +643,7 @@ def redraw_choices(scene: Scene, drawn: Drawn, count: int) -> list[Drawn]:
             play(scene, recorder)
         except (OutOfDraws, ValueError):
             continue
-        redrawn.append(Drawn.recorded(recorder.calls, seed))
+        redrawn.append(Drawn.recorded(recorder.calls, seed, directions))
     return redrawn
 
 

@@ -4,8 +4,9 @@ Every number that a scene draws is a share of its distribution, uniform in 0..1;
 normal. Played back in the order of the calls, the same shares give the same state, and others its neighbours.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,8 @@ from scipy.special import ndtr, ndtri
 from mereo.deformation.maps import Deformation
 from mereo.deformation.moving_least_squares import Anchors, PointWeights, spread
 from mereo.geometry.transforms import best_rotations
-from mereo.scenes.draw_recorder import SMOOTH, Call, OutOfDraws, Recorder, Shares
-from mereo.scenes.parameters import random_state
+from mereo.scenes.draw_recorder import SMOOTH, Call, OutOfDraws, Place, Recorder, Shares
+from mereo.scenes.parameters import play, random_state
 from mereo.scenes.random_states import state_points
 from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel, following
@@ -28,8 +29,17 @@ STATES_SEED = 400_000
 MOST_DRAWS = 120
 """Scenes with more free numbers are left to the modes."""
 
+SHORTEST = 1e-9
+"""Least length of a direction."""
+
 LARGEST = 4.0
 """Standard deviations; farther out a share is 0 or 1."""
+
+
+Directions = Mapping[Place, tuple[slice, ...]]
+"""Which numbers of the calls from a place are a direction each."""
+
+NO_DIRECTIONS: Directions = MappingProxyType({})
 
 
 class Playback(Recorder):
@@ -54,12 +64,14 @@ class Drawn:
         seed: of what is not recorded.
         z, smooth: all draws in the order of the calls, standard normal, and which of them move the state continuously.
         sizes: how many numbers each call drew.
+        directions: draws that are a direction each: how long it is moves nothing (``find_directions``).
     """
 
     seed: int
     z: Float[np.ndarray, " d"]
     sizes: tuple[int, ...]
     smooth: Bool[np.ndarray, " d"]
+    directions: tuple[slice, ...] = ()
 
     @classmethod
     def of(cls, scene: Scene, seed: int) -> "Drawn":
@@ -67,11 +79,29 @@ class Drawn:
         return cls.recorded(random_state(scene, seed).calls, seed)
 
     @classmethod
-    def recorded(cls, calls: Sequence[Call], seed: int) -> "Drawn":
+    def recorded(cls, calls: Sequence[Call], seed: int, directions: Directions = NO_DIRECTIONS) -> "Drawn":
         """The state of recorded calls; ``seed`` is that of what is not recorded."""
         sizes = tuple(len(call.shares) for call in calls)
         smooth = np.concatenate([np.full(len(call.shares), call.kind in SMOOTH) for call in calls])
-        return cls(seed, ndtri(np.concatenate([call.shares for call in calls])), sizes, smooth)
+        firsts = np.cumsum((0, *sizes)).tolist()
+        found = tuple(
+            slice(first + part.start, first + part.stop)
+            for call, first in zip(calls, firsts, strict=False)
+            for part in directions.get(call.key[0], ())
+        )
+        drawn = cls(seed, ndtri(np.concatenate([call.shares for call in calls])), sizes, smooth, found)
+        return replace(drawn, z=drawn.normalized(drawn.z))
+
+    def normalized(self, z: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
+        """The same state by draws whose directions have one length.
+
+        With it a standard deviation across a direction is, squared, what random directions are off it on average. The
+        prior of normal numbers would have each as short as can be, where a small step turns it to any other.
+        """
+        z = z.copy()
+        for each in self.directions:
+            z[each] *= np.sqrt((each.stop - each.start - 1) / 2) / max(float(np.linalg.norm(z[each])), SHORTEST)
+        return z
 
     def deformations(
         self, scene: Scene, z: Float[np.ndarray, " d"], checked: bool = True
@@ -136,6 +166,7 @@ class DrawnStates:
         z: their draws, standard normal; NaN of states with other calls than the first that was not drawn again.
         modes: their coefficients in the statistical model.
         played: points whose motion is played for derivatives.
+        directions: where draws come from that are directions, and which of a call's numbers.
         recorded: what ``drawn`` has recorded so far.
     """
 
@@ -145,12 +176,13 @@ class DrawnStates:
     z: Float[np.ndarray, "n d"]
     modes: Float[np.ndarray, "n k"]
     played: Played
+    directions: Directions
     recorded: dict[int, Drawn] = field(default_factory=dict)
 
     def drawn(self, seed: int) -> Drawn:
         """``Drawn.of`` one of the seeds, recorded once: frames share their starts."""
         if seed not in self.recorded:
-            self.recorded[seed] = Drawn.of(self.scene, seed)
+            self.recorded[seed] = Drawn.recorded(random_state(self.scene, seed).calls, seed, self.directions)
         return self.recorded[seed]
 
     @classmethod
@@ -159,15 +191,18 @@ class DrawnStates:
     ) -> "DrawnStates":
         """States of ``count`` seeds from ``first_seed`` on."""
         seeds = tuple(range(first_seed, first_seed + count))
-        material, draws = [], []
+        material, calls, played = [], [], Played.of(model)
         for seed in seeds:
             recorder = Recorder(seed, {})
-            state = scene.deform(scene.sample_deformations(recorder))
+            state = scene.deform(play(scene, recorder))
             material.append(state_points(state, model.nodes, model.node_labels).astype(np.float32))
-            draws.append(ndtri(np.concatenate([call.shares for call in recorder.calls])))
+            calls.append(recorder.calls)
+        directions = find_directions(scene, played, calls)
+        draws = [Drawn.recorded(each, seed, directions).z for each, seed in zip(calls, seeds, strict=True)]
         fewest = min(len(z) for z in draws)
         z = np.stack([z if len(z) == fewest else np.full(fewest, np.nan) for z in draws])
-        return cls(scene, seeds, np.stack(material), z, coefficients(model, np.stack(material)), Played.of(model))
+        modes = coefficients(model, np.stack(material))
+        return cls(scene, seeds, np.stack(material), z, modes, played, directions)
 
     def guess(self, modes: Float[np.ndarray, " k"], motion: Float[np.ndarray, " k"]) -> Drawn:
         """Draws of a state of these coefficients: ridge regression on states, those near it counting more.
@@ -184,6 +219,48 @@ class DrawnStates:
         answer = np.linalg.solve(weighted.T @ basis + ridge, weighted.T @ self.z[usable])[0]
         like = self.drawn(self.seeds[usable[0]])
         return replace(like, z=np.where(like.smooth, np.clip(answer, -2.0, 2.0), like.z))
+
+
+def find_directions(scene: Scene, played: Played, states: Sequence[Sequence[Call]]) -> Directions:
+    """Find the normal draws that are directions: rows of a call's numbers, or all that are none of these together.
+
+    Half as long a direction moves nothing, turned round it does.
+    """
+    cases = dict[Place, list[tuple[Drawn, int]]]()
+    shapes = dict[Place, tuple[int, ...]]()
+    for calls in states:
+        drawn, ends = Drawn.recorded(calls, 0), np.cumsum([len(call.shares) for call in calls])
+        for call, end in zip(calls, ends.tolist(), strict=True):
+            if call.kind == "normal" and len(call.shares) > 1:
+                cases.setdefault(call.key[0], []).append((drawn, end - len(call.shares)))
+                shapes[call.key[0]] = call.shape
+
+    def moved(drawn: Drawn, part: slice, factor: float) -> float:
+        z = drawn.z.copy()
+        z[part] *= factor
+        both = [drawn.deformations(scene, each, checked=False) for each in (drawn.z, z)]
+        places = [played.moved(each) for each in both if each is not None]
+        return float(np.abs(places[0] - places[-1]).max()) if len(places) == 2 else np.inf
+
+    def is_direction(place: Place, part: slice) -> bool:
+        few = [(drawn, slice(first + part.start, first + part.stop)) for drawn, first in cases[place][:TRIED]]
+        return all(moved(*each, 0.5) < SAME for each in few) and any(moved(*each, -1.0) > SAME for each in few)
+
+    found = dict[Place, tuple[slice, ...]]()
+    for place, shape in shapes.items():
+        rows = [slice(first, first + shape[-1]) for first in range(0, int(np.prod(shape)), shape[-1])]
+        parts = [row for row in rows if is_direction(place, row)]
+        rest = slice(parts[-1].stop if parts else 0, rows[-1].stop)
+        parts += [rest] if rest.start < rest.stop and rest not in rows and is_direction(place, rest) else []
+        found[place] = tuple(parts)
+    return {place: parts for place, parts in found.items() if parts}
+
+
+TRIED = 4
+"""States in which draws are tried."""
+
+SAME = 1e-3
+"""Scene units by which places differ that are the same, in single precision."""
 
 
 def coefficients(model: StatisticalModel, material: Float32[np.ndarray, "n m 3"]) -> Float[np.ndarray, "n k"]:
