@@ -95,8 +95,7 @@ def answer_candidate(
         raise candidate.error
     modes = candidate.modes
     answer = answer_of(seen, model, registrar, candidate, likelier, None if modes is None else modes.registration)
-    # of what is no view of the object, the parameters of its scene say nothing, and take longest
-    if registrar is not None and modes is not None and (registrar.method == "full" or answer.recognition.known):
+    if registrar is not None and modes is not None:
         with stage("fit the parameters of the scene"):
             registration = registrar.finish(modes)
         if registration is not modes.registration:
